@@ -1,0 +1,1 @@
+"""Prefect flows over lidarops: thin, no logic of their own."""

@@ -1,0 +1,344 @@
+"""The campaign file: what a person writes, as validated models.
+
+A campaign is one YAML file. Everything has a default that a lidar scientist would choose.
+Facts about an instrument carry validity periods, because an archive of ten years needs them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import yaml
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+from lidarops.errors import CampaignError
+from lidarops.simulate.settings import SimulationSettings
+
+ARCHIVE_VARIABLE = "LIDAROPS_ARCHIVE"
+
+
+def _utc(value: datetime) -> datetime:
+    return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+def _as_list(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+def _clean_pattern(value: str) -> str:
+    if value.startswith(("/", "~")) or ".." in value.split("/"):
+        raise ValueError(f"pattern {value!r} must stay inside the archive: relative, without '..'")
+    return value
+
+
+def _as_interval(value: Any) -> Any:
+    # YAML reads 1:30 as 90 and 3600 as seconds; people write 6h or 30min.
+    if isinstance(value, str) and value != "day":
+        units = {"s": 1, "min": 60, "h": 3600, "d": 86400}
+        number = value.rstrip("abcdefghijklmnopqrstuvwxyz ")
+        unit = value[len(number) :].strip()
+        if unit in units:
+            return timedelta(seconds=float(number) * units[unit])
+    return value
+
+
+Instant = Annotated[datetime, AfterValidator(_utc)]
+Patterns = Annotated[
+    list[Annotated[str, AfterValidator(_clean_pattern)]], BeforeValidator(_as_list), Field()
+]
+Identifier = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$", max_length=40)]
+Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Station(_Model):
+    """A place where instruments stand."""
+
+    name: str
+    latitude: float = Field(ge=-90, le=90, description="degrees north")
+    longitude: float = Field(ge=-180, le=180, description="degrees east")
+    altitude: float = Field(default=0.0, ge=-500, le=9000, description="m above the geoid")
+
+
+class ChannelFacts(_Model):
+    """What is known of one channel over a validity period."""
+
+    wavelength: float | None = Field(
+        default=None, gt=1e-7, lt=2e-5, description="m, where the header is wrong"
+    )
+    dead_time: float | None = Field(default=None, gt=0, lt=1e-6, description="s")
+    range_offset: float | None = Field(
+        default=None, ge=-500, le=500, description="m added to the range of every bin"
+    )
+    noise_variance: float | None = Field(
+        default=None, gt=0, description="analog noise variance of one profile, mV^2"
+    )
+
+
+class InstrumentFacts(_Model):
+    """What is known of an instrument over a validity period."""
+
+    valid_from: Instant = datetime.min.replace(tzinfo=UTC)
+    valid_to: Instant = datetime.max.replace(tzinfo=UTC)
+    zenith_angle: float | None = Field(default=None, ge=0, le=180, description="degree")
+    azimuth: float | None = Field(default=None, ge=0, lt=360, description="degree")
+    full_overlap_range: Metres = Field(default=0.0, description="m")
+    channels: dict[str, ChannelFacts] = {}
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.valid_to <= self.valid_from:
+            raise ValueError("valid_to must be later than valid_from")
+        return self
+
+
+class SignalSettings(_Model):
+    """The ``signal`` product: background-subtracted, range-corrected signals."""
+
+    channels: list[str] | Literal["all"] = "all"
+    background_range: tuple[Metres, Metres] | None = Field(
+        default=None, description="m; the last tenth of the bins where not given"
+    )
+
+
+class HomogeneousSettings(_Model):
+    """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
+
+    channels: list[str] = Field(min_length=1)
+    sections: list[tuple[Metres, Metres]] = Field(min_length=1, description="m")
+    method: Literal["auto", "cubic"] = "auto"
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        for near, far in self.sections:
+            if far <= near:
+                raise ValueError(f"section [{near}, {far}] must end farther than it starts")
+        return self
+
+
+class Products(_Model):
+    """Which products of an instrument are wanted, with which settings."""
+
+    signal: SignalSettings | None = None
+    homogeneous: HomogeneousSettings | None = None
+
+
+class Instrument(_Model):
+    """A lidar, the files it wrote, what is known of it and what is wanted from it."""
+
+    station: Identifier
+    name: str = ""
+    files: Patterns
+    dark_files: Patterns = []
+    header_position: Literal["longitude_first", "latitude_first", "ignore"] = "longitude_first"
+    facts: list[InstrumentFacts] = [InstrumentFacts()]
+    products: Products = Products()
+
+    @model_validator(mode="after")
+    def _disjoint(self) -> Self:
+        periods = sorted((fact.valid_from, fact.valid_to) for fact in self.facts)
+        for (_, stop), (start, _) in pairwise(periods):
+            if start < stop:
+                raise ValueError(f"validity periods of facts overlap at {start:%Y-%m-%d}")
+        return self
+
+    def facts_at(self, moment: datetime) -> InstrumentFacts:
+        """Return the facts that are valid at `moment`, or empty ones."""
+        for fact in self.facts:
+            if fact.valid_from <= moment < fact.valid_to:
+                return fact
+        return InstrumentFacts()
+
+
+class Metadata(_Model):
+    """Who made the data: global attributes of every product (ACDD-1.3)."""
+
+    institution: str = "unknown institution"
+    project: str = "lidarops"
+    creator_name: str = "unknown creator"
+    creator_email: str = "unknown@example.org"
+    creator_url: str = "https://example.org"
+    publisher_name: str = ""
+    publisher_email: str = ""
+    publisher_url: str = ""
+    naming_authority: str = "org.example"
+    license: str = "Not stated. Ask the creator before use."
+    acknowledgement: str = "Not stated."
+    references: str = ""
+    comment: str = ""
+    program: str = ""
+
+
+class Scenes(_Model):
+    """How granules are cut into scenes."""
+
+    window: Annotated[Literal["day"] | timedelta, BeforeValidator(_as_interval)] = "day"
+
+    @model_validator(mode="after")
+    def _divides_day(self) -> Self:
+        if isinstance(self.window, timedelta):
+            seconds = self.window.total_seconds()
+            if seconds < 60 or 86400 % seconds:
+                raise ValueError("window must be at least 1 min and divide a day: 30min, 6h, day")
+        return self
+
+
+class Campaign(_Model):
+    """One campaign: stations, instruments, where the raw files are, which products."""
+
+    name: Identifier
+    title: str
+    summary: str = ""
+    archive: str = Field(description="folder of the raw files, relative to the campaign file")
+    output: str = Field(description="folder of catalog, products and reports")
+    metadata: Metadata = Metadata()
+    stations: dict[Identifier, Station] = Field(min_length=1)
+    instruments: dict[Identifier, Instrument] = Field(min_length=1)
+    scenes: Scenes = Scenes()
+    simulation: SimulationSettings | None = None
+
+    @model_validator(mode="after")
+    def _known_stations(self) -> Self:
+        for key, instrument in self.instruments.items():
+            if instrument.station not in self.stations:
+                known = ", ".join(sorted(self.stations))
+                raise ValueError(
+                    f"instrument {key!r} stands at unknown station {instrument.station!r};"
+                    f" known: {known}"
+                )
+        return self
+
+    @property
+    def catalog_url(self) -> str:
+        """SQLAlchemy URL of the campaign's catalog."""
+        return f"sqlite:///{Path(self.output) / 'catalog.sqlite'}"
+
+    @property
+    def products_root(self) -> Path:
+        """Folder of the products."""
+        return Path(self.output) / "products"
+
+    @property
+    def report_root(self) -> Path:
+        """Folder of the run reports."""
+        return Path(self.output) / "report"
+
+    @property
+    def truth_path(self) -> Path:
+        """The truth file of a simulated campaign."""
+        return Path(self.archive) / "truth.nc"
+
+
+def load(
+    path: str | Path, *, archive: str | Path | None = None, output: str | Path | None = None
+) -> Campaign:
+    """Read and validate a campaign file.
+
+    Parameters
+    ----------
+    path : path or str
+        The YAML file.
+    archive : path or str, optional
+        Root of the raw files; wins over the environment variable ``LIDAROPS_ARCHIVE``, which
+        wins over the file.
+    output : path or str, optional
+        Folder of catalog, products and reports; wins over the file.
+
+    Returns
+    -------
+    Campaign
+        With `archive` and `output` absolute.
+
+    Raises
+    ------
+    CampaignError
+        With file, line, key and the valid choices, where the file cannot be used.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CampaignError(
+            f"cannot be read: {error}", file=path, remedy="give the path of a campaign YAML file"
+        ) from error
+    try:
+        tree = yaml.compose(text, Loader=yaml.SafeLoader)
+        raw = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise CampaignError(f"is not valid YAML: {error}", file=path) from error
+    if not isinstance(raw, dict):
+        raise CampaignError(
+            "is not a mapping", file=path, remedy="see catalogs/demo.yaml for an example"
+        )
+    try:
+        campaign = Campaign.model_validate(raw)
+    except ValidationError as error:
+        raise CampaignError(_explain(error, tree), file=path) from error
+    base = path.resolve().parent
+    chosen = archive or os.environ.get(ARCHIVE_VARIABLE)
+    return campaign.model_copy(
+        update={
+            "archive": str(Path(chosen).resolve() if chosen else _within(base, campaign.archive)),
+            "output": str(Path(output).resolve() if output else _within(base, campaign.output)),
+        }
+    )
+
+
+def _within(base: Path, location: str) -> Path:
+    return (base / Path(location).expanduser()).resolve()
+
+
+def _explain(error: ValidationError, tree: yaml.Node | None) -> str:
+    lines = []
+    for problem in error.errors():
+        keys = [str(key) for key in problem["loc"]]
+        line = _line_of(tree, keys)
+        place = ".".join(keys) or "top level"
+        lines.append(f"{f'line {line}: ' if line else ''}{place}: {problem['msg']}")
+    return "\n  ".join(["is not a valid campaign:", *lines])
+
+
+def _line_of(node: yaml.Node | None, keys: list[str]) -> int | None:
+    line = None
+    for key in keys:
+        node = next((value for name, value in _children(node) if name == key), None)
+        if node is None:
+            break
+        line = node.start_mark.line + 1
+    return line
+
+
+def _children(node: yaml.Node | None) -> Iterator[tuple[str, yaml.Node]]:
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield str(key.value), value
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            yield str(index), value
+
+
+def channel_facts(facts: InstrumentFacts, channel: str) -> ChannelFacts:
+    """Return what `facts` say of `channel`, or empty facts."""
+    return facts.channels.get(channel, ChannelFacts())
+
+
+def as_settings(model: BaseModel) -> Mapping[str, Any]:
+    """Return a model as plain JSON types, for provenance and hashes."""
+    dumped: dict[str, Any] = model.model_dump(mode="json")
+    return dumped

@@ -1,0 +1,1 @@
+"""The catalog of raw files and the ledger of products."""

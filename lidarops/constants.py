@@ -1,0 +1,17 @@
+"""Physical and format constants, each with its unit and source."""
+
+from __future__ import annotations
+
+from typing import Final
+
+SPEED_OF_LIGHT: Final = 299_792_458.0
+"""m s-1, exact (SI)."""
+
+LICEL_RANGE_PER_MICROSECOND: Final = 150.0
+"""m. Licel converts counts to MHz with this nominal value, not with c / 2 (`licel2023`)."""
+
+LICEL_DISCRIMINATOR_STEP: Final = 25.0e-3 / 63.0
+"""V per discriminator level of a Licel photon-counting channel (`licel2023`)."""
+
+DEFAULT_DEAD_TIME: Final = 4.0e-9
+"""s. Used only to judge pile-up where the campaign gives no dead time, never to correct."""

@@ -1,0 +1,82 @@
+"""The errors that lidarops raises: one base, few leaves.
+
+Every message names what was wrong, where, and what to do about it, so that it can be
+shown to a user as it is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class LidarOpsError(Exception):
+    """Base of every error that lidarops raises on purpose.
+
+    Parameters
+    ----------
+    problem : str
+        What is wrong, in one sentence.
+    file : path or str, optional
+        The file in which it was found.
+    field : str, optional
+        The field, key, variable or argument in which it was found.
+    remedy : str, optional
+        What the user can do about it.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: str | Path | None = None,
+        field: str | None = None,
+        remedy: str | None = None,
+    ) -> None:
+        self.problem = problem
+        self.file = None if file is None else str(file)
+        self.field = field
+        self.remedy = remedy
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        where = ": ".join(part for part in (self.file, self.field) if part)
+        text = f"{where}: {self.problem}" if where else self.problem
+        return f"{text} ({self.remedy})" if self.remedy else text
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword-only arguments are lost by the default, and errors cross process borders.
+        return _rebuild, (type(self), self.problem, self.file, self.field, self.remedy)
+
+
+def _rebuild(
+    kind: type[LidarOpsError],
+    problem: str,
+    file: str | None,
+    field: str | None,
+    remedy: str | None,
+) -> LidarOpsError:
+    return kind(problem, file=file, field=field, remedy=remedy)
+
+
+class RawFormatError(LidarOpsError, ValueError):
+    """A raw file that cannot be read as the format it claims."""
+
+
+class CampaignError(LidarOpsError, ValueError):
+    """A campaign file that is missing, unreadable or inconsistent."""
+
+
+class CatalogError(LidarOpsError):
+    """A catalog or archive that cannot be opened, read or written."""
+
+
+class SceneError(LidarOpsError):
+    """A scene that cannot be processed as planned."""
+
+
+class RetrievalInputError(LidarOpsError, ValueError):
+    """Arguments of a retrieval whose shapes, units or values cannot be right."""
+
+
+class ProductError(LidarOpsError):
+    """A product that cannot be built, written or read."""

@@ -1,0 +1,97 @@
+"""Quality of a retrieved or measured value: the one source of every CF flag attribute.
+
+A value is a bit mask; 0 means that no test failed.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+
+
+class Severity(IntEnum):
+    """What a raised bit asks of the person who uses the value."""
+
+    CARE = 1
+    """Use with care: the value stands, its uncertainty may be understated."""
+    REJECT = 2
+    """Do not use: the value does not mean what its name says."""
+
+
+class Quality(IntFlag):
+    """Quality bits of every product. Names become CF ``flag_meanings`` in lower case."""
+
+    INPUT_MISSING = 1 << 0
+    SATURATED = 1 << 1
+    PILE_UP = 1 << 2
+    INCOMPLETE_OVERLAP = 1 << 3
+    TOO_FEW_BINS = 1 << 4
+    NO_SIGNAL = 1 << 5
+    LOW_SIGNAL = 1 << 6
+    POORLY_DETERMINED = 1 << 7
+    NEGATIVE_AMPLITUDE = 1 << 8
+    AT_BOUND = 1 << 9
+    POOR_FIT = 1 << 10
+    NOT_HOMOGENEOUS = 1 << 11
+    OUTLIER = 1 << 12
+    NO_REAL_SOLUTION = 1 << 13
+
+    @property
+    def description(self) -> str:
+        """One sentence on what the single bit means."""
+        return _ABOUT[self][1]
+
+    @property
+    def severity(self) -> Severity:
+        """What the single bit asks of the user."""
+        return _ABOUT[self][0]
+
+    @classmethod
+    def rejecting(cls) -> Quality:
+        """Return the union of the bits whose severity is `Severity.REJECT`."""
+        union = cls(0)
+        for bit in cls:
+            if bit.severity is Severity.REJECT:
+                union |= bit
+        return union
+
+
+_ABOUT: dict[Quality, tuple[Severity, str]] = {
+    Quality.INPUT_MISSING: (Severity.REJECT, "the raw data are missing or not finite"),
+    Quality.SATURATED: (
+        Severity.REJECT,
+        "the digitiser is at full scale or the photon counter is paralysed",
+    ),
+    Quality.PILE_UP: (
+        Severity.CARE,
+        "the dead-time effect on the count rate exceeds 10 percent",
+    ),
+    Quality.INCOMPLETE_OVERLAP: (
+        Severity.REJECT,
+        "nearer than the range of full overlap of beam and telescope",
+    ),
+    Quality.TOO_FEW_BINS: (Severity.REJECT, "fewer than 8 valid range bins in the section"),
+    Quality.NO_SIGNAL: (Severity.REJECT, "the profile is constant: it holds no backscatter"),
+    Quality.LOW_SIGNAL: (
+        Severity.REJECT,
+        "the backscattered signal is less than 5 times its standard error",
+    ),
+    Quality.POORLY_DETERMINED: (
+        Severity.REJECT,
+        "the standard error of extinction exceeds 15 percent of extinction plus 1 / mean range",
+    ),
+    Quality.NEGATIVE_AMPLITUDE: (Severity.REJECT, "the fitted amplitude is not positive"),
+    Quality.AT_BOUND: (Severity.REJECT, "the extinction lies at a bound of its physical range"),
+    Quality.POOR_FIT: (
+        Severity.REJECT,
+        "the residuals are larger or smaller than the noise allows (reduced chi-square)",
+    ),
+    Quality.NOT_HOMOGENEOUS: (
+        Severity.REJECT,
+        "the residuals vary systematically along range: the path is not homogeneous",
+    ),
+    Quality.OUTLIER: (Severity.CARE, "at least one bin lies more than 5 standard errors off"),
+    Quality.NO_REAL_SOLUTION: (
+        Severity.REJECT,
+        "the estimating equation has no admissible real root",
+    ),
+}

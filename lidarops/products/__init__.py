@@ -1,0 +1,1 @@
+"""NetCDF products: what they hold, how they are built, written and traced."""

@@ -1,0 +1,1 @@
+"""Raw formats: one module each, and the xarray engine over them."""

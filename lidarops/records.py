@@ -1,0 +1,242 @@
+"""Frozen records that cross module borders: the vocabulary of lidarops, no logic.
+
+The words mean the same everywhere: a *granule* is one raw file as catalogued, a *scene*
+the granules that are processed together, a *plan* what runs for one scene and what is
+left out and why, a *product* one NetCDF file, a *run* one execution over many scenes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+
+class DetectionMode(StrEnum):
+    """How a channel detects light."""
+
+    ANALOG = "analog"
+    PHOTON = "photon"
+
+
+class Role(StrEnum):
+    """What a raw file is for."""
+
+    SIGNAL = "signal"
+    DARK = "dark"
+
+
+class Status(StrEnum):
+    """Whether a granule can be used."""
+
+    GOOD = "good"
+    REFUSED = "refused"
+
+
+class ProductKind(StrEnum):
+    """Kinds of product."""
+
+    SIGNAL = "signal"
+    HOMOGENEOUS = "homogeneous"
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelLayout:
+    """What a channel looks like in every file of a layout: its place on the range grid."""
+
+    name: str
+    """Identifier such as ``photon_532o``: mode, wavelength label, polarisation."""
+    mode: DetectionMode
+    wavelength: float
+    """m; NaN where the header holds no wavelength that light detectors know."""
+    bins: int
+    bin_width: float
+    """m."""
+    adc_bits: int
+    """0 for photon counting."""
+
+
+@dataclass(frozen=True, slots=True)
+class Granule:
+    """One raw file as catalogued."""
+
+    path: str
+    """Relative to the archive root, with forward slashes."""
+    size: int
+    mtime_ns: int
+    instrument: str
+    role: Role
+    status: Status
+    reason: str = ""
+    """Why the granule is refused; empty when good."""
+    notes: tuple[str, ...] = ()
+    """What is odd about a good granule, in words."""
+    start: datetime | None = None
+    stop: datetime | None = None
+    zenith_angle: float | None = None
+    """degree, 0 = up."""
+    azimuth: float | None = None
+    """degree, clockwise from north."""
+    latitude: float | None = None
+    longitude: float | None = None
+    altitude: float | None = None
+    """m above the geoid."""
+    layout: tuple[ChannelLayout, ...] = ()
+    sha256: str | None = None
+    """Of the whole file; None until the file has been read whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The granules that are processed together."""
+
+    id: str
+    campaign: str
+    station: str
+    instrument: str
+    start: datetime
+    """Start of the window, not of the first granule."""
+    stop: datetime
+    granules: tuple[Granule, ...]
+    """Good signal granules, by start time then path."""
+    dark: tuple[Granule, ...] = ()
+    """Good dark granules that serve this scene, by start time then path."""
+
+    @property
+    def layout(self) -> tuple[ChannelLayout, ...]:
+        """Channels that every granule of the scene has."""
+        return self.granules[0].layout
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One thing that the plan does, with the settings it does it with."""
+
+    name: str
+    channel: str
+    settings: Mapping[str, Any]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """One thing that the plan does not do, and why."""
+
+    name: str
+    channel: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What runs for one scene, and what is left out and why. Pure data."""
+
+    scene: str
+    steps: tuple[Step, ...]
+    left_out: tuple[LeftOut, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the plan as plain JSON types."""
+        plain = asdict(self)
+        plain["steps"] = [{**step, "settings": dict(step["settings"])} for step in plain["steps"]]
+        plain["left_out"] = list(plain["left_out"])
+        return plain
+
+    @property
+    def hash(self) -> str:
+        """sha256 of the canonical JSON form."""
+        text = json.dumps(self.as_dict(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class InputRecord:
+    """One file that a product was made from."""
+
+    path: str
+    role: Role
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Where a product came from: everything that its content depends on."""
+
+    campaign: str
+    scene: str
+    kind: ProductKind
+    channel: str
+    inputs: tuple[InputRecord, ...]
+    plan: Plan
+    settings: Mapping[str, Any]
+    """The part of the campaign that the product depends on, as plain JSON types."""
+    versions: Mapping[str, str]
+    """Package name -> version."""
+    code_version: str
+
+
+@dataclass(frozen=True, slots=True)
+class ProductRecord:
+    """One product that was written."""
+
+    path: str
+    """Relative to the product root, with forward slashes."""
+    kind: ProductKind
+    channel: str
+    sha256: str
+    size: int
+    values: int
+    """Number of retrieved or measured values in the product's main variable."""
+    flagged: Mapping[str, int]
+    """Quality bit name -> number of values that carry it."""
+    unflagged: int
+    """Number of values that carry no bit."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneOutcome:
+    """What became of one scene."""
+
+    scene: str
+    station: str
+    instrument: str
+    start: datetime
+    granules: int
+    plan: Plan | None
+    products: tuple[ProductRecord, ...] = ()
+    refused: tuple[Granule, ...] = ()
+    """Granules that turned out unreadable while processing."""
+    inputs: tuple[InputRecord, ...] = ()
+    error: str = ""
+    """Why the scene gave no product; empty when it did."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Wall time by stage."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """One execution over many scenes."""
+
+    id: str
+    campaign: str
+    title: str
+    started: datetime
+    finished: datetime
+    version: str
+    archive: str
+    products: str
+    """Root of the products."""
+    scenes: tuple[SceneOutcome, ...]
+    refused: tuple[Granule, ...]
+    """Granules that the catalog refused."""
+    truth: str = ""
+    """Path of the truth file of a simulated campaign, empty for real data."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether anything was refused or failed."""
+        return bool(self.refused) or any(scene.error or scene.refused for scene in self.scenes)

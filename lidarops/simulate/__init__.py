@@ -1,0 +1,1 @@
+"""The lidar equation forward: simulated campaigns of raw files with known truth."""
