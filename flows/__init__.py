@@ -1,1 +1,15 @@
-"""Prefect flows over lidarops: thin, no logic of their own."""
+"""Prefect flows over lidarops: thin, no logic of their own.
+
+Importing this package sets what an ephemeral Prefect server needs on a machine without any
+set-up; a value in the environment wins.
+"""
+
+from __future__ import annotations
+
+import os
+
+# Prefect gives its own server 20 s to start, which a busy machine exceeds.
+os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "120")
+# A station may have no network, and reprocessing is nobody else's business.
+os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+os.environ.setdefault("DO_NOT_TRACK", "1")

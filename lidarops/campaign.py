@@ -294,14 +294,20 @@ def load(
     chosen = archive or os.environ.get(ARCHIVE_VARIABLE)
     return campaign.model_copy(
         update={
-            "archive": str(Path(chosen).resolve() if chosen else _within(base, campaign.archive)),
-            "output": str(Path(output).resolve() if output else _within(base, campaign.output)),
+            "archive": _located(str(chosen), Path.cwd())
+            if chosen
+            else _located(campaign.archive, base),
+            "output": _located(str(output), Path.cwd())
+            if output
+            else _located(campaign.output, base),
         }
     )
 
 
-def _within(base: Path, location: str) -> Path:
-    return (base / Path(location).expanduser()).resolve()
+def _located(location: str, base: Path) -> str:
+    if "://" in location:
+        return location
+    return str((base / Path(location).expanduser()).resolve())
 
 
 def _explain(error: ValidationError, tree: yaml.Node | None) -> str:

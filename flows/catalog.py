@@ -1,0 +1,58 @@
+"""Flow: bring the catalog of a campaign up to date.
+
+``python -m flows.catalog catalogs/demo.yaml``
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import typer
+from prefect import flow, get_run_logger
+from prefect.artifacts import create_table_artifact
+
+from lidarops.campaign import load
+from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.store import Store
+from lidarops.records import Status
+
+
+@flow(name="lidarops-catalog")
+def catalog(campaign: str, archive: str | None = None, out: str | None = None) -> ScanSummary:
+    """Scan the archive of a campaign and publish what it refuses as an artifact.
+
+    Parameters
+    ----------
+    campaign : str
+        Path of the campaign file.
+    archive, out : str, optional
+        As on the command line.
+
+    Returns
+    -------
+    ScanSummary
+    """
+    settings = load(campaign, archive=archive, output=out)
+    store = Store(settings.catalog_url, settings.name)
+    try:
+        summary = scan(settings, store)
+        refused = store.granules(status=Status.REFUSED)
+    finally:
+        store.close()
+    get_run_logger().info("catalog of %s: %s", settings.name, asdict(summary))
+    create_table_artifact(
+        key=f"{settings.name.lower()}-refused",
+        table=[{"file": granule.path, "reason": granule.reason} for granule in refused],
+        description=f"Files of campaign {settings.name} that the catalog refuses",
+    )
+    return summary
+
+
+def main(campaign: str, archive: str | None = None, out: str | None = None) -> None:
+    """Bring the catalog of a campaign up to date as a Prefect flow."""
+    summary = catalog(campaign, archive, out)
+    raise typer.Exit(1 if summary.refused else 0)
+
+
+if __name__ == "__main__":
+    typer.run(main)

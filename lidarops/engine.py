@@ -1,0 +1,510 @@
+"""Run scenes: open -> plan -> retrieve -> build -> write, serially or on a dask cluster.
+
+A scene is the unit of work: it becomes its product files or a stated failure, and nothing that
+happens to one scene stops the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import dask
+import xarray as xr
+
+from lidarops import __version__
+from lidarops.campaign import Campaign, as_settings
+from lidarops.catalog.store import Store
+from lidarops.errors import LidarOpsError, SceneError
+from lidarops.flags import Quality
+from lidarops.plans import StepName, plan
+from lidarops.products import build, provenance, write
+from lidarops.raw import licel
+from lidarops.raw.archive import open_archive
+from lidarops.records import (
+    ChannelLayout,
+    DetectionMode,
+    Granule,
+    InputRecord,
+    Plan,
+    ProductKind,
+    ProductRecord,
+    Provenance,
+    RunRecord,
+    Scene,
+    SceneOutcome,
+    Status,
+    Step,
+)
+from lidarops.retrieve import labeled, labeled_signal
+from lidarops.scenes import Cut
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Progress = Callable[[SceneOutcome], None]
+
+# What broken data, a broken disk or a broken library can raise; a bug in lidarops itself that
+# raises anything else must be seen, not entered in a report.
+_FAILURES = (
+    LidarOpsError,
+    OSError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    RuntimeError,
+    MemoryError,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Everything that a worker needs to process one scene."""
+
+    campaign: Campaign
+    scene: Scene
+    plan: Plan
+    profiles_per_chunk: int | None = None
+
+
+def run(
+    campaign: Campaign,
+    cut: Cut,
+    *,
+    workers: int = 1,
+    client: Client | None = None,
+    profiles_per_chunk: int | None = None,
+    progress: Progress | None = None,
+) -> RunRecord:
+    """Process scenes into products and enter the run in the ledger.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    cut : Cut
+        The scenes, from `lidarops.scenes.cut` (and `select`).
+    workers : int
+        Processes; 1 runs in this one, more start a dask cluster on this machine.
+    client : distributed.Client, optional
+        A cluster to use instead.
+    profiles_per_chunk : int, optional
+        Profiles a dask chunk; changes memory and speed, never a result.
+    progress : callable, optional
+        Called with the outcome of each scene as it ends.
+
+    Returns
+    -------
+    RunRecord
+
+    Raises
+    ------
+    CatalogError
+        If the ledger cannot be written.
+    """
+    started = datetime.now(UTC)
+    jobs = make_jobs(campaign, cut, profiles_per_chunk=profiles_per_chunk)
+    outcomes = process_all(jobs, workers=workers, client=client, progress=progress)
+    return conclude(campaign, cut, outcomes, started=started)
+
+
+def make_jobs(campaign: Campaign, cut: Cut, *, profiles_per_chunk: int | None = None) -> list[Job]:
+    """Plan every scene."""
+    return [Job(campaign, scene, plan(scene, campaign), profiles_per_chunk) for scene in cut.scenes]
+
+
+def process_all(
+    jobs: Sequence[Job],
+    *,
+    workers: int = 1,
+    client: Client | None = None,
+    progress: Progress | None = None,
+) -> list[SceneOutcome]:
+    """Process scenes serially, on new local workers or on a cluster; see `run`."""
+    outcomes: list[SceneOutcome] = []
+    with _outcomes(jobs, workers, client) as stream:
+        for outcome in stream:
+            outcomes.append(outcome)
+            if progress:
+                progress(outcome)
+    return outcomes
+
+
+def conclude(
+    campaign: Campaign, cut: Cut, outcomes: Sequence[SceneOutcome], *, started: datetime
+) -> RunRecord:
+    """Make the record of a run and enter it in the ledger; see `run`."""
+    store = Store(campaign.catalog_url, campaign.name)
+    try:
+        record = RunRecord(
+            id=f"{started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}",
+            campaign=campaign.name,
+            title=campaign.title,
+            started=started,
+            finished=datetime.now(UTC),
+            version=__version__,
+            archive=campaign.archive,
+            products=str(campaign.products_root),
+            scenes=tuple(sorted(outcomes, key=lambda outcome: outcome.scene)),
+            refused=(*store.granules(status=Status.REFUSED), *cut.set_aside),
+            truth=_truth(campaign),
+        )
+        store.record_run(record)
+    finally:
+        store.close()
+    return record
+
+
+def _truth(campaign: Campaign) -> str:
+    if campaign.simulation is None or not campaign.truth_path.exists():
+        return ""
+    return str(campaign.truth_path)
+
+
+@contextmanager
+def _outcomes(
+    jobs: Sequence[Job], workers: int, client: Client | None
+) -> Iterator[Iterator[SceneOutcome]]:
+    if client is not None:
+        yield _distributed(jobs, client)
+    elif workers <= 1 or len(jobs) <= 1:
+        yield map(process, jobs)
+    else:
+        with local_client(min(workers, len(jobs))) as own:
+            yield _distributed(jobs, own)
+
+
+@contextmanager
+def local_client(workers: int) -> Iterator[Client]:
+    """Start a dask cluster of single-threaded processes on this machine.
+
+    netCDF4 writes from one thread of a process only, and BLAS and numba gain nothing from more.
+    """
+    from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
+
+    with (
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def _distributed(jobs: Sequence[Job], client: Client) -> Iterator[SceneOutcome]:
+    from distributed import as_completed  # noqa: PLC0415 - takes a second to import
+
+    # The largest scene last would keep one worker busy while the others idle.
+    largest_first = sorted(jobs, key=lambda job: -sum(g.size for g in job.scene.granules))
+    futures = {client.submit(process, job, pure=False): job for job in largest_first}
+    for future in as_completed(futures):
+        job = futures[future]
+        error = future.exception()
+        if error is None:
+            yield future.result()
+        else:
+            yield _failed(job, f"the worker failed: {error!r}")
+        future.release()
+
+
+def process(job: Job) -> SceneOutcome:
+    """Process one scene: its products, or why there are none.
+
+    Parameters
+    ----------
+    job : Job
+
+    Returns
+    -------
+    SceneOutcome
+        Never raises for bad data or a bad disk; the outcome tells.
+    """
+    try:
+        with _Archive.of(job.campaign.archive).local(job.scene) as root:
+            return _process(job, root)
+    except _FAILURES as error:
+        text = str(error) if isinstance(error, LidarOpsError | OSError) else repr(error)
+        return _failed(job, text)
+
+
+def _failed(job: Job, error: str) -> SceneOutcome:
+    scene = job.scene
+    return SceneOutcome(
+        scene=scene.id,
+        station=scene.station,
+        instrument=scene.instrument,
+        start=scene.start,
+        granules=len(scene.granules),
+        plan=job.plan,
+        error=error,
+    )
+
+
+def _process(job: Job, root: Path) -> SceneOutcome:
+    clock = _Clock()
+    usable, inputs, refused = _digest(job.scene, root)
+    clock.lap("digest")
+    failed = replace(_failed(job, ""), refused=refused, inputs=inputs)
+    wanted = [step for step in job.plan.steps if step.name in tuple(ProductKind)]
+    if not wanted:
+        reasons = {left.reason for left in job.plan.left_out}
+        return replace(failed, error="nothing to do: " + "; ".join(sorted(reasons)))
+    if not usable.granules:
+        return replace(failed, error="no granule of the scene can be read")
+    channels = list(dict.fromkeys(step.channel for step in wanted))
+    with dask.config.set(scheduler="synchronous"):
+        archive = _open(job, usable.granules, root, channels)
+        dark = _open_dark(job, usable, root)
+        products = tuple(
+            product
+            for channel in channels
+            for product in _channel_products(job, usable, inputs, archive, dark, channel, clock)
+        )
+    return replace(failed, products=products, seconds=clock.laps)
+
+
+class _Clock:
+    """Wall time by stage."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
+def _digest(scene: Scene, root: Path) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...]]:
+    """Read every file once: its digest, and whether it is still what the catalog says."""
+    usable: dict[str, Granule] = {}
+    inputs: list[InputRecord] = []
+    refused: list[Granule] = []
+    for granule in (*scene.granules, *scene.dark):
+        try:
+            data = (root / granule.path).read_bytes()
+            if len(data) != granule.size:
+                raise SceneError(
+                    f"holds {len(data)} bytes, the catalog says {granule.size}",
+                    remedy="run lidarops catalog again",
+                )
+            licel.parse_header(data, file=granule.path, size=len(data))
+        except (LidarOpsError, OSError) as error:
+            reason = str(error).removeprefix(f"{granule.path}: ")
+            refused.append(replace(granule, status=Status.REFUSED, reason=reason))
+        else:
+            usable[granule.path] = granule
+            inputs.append(InputRecord(granule.path, granule.role, hashlib.sha256(data).hexdigest()))
+    remaining = replace(
+        scene,
+        granules=tuple(g for g in scene.granules if g.path in usable),
+        dark=tuple(g for g in scene.dark if g.path in usable),
+    )
+    return remaining, tuple(inputs), tuple(refused)
+
+
+def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]) -> xr.Dataset:
+    return open_archive(
+        list(granules),
+        root=root,
+        channels=channels,
+        mask_and_scale=False,
+        profiles_per_chunk=job.profiles_per_chunk,
+    )
+
+
+def _open_dark(job: Job, scene: Scene, root: Path) -> dict[str, xr.Dataset]:
+    """Average the dark files of each channel whose plan subtracts them."""
+    channels = [step.channel for step in job.plan.steps if step.name == StepName.DARK]
+    if not channels or not scene.dark:
+        return {}
+    archive = _open(job, scene.dark, root, channels)
+    return {channel: labeled_signal.dark_mean(archive, channel) for channel in channels}
+
+
+def _channel_products(
+    job: Job,
+    scene: Scene,
+    inputs: tuple[InputRecord, ...],
+    archive: xr.Dataset,
+    dark: Mapping[str, xr.Dataset],
+    name: str,
+    clock: _Clock,
+) -> Iterator[ProductRecord]:
+    steps = {step.name: step for step in job.plan.steps if step.channel == name}
+    layout = next(channel for channel in scene.layout if channel.name == name)
+    conditioned = labeled_signal.condition(
+        archive,
+        name,
+        dead_time=_setting(steps, StepName.DEAD_TIME, "dead_time"),
+        noise_variance=_setting(steps, StepName.NOISE, "noise_variance"),
+        dark=dark.get(name),
+        range_offset=_setting(steps, StepName.RANGE_OFFSET, "range_offset") or 0.0,
+        full_overlap_range=_setting(steps, StepName.OVERLAP, "full_overlap_range") or 0.0,
+    )
+    geometry = archive[[v for v in _GEOMETRY if v in archive]]
+    shots = archive[f"{name}_shots"]
+    lazy = {
+        kind: retrieve(conditioned, steps).assign(shots=shots).assign_coords(geometry.variables)
+        for kind, retrieve in _RETRIEVALS.items()
+        if kind in steps
+    }
+    # Together, so that products of one channel share one reading of the files.
+    computed = dict(zip(lazy, dask.compute(*lazy.values()), strict=True))
+    clock.lap("retrieve")
+    for kind, data in computed.items():
+        context = _context(job, scene, kind, layout, steps, inputs)
+        path = build.product_path(context)
+        written = write.write(build.build(data, context), job.campaign.products_root / path)
+        clock.lap("write")
+        yield _record(kind, name, path, written, data)
+
+
+_GEOMETRY = ("time", "time_bnds", "zenith_angle", "azimuth")
+
+
+def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
+    step = steps.get(name)
+    return None if step is None else step.settings.get(key)
+
+
+def _retrieve_signal(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
+    start, stop = steps[StepName.BACKGROUND].settings["range"]
+    tail = labeled.tail_mean(
+        conditioned["power"].sel(range=slice(start, stop)),
+        variance=conditioned["variance"].sel(range=slice(start, stop)),
+    )
+    result = labeled_signal.range_corrected(
+        conditioned, tail["background"], tail["background_standard_error"]
+    )
+    return result.assign(
+        background=tail["background"],
+        background_standard_error=tail["background_standard_error"],
+        quality_flag=conditioned["quality"],
+    )
+
+
+def _retrieve_homogeneous(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
+    settings = steps[StepName.HOMOGENEOUS].settings
+    return labeled.homogeneous(
+        conditioned["power"],
+        sections=[(near, far) for near, far in settings["sections"]],
+        variance=conditioned["variance"],
+        quality=conditioned["quality"],
+        method=settings["method"],
+    )
+
+
+_RETRIEVALS: dict[ProductKind, Callable[[xr.Dataset, Mapping[str, Step]], xr.Dataset]] = {
+    ProductKind.SIGNAL: _retrieve_signal,
+    ProductKind.HOMOGENEOUS: _retrieve_homogeneous,
+}
+
+
+def _context(
+    job: Job,
+    scene: Scene,
+    kind: ProductKind,
+    channel: ChannelLayout,
+    steps: Mapping[str, Step],
+    inputs: tuple[InputRecord, ...],
+) -> build.Context:
+    campaign = job.campaign
+    instrument = campaign.instruments[scene.instrument]
+    facts = instrument.facts_at(scene.granules[0].start or scene.start)
+    return build.Context(
+        kind=kind,
+        channel=channel.name,
+        mode=DetectionMode(channel.mode),
+        wavelength=steps[StepName.READ].settings["wavelength"],
+        station_key=scene.station,
+        station=campaign.stations[scene.station],
+        instrument_key=scene.instrument,
+        instrument_name=instrument.name or scene.instrument,
+        metadata=campaign.metadata,
+        campaign=campaign.name,
+        title=campaign.title,
+        summary=campaign.summary,
+        scene=scene.id,
+        start=scene.start,
+        stop=scene.stop,
+        provenance=Provenance(
+            campaign=campaign.name,
+            scene=scene.id,
+            kind=kind,
+            channel=channel.name,
+            inputs=inputs,
+            plan=job.plan,
+            settings={
+                "station": as_settings(campaign.stations[scene.station]),
+                "facts": as_settings(facts),
+                "metadata": as_settings(campaign.metadata),
+            },
+            versions=provenance.package_versions(),
+            code_version=provenance.code_version(),
+        ),
+    )
+
+
+def _record(
+    kind: ProductKind, channel: str, path: str, written: write.Written, data: xr.Dataset
+) -> ProductRecord:
+    flags = data["quality_flag"].to_numpy()
+    return ProductRecord(
+        path=path,
+        kind=kind,
+        channel=channel,
+        sha256=written.sha256,
+        size=written.size,
+        values=int(flags.size),
+        flagged={
+            bit.name: count
+            for bit in Quality
+            if bit.name and (count := int(((flags & int(bit)) != 0).sum()))
+        },
+        unflagged=int((flags == 0).sum()),
+    )
+
+
+class _Archive:
+    """The raw files of a scene, on a local disk."""
+
+    def __init__(self, root: str) -> None:
+        self._root = root
+
+    @staticmethod
+    def of(archive: str) -> _Archive:
+        return _RemoteArchive(archive) if "://" in archive else _Archive(archive)
+
+    @contextmanager
+    def local(self, scene: Scene) -> Iterator[Path]:  # noqa: ARG002 - the remote one needs it
+        """Give the folder under which the scene's granules can be opened."""
+        yield Path(self._root)
+
+
+class _RemoteArchive(_Archive):
+    """Raw files behind an fsspec URL: fetched for the time of the scene."""
+
+    @contextmanager
+    def local(self, scene: Scene) -> Iterator[Path]:
+        import fsspec  # noqa: PLC0415 - most archives are local
+
+        store, prefix = fsspec.core.url_to_fs(self._root)
+        with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+            for granule in (*scene.granules, *scene.dark):
+                target = Path(folder) / granule.path
+                target.parent.mkdir(parents=True, exist_ok=True)
+                store.get_file(f"{prefix.rstrip('/')}/{granule.path}", str(target))
+            yield Path(folder)

@@ -1,0 +1,196 @@
+"""Scanning an archive: incremental, never aborted, nothing lost."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import factories
+import fsspec
+import pytest
+import rawfiles
+
+from lidarops.campaign import Campaign
+from lidarops.catalog import scan as scan_module
+from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError
+from lidarops.records import Role, Status
+
+
+@pytest.fixture
+def campaign(tmp_path: Path) -> Campaign:
+    """A campaign over an empty archive."""
+    (tmp_path / "raw").mkdir()
+    return factories.campaign().model_copy(
+        update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
+    )
+
+
+@pytest.fixture
+def store(campaign: Campaign) -> Iterator[Store]:
+    """The catalog of that campaign."""
+    opened = Store(campaign.catalog_url, campaign.name)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files whose headers were parsed."""
+    names: list[str] = []
+    parse = scan_module.licel.parse_header
+
+    def counting(buffer: bytes, *, file: str, size: int) -> object:
+        names.append(file)
+        return parse(buffer, file=file, size=size)
+
+    monkeypatch.setattr(scan_module.licel, "parse_header", counting)
+    return names
+
+
+def _fill(campaign: Campaign, count: int = 5) -> Path:
+    root = Path(campaign.archive)
+    for k in range(count):
+        rawfiles.write(root / "coast" / f"h{k}", rawfiles.content(k))
+    rawfiles.write(root / "dark" / "d0", rawfiles.content(-30))
+    rawfiles.write(root / "coast" / "notes.txt", b"not claimed by any pattern")
+    return root
+
+
+def test_granules_say_what_the_headers_say(campaign: Campaign, store: Store) -> None:
+    _fill(campaign)
+    assert scan(campaign, store) == ScanSummary(6, 6, 0, 0, 0, 0)
+    granules = store.granules()
+    assert [granule.role for granule in granules].count(Role.DARK) == 1
+    first = next(granule for granule in granules if granule.path == "coast/h0")
+    assert first.start == factories.DAY
+    assert first.zenith_angle == 90
+    assert (first.latitude, first.longitude) == (46.4, 30.7)
+    assert [channel.name for channel in first.layout] == ["analog_532o", "photon_532o"]
+    assert [channel.bins for channel in first.layout] == [64, 64]
+
+
+def test_only_what_changed_is_opened(campaign: Campaign, store: Store, opened: list[str]) -> None:
+    root = _fill(campaign)
+    scan(campaign, store)
+    opened.clear()
+    assert scan(campaign, store) == ScanSummary(6, 0, 0, 6, 0, 0)
+    assert opened == []
+    rawfiles.write(root / "coast" / "h1", rawfiles.content(1, seed=9))
+    os.utime(root / "coast" / "h1", ns=(1, 1))
+    rawfiles.write(root / "coast" / "h9", rawfiles.content(9))
+    (root / "coast" / "h2").unlink()
+    assert scan(campaign, store) == ScanSummary(6, 1, 1, 4, 1, 0)
+    assert sorted(opened) == ["coast/h1", "coast/h9"]
+    assert "coast/h2" not in {granule.path for granule in store.granules()}
+
+
+def test_a_changed_fact_of_the_campaign_rescans(campaign: Campaign, store: Store) -> None:
+    _fill(campaign)
+    scan(campaign, store)
+    told = factories.campaign(facts=[{"zenith_angle": 85.0}])
+    told = told.model_copy(update={"archive": campaign.archive, "output": campaign.output})
+    assert scan(told, store).changed == 6
+    assert {granule.zenith_angle for granule in store.granules()} == {85.0}
+
+
+def test_damaged_files_are_refused_with_a_reason(campaign: Campaign, store: Store) -> None:
+    root = _fill(campaign)
+    good = rawfiles.content(7)
+    damaged = {
+        "h-truncated": good[:-100],
+        "h-empty": b"",
+        "h-garbage": bytes(range(256)) * 8,
+        "h-text": b"Operator log: clouds after midnight\n" * 20,
+        "h-position": good.replace(b" 046.4", b" 146.4").replace(b"0046.4", b"0146.4"),
+    }
+    for name, data in damaged.items():
+        rawfiles.write(root / "coast" / name, data)
+    summary = scan(campaign, store)
+    assert summary.refused == len(damaged)
+    refused = {granule.path: granule.reason for granule in store.granules(status=Status.REFUSED)}
+    assert set(refused) == {f"coast/{name}" for name in damaged}
+    assert all(refused.values())
+    assert "bytes" in refused["coast/h-truncated"]
+    assert len(store.granules(status=Status.GOOD)) == 6
+
+
+def test_an_unreadable_file_does_not_abort(campaign: Campaign, store: Store) -> None:
+    root = _fill(campaign)
+    (root / "coast" / "h-link").symlink_to("nowhere")
+    (root / "coast" / "h-loop").symlink_to("h-loop")
+    os.mkfifo(root / "coast" / "h-pipe")
+    assert scan(campaign, store) == ScanSummary(9, 9, 0, 0, 0, 3)
+    assert len(store.granules(status=Status.GOOD)) == 6
+
+
+def test_a_file_of_two_instruments_is_refused(campaign: Campaign, store: Store) -> None:
+    _fill(campaign)
+    both = {**campaign.instruments, "other": campaign.instruments["lidar"]}
+    scan(campaign.model_copy(update={"instruments": both}), store)
+    refused = store.granules(status=Status.REFUSED)
+    assert len(refused) == 6
+    assert "lidar and other" in refused[0].reason
+
+
+def test_swapped_coordinates_are_noted(campaign: Campaign, store: Store) -> None:
+    root = Path(campaign.archive)
+    rawfiles.write(root / "coast" / "h0", rawfiles.content(0, position=(30.7, 46.4)))
+    scan(campaign, store)
+    assert "swapped" in store.granules()[0].notes[-1]
+    told = {
+        "lidar": campaign.instruments["lidar"].model_copy(
+            update={"header_position": "latitude_first"}
+        )
+    }
+    scan(campaign.model_copy(update={"instruments": told}), store)
+    assert store.granules()[0].notes == ()
+    assert store.granules()[0].latitude == 46.4
+
+
+def test_an_archive_behind_a_url(campaign: Campaign, store: Store) -> None:
+    memory = fsspec.filesystem("memory")
+    memory.pipe("/lidar-archive/coast/h0", rawfiles.content(0))
+    memory.pipe("/lidar-archive/coast/h1", rawfiles.content(1)[:-50])
+    remote = campaign.model_copy(update={"archive": "memory://lidar-archive"})
+    try:
+        assert scan(remote, store) == ScanSummary(2, 2, 0, 0, 0, 1)
+        assert scan(remote, store).unchanged == 2
+        assert [granule.path for granule in store.granules()] == ["coast/h1", "coast/h0"]
+    finally:
+        memory.rm("/lidar-archive", recursive=True)
+
+
+def test_an_absent_archive_is_named(campaign: Campaign, store: Store) -> None:
+    with pytest.raises(CatalogError, match="LIDAROPS_ARCHIVE"):
+        scan(campaign.model_copy(update={"archive": "/nowhere"}), store)
+
+
+def test_a_broken_database_is_named(tmp_path: Path) -> None:
+    path = rawfiles.write(tmp_path / "catalog.sqlite", b"this is no database" * 100)
+    with pytest.raises(CatalogError, match=r"catalog\.sqlite"):
+        Store(f"sqlite:///{path}", "test")
+    with pytest.raises(CatalogError, match="--out"):
+        Store(f"sqlite:///{path}/below/a-file.sqlite", "test")
+
+
+def test_granules_round_trip(store: Store) -> None:
+    granules = [
+        factories.granule(0),
+        factories.granule(1, status=Status.REFUSED, reason="odd", start=None, layout=()),
+        factories.granule(2, notes=("a", "b"), azimuth=12.5, sha256="0" * 64),
+    ]
+    store.replace((granule, "key") for granule in granules)
+    assert sorted(store.granules(), key=lambda g: g.path) == granules
+    store.replace([(replace(granules[0], size=7), "key")])
+    assert len(store.granules()) == 3
+
+
+def test_campaigns_share_a_database(campaign: Campaign, store: Store) -> None:
+    store.replace([(factories.granule(0), "key")])
+    other = Store(campaign.catalog_url, "other")
+    assert other.granules() == []
+    other.close()
