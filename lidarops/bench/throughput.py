@@ -1,0 +1,117 @@
+"""How fast raw files become arrays, against floors measured in the same run.
+
+Times are CPU times of this process, the least of several repeats, with files in the page cache.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dask
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.errors import RawFormatError
+from lidarops.raw.archive import open_archive
+from lidarops.raw.licel import read_header, read_physical, select
+
+
+@dataclass(frozen=True, slots=True)
+class Throughput:
+    """How fast one way of reading is."""
+
+    name: str
+    files_per_second: float
+    """Of CPU time."""
+    megabytes_per_second: float
+    """10^6 bytes of raw file per second of CPU time."""
+    times_floor: float
+    """CPU time as a multiple of that of the floor; 1 for a floor itself."""
+
+
+def reader(paths: Sequence[str | os.PathLike[str]], repeats: int = 7) -> list[Throughput]:
+    """Measure header scan, raw files to float32 and the archive path.
+
+    Parameters
+    ----------
+    paths : sequence of path or str
+        Files of one layout.
+    repeats : int
+        Of which the least time counts.
+
+    Returns
+    -------
+    list of Throughput
+        The floors first: reading the bytes, the same with ``np.frombuffer`` and one
+        multiplication a channel at known offsets. The header scan is compared with the first,
+        what gives physical values with the second.
+
+    Raises
+    ------
+    RawFormatError
+        Where there is no file, or one cannot be read.
+    """
+    if not paths or repeats < 1:
+        raise RawFormatError("at least one file and one repeat are needed", field="paths")
+    size = sum(Path(path).stat().st_size for path in paths)
+    channels = [
+        (dataset.offset or 0, dataset.bins, np.float32(dataset.scale))
+        for dataset in select(read_header(paths[0]))
+    ]
+    read = _least(lambda: _read_bytes(paths), repeats)
+    multiply = _least(lambda: _multiply(paths, channels), repeats)
+    ways: list[tuple[str, Callable[[], object], float]] = [
+        ("header scan", lambda: [read_header(path) for path in paths], read),
+        ("raw to float32", lambda: read_physical(paths), multiply),
+        ("archive to float32", lambda: _archive(paths), multiply),
+    ]
+    timed = [("read bytes (floor)", read, read), ("numpy (floor)", multiply, multiply)]
+    timed += [(name, _least(way, repeats), floor) for name, way, floor in ways]
+    return [
+        Throughput(name, len(paths) / seconds, size / seconds / 1e6, seconds / floor)
+        for name, seconds, floor in timed
+    ]
+
+
+def _least(way: Callable[[], object], repeats: int) -> float:
+    times = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        way()
+        times.append(time.process_time() - begin)
+    # The clock of a fast machine with few files may not have moved.
+    return max(min(times), 1e-9)
+
+
+def _read_bytes(paths: Sequence[str | os.PathLike[str]]) -> None:
+    for path in paths:
+        _read(path)
+
+
+def _read(path: str | os.PathLike[str]) -> bytes:
+    with Path(path).open("rb", buffering=0) as file:
+        return file.read()
+
+
+def _multiply(
+    paths: Sequence[str | os.PathLike[str]], channels: list[tuple[int, int, np.float32]]
+) -> NDArray[Any]:
+    values = np.empty((len(paths), sum(bins for _, bins, _ in channels)), np.float32)
+    for row, path in zip(values, paths, strict=True):
+        content = _read(path)
+        start = 0
+        for offset, bins, scale in channels:
+            counts = np.frombuffer(content, "<i4", bins, offset)
+            np.multiply(counts, scale, out=row[start : start + bins], casting="unsafe")
+            start += bins
+    return values
+
+
+def _archive(paths: Sequence[str | os.PathLike[str]]) -> None:
+    with dask.config.set(scheduler="synchronous"):
+        open_archive(paths).compute()

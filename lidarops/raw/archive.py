@@ -1,0 +1,185 @@
+"""Many raw files of one layout as one dask-backed Dataset.
+
+The data model is that of `lidarops.raw.model`. Headers are read once, when the archive is opened;
+a task of the graph reads the bytes of one channel in the files of one chunk.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from dask.base import tokenize
+from numpy.typing import NDArray
+
+from lidarops.errors import RawFormatError
+from lidarops.raw.licel import Dataset, RawFile, channel_names, to_physical
+from lidarops.raw.model import Columns, Position, build
+from lidarops.records import Granule
+
+Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
+
+_CHUNK_BYTES = 16_000_000
+
+
+def open_archive(
+    source: Source,
+    *,
+    channels: Iterable[str] | None = None,
+    mask_and_scale: bool = True,
+    profiles_per_chunk: int | None = None,
+    header_position: Position = "longitude_first",
+    root: str | os.PathLike[str] | None = None,
+) -> xr.Dataset:
+    """Open raw files of one layout as one Dataset.
+
+    Parameters
+    ----------
+    source : str, path, or iterable of paths or Granule
+        A folder (with its subfolders, hidden files left out), a file, a glob pattern, or files.
+        The order does not matter: profiles are sorted by start, then path.
+    channels : iterable of str, optional
+        Channels to open, which all files must have alike; all signal channels, which must be
+        the same in all files, where not given.
+    mask_and_scale : bool
+        Whether to give physical values (float32, mV or MHz) or raw counts (int32).
+    profiles_per_chunk : int, optional
+        About 16 MB a chunk where not given.
+    header_position : {"longitude_first", "latitude_first", "ignore"}
+        Which coordinate the instrument writes first.
+    root : path or str, optional
+        Folder that relative paths start from; the working directory where not given.
+
+    Returns
+    -------
+    xarray.Dataset
+        Channels are dask arrays (time, range), chunked along time. Computing one raises
+        `RawFormatError` where a file has changed since.
+
+    Raises
+    ------
+    RawFormatError
+        Naming the file where one cannot be read or is of another layout.
+    """
+    columns = Columns(channels=None if channels is None else tuple(channels), order=header_position)
+    stamps = []
+    for path in _files(source, root):
+        with RawFile(path) as file:
+            columns.append(file.read_header())
+            stamps.append((path, file.size, file.mtime_ns))
+    columns.sort()
+    chunks = _chunks(columns, profiles_per_chunk)
+    token = tokenize(stamps)
+
+    def signal(channel: int, dataset: Dataset) -> da.Array:
+        scales = columns.fact(channel, "scale") if mask_and_scale else None
+        offsets = columns.fact(channel, "offset").astype(np.int64)
+        name = f"licel-{dataset.name}-{tokenize(token, offsets, scales, len(chunks))}"
+        graph = {
+            (name, index, 0): (
+                _Chunk(
+                    files, offsets[part], dataset.bins, None if scales is None else scales[part]
+                ),
+            )
+            for index, (part, files) in enumerate(chunks)
+        }
+        lengths = tuple(len(files.paths) for _, files in chunks)
+        dtype = np.int32 if scales is None else np.float32
+        shape = (lengths, (dataset.bins,))
+        return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
+
+    return build(columns, signal, scaled=mask_and_scale)
+
+
+@dataclass(frozen=True, slots=True)
+class _Files:
+    """The files of one chunk, shared by the tasks of all channels."""
+
+    paths: tuple[str, ...]
+    sizes: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """One task: reads one channel of the files of one chunk. Small, and can be pickled."""
+
+    files: _Files
+    offsets: NDArray[np.int64]
+    bins: int
+    scales: NDArray[np.float64] | None
+    """None for counts."""
+
+    def __call__(self) -> NDArray[Any]:
+        values = np.empty(
+            (len(self.offsets), self.bins), np.int32 if self.scales is None else np.float32
+        )
+        row = np.empty(self.bins, np.dtype("<i4"))
+        for index, (path, size) in enumerate(zip(self.files.paths, self.files.sizes, strict=True)):
+            with RawFile(path) as file:
+                file.expect(size)
+                file.read_counts(int(self.offsets[index]), [row])
+            if self.scales is None:
+                values[index] = row
+            else:
+                to_physical(row, self.scales[index], values[index])
+        return values
+
+
+def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]]:
+    if profiles is None:
+        largest = max(dataset.bins for dataset in columns.datasets)
+        profiles = max(1, _CHUNK_BYTES // (4 * largest))
+    if profiles < 1:
+        raise RawFormatError(
+            f"{profiles} is not a number of profiles",
+            field="profiles_per_chunk",
+            remedy="give at least 1",
+        )
+    parts = [slice(i, i + profiles) for i in range(0, len(columns.paths), profiles)]
+    return [
+        (part, _Files(tuple(columns.paths[part]), tuple(columns.sizes[part]))) for part in parts
+    ]
+
+
+def _files(source: Source, root: str | os.PathLike[str] | None) -> list[str]:
+    # Sorted, so that the first file, with which the layout of others is compared, is always
+    # the same.
+    base = Path(root) if root is not None else Path()
+    place = None
+    if isinstance(source, str | os.PathLike):
+        place = base / source
+        files = _expand(place)
+    else:
+        files = [str(base / (item.path if isinstance(item, Granule) else item)) for item in source]
+    if not files:
+        raise RawFormatError(
+            "no files are found",
+            file=place,
+            remedy="give a folder, a glob pattern or paths that exist",
+        )
+    path, times = Counter(files).most_common(1)[0]
+    if times > 1:
+        raise RawFormatError(f"is given {times} times", file=path)
+    return sorted(files)
+
+
+def _expand(place: Path) -> list[str]:
+    if place.is_dir():
+        return [
+            str(path)
+            for path in place.rglob("*")
+            if path.is_file()
+            and not any(part.startswith(".") for part in path.relative_to(place).parts)
+        ]
+    if place.exists():
+        return [str(place)]
+    anchor = Path(place.anchor)
+    pattern = str(place.relative_to(anchor))
+    return [str(path) for path in anchor.glob(pattern) if path.is_file()]

@@ -1,0 +1,593 @@
+"""Header of a Licel raw file: bytes to dataclasses (standard library only).
+
+Line 1 holds the file name; line 2 site, start, stop, altitude, longitude, latitude and zenith
+angle, then azimuth and a quoted text (newer Licel) or a dummy, temperature and pressure
+(Raymetrics); line 3 the lasers and the number of datasets; then one line per dataset and an
+empty line (`licel2023`). Instruments deviate in widths, padding, decimals and site names, so
+line 2 is found by its dates, never by columns.
+
+There is no checksum: the one guard against a wrong header is that the offsets add up to the
+size of the file. A truncated file, or one with surplus bytes, is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import IntEnum
+from functools import lru_cache
+from itertools import count as counter
+from typing import Any, Final, Literal, NamedTuple
+
+from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
+from lidarops.errors import RawFormatError
+from lidarops.records import DetectionMode
+
+CONVENTION: Final = (
+    "analog: mV = counts * input_range * 1000 / (shots * 2^adc_bits);"
+    " photon counting: MHz = counts / shots * (150 m / bin_width)"
+)
+"""How counts become physical values. Licel's own later reader divides by 2^adc_bits - 1."""
+
+HeaderOrder = Literal["longitude_first", "latitude_first"]
+
+_LINE_LIMIT = 1024
+_CACHED_BLOCK = 4 * 1024
+_MAX_DATASETS = 1000
+_MAX_BINS = 1_000_000
+_MAX_BIN_WIDTH = 1000.0
+_MAX_BITS = 32
+_MAX_INPUT_RANGE = 100.0
+_WAVELENGTHS = (1e-7, 2e-5)
+_YEARS = (1960, 2200)
+_ICE_POINT = 273.15
+
+_NUMBER = re.compile(r"[+-]?(?:\d{1,9}(?:[.,]\d{0,9})?|[.,]\d{1,9})", re.ASCII)
+_INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
+_WAVELENGTH = re.compile(r"(\d{1,5})[.,]([A-Za-z0-9])", re.ASCII)
+_DATE = r"(\d{1,2})/(\d{1,2})/(\d{4}) {1,8}(\d{1,2}):(\d{2}):(\d{2})"
+_DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
+
+
+class DatasetKind(IntEnum):
+    """Type code of a dataset."""
+
+    ANALOG = 0
+    PHOTON = 1
+    ANALOG_SQUARED = 2
+    PHOTON_SQUARED = 3
+    POWER_METER = 4
+    OVERFLOW = 5
+
+
+_MODES = {
+    DatasetKind.ANALOG: DetectionMode.ANALOG,
+    DatasetKind.PHOTON: DetectionMode.PHOTON,
+}
+_ANALOG = frozenset({DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED})
+_PHOTON = frozenset({DatasetKind.PHOTON, DatasetKind.PHOTON_SQUARED})
+
+
+class Laser(NamedTuple):
+    """What line 3 of the header says of one laser."""
+
+    shots: int
+    repetition_rate: float
+    """Hz; 0 in many files although the laser fires."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """One dataset line of a header. Made by the parser or `licel_write.new_dataset`."""
+
+    name: str
+    """Unique in its header: ``analog_532o``, ``photon_355p``, ``analog_532o_2``."""
+    kind: DatasetKind
+    active: bool
+    laser: int
+    bins: int
+    laser_polarisation: int
+    high_voltage: float
+    """V."""
+    bin_width: float
+    """m."""
+    wavelength_label: str
+    """As written, for example ``00532.o``."""
+    polarisation: str
+    """o none, p parallel, s perpendicular, r and l circular."""
+    bin_shift: float
+    """Bins."""
+    adc_bits: int
+    """0 for photon counting."""
+    shots: int
+    input_range: float | None
+    """V; None but for analog."""
+    discriminator: float | None
+    """V; None but for photon counting."""
+    device: str
+    comment: str
+    offset: int | None
+    """Byte at which the counts start; None where the file does not hold them."""
+    line: bytes = field(compare=False, repr=False)
+    """As written, with CRLF."""
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.offset, self.shots))
+
+    @property
+    def mode(self) -> DetectionMode | None:
+        """How the dataset detects light; None where it is not a signal."""
+        return _MODES.get(self.kind)
+
+    @property
+    def wavelength(self) -> float:
+        """m; NaN where the label is no wavelength that light detectors know (53200 nm)."""
+        wavelength = int(self.wavelength_label.partition(".")[0]) * 1e-9
+        low, high = _WAVELENGTHS
+        return wavelength if low < wavelength < high else math.nan
+
+    @property
+    def units(self) -> str:
+        """Unit of the physical values."""
+        return "mV" if self.kind is DatasetKind.ANALOG else "MHz"
+
+    @property
+    def scale(self) -> float:
+        """Physical value of one count, mV or MHz (`CONVENTION`); NaN without shots or signal."""
+        if self.shots == 0 or self.mode is None:
+            return math.nan
+        if self.input_range is not None:
+            return self.input_range * 1e3 / (self.shots << self.adc_bits)
+        return LICEL_RANGE_PER_MICROSECOND / self.bin_width / self.shots
+
+    @property
+    def full_scale(self) -> int | None:
+        """Counts of a saturated digitiser, ``shots (2^adc_bits - 1)``; None without one."""
+        return self.shots * ((1 << self.adc_bits) - 1) if self.kind is DatasetKind.ANALOG else None
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Header of a Licel file. Made by the parser or `licel_write.new_header`."""
+
+    name: str
+    """File name that the instrument wrote into line 1."""
+    site: str
+    start: datetime
+    """UTC."""
+    stop: datetime
+    """UTC."""
+    altitude: float
+    """m above the geoid."""
+    longitude: float
+    """degree; the first of the two coordinates, see `position`."""
+    latitude: float
+    """degree; the second of the two coordinates, see `position`."""
+    zenith_as_written: float
+    """degree; see `zenith_angle`."""
+    azimuth: float | None
+    """degree in [0, 360)."""
+    temperature: float | None
+    """K at the ground."""
+    pressure: float | None
+    """Pa at the ground."""
+    custom: str | None
+    """The quoted text of line 2."""
+    lasers: tuple[Laser, ...]
+    """Two or three."""
+    timestamp: str | None
+    """Of the controller, as written."""
+    datasets: tuple[Dataset, ...]
+    """In file order, inactive ones and those that are no signal included."""
+    data_start: int
+    """Byte after the empty line."""
+    size: int
+    """Bytes of the file."""
+    notes: tuple[str, ...]
+    """What is odd, in words."""
+    path: str = field(compare=False)
+    """Where the header was read; empty for bytes in memory."""
+    source: bytes = field(compare=False, repr=False)
+    """The header as written: `data_start` bytes."""
+
+    @property
+    def zenith_angle(self) -> float:
+        """degree, 0 = up. -90 means vertical (Raymetrics); other signs are dropped."""
+        return 0.0 if self.zenith_as_written == -90.0 else abs(self.zenith_as_written)
+
+    @property
+    def channels(self) -> tuple[Dataset, ...]:
+        """Stored analog and photon-counting datasets, in file order."""
+        return tuple(d for d in self.datasets if d.offset is not None and d.kind in _MODES)
+
+    def position(self, order: HeaderOrder = "longitude_first") -> tuple[float, float]:
+        """Return latitude and longitude in degree.
+
+        Parameters
+        ----------
+        order : {"longitude_first", "latitude_first"}
+            Which coordinate the instrument wrote first; Licel says the longitude.
+
+        Raises
+        ------
+        RawFormatError
+            Where the pair is impossible in this order.
+        """
+        latitude, longitude = self.latitude, self.longitude
+        if order == "latitude_first":
+            latitude, longitude = longitude, latitude
+        if abs(latitude) > 90 or abs(longitude) > 180:
+            raise RawFormatError(
+                f"latitude {latitude:g}, longitude {longitude:g} is no place on Earth",
+                file=self.path or self.name,
+                field="position",
+                remedy=f"header_position is {order}: choose the other order, or 'ignore',"
+                " in the campaign",
+            )
+        return latitude, longitude
+
+
+class _Site(NamedTuple):
+    altitude: float
+    longitude: float
+    latitude: float
+    zenith: float
+    azimuth: float | None
+    temperature: float | None
+    pressure: float | None
+    custom: str | None
+    notes: tuple[str, ...]
+
+
+class IncompleteHeaderError(RawFormatError):
+    """The bytes end inside the header."""
+
+
+def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> Header:
+    """Parse the header at the start of `buffer`.
+
+    Parameters
+    ----------
+    buffer : bytes
+        A whole file or its beginning.
+    file : str
+        Name for messages.
+    size : int, optional
+        Bytes of the whole file; the length of `buffer` where not given.
+
+    Returns
+    -------
+    Header
+
+    Raises
+    ------
+    RawFormatError
+        Naming file, field and bytes, where the header is not one, is absurd, or promises
+        another size than the file has. Only a missing last CRLF is tolerated, with a note.
+    """
+    try:
+        return _parse(buffer, file, len(buffer) if size is None else size)
+    except RawFormatError as error:
+        kind = type(error)
+        raise kind(
+            error.problem, file=file or None, field=error.field, remedy=error.remedy
+        ) from None
+
+
+def _parse(buffer: bytes, file: str, size: int) -> Header:
+    ends = _line_ends(buffer, 0, 3)
+    first, second, third = (
+        buffer[start:end].decode("latin-1")
+        for start, end in zip((0, ends[0] + 2, ends[1] + 2), ends, strict=True)
+    )
+    dates = _DATES.search(second)
+    if dates is None:
+        raise RawFormatError(
+            "holds no start and stop date: this is not a Licel file", field="header line 2"
+        )
+    start, stop = _moments(dates)
+    place = _parse_site(second[dates.end() :])
+    lasers, number, timestamp, notes = _parse_lasers(third)
+    block_start = ends[2] + 2
+    block_end = _line_ends(buffer, block_start, number)[-1] + 2
+    if buffer[block_end : block_end + 2] != b"\r\n":
+        if len(buffer) < block_end + 2:
+            raise IncompleteHeaderError("the file ends inside the header", field="empty line")
+        raise RawFormatError(
+            "no empty line follows the dataset lines: the number of datasets in line 3 is wrong",
+            field="number of datasets",
+        )
+    data_start = block_end + 2
+    block = buffer[block_start:block_end]
+    datasets, ending = _fit(block, data_start, size)
+    return Header(
+        name=first.strip(),
+        site=second[: dates.start()].strip(),
+        start=start,
+        stop=stop,
+        altitude=place.altitude,
+        longitude=place.longitude,
+        latitude=place.latitude,
+        zenith_as_written=place.zenith,
+        azimuth=place.azimuth,
+        temperature=place.temperature,
+        pressure=place.pressure,
+        custom=place.custom,
+        lasers=lasers,
+        timestamp=timestamp,
+        datasets=datasets,
+        data_start=data_start,
+        size=size,
+        notes=place.notes + notes + _dataset_notes(datasets) + ending,
+        path=file,
+        source=buffer[:data_start],
+    )
+
+
+def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:
+    ends = []
+    for _ in range(number):
+        end = buffer.find(b"\r\n", start, start + _LINE_LIMIT)
+        if end < 0:
+            if len(buffer) < start + _LINE_LIMIT:
+                raise IncompleteHeaderError("the file ends inside the header", field="header")
+            raise RawFormatError(
+                f"no line end within {_LINE_LIMIT} bytes: this is not a Licel file",
+                field="header",
+            )
+        ends.append(end)
+        start = end + 2
+    return ends
+
+
+def _number(token: str, name: str) -> float:
+    if _NUMBER.fullmatch(token) is None:
+        raise RawFormatError(f"{token[:40]!r} is not a number", field=name)
+    return float(token.replace(",", "."))
+
+
+def _integer(token: str, name: str) -> int:
+    if _INTEGER.fullmatch(token) is None:
+        raise RawFormatError(f"{token[:40]!r} is not an integer", field=name)
+    return int(token)
+
+
+def _bounded(value: float, low: float, high: float, name: str) -> None:
+    if not low <= value <= high:
+        raise RawFormatError(f"{value:g} is not within {low:g} to {high:g}", field=name)
+
+
+def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
+    numbers = [int(group) for group in dates.groups()]
+    start, stop = _moment(numbers[:6], "start"), _moment(numbers[6:], "stop")
+    if stop < start:
+        raise RawFormatError(f"{stop:%Y-%m-%d %H:%M:%S} lies before the start", field="stop")
+    return start, stop
+
+
+def _moment(numbers: list[int], name: str) -> datetime:
+    day, month, year, hour, minute, second = numbers
+    _bounded(year, *_YEARS, name)
+    try:
+        return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+    except ValueError as error:
+        raise RawFormatError(f"is no date and time: {error}", field=name) from None
+
+
+def _parse_site(text: str) -> _Site:
+    tokens, custom = _split_custom(text)
+    if len(tokens) < 4:
+        raise RawFormatError(
+            "altitude, longitude, latitude and zenith angle do not follow the dates",
+            field="header line 2",
+        )
+    names = ("altitude", "longitude", "latitude", "zenith angle")
+    altitude, longitude, latitude, zenith = map(_number, tokens, names)
+    _bounded(zenith, -180, 180, "zenith angle")
+    notes = _zenith_notes(zenith)
+    azimuth = temperature = pressure = None
+    if len(tokens) in {5, 7} and _holds_azimuth(tokens):
+        azimuth = _number(tokens[4], "azimuth")
+        _bounded(azimuth, -360, 360, "azimuth")
+        azimuth %= 360.0
+    if len(tokens) == 7:
+        temperature, pressure, more = _parse_weather(*tokens[5:])
+        notes += more
+    elif len(tokens) not in {4, 5}:
+        notes += (f"{len(tokens) - 4} values after the zenith angle are not interpreted",)
+    return _Site(
+        altitude, longitude, latitude, zenith, azimuth, temperature, pressure, custom, notes
+    )
+
+
+def _split_custom(text: str) -> tuple[list[str], str | None]:
+    before, quote, after = text.partition('"')
+    if not quote:
+        return before.split(), None
+    custom, quote, _ = after.rpartition('"')
+    if not quote:
+        raise RawFormatError("the quoted text does not end", field="header line 2")
+    return before.split(), custom
+
+
+def _holds_azimuth(tokens: list[str]) -> bool:
+    # Raymetrics: zenith, a dummy integer, temperature, pressure. Licel: zenith, azimuth.
+    return len(tokens) == 5 or "." in tokens[4] or "," in tokens[4]
+
+
+def _zenith_notes(zenith: float) -> tuple[str, ...]:
+    if zenith == -90.0:
+        return ("zenith angle -90 taken as vertical",)
+    if zenith < 0:
+        return (f"zenith angle {zenith:g} taken as {-zenith:g}",)
+    return ()
+
+
+def _parse_weather(
+    celsius: str, hectopascal: str
+) -> tuple[float | None, float | None, tuple[str, ...]]:
+    temperature = _number(celsius, "temperature") + _ICE_POINT
+    pressure = _number(hectopascal, "pressure") * 1e2
+    if 150 < temperature < 350 and 1e4 < pressure < 1.2e5:
+        return temperature, pressure, ()
+    return None, None, (f"{celsius} degC, {hectopascal} hPa are not believed",)
+
+
+def _parse_lasers(text: str) -> tuple[tuple[Laser, ...], int, str | None, tuple[str, ...]]:
+    tokens = text.split()
+    if len(tokens) < 5:
+        raise RawFormatError("holds fewer than 5 values", field="header line 3")
+    number = _integer(tokens[4], "number of datasets")
+    _bounded(number, 1, _MAX_DATASETS, "number of datasets")
+    pairs = [tokens[0:2], tokens[2:4]] + ([tokens[5:7]] if len(tokens) >= 7 else [])
+    lasers = tuple(
+        Laser(_integer(shots, "laser shots"), _number(rate, "repetition rate"))
+        for shots, rate in pairs
+    )
+    timestamp = tokens[9] if len(tokens) == 10 else None
+    odd = len(tokens) not in {5, 7, 9, 10}
+    notes = (f"{len(tokens)} values in line 3 are not all interpreted",) if odd else ()
+    return lasers, number, timestamp, notes
+
+
+def _fit(block: bytes, data_start: int, size: int) -> tuple[tuple[Dataset, ...], tuple[str, ...]]:
+    # By the specification inactive datasets are not stored; some software stores them.
+    parse = _parse_block if len(block) <= _CACHED_BLOCK else _parse_block.__wrapped__
+    expected = 0
+    for stored, note in ((False, ()), (True, ("inactive datasets are stored",))):
+        datasets: tuple[Dataset, ...] = parse(block, data_start, stored)
+        promised = _promised_size(datasets, data_start)
+        if size == promised:
+            return datasets, note
+        if promised - 2 <= size < promised and promised > data_start:
+            return datasets, (*note, "the last CRLF is missing")
+        expected = expected or promised
+        if all(dataset.active for dataset in datasets):
+            break
+    raise RawFormatError(
+        f"the header promises {expected} bytes, the file has {size}:"
+        f" it {'is truncated' if size < expected else 'has surplus bytes'}",
+        field="size",
+        remedy="copy the file again from the instrument, or leave it out",
+    )
+
+
+def _promised_size(datasets: Iterable[Dataset], data_start: int) -> int:
+    return data_start + sum(4 * d.bins + 2 for d in datasets if d.offset is not None)
+
+
+# The dataset lines of an archive repeat from file to file: parsing them once is what makes
+# a header scan fast.
+@lru_cache(maxsize=128)
+def _parse_block(block: bytes, data_start: int, stored: bool) -> tuple[Dataset, ...]:  # noqa: FBT001
+    lines = [line + b"\r\n" for line in block[:-2].split(b"\r\n")]
+    drafts = [_parse_dataset(number, line) for number, line in enumerate(lines, 1)]
+    taken: set[str] = set()
+    names = [""] * len(drafts)
+    # An inactive dataset must not take the name of a stored one.
+    for index in sorted(range(len(drafts)), key=lambda index: not drafts[index]["active"]):
+        names[index] = _unique(drafts[index].pop("name"), taken)
+    datasets, offset = [], data_start
+    for draft, name in zip(drafts, names, strict=True):
+        held = draft["active"] or stored
+        datasets.append(Dataset(name=name, offset=offset if held else None, **draft))
+        offset += (4 * draft["bins"] + 2) if held else 0
+    return tuple(datasets)
+
+
+def _unique(base: str, taken: set[str]) -> str:
+    name = base
+    suffixes = counter(2)
+    while name in taken:
+        name = f"{base}_{next(suffixes)}"
+    taken.add(name)
+    return name
+
+
+def parse_dataset(line: bytes) -> Dataset:
+    """Parse one dataset line outside of a header: its offset is 0 and its name not yet unique.
+
+    Raises
+    ------
+    RawFormatError
+    """
+    return Dataset(offset=0, **_dataset_fields(line))
+
+
+def _parse_dataset(number: int, line: bytes) -> dict[str, Any]:
+    try:
+        return _dataset_fields(line)
+    except RawFormatError as error:
+        place = f"dataset {number}, {error.field}"
+        raise RawFormatError(error.problem, field=place) from None
+
+
+def _dataset_fields(line: bytes) -> dict[str, Any]:
+    tokens = line.decode("latin-1").split()
+    if len(tokens) < 16:
+        raise RawFormatError(f"holds {len(tokens)} values instead of 16", field="line")
+    kind = _kind(tokens[1])
+    label = _WAVELENGTH.fullmatch(tokens[7])
+    if label is None:
+        raise RawFormatError(f"{tokens[7][:40]!r} is not of the form 00532.o", field="wavelength")
+    polarisation = label[2].lower().replace("0", "o")
+    bits = _integer(tokens[12], "ADC bits")
+    level = _number(tokens[14], "input range")
+    analog, photon = kind in _ANALOG, kind in _PHOTON
+    if analog:
+        _bounded(level, 1e-6, _MAX_INPUT_RANGE, "input range")
+    _bounded(bits, 1 if analog else 0, _MAX_BITS, "ADC bits")
+    bins = _integer(tokens[3], "bins")
+    _bounded(bins, 1, _MAX_BINS, "bins")
+    width = _number(tokens[6], "bin width")
+    _bounded(width, 1e-3 if analog or photon else 0, _MAX_BIN_WIDTH, "bin width")
+    shots = _integer(tokens[13], "shots")
+    _bounded(shots, 0, 10**9, "shots")
+    return {
+        "name": f"{kind.name.lower()}_{int(label[1])}{polarisation}",
+        "kind": kind,
+        "active": _active(tokens[0]),
+        "laser": _integer(tokens[2], "laser"),
+        "bins": bins,
+        "laser_polarisation": _integer(tokens[4], "laser polarisation"),
+        "high_voltage": _number(tokens[5], "high voltage"),
+        "bin_width": width,
+        "wavelength_label": f"{label[1]}.{label[2]}",
+        "polarisation": polarisation,
+        "bin_shift": _bin_shift(*tokens[10:12]),
+        "adc_bits": bits,
+        "shots": shots,
+        "input_range": level if analog else None,
+        "discriminator": level * 1e-3 if photon else None,
+        "device": tokens[15],
+        "comment": " ".join(tokens[16:]),
+        "line": line,
+    }
+
+
+def _kind(token: str) -> DatasetKind:
+    code = _integer(token, "type")
+    _bounded(code, DatasetKind.ANALOG, DatasetKind.OVERFLOW, "type")
+    return DatasetKind(code)
+
+
+def _active(text: str) -> bool:
+    if text not in {"0", "1"}:
+        raise RawFormatError(f"{text[:40]!r} is neither 0 nor 1", field="active")
+    return text == "1"
+
+
+def _bin_shift(whole: str, decimals: str) -> float:
+    fraction = float(f"0.{abs(_integer(decimals, 'bin shift')):0{len(decimals)}d}")
+    return _integer(whole, "bin shift") + fraction
+
+
+def _dataset_notes(datasets: tuple[Dataset, ...]) -> tuple[str, ...]:
+    return tuple(
+        f"{d.name} has no shots: its values are not known"
+        for d in datasets
+        if d.shots == 0 and d.active
+    )

@@ -1,0 +1,355 @@
+"""Write Licel raw files: numbers to header text, counts to bytes.
+
+Every header line is one blank and its values separated by single blanks, padded to 78
+characters, and CRLF, as Licel instruments write it. Headers are made by formatting and then
+parsing, so that a `Header` never differs from what a reader will find in the file.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.errors import RawFormatError
+from lidarops.raw.licel_header import (
+    Dataset,
+    DatasetKind,
+    Header,
+    Laser,
+    parse_dataset,
+    parse_header,
+)
+
+Dialect = Literal["classic", "extended", "raymetrics"]
+
+_LINE = 78
+_INT32 = np.iinfo(np.int32)
+_ICE_POINT = 273.15
+
+
+def new_dataset(
+    *,
+    kind: DatasetKind = DatasetKind.ANALOG,
+    wavelength: float,
+    bins: int,
+    bin_width: float,
+    shots: int,
+    polarisation: str = "o",
+    laser: int = 1,
+    high_voltage: float = 0.0,
+    adc_bits: int = 12,
+    input_range: float = 0.5,
+    discriminator: float = 3.1746e-3,
+    device: str | None = None,
+    active: bool = True,
+    laser_polarisation: int = 1,
+    bin_shift: float = 0.0,
+    comment: str = "",
+) -> Dataset:
+    """Build a dataset line from numbers.
+
+    Parameters
+    ----------
+    kind : DatasetKind
+        ``DatasetKind.ANALOG`` or ``DatasetKind.PHOTON`` for a signal channel.
+    wavelength : float
+        m; written in whole nm (5.32e-5 gives the mis-typed ``53200.o``).
+    bins : int
+    bin_width : float
+        m; must be writable in four characters, such as 7.5 or 15.
+    shots : int
+    polarisation : str
+        o, p, s, r or l.
+    laser, laser_polarisation : int
+    high_voltage : float
+        V; written in whole volts.
+    adc_bits : int
+        Written as 0 for photon counting.
+    input_range : float
+        V, analog.
+    discriminator : float
+        V, photon counting.
+    device : str, optional
+        ``BT0`` or ``BC0`` where not given.
+    active : bool
+    bin_shift : float
+        Bins; written with three decimals.
+    comment : str
+
+    Returns
+    -------
+    Dataset
+        With `offset` 0: its place and final name are known in a header only.
+
+    Raises
+    ------
+    RawFormatError
+        Where a number does not fit the format.
+    """
+    analog = kind in {DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED}
+    thousandths = round(bin_shift * 1000)
+    tokens = [
+        f"{active:d}",
+        f"{kind:d}",
+        f"{laser:d}",
+        f"{bins:05d}",
+        f"{laser_polarisation:d}",
+        f"{high_voltage:04.0f}",
+        _four_characters(bin_width, "bin width"),
+        f"{round(wavelength * 1e9):05d}.{polarisation}",
+        "0 0",
+        f"{thousandths // 1000:02d}",
+        f"{thousandths % 1000:03d}",
+        f"{adc_bits if analog else 0:02d}",
+        f"{shots:06d}",
+        f"{input_range:.3f}" if analog else f"{discriminator * 1e3:.4f}",
+        device or ("BT0" if analog else "BC0"),
+        comment,
+    ]
+    return parse_dataset(_line(*tokens))
+
+
+def new_header(
+    *,
+    name: str,
+    site: str,
+    start: datetime,
+    stop: datetime,
+    altitude: float,
+    longitude: float,
+    latitude: float,
+    datasets: Sequence[Dataset],
+    lasers: Sequence[Laser],
+    zenith_angle: float = 0.0,
+    azimuth: float | None = None,
+    temperature: float | None = None,
+    pressure: float | None = None,
+    custom: str | None = None,
+    timestamp: int | None = None,
+    dialect: Dialect | None = None,
+) -> Header:
+    """Build a header from numbers.
+
+    Parameters
+    ----------
+    name : str
+        File name for line 1.
+    site : str
+    start, stop : datetime
+        Aware; written in UTC, in whole seconds.
+    altitude : float
+        m; written in whole metres.
+    longitude, latitude : float
+        degree; one decimal, or six in the extended dialect.
+    datasets : sequence of Dataset
+        From `new_dataset` or a parsed header.
+    lasers : sequence of Laser
+        Two or three: shots and repetition rate in Hz.
+    zenith_angle : float
+        degree; whole degrees but in the extended dialect. Raymetrics writes -90 for vertical.
+    azimuth : float, optional
+        degree; makes the dialect extended, where it is needed.
+    temperature, pressure : float, optional
+        K and Pa; make the dialect raymetrics, where both are needed.
+    custom : str, optional
+        Quoted text; makes the dialect extended.
+    timestamp : int, optional
+        Of the controller; needs three lasers.
+    dialect : {"classic", "extended", "raymetrics"}, optional
+        Chosen by what is given where not given.
+
+    Returns
+    -------
+    Header
+        As a reader will see it: rounded as written, with offsets, names and promised size.
+
+    Raises
+    ------
+    RawFormatError
+        Where a number does not fit the dialect.
+    """
+    dialect = dialect or _dialect(azimuth, temperature, pressure, custom)
+    place = [
+        f"{altitude:04.0f}",
+        *_coordinates(dialect, longitude, latitude),
+        *_angles(dialect, zenith_angle, azimuth),
+        *_weather(dialect, temperature, pressure),
+        *([] if custom is None else [f'"{custom}"']),
+    ]
+    text = b"".join(
+        [
+            _line(name),
+            _line(
+                site if dialect == "raymetrics" else f"{site:<8}",
+                _utc(start, "start"),
+                _utc(stop, "stop"),
+                *place,
+            ),
+            _line(*_laser_tokens(lasers, len(datasets), timestamp)),
+            *(dataset.line for dataset in datasets),
+            b"\r\n",
+        ]
+    )
+    size = len(text) + sum(4 * dataset.bins + 2 for dataset in datasets if dataset.active)
+    header = parse_header(text, file=name, size=size)
+    _compare("site", site.strip(), header.site)
+    _compare("custom text", custom, header.custom)
+    _compare("zenith angle", round(zenith_angle, 6), header.zenith_as_written)
+    _compare("datasets", len(datasets), len(header.datasets))
+    return header
+
+
+def format_header(header: Header) -> bytes:
+    """Return the header as bytes: as it was read, or as `new_header` made it.
+
+    Raises
+    ------
+    RawFormatError
+        Where a field was changed after the header was made, so that it contradicts the text.
+    """
+    if parse_header(header.source, file=header.path, size=header.size) != header:
+        raise RawFormatError(
+            "the fields contradict the text of the header",
+            file=header.path or header.name,
+            remedy="build a changed header with new_header",
+        )
+    return header.source
+
+
+def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return the bytes of a file.
+
+    Parameters
+    ----------
+    header : Header
+    counts : mapping of str to integer array (bins,)
+        By dataset name, for every dataset that `header` stores.
+
+    Raises
+    ------
+    RawFormatError
+        Where counts are missing, surplus, of a wrong shape or type, or beyond 32 bits.
+    """
+    stored = [dataset for dataset in header.datasets if dataset.offset is not None]
+    surplus = set(counts) - {dataset.name for dataset in stored}
+    if surplus:
+        raise RawFormatError(f"not stored by the header: {', '.join(sorted(surplus))}")
+    parts = [format_header(header)]
+    for dataset in stored:
+        parts += [_counts(dataset, counts).tobytes(), b"\r\n"]
+    # A file that was read without its last CRLF is written without it.
+    return b"".join(parts)[: header.size]
+
+
+def write(path: str | os.PathLike[str], header: Header, counts: Mapping[str, NDArray[Any]]) -> None:
+    """Write a file: complete under its final name, or not at all.
+
+    Raises
+    ------
+    RawFormatError
+        As `encode`.
+    """
+    target = Path(path)
+    content = encode(header, counts)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _counts(dataset: Dataset, counts: Mapping[str, NDArray[Any]]) -> NDArray[np.int32]:
+    if dataset.name not in counts:
+        raise RawFormatError("no counts are given", field=dataset.name)
+    values = np.asarray(counts[dataset.name])
+    if values.shape != (dataset.bins,) or values.dtype.kind not in "iu":
+        raise RawFormatError(
+            f"counts are {values.dtype} of shape {values.shape}, not integers of shape"
+            f" ({dataset.bins},)",
+            field=dataset.name,
+        )
+    if values.min() < _INT32.min or values.max() > _INT32.max:
+        raise RawFormatError("counts exceed 32 bits", field=dataset.name)
+    return values.astype("<i4")
+
+
+def _line(*tokens: str) -> bytes:
+    text = " " + " ".join(token for token in tokens if token)
+    if not text.isprintable():
+        raise RawFormatError(f"{text!r} holds a character that ends lines or does not print")
+    try:
+        return text.ljust(_LINE).encode("latin-1") + b"\r\n"
+    except UnicodeEncodeError:
+        raise RawFormatError(f"{text!r} is not Latin-1 text") from None
+
+
+def _four_characters(value: float, name: str) -> str:
+    text = f"{value:.2f}"[:4] if value < 100 else f"{value:04.0f}"
+    if not np.isclose(float(text), value, rtol=1e-12, atol=0):
+        raise RawFormatError(f"{value:g} cannot be written in four characters", field=name)
+    return text
+
+
+def _dialect(
+    azimuth: float | None, temperature: float | None, pressure: float | None, custom: str | None
+) -> Dialect:
+    if temperature is not None or pressure is not None:
+        return "raymetrics"
+    return "classic" if azimuth is None and custom is None else "extended"
+
+
+def _coordinates(dialect: Dialect, *degrees: float) -> list[str]:
+    if dialect == "extended":
+        return [f"{value:011.6f}" for value in degrees]
+    return [f"{value:06.1f}" for value in degrees]
+
+
+def _angles(dialect: Dialect, zenith: float, azimuth: float | None) -> list[str]:
+    if dialect != "extended":
+        if azimuth is not None:
+            raise RawFormatError("needs the extended dialect", field="azimuth")
+        return [f"{zenith:02.0f}"]
+    if azimuth is None:
+        raise RawFormatError("the extended dialect needs one", field="azimuth")
+    return [f"{zenith:04.1f}", f"{azimuth:04.1f}"]
+
+
+def _weather(dialect: Dialect, temperature: float | None, pressure: float | None) -> list[str]:
+    if dialect != "raymetrics":
+        if temperature is not None or pressure is not None:
+            raise RawFormatError("needs the raymetrics dialect", field="temperature and pressure")
+        return []
+    if temperature is None or pressure is None:
+        raise RawFormatError("the raymetrics dialect needs both", field="temperature and pressure")
+    return ["00", f"{temperature - _ICE_POINT:.1f}", f"{pressure / 100:.1f}"]
+
+
+def _laser_tokens(lasers: Sequence[Laser], datasets: int, timestamp: int | None) -> list[str]:
+    if len(lasers) not in {2, 3} or (timestamp is not None and len(lasers) == 2):
+        raise RawFormatError("two or three are needed, three with a timestamp", field="lasers")
+    pairs = [f"{laser.shots:07d} {laser.repetition_rate:04.0f}" for laser in lasers]
+    reserved = ["0000000 0000"] if len(lasers) == 3 else []
+    last = [] if timestamp is None else [f"{timestamp:d}"]
+    return [*pairs[:2], f"{datasets:02d}", *pairs[2:], *reserved, *last]
+
+
+def _utc(moment: datetime, name: str) -> str:
+    if moment.tzinfo is None or moment.microsecond:
+        raise RawFormatError("must be aware, in whole seconds", field=name)
+    return f"{moment.astimezone(UTC):%d/%m/%Y %H:%M:%S}"
+
+
+def _compare(name: str, asked: object, written: object) -> None:
+    if asked != written:
+        raise RawFormatError(f"{asked!r} cannot be written: it reads as {written!r}", field=name)

@@ -1,0 +1,309 @@
+"""The data model of raw files in xarray: the only module that names variables and attributes.
+
+For every channel ``<channel>(time, range)`` in mV (analog) or MHz (photon counting), or raw
+counts, with ``<channel>_shots(time)`` and, for analog channels, ``<channel>_input_range(time)``
+in V. ``time`` is the middle of the interval in ``time_bnds(time, nv)``; ``range`` is the centre of
+the bin. Channels on another range grid have their own dimension, ``range_2`` and so on.
+``zenith_angle(time)`` and, where known, ``azimuth(time)`` are coordinates, as are latitude,
+longitude and altitude. What is the same in all files is an attribute of the channel;
+what varies from file to file is a variable ``<channel>_<fact>(time)``.
+
+Nothing is masked: a value at or above the attribute ``full_scale`` (in the units of the variable,
+present where it is the same in all files) is saturated or a glitch, and the processing flags it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.errors import RawFormatError
+from lidarops.raw.licel import CONVENTION, Dataset, Header, check_layout, select
+
+Position = Literal["longitude_first", "latitude_first", "ignore"]
+
+POSITIONS: Final = ("longitude_first", "latitude_first", "ignore")
+
+_EPOCH = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
+_SECOND = timedelta(seconds=1)
+_POLARISATIONS = {
+    "o": "no",
+    "p": "parallel",
+    "s": "perpendicular",
+    "r": "right circular",
+    "l": "left circular",
+}
+
+
+class _Fact(NamedTuple):
+    about: str
+    units: str
+    """Empty for those of the channel."""
+    dtype: type
+    may_be_attribute: bool
+    """Whether an attribute says it where all files agree."""
+
+
+_FACTS: Mapping[str, _Fact] = {
+    "shots": _Fact("laser shots", "1", np.int32, may_be_attribute=False),
+    "input_range": _Fact("digitiser input range", "V", np.float64, may_be_attribute=False),
+    "scale": _Fact("value of one count", "", np.float64, may_be_attribute=False),
+    "laser": _Fact("laser", "1", np.int32, may_be_attribute=True),
+    "high_voltage": _Fact("detector voltage", "V", np.float64, may_be_attribute=True),
+    "discriminator": _Fact("discriminator level", "V", np.float64, may_be_attribute=True),
+    "bin_shift": _Fact("bin shift", "1", np.float64, may_be_attribute=True),
+}
+
+
+@dataclass(slots=True)
+class Columns:
+    """What many headers of one layout say, one column a fact. Grows by `append`."""
+
+    channels: tuple[str, ...] | None
+    """Names to open; None for all."""
+    order: Position
+    paths: list[str] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    times: list[tuple[int, int]] = field(default_factory=list)
+    """Start and stop in s since 1970."""
+    places: list[tuple[float, float, float, float, float]] = field(default_factory=list)
+    """Latitude, longitude, altitude, zenith angle, azimuth; NaN where not known."""
+    sites: set[str] = field(default_factory=set)
+    notes: set[str] = field(default_factory=set)
+    variants: dict[tuple[Dataset, ...], tuple[int, tuple[Dataset, ...]]] = field(
+        default_factory=dict
+    )
+    """All datasets of a header -> number of the variant, chosen datasets."""
+    variant: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.order not in POSITIONS:
+            raise RawFormatError(
+                f"{self.order!r} is not known",
+                field="header_position",
+                remedy=f"choose one of {', '.join(POSITIONS)}",
+            )
+
+    def append(self, header: Header) -> None:
+        """Add a file.
+
+        Raises
+        ------
+        RawFormatError
+            Where the file lacks a channel, has it on another range grid than the first file, or
+            an impossible position.
+        """
+        if header.datasets not in self.variants:
+            chosen = select(header, self.channels)
+            check_layout(header, chosen, self.datasets if self.variants else chosen)
+            ordered = sorted(chosen, key=lambda d: self._rank(d.name))
+            self.variants[header.datasets] = (len(self.variants), tuple(ordered))
+        latitude, longitude = (
+            (math.nan, math.nan) if self.order == "ignore" else header.position(self.order)
+        )
+        azimuth = math.nan if header.azimuth is None else header.azimuth
+        self.paths.append(header.path)
+        self.sizes.append(header.size)
+        self.times.append(((header.start - _EPOCH) // _SECOND, (header.stop - _EPOCH) // _SECOND))
+        self.places.append((latitude, longitude, header.altitude, header.zenith_angle, azimuth))
+        self.sites.add(header.site)
+        self.notes.update(header.notes)
+        self.variant.append(self.variants[header.datasets][0])
+
+    @property
+    def datasets(self) -> tuple[Dataset, ...]:
+        """The chosen datasets of the first file."""
+        return next(iter(self.variants.values()))[1]
+
+    def fact(self, channel: int, name: str) -> NDArray[Any]:
+        """Return a property of dataset number `channel`, one value a file."""
+        by_variant = [getattr(chosen[channel], name) for _, chosen in self.variants.values()]
+        return np.array(by_variant)[self.variant]
+
+    def sort(self) -> None:
+        """Order the files by start, then path."""
+        order = sorted(range(len(self.paths)), key=lambda i: (self.times[i][0], self.paths[i]))
+        for name in ("paths", "sizes", "times", "places", "variant"):
+            values = getattr(self, name)
+            setattr(self, name, [values[index] for index in order])
+
+    def _rank(self, name: str) -> int:
+        if not self.variants:
+            return 0
+        return next(i for i, dataset in enumerate(self.datasets) if dataset.name == name)
+
+
+Signal = Callable[[int, Dataset], Any]
+"""Channel number, its dataset in the first file -> array (time, range), lazy or not."""
+
+
+def build(columns: Columns, signal: Signal, *, scaled: bool) -> xr.Dataset:
+    """Return the Dataset of the files in `columns`.
+
+    Parameters
+    ----------
+    columns : Columns
+    signal : callable
+        Gives the array of a channel.
+    scaled : bool
+        Whether `signal` gives physical values or counts.
+    """
+    grids = _grids(columns.datasets)
+    variables: dict[str, xr.Variable] = {}
+    for channel, dataset in enumerate(columns.datasets):
+        dims = ("time", grids[dataset.bins, dataset.bin_width])
+        facts, attributes = _facts(columns, channel, scaled=scaled)
+        variables[dataset.name] = xr.Variable(dims, signal(channel, dataset), attributes)
+        variables.update(facts)
+    return xr.Dataset(
+        variables,
+        {**_time(columns), **_ranges(grids), **_place(columns)},
+        {
+            "source_format": "Licel",
+            "site": ", ".join(sorted(columns.sites)),
+            **({"notes": "; ".join(sorted(columns.notes))} if columns.notes else {}),
+        },
+    )
+
+
+def _grids(datasets: tuple[Dataset, ...]) -> dict[tuple[int, float], str]:
+    # The most common grid is "range"; the others follow in file order.
+    uses = Counter((dataset.bins, dataset.bin_width) for dataset in datasets)
+    ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
+    return {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
+
+
+def _facts(
+    columns: Columns, channel: int, *, scaled: bool
+) -> tuple[dict[str, xr.Variable], dict[str, Any]]:
+    dataset = columns.datasets[channel]
+    devices = sorted(set(columns.fact(channel, "device").tolist()))
+    attributes = {
+        **_attributes(dataset, scaled=scaled),
+        "device": ", ".join(devices),
+        **_full_scale(columns, channel, scaled=scaled),
+    }
+    variables = {}
+    for name, fact in _FACTS.items():
+        values = columns.fact(channel, name)
+        if values[0] is None or (name == "scale" and scaled):
+            continue
+        if fact.may_be_attribute and _is_constant(values):
+            attributes[name] = values[0].item()
+            continue
+        variables[f"{dataset.name}_{name}"] = xr.Variable(
+            ("time",),
+            values.astype(fact.dtype),
+            {
+                "units": fact.units or dataset.units,
+                "long_name": f"{fact.about} of {dataset.name}",
+            },
+        )
+    return variables, attributes
+
+
+def _full_scale(columns: Columns, channel: int, *, scaled: bool) -> dict[str, float]:
+    dataset = columns.datasets[channel]
+    if dataset.input_range is None:
+        return {}
+    if scaled:
+        # In the precision of the signal, so that a saturated value compares equal.
+        nominal = columns.fact(channel, "input_range") * 1e3 * (1 - 0.5**dataset.adc_bits)
+        values = nominal.astype(np.float32)
+    else:
+        values = columns.fact(channel, "full_scale")
+    return {"full_scale": values[0].item()} if _is_constant(values) else {}
+
+
+def _is_constant(values: NDArray[Any]) -> bool:
+    return bool((values == values[0]).all())
+
+
+def _attributes(dataset: Dataset, *, scaled: bool) -> dict[str, Any]:
+    polarisation = _POLARISATIONS.get(dataset.polarisation, dataset.polarisation)
+    kind = dataset.kind.name.lower().replace("_", " ")
+    label = int(dataset.wavelength_label.partition(".")[0])
+    known = {} if math.isnan(dataset.wavelength) else {"wavelength": dataset.wavelength}
+    return {
+        "units": dataset.units if scaled else "count",
+        "long_name": f"{kind} signal at {label} nm, {polarisation} polarisation",
+        "detection_mode": kind,
+        "wavelength_label": dataset.wavelength_label,
+        **known,
+        "polarisation": polarisation,
+        "bin_width": dataset.bin_width,
+        "adc_bits": dataset.adc_bits,
+        "conversion": CONVENTION,
+    }
+
+
+def _time(columns: Columns) -> dict[str, xr.Variable]:
+    bounds = np.array(columns.times, dtype=np.int64) * 1_000_000_000
+    middle = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
+    return {
+        "time": xr.Variable(
+            ("time",),
+            middle.astype("datetime64[ns]"),
+            {
+                "standard_name": "time",
+                "long_name": "middle of the measurement interval, UTC",
+                "bounds": "time_bnds",
+            },
+        ),
+        "time_bnds": xr.Variable(("time", "nv"), bounds.astype("datetime64[ns]")),
+    }
+
+
+def _ranges(grids: Mapping[tuple[int, float], str]) -> dict[str, xr.Variable]:
+    return {
+        name: xr.Variable(
+            (name,),
+            (np.arange(bins) + 0.5) * width,
+            {"units": "m", "long_name": "distance of the bin centre from the lidar"},
+        )
+        for (bins, width), name in grids.items()
+    }
+
+
+def _place(columns: Columns) -> dict[str, xr.Variable]:
+    latitude, longitude, altitude, zenith, azimuth = np.array(columns.places).T
+    place = {
+        "zenith_angle": xr.Variable(
+            ("time",),
+            zenith,
+            {"units": "degree", "long_name": "zenith angle of the beam, 0 = up"},
+        ),
+        "altitude": _constant(
+            altitude,
+            {"units": "m", "standard_name": "altitude", "long_name": "altitude of the lidar"},
+        ),
+    }
+    if np.isfinite(azimuth).any():
+        place["azimuth"] = xr.Variable(
+            ("time",),
+            azimuth,
+            {"units": "degree", "long_name": "azimuth of the beam, clockwise from north"},
+        )
+    if columns.order != "ignore":
+        place["latitude"] = _constant(
+            latitude, {"units": "degrees_north", "standard_name": "latitude"}
+        )
+        place["longitude"] = _constant(
+            longitude, {"units": "degrees_east", "standard_name": "longitude"}
+        )
+    return place
+
+
+def _constant(values: NDArray[np.float64], attributes: dict[str, str]) -> xr.Variable:
+    # A lidar on the move has a place at every time.
+    if _is_constant(values):
+        return xr.Variable((), values[0], attributes)
+    return xr.Variable(("time",), values, attributes)

@@ -1,0 +1,263 @@
+"""Run records as JSON: what a run did, kept beside its report."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+import types
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from datetime import datetime
+from enum import StrEnum
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from lidarops.errors import CatalogError
+from lidarops.records import RunRecord
+
+FILE_NAME: Final = "run.json"
+"""Name of the record inside a run's report folder."""
+
+_FORMAT: Final = "lidarops run record"
+_VERSION: Final = 1
+_T = TypeVar("_T")
+_REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"
+# JSON has no such numbers, and other readers than Python refuse Python's spelling of them.
+_NOT_FINITE: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+
+
+class _MismatchError(Exception):
+    """A value that is not what its field says; carries the place and what was expected."""
+
+    def __init__(self, place: str, expected: str) -> None:
+        self.place = place
+        self.expected = expected
+        super().__init__(place, expected)
+
+
+def save(record: RunRecord, folder: Path) -> Path:
+    """Write a run record to ``run.json`` in `folder`, in one atomic step.
+
+    Parameters
+    ----------
+    record : RunRecord
+        The run. Settings in it must be plain JSON types, as `lidarops.records` says.
+    folder : Path
+        Report folder of the run; made where missing.
+
+    Returns
+    -------
+    Path
+        The file. `load` gives back an equal record; tuples within settings become lists.
+
+    Raises
+    ------
+    CatalogError
+        Where the folder cannot be written, or a setting is not a plain JSON type.
+    """
+    target = Path(folder) / FILE_NAME
+    document = {"format": _FORMAT, "version": _VERSION, "record": _plain(record)}
+    try:
+        text = json.dumps(document, indent=1, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise CatalogError(
+            f"the run record holds what JSON cannot: {error}",
+            file=target,
+            field="settings",
+            remedy="keep settings to text, finite numbers, booleans, lists and mappings",
+        ) from error
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(target, text.encode("ascii"))
+    except OSError as error:
+        raise CatalogError(
+            f"cannot be written: {error}", file=target, remedy="choose a folder you can write to"
+        ) from error
+    return target
+
+
+def load(path: str | Path) -> RunRecord:
+    """Read a run record that `save` wrote.
+
+    Parameters
+    ----------
+    path : path or str
+        The run's report folder, or the ``run.json`` in it.
+
+    Returns
+    -------
+    RunRecord
+        Equal to the one that was saved.
+
+    Raises
+    ------
+    CatalogError
+        With file, field and what was expected, where the file is missing, damaged or not
+        exactly a run record: a wrong type, an unknown or a missing field.
+    """
+    path = Path(path)
+    path = path / FILE_NAME if path.is_dir() else path
+    try:
+        document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+    except OSError as error:
+        raise CatalogError(f"cannot be read: {error}", file=path, remedy=_REMEDY) from error
+    except (ValueError, RecursionError) as error:
+        raise CatalogError(f"is not a JSON document: {error}", file=path, remedy=_REMEDY) from error
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise CatalogError("is not a lidarops run record", file=path, remedy=_REMEDY)
+    if document.get("version") != _VERSION:
+        raise CatalogError(
+            f"is version {document.get('version')!r}, and this lidarops reads {_VERSION}",
+            file=path,
+            field="version",
+            remedy="use the lidarops that wrote it, or run the campaign again",
+        )
+    try:
+        record = _dataclass(RunRecord, document.get("record"), "record")
+    except _MismatchError as error:
+        raise CatalogError(
+            f"expected {error.expected}", file=path, field=error.place, remedy=_REMEDY
+        ) from error
+    return record
+
+
+def write_atomically(target: Path, content: bytes) -> None:
+    """Write `content` to a temporary file beside `target`, sync it and rename it.
+
+    Parameters
+    ----------
+    target : Path
+        The file to make or replace; its folder exists.
+    content : bytes
+        All of it.
+
+    Raises
+    ------
+    OSError
+        Where the file system refuses; `target` is then as before.
+    """
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        # mkstemp makes files that only their owner may read, and reports are for others.
+        temporary.chmod(0o644)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _plain(value: object) -> object:
+    if is_dataclass(value) and not isinstance(value, type):
+        return {item.name: _plain(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, float) and not math.isfinite(value):
+        return next(name for name, number in _NOT_FINITE.items() if repr(number) == repr(value))
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, datetime):
+        return value.isoformat()
+    # Settings are plain already: a number that is not finite in them is refused by `save`,
+    # because text in its place could not be told from text when it is read.
+    return dict(value) if isinstance(value, Mapping) else value
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not JSON")
+
+
+@cache
+def _hints(kind: type) -> dict[str, object]:
+    return typing.get_type_hints(kind)
+
+
+def _typed(expected: object, value: object, place: str) -> object:
+    """Return `value`, as JSON gave it, as the type `expected` of a field."""
+    origin, parts = typing.get_origin(expected), typing.get_args(expected)
+    if origin is types.UnionType:
+        (kind,) = (part for part in parts if part is not type(None))
+        return None if value is None else _typed(kind, value, place)
+    if origin is tuple:
+        items = _checked(value, list, "a list", place)
+        return tuple(_typed(parts[0], item, f"{place}[{i}]") for i, item in enumerate(items))
+    if origin is Mapping:
+        pairs = _checked(value, dict, "a mapping", place)
+        return {key: _typed(parts[1], item, f"{place}.{key}") for key, item in pairs.items()}
+    if isinstance(expected, type) and is_dataclass(expected):
+        return _dataclass(expected, value, place)
+    if isinstance(expected, type) and issubclass(expected, StrEnum):
+        return _enum(expected, value, place)
+    return _SCALARS[expected](value, place)
+
+
+def _dataclass(kind: type[_T], value: object, place: str) -> _T:
+    given = _checked(value, dict, f"the fields of {kind.__name__}", place)
+    hints = _hints(kind)  # type: ignore[arg-type]  # mypy asks the instances' __hash__
+    for name in sorted(set(hints) ^ set(given)):
+        missing = "this field, which is missing"
+        raise _MismatchError(
+            f"{place}.{name}", missing if name in hints else f"no such field of {kind.__name__}"
+        )
+    return kind(**{name: _typed(hints[name], given[name], f"{place}.{name}") for name in hints})
+
+
+def _enum(kind: type[StrEnum], value: object, place: str) -> StrEnum:
+    for member in kind:
+        if member.value == value:
+            return member
+    choices = ", ".join(member.value for member in kind)
+    raise _MismatchError(place, f"one of {choices}, not {value!r:.80}")
+
+
+def _checked(value: object, kind: type[_T], words: str, place: str) -> _T:
+    # JSON's true and false are whole numbers to Python.
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise _MismatchError(place, f"{words}, not {value!r:.80}")
+    return value
+
+
+def _text(value: object, place: str) -> str:
+    return _checked(value, str, "text", place)
+
+
+def _whole(value: object, place: str) -> int:
+    return _checked(value, int, "a whole number", place)
+
+
+def _float(value: object, place: str) -> float:
+    if isinstance(value, str) and value in _NOT_FINITE:
+        return _NOT_FINITE[value]
+    if isinstance(value, float):
+        return value
+    whole = _checked(value, int, "a number", place)
+    try:
+        return float(whole)
+    except OverflowError as error:
+        raise _MismatchError(place, f"a number below 1e308, not {whole!r:.80}") from error
+
+
+def _datetime(value: object, place: str) -> datetime:
+    text = _checked(value, str, "an ISO 8601 date and time", place)
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError as error:
+        raise _MismatchError(place, f"an ISO 8601 date and time, not {text!r:.80}") from error
+
+
+def _anything(value: object, _: str) -> object:
+    return value
+
+
+_SCALARS: Final[Mapping[object, Callable[[object, str], object]]] = {
+    str: _text,
+    int: _whole,
+    float: _float,
+    datetime: _datetime,
+    Any: _anything,
+}

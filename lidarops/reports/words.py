@@ -1,0 +1,49 @@
+"""Numbers and names as reports spell them."""
+
+from __future__ import annotations
+
+import math
+
+from lidarops.flags import Quality
+
+
+def bit_name(bit: Quality) -> str:
+    """Return the name of a single bit as CF flag meanings spell it."""
+    return (bit.name or "").lower()
+
+
+def percent(share: float) -> str:
+    """Return a share from 0 to 1 in percent, never rounded to 0 or 100 when it is neither."""
+    if math.isnan(share):
+        return "no value"
+    number = 100.0 * share
+    if 0.0 < number < 0.1:
+        return "<0.1 %"
+    if 99.9 < number < 100.0:
+        return ">99.9 %"
+    return f"{number:.1f} %" if number % 100.0 else f"{number:.0f} %"
+
+
+def size(count: float) -> str:
+    """Return a number of bytes in decimal units."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000.0:
+            return f"{count:.3g} {unit}"
+        count /= 1000.0
+    return f"{count:,.1f} TB"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in the unit that suits it."""
+    if seconds < 1.0:
+        return f"{1e3 * seconds:.0f} ms"
+    if seconds < 60.0:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, which takes an s in the plural."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -1,0 +1,155 @@
+"""Results as the engine hands them over, made up."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidarops.campaign import Metadata, Station
+from lidarops.flags import Quality
+from lidarops.products.build import Context
+from lidarops.records import (
+    DetectionMode,
+    InputRecord,
+    LeftOut,
+    Plan,
+    ProductKind,
+    Provenance,
+    Role,
+    Step,
+)
+
+START = datetime(2026, 3, 1, tzinfo=UTC)
+STATION = Station(name="Одеса, hill", latitude=46.44, longitude=30.76, altitude=53.5)
+METADATA = Metadata(
+    institution="Université d'Été",
+    creator_name="A. Person",
+    creator_email="a.person@example.org",
+    license="CC-BY-4.0",
+    comment="A comment of the campaign.",
+)
+
+
+def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Provenance:
+    plan = Plan(
+        scene="scene-1",
+        steps=(
+            Step("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
+            Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
+        ),
+        left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
+    )
+    inputs = tuple(
+        InputRecord(f"2026/03/a{number:02d}.dat", Role.SIGNAL, f"{number:064x}")
+        for number in range(3)
+    )
+    fields = {
+        "campaign": "demo",
+        "scene": "scene-1",
+        "kind": kind,
+        "channel": "photon_532o",
+        "inputs": (*inputs, InputRecord("dark/d.dat", Role.DARK, "f" * 64)),
+        "plan": plan,
+        "settings": {"facts": {"full_overlap_range": 500.0}, "station": {"name": "Одеса"}},
+        "versions": {"numpy": "2.4.6", "lidarops": "0.1.0"},
+        "code_version": "0123456789abcdef",
+    }
+    return Provenance(**(fields | changes))
+
+
+def context(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Context:
+    fields = {
+        "kind": kind,
+        "channel": "photon_532o",
+        "mode": DetectionMode.PHOTON,
+        "wavelength": 532e-9,
+        "station_key": "odesa",
+        "station": STATION,
+        "instrument_key": "lidar-1",
+        "instrument_name": "Lidar One",
+        "metadata": METADATA,
+        "campaign": "demo",
+        "title": "Demo campaign",
+        "summary": "What the campaign is about.",
+        "scene": "scene-1",
+        "start": START,
+        "stop": START + timedelta(days=1),
+        "provenance": provenance(kind),
+    }
+    return Context(**(fields | changes))
+
+
+def clock(profiles: int, zenith: Any = 90.0, azimuth: Any = None) -> dict[str, Any]:
+    """Coordinates that every kind has: profiles of 10 minutes, zenith angle over time."""
+    first = np.datetime64("2026-03-01T10:00:00", "ns")
+    length = np.timedelta64(600, "s")
+    starts = first + length * np.arange(profiles)
+    found = {
+        "time": ("time", starts + length // 2),
+        "time_bnds": (("time", "nv"), np.stack([starts, starts + length], axis=-1)),
+        "zenith_angle": ("time", np.broadcast_to(np.float64(zenith), (profiles,)).copy()),
+    }
+    if azimuth is not None:
+        found["azimuth"] = ("time", np.broadcast_to(np.float64(azimuth), (profiles,)).copy())
+    return found
+
+
+def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset:
+    """A labelled homogeneous retrieval, as `lidarops.retrieve.labeled.homogeneous` gives it."""
+    rng = np.random.default_rng(1)
+    shape = (profiles, sections)
+    dims = ("time", "section")
+    near = 500.0 + 1000.0 * np.arange(sections)
+    extinction = rng.uniform(1e-6, 1e-3, shape)
+    flags = np.zeros(shape, np.int32)
+    flags[0, 0] = Quality.NO_SIGNAL | Quality.LOW_SIGNAL
+    extinction[0, 0] = np.nan
+    return xr.Dataset(
+        {
+            "extinction": (dims, extinction),
+            "extinction_standard_error": (dims, np.abs(extinction) * 0.05),
+            "amplitude": (dims, rng.uniform(1e7, 1e12, shape)),
+            "amplitude_standard_error": (dims, rng.uniform(1e5, 1e9, shape)),
+            "background": (dims, rng.uniform(0.1, 2.0, shape)),
+            "background_standard_error": (dims, rng.uniform(1e-4, 1e-3, shape)),
+            "reduced_chi2": (dims, rng.uniform(0.8, 1.2, shape)),
+            "valid_bins": (dims, rng.integers(8, 500, shape)),
+            "quality_flag": (dims, flags),
+            "shots": ("time", np.full(profiles, 600, np.int64)),
+        },
+        coords={
+            **clock(profiles, **beam),
+            "section": ("section", np.arange(sections)),
+            "section_range": ("section", near + 1000.0),
+            "section_bounds": (("section", "nv"), np.stack([near, near + 2000.0], axis=-1)),
+        },
+    )
+
+
+def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
+    """A background-subtracted, range-corrected signal."""
+    rng = np.random.default_rng(2)
+    dims = ("time", "range")
+    shape = (profiles, bins)
+    values = rng.normal(1e6, 1e4, shape)
+    flags = np.zeros(shape, np.int32)
+    flags[:, :3] = Quality.INCOMPLETE_OVERLAP
+    flags[0, 0] |= Quality.INPUT_MISSING
+    values[0, 0] = np.nan
+    return xr.Dataset(
+        {
+            "signal": (dims, values),
+            "signal_standard_error": (dims, np.full(shape, 1e4)),
+            "background": ("time", rng.uniform(0.1, 2.0, profiles)),
+            "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
+            "quality_flag": (dims, flags),
+            "shots": ("time", np.full(profiles, 600, np.int32)),
+        },
+        coords={**clock(profiles, **beam), "range": ("range", 7.5 * (np.arange(bins) + 0.5))},
+    )
+
+
+MAKERS = {ProductKind.SIGNAL: signal, ProductKind.HOMOGENEOUS: homogeneous}

@@ -1,0 +1,114 @@
+"""Products of every shape against compliance-checker in strict mode."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from compliance_checker.runner import CheckSuite, ComplianceChecker
+from fabricated import MAKERS, STATION, context, homogeneous, signal
+
+from lidarops.flags import Quality
+from lidarops.products.build import build
+from lidarops.products.table import LAYOUTS
+from lidarops.products.write import write
+from lidarops.records import DetectionMode, ProductKind
+
+SCAN = {"zenith": [0.0, 30.0, 60.0, 80.0, 90.0], "azimuth": [0.0, 1.0, 2.0, 3.0, 4.0]}
+SHAPES: dict[str, dict[str, Any]] = {
+    "vertical": {"zenith": 0.0},
+    "horizontal": {"zenith": 90.0, "azimuth": 200.0},
+    "slant": {"zenith": 60.0, "azimuth": 0.0},
+    "down": {"zenith": 180.0},
+    "scan": SCAN,
+    "one_profile": {"zenith": 3.0, "profiles": 1},
+    "many_profiles": {"zenith": 0.0, "profiles": 300},
+}
+
+
+def missing(kind: ProductKind) -> xr.Dataset:
+    data = MAKERS[kind](zenith=90.0)
+    data["quality_flag"][:] = int(Quality.INPUT_MISSING)
+    for variable in data.data_vars.values():
+        if variable.dtype.kind == "f":
+            variable[:] = np.nan
+    return data
+
+
+def findings(path: Path, check: str) -> set[str]:
+    """Everything that the checker has to say of a file."""
+    CheckSuite.load_all_available_checkers()
+    report = path.with_suffix(".json")
+    ComplianceChecker.run_checker(
+        str(path), [check], 0, "strict", output_filename=str(report), output_format="json"
+    )
+    result = json.loads(report.read_text(encoding="utf-8"))[check]
+    assert result["possible_points"] > 90
+    said = set(_said(result["all_priorities"]))
+    assert bool(said) == (result["scored_points"] != result["possible_points"])
+    return said
+
+
+def _said(results: list[dict[str, Any]]) -> Iterator[str]:
+    for result in results:
+        yield from (f"{result['name']} {message}" for message in result["msgs"])
+        yield from _said(result["children"])
+
+
+def permitted(kind: ProductKind) -> set[str]:
+    """One finding for each quantity that CF has no standard name for; none is left out."""
+    return {
+        f'variable "{row.name}" missing the following attributes: standard_name'
+        for row in LAYOUTS[kind].variables
+        if row.standard_name is None
+    }
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("kind", list(ProductKind))
+def test_products_comply(kind: ProductKind, shape: str, tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write(build(MAKERS[kind](**SHAPES[shape]), context(kind)), path)
+    assert findings(path, "cf:1.11") == set()
+    assert findings(path, "acdd:1.3") == permitted(kind)
+
+
+@pytest.mark.parametrize("kind", list(ProductKind))
+def test_a_product_of_nothing_but_missing_values_complies(kind: ProductKind, tmp_path: Path):
+    path = tmp_path / "product.nc"
+    of = context(kind, mode=DetectionMode.ANALOG, wavelength=float("nan"))
+    write(build(missing(kind), of), path)
+    assert findings(path, "cf:1.11") == set()
+    assert findings(path, "acdd:1.3") == permitted(kind)
+    with xr.open_dataset(path) as product:
+        main = "signal" if kind is ProductKind.SIGNAL else "extinction"
+        assert np.isnan(product[main]).all()
+        assert "wavelength" not in product
+
+
+def test_the_checker_would_find_a_fault(tmp_path: Path):
+    product = build(homogeneous(), context())
+    product["extinction"].attrs["units"] = "kg"
+    product["extinction"].attrs["standard_name"] = "altitude"
+    path = tmp_path / "product.nc"
+    write(product, path)
+    assert any("extinction" in said for said in findings(path, "cf:1.11"))
+
+
+@pytest.mark.skipif(shutil.which("ncdump") is None, reason="ncdump is not installed")
+def test_ncdump_reads_the_header(tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write(build(signal(), context(ProductKind.SIGNAL)), path)
+    header = subprocess.run(
+        ["ncdump", "-h", str(path)], capture_output=True, text=True, check=True
+    ).stdout
+    assert "time = UNLIMITED ; // (5 currently)" in header
+    assert "float signal(time, range) ;" in header
+    assert STATION.name in header

@@ -1,0 +1,184 @@
+"""The demo campaign: simulate, catalog, process, and compare with the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+from lidarops.campaign import Campaign, load
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.engine import run
+from lidarops.pipeline import prepare
+from lidarops.records import RunRecord, Status
+
+
+@pytest.fixture(scope="session")
+def demo_archive(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The simulated demo archive, written by the command line."""
+    archive = tmp_path_factory.mktemp("demo") / "raw"
+    result = CliRunner().invoke(
+        app, ["simulate", str(repository / "catalogs/demo.yaml"), "--archive", str(archive)]
+    )
+    assert result.exit_code == 0, result.output
+    return archive
+
+
+def _campaign(repository: Path, archive: Path, out: Path) -> Campaign:
+    return load(repository / "catalogs/demo.yaml", archive=archive, output=out)
+
+
+@pytest.fixture(scope="session")
+def demo(
+    repository: Path, demo_archive: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Campaign, RunRecord]]:
+    """One serial run over it."""
+    campaign = _campaign(repository, demo_archive, tmp_path_factory.mktemp("serial"))
+    return campaign, run(campaign, prepare(campaign))
+
+
+def _products(record: RunRecord, kind: str, instrument: str) -> xr.Dataset:
+    parts = [
+        xr.load_dataset(Path(record.products) / product.path).assign_coords(channel=product.channel)
+        for scene in record.scenes
+        if scene.instrument == instrument
+        for product in scene.products
+        if product.kind == kind
+    ]
+    assert parts
+    return xr.concat(
+        [part[["extinction", "extinction_standard_error", "quality_flag"]] for part in parts],
+        dim="time",
+    )
+
+
+def test_extinction_agrees_with_the_truth(demo: tuple[Campaign, RunRecord]) -> None:
+    campaign, record = demo
+    retrieved = _products(record, "homogeneous", "coast-horizontal")
+    truth = xr.load_dataset(campaign.truth_path)
+    truth = truth.isel(granule=(truth["instrument"] == "coast-horizontal").values)
+    truth = truth.swap_dims(granule="time").sortby("time")["extinction"]
+    expected = truth.sel(time=retrieved["time"], method="nearest").values[:, np.newaxis]
+    good = retrieved["quality_flag"].values == 0
+    score = (retrieved["extinction"].values - expected) / retrieved[
+        "extinction_standard_error"
+    ].values
+    assert good.mean() > 0.5
+    assert (np.abs(score[good]) < 3).mean() >= 0.99
+    # Neither too small an error nor too large a one.
+    assert 0.8 < score[good].std() < 1.2
+
+
+def test_a_vertical_path_is_said_not_to_be_homogeneous(
+    demo: tuple[Campaign, RunRecord],
+) -> None:
+    _, record = demo
+    retrieved = _products(record, "homogeneous", "hill-vertical")
+    assert (retrieved["quality_flag"].values != 0).mean() > 0.99
+
+
+def test_every_damaged_file_is_refused_and_no_other(demo: tuple[Campaign, RunRecord]) -> None:
+    campaign, record = demo
+    truth = xr.load_dataset(campaign.truth_path)
+    harmless = ("", "no_final_newline")
+    damaged = {
+        str(path)
+        for path, damage in zip(truth["path"].values, truth["damage"].values, strict=True)
+        if damage not in harmless
+    }
+    assert damaged
+    assert {granule.path for granule in record.refused} == damaged
+    assert all(granule.reason for granule in record.refused)
+    assert not any(scene.error or scene.refused for scene in record.scenes)
+
+
+def test_every_good_file_is_in_a_product(demo: tuple[Campaign, RunRecord]) -> None:
+    campaign, _record = demo
+    store = Store(campaign.catalog_url, campaign.name)
+    good = {granule.path for granule in store.granules(status=Status.GOOD)}
+    used = {
+        path for product in store.products() for path in store.product_inputs(str(product["path"]))
+    }
+    store.close()
+    assert used == good
+    assert len(used) > 100
+
+
+def _hashes(record: RunRecord) -> dict[str, str]:
+    return {product.path: product.sha256 for scene in record.scenes for product in scene.products}
+
+
+@pytest.mark.parametrize(
+    ("workers", "profiles_per_chunk"), [(2, None), (1, 7), (2, 1)], ids=["2w", "chunk7", "2w1"]
+)
+def test_products_do_not_depend_on_workers_and_chunks(
+    demo: tuple[Campaign, RunRecord],
+    repository: Path,
+    demo_archive: Path,
+    tmp_path: Path,
+    workers: int,
+    profiles_per_chunk: int | None,
+) -> None:
+    campaign = _campaign(repository, demo_archive, tmp_path)
+    again = run(campaign, prepare(campaign), workers=workers, profiles_per_chunk=profiles_per_chunk)
+    assert _hashes(again) == _hashes(demo[1])
+
+
+def test_the_command_line_reprocesses_and_tells(
+    repository: Path, demo_archive: Path, tmp_path: Path, demo: tuple[Campaign, RunRecord]
+) -> None:
+    runner = CliRunner()
+    where = ["--archive", str(demo_archive), "--out", str(tmp_path)]
+    name = str(repository / "catalogs/demo.yaml")
+    result = runner.invoke(app, ["catalog", name, *where, "--json"])
+    assert result.exit_code == 1
+    summary = json.loads(result.stdout)
+    assert summary["refused"] == len(demo[1].refused)
+    result = runner.invoke(
+        app, ["reprocess", name, *where, "--instrument", "hill-vertical", "--json"]
+    )
+    assert result.exit_code == 1
+    told = json.loads(result.stdout)
+    assert told["scenes"] > 0
+    assert all(path.startswith("hill/") for path in told["products"])
+    assert len(told["refused_files"]) == summary["refused"]
+    page = Path(told["report"])
+    assert page.is_file()
+    result = runner.invoke(app, ["report", str(page.parent)])
+    assert result.exit_code == 0
+    assert result.stdout.strip() == str(page)
+    product = tmp_path / "products" / told["products"][0]
+    assert runner.invoke(app, ["inspect", str(product)]).exit_code == 0
+    result = runner.invoke(app, ["inspect", str(product), "--provenance"])
+    assert "wasGeneratedBy" in json.loads(result.stdout)
+    raw = next((demo_archive / "hill").rglob("v*"), None) or next(demo_archive.rglob("h2*"))
+    assert "Channels" in runner.invoke(app, ["inspect", str(raw)]).stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["catalog", "nowhere.yaml"], 2, "nowhere.yaml"),
+        (["reprocess", "CAMPAIGN", "--workers", "0"], 2, "workers"),
+        (["reprocess", "CAMPAIGN", "--archive", "/nowhere"], 1, "/nowhere"),
+        (["inspect", "/nowhere"], 1, "/nowhere"),
+        (["report", "/nowhere"], 1, "/nowhere"),
+        (["bench", "luck"], 2, "throughput"),
+    ],
+)
+def test_wrong_use_is_told(
+    repository: Path, tmp_path: Path, arguments: list[str], code: int, said: str
+) -> None:
+    campaign = str(repository / "catalogs/demo.yaml")
+    words = [campaign if word == "CAMPAIGN" else word for word in arguments]
+    if words[0] == "reprocess":
+        words += ["--out", str(tmp_path)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == code
+    assert said in result.output
