@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ def open_archive(
     RawFormatError
         Naming the file where one cannot be read or is of another layout.
     """
-    columns = Columns(channels=None if channels is None else tuple(channels), order=header_position)
+    columns = Columns(channel_names(channels), header_position)
     stamps = []
     for path in _files(source, root):
         with RawFile(path) as file:
@@ -79,20 +79,16 @@ def open_archive(
     token = tokenize(stamps)
 
     def signal(channel: int, dataset: Dataset) -> da.Array:
-        scales = columns.fact(channel, "scale") if mask_and_scale else None
         offsets = columns.fact(channel, "offset").astype(np.int64)
-        name = f"licel-{dataset.name}-{tokenize(token, offsets, scales, len(chunks))}"
-        graph = {
-            (name, index, 0): (
-                _Chunk(
-                    files, offsets[part], dataset.bins, None if scales is None else scales[part]
-                ),
-            )
-            for index, (part, files) in enumerate(chunks)
-        }
+        scales = columns.fact(channel, "scale") if mask_and_scale else None
         lengths = tuple(len(files.paths) for _, files in chunks)
-        dtype = np.int32 if scales is None else np.float32
+        name = f"licel-{dataset.name}-{tokenize(token, offsets, scales, lengths)}"
+        graph = {}
+        for index, (part, files) in enumerate(chunks):
+            scale = None if scales is None else scales[part]
+            graph[name, index, 0] = (_Chunk(files, offsets[part], dataset.bins, scale),)
         shape = (lengths, (dataset.bins,))
+        dtype = np.int32 if scales is None else np.float32
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
 
     return build(columns, signal, scaled=mask_and_scale)
@@ -149,37 +145,42 @@ def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]
 
 
 def _files(source: Source, root: str | os.PathLike[str] | None) -> list[str]:
-    # Sorted, so that the first file, with which the layout of others is compared, is always
-    # the same.
     base = Path(root) if root is not None else Path()
-    place = None
     if isinstance(source, str | os.PathLike):
-        place = base / source
-        files = _expand(place)
+        files = _expand(base, Path(source))
     else:
         files = [str(base / (item.path if isinstance(item, Granule) else item)) for item in source]
     if not files:
         raise RawFormatError(
             "no files are found",
-            file=place,
+            file=base / source if isinstance(source, str | os.PathLike) else None,
             remedy="give a folder, a glob pattern or paths that exist",
         )
     path, times = Counter(files).most_common(1)[0]
     if times > 1:
         raise RawFormatError(f"is given {times} times", file=path)
+    # The first file, with which the layout of the others is compared, is always the same.
     return sorted(files)
 
 
-def _expand(place: Path) -> list[str]:
+def _expand(base: Path, source: Path) -> list[str]:
+    place = base / source
     if place.is_dir():
-        return [
-            str(path)
-            for path in place.rglob("*")
-            if path.is_file()
-            and not any(part.startswith(".") for part in path.relative_to(place).parts)
-        ]
+        return list(_walk(place))
     if place.exists():
         return [str(place)]
-    anchor = Path(place.anchor)
-    pattern = str(place.relative_to(anchor))
-    return [str(path) for path in anchor.glob(pattern) if path.is_file()]
+    start = Path(source.anchor) if source.is_absolute() else base
+    pattern = str(source.relative_to(source.anchor))
+    try:
+        return [str(path) for path in start.glob(pattern) if path.is_file()]
+    except ValueError as error:
+        raise RawFormatError(f"is no glob pattern: {error}", file=source) from None
+
+
+def _walk(folder: Path) -> Iterator[str]:
+    def fail(error: OSError) -> None:
+        raise RawFormatError(f"cannot be listed: {error.strerror}", file=error.filename) from None
+
+    for place, folders, names in os.walk(folder, onerror=fail):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        yield from (str(Path(place, name)) for name in names if not name.startswith("."))

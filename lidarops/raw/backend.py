@@ -66,9 +66,7 @@ class LicelBackendEntrypoint(BackendEntrypoint):
             raise RawFormatError(
                 f"cannot open a {type(filename_or_obj).__name__}", remedy="give a local path"
             )
-        columns = Columns(
-            channels=None if channels is None else tuple(channels), order=header_position
-        )
+        columns = Columns(channel_names(channels), header_position)
         header = read_header(filename_or_obj)
         columns.append(header)
 

@@ -60,6 +60,7 @@ __all__ = [
     "read_header",
     "read_physical",
     "select",
+    "select_signals",
     "to_physical",
     "write",
 ]
@@ -262,6 +263,26 @@ def select(header: Header, channels: Iterable[str] | None = None) -> tuple[Datas
     return tuple(stored[name] for name in names)
 
 
+def select_signals(header: Header, channels: Iterable[str] | None = None) -> tuple[Dataset, ...]:
+    """Return the signal channels of these names, as `select`.
+
+    Raises
+    ------
+    RawFormatError
+        As `select`, and where a dataset is no signal.
+    """
+    datasets = select(header, channels)
+    for dataset in datasets:
+        if dataset.mode is None:
+            raise RawFormatError(
+                f"{dataset.name} is no signal: it has no physical values",
+                file=header.path or header.name,
+                field="channels",
+                remedy="read it with licel.read_counts",
+            )
+    return datasets
+
+
 def read_counts(
     path: PathLike, channels: Iterable[str] | None = None, *, bins: int | None = None
 ) -> tuple[Header, dict[str, Counts]]:
@@ -345,7 +366,7 @@ def read_physical(
             header = file.read_header()
             # Files with the same dataset lines share the parsed ones: nothing to choose anew.
             if not headers or header.datasets is not headers[-1].datasets:
-                datasets = select(header, names)
+                datasets = select_signals(header, names)
                 scales = [dataset.scale for dataset in datasets]
             if not headers:
                 first = datasets

@@ -73,9 +73,9 @@ def new_dataset(
     adc_bits : int
         Written as 0 for photon counting.
     input_range : float
-        V, analog.
+        V, analog; in whole millivolts.
     discriminator : float
-        V, photon counting.
+        V, photon counting; written in mV with four decimals.
     device : str, optional
         ``BT0`` or ``BC0`` where not given.
     active : bool
@@ -113,7 +113,11 @@ def new_dataset(
         device or ("BT0" if analog else "BC0"),
         comment,
     ]
-    return parse_dataset(_line(*tokens))
+    dataset = parse_dataset(_line(*tokens))
+    _compare("device", tokens[-2], dataset.device)
+    if analog:
+        _compare("input range", round(input_range, 9), dataset.input_range)
+    return dataset
 
 
 def new_header(

@@ -26,7 +26,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.licel import CONVENTION, Dataset, Header, check_layout, select
+from lidarops.raw.licel import CONVENTION, Dataset, Header, check_layout, select_signals
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]
 
@@ -102,7 +102,7 @@ class Columns:
             an impossible position.
         """
         if header.datasets not in self.variants:
-            chosen = select(header, self.channels)
+            chosen = select_signals(header, self.channels)
             check_layout(header, chosen, self.datasets if self.variants else chosen)
             ordered = sorted(chosen, key=lambda d: self._rank(d.name))
             self.variants[header.datasets] = (len(self.variants), tuple(ordered))

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-STEPS: Final = 4
+STEPS: Final = 5
 """Newton steps after the start, which is good to some hundredths of the spacing of nodes."""
 NODES: Final = 24
 NODE_SCALE: Final = 0.3
@@ -35,9 +35,9 @@ DEPENDENT: Final = 1e-9
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning.
 _SUMS: Final = {"reassoc", "contract", "nsz"}
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-_summing = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
-_finding = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"})
+_compiled = numba.njit(cache=False, nogil=True, error_model="numpy", forceinline=True)
+_summing = numba.njit(cache=False, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
+_finding = numba.njit(cache=False, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"})
 
 # What became of a profile.
 FITTED: Final = 0

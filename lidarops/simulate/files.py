@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from lidarops.campaign import Instrument, InstrumentFacts, Station, channel_facts
 from lidarops.constants import LICEL_DISCRIMINATOR_STEP
 from lidarops.errors import CampaignError
-from lidarops.raw.licel_header import Dataset, DatasetKind, Laser
-from lidarops.raw.licel_write import encode, new_dataset, new_header
+from lidarops.raw.licel import Dataset, DatasetKind, Laser, encode, new_dataset, new_header
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.damage import FOREIGN_NAME, damaged
 from lidarops.simulate.instrument import Counts, Photoelectrons, count_photons, digitise, release

@@ -7,6 +7,7 @@ noise is correlated as in a real instrument.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from scipy.special import ndtr
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.simulate.settings import AnalogRecorder
+
+BRIGHTEST: Final = 1.0e6
+"""MHz: no detector releases more, so that nothing overflows a metre before the telescope."""
 
 Counts = NDArray[np.int64]
 Array = NDArray[np.float64]
@@ -45,7 +49,7 @@ def release(
     Parameters
     ----------
     rate : ndarray, MHz, shape (bins,)
-        Expected rate: signal and sky together.
+        Expected rate: signal and sky together, cut at `BRIGHTEST`.
     shots : int
     bin_width : float, m
         Converted to time by the nominal 150 m per microsecond of the format (`licel2023`), by
@@ -53,6 +57,7 @@ def release(
     random : numpy.random.Generator
     """
     bin_time = bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
+    rate = np.minimum(rate, BRIGHTEST)
     number = random.poisson(rate * (shots * bin_time * 1e6))
     return Photoelectrons(rate=rate, number=number, shots=shots, bin_time=bin_time)
 

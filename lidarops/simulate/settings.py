@@ -27,8 +27,7 @@ def _whole_seconds(value: datetime) -> datetime:
 
 
 Instant = Annotated[datetime, AfterValidator(_utc), AfterValidator(_whole_seconds)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Hour = Annotated[float, Field(ge=0, lt=24, allow_inf_nan=False)]
 
 
@@ -106,14 +105,16 @@ class PhotonCounter(_Model):
 class AnalogRecorder(_Model):
     """The analog output of a detector."""
 
-    gain: Positive = Field(description="mV per MHz of photoelectrons")
+    gain: float = Field(gt=0, le=100, description="mV per MHz of photoelectrons")
     excess_noise: float = Field(
         default=1.2,
         ge=1,
         le=10,
         description="variance of the charge over that of equal pulses: 1 + relative variance",
     )
-    noise: Positive = Field(description="electronic noise of one sample of one shot, mV")
+    noise: float = Field(
+        gt=0, le=1000, description="electronic noise of one sample of one shot, mV"
+    )
     dark_offset: NotNegative = Field(description="mV, without any light")
     adc_range: float = Field(default=500.0, gt=0, le=10_000, description="mV at full scale")
     adc_bits: int = Field(default=12, ge=8, le=16)
@@ -160,9 +161,11 @@ class Detector(_Model):
     wavelength: int = Field(ge=200, le=3000, description="nm, as in the headers")
     polarisation: Literal["o", "p", "s"] = "o"
     high_voltage: int = Field(default=800, ge=0, le=9999, description="V")
-    signal_rate: Positive = Field(
+    signal_rate: float = Field(
+        gt=0,
+        le=1e5,
         description="MHz of photoelectrons from a backscatter coefficient of 1e-6 m-1 sr-1 at a"
-        " range of 1 km, with full overlap and without extinction"
+        " range of 1 km, with full overlap and without extinction",
     )
     background: Background
     photon: PhotonCounter | None = None
@@ -221,6 +224,16 @@ class _Instrument(_Model):
             raise ValueError("a file can be damaged in one way only: give each index once")
         return self
 
+    @model_validator(mode="after")
+    def _fits_32_bits(self) -> Self:
+        for recorder in (detector.analog for detector in self.detectors):
+            if recorder and self.acquisition.shots * 2**recorder.adc_bits > 2**31:
+                raise ValueError(
+                    f"{self.acquisition.shots} shots of {recorder.adc_bits} bits do not fit into"
+                    " the 32 bits of a raw file: take fewer shots"
+                )
+        return self
+
 
 class HorizontalPath(_Instrument):
     """A lidar that looks along a homogeneous path."""
@@ -228,6 +241,12 @@ class HorizontalPath(_Instrument):
     kind: Literal["horizontal"]
     aerosol: Aerosol = Aerosol()
     aerosol_extinction: DiurnalCourse = Field(description="m-1 at 532 nm")
+
+    @model_validator(mode="after")
+    def _is_air(self) -> Self:
+        if self.aerosol_extinction.maximum > 1.0:
+            raise ValueError("aerosol_extinction is in m-1: 1e-4 is 0.1 per km")
+        return self
 
     @model_validator(mode="after")
     def _one_extinction(self) -> Self:
@@ -256,7 +275,7 @@ class Layer(_Model):
 
     name: str
     aerosol: Aerosol = Aerosol()
-    extinction: Positive = Field(le=1.0, description="m-1 at 532 nm at the centre")
+    extinction: float = Field(gt=0, le=1.0, description="m-1 at 532 nm at the centre")
     height: float = Field(gt=0, le=30_000, description="m above the ground, of the centre")
     depth: float = Field(gt=0, le=10_000, description="m, standard deviation of the Gaussian")
     start: Instant

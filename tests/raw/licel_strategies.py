@@ -63,12 +63,13 @@ def naive_physical(tokens, counts):
 
 
 SIGNALS = st.sampled_from([licel.DatasetKind.ANALOG, licel.DatasetKind.PHOTON])
+ACTIVE = st.just(True)
 WIDTHS = st.sampled_from([0.75, 1.5, 3.75, 7.5, 15.0, 30.0, 60.0])
 WORDS = st.text(st.sampled_from("abcXYZ019_-"), min_size=1, max_size=12)
 
 
 @st.composite
-def datasets(draw, kinds=SIGNALS, active=st.just(True)):
+def datasets(draw, kinds=SIGNALS, active=ACTIVE):
     return licel.new_dataset(
         kind=draw(kinds),
         wavelength=draw(st.sampled_from([355, 387, 532, 607, 1064, 1550, 53200])) * 1e-9,
@@ -105,8 +106,11 @@ def _place(draw):
     return {"zenith_angle": float(draw(st.integers(-90, 90)))}
 
 
+DATASETS = st.lists(datasets(), min_size=1, max_size=5)
+
+
 @st.composite
-def headers(draw, datasets=st.lists(datasets(), min_size=1, max_size=5)):
+def headers(draw, datasets=DATASETS):
     start = draw(
         st.datetimes(datetime(1990, 1, 1), datetime(2060, 1, 1), timezones=st.just(UTC))  # noqa: DTZ001
     ).replace(microsecond=0)
@@ -125,8 +129,11 @@ def headers(draw, datasets=st.lists(datasets(), min_size=1, max_size=5)):
     )
 
 
+HEADERS = headers()
+
+
 @st.composite
-def files(draw, headers=headers()):
+def files(draw, headers=HEADERS):
     """A header and counts for all that it stores."""
     header = draw(headers)
     seed = draw(st.integers(0, 2**32 - 1))
