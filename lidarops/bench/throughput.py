@@ -58,7 +58,7 @@ def reader(paths: Sequence[str | os.PathLike[str]], repeats: int = 7) -> list[Th
     """
     if not paths or repeats < 1:
         raise RawFormatError("at least one file and one repeat are needed", field="paths")
-    size = sum(Path(path).stat().st_size for path in paths)
+    size = sum(read_header(path).size for path in paths)
     channels = [
         (dataset.offset or 0, dataset.bins, np.float32(dataset.scale))
         for dataset in select(read_header(paths[0]))

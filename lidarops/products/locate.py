@@ -124,8 +124,11 @@ def _along(source: Intake, row: Row) -> Coordinate:
         return Coordinate(row, row.dims, values)
     if row.bounds in source:
         bounds = _finite(row.bounds, source.take(row.bounds, (*row.dims, BOUNDS_DIM)))
-    else:
+    elif row.dims == (row.name,):
         bounds = _midpoints(row, values)
+    else:
+        # Sections overlap or leave gaps: nothing tells their ends.
+        raise ProductError("is missing", field=row.bounds)
     return _celled(row, values, bounds)
 
 

@@ -85,16 +85,16 @@ def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
     except (TypeError, ValueError) as error:
         raise ProductError(f"cannot be encoded: {error}", file=path) from error
     # As data variables: what xarray holds as coordinates it would encode a second time.
-    plain = {str(name): _as_chars(str(name), variable) for name, variable in encoded.items()}
+    plain = {str(name): _as_chars(path, str(name), each) for name, each in encoded.items()}
     return _write(xr.Dataset(plain, attrs=dict(attributes)), Path(path), "NETCDF4")
 
 
-def _as_chars(name: str, variable: xr.Variable) -> xr.Variable:
+def _as_chars(path: str | Path, name: str, variable: xr.Variable) -> xr.Variable:
     values = np.asarray(variable.values)
     if values.dtype.kind not in "OU":
         return variable
     if not all(isinstance(value, str) for value in values.flat):
-        raise ProductError("holds objects that are no text", field=name)
+        raise ProductError("holds objects that are no text", file=path, field=name)
     # Text of variable length lies on HDF5's heap, where no order of bytes is promised.
     packed = np.char.encode(values.astype(str), "utf-8")
     length = max(packed.dtype.itemsize, 1)

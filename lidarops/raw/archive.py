@@ -6,6 +6,7 @@ a task of the graph reads the bytes of one channel in the files of one chunk.
 
 from __future__ import annotations
 
+import glob
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -169,12 +170,9 @@ def _expand(base: Path, source: Path) -> list[str]:
         return list(_walk(place))
     if place.exists():
         return [str(place)]
-    start = Path(source.anchor) if source.is_absolute() else base
-    pattern = str(source.relative_to(source.anchor))
-    try:
-        return [str(path) for path in start.glob(pattern) if path.is_file()]
-    except ValueError as error:
-        raise RawFormatError(f"is no glob pattern: {error}", file=source) from None
+    # Unlike Path.glob this leaves hidden files out, such as those that are being written.
+    found = glob.glob(str(source), root_dir=base, recursive=True)  # noqa: PTH207
+    return [str(base / path) for path in found if (base / path).is_file()]
 
 
 def _walk(folder: Path) -> Iterator[str]:

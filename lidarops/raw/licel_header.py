@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import IntEnum
 from functools import lru_cache
-from itertools import count as counter
-from typing import Any, Final, Literal, NamedTuple
+from sys import intern
+from typing import Final, Literal, NamedTuple
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RawFormatError
@@ -483,28 +484,26 @@ def _promised_size(datasets: Iterable[Dataset], data_start: int) -> int:
 # a header scan fast.
 @lru_cache(maxsize=128)
 def _parse_block(block: bytes, data_start: int, stored: bool) -> tuple[Dataset, ...]:  # noqa: FBT001
-    lines = [line + b"\r\n" for line in block[:-2].split(b"\r\n")]
-    drafts = [_parse_dataset(number, line) for number, line in enumerate(lines, 1)]
-    taken: set[str] = set()
-    names = [""] * len(drafts)
-    # An inactive dataset must not take the name of a stored one.
-    for index in sorted(range(len(drafts)), key=lambda index: not drafts[index]["active"]):
-        names[index] = _unique(drafts[index].pop("name"), taken)
-    datasets, offset = [], data_start
-    for draft, name in zip(drafts, names, strict=True):
-        held = draft["active"] or stored
-        datasets.append(Dataset(name=name, offset=offset if held else None, **draft))
-        offset += (4 * draft["bins"] + 2) if held else 0
+    datasets: list[Dataset] = []
+    offset, start = data_start, 0
+    while start < len(block):
+        end = block.index(b"\r\n", start) + 2
+        try:
+            dataset = _parse_line(block[start:end], offset, stored)
+        except RawFormatError as error:
+            place = f"dataset {len(datasets) + 1}, {error.field}"
+            raise RawFormatError(error.problem, field=place) from None
+        datasets.append(dataset)
+        offset += 0 if dataset.offset is None else 4 * dataset.bins + 2
+        start = end
+    uses: Counter[str] = Counter()
+    # An inactive dataset must not take the name of an active one.
+    for index in sorted(range(len(datasets)), key=lambda index: not datasets[index].active):
+        name = datasets[index].name
+        uses[name] += 1
+        if uses[name] > 1:
+            datasets[index] = replace(datasets[index], name=f"{name}_{uses[name]}")
     return tuple(datasets)
-
-
-def _unique(base: str, taken: set[str]) -> str:
-    name = base
-    suffixes = counter(2)
-    while name in taken:
-        name = f"{base}_{next(suffixes)}"
-    taken.add(name)
-    return name
 
 
 def parse_dataset(line: bytes) -> Dataset:
@@ -514,18 +513,10 @@ def parse_dataset(line: bytes) -> Dataset:
     ------
     RawFormatError
     """
-    return Dataset(offset=0, **_dataset_fields(line))
+    return _parse_line(line, 0, stored=True)
 
 
-def _parse_dataset(number: int, line: bytes) -> dict[str, Any]:
-    try:
-        return _dataset_fields(line)
-    except RawFormatError as error:
-        place = f"dataset {number}, {error.field}"
-        raise RawFormatError(error.problem, field=place) from None
-
-
-def _dataset_fields(line: bytes) -> dict[str, Any]:
+def _parse_line(line: bytes, offset: int, stored: bool) -> Dataset:  # noqa: FBT001
     tokens = line.decode("latin-1").split()
     if len(tokens) < 16:
         raise RawFormatError(f"holds {len(tokens)} values instead of 16", field="line")
@@ -546,26 +537,28 @@ def _dataset_fields(line: bytes) -> dict[str, Any]:
     _bounded(width, 1e-3 if analog or photon else 0, _MAX_BIN_WIDTH, "bin width")
     shots = _integer(tokens[13], "shots")
     _bounded(shots, 0, 10**9, "shots")
-    return {
-        "name": f"{kind.name.lower()}_{int(label[1])}{polarisation}",
-        "kind": kind,
-        "active": _active(tokens[0]),
-        "laser": _integer(tokens[2], "laser"),
-        "bins": bins,
-        "laser_polarisation": _integer(tokens[4], "laser polarisation"),
-        "high_voltage": _number(tokens[5], "high voltage"),
-        "bin_width": width,
-        "wavelength_label": f"{label[1]}.{label[2]}",
-        "polarisation": polarisation,
-        "bin_shift": _bin_shift(*tokens[10:12]),
-        "adc_bits": bits,
-        "shots": shots,
-        "input_range": level if analog else None,
-        "discriminator": level * 1e-3 if photon else None,
-        "device": tokens[15],
-        "comment": " ".join(tokens[16:]),
-        "line": line,
-    }
+    active = _active(tokens[0])
+    return Dataset(
+        name=f"{kind.name.lower()}_{int(label[1])}{polarisation}",
+        kind=kind,
+        active=active,
+        laser=_integer(tokens[2], "laser"),
+        bins=bins,
+        laser_polarisation=_integer(tokens[4], "laser polarisation"),
+        high_voltage=_number(tokens[5], "high voltage"),
+        bin_width=width,
+        wavelength_label=intern(f"{label[1]}.{label[2]}"),
+        polarisation=polarisation,
+        bin_shift=_bin_shift(*tokens[10:12]),
+        adc_bits=bits,
+        shots=shots,
+        input_range=level if analog else None,
+        discriminator=level * 1e-3 if photon else None,
+        device=intern(tokens[15]),
+        comment=" ".join(tokens[16:]),
+        offset=offset if active or stored else None,
+        line=line,
+    )
 
 
 def _kind(token: str) -> DatasetKind:

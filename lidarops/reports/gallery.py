@@ -26,6 +26,8 @@ from lidarops.reports.words import counted
 FIGURES: Final = 40
 """Most figures of products in a report."""
 _FLAG_ROWS: Final = 40
+_DARK_STEP: Final = "dark"
+"""Name of the step of a plan that subtracts dark files."""
 _KINDS: Final = (ProductKind.HOMOGENEOUS, ProductKind.SIGNAL)
 # What opening and reading a damaged or foreign file has been seen to raise.
 _UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, ProductError)
@@ -193,7 +195,12 @@ def _homogeneous(
         try:
             with _opened(path) as opened:
                 found += read_sections(
-                    opened, truth, instrument=group.instrument, channel=group.channel, paths=paths
+                    opened,
+                    truth,
+                    instrument=group.instrument,
+                    channel=group.channel,
+                    paths=paths,
+                    dark_subtracted=_dark_subtracted(scene, group.channel),
                 )
             scenes += 1
         except _UNREADABLE as error:
@@ -221,6 +228,11 @@ def _homogeneous(
                 f"Unflagged values against the truth of the simulation: {where}.",
                 figures.render(figures.draw_comparison(few, title=group.label)),
             )
+
+
+def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:
+    steps = scene.plan.steps if scene.plan else ()
+    return any(step.name == _DARK_STEP and step.channel == channel for step in steps)
 
 
 def _signal(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Drawn]:

@@ -76,7 +76,7 @@ class Comparison:
     spread: float
     """Root mean square of (retrieved - truth) / standard error; 1 for normal errors."""
     without_error: int
-    """Unflagged values with a truth, but without a finite, positive standard error."""
+    """Values without a flag and with a truth, but not finite with a positive standard error."""
 
     @property
     def suspicious(self) -> bool:
@@ -85,6 +85,8 @@ class Comparison:
         Chance allows the expected 0.27 percent and three times its Poisson spread, but at
         least one value.
         """
+        if self.count == 0:
+            return self.without_error > 0
         expected = 0.0027 * self.count
         beyond = round((1.0 - self.within_3) * self.count)
         return self.without_error > 0 or beyond > max(1.0, expected + 3.0 * expected**0.5)
@@ -97,6 +99,7 @@ def read_sections(
     instrument: str = "",
     channel: str = "",
     paths: Sequence[str] = (),
+    dark_subtracted: bool = True,
 ) -> list[Section]:
     """Take the sections out of one homogeneous product.
 
@@ -111,6 +114,9 @@ def read_sections(
     paths : sequence of str, optional
         Raw files behind the profiles, in their order: where there are as many as profiles the
         truth is matched by path, else by time.
+    dark_subtracted : bool, optional
+        Whether the signal without any light was subtracted beforehand; where it was not, it is
+        part of the retrieved background, and so of its truth.
 
     Returns
     -------
@@ -125,10 +131,11 @@ def read_sections(
     _check(product)
     order = np.argsort(product["time"].values, kind="stable")
     time = product["time"].values.astype("datetime64[ns]")[order]
-    at = None
-    if truth is not None:
-        ordered = [paths[i] for i in order] if len(paths) == time.size else []
-        at = _match(time, truth, instrument, ordered)
+    ordered = [paths[i] for i in order] if len(paths) == time.size else []
+    true = {
+        name: _truth(truth, time, instrument, ordered, variables)
+        for name, variables in _true_variables(channel, dark_subtracted=dark_subtracted).items()
+    }
     flags = _integers(product["quality_flag"])[order]
     bounds = product["section_bounds"].values.astype(np.float64)
     found = []
@@ -137,14 +144,13 @@ def read_sections(
             name: Estimate(
                 value=_floats(product, name)[order, k],
                 standard_error=_floats(product, f"{name}_standard_error")[order, k],
-                truth=_true_values(truth, at, name, channel, time.size),
+                truth=true[name],
                 units=str(product[name].attrs.get("units", "")),
             )
             for name in QUANTITIES
         }
-        found.append(
-            Section(float(bounds[k, 0]), float(bounds[k, 1]), time, flags[:, k], estimates)
-        )
+        near, far = float(bounds[k, 0]), float(bounds[k, 1])
+        found.append(Section(near, far, time, flags[:, k], estimates))
     return found
 
 
@@ -198,7 +204,8 @@ def compare(section: Section, quantity: str) -> Comparison | None:
 def normalised_error(section: Section, quantity: str) -> Floats:
     """Return (retrieved - truth) / standard error, shape (time,); NaN where undefined."""
     estimate = section.estimates[quantity]
-    error = np.where(estimate.standard_error > 0, estimate.standard_error, np.nan)
+    stated = np.isfinite(estimate.standard_error) & (estimate.standard_error > 0)
+    error = np.where(stated, estimate.standard_error, np.nan)
     return np.asarray((estimate.value - estimate.truth) / error)
 
 
@@ -341,14 +348,29 @@ def _integers(flags: xr.DataArray) -> NDArray[np.int64]:
     return np.asarray(values, dtype=np.int64)
 
 
-def _true_values(
-    truth: xr.Dataset | None, at: NDArray[np.intp] | None, name: str, channel: str, size: int
+def _true_variables(channel: str, *, dark_subtracted: bool) -> Mapping[str, Sequence[str]]:
+    """Return for every quantity the variables of the truth whose sum is its truth."""
+    offset = () if dark_subtracted else (f"dark_offset_{channel}",)
+    return {
+        "extinction": ("extinction",),
+        "background": (f"background_{channel}", *offset),
+        "amplitude": (f"amplitude_{channel}",),
+    }
+
+
+def _truth(
+    truth: xr.Dataset | None,
+    time: Times,
+    instrument: str,
+    paths: Sequence[str],
+    variables: Sequence[str],
 ) -> Floats:
-    variable = name if name == "extinction" else f"{name}_{channel}"
-    if truth is None or at is None or variable not in truth.variables:
-        return np.full(size, np.nan)
-    values = np.asarray(truth[variable].values, dtype=np.float64)
-    return np.where(at >= 0, values[at], np.nan)
+    if truth is None or variables[0] not in truth.variables or truth.sizes["granule"] == 0:
+        return np.full(time.size, np.nan)
+    # Photon counting has no dark offset.
+    known = [_floats(truth, name) for name in variables if name in truth.variables]
+    at = _match(time, truth, instrument, paths)
+    return np.where(at >= 0, np.sum(known, axis=0)[at], np.nan)
 
 
 def _match(

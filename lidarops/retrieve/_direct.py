@@ -35,9 +35,9 @@ DEPENDENT: Final = 1e-9
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning.
 _SUMS: Final = {"reassoc", "contract", "nsz"}
-_compiled = numba.njit(cache=False, nogil=True, error_model="numpy", forceinline=True)
-_summing = numba.njit(cache=False, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
-_finding = numba.njit(cache=False, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"})
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_summing = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
+_finding = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={*_SUMS, "nnan"})
 
 # What became of a profile.
 FITTED: Final = 0
@@ -116,6 +116,7 @@ class _Scratch(NamedTuple):
     pull: Array
     used: Array
     fine: Array
+    lengths: Array
     tests: tuple[Array, Array, Array, Array]
 
 
@@ -232,14 +233,14 @@ def _total(values: Array) -> float:
 
 
 @_summing
-def _project(shape: Array, s: _Scratch, w0: float, wz: float, free: float) -> float:
+def _project(shape: Array, w: Array, z: Array, w0: float, wz: float, free: float) -> float:
     """Return the signed length of the profile along a shape, background projected out."""
     s1 = s2 = sz = 0.0
     for i in range(shape.size):
-        weighted = s.w[i] * shape[i]
+        weighted = w[i] * shape[i]
         s1 += weighted
         s2 += weighted * shape[i]
-        sz += weighted * s.z[i]
+        sz += weighted * z[i]
     norm = s2 - free * s1 * s1 / w0
     # A shape that is flat over the valid bins, or gone before the first, tells nothing.
     if not (norm > 1e-13 * s2 and s2 > TINY):
@@ -250,21 +251,22 @@ def _project(shape: Array, s: _Scratch, w0: float, wz: float, free: float) -> fl
 @_compiled
 def _start(g: Grid, s: _Scratch, w0: float, wz: float, free: float) -> tuple[float, float, float]:
     """Return tau at the vertex about the best node, and the nodes that bracket it."""
-    best, best_length = 0, 0.0
+    shapes, nodes, w, z, lengths = g.shapes, g.nodes, s.w, s.z, s.lengths
+    best = 0
     for j in range(NODES):
-        length = _project(g.shapes[j], s, w0, wz, free)
-        if abs(length) > abs(best_length):
-            best, best_length = j, length
+        lengths[j] = _project(shapes[j], w, z, w0, wz, free)
+        if abs(lengths[j]) > abs(lengths[best]):
+            best = j
     # At an end of the grid, the vertex is extrapolated from the last three nodes.
     middle = min(max(best, 1), NODES - 2)
-    sign = math.copysign(1.0, best_length)
+    sign = math.copysign(1.0, lengths[best])
     before, here, after = (
-        sign * _project(g.shapes[middle - 1], s, w0, wz, free),
-        sign * _project(g.shapes[middle], s, w0, wz, free),
-        sign * _project(g.shapes[middle + 1], s, w0, wz, free),
+        sign * lengths[middle - 1],
+        sign * lengths[middle],
+        sign * lengths[middle + 1],
     )
-    low, high = g.nodes[max(best - 1, 0)], g.nodes[min(best + 1, NODES - 1)]
-    start = g.nodes[best]
+    low, high = nodes[max(best - 1, 0)], nodes[min(best + 1, NODES - 1)]
+    start = nodes[best]
     bend = before - 2.0 * here + after
     if bend < 0.0:
         vertex = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
@@ -273,54 +275,62 @@ def _start(g: Grid, s: _Scratch, w0: float, wz: float, free: float) -> tuple[flo
 
 
 @_compiled
-def _shape(tau: float, g: Grid, phi: Array, fine: Array) -> None:
+def _shape(tau: float, x: Array, envelope: Array, step: float, phi: Array, fine: Array) -> None:
     n = phi.size
-    if g.step == 0.0:
+    if step == 0.0:
         for i in range(n):
-            phi[i] = math.exp(-2.0 * tau * g.x[i]) * g.envelope[i]
+            phi[i] = math.exp(-2.0 * tau * x[i]) * envelope[i]
         return
     # Two short geometric series instead of many exponentials: few roundings, no long chain.
-    ratio = math.exp(-2.0 * tau * g.step)
+    ratio = math.exp(-2.0 * tau * step)
     fine[0] = 1.0
     for j in range(1, BLOCK):
         fine[j] = fine[j - 1] * ratio
     coarse = 1.0
-    ratio = math.exp(-2.0 * BLOCK * tau * g.step)
+    ratio = math.exp(-2.0 * BLOCK * tau * step)
     for k in range(0, n, BLOCK):
-        block, envelope = phi[k : k + BLOCK], g.envelope[k : k + BLOCK]
+        block, falling = phi[k : k + BLOCK], envelope[k : k + BLOCK]
         for j in range(BLOCK):
-            block[j] = coarse * fine[j] * envelope[j]
+            block[j] = coarse * fine[j] * falling[j]
         coarse *= ratio
 
 
 @_summing
-def _moments(g: Grid, s: _Scratch) -> tuple[float, float, float, float, float]:
+def _moments(x: Array, w: Array, z: Array, phi: Array) -> tuple[float, float, float, float, float]:
     s1 = s2 = sz = x1 = x2 = 0.0
-    for i in range(s.z.size):
-        weighted = s.w[i] * s.phi[i]
-        square = weighted * s.phi[i]
+    for i in range(z.size):
+        weighted = w[i] * phi[i]
+        square = weighted * phi[i]
         s1 += weighted
         s2 += square
-        sz += weighted * s.z[i]
-        x1 += weighted * g.x[i]
-        x2 += square * g.x[i]
+        sz += weighted * z[i]
+        x1 += weighted * x[i]
+        x2 += square * x[i]
     return s1, s2, sz, x1, x2
 
 
 @_summing
 def _gradients(
-    g: Grid, s: _Scratch, mean_phi: float, mean_z: float, b: float, centroid: float, mean_t: float
+    x: Array,
+    w: Array,
+    z: Array,
+    phi: Array,
+    mean_phi: float,
+    mean_z: float,
+    b: float,
+    centroid: float,
+    mean_t: float,
 ) -> tuple[float, float, float, float, float]:
     """Return the products of residual, shape and its slope that a Newton step needs."""
     rt = tt = rh = r0 = r1 = 0.0
-    for i in range(s.z.size):
-        lever = -2.0 * (g.x[i] - centroid)
-        first = lever * s.phi[i]
-        centred = s.phi[i] - mean_phi
+    for i in range(z.size):
+        lever = -2.0 * (x[i] - centroid)
+        first = lever * phi[i]
+        centred = phi[i] - mean_phi
         slope = first - mean_t
-        residual = s.w[i] * (s.z[i] - mean_z - b * centred)
+        residual = w[i] * (z[i] - mean_z - b * centred)
         rt += residual * slope
-        tt += s.w[i] * slope * slope
+        tt += w[i] * slope * slope
         rh += residual * lever * first
         r0 += residual
         r1 += residual * centred
@@ -329,15 +339,16 @@ def _gradients(
 
 @_compiled
 def _evaluate(tau: float, g: Grid, s: _Scratch, w0: float, wz: float, free: float) -> _Point:
-    _shape(tau, g, s.phi, s.fine)
-    s1, s2, sz, x1, x2 = _moments(g, s)
+    x, w, z, phi = g.x, s.w, s.z, s.phi
+    _shape(tau, x, g.envelope, g.step, phi, s.fine)
+    s1, s2, sz, x1, x2 = _moments(x, w, z, phi)
     mean_phi, mean_z = free * s1 / w0, free * wz / w0
     norm = s2 - s1 * mean_phi
     # About the information centroid, amplitude and extinction are uncorrelated.
     centroid = (x2 - mean_phi * x1) / norm
     mean_t = -2.0 * free * (x1 - centroid * s1) / w0
     b = (sz - mean_phi * wz) / norm
-    rt, tt, rh, r0, r1 = _gradients(g, s, mean_phi, mean_z, b, centroid, mean_t)
+    rt, tt, rh, r0, r1 = _gradients(x, w, z, phi, mean_phi, mean_z, b, centroid, mean_t)
     return _Point(
         b + r1 / norm,
         mean_z + free * r0 / w0,
@@ -512,6 +523,7 @@ def _scratch(n: int) -> _Scratch:
         np.zeros(n),
         np.zeros(n),
         np.zeros(BLOCK),
+        np.zeros(NODES),
         (np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)),
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from fabricated import MAKERS, STATION, context, homogeneous, provenance, signal
+from made_products import MAKERS, STATION, context, homogeneous, provenance, signal
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -233,9 +233,7 @@ def put(name: str, value: float, where: tuple[int, ...] = ()) -> Callable[[xr.Da
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_missing_variable_is_named(kind: ProductKind):
     data = MAKERS[kind]()
-    # Limits that are not given lie half way between the centres.
-    optional = {"section_bounds"}
-    needed = [str(name) for name in data.variables if name not in optional]
+    needed = [str(name) for name in data.variables]
     assert len(needed) > 9
     for name in needed:
         with pytest.raises(ProductError) as caught:

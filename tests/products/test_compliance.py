@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from compliance_checker.runner import CheckSuite, ComplianceChecker
-from fabricated import MAKERS, STATION, context, homogeneous, signal
+from made_products import MAKERS, STATION, context, homogeneous, signal
 
 from lidarops.flags import Quality
 from lidarops.products.build import build

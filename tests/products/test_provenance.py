@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from fabricated import context, homogeneous, provenance
+from made_products import context, homogeneous, provenance
 from hypothesis import given
 from hypothesis import strategies as st
 

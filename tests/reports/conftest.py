@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fabricated import Archive, homogeneous, outcome, run_record, signal, times, truth_of, START
+from fabricated import START, Archive, homogeneous, outcome, run_record, signal, times, truth_of
 
 from lidarops.records import InputRecord, ProductKind, Role, RunRecord
 

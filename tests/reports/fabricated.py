@@ -12,7 +12,6 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.records import (
     Granule,
-    InputRecord,
     LeftOut,
     Plan,
     ProductKind,
@@ -102,16 +101,19 @@ def signal(
     top = 1000.0 + 500.0 * np.sin(2 * np.pi * (hour - 8) / 24)
     beta = 0.15 * np.exp(-span / 8000.0)[None, :]
     beta = beta + 1.0 / (1.0 + np.exp((span[None, :] - top[:, None]) / 100.0))
-    beta = beta + 0.8 * np.exp(-0.5 * ((span[None, :] - layer) / 150.0) ** 2) * (
-        (hour > 6) & (hour < 15)
-    )[:, None]
+    beta = (
+        beta
+        + 0.8
+        * np.exp(-0.5 * ((span[None, :] - layer) / 150.0) ** 2)
+        * ((hour > 6) & (hour < 15))[:, None]
+    )
     error = 1e-3 * (span[None, :] ** 2) * np.sqrt(0.1 + true_background(time))[:, None] * 2e-2
     clean = 3e6 * beta * np.exp(-span / 9000.0) * 1e-3
     value = clean + error * random.standard_normal((time.size, gates))
     flag = np.zeros(value.shape, dtype=np.int32)
     flag[:, span < 150.0] |= int(Quality.INCOMPLETE_OVERLAP)
     flag[:, (span >= 150) & (span < 300.0)] |= int(Quality.PILE_UP)
-    thick = clean > 1.3 * np.median(clean[:, 20])
+    thick = clean > 1.3 * np.median(clean[:, min(20, gates - 1)])
     flag[thick] |= int(Quality.SATURATED)
     attrs = {"units": "MHz m2"}
     level = true_background(time)

@@ -106,9 +106,7 @@ outcomes = st.builds(
     refused=some(granules),
     inputs=some(st.builds(InputRecord, text, st.sampled_from(Role), text)),
     error=text,
-    seconds=st.dictionaries(
-        text, st.floats(allow_nan=False, allow_infinity=False), max_size=3
-    ),
+    seconds=st.dictionaries(text, st.floats(allow_nan=False, allow_infinity=False), max_size=3),
 )
 records = st.builds(
     RunRecord,
@@ -196,7 +194,9 @@ def test_folder_that_cannot_be_made(tmp_path):
 
 
 def _tree(tmp_path: Path) -> tuple[Path, dict]:
-    scene = fab.outcome("s", products=(ProductRecord("p", ProductKind.SIGNAL, "c", "", 1, 2, {}, 2),))
+    scene = fab.outcome(
+        "s", products=(ProductRecord("p", ProductKind.SIGNAL, "c", "", 1, 2, {}, 2),)
+    )
     path = save(fab.run_record(tmp_path, [scene]), tmp_path)
     return path, json.loads(path.read_text())
 
