@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lidarops.errors import LidarOpsError, ProductError, RawFormatError
-from lidarops.products.provenance import read_provenance_text
+from lidarops.products.provenance import read_provenance
 from lidarops.raw import licel
 
 _NETCDF_MAGIC = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
@@ -40,7 +41,7 @@ def provenance(file: Path) -> str:
     ProductError
         If the file is not a product of lidarops.
     """
-    return read_provenance_text(file)
+    return json.dumps(read_provenance(file), indent=2)
 
 
 def _raw(file: Path) -> list[Table]:

@@ -49,15 +49,17 @@ def product_path(context: Context) -> str:
     -------
     str
         Relative to the product root, with forward slashes:
-        ``station/instrument/kind/YYYY/station_instrument_kind_channel_YYYYMMDDTHHMMSS.nc``.
+        ``station/instrument/kind/YYYY/station_instrument_kind_channel_YYYYMMDDTHHMMSS.nc``;
+        a scene of one of several range grids adds its key.
 
     Raises
     ------
     ProductError
         If a name would lead out of its folder.
     """
-    start = context.start.astimezone(UTC)
-    parts = (context.station_key, context.instrument_key, context.kind.value, context.channel)
+    # What the scene's name says beyond the instrument: its start, and its grid where there are two.
+    when = context.scene.removeprefix(f"{context.instrument_key}_")
+    parts = (context.station_key, context.instrument_key, context.kind.value, context.channel, when)
     for part in parts:
         if not _SAFE.fullmatch(part):
             raise ProductError(
@@ -65,5 +67,5 @@ def product_path(context: Context) -> str:
                 field=context.scene,
                 remedy="use letters, digits, '.', '_' and '-' in names of the campaign file",
             )
-    folder = "/".join((*parts[:3], f"{start:%Y}"))
-    return f"{folder}/{'_'.join(parts)}_{start:%Y%m%dT%H%M%S}.nc"
+    folder = "/".join((*parts[:3], f"{context.start.astimezone(UTC):%Y}"))
+    return f"{folder}/{'_'.join(parts)}.nc"

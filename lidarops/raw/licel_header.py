@@ -344,12 +344,15 @@ def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:
     return ends
 
 
+# The same few numbers stand in every header.
+@lru_cache(maxsize=1024)
 def _number(token: str, name: str) -> float:
     if _NUMBER.fullmatch(token) is None:
         raise RawFormatError(f"{token[:40]!r} is not a number", field=name)
     return float(token.replace(",", "."))
 
 
+@lru_cache(maxsize=1024)
 def _integer(token: str, name: str) -> int:
     if _INTEGER.fullmatch(token) is None:
         raise RawFormatError(f"{token[:40]!r} is not an integer", field=name)

@@ -23,7 +23,7 @@ from lidarops.reports import panels
 from lidarops.reports.raster import COLUMNS, Raster, read_raster
 from lidarops.reports.series import QUANTITIES, Section, compare, join, read_sections
 from lidarops.reports.timeaxis import Times, time_axis
-from lidarops.reports.words import bit_name, percent
+from lidarops.reports.words import bit_name, percent, visible
 
 DPI: Final = 150
 
@@ -201,7 +201,7 @@ def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str 
         A table of percentages, shaded; only bits that occur.
     """
     bits = [bit for bit in Quality if any(share.get(bit, 0.0) > 0 for share in shares.values())]
-    labels = list(shares)
+    labels = [" ".join(visible(label).split()) for label in shares]
     width = 1.5 + 0.085 * max(len(label) for label in labels) + 0.8 * max(len(bits), 5)
     figure = Figure(figsize=(width, 1.9 + 0.32 * len(labels)), dpi=DPI, layout="constrained")
     panel = figure.subplots()
@@ -306,7 +306,7 @@ def _stack(heights: tuple[float, ...], title: str) -> tuple[Figure, list[Axes]]:
 
 
 def _described(figure: Figure, words: str) -> Figure:
-    figure.set_label(words)
+    figure.set_label(visible(words))
     return figure
 
 

@@ -13,14 +13,13 @@ from typing import Final
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from lidarops.errors import CatalogError
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import content, gallery
 from lidarops.reports.gallery import Compared, Gallery, Picture
 from lidarops.reports.record import FILE_NAME, write_atomically
-from lidarops.reports.words import duration, percent, size
+from lidarops.reports.words import duration, percent, size, visible
 
 INDEX: Final = "index.html"
 """Name of the page inside a run's report folder."""
@@ -127,6 +126,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
     problems = {problem.path: problem.reason for problem in filled.problems}
     problems = dict.fromkeys(sorted(gone), "the file is missing") | problems
     stages = content.stages(record)
+    pictures = _by_instrument(filled.pictures)
     return _environment().get_template("run.html").render(
         record=record,
         summary=content.summary(record),
@@ -144,8 +144,8 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         problems=sorted(problems.items()),
         compared=filled.compared,
         compared_words=_compared_words(filled.compared),
-        pictures=_by_instrument(filled.pictures),
-        drawn={picture.instrument for picture in filled.pictures},
+        pictures=pictures,
+        drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
         flags_picture=filled.flags,
         undrawn=filled.undrawn,
         plan_hash=_plan_hash(record),
@@ -160,22 +160,12 @@ def _environment() -> Environment:
         loader=PackageLoader("lidarops.reports"),
         autoescape=True,
         undefined=StrictUndefined,
-        finalize=_visible,
+        finalize=lambda value: visible(value) if type(value) is str else value,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters |= {"percent": percent, "moment": content.moment, "url": quote}
     return environment
-
-
-def _visible(value: object) -> object:
-    """Make control characters in names visible: HTML has no place for them."""
-    if isinstance(value, str) and not isinstance(value, Markup):
-        return "".join(
-            c if c.isprintable() or c in " \n\t" or not c.isascii() else f"\\x{ord(c):02x}"
-            for c in value
-        )
-    return value
 
 
 def _scene_row(

@@ -27,7 +27,7 @@ from lidarops.flags import Quality
 from lidarops.reports.raster import Raster, share_with_care
 from lidarops.reports.series import Section, compare, normalised_error, thin
 from lidarops.reports.timeaxis import TimeAxis, Times, segments
-from lidarops.reports.words import bit_name, percent
+from lidarops.reports.words import bit_name, percent, visible
 
 Floats = NDArray[np.float64]
 
@@ -68,6 +68,7 @@ SECTIONS: Final = len(_STYLES)
 
 def title(figure: Figure, words: str) -> None:
     """Write a title at the left. Names come from files: a dollar sign starts no formula."""
+    words = " ".join(visible(words).split())
     figure.suptitle(words, x=0.008, ha="left", fontsize=11.5, color=INK, parse_math=False)
 
 
@@ -213,7 +214,7 @@ def _marks(
     notes = [f"{beyond.sum():,} off the axis, drawn at its edge"] if beyond.any() else []
     notes += [f"{(~finite).sum():,} without a value"] if not finite.all() else []
     what = "use with care" if care else "flagged, do not use"
-    panel.plot(
+    (marks,) = panel.plot(
         axis.x(times[some]),
         np.clip(values[some], low, high),
         linestyle="none",
@@ -227,6 +228,8 @@ def _marks(
         label="\n".join([f"{what}: {counts}", *notes]),
         gid=f"{'care' if care else 'flagged'}-{quantity}",
     )
+    # Marks at the edge reach out of the panel; the layout must not make room for them.
+    marks.set_in_layout(False)
 
 
 def _subset(index: NDArray[np.intp], at_most: int) -> NDArray[np.intp]:

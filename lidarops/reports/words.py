@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import math
+import unicodedata
+from typing import Final
 
 from lidarops.flags import Quality
+
+
+_REORDERING: Final = frozenset(
+    "\N{LEFT-TO-RIGHT EMBEDDING}\N{RIGHT-TO-LEFT EMBEDDING}\N{POP DIRECTIONAL FORMATTING}"
+    "\N{LEFT-TO-RIGHT OVERRIDE}\N{RIGHT-TO-LEFT OVERRIDE}"
+    "\N{LEFT-TO-RIGHT ISOLATE}\N{RIGHT-TO-LEFT ISOLATE}"
+    "\N{FIRST STRONG ISOLATE}\N{POP DIRECTIONAL ISOLATE}"
+)
 
 
 def bit_name(bit: Quality) -> str:
@@ -47,3 +57,19 @@ def duration(seconds: float) -> str:
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun, which takes an s in the plural."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def visible(text: str) -> str:
+    """Return text with control characters, and bytes that are no text, shown by their escapes."""
+    if text.isprintable():
+        return text
+    return "".join(c if c in "\n\t" or not _is_control(c) else _escape(c) for c in text)
+
+
+def _is_control(character: str) -> bool:
+    # Cc: control. Cs: a byte of a file name that is not UTF-8. The others reorder text.
+    return unicodedata.category(character) in {"Cc", "Cs"} or character in _REORDERING
+
+
+def _escape(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

@@ -35,9 +35,9 @@ DEPENDENT: Final = 1e-9
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning.
 _SUMS: Final = {"reassoc", "contract", "nsz"}
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-_summing = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
-_finding = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={*_SUMS, "nnan"})
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+_summing = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
+_finding = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"})
 
 # What became of a profile.
 FITTED: Final = 0
@@ -52,7 +52,7 @@ COLUMNS: Final = (
     "amplitude",
     "extinction",
     "background_variance",
-    "amplitude_variance",
+    "amplitude_relative_variance",
     "extinction_variance",
     "signal_energy",
     "misfit",
@@ -73,7 +73,7 @@ COLUMNS: Final = (
     AMPLITUDE,
     EXTINCTION,
     BACKGROUND_VARIANCE,
-    AMPLITUDE_VARIANCE,
+    AMPLITUDE_RELATIVE_VARIANCE,
     EXTINCTION_VARIANCE,
     SIGNAL_ENERGY,
     MISFIT,
@@ -260,11 +260,7 @@ def _start(g: Grid, s: _Scratch, w0: float, wz: float, free: float) -> tuple[flo
     # At an end of the grid, the vertex is extrapolated from the last three nodes.
     middle = min(max(best, 1), NODES - 2)
     sign = math.copysign(1.0, lengths[best])
-    before, here, after = (
-        sign * lengths[middle - 1],
-        sign * lengths[middle],
-        sign * lengths[middle + 1],
-    )
+    before, here, after = sign * lengths[middle - 1], sign * lengths[middle], sign * lengths[middle + 1]
     low, high = nodes[max(best - 1, 0)], nodes[min(best + 1, NODES - 1)]
     start = nodes[best]
     bend = before - 2.0 * here + after
@@ -275,7 +271,7 @@ def _start(g: Grid, s: _Scratch, w0: float, wz: float, free: float) -> tuple[flo
 
 
 @_compiled
-def _shape(tau: float, x: Array, envelope: Array, step: float, phi: Array, fine: Array) -> None:
+def _shape(tau: float, x: Array, envelope:Array, step: float, phi: Array, fine: Array) -> None:
     n = phi.size
     if step == 0.0:
         for i in range(n):
@@ -485,9 +481,11 @@ def _fit(g: Grid, s: _Scratch, free: float, row: Array) -> None:
     row[BACKGROUND_VARIANCE] = (
         free / w0 + p.mean_phi * p.mean_phi / p.norm + p.mean_t * p.mean_t / p.slope_norm
     )
-    # Of the logarithm of B, which the extinction moves by twice the range of the centroid.
+    # Extinction moves the logarithm of B by twice the range of the centroid.
     lever = 2.0 * (g.start / g.length + p.centroid)
-    row[AMPLITUDE_VARIANCE] = 1.0 / row[SIGNAL_ENERGY] + lever * lever * row[EXTINCTION_VARIANCE]
+    row[AMPLITUDE_RELATIVE_VARIANCE] = (
+        1.0 / row[SIGNAL_ENERGY] + lever * lever * row[EXTINCTION_VARIANCE]
+    )
     row[MEAN_RANGE] = _product(s.w, g.x) / w0
     _judge(g, s, p, tau, (w0, wz, free), row)
 
@@ -503,7 +501,7 @@ def _unscale(g: Grid, reference: float, scale: float, unit: float, row: Array) -
     row[AMPLITUDE] = sign * math.exp(logarithm)
     row[EXTINCTION] /= g.length
     row[BACKGROUND_VARIANCE] /= unit
-    row[AMPLITUDE_VARIANCE] *= (row[AMPLITUDE] / energy) * row[AMPLITUDE]
+    row[AMPLITUDE_RELATIVE_VARIANCE] /= energy
     row[EXTINCTION_VARIANCE] /= energy * g.length * g.length
     row[SIGNAL_ENERGY] *= energy
     row[MISFIT] *= energy

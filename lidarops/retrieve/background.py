@@ -1,32 +1,54 @@
-"""Background light of a lidar profile: the cubic of a homogeneous path, and the tail's mean."""
+"""The background of a profile: by the cubic of a homogeneous path, or as the mean of its tail."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from enum import StrEnum
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve._arguments import Array, Profiles, is_uniform, profiles, spread
+from lidarops.retrieve import _cubic, _inputs
 
-LAG_SHARE: Final = 1.0 / 3.0
-"""Default lag over number of bins; from 0.25 to 0.42 the error of the background is flat."""
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
 
-_Shared = dict[str, Any]
+FEWEST_BINS: Final = 8
+_LAG_SHARE: Final = 0.37
+_UNIFORM: Final = 2.0**-22
+"""Largest deviation from a uniform grid over the last range: what float32 ranges need."""
+
+_QUALITY_OF_STATUS: Final = {
+    _cubic.MISSING: Quality.INPUT_MISSING,
+    _cubic.CONSTANT: Quality.NO_SIGNAL,
+    _cubic.LOST: Quality.NO_REAL_SOLUTION,
+}
+
+
+class Statistics(StrEnum):
+    """How the noise of a power is distributed."""
+
+    GAUSS = "gauss"
+    POISSON = "poisson"
 
 
 @dataclass(frozen=True, slots=True)
 class BackgroundResult:
-    """A background with its standard error; arrays over the leading axes of the power."""
+    """Backgrounds, one of each for every profile, with the leading axes of the power."""
 
     background: Array
-    """In the unit of the power."""
+    """In the unit of the power; NaN where it could not be found."""
     background_standard_error: Array
-    quality: npt.NDArray[np.int32]
-    """Bits of `lidarops.flags.Quality`."""
+    quality: Flags
+    """Bits of `lidarops.flags.Quality`; 0 where no test failed."""
+
+
+def default_lag(bins: int) -> int:
+    """Return the lag at which the cubic scatters least, 0.37 of the bins."""
+    return max(min(round(_LAG_SHARE * bins), (bins - 1) // 2), 1)
 
 
 def cubic(
@@ -35,73 +57,126 @@ def cubic(
     *,
     lag: int | None = None,
     variance: npt.ArrayLike | None = None,
-    statistics: Literal["gauss", "poisson"] = "gauss",
+    statistics: str = "gauss",
 ) -> BackgroundResult:
-    r"""Estimate the background of a homogeneous path from a cubic equation.
+    r"""Find the background of a homogeneous path without iteration.
 
-    Three bins at equal distances ``s`` of a homogeneous path obey
-    :math:`f_i(P^*) = a_i P^{*2} + b_i P^* + c_i = 0`. The minimum of :math:`\sum f_i^2` solves
+    On a homogeneous path, three bins at a distance of `lag` obey
+    :math:`(P_0 - P^*) R_0^2 (P_2 - P^*) R_2^2 = (P_1 - P^*)^2 R_1^4`. The sum of the squared
+    differences over all triples,
 
-    .. math:: x^3 + \frac{3 \sum ab}{2 \sum a^2} x^2
-              + \frac{\sum (2ac + b^2)}{2 \sum a^2} x + \frac{\sum bc}{2 \sum a^2} = 0
+    .. math:: S(x) = \sum_i (a_i x^2 + b_i x + c_i)^2,
 
-    whose largest real root is the background (`bobrovsky2024`, whose eq. 8 lacks the outer
-    square and whose eq. 13 misprints the second sum). The quadratic and the constant sum are
-    freed of the bias that noise gives them, which for the paper's lag of one bin is larger than
-    the signal. Closed form; use it as an independent check of
-    `lidarops.retrieve.homogeneous.solve`, whose error is 1.3 to 2 times smaller.
+    has its minimum at the largest real root of the cubic :math:`S'(x) = 0`, which is
+    evaluated in a form that keeps its digits. What the noise adds to the coefficients on
+    average is subtracted first; without that, a short lag gives a background that is too high.
+
+    The scatter is 1.3 to 2.1 times the least possible one (`lidarops.retrieve.homogeneous`
+    reaches that), and the start of the section must stand out of the noise.
 
     Parameters
     ----------
     power : (..., range) float
-        At least 3 bins. A triple of bins that touches NaN is passed over.
+        Any unit; of a section that begins beyond full overlap.
     range : (range,) float
         m, uniform.
     lag : int, optional
-        Bins from one bin of a triple to the next; a third of the bins where absent.
+        Distance of the bins of a triple, `default_lag` where not given.
     variance : (..., range) float, optional
-        Noise variance of the power; broadcasts. Where absent, it is estimated from third
-        differences (``gauss``) or is the power itself (``poisson``).
+        Noise variance in the square of the power's unit, broadcast against `power`. Where not
+        given, one variance for the profile is estimated from differences along range.
     statistics : {"gauss", "poisson"}
-        Law of the noise. ``poisson`` wants the power in counts.
+        "poisson" takes `power` as counts, which are their own variance.
 
     Returns
     -------
     BackgroundResult
-        ``INPUT_MISSING`` where no triple is valid, ``NO_REAL_SOLUTION`` where no root is finite.
+        The standard error follows from the implicit derivative of the root with respect to the
+        power of each bin. INPUT_MISSING where a bin is not finite, TOO_FEW_BINS below 8 bins
+        (NaN below 3), NO_SIGNAL where the profile is constant, NO_REAL_SOLUTION where the root
+        is not a minimum.
 
     Raises
     ------
     RetrievalInputError
-        Where the range is not uniform, or arguments do not fit.
+        For arguments that cannot be right, among them a range that is not uniform.
 
     References
     ----------
-    bobrovsky2024
+    bobrovsky2024 (equation 8 without the outer square, 13 with a misprinted coefficient).
     """
-    given = profiles(power, range)
-    if not is_uniform(given.range):
+    grid = _inputs.range_grid(range)
+    rows, leading = _inputs.profiles(power, grid)
+    noise = _inputs.variance_rows(variance, grid, leading)
+    kind = _statistics(statistics)
+    if kind is Statistics.POISSON and variance is not None:
         raise RetrievalInputError(
-            "is not uniform, so that the cubic does not hold",
-            field="range",
-            remedy="use lidarops.retrieve.homogeneous.solve",
+            "is given for counts, which are their own variance",
+            field="variance",
+            remedy="leave it out, or choose statistics='gauss'",
         )
-    if statistics not in ("gauss", "poisson"):
-        raise RetrievalInputError(
-            f"{statistics!r} is not known", field="statistics", remedy="choose gauss or poisson"
+    if kind is Statistics.POISSON and np.any(rows < 0):
+        raise RetrievalInputError("holds negative counts", field="power")
+    result = solve_cubic(
+        rows, grid.values, lag, noise, known_variance=variance is not None, kind=kind
+    )[0]
+    return BackgroundResult(
+        result.background.reshape(leading),
+        result.background_standard_error.reshape(leading),
+        result.quality.reshape(leading),
+    )
+
+
+def solve_cubic(
+    power: _inputs.Floats,
+    range_: Array,
+    lag: int | None,
+    variance: Array,
+    *,
+    known_variance: bool,
+    kind: Statistics = Statistics.GAUSS,
+    want_gradients: bool = False,
+) -> tuple[BackgroundResult, Array]:
+    """Solve `cubic` on arrays that `lidarops.retrieve._inputs` has prepared.
+
+    Parameters
+    ----------
+    power, variance : (profile, bin) float
+        The variance may be one row, and relative where it is not known.
+    range_ : (bin,) float
+        m, ascending.
+    lag : int, optional
+    known_variance : bool
+    kind : Statistics
+    want_gradients : bool
+        Whether to return the derivatives of the backgrounds with respect to the power.
+
+    Returns
+    -------
+    BackgroundResult
+        (profile,).
+    gradients : (profile, bin) float
+        One row of no meaning where not wanted.
+    """
+    _require_uniform(range_)
+    count, bins = power.shape
+    out = np.full((count, len(_cubic.COLUMNS)), np.nan)
+    gradients = np.zeros((count if want_gradients else 1, bins))
+    if bins >= 3:
+        triples = _cubic.make_triples(range_, _checked_lag(lag, bins))
+        _cubic.solve_profiles(
+            power, variance, known_variance, kind is Statistics.POISSON, triples, gradients, out
         )
-    bins = given.range.size
-    step = max(1, round(LAG_SHARE * bins)) if lag is None else lag
-    if not 1 <= step <= (bins - 1) // 2:
-        raise RetrievalInputError(
-            f"{step} bins leave no triple in {bins} bins",
-            field="lag",
-            remedy=f"choose 1 to {(bins - 1) // 2}",
-        )
-    noise = _noise(given, variance, poisson=statistics == "poisson")
-    with np.errstate(all="ignore"):
-        background, error = _solve(given, noise, step, poisson=statistics == "poisson")
-    return _result(given, background, error)
+    status = out[:, _cubic.STATUS]
+    quality = np.zeros(count, dtype=np.int32)
+    for code, bit in _QUALITY_OF_STATUS.items():
+        quality[status == code] |= np.int32(bit)
+    if bins < FEWEST_BINS:
+        quality[status != _cubic.MISSING] |= np.int32(Quality.TOO_FEW_BINS)
+    lost = status == _cubic.LOST
+    background = np.where(lost, np.nan, out[:, _cubic.BACKGROUND])
+    error = np.sqrt(np.where(lost, np.nan, out[:, _cubic.VARIANCE]))
+    return BackgroundResult(background, error, quality), gradients
 
 
 def tail_mean(
@@ -111,187 +186,90 @@ def tail_mean(
     start: float | None = None,
     variance: npt.ArrayLike | None = None,
 ) -> BackgroundResult:
-    r"""Average the far bins: the field's habit, biased by whatever signal is left there.
+    """Take the mean of the far end of a profile as its background, as the field does.
 
-    .. math:: P^* = \frac{1}{n} \sum_{R_i \ge R_t} P_i, \qquad
-              \mathrm{se}^2 = \frac{1}{n^2} \sum v_i
+    What is left of the signal there is part of the mean: the background is too high by it.
 
     Parameters
     ----------
     power : (..., range) float
-        NaN is passed over.
+        Any unit; bins that are not finite are passed over.
     range : (range,) float
         m.
     start : float, optional
-        m; nearest bin to average. The last tenth of the bins where absent.
+        m; bins from here on are averaged, the last tenth of the bins where not given.
     variance : (..., range) float, optional
-        Noise variance; the scatter about the mean where absent.
+        Noise variance in the square of the power's unit, broadcast against `power`; where not
+        given, the scatter of the averaged bins tells it.
 
     Returns
     -------
     BackgroundResult
-        ``INPUT_MISSING`` where no bin is valid, ``TOO_FEW_BINS`` where fewer than 8 are.
+        INPUT_MISSING where no averaged bin is finite, TOO_FEW_BINS where fewer than 8 are.
 
     Raises
     ------
     RetrievalInputError
-        Where no bin lies beyond `start`, or arguments do not fit.
+        For arguments that cannot be right, among them a start beyond the range.
     """
-    given = profiles(power, range)
-    first = given.range[-max(1, given.range.size // 10)] if start is None else start
-    tail = given.range >= first
-    if not tail.any():
-        raise RetrievalInputError(
-            f"no bin lies beyond {first:g} m",
-            field="start",
-            remedy=f"the last bin is at {given.range[-1]:g} m",
-        )
-    values = given.power[:, tail].astype(np.float64)
-    valid = np.isfinite(values)
-    count = valid.sum(axis=-1)
-    with np.errstate(all="ignore"):
-        mean = np.where(valid, values, 0.0).sum(axis=-1) / count
+    grid = _inputs.range_grid(range)
+    rows, leading = _inputs.profiles(power, grid)
+    noise = _inputs.variance_rows(variance, grid, leading)
+    first = _first_of_tail(grid.values, start)
+    values = np.ascontiguousarray(rows[:, first:], dtype=np.float64)
+    noise = np.broadcast_to(noise[:, first:], values.shape)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        valid = np.isfinite(values) & np.isfinite(noise)
+        bins = valid.sum(axis=-1)
+        mean = np.where(valid, values, 0.0).sum(axis=-1) / bins
         if variance is None:
-            square = np.where(valid, values - mean[:, np.newaxis], 0.0) ** 2
-            error = np.sqrt(square.sum(axis=-1) / (count - 1) / count)
+            scatter = np.where(valid, values - mean[:, np.newaxis], 0.0) ** 2
+            error = np.sqrt(scatter.sum(axis=-1) / (bins - 1) / bins)
         else:
-            noise = spread(variance, given, "variance")[:, tail]
-            error = np.sqrt(np.where(valid, noise, 0.0).sum(axis=-1)) / count
-    result = _result(given, mean, error)
-    few = given.shaped((count > 0) & (count < 8))
-    quality = result.quality | np.where(few, np.int32(Quality.TOO_FEW_BINS), np.int32(0))
-    return BackgroundResult(result.background, result.background_standard_error, quality)
+            error = np.sqrt(np.where(valid, noise, 0.0).sum(axis=-1)) / bins
+    quality = np.zeros(bins.shape, dtype=np.int32)
+    quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
+    quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    error[bins < 2 if variance is None else bins < 1] = np.nan
+    return BackgroundResult(mean.reshape(leading), error.reshape(leading), quality.reshape(leading))
 
 
-def _result(given: Profiles, background: Array, error: Array) -> BackgroundResult:
-    present = np.isfinite(given.power).any(axis=-1)
-    solved = np.isfinite(background)
-    quality = np.where(
-        solved, 0, np.where(present, int(Quality.NO_REAL_SOLUTION), int(Quality.INPUT_MISSING))
-    )
-    return BackgroundResult(
-        given.shaped(np.where(solved, background, np.nan)),
-        given.shaped(np.where(solved, error, np.nan)),
-        given.shaped(quality.astype(np.int32)),
-    )
+def _first_of_tail(range_: Array, start: float | None) -> int:
+    if start is None:
+        return int(range_.size - max(range_.size // 10, 1))
+    if not np.isfinite(start) or start > range_[-1]:
+        raise RetrievalInputError(
+            f"is {start} m, but the range ends at {range_[-1]:g} m", field="start"
+        )
+    return int(np.searchsorted(range_, start, side="left"))
 
 
-def _noise(given: Profiles, variance: npt.ArrayLike | None, *, poisson: bool) -> Array:
-    if variance is not None:
-        return spread(variance, given, "variance")
-    power = given.power.astype(np.float64)
-    if poisson:
-        return np.maximum(power, 0.0)
-    if given.range.size < 5:
-        return np.zeros_like(power)
-    with np.errstate(all="ignore"):
-        third = np.diff(power, 3, axis=-1) ** 2 / 20.0
-        level = np.nanmean(np.where(np.isfinite(third), third, np.nan), axis=-1, keepdims=True)
-    return np.broadcast_to(np.nan_to_num(level), power.shape)
+def _statistics(name: str) -> Statistics:
+    try:
+        return Statistics(name)
+    except ValueError:
+        raise RetrievalInputError(
+            f"is {name!r}", field="statistics", remedy=f"choose one of {', '.join(Statistics)}"
+        ) from None
 
 
-def _solve(given: Profiles, noise: Array, lag: int, *, poisson: bool) -> tuple[Array, Array]:
-    power = given.power.astype(np.float64)
-    reference = _reference(power)
-    shifted = power - reference
-    scale = np.nanmax(
-        np.abs(np.where(np.isfinite(shifted), shifted, np.nan)), axis=-1, keepdims=True
-    )
-    scale = np.where(scale > 0, scale, 1.0)
-    p, v = shifted / scale, noise / scale**2
-    p0, p1, p2 = p[:, : -2 * lag], p[:, lag:-lag], p[:, 2 * lag :]
-    v0, v1, v2 = v[:, : -2 * lag], v[:, lag:-lag], v[:, 2 * lag :]
-    r = given.range / given.range[-1]
-    r0, r1, r2 = r[: -2 * lag], r[lag:-lag], r[2 * lag :]
-    d1, d2 = r1 - r0, r2 - r1
-    u, w = (r0 * r2) ** 2, r1**4
-    # Written so that nothing cancels where the triple is short against its range.
-    a = (d1 * d2 + r1 * (d1 - d2)) * (r1**2 + r0 * r2)
-    b = u * (p0 - 2.0 * p1 + p2) - 2.0 * a * p1
-    c = a * p1**2 - u * (p0 * p2 - p1**2)
-    valid = np.isfinite(b) & np.isfinite(c)
-    skew = v1 / scale if poisson else 0.0
-    bias2 = 2.0 * a * w * v1 + u**2 * (v0 + v2) + 4.0 * w**2 * v1
-    bias3 = (
-        u * w * v1 * (p0 + p2)
-        - u**2 * (v0 * p2 + v2 * p0)
-        - 6.0 * w**2 * v1 * p1
-        + 4.0 * w**2 * skew
-    )
-    half = 2.0 * _sum(a**2, valid)
-    second = 3.0 * _sum(a * b, valid) / half
-    first = _sum(2.0 * a * c + b**2 - bias2, valid) / half
-    constant = _sum(b * c - bias3, valid) / half
-    x = largest_root(second, first, constant)
-    spread_ = _propagate(x, (a, b, c), (u, w), (p0, p1, p2), v, valid, lag)
-    return (reference + scale * x[:, np.newaxis])[:, 0], scale[:, 0] * spread_
+def _checked_lag(lag: int | None, bins: int) -> int:
+    if lag is None:
+        return default_lag(bins)
+    if not 1 <= lag <= (bins - 1) // 2:
+        raise RetrievalInputError(
+            f"is {lag} with {bins} bins",
+            field="lag",
+            remedy=f"choose a whole number from 1 to {(bins - 1) // 2}",
+        )
+    return lag
 
 
-def _reference(power: Array) -> Array:
-    """Return the last finite value of each profile, near which the background lies."""
-    finite = np.isfinite(power)
-    last = power.shape[-1] - 1 - np.argmax(finite[:, ::-1], axis=-1)
-    return np.take_along_axis(power, last[:, np.newaxis], axis=-1)
-
-
-def _sum(terms: Array, valid: npt.NDArray[np.bool_]) -> Array:
-    total: Array = np.where(valid, terms, 0.0).sum(axis=-1)
-    return np.where(valid.any(axis=-1), total, np.nan)
-
-
-def largest_root(a: Array, b: Array, c: Array) -> Array:
-    r"""Return the largest real root of :math:`x^3 + a x^2 + b x + c`.
-
-    Trigonometric where there are three, by the larger of the two cube roots where there is one,
-    then one Newton step on the cubic itself.
-
-    Parameters
-    ----------
-    a, b, c : (...) float
-
-    Returns
-    -------
-    (...) float
-    """
-    p = b - a * a / 3.0
-    q = 2.0 * (a / 3.0) ** 3 - a * b / 3.0 + c
-    discriminant = (p / 3.0) ** 3 + (q / 2.0) ** 2
-    with np.errstate(all="ignore"):
-        reach = 2.0 * np.sqrt(np.maximum(-p / 3.0, 0.0))
-        angle = np.arccos(np.clip(3.0 * q / (p * reach), -1.0, 1.0))
-        three = reach * np.cos(angle / 3.0)
-        big = -np.copysign(np.cbrt(np.abs(q) / 2.0 + np.sqrt(np.maximum(discriminant, 0.0))), q)
-        one = np.where(big == 0.0, 0.0, big - p / (3.0 * big))
-        x = np.where(discriminant < 0.0, three, one) - a / 3.0
-        slope = (3.0 * x + 2.0 * a) * x + b
-        newton = x - (((x + a) * x + b) * x + c) / slope
-    # At a double root there is no slope, and the closed form is all there is.
-    return np.where(np.isfinite(newton), newton, x)
-
-
-def _propagate(
-    x: Array,
-    abc: tuple[Array, Array, Array],
-    uw: tuple[Array, Array],
-    triples: tuple[Array, Array, Array],
-    variance: Array,
-    valid: npt.NDArray[np.bool_],
-    lag: int,
-) -> Array:
-    """Return the standard error of the root, by the derivative of its equation to each bin."""
-    a, b, c = abc
-    u, w = uw
-    p0, p1, p2 = triples
-    x = x[:, np.newaxis]
-    f, slope = (a * x + b) * x + c, 2.0 * a * x + b
-    pull = np.zeros_like(variance)
-    parts = (
-        (slice(None, -2 * lag), u * (x - p2) * slope + f * u),
-        (slice(lag, -lag), -2.0 * w * (x - p1) * slope - 2.0 * f * w),
-        (slice(2 * lag, None), u * (x - p0) * slope + f * u),
-    )
-    for where, part in parts:
-        pull[:, where] += np.where(valid, part, 0.0)
-    stiffness = _sum(slope**2 + 2.0 * f * a, valid)
-    error: Array = np.sqrt((pull**2 * np.nan_to_num(variance)).sum(axis=-1)) / np.abs(stiffness)
-    return error
+def _require_uniform(range_: Array) -> None:
+    grid = np.linspace(range_[0], range_[-1], range_.size)
+    if np.max(np.abs(range_ - grid)) > _UNIFORM * range_[-1]:
+        raise RetrievalInputError(
+            "is not uniform, as the cubic needs it",
+            field="range",
+            remedy="use the method 'direct' of lidarops.retrieve.homogeneous.solve",
+        )

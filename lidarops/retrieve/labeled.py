@@ -219,7 +219,7 @@ def _tail_mean(
     power: _Block,
     variance: _Block | None = None,
     *,
-    range: _Block,
+    range: _Block,  # noqa: A002 - the field's word
     start: float | None,
 ) -> tuple[_Block, _Block, _Block]:
     found = background.tail_mean(power, range, start=start, variance=variance)

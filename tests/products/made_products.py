@@ -23,6 +23,7 @@ from lidarops.records import (
 )
 
 START = datetime(2026, 3, 1, tzinfo=UTC)
+SCENE = "lidar-1_20260301T000000"
 STATION = Station(name="Одеса, hill", latitude=46.44, longitude=30.76, altitude=53.5)
 METADATA = Metadata(
     institution="Université d'Été",
@@ -35,7 +36,7 @@ METADATA = Metadata(
 
 def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Provenance:
     plan = Plan(
-        scene="scene-1",
+        scene=SCENE,
         steps=(
             Step("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
             Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
@@ -48,7 +49,7 @@ def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> P
     )
     fields = {
         "campaign": "demo",
-        "scene": "scene-1",
+        "scene": SCENE,
         "kind": kind,
         "channel": "photon_532o",
         "inputs": (*inputs, InputRecord("dark/d.dat", Role.DARK, "f" * 64)),
@@ -74,7 +75,7 @@ def context(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> Cont
         "campaign": "demo",
         "title": "Demo campaign",
         "summary": "What the campaign is about.",
-        "scene": "scene-1",
+        "scene": SCENE,
         "start": START,
         "stop": START + timedelta(days=1),
         "provenance": provenance(kind),

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from made_products import MAKERS, STATION, context, homogeneous, provenance, signal
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from made_products import MAKERS, STATION, context, homogeneous, provenance, signal
 
 from lidarops.campaign import Metadata, Station
 from lidarops.errors import ProductError
@@ -97,6 +97,7 @@ def test_range_limits_are_half_way_between_centres():
     np.testing.assert_array_equal(product["range_bnds"][:, 1], 7.5 * np.arange(1, 41))
 
 
+@settings(deadline=None, max_examples=50)
 @given(
     zenith=st.floats(0, 180),
     altitude=st.floats(-500, 9000),
@@ -151,6 +152,7 @@ def test_extents_are_those_of_the_data():
     assert attrs["geospatial_bounds"] == "POINT (46.44 30.76)"
 
 
+@settings(deadline=None)
 @given(st.integers(0, 10**9))
 def test_durations_read_back(milliseconds: int):
     assert pd.Timedelta(_duration(milliseconds / 1000)) == pd.Timedelta(milliseconds, "ms")
@@ -201,9 +203,15 @@ def test_paths():
     path = product_path(context(ProductKind.SIGNAL))
     assert path == ("odesa/lidar-1/signal/2026/odesa_lidar-1_signal_photon_532o_20260301T000000.nc")
     local = context(start=datetime.fromisoformat("2026-01-01T01:00:00+03:00"))
-    assert product_path(local).endswith(
-        "/2025/odesa_lidar-1_homogeneous_photon_532o_20251231T220000.nc"
-    )
+    assert product_path(local).startswith("odesa/lidar-1/homogeneous/2025/")
+
+
+def test_scenes_of_two_range_grids_have_two_files():
+    start = "lidar-1_20260301T000000"
+    paths = {
+        product_path(context(scene=scene)) for scene in (f"{start}-4096x75", f"{start}-100x30")
+    }
+    assert len(paths) == 2
 
 
 @pytest.mark.parametrize("channel", ["../x", "", "a/b", ".hidden", "a b"])
@@ -328,6 +336,7 @@ def test_a_missing_value_with_a_bit_is_written_as_missing():
 # Properties
 
 
+@settings(deadline=None, max_examples=40)
 @given(
     st.sampled_from(KINDS).flatmap(
         lambda kind: st.tuples(
@@ -358,6 +367,7 @@ def test_flags_read_back_from_masks_and_meanings(case):
 normal = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)
 
 
+@settings(deadline=None)
 @given(values=st.lists(normal, min_size=1), bits=st.integers(1, 23))
 def test_bitround_is_rounding_of_the_mantissa_half_to_even(values: list[float], bits: int):
     given_ = np.array(values, np.float32)

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from made_products import context, homogeneous, provenance
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_products import context, homogeneous, provenance
 
 from lidarops.errors import ProductError
 from lidarops.products.build import build
@@ -104,6 +104,7 @@ def test_equal_files_are_one_entity_used_twice():
     assert len(document["used"]) == 2
 
 
+@settings(deadline=None)
 @given(st.permutations(provenance().inputs))
 def test_order_of_inputs_changes_nothing(inputs):
     shuffled = provenance(inputs=tuple(inputs))

@@ -16,7 +16,7 @@ from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 
 MUTANTS = 10_400
-SMALL_CONSTANT = 128 * 1024
+SMALL_CONSTANT = 192 * 1024
 HUGE = [b"99999", b"999999999", b"1000000", b"2147483648", b"-1", b"1e308", b"nan", b"0x7f"]
 
 CONSTRUCTED = [
@@ -102,7 +102,7 @@ def measured():
 
 def survives(path, content) -> bool:
     """Whether the file is accepted. Then it must be written back as it is."""
-    path.write_bytes(content)
+    rewrite(path, content)
     before = start_measuring()
     message = ""
     try:
@@ -115,6 +115,13 @@ def survives(path, content) -> bool:
         return False
     assert licel.encode(header, counts) == content
     return True
+
+
+def rewrite(path, content):
+    # Truncating first, as write_bytes does, takes most of the time of this module.
+    with path.open("r+b" if path.exists() else "wb") as file:
+        file.write(content)
+        file.truncate()
 
 
 def start_measuring():
@@ -142,7 +149,7 @@ def test_mutants_are_read_or_refused(tmp_path, originals):
         # Tracing makes reading ten times slower.
         if number % (MUTANTS // 8) == 0:
             tracemalloc.start()
-        if number % (MUTANTS // 8) == 200:
+        if number % (MUTANTS // 8) == 80:
             tracemalloc.stop()
         content = bytearray(originals[number % len(originals)])
         for mutate in rng.choices(MUTATIONS, k=rng.choice([1, 1, 2, 5])):

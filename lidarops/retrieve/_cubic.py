@@ -1,0 +1,241 @@
+"""Compiled cubic of the background, in a form that keeps its digits, one profile at a time.
+
+Three bins at equal distance, ``r0 < r1 < r2``, of a homogeneous path obey
+``(P0 - x) r0^2 (P2 - x) r2^2 = (P1 - x)^2 r1^4`` at the background x. The sum over all triples of
+the squared differences is a quartic in x; its derivative is the cubic of `bobrovsky2024`, here
+with the outer square and the coefficient that the paper misprints, an arbitrary lag, the
+expectation of the noise in the coefficients subtracted, and no difference of large numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+HUGE: Final = 1e150
+"""Powers beyond this are taken as not finite: the quartic needs their fourth power."""
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+# What became of a profile.
+SOLVED: Final = 0
+MISSING: Final = 1
+CONSTANT: Final = 2
+LOST: Final = 3
+
+COLUMNS: Final = ("status", "background", "variance")
+STATUS, BACKGROUND, VARIANCE = range(3)
+
+
+class Triples(NamedTuple):
+    """Coefficients of every triple of bins, ranges over the last range."""
+
+    lag: int
+    u: Array
+    """``(r0 r2)^2``."""
+    v: Array
+    """``r1^4``."""
+    a: Array
+    """``v - u``, without cancellation."""
+
+
+class _Coefficients(NamedTuple):
+    """Of half the derivative of the quartic: cubic, square, linear, constant, and its noise."""
+
+    cubic: float
+    square: float
+    linear: float
+    constant: float
+
+
+def make_triples(range_: Array, lag: int) -> Triples:
+    """Tabulate the triples of an ascending range grid."""
+    r = range_ / range_[-1]
+    r0, r1, r2 = r[: -2 * lag], r[lag:-lag], r[2 * lag :]
+    before, after = r1 - r0, r2 - r1
+    a = (before * after + r1 * (before - after)) * (r1 * r1 + r0 * r2)
+    return Triples(lag, (r0 * r2) ** 2, r1**4, a)
+
+
+@_compiled
+def _coefficients(p: Array, v: Array, t: Triples, poisson: float) -> _Coefficients:
+    """Sum the coefficients over the triples, less the expectation of their noise."""
+    s3 = s2 = s1 = s0 = 0.0
+    for i in range(t.a.size):
+        p0, p1, p2 = p[i], p[i + t.lag], p[i + 2 * t.lag]
+        v0, v1, v2 = v[i], v[i + t.lag], v[i + 2 * t.lag]
+        a, u, w = t.a[i], t.u[i], t.v[i]
+        b = u * (p0 - 2.0 * p1 + p2) - 2.0 * a * p1
+        c = a * p1 * p1 - u * (p0 * p2 - p1 * p1)
+        s3 += a * a
+        s2 += a * b
+        s1 += 2.0 * a * c + b * b
+        s1 -= 2.0 * a * w * v1 + u * u * (v0 + v2) + 4.0 * w * w * v1
+        s0 += b * c
+        s0 -= u * w * v1 * (p0 + p2) - u * u * (v0 * p2 + v2 * p0)
+        s0 += w * w * v1 * (6.0 * p1 - 4.0 * poisson)
+    return _Coefficients(2.0 * s3, 3.0 * s2, s1, s0)
+
+
+@_compiled
+def largest_root(a: float, b: float, c: float) -> float:
+    """Return the largest real root of ``x^3 + a x^2 + b x + c``."""
+    p = b - a * a / 3.0
+    q = 2.0 * (a / 3.0) ** 3 - a * b / 3.0 + c
+    discriminant = (p / 3.0) ** 3 + (0.5 * q) ** 2
+    if discriminant <= 0.0 and p < 0.0:
+        radius = 2.0 * math.sqrt(-p / 3.0)
+        cosine = min(max(3.0 * q / (p * radius), -1.0), 1.0)
+        return radius * math.cos(math.acos(cosine) / 3.0) - a / 3.0
+    # The summand without cancellation, and the other from their product -p / 3.
+    cube = 0.5 * abs(q) + math.sqrt(max(discriminant, 0.0))
+    big = -math.copysign(cube ** (1.0 / 3.0), q)
+    small = -p / (3.0 * big) if big != 0.0 else 0.0
+    return big + small - a / 3.0
+
+
+@_compiled
+def _load(power: Any, p: Array) -> bool:
+    """Copy one profile; return whether all of it can be used."""
+    whole = True
+    for i in range(p.size):
+        p[i] = power[i]
+        whole = whole and abs(p[i]) < HUGE
+    return whole
+
+
+@_compiled
+def _difference_variance(p: Array, relative: Array) -> float:
+    """Estimate the variance of unit relative variance from fourth differences along range."""
+    total = norm = 0.0
+    for i in range(p.size - 4):
+        bend = p[i] - 4.0 * p[i + 1] + 6.0 * p[i + 2] - 4.0 * p[i + 3] + p[i + 4]
+        total += bend * bend
+        norm += relative[i] + relative[i + 4] + 36.0 * relative[i + 2]
+        norm += 16.0 * (relative[i + 1] + relative[i + 3])
+    return total / norm
+
+
+@_compiled
+def _fill_variance(
+    p: Array, relative: Array, known_variance: bool, poisson: bool, v: Array
+) -> float:
+    """Fill the variance of every bin; return its level, 0 where there is none."""
+    level = 1.0 if known_variance or poisson else _difference_variance(p, relative)
+    if not math.isfinite(level):
+        level = 0.0
+    for i in range(v.size):
+        v[i] = max(p[i], 0.0) if poisson else level * relative[i]
+    return level
+
+
+@_compiled
+def _all_finite(values: Array) -> bool:
+    finite = True
+    for i in range(values.size):
+        finite = finite and math.isfinite(values[i])
+    return finite
+
+
+@_compiled
+def _gradient(p: Array, v: Array, t: Triples, poisson: float, out: Array) -> None:
+    """Fill the derivatives of the constant coefficient with respect to the power of each bin."""
+    for i in range(out.size):
+        out[i] = 0.0
+    for i in range(t.a.size):
+        j, k = i + t.lag, i + 2 * t.lag
+        a, u, w = t.a[i], t.u[i], t.v[i]
+        b = u * (p[i] - 2.0 * p[j] + p[k]) - 2.0 * a * p[j]
+        c = a * p[j] * p[j] - u * (p[i] * p[k] - p[j] * p[j])
+        noise = u * w * v[j]
+        out[i] += u * (c - b * p[k]) - noise + u * u * (v[k] + poisson * p[k])
+        out[k] += u * (c - b * p[i]) - noise + u * u * (v[i] + poisson * p[i])
+        out[j] += 2.0 * w * (b * p[j] - c) + 6.0 * w * w * v[j]
+        out[j] += poisson * w * (w * (6.0 * p[j] - 4.0 * poisson) - u * (p[i] + p[k]))
+
+
+@_compiled
+def _centre(p: Array) -> float:
+    half = p.size // 2
+    total = 0.0
+    for i in range(half, p.size):
+        total += p[i]
+    return total / (p.size - half)
+
+
+@_compiled
+def _solve_profile(
+    p: Array, v: Array, t: Triples, poisson: float, gradient: Array, row: Array
+) -> None:
+    """Solve one loaded profile: the root about a rough centre, then one Newton step about it."""
+    centre, scale = _centre(p), 0.0
+    for i in range(p.size):
+        scale = max(scale, abs(p[i] - centre))
+    if scale == 0.0:
+        row[STATUS], row[BACKGROUND] = CONSTANT, p[0]
+        return
+    for i in range(p.size):
+        p[i] = (p[i] - centre) / scale
+        v[i] /= scale * scale
+    # In units of the scale, a Poisson variance is its mean over the scale.
+    unit = poisson / scale
+    s = _coefficients(p, v, t, unit)
+    x = largest_root(s.square / s.cubic, s.linear / s.cubic, s.constant / s.cubic)
+    for i in range(p.size):
+        p[i] -= x
+    s = _coefficients(p, v, t, unit)
+    row[BACKGROUND] = centre + scale * (x - s.constant / s.linear)
+    row[STATUS] = SOLVED if s.linear > 0.0 and math.isfinite(row[BACKGROUND]) else LOST
+    _gradient(p, v, t, unit, gradient)
+    variance = 0.0
+    for i in range(p.size):
+        gradient[i] /= -s.linear
+        variance += gradient[i] * gradient[i] * v[i]
+    row[VARIANCE] = variance * scale * scale
+
+
+@_compiled
+def solve_profiles(
+    power: Any,
+    variance: Array,
+    known_variance: bool,
+    poisson: bool,
+    t: Triples,
+    gradients: Array,
+    out: Array,
+) -> None:
+    """Solve every profile of a batch.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    variance : (profile or 1, bin) float64
+        Absolute, or relative where it is not known; not used for counts.
+    known_variance : bool
+    poisson : bool
+        Whether the power are counts.
+    t : Triples
+        Of `make_triples`.
+    gradients : (profile or 1, bin) float64
+        Gets the derivatives of the backgrounds with respect to the power; one row where nobody
+        wants them.
+    out : (profile, column) float64
+        Filled with NaN; gets the `COLUMNS`.
+    """
+    n = power.shape[1]
+    p, v = np.empty(n), np.empty(n)
+    for k in range(power.shape[0]):
+        whole = _load(power[k], p)
+        level = _fill_variance(p, variance[k % variance.shape[0]], known_variance, poisson, v)
+        if not (whole and _all_finite(v)):
+            out[k, STATUS] = MISSING
+            continue
+        _solve_profile(p, v, t, float(poisson), gradients[k % gradients.shape[0]], out[k])
+        # Without a noise level nothing was subtracted, and there is no standard error.
+        out[k, VARIANCE] *= level / level

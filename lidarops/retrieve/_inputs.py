@@ -1,0 +1,156 @@
+"""What the retrievals along range accept, and the one shape in which their kernels get it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+
+SHORTEST_REACH = 100.0
+"""m. No lidar section ends nearer, and every section in km ends nearer: a guard of units."""
+
+
+@dataclass(frozen=True, slots=True)
+class RangeGrid:
+    """A range grid, ascending, and how to turn other arrays the same way."""
+
+    values: Array
+    """m."""
+    descending: bool
+
+    @property
+    def size(self) -> int:
+        """Number of bins."""
+        return int(self.values.size)
+
+    def turn(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return `values` with their last axis ascending in range."""
+        return values[..., ::-1] if self.descending and values.shape[-1] > 1 else values
+
+
+def real_array(values: npt.ArrayLike, name: str) -> Floats:
+    """Return `values` as float32 (where they are) or float64, masked entries as NaN.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where they are not real numbers.
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        values = values.astype(np.float64).filled(np.nan)
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        raise RetrievalInputError(
+            f"holds {array.dtype}, not real numbers", field=name, remedy="give floats or integers"
+        )
+    narrow = array.dtype.kind == "f" and array.dtype.itemsize == 4
+    return array.astype(np.float32 if narrow else np.float64, copy=False)
+
+
+def range_grid(values: npt.ArrayLike) -> RangeGrid:
+    """Check a range axis in m.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where it is not one-dimensional, finite, positive and strictly monotonic, or ends nearer
+        than 100 m, as ranges in km do.
+    """
+    grid = real_array(values, "range").astype(np.float64)
+    if grid.ndim != 1 or grid.size == 0:
+        raise RetrievalInputError(
+            f"has the shape {grid.shape}", field="range", remedy="give one value in m per bin"
+        )
+    steps = np.diff(grid)
+    if not np.all(np.isfinite(grid)) or not (np.all(steps > 0) or np.all(steps < 0)):
+        raise RetrievalInputError("is not finite and strictly monotonic", field="range")
+    descending = bool(grid[0] > grid[-1])
+    grid = np.ascontiguousarray(grid[::-1] if descending else grid)
+    if grid[0] <= 0:
+        raise RetrievalInputError(
+            f"starts at {grid[0]:g} m", field="range", remedy="cut the bins at and behind the lidar"
+        )
+    if grid[-1] < SHORTEST_REACH:
+        raise RetrievalInputError(
+            f"ends at {grid[-1]:g} m: range must be in m, this looks like km",
+            field="range",
+            remedy="multiply by 1000",
+        )
+    return RangeGrid(grid, descending)
+
+
+def profiles(power: npt.ArrayLike, grid: RangeGrid) -> tuple[Floats, tuple[int, ...]]:
+    """Return `power` as contiguous (profile, bin), and the shape of its leading axes.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where the last axis does not fit the range.
+    """
+    array = real_array(power, "power")
+    if array.ndim == 0 or array.shape[-1] != grid.size:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, but range has {grid.size} bins",
+            field="power",
+            remedy="the last axis of power is range",
+        )
+    leading = array.shape[:-1]
+    flat = grid.turn(array).reshape(_count(leading), grid.size)
+    return np.ascontiguousarray(flat), leading
+
+
+def noise_rows(
+    noise: npt.ArrayLike | None, name: str, grid: RangeGrid, leading: tuple[int, ...]
+) -> Array:
+    """Return variances or weights as contiguous (profile or 1, bin); ones for None.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where they do not broadcast to the power.
+    """
+    if noise is None:
+        return np.ones((1, grid.size))
+    array = real_array(noise, name).astype(np.float64, copy=False)
+    if array.ndim > 0:
+        array = grid.turn(array)
+    shared = array.size == 1 or all(length == 1 for length in array.shape[:-1])
+    target = (*((1,) * len(leading) if shared else leading), grid.size)
+    try:
+        rows = np.broadcast_to(array.reshape(array.shape[-1:]) if shared else array, target)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, which does not broadcast to the shape"
+            f" {(*leading, grid.size)} of power",
+            field=name,
+        ) from None
+    return np.ascontiguousarray(rows.reshape(1 if shared else _count(leading), grid.size))
+
+
+def variance_rows(
+    variance: npt.ArrayLike | None, grid: RangeGrid, leading: tuple[int, ...]
+) -> Array:
+    """Return `noise_rows` of a variance.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where it does not broadcast to the power, or is negative.
+    """
+    rows = noise_rows(variance, "variance", grid, leading)
+    if np.any(rows < 0):
+        raise RetrievalInputError(
+            "is negative", field="variance", remedy="give squares of the power's unit"
+        )
+    return rows
+
+
+def _count(leading: tuple[int, ...]) -> int:
+    return int(np.prod(leading, dtype=np.int64))

@@ -1,0 +1,183 @@
+"""Whether a fit of a homogeneous path can be believed: noise level, misfit, quality bits.
+
+Every test on residuals has a false-alarm rate of `FALSE_ALARM` at any number of bins. Where the
+variance of the noise is not known, it is estimated from second differences of the residuals,
+which smooth misfit hardly touches, and the tests allow for the scatter of that estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from lidarops.flags import Quality
+from lidarops.retrieve import _direct
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
+
+FALSE_ALARM: Final = 5e-4
+"""Rate at which one test flags a profile that is as it should be."""
+LOWEST_SIGNAL: Final = 5.0
+"""Amplitude over its standard error at known extinction."""
+LARGEST_RELATIVE_ERROR: Final = 0.15
+"""Standard error of extinction over extinction plus 1 / mean range."""
+OUTLIER: Final = 5.0
+"""Least deviation, in standard deviations of the noise, that makes an outlier."""
+FEWEST_BINS: Final = 8
+FEWEST_BENDS: Final = 5
+"""Second differences below which the noise is taken from the residuals themselves."""
+
+_BEND_DOF: Final = 18.0 / 35.0
+"""Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What a solver knows of a batch of profiles, one value each, before it is judged.
+
+    Variances and energies are for noise of unit variance where the weights are relative.
+    """
+
+    status: Array
+    """`_direct.FITTED`, `EMPTY`, `CONSTANT` or `TOO_SHORT`."""
+    bins: Array
+    """Bins used."""
+    background: Array
+    amplitude: Array
+    extinction: Array
+    background_variance: Array
+    amplitude_relative_variance: Array
+    extinction_variance: Array
+    signal_energy: Array
+    """Squared amplitude over its variance at known extinction."""
+    misfit: Array
+    """Weighted sum of squared residuals."""
+    bends: Array
+    """Sum of squared second differences of the weighted residuals, and their number."""
+    bend_count: Array
+    largest: Array
+    """Largest weighted residual."""
+    trend: Array
+    """Energy of the residuals in shapes that the model lacks, and the number of shapes."""
+    trend_count: Array
+    rounding: Array
+    """Variance that the rounding of the power alone explains."""
+    mean_range: Array
+    """Weighted, m."""
+    bounded: Array
+    """1 where the extinction lies at a bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Noise variance (of unit weight), reduced chi-square and quality of a batch."""
+
+    noise: Array
+    reduced_chi2: Array
+    quality: Flags
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """Beyond which values the tests fail."""
+
+    least_misfit: Array
+    """Of the reduced chi-square."""
+    most_misfit: Array
+    trend: Array
+    outlier: Array
+
+
+def judge(fit: Estimate, *, known_variance: bool) -> Verdict:
+    """Judge a batch of fits.
+
+    Parameters
+    ----------
+    fit : Estimate
+    known_variance : bool
+        Whether the weights were inverse variances.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        noise = np.ones_like(fit.status) if known_variance else _estimated_noise(fit)
+        reduced = fit.misfit / _residual_dof(fit.bins) / noise
+        limits = _limits(fit, known_variance=known_variance)
+        tests = (
+            (Quality.LOW_SIGNAL, fit.signal_energy / noise > LOWEST_SIGNAL**2),
+            (Quality.POORLY_DETERMINED, _determined(fit, noise)),
+            (Quality.NEGATIVE_AMPLITUDE, fit.amplitude > 0),
+            (Quality.AT_BOUND, fit.bounded == 0),
+            (Quality.POOR_FIT, reduced >= limits.least_misfit),
+            (Quality.POOR_FIT, reduced <= limits.most_misfit),
+            (Quality.NOT_HOMOGENEOUS, fit.trend / noise <= limits.trend),
+            (Quality.OUTLIER, fit.largest / np.sqrt(noise) <= limits.outlier),
+        )
+        # Passed, not failed, is asked for: what compares with NaN does not pass.
+        quality = np.zeros(fit.status.shape, dtype=np.int32)
+        fitted = fit.status == _direct.FITTED
+        for bit, passed in tests:
+            quality[fitted & ~passed] |= np.int32(bit)
+    quality[fit.status == _direct.CONSTANT] |= np.int32(Quality.NO_SIGNAL)
+    quality[fit.status == _direct.EMPTY] |= np.int32(Quality.INPUT_MISSING)
+    quality[(fit.bins > 0) & (fit.bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    return Verdict(noise, reduced, quality)
+
+
+def _residual_dof(bins: Array) -> Array:
+    return np.maximum(bins - 3.0, 1.0)
+
+
+def _estimated_noise(fit: Estimate) -> Array:
+    from_bends = fit.bends / (6.0 * fit.bend_count)
+    from_residuals = fit.misfit / _residual_dof(fit.bins)
+    variance = np.where(fit.bend_count >= FEWEST_BENDS, from_bends, from_residuals)
+    return np.maximum(variance, fit.rounding)
+
+
+def _determined(fit: Estimate, noise: Array) -> npt.NDArray[np.bool_]:
+    error = np.sqrt(fit.extinction_variance * noise)
+    scale = fit.extinction + 1.0 / fit.mean_range
+    finite = np.isfinite(fit.amplitude * np.sqrt(fit.amplitude_relative_variance * noise))
+    determined: npt.NDArray[np.bool_] = finite & (error < LARGEST_RELATIVE_ERROR * scale)
+    return determined
+
+
+def _limits(fit: Estimate, *, known_variance: bool) -> _Limits:
+    counts = (np.nan_to_num(fit.bins), np.nan_to_num(fit.bend_count), np.nan_to_num(fit.trend_count))
+    # Limits depend on counts alone, which most profiles share: evaluate each kind once.
+    key = np.zeros(fit.status.shape, dtype=np.int64)
+    for count in counts:
+        key = (key << 20) + count.astype(np.int64)
+    _, sample, kind = np.unique(key, return_index=True, return_inverse=True)
+    of_kinds = _known_limits if known_variance else _estimated_limits
+    limits = of_kinds(*(count[sample] for count in counts))
+    return _Limits(*(limit[kind] for limit in limits))
+
+
+def _known_limits(bins: Array, _: Array, shapes: Array) -> tuple[Array, Array, Array, Array]:
+    dof = _residual_dof(bins)
+    return (
+        special.chdtri(dof, 1.0 - 0.5 * FALSE_ALARM) / dof,
+        special.chdtri(dof, 0.5 * FALSE_ALARM) / dof,
+        np.where(shapes > 0, special.chdtri(shapes, FALSE_ALARM), np.inf),
+        np.maximum(OUTLIER, -special.ndtri(0.5 * FALSE_ALARM / np.maximum(bins, 1.0))),
+    )
+
+
+def _estimated_limits(bins: Array, bends: Array, shapes: Array) -> tuple[Array, Array, Array, Array]:
+    independent = bends >= FEWEST_BENDS
+    dof = np.where(independent, _BEND_DOF * bends, _residual_dof(bins))
+    # The ratio of two estimates of one variance from the same residuals: the logarithm of its
+    # quantile, 4.525 = 3.29 sqrt(17 / 9), with a term for short sections fitted to simulations.
+    neighbours = bends + 2.0
+    ratio = np.exp(4.525 / np.sqrt(neighbours) + 7.3 / neighbours)
+    return (
+        np.zeros_like(bins),
+        np.where(independent, ratio, np.inf),
+        np.where(shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - FALSE_ALARM), np.inf),
+        np.maximum(OUTLIER, -special.stdtrit(dof, 0.5 * FALSE_ALARM / np.maximum(bins, 1.0))),
+    )
