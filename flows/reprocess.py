@@ -10,7 +10,8 @@ import base64
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar, cast
+from uuid import UUID
 
 import typer
 from prefect import flow, get_run_logger, task
@@ -30,8 +31,15 @@ from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import page
 from lidarops.scenes import Cut
 
+_T = TypeVar("_T")
+
 BATCH = 50
 """Scenes a Prefect task: a task costs tens of milliseconds, so never one a file."""
+
+
+def _opaque(value: _T) -> _T:
+    """Keep Prefect from walking an argument in search of futures: a scene holds thousands."""
+    return cast("_T", quote(value))
 
 
 @task(name="catalog")
@@ -94,16 +102,16 @@ def reprocess(
     """
     started = datetime.now(UTC)
     settings = load(campaign, archive=archive, output=out)
-    # Quoted, because Prefect walks every argument in search of futures.
-    cut = catalog_task(quote(settings), quote(instruments or []))
+    cut = catalog_task(_opaque(settings), _opaque(instruments or []))
     jobs = make_jobs(settings, cut)
-    progress = create_progress_artifact(0.0, description=f"Scenes of campaign {settings.name}")
+    description = f"Scenes of campaign {settings.name}"
+    progress = cast("UUID", create_progress_artifact(0.0, description=description))
     outcomes: list[SceneOutcome] = []
     for first in range(0, len(jobs), BATCH):
-        outcomes += process_task(quote(jobs[first : first + BATCH]), workers)
+        outcomes += process_task(_opaque(jobs[first : first + BATCH]), workers)
         update_progress_artifact(progress, 100.0 * len(outcomes) / len(jobs))
     record = conclude(settings, cut, outcomes, started=started)
-    built = report_task(quote(settings), quote(record))
+    built = report_task(_opaque(settings), _opaque(record))
     get_run_logger().info("run %s: %d scenes, report %s", record.id, len(outcomes), built)
     return record, built
 

@@ -252,20 +252,18 @@ def inspect(
 @_plainly
 def bench(
     what: Annotated[str, typer.Argument(help="throughput", metavar="WHAT")],
-    files: Annotated[
-        list[Path] | None, typer.Argument(help="Raw files of one layout; simulated where none.")
-    ] = None,
+    files: Annotated[list[Path], typer.Argument(help="Raw files of one layout.")],
     repeats: Annotated[int, typer.Option(min=1, max=100, help="Counted repeats.")] = 7,
 ) -> None:
     """Measure speed on this machine against floors measured in the same run.
 
-    Example: lidarops bench throughput raw/h2630100.*
+    Example: lidarops bench throughput demo/raw/coast/h*.*0
     """
     from lidarops.bench import throughput
 
     if what != "throughput":
         raise CampaignError(f"no benchmark {what!r}", remedy="choose: throughput")
-    _show(_bench_table(throughput.reader(files or [], repeats=repeats)))
+    _show(_bench_table(throughput.reader(files, repeats=repeats)))
 
 
 def _store(campaign: Campaign) -> Store:

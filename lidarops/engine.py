@@ -17,8 +17,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import dask
+import dask.config
 import xarray as xr
+from dask.base import compute
 
 from lidarops import __version__
 from lidarops.campaign import Campaign, as_settings
@@ -362,7 +363,7 @@ def _channel_products(
         if kind in steps
     }
     # Together, so that products of one channel share one reading of the files.
-    computed = dict(zip(lazy, dask.compute(*lazy.values()), strict=True))
+    computed = dict(zip(lazy, compute(*lazy.values()), strict=True))
     clock.lap("retrieve")
     for kind, data in computed.items():
         context = _context(job, scene, kind, layout, steps, inputs)

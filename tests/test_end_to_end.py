@@ -171,7 +171,7 @@ def test_the_command_line_reprocesses_and_tells(
         (["reprocess", "CAMPAIGN", "--archive", "/nowhere"], 1, "/nowhere"),
         (["inspect", "/nowhere"], 1, "/nowhere"),
         (["report", "/nowhere"], 1, "/nowhere"),
-        (["bench", "luck"], 2, "throughput"),
+        (["bench", "luck", "file"], 2, "throughput"),
     ],
 )
 def test_wrong_use_is_told(

@@ -213,7 +213,7 @@ def stages(record: RunRecord) -> list[StageRow]:
     rows = []
     for stage, spent in times.items():
         total = sum(seconds for seconds, _ in spent)
-        longest, scene_id = max(spent)
+        longest, scene_id = max(spent, key=lambda row: row[0])
         rows.append(
             StageRow(
                 stage=stage,

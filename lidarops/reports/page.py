@@ -84,10 +84,7 @@ def build(record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES) ->
         folder.mkdir(parents=True, exist_ok=True)
         filled = gallery.fill(record, folder, limit=figures)
         target = folder / INDEX
-        # Names of files need not be text: what is not is shown by its escape.
-        write_atomically(
-            target, _render(record, folder, filled).encode("utf-8", "backslashreplace")
-        )
+        write_atomically(target, _render(record, folder, filled).encode())
     except OSError as error:
         raise CatalogError(
             f"the report cannot be written: {error}",

@@ -29,8 +29,9 @@ MISSING: Final = 1
 CONSTANT: Final = 2
 LOST: Final = 3
 
-COLUMNS: Final = ("status", "background", "variance")
-STATUS, BACKGROUND, VARIANCE = range(3)
+STATUS, BACKGROUND, VARIANCE, CONTRAST = range(4)
+COLUMNS: Final = 4
+"""Status, background, its variance, and the curvature of the quartic over what noise adds."""
 
 
 class Triples(NamedTuple):
@@ -52,6 +53,8 @@ class _Coefficients(NamedTuple):
     square: float
     linear: float
     constant: float
+    noise: float
+    """What was subtracted from the linear one."""
 
 
 def make_triples(range_: Array, lag: int) -> Triples:
@@ -66,7 +69,7 @@ def make_triples(range_: Array, lag: int) -> Triples:
 @_compiled
 def _coefficients(p: Array, v: Array, t: Triples, poisson: float) -> _Coefficients:
     """Sum the coefficients over the triples, less the expectation of their noise."""
-    s3 = s2 = s1 = s0 = 0.0
+    s3 = s2 = s1 = s0 = noise = 0.0
     for i in range(t.a.size):
         p0, p1, p2 = p[i], p[i + t.lag], p[i + 2 * t.lag]
         v0, v1, v2 = v[i], v[i + t.lag], v[i + 2 * t.lag]
@@ -76,11 +79,11 @@ def _coefficients(p: Array, v: Array, t: Triples, poisson: float) -> _Coefficien
         s3 += a * a
         s2 += a * b
         s1 += 2.0 * a * c + b * b
-        s1 -= 2.0 * a * w * v1 + u * u * (v0 + v2) + 4.0 * w * w * v1
+        noise += 2.0 * a * w * v1 + u * u * (v0 + v2) + 4.0 * w * w * v1
         s0 += b * c
         s0 -= u * w * v1 * (p0 + p2) - u * u * (v0 * p2 + v2 * p0)
         s0 += w * w * v1 * (6.0 * p1 - 4.0 * poisson)
-    return _Coefficients(2.0 * s3, 3.0 * s2, s1, s0)
+    return _Coefficients(2.0 * s3, 3.0 * s2, s1 - noise, s0, noise)
 
 
 @_compiled
@@ -192,6 +195,7 @@ def _solve_profile(
     s = _coefficients(p, v, t, unit)
     row[BACKGROUND] = centre + scale * (x - s.constant / s.linear)
     row[STATUS] = SOLVED if s.linear > 0.0 and math.isfinite(row[BACKGROUND]) else LOST
+    row[CONTRAST] = s.linear / s.noise
     _gradient(p, v, t, unit, gradient)
     variance = 0.0
     for i in range(p.size):
@@ -226,7 +230,7 @@ def solve_profiles(
         Gets the derivatives of the backgrounds with respect to the power; one row where nobody
         wants them.
     out : (profile, column) float64
-        Filled with NaN; gets the `COLUMNS`.
+        Filled with NaN.
     """
     n = power.shape[1]
     p, v = np.empty(n), np.empty(n)
@@ -236,6 +240,6 @@ def solve_profiles(
         if not (whole and _all_finite(v)):
             out[k, STATUS] = MISSING
             continue
-        _solve_profile(p, v, t, float(poisson), gradients[k % gradients.shape[0]], out[k])
+        _solve_profile(p, v, t, 1.0 if poisson else 0.0, gradients[k % gradients.shape[0]], out[k])
         # Without a noise level nothing was subtracted, and there is no standard error.
         out[k, VARIANCE] *= level / level

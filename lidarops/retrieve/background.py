@@ -17,7 +17,10 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
 FEWEST_BINS: Final = 8
-_LAG_SHARE: Final = 0.37
+_LAG_SHARE: Final = 0.4
+LOWEST_CONTRAST: Final = 10.0
+"""Curvature of the quartic at its minimum over what the noise adds to it; below, the minimum may
+be another one, and the standard error understates by a factor of 2 (simulations)."""
 _UNIFORM: Final = 2.0**-22
 """Largest deviation from a uniform grid over the last range: what float32 ranges need."""
 
@@ -47,7 +50,7 @@ class BackgroundResult:
 
 
 def default_lag(bins: int) -> int:
-    """Return the lag at which the cubic scatters least, 0.37 of the bins."""
+    """Return the lag at which the cubic scatters least, 0.4 of the bins."""
     return max(min(round(_LAG_SHARE * bins), (bins - 1) // 2), 1)
 
 
@@ -93,8 +96,8 @@ def cubic(
     BackgroundResult
         The standard error follows from the implicit derivative of the root with respect to the
         power of each bin. INPUT_MISSING where a bin is not finite, TOO_FEW_BINS below 8 bins
-        (NaN below 3), NO_SIGNAL where the profile is constant, NO_REAL_SOLUTION where the root
-        is not a minimum.
+        (NaN below 3), NO_SIGNAL where the profile is constant, LOW_SIGNAL where the noise may
+        have moved the minimum to another root, NO_REAL_SOLUTION where the root is no minimum.
 
     Raises
     ------
@@ -160,7 +163,7 @@ def solve_cubic(
     """
     _require_uniform(range_)
     count, bins = power.shape
-    out = np.full((count, len(_cubic.COLUMNS)), np.nan)
+    out = np.full((count, _cubic.COLUMNS), np.nan)
     gradients = np.zeros((count if want_gradients else 1, bins))
     if bins >= 3:
         triples = _cubic.make_triples(range_, _checked_lag(lag, bins))
@@ -171,6 +174,7 @@ def solve_cubic(
     quality = np.zeros(count, dtype=np.int32)
     for code, bit in _QUALITY_OF_STATUS.items():
         quality[status == code] |= np.int32(bit)
+    quality[out[:, _cubic.CONTRAST] < LOWEST_CONTRAST] |= np.int32(Quality.LOW_SIGNAL)
     if bins < FEWEST_BINS:
         quality[status != _cubic.MISSING] |= np.int32(Quality.TOO_FEW_BINS)
     lost = status == _cubic.LOST

@@ -1,62 +1,83 @@
-"""Background, amplitude and extinction of a homogeneous path, without iteration to convergence.
-
-`solve` fits ``P = P* + B R^-2 exp(-2 sigma R)`` by least squares in a fixed number of closed-form
-steps (`golub1973`, `potapova2023`), tests the fit, and says by quality bits what to think of it.
-"""
+"""Background, amplitude and extinction of a homogeneous path."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
-from lidarops.retrieve import _direct as direct
-from lidarops.retrieve import background as backgrounds
-from lidarops.retrieve._arguments import Array, Profiles, profiles, spread
+from lidarops.retrieve import _direct, _inputs
+from lidarops.retrieve._verdict import Estimate, judge
+from lidarops.retrieve.background import solve_cubic
 
-Method = Literal["auto", "direct", "cubic"]
-METHODS: Final = ("auto", "direct", "cubic")
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
 
-LOWEST: Final = -0.3
-"""Lower bound of extinction times the far end of the range: below it a second optimum lies."""
-HIGHEST: Final = 60.0
-"""Upper bound of extinction times the length of the section."""
-MIN_DETECTION: Final = 5.0
-"""Signal over its standard error below which there is no signal to speak of."""
-MAX_RELATIVE_ERROR: Final = 0.15
-"""Standard error over (extinction + 1 / mean range) above which extinction is not determined."""
-MIN_BINS: Final = 8
-FALSE_ALARM: Final = 5e-4
-"""Share of clean profiles that a test of the misfit may flag."""
-OUTLIER_LIMIT: Final = 5.0
-"""Smallest residual, in standard deviations of a bin, that makes an outlier."""
-_DIFFERENCE_SPREAD: Final = 1.9
-"""Bins times variance of the ratio of mean square to second-difference noise estimate, / 1."""
+LOWEST_EXTINCTION: Final = -0.3
+"""Default lower bound, over the far end of the section. Where extinction approaches
+-1 / range, the shape stops falling and a second minimum appears."""
+HIGHEST_OPTICAL_DEPTH: Final = 60.0
+"""Default upper bound, over the length of the section: the signal is gone after two bins."""
+_LARGEST_OPTICAL_DEPTH: Final = 300.0
+"""Beyond this the exponential leaves the numbers that a computer has."""
+_BLOCK: Final = 256
+
+
+class Method(StrEnum):
+    """Ways to solve a homogeneous path."""
+
+    AUTO = "auto"
+    DIRECT = "direct"
+    CUBIC = "cubic"
 
 
 @dataclass(frozen=True, slots=True)
 class HomogeneousResult:
-    """What a homogeneous path is made of; arrays over the leading axes of the power."""
+    """What a homogeneous path was found to be, with the leading axes of the power.
+
+    Standard errors are conditional on the model: what bends the profile along the model's own
+    shapes, such as a slope of backscatter along the path, moves the result without a trace.
+    """
 
     background: Array
     """P*, in the unit of the power."""
     background_standard_error: Array
     amplitude: Array
-    """B, in the unit of the power times m2."""
+    """B of ``P = P* + B R^-2 exp(-2 extinction R)``, in the unit of the power times m2."""
     amplitude_standard_error: Array
     extinction: Array
-    """sigma, m-1."""
+    """m-1."""
     extinction_standard_error: Array
     reduced_chi2: Array
-    """Of the residuals, against the variance given or the noise of neighbouring bins."""
-    valid_bins: npt.NDArray[np.int32]
-    quality: npt.NDArray[np.int32]
-    """Bits of `lidarops.flags.Quality`; 0 = no test failed."""
+    """1 where the residuals are noise; relative to the estimated noise without a variance."""
+    valid_bins: Flags
+    quality: Flags
+    """Bits of `lidarops.flags.Quality`; 0 where no test failed."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    power: _inputs.Floats
+    """(profile, bin)."""
+    range: Array
+    """m, ascending."""
+    noise: Array
+    """(profile or 1, bin): variances or relative weights."""
+    known_variance: bool
+    bounds: tuple[float, float]
+    """m-1."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    estimate: Estimate
+    quality: Flags
+    """What the solver itself has to say."""
 
 
 def solve(
@@ -65,221 +86,243 @@ def solve(
     *,
     variance: npt.ArrayLike | None = None,
     weights: npt.ArrayLike | None = None,
-    method: Method = "auto",
+    method: str = "auto",
     extinction_bounds: tuple[float, float] | None = None,
 ) -> HomogeneousResult:
-    r"""Fit background, amplitude and extinction of a homogeneous path.
+    r"""Find background, amplitude and extinction of a homogeneous path.
 
     .. math:: P(R) = P^* + B R^{-2} e^{-2 \sigma R}
-
-    Background and amplitude are linear and are projected out; extinction is found by a matched
-    grid of 24 nodes, a parabola, and five Newton steps that cannot leave the bracket of the best
-    node. Standard errors are those of the information matrix at the solution.
 
     Parameters
     ----------
     power : (..., range) float
-        Signal with its background, in any unit. NaN and infinity leave the bin out.
+        Any unit. Bins that are not finite are left out of the fit.
     range : (range,) float
-        m, positive and monotonic; need not be uniform.
-    variance : float or (..., range) float, optional
-        Noise variance of the power; broadcasts. A bin whose variance is not positive and finite
-        is left out. Where absent, the noise is estimated from second differences of the
-        residuals between neighbouring bins.
+        m, positive, in any strict order and spacing.
+    variance : (..., range) float, optional
+        Noise variance in the square of the power's unit, broadcast against `power`; a scalar
+        holds for every bin. Bins whose variance is zero or not finite are left out.
     weights : (..., range) float, optional
-        Relative weights (inverse variance up to a factor) where there is no variance.
+        Inverse variances up to a common factor, in place of `variance`. Bins whose weight is
+        not positive and finite are left out.
     method : {"auto", "direct", "cubic"}
-        ``direct`` is the fit; ``auto`` chooses it; ``cubic`` takes the background from
-        `lidarops.retrieve.background.cubic` and fits the rest, for comparison.
+        "direct" is the least-squares solution by a fixed number of closed-form steps: the best
+        of 24 extinctions with background and amplitude eliminated (variable projection), the
+        vertex of a parabola through it, five Newton steps. It takes gaps, weights and any
+        spacing, and reaches the least possible scatter. "cubic" takes the background of
+        `lidarops.retrieve.background.cubic`, then fits amplitude and extinction to what is
+        above it; it needs a uniform range without gaps and scatters about twice as much.
+        "auto" chooses "direct".
     extinction_bounds : (float, float), optional
-        m-1; ``(-0.3 / R_end, 60 / L)`` where absent, L being the length of the section. Below
-        the lower one a second, false optimum lies near ``-1 / R_end``.
+        Lowest and highest extinction in m-1; -0.3 / (last range) and 60 / (last - first range)
+        where not given. The lower one keeps a second, unphysical minimum near -1 / (last
+        range) out; it is negative so that noise about zero is not clipped.
 
     Returns
     -------
     HomogeneousResult
-        Not finite where `quality` says why. ``TOO_FEW_BINS``: fewer than 8 valid bins;
-        ``NO_SIGNAL``: constant power; ``LOW_SIGNAL``, ``POORLY_DETERMINED``,
-        ``NEGATIVE_AMPLITUDE``, ``AT_BOUND``: not solved; ``POOR_FIT``, ``NOT_HOMOGENEOUS``,
-        ``OUTLIER``: the model does not describe the data, at a false-alarm rate of 5e-4 each.
+        Without `variance`, the noise is estimated from second differences of the residuals
+        along range and scales the standard errors.
+
+        A result stands (no bit raised) when the signal is more than 5 times its standard error
+        (else LOW_SIGNAL), the standard error of extinction less than 15 percent of extinction
+        + 1 / mean range (POORLY_DETERMINED), the amplitude positive (NEGATIVE_AMPLITUDE) and
+        the extinction off its bounds (AT_BOUND); when the reduced chi-square is within what
+        its degrees of freedom allow (POOR_FIT), the residuals are free of the shapes of
+        backscatter that bends along the path and of a detector that is not linear
+        (NOT_HOMOGENEOUS), and none is beyond 5 standard deviations (OUTLIER); each of these
+        three at a false-alarm rate of 5e-4. Fewer than 8 bins are TOO_FEW_BINS, fewer than 4
+        give NaN; none at all is INPUT_MISSING. A constant profile is NO_SIGNAL: its value is
+        the background, the amplitude is 0 and the extinction NaN.
+
+        Each profile is solved on its own: a result does not depend on what else is in `power`.
 
     Raises
     ------
     RetrievalInputError
-        Where arguments cannot be right, naming the argument.
+        For arguments whose shapes, units or values cannot be right.
 
     References
     ----------
-    golub1973, potapova2023, bobrovsky2024
+    golub1973 (variable projection); bobrovsky2024 (cubic); potapova2023 (linearised step, here
+    about the centroid of information, not about range zero).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> distance = np.arange(2500.0, 10500.0, 37.5)
+    >>> power = 370.0 + 6.25e9 / distance**2 * np.exp(-2 * 3e-5 * distance)
+    >>> float(np.round(solve(power, distance).extinction, 12))
+    3e-05
     """
-    if method not in METHODS:
-        raise RetrievalInputError(
-            f"{method!r} is not known", field="method", remedy=f"choose {', '.join(METHODS)}"
-        )
+    grid = _inputs.range_grid(range)
+    rows, leading = _inputs.profiles(power, grid)
     if variance is not None and weights is not None:
         raise RetrievalInputError(
-            "cannot be given together with variance", field="weights", remedy="give one of them"
+            "is given together with variance", field="weights", remedy="give one of the two"
         )
-    given = profiles(power, range)
-    grid = direct.make_grid(given.range, _bounds(given.range, extinction_bounds))
-    noise = _noise(given, variance, weights)
-    known = variance is not None
-    if method == "cubic":
-        return _with_cubic(given, grid, noise, known=known)
-    return _finish(given, _fit(given, grid, noise, known=known), known=known)
-
-
-def _bounds(distance: Array, given: tuple[float, float] | None) -> tuple[float, float]:
-    length = float(distance[-1] - distance[0]) or 1.0
-    low, high = given or (LOWEST / float(distance[-1]), HIGHEST / length)
-    if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise RetrievalInputError(
-            f"({low}, {high}) are no bounds",
-            field="extinction_bounds",
-            remedy="give two finite values in m-1, the lower first",
-        )
-    return low, high
-
-
-def _noise(given: Profiles, variance: npt.ArrayLike | None, weights: npt.ArrayLike | None) -> Array:
     if variance is not None:
-        return spread(variance, given, "variance")
-    if weights is not None:
-        return spread(weights, given, "weights")
-    return np.ones((1, given.range.size))
-
-
-_Columns = dict[str, Array]
-
-
-def _fit(
-    given: Profiles,
-    grid: direct.Grid,
-    noise: Array,
-    *,
-    known: bool,
-    background: Array | None = None,
-) -> _Columns:
-    out = np.full((given.power.shape[0], len(direct.COLUMNS)), np.nan)
-    # Rounding to the type of the power is noise that no variance tells of.
-    rounding = float(np.finfo(given.power.dtype).eps) / np.sqrt(12.0)
-    held = np.full(1, np.nan) if background is None else background
-    if out.size:
-        direct.solve_profiles(given.power, noise, known, held, rounding, grid, out)
-    return dict(zip(direct.COLUMNS, out.T, strict=True))
-
-
-def _finish(
-    given: Profiles, found: _Columns, *, known: bool, extra: _Columns | None = None
-) -> HomogeneousResult:
-    """Scale errors by the noise, judge the fit, and give the result its shape."""
-    with np.errstate(all="ignore"):
-        level = _level(found, known=known)
-        free = np.where(found["status"] == direct.FITTED, found["bins"] - 3.0, np.nan)
-        chi2 = np.where(free > 0, found["misfit"] / free / level, np.nan)
-        extra = extra or {}
-        errors = {
-            name: np.sqrt(found[f"{name}_variance"] * level + extra.get(name, 0.0))
-            for name in ("background", "amplitude", "extinction")
-        }
-        quality = _judge(found, level, chi2, errors["extinction"], known=known)
-    constant = found["status"] == direct.CONSTANT
-    amplitude = np.where(constant, 0.0, found["amplitude"])
-
-    def shaped(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return given.shaped(np.ascontiguousarray(values))
-
-    return HomogeneousResult(
-        background=shaped(found["background"]),
-        background_standard_error=shaped(errors["background"]),
-        amplitude=shaped(amplitude),
-        amplitude_standard_error=shaped(errors["amplitude"]),
-        extinction=shaped(found["extinction"]),
-        extinction_standard_error=shaped(errors["extinction"]),
-        reduced_chi2=shaped(chi2),
-        valid_bins=shaped(np.nan_to_num(found["bins"]).astype(np.int32)),
-        quality=shaped(quality),
-    )
-
-
-def _level(found: _Columns, *, known: bool) -> Array:
-    """Return the variance of the noise in units of the variance or inverse weight given."""
-    rounding = np.nan_to_num(found["rounding"])
-    if known:
-        return 1.0 + rounding
-    # A second difference of white noise has six times its variance; the fit takes little of it.
-    estimate: Array = found["bends"] / (6.0 * found["bend_count"]) + rounding
-    return estimate
-
-
-def _judge(
-    found: _Columns, level: Array, chi2: Array, error: Array, *, known: bool
-) -> npt.NDArray[np.int32]:
-    status, bins = found["status"], np.nan_to_num(found["bins"])
-    fitted = status == direct.FITTED
-    detection = np.sqrt(found["signal_energy"] / level)
-    relative = error / (found["extinction"] + 1.0 / found["mean_range"])
-    trend = found["trend"] / level
-    largest = found["largest"] / np.sqrt(level)
-    limit = np.maximum(
-        OUTLIER_LIMIT, special.ndtri(1.0 - FALSE_ALARM / (2.0 * np.maximum(bins, 1)))
-    )
-    # Compared so that NaN fails the test.
-    failed = {
-        Quality.INPUT_MISSING: status == direct.EMPTY,
-        Quality.TOO_FEW_BINS: (bins < MIN_BINS) & (status != direct.EMPTY),
-        Quality.NO_SIGNAL: status == direct.CONSTANT,
-        Quality.LOW_SIGNAL: fitted & ~(detection > MIN_DETECTION),
-        Quality.POORLY_DETERMINED: fitted & ~(relative < MAX_RELATIVE_ERROR),
-        Quality.NEGATIVE_AMPLITUDE: fitted & ~(found["amplitude"] > 0.0),
-        Quality.AT_BOUND: fitted & (found["bounded"] != 0.0),
-        Quality.POOR_FIT: fitted & (bins > 3) & ~_plausible(chi2, bins, known=known),
-        Quality.NOT_HOMOGENEOUS: fitted & ~(trend <= _trend_limit(found["trend_count"])),
-        Quality.OUTLIER: fitted & ~(largest <= limit),
-    }
-    quality = np.zeros(status.shape, np.int32)
-    for bit, where in failed.items():
-        quality[where] |= np.int32(bit)
-    return quality
-
-
-def _plausible(chi2: Array, bins: Array, *, known: bool) -> npt.NDArray[np.bool_]:
-    """Return whether a reduced chi-square is what noise alone gives."""
-    freedom = np.maximum(bins - 3.0, 1.0)
-    if known:
-        low = special.chdtri(freedom, 1.0 - FALSE_ALARM / 2.0) / freedom
-        high = special.chdtri(freedom, FALSE_ALARM / 2.0) / freedom
+        noise = _inputs.variance_rows(variance, grid, leading)
     else:
-        width = special.ndtri(1.0 - FALSE_ALARM / 2.0) * np.sqrt(_DIFFERENCE_SPREAD / freedom)
-        low, high = 1.0 / (1.0 + width), 1.0 + width
-    inside: npt.NDArray[np.bool_] = (chi2 >= low) & (chi2 <= high)
-    return inside
-
-
-def _trend_limit(count: Array) -> Array:
-    """Return the energy that `count` shapes of noise exceed with the rate of false alarms."""
-    limit: Array = np.where(count > 0, special.chdtri(np.maximum(count, 1.0), FALSE_ALARM), np.inf)
-    return limit
-
-
-def _with_cubic(
-    given: Profiles, grid: direct.Grid, noise: Array, *, known: bool
-) -> HomogeneousResult:
-    """Hold the background of the cubic, and carry its error into the other two."""
-    of_cubic = backgrounds.cubic(given.power, given.range, variance=noise if known else None)
-    held, error = of_cubic.background, of_cubic.background_standard_error
-    found = _fit(given, grid, noise, known=known, background=held)
-    moved = _fit(given, grid, noise, known=known, background=held + error)
-    extra = {name: (moved[name] - found[name]) ** 2 for name in ("amplitude", "extinction")}
-    extra["background"] = error**2
-    found["background"], found["background_variance"] = held, np.zeros_like(held)
-    result = _finish(given, found, known=known, extra=extra)
-    quality = result.quality | given.shaped(of_cubic.quality.reshape(-1))
-    return HomogeneousResult(
-        **{
-            field: getattr(result, field)
-            for field in result.__dataclass_fields__
-            if field != "quality"
-        },
-        quality=quality,
+        noise = _inputs.noise_rows(weights, "weights", grid, leading)
+    problem = _Problem(
+        power=rows,
+        range=grid.values,
+        noise=noise,
+        known_variance=variance is not None,
+        bounds=_bounds(extinction_bounds, grid.values),
     )
+    solution = _SOLVERS[_method(method)](problem)
+    return _result(solution, problem, leading)
+
+
+def _solve_direct(problem: _Problem) -> _Solution:
+    background = np.full(1, np.nan)
+    return _Solution(_estimate(problem, background), np.zeros(1, dtype=np.int32))
+
+
+def _solve_cubic(problem: _Problem) -> _Solution:
+    """Take the background from the cubic and propagate its error into the rest."""
+    with np.errstate(divide="ignore"):
+        variance = problem.noise if problem.known_variance else 1.0 / problem.noise
+    found, gradients = solve_cubic(
+        problem.power,
+        problem.range,
+        None,
+        variance,
+        known_variance=problem.known_variance,
+        want_gradients=True,
+    )
+    fit = _estimate(problem, found.background)
+    unsolved = np.isnan(found.background)
+    of_background = np.empty_like(fit.extinction)
+    of_amplitude, of_extinction = np.empty_like(of_background), np.empty_like(of_background)
+    for first in np.arange(0, of_background.size, _BLOCK):
+        part = slice(first, first + _BLOCK)
+        noise = np.broadcast_to(variance, problem.power.shape)[part]
+        of_background[part], of_amplitude[part], of_extinction[part] = _propagated(
+            fit.extinction[part], fit.amplitude[part], gradients[part], noise, problem.range
+        )
+    fit = replace(
+        fit,
+        background=found.background,
+        background_variance=of_background,
+        amplitude_relative_variance=of_amplitude,
+        extinction_variance=of_extinction,
+    )
+    status = np.where(unsolved, np.nan, fit.status)
+    return _Solution(replace(fit, status=status), found.quality)
+
+
+def _propagated(
+    extinction: Array, amplitude: Array, gradients: Array, variance: Array, range_: Array
+) -> tuple[Array, Array, Array]:
+    """Propagate the noise of every bin, through the background too, to first order.
+
+    Returns
+    -------
+    tuple of (profile,) float
+        Variance of background, relative variance of amplitude, variance of extinction.
+    """
+    start = range_[0]
+    with np.errstate(all="ignore"):
+        decay = np.exp(-2.0 * extinction[:, np.newaxis] * (range_ - start))
+        phi = (start / range_) ** 2 * decay
+        b = amplitude * np.exp(-2.0 * extinction * start) / start**2
+        weighted = phi / variance
+        norm = (weighted * phi).sum(axis=-1)
+        centroid = (weighted * phi * range_).sum(axis=-1) / norm
+        lever = -2.0 * (range_ - centroid[:, np.newaxis])
+        slope = (weighted * phi * lever**2).sum(axis=-1)
+
+        def response(direction: Array, scale: Array) -> Array:
+            through = direction.sum(axis=-1)[:, np.newaxis] * gradients
+            result: Array = (direction - through) / scale[:, np.newaxis]
+            return result
+
+        of_extinction = response(weighted * lever, b * slope)
+        of_amplitude = response(weighted, b * norm)
+        of_amplitude += 2.0 * centroid[:, np.newaxis] * of_extinction
+        return (
+            (gradients**2 * variance).sum(axis=-1),
+            (of_amplitude**2 * variance).sum(axis=-1),
+            (of_extinction**2 * variance).sum(axis=-1),
+        )
+
+
+def _estimate(problem: _Problem, background: Array) -> Estimate:
+    """Run the kernel, with the background fitted where `background` is NaN."""
+    table = np.full((problem.power.shape[0], len(_direct.COLUMNS)), np.nan)
+    # Half a unit in the last place, as a standard deviation, and what the kernel itself loses.
+    rounding = 0.3 * np.finfo(problem.power.dtype).eps + 8.0 * np.finfo(np.float64).eps
+    _direct.solve_profiles(
+        problem.power,
+        problem.noise,
+        problem.known_variance,
+        background,
+        float(rounding),
+        _direct.make_grid(problem.range, problem.bounds),
+        table,
+    )
+    return Estimate(**dict(zip(_direct.COLUMNS, table.T, strict=True)))
+
+
+_SOLVERS: Final[dict[Method, Callable[[_Problem], _Solution]]] = {
+    Method.AUTO: _solve_direct,
+    Method.DIRECT: _solve_direct,
+    Method.CUBIC: _solve_cubic,
+}
+
+
+def _result(
+    solution: _Solution, problem: _Problem, leading: tuple[int, ...]
+) -> HomogeneousResult:
+    fit = solution.estimate
+    verdict = judge(fit, known_variance=problem.known_variance)
+    fitted, constant = fit.status == _direct.FITTED, fit.status == _direct.CONSTANT
+
+    def shaped(values: Array, where: npt.NDArray[np.bool_], other: float = np.nan) -> Array:
+        return np.where(where, values, other).reshape(leading)
+
+    with np.errstate(invalid="ignore", over="ignore"):
+        background_error = np.sqrt(fit.background_variance * verdict.noise)
+        relative_error = np.sqrt(fit.amplitude_relative_variance * verdict.noise)
+        amplitude_error = np.abs(fit.amplitude) * relative_error
+        extinction_error = np.sqrt(fit.extinction_variance * verdict.noise)
+    return HomogeneousResult(
+        background=shaped(fit.background, fitted | constant),
+        background_standard_error=shaped(
+            background_error, fitted | (constant & problem.known_variance)
+        ),
+        amplitude=np.where(constant.reshape(leading), 0.0, shaped(fit.amplitude, fitted)),
+        amplitude_standard_error=shaped(amplitude_error, fitted),
+        extinction=shaped(fit.extinction, fitted),
+        extinction_standard_error=shaped(extinction_error, fitted),
+        reduced_chi2=shaped(verdict.reduced_chi2, fitted),
+        valid_bins=np.nan_to_num(fit.bins).astype(np.int32).reshape(leading),
+        quality=(verdict.quality | solution.quality).reshape(leading),
+    )
+
+
+def _method(name: str) -> Method:
+    try:
+        return Method(name)
+    except ValueError:
+        raise RetrievalInputError(
+            f"is {name!r}", field="method", remedy=f"choose one of {', '.join(Method)}"
+        ) from None
+
+
+def _bounds(bounds: tuple[float, float] | None, range_: Array) -> tuple[float, float]:
+    length = float(range_[-1] - range_[0]) if range_.size > 1 else 1.0
+    if bounds is None:
+        return LOWEST_EXTINCTION / float(range_[-1]), HIGHEST_OPTICAL_DEPTH / length
+    lowest, highest = (float(bound) for bound in bounds)
+    limit = _LARGEST_OPTICAL_DEPTH / length
+    if not -limit <= lowest < highest <= limit:
+        raise RetrievalInputError(
+            f"is ({lowest:g}, {highest:g}) m-1",
+            field="extinction_bounds",
+            remedy=f"give two rising values within +-{limit:g} m-1 (300 over the length)",
+        )
+    return lowest, highest

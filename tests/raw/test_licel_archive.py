@@ -112,7 +112,7 @@ def test_a_task_reads_only_its_channel_and_files(pilar, monkeypatch):
     assert read == [4 * 4096 + 2] * 4
 
 
-def test_threads_and_processes_agree(pilar, stacked):
+def test_threads_and_pickled_graphs_agree(pilar, stacked):
     archive = open_archive(pilar, channels="photon_532s", profiles_per_chunk=2)
     with dask.config.set(num_workers=2):
         threads = archive.photon_532s.compute(scheduler="threads")

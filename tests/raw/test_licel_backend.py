@@ -230,6 +230,16 @@ def test_a_changed_file_is_refused(file):
         opened.photon_532p.load()
 
 
+def test_a_whole_profile_is_checked_for_its_place(tmp_path):
+    content = bytearray(raw_file())
+    content[licel.parse_header(bytes(content)).datasets[1].offset - 1] = 0
+    path = tmp_path / "x"
+    path.write_bytes(content)
+    opened = xr.open_dataset(path, engine="licel")
+    with pytest.raises(RawFormatError, match="no CRLF follows"):
+        opened.analog_532p.load()
+
+
 def test_the_engine_is_guessed_from_content(file, tmp_path):
     assert "photon_532p" in xr.open_dataset(file)
     assert "licel" in xr.backends.list_engines()

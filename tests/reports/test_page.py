@@ -105,7 +105,7 @@ class TestSimulatedRun:
         ]  # fmt: skip
 
     def test_counts_are_those_of_the_products(self, simulated, tmp_path):
-        found = built(simulated, tmp_path / "report")
+        found = built(simulated, tmp_path / "report", figures=0)
         for product in simulated.scenes[0].products:
             share = percent((product.values - product.unflagged) / product.values)
             assert f"Flagged, {product.kind} {share} of {product.values:,} values" in found.text
@@ -117,7 +117,7 @@ class TestSimulatedRun:
                 assert row in found.text
 
     def test_truth_table_is_the_share_within(self, simulated, tmp_path):
-        found = built(simulated, tmp_path / "report")
+        found = built(simulated, tmp_path / "report", figures=0)
         root = Path(simulated.products)
         with xr.open_dataset(root / "h/extinction.nc") as product:
             product.load()
@@ -139,12 +139,12 @@ class TestSimulatedRun:
             assert row in found.text
 
     def test_wrong_standard_errors_are_called_out(self, simulated, tmp_path, archive):
-        time = times(START, 288, 300.0)
+        time = times(START, 96, 900.0)
         worse = archive.write(
             "h/worse.nc", homogeneous(time, scale=3.0, flagged=0.0), ProductKind.HOMOGENEOUS
         )
         scene = replace(simulated.scenes[0], products=(worse,))
-        found = built(replace(simulated, scenes=(scene,)), tmp_path / "report")
+        found = built(replace(simulated, scenes=(scene,)), tmp_path / "report", figures=0)
         assert found.text.count("too many beyond 3") == 6
         assert "as stated" not in found.text
 
@@ -153,16 +153,19 @@ class TestSimulatedRun:
         truth[f"dark_offset_{CHANNEL}"] = ("granule", np.full(truth.sizes["granule"], 0.5))
         truth.to_netcdf(simulated.truth)
         words = "too many beyond 3"
-        assert words in built(simulated, tmp_path / "without").text
+        assert words in built(simulated, tmp_path / "without", figures=0).text
         plan = simulated.scenes[0].plan
         plan = replace(plan, steps=(*plan.steps, Step("dark", CHANNEL, {"files": 2}, "2 files")))
         scene = replace(simulated.scenes[0], plan=plan)
-        assert words not in built(replace(simulated, scenes=(scene,)), tmp_path / "with").text
+        assert (
+            words
+            not in built(replace(simulated, scenes=(scene,)), tmp_path / "with", figures=0).text
+        )
 
     def test_run_record_is_linked_where_it_stands(self, simulated, tmp_path):
-        assert "run.json" not in built(simulated, tmp_path / "report").links
+        assert "run.json" not in built(simulated, tmp_path / "report", figures=0).links
         record.save(simulated, tmp_path / "report")
-        assert "run.json" in built(simulated, tmp_path / "report").links
+        assert "run.json" in built(simulated, tmp_path / "report", figures=0).links
 
     def test_same_run_gives_the_same_page(self, simulated, tmp_path):
         built(simulated, tmp_path / "report")
@@ -209,7 +212,7 @@ class TestUnusableFiles:
         truth.unlink()
         if content_ is not None:
             truth.write_bytes(content_)
-        found = built(simulated, tmp_path / "report")
+        found = built(simulated, tmp_path / "report", figures=0)
         assert "truth.nc" in found.text[: found.text.index("What was processed")]
         assert "No unflagged value could be compared with the truth." in found.text
 
@@ -306,7 +309,7 @@ class TestManyScenes:
         found = built(many, tmp_path / "report")
         assert "The first 40 of 300 scenes." in found.text
         assert "The first 40 of 300 files." in found.text
-        assert "vertical_299" not in found.text
+        assert "raw/99" not in found.text
 
     def test_figures_are_limited_and_the_rest_is_named(self, archive, tmp_path):
         time = times(START, 5, 60.0)
@@ -342,35 +345,44 @@ NASTY = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("nasty", NASTY)
-def test_every_text_is_escaped(nasty, archive, tmp_path):
-    time = times(START, 4, 60.0)
-    written = archive.write("x.nc", homogeneous(time), ProductKind.HOMOGENEOUS)
-    written = replace(written, channel=nasty, flagged={nasty: 3})
+def nasty_run(nasty: str, archive):
+    """Return a run that says the same nasty thing everywhere."""
+    written = archive.write("x.nc", homogeneous(times(START, 4, 60.0)), ProductKind.HOMOGENEOUS)
     scene = outcome(
         nasty,
         station=nasty,
         instrument=nasty,
-        products=(written,),
+        products=(replace(written, channel=nasty, flagged={nasty: 3}),),
         refused=(fab.granule(nasty, nasty),),
         plan=fab.plan(nasty, LeftOut(nasty, nasty, nasty)),
         seconds={nasty: 1.0},
     )
     failed = replace(scene, scene="failed", products=(), error=nasty)
-    run = run_record(
+    return run_record(
         archive.root, [scene, failed], id=nasty, campaign=nasty, title=nasty, version=nasty,
         archive=nasty, truth=nasty, refused=(fab.granule(nasty, nasty, instrument=nasty),),
     )  # fmt: skip
-    plain = built(run_record(archive.root), tmp_path / "plain")
-    found = built(run, tmp_path / "report")
-    assert set(found.tags) <= set(plain.tags) | {
-        "tr", "td", "th", "table", "thead", "tbody", "details", "summary", "figure", "img",
-        "figcaption", "ul", "li", "div", "span", "h3", "strong", "caption",
-    }  # fmt: skip
-    shown = nasty.encode("utf-8", "backslashreplace").decode()
-    shown = shown.replace("\x07", "\\x07").replace("\x1b", "\\x1b")
-    assert found.text.count(" ".join(shown.split())) >= 10
-    assert "49" not in found.text.split("Provenance")[-1].replace(scene.plan.hash, "")[:60]
+
+
+@pytest.mark.parametrize("nasty", NASTY)
+def test_every_text_is_escaped(nasty, archive, tmp_path):
+    # Drawing is slow, and done for all at once below.
+    found = built(nasty_run(nasty, archive), tmp_path / "report", figures=0)
+    calm = built(nasty_run("calm", archive), tmp_path / "calm", figures=0)
+    assert found.tags == calm.tags
+    shown = nasty.replace("\x07", "\\x07").replace("\x1b", "\\x1b")
+    shown = shown.replace("\udcff\udcfe", "\\udcff\\udcfe").replace("\u202e", "\\u202e")
+    shown = " ".join(shown.split())
+    # Names of bits are shown in lower case.
+    assert found.text.lower().count(shown.lower()) == calm.text.count("calm")
+
+
+def test_every_title_can_be_drawn(archive, tmp_path):
+    runs = [nasty_run(nasty, archive) for nasty in NASTY[4:10]]
+    scenes = tuple(scene for run in runs for scene in run.scenes)
+    found = built(run_record(archive.root, scenes), tmp_path / "report")
+    assert len(found.sources) == 7
+    assert len({found.target(source).resolve() for source in found.sources}) == 7
 
 
 def test_product_names_with_special_characters_are_linked(archive, tmp_path):
@@ -405,11 +417,11 @@ def test_summary_rows_are_plain(simulated):
         "instrument": "horizontal",
         "scenes": 1,
         "failed": 0,
-        "granules": 288,
+        "granules": 96,
         "refused": 0,
         "products": 2,
-        "retrieved values": 576,
-        "flagged": percent((576 - product.unflagged) / 576),
+        "retrieved values": 192,
+        "flagged": percent((192 - product.unflagged) / 192),
         "time": "1.8 s",
     }
 
