@@ -353,14 +353,14 @@ def _plan_table(title: str, plan: Plan) -> Table:
 
 
 def _bench_table(rows: list[Any]) -> Table:
-    table = _table("Throughput, one core, CPU time", "what", "files/s", "MB/s", "of floor")
+    table = _table("Throughput, one core, CPU time", "what", "files/s", "MB/s", "times floor")
     for row in rows:
         _row(
             table,
             row.name,
             f"{row.files_per_second:,.0f}",
             f"{row.megabytes_per_second:,.0f}",
-            f"{row.floor_ratio:.2f}",
+            f"{row.times_floor:.2f}",
         )
     return table
 

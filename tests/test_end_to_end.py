@@ -184,3 +184,11 @@ def test_wrong_use_is_told(
     result = CliRunner().invoke(app, words)
     assert result.exit_code == code
     assert said in result.output
+
+
+def test_the_benchmark_reports_every_way_of_reading(demo_archive: Path) -> None:
+    files = sorted(str(path) for path in (demo_archive / "hill").glob("v24921*"))[:4]
+    result = CliRunner().invoke(app, ["bench", "throughput", *files, "--repeats", "1"])
+    assert result.exit_code == 0, result.output
+    assert "header" in result.stdout
+    assert "times floor" in result.stdout

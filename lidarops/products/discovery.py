@@ -13,7 +13,7 @@ from lidarops import __version__
 from lidarops.products.context import Context
 from lidarops.products.provenance import product_date, product_id
 from lidarops.products.table import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.records import DetectionMode
+from lidarops.records import DetectionMode, LeftOut, Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def _description(context: Context, layout: Layout, made: datetime, why: str) -> 
         f" {context.instrument_name}",
         "processing_level": layout.processing_level,
         "product_version": f"{__version__}+{context.provenance.code_version}",
-        "history": _history(context, made),
+        "history": _history(context, layout, made),
         "references": "\n".join(text for text in references if text),
         "comment": _sentences(metadata.comment, layout.comment, dates),
         "acknowledgement": metadata.acknowledgement or "Not stated.",
@@ -102,20 +102,16 @@ def _wavelength(context: Context) -> str:
     return "wavelength not known"
 
 
-def _history(context: Context, made: datetime) -> str:
+def _history(context: Context, layout: Layout, made: datetime) -> str:
     """One line a step, as CF wants it: when, what, with which program."""
     program = f"lidarops {__version__} ({context.provenance.code_version})"
     plan = context.provenance.plan
-    done = [
-        f"{step.name}: {step.reason}"
-        for step in plan.steps
-        if step.channel in ("", context.channel)
-    ]
-    omitted = [
-        f"left out {left.name}: {left.reason}"
-        for left in plan.left_out
-        if left.channel in ("", context.channel)
-    ]
+
+    def concerns(item: Step | LeftOut) -> bool:
+        return item.channel in ("", context.channel) and item.name not in layout.unused_steps
+
+    done = [f"{step.name}: {step.reason}" for step in plan.steps if concerns(step)]
+    omitted = [f"left out {left.name}: {left.reason}" for left in plan.left_out if concerns(left)]
     lines = [*done, *omitted, f"wrote the {context.kind.value} product"]
     return "\n".join(f"{_iso(made)} {' '.join(line.split())} [{program}]" for line in lines)
 

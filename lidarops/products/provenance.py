@@ -99,7 +99,7 @@ def _product(provenance: Provenance) -> dict[str, Any]:
         "lidarops:scene": provenance.scene,
         "lidarops:kind": provenance.kind.value,
         "lidarops:channel": provenance.channel,
-        "lidarops:settings": _canonical(provenance.settings),
+        "lidarops:settings": _canonical(dict(provenance.settings)),
     }
 
 
@@ -152,7 +152,7 @@ def product_id(provenance: Provenance) -> str:
         "channel": provenance.channel,
         "inputs": sorted([record.role.value, record.sha256] for record in provenance.inputs),
         "plan": provenance.plan.hash,
-        "settings": provenance.settings,
+        "settings": dict(provenance.settings),
         "code_version": provenance.code_version,
     }
     return str(uuid5(NAMESPACE_URL, NAMESPACE + _canonical(content)))

@@ -107,6 +107,8 @@ class Layout:
     comment: str
     sampled: str
     """The dimension besides time."""
+    unused_steps: frozenset[str]
+    """Steps of a scene's plan that other kinds need and this one does not."""
     coordinates: tuple[Row, ...]
     data: tuple[Row, ...]
 
@@ -410,6 +412,7 @@ _SIGNAL = Layout(
     comment="The standard errors of the range bins of one profile share the error of its"
     " background.",
     sampled="range",
+    unused_steps=frozenset({"homogeneous"}),
     coordinates=_coordinates((_RANGE,), _altitude("range")),
     data=(
         Row(
@@ -471,6 +474,7 @@ _HOMOGENEOUS = Layout(
     " range r. altitude, and with it geospatial_vertical_min and _max, is that of the middle of"
     " a section; altitude_bnds holds its ends where the beam stands still.",
     sampled="section",
+    unused_steps=frozenset({"signal", "background"}),
     coordinates=_coordinates((_SECTION, _SECTION_RANGE), _altitude("section", "altitude_bnds")),
     data=(
         Row(

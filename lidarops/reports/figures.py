@@ -82,6 +82,7 @@ def draw_retrieval(sections: Sequence[Section], *, title: str = "") -> Figure:
     panels.estimates(lower, axis, sections, "background")
     panels.time_ticks([upper, lower], axis)
     panels.legend(upper)
+    panels.legend(lower, besides=upper)
     words = f"{title}: retrieved extinction and background against time."
     return _described(figure, f"{words} {_retrieved(sections)}.")
 

@@ -287,8 +287,6 @@ def _shares(record: RunRecord) -> Mapping[str, Mapping[Quality, float]]:
         for label in values
         if values[label] > 0
     }
-    if len(rows) <= _FLAG_ROWS:
-        return rows
     worst = sorted(rows, key=lambda label: -max(rows[label].values(), default=0.0))
     return {label: rows[label] for label in sorted(worst[:_FLAG_ROWS])}
 

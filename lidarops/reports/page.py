@@ -177,7 +177,7 @@ def _scene_row(
         scene=scene.scene,
         station=scene.station,
         instrument=scene.instrument,
-        start=content.moment(scene.start),
+        start=content.moment(scene.start).removesuffix(":00 UTC").removesuffix(" UTC"),
         granules=scene.granules,
         outcome=content.outcome_word(scene),
         products=tuple(

@@ -77,9 +77,20 @@ def nothing(panel: Axes, words: str) -> None:
     panel.text(0.5, 0.5, words, ha="center", va="center", transform=panel.transAxes, color=GREY)
 
 
-def legend(panel: Axes, handles: Sequence[Artist] = (), *, columns: int = 3) -> None:
-    """Write the legend above a panel, where it hides nothing."""
-    found = list(handles) or panel.get_legend_handles_labels()[0]
+def legend(
+    panel: Axes,
+    handles: Sequence[Artist] = (),
+    *,
+    columns: int = 3,
+    besides: Axes | None = None,
+) -> None:
+    """Write the legend above a panel, where it hides nothing; not what is told `besides`."""
+    told = besides.get_legend_handles_labels()[1] if besides is not None else []
+    found = list(handles) or [
+        handle
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+        if label not in told
+    ]
     if found:
         panel.legend(
             handles=found,
@@ -247,7 +258,7 @@ def _limits(sections: Sequence[Section], quantity: str, scale: float) -> tuple[f
     inside = _finite(edges)
     if inside.size == 0:
         rejected = _finite([section.estimates[quantity].value for section in sections])
-        inside = np.percentile(rejected, [10.0, 90.0]) if rejected.size else np.array([0.0, 1.0])
+        inside = np.percentile(rejected, [2.0, 98.0]) if rejected.size else np.array([0.0, 1.0])
     low, high = scale * float(inside.min()), scale * float(inside.max())
     margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - margin, high + margin
@@ -326,7 +337,7 @@ def image(figure: Figure, panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]
     for raster in cut:
         _rejected(panel, axis, raster)
     _altitude_axis(panel, rasters)
-    return _notes(panel, cut, far, full)
+    return _notes(panel, rasters, far, full)
 
 
 def _signal(panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> list[QuadMesh]:
@@ -378,9 +389,9 @@ def _notes(panel: Axes, rasters: Sequence[Raster], far: float, full: float) -> s
     if any(raster.flagged.any() for raster in rasters):
         names = [bit_name(bit) for bit in bits & Quality.rejecting() & ~Quality.INPUT_MISSING]
         notes.append(f"black: flagged {', '.join(names)}")
-        handles.append(Patch(color=_REJECT_COLOR, label=_wrapped(notes[0][7:])))
+        handles.append(Patch(color=_REJECT_COLOR, label=_wrapped(f"flagged: {', '.join(names)}")))
     if far < full:
-        notes.append(f"shown to {far / 1e3:.3g} of {full / 1e3:.3g} km, beyond noise prevails")
+        notes.append(f"shown to {far / 1e3:.3g} of {full / 1e3:.3g} km: noise prevails beyond")
     care = share_with_care(rasters)
     if care > 0:
         names = [bit_name(bit) for bit in bits & ~Quality.rejecting()]
@@ -418,17 +429,21 @@ def background(panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> None:
     """Draw the background of rasters against time, with its standard error."""
     _calm(panel)
     panel.set_ylabel(f"background\n({rasters[0].background_units})")
+    start = np.concatenate([raster.start for raster in rasters])
+    stop = np.concatenate([raster.stop for raster in rasters])
+    order = np.argsort(start, kind="stable")
+    middle = (start + (stop - start) / 2)[order]
+    level = np.concatenate([raster.background for raster in rasters])[order]
+    spread = np.concatenate([raster.background_error for raster in rasters])[order]
+    x, value, error = _with_gaps(middle, axis, level, spread)
     color = _STYLES[0].color
-    for raster in rasters:
-        middle = raster.start + (raster.stop - raster.start) / 2
-        x, value, error = _with_gaps(middle, axis, raster.background, raster.background_error)
-        panel.fill_between(x, value - error, value + error, color=color, alpha=0.3, linewidth=0)
-        panel.plot(
-            x,
-            value,
-            color=color,
-            linewidth=0.9,
-            marker="." if x.size <= _BARS else None,
-            markersize=3.0,
-            gid="values-background",
-        )
+    panel.fill_between(x, value - error, value + error, color=color, alpha=0.3, linewidth=0)
+    panel.plot(
+        x,
+        value,
+        color=color,
+        linewidth=0.9,
+        marker="." if x.size <= _BARS else None,
+        markersize=3.0,
+        gid="values-background",
+    )

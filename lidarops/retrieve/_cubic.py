@@ -7,6 +7,7 @@ with the outer square and the coefficient that the paper misprints, an arbitrary
 expectation of the noise in the coefficients subtracted, and no difference of large numbers.
 """
 
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
 import math
@@ -243,3 +244,65 @@ def solve_profiles(
         _solve_profile(p, v, t, 1.0 if poisson else 0.0, gradients[k % gradients.shape[0]], out[k])
         # Without a noise level nothing was subtracted, and there is no standard error.
         out[k, VARIANCE] *= level / level
+
+
+@_compiled
+def _propagate_profile(
+    extinction: float, b: float, range_: Array, variance: Array, gradient: Array, row: Array
+) -> None:
+    """Propagate the noise of the bins of one profile, through its background too."""
+    start = range_[0]
+    norm = slope = first = whole = 0.0
+    for i in range(range_.size):
+        phi = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction * (range_[i] - start))
+        norm += phi * phi / variance[i]
+        first += phi * phi / variance[i] * range_[i]
+        whole += phi / variance[i]
+    centroid = first / norm
+    tilted = 0.0
+    for i in range(range_.size):
+        phi = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction * (range_[i] - start))
+        lever = -2.0 * (range_[i] - centroid)
+        slope += lever * lever * phi * phi / variance[i]
+        tilted += lever * phi / variance[i]
+    row[:] = 0.0
+    for i in range(range_.size):
+        phi = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction * (range_[i] - start))
+        lever = -2.0 * (range_[i] - centroid)
+        of_extinction = (lever * phi / variance[i] - tilted * gradient[i]) / (b * slope)
+        of_logarithm = (phi / variance[i] - whole * gradient[i]) / (b * norm)
+        of_logarithm += 2.0 * centroid * of_extinction
+        row[0] += gradient[i] * gradient[i] * variance[i]
+        row[1] += of_logarithm * of_logarithm * variance[i]
+        row[2] += of_extinction * of_extinction * variance[i]
+
+
+@_compiled
+def propagate(
+    extinction: Array,
+    amplitude: Array,
+    range_: Array,
+    variance: Array,
+    gradients: Array,
+    out: Array,
+) -> None:
+    """Propagate noise into what is fitted above a background from `solve_profiles`, to first order.
+
+    Parameters
+    ----------
+    extinction, amplitude : (profile,) float
+        m-1, power times m2: the weighted fit to the power less the background.
+    range_ : (bin,) float
+        m.
+    variance : (profile or 1, bin) float64
+    gradients : (profile, bin) float64
+        Derivatives of the background with respect to the power.
+    out : (profile, 3) float64
+        Gets the variance of the background, the relative variance of the amplitude and the
+        variance of the extinction.
+    """
+    start = range_[0]
+    for k in range(extinction.size):
+        b = amplitude[k] * math.exp(-2.0 * extinction[k] * start) / start**2
+        noise = variance[k % variance.shape[0]]
+        _propagate_profile(extinction[k], b, range_, noise, gradients[k], out[k])

@@ -10,6 +10,7 @@ Everything is scaled: ``x = (R - R_0) / L`` with the length L of the section, ex
 and over a power of two, the weights over a power of two.
 """
 
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
 import math
@@ -35,9 +36,12 @@ DEPENDENT: Final = 1e-9
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning.
 _SUMS: Final = {"reassoc", "contract", "nsz"}
+# Inlining by force spares the reference counts of arrays that pass from function to function.
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 _summing = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
-_finding = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"})
+_finding = numba.njit(
+    cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"}
+)
 
 # What became of a profile.
 FITTED: Final = 0
@@ -260,7 +264,11 @@ def _start(g: Grid, s: _Scratch, w0: float, wz: float, free: float) -> tuple[flo
     # At an end of the grid, the vertex is extrapolated from the last three nodes.
     middle = min(max(best, 1), NODES - 2)
     sign = math.copysign(1.0, lengths[best])
-    before, here, after = sign * lengths[middle - 1], sign * lengths[middle], sign * lengths[middle + 1]
+    before, here, after = (
+        sign * lengths[middle - 1],
+        sign * lengths[middle],
+        sign * lengths[middle + 1],
+    )
     low, high = nodes[max(best - 1, 0)], nodes[min(best + 1, NODES - 1)]
     start = nodes[best]
     bend = before - 2.0 * here + after
@@ -271,7 +279,7 @@ def _start(g: Grid, s: _Scratch, w0: float, wz: float, free: float) -> tuple[flo
 
 
 @_compiled
-def _shape(tau: float, x: Array, envelope:Array, step: float, phi: Array, fine: Array) -> None:
+def _shape(tau: float, x: Array, envelope: Array, step: float, phi: Array, fine: Array) -> None:
     n = phi.size
     if step == 0.0:
         for i in range(n):

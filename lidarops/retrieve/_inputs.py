@@ -44,14 +44,15 @@ def real_array(values: npt.ArrayLike, name: str) -> Floats:
         Where they are not real numbers.
     """
     if isinstance(values, np.ma.MaskedArray):
-        values = values.astype(np.float64).filled(np.nan)
+        values = np.where(np.ma.getmaskarray(values), np.nan, values.data)
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":
         raise RetrievalInputError(
             f"holds {array.dtype}, not real numbers", field=name, remedy="give floats or integers"
         )
-    narrow = array.dtype.kind == "f" and array.dtype.itemsize == 4
-    return array.astype(np.float32 if narrow else np.float64, copy=False)
+    if array.dtype.kind == "f" and array.dtype.itemsize == 4:
+        return array.astype(np.float32, copy=False)
+    return array.astype(np.float64, copy=False)
 
 
 def range_grid(values: npt.ArrayLike) -> RangeGrid:

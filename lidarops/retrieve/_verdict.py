@@ -147,7 +147,7 @@ def _determined(fit: Estimate, noise: Array) -> npt.NDArray[np.bool_]:
 
 
 def _limits(fit: Estimate, *, known_variance: bool) -> _Limits:
-    counts = (np.nan_to_num(fit.bins), np.nan_to_num(fit.bend_count), np.nan_to_num(fit.trend_count))
+    counts = [np.nan_to_num(count) for count in (fit.bins, fit.bend_count, fit.trend_count)]
     # Limits depend on counts alone, which most profiles share: evaluate each kind once.
     key = np.zeros(fit.status.shape, dtype=np.int64)
     for count in counts:
@@ -158,7 +158,7 @@ def _limits(fit: Estimate, *, known_variance: bool) -> _Limits:
     return _Limits(*(limit[kind] for limit in limits))
 
 
-def _known_limits(bins: Array, _: Array, shapes: Array) -> tuple[Array, Array, Array, Array]:
+def _known_limits(bins: Array, _: Array, shapes: Array) -> tuple[Array, ...]:
     dof = _residual_dof(bins)
     return (
         special.chdtri(dof, 1.0 - 0.5 * FALSE_ALARM) / dof,
@@ -168,7 +168,7 @@ def _known_limits(bins: Array, _: Array, shapes: Array) -> tuple[Array, Array, A
     )
 
 
-def _estimated_limits(bins: Array, bends: Array, shapes: Array) -> tuple[Array, Array, Array, Array]:
+def _estimated_limits(bins: Array, bends: Array, shapes: Array) -> tuple[Array, ...]:
     independent = bends >= FEWEST_BENDS
     dof = np.where(independent, _BEND_DOF * bends, _residual_dof(bins))
     # The ratio of two estimates of one variance from the same residuals: the logarithm of its

@@ -1,8 +1,8 @@
-"""The retrievals over xarray: units checked, dask-aware, quality merged."""
+"""The retrievals along range over xarray: units checked, sections cut, quality merged."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -11,26 +11,29 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve import background
+from lidarops.retrieve import background as _background
 from lidarops.retrieve import homogeneous as _homogeneous
-from lidarops.retrieve.homogeneous import Method
 
 EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
 """Bits of a bin that keep it out of a fit."""
 CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
 """Bits of a bin that its section carries too."""
+FEWEST_BINS: Final = 4
 
-_VALUES: Final = (
-    "background",
-    "background_standard_error",
-    "amplitude",
-    "amplitude_standard_error",
-    "extinction",
-    "extinction_standard_error",
-    "reduced_chi2",
-)
-_COUNTS: Final = ("valid_bins", "quality_flag")
+_METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
+_TAIL: Final = {"background": "{}", "background_standard_error": "{}"}
+_SECTION: Final = {
+    **_TAIL,
+    "amplitude": "{} m2",
+    "amplitude_standard_error": "{} m2",
+    "extinction": "m-1",
+    "extinction_standard_error": "m-1",
+    "reduced_chi2": "1",
+}
+"""Variables and their units, in terms of the unit of the power."""
+
 _Block = npt.NDArray[Any]
+_Function = Callable[..., tuple[_Block, ...]]
 
 
 def homogeneous(
@@ -39,112 +42,242 @@ def homogeneous(
     sections: Sequence[tuple[float, float]],
     variance: xr.DataArray | float | None = None,
     quality: xr.DataArray | None = None,
-    method: Method = "auto",
+    method: str = "auto",
 ) -> xr.Dataset:
     """Retrieve background, amplitude and extinction of sections of range.
 
     Parameters
     ----------
-    power : xr.DataArray
-        With dimension ``range`` and its coordinate in m; may be dask-backed. Any unit.
+    power : xr.DataArray, (..., range)
+        Any unit; the coordinate of ``range`` in m. May be dask-backed, chunked in any way.
     sections : sequence of (float, float)
-        m; bins with near <= range < far.
+        m; of each, the bins with near <= range < far.
     variance : xr.DataArray or float, optional
-        Of the noise of `power`.
+        Noise variance in the square of the power's unit. Its dimensions are among those of
+        `power`.
     quality : xr.DataArray, optional
-        Bits of each bin, as `lidarops.retrieve.labeled_signal.condition` gives them. Missing,
-        saturated and incompletely overlapping bins are left out; a section carries the bits
-        SATURATED, PILE_UP and INCOMPLETE_OVERLAP of its bins.
+        Bits of `lidarops.flags.Quality` of each bin. Missing, saturated and incompletely
+        overlapping bins are left out; a section carries SATURATED, PILE_UP and
+        INCOMPLETE_OVERLAP of its bins.
     method : {"auto", "direct", "cubic"}
+        See `lidarops.retrieve.homogeneous.solve`.
 
     Returns
     -------
-    xr.Dataset
-        Over the other dimensions of `power` and ``section``; as lazy as the input. The same bits
-        for any chunking.
+    xr.Dataset, (..., section)
+        ``background``, ``amplitude``, ``extinction``, each with ``_standard_error``,
+        ``reduced_chi2``, ``valid_bins`` and ``quality_flag``, with the coordinates ``section``,
+        ``section_range`` (its middle) and ``section_bounds``; as lazy as the input, and the same
+        to the last bit for any chunking.
 
     Raises
     ------
     RetrievalInputError
-        Where units or sections cannot be right.
+        Where units, dimensions or sections cannot be right.
     """
     distance = _distance(power)
-    parts = [_section(power, distance, section, variance, quality, method) for section in sections]
-    if not parts:
-        raise RetrievalInputError(
-            "is empty", field="sections", remedy="give [[near, far], ...] in m"
-        )
-    result: xr.Dataset = xr.concat(parts, dim="section")
+    edges = _edges(sections)
+    inputs = _Inputs.gather(power, variance, quality)
+    parts = [_section(inputs, distance, near, far, method) for near, far in edges]
     others = [dim for dim in power.dims if dim != "range"]
-    edges = np.asarray(sections, dtype=np.float64)
-    result = result.transpose(*others, "section").assign_coords(
+    result: xr.Dataset = xr.concat(parts, dim="section").transpose(*others, "section")
+    _set_units(result, _SECTION, power)
+    return result.assign_coords(
         section=("section", np.arange(len(parts), dtype=np.int32)),
         section_range=("section", edges.mean(axis=1), {"units": "m"}),
         section_bounds=(("section", "nv"), edges, {"units": "m"}),
     )
-    unit = power.attrs.get("units", "1")
-    for name in _VALUES:
-        result[name].attrs["units"] = (
-            unit if "background" in name else f"{unit} m2" if "amplitude" in name else "m-1"
-        )
-    result["reduced_chi2"].attrs["units"] = "1"
+
+
+def tail_mean(
+    power: xr.DataArray,
+    *,
+    start: float | None = None,
+    variance: xr.DataArray | float | None = None,
+) -> xr.Dataset:
+    """Take the mean of the far bins as background; see `lidarops.retrieve.background.tail_mean`.
+
+    Parameters
+    ----------
+    power : xr.DataArray, (..., range)
+        Any unit; the coordinate of ``range`` in m.
+    start : float, optional
+        m; bins from here on are averaged, the last tenth of the bins where not given.
+    variance : xr.DataArray or float, optional
+        Noise variance in the square of the power's unit.
+
+    Returns
+    -------
+    xr.Dataset, (...)
+        ``background``, ``background_standard_error`` and ``quality_flag``.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where units, dimensions or `start` cannot be right.
+    """
+    distance = _distance(power)
+    inputs = _Inputs.gather(power, variance, None)
+    outputs = inputs.map(_tail_mean, len(_TAIL), 1, {"range": distance, "start": start})
+    result = xr.Dataset(dict(zip((*_TAIL, "quality_flag"), outputs, strict=True)))
+    _set_units(result, _TAIL, power)
     return result
 
 
+class _Inputs:
+    """Power and what comes with it, aligned, the range of each in one chunk."""
+
+    def __init__(self, arrays: Mapping[str, xr.DataArray], variance: float | None) -> None:
+        self._arrays = arrays
+        self._variance = variance
+
+    @classmethod
+    def gather(
+        cls,
+        power: xr.DataArray,
+        variance: xr.DataArray | float | None,
+        quality: xr.DataArray | None,
+    ) -> _Inputs:
+        arrays = {"power": power}
+        number = None
+        if isinstance(variance, xr.DataArray):
+            arrays["variance"] = variance
+        else:
+            number = variance
+        if quality is not None:
+            arrays["quality"] = quality
+        for name, array in arrays.items():
+            _check_dimensions(array, power, name)
+        return cls({name: _one_chunk(array) for name, array in arrays.items()}, number)
+
+    def isel(self, bins: slice) -> _Inputs:
+        cut = {
+            name: array.isel(range=bins, missing_dims="ignore")
+            for name, array in self._arrays.items()
+        }
+        return _Inputs(cut, self._variance)
+
+    def map(
+        self, function: _Function, values: int, counts: int, settings: Mapping[str, Any]
+    ) -> tuple[xr.DataArray, ...]:
+        """Map a function of blocks that gives `values` floats and `counts` integers a profile."""
+        outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
+            _on_blocks,
+            *self._arrays.values(),
+            input_core_dims=[
+                ["range"] if "range" in array.dims else [] for array in self._arrays.values()
+            ],
+            output_core_dims=[[]] * (values + counts),
+            kwargs={
+                "function": function,
+                "ranged": {name: "range" in array.dims for name, array in self._arrays.items()},
+                "settings": {"variance": self._variance} | dict(settings),
+            },
+            dask="parallelized",
+            output_dtypes=[np.float64] * values + [np.int32] * counts,
+            keep_attrs=False,
+        )
+        return outputs
+
+
+def _on_blocks(
+    *blocks: _Block, function: _Function, ranged: Mapping[str, bool], settings: Mapping[str, Any]
+) -> tuple[_Block, ...]:
+    # What holds for whole profiles broadcasts along range.
+    arguments = {
+        name: block if along else np.asarray(block)[..., np.newaxis]
+        for (name, along), block in zip(ranged.items(), blocks, strict=True)
+    }
+    return function(**(dict(settings) | arguments))
+
+
+def _section(
+    inputs: _Inputs, distance: npt.NDArray[np.float64], near: float, far: float, method: str
+) -> xr.Dataset:
+    inside = np.flatnonzero((distance >= near) & (distance < far))
+    if inside.size < FEWEST_BINS:
+        raise RetrievalInputError(
+            f"[{near:g}, {far:g}] m holds {inside.size} bins of the range grid, which reaches"
+            f" from {distance.min():g} to {distance.max():g} m",
+            field="sections",
+            remedy=f"choose sections that hold at least {FEWEST_BINS}, better 50, bins",
+        )
+    bins = slice(int(inside[0]), int(inside[-1]) + 1)
+    settings = {"range": distance[bins], "method": method}
+    outputs = inputs.isel(bins).map(_solve, len(_SECTION), 2, settings)
+    names = (*_SECTION, "valid_bins", "quality_flag")
+    return xr.Dataset(dict(zip(names, outputs, strict=True)))
+
+
+def _solve(
+    power: _Block,
+    variance: _Block | float | None,
+    quality: _Block | None = None,
+    *,
+    range: _Block,  # noqa: A002 - the field's word
+    method: str,
+) -> tuple[_Block, ...]:
+    carried = np.int32(0)
+    if quality is not None:
+        power = np.where((quality & EXCLUDED) != 0, np.nan, power)
+        carried = np.bitwise_or.reduce(quality & CARRIED, axis=-1).astype(np.int32)
+    found = _homogeneous.solve(power, range, variance=variance, method=method)
+    values = tuple(getattr(found, name) for name in _SECTION)
+    return (*values, found.valid_bins, found.quality | carried)
+
+
+def _tail_mean(
+    power: _Block,
+    variance: _Block | float | None,
+    *,
+    range: _Block,  # noqa: A002 - the field's word
+    start: float | None,
+) -> tuple[_Block, ...]:
+    found = _background.tail_mean(power, range, start=start, variance=variance)
+    return found.background, found.background_standard_error, found.quality
+
+
 def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:
+    """Return the range coordinate, in m and monotonic."""
     if "range" not in power.dims or "range" not in power.coords:
         raise RetrievalInputError(
-            f"has dimensions {power.dims}",
+            f"has the dimensions {power.dims} and coordinates {tuple(power.coords)}",
             field="power",
             remedy="give it a dimension range with a coordinate in m",
         )
     unit = power["range"].attrs.get("units")
-    if unit not in ("m", "meter", "metre"):
+    if unit not in _METRES:
         raise RetrievalInputError(
-            f"has units {unit!r}",
+            f"is in {unit!r}, not in 'm'" if unit else "has no attribute units",
             field="range",
             remedy="convert the coordinate to m and set its attribute units to 'm'",
         )
-    return power["range"].to_numpy().astype(np.float64)
+    distance = power["range"].to_numpy().astype(np.float64)
+    steps = np.diff(distance)
+    if not (np.all(steps > 0) or np.all(steps < 0)):
+        raise RetrievalInputError("is not finite and strictly monotonic", field="range")
+    return distance
 
 
-def _section(
-    power: xr.DataArray,
-    distance: npt.NDArray[np.float64],
-    section: tuple[float, float],
-    variance: xr.DataArray | float | None,
-    quality: xr.DataArray | None,
-    method: Method,
-) -> xr.Dataset:
-    near, far = section
-    inside = np.flatnonzero((distance >= near) & (distance < far))
-    if inside.size < 4:
+def _edges(sections: Sequence[tuple[float, float]]) -> npt.NDArray[np.float64]:
+    edges = np.asarray(sections, dtype=np.float64)
+    if edges.ndim != 2 or edges.shape[1] != 2 or not np.all(edges[:, 0] < edges[:, 1]):
         raise RetrievalInputError(
-            f"[{near:g}, {far:g}] m holds {inside.size} bins",
-            field="sections",
-            remedy=f"the bins reach from {distance.min():g} to {distance.max():g} m",
+            f"is {sections!r}", field="sections", remedy="give pairs (near, far) in m, near first"
         )
-    part = slice(int(inside[0]), int(inside[-1]) + 1)
-    arrays: list[Any] = [power.isel(range=part)]
-    arrays.append(variance.isel(range=part) if isinstance(variance, xr.DataArray) else variance)
-    arrays.append(None if quality is None else quality.isel(range=part))
-    present = [array for array in arrays if isinstance(array, xr.DataArray)]
-    outputs = xr.apply_ufunc(
-        _solve,
-        *[_one_chunk(array) for array in present],
-        input_core_dims=[["range"] if "range" in array.dims else [] for array in present],
-        output_core_dims=[[]] * (len(_VALUES) + len(_COUNTS)),
-        kwargs={
-            "range": distance[part],
-            "method": method,
-            "has_variance": isinstance(variance, xr.DataArray),
-            "has_quality": quality is not None,
-            "variance": None if isinstance(variance, xr.DataArray) else variance,
-        },
-        dask="parallelized",
-        output_dtypes=[np.float64] * len(_VALUES) + [np.int32] * len(_COUNTS),
-    )
-    return xr.Dataset(dict(zip((*_VALUES, *_COUNTS), outputs, strict=True)))
+    return edges
+
+
+def _check_dimensions(array: xr.DataArray, power: xr.DataArray, name: str) -> None:
+    extra = set(array.dims) - set(power.dims)
+    try:
+        xr.align(power, array, join="exact", copy=False)
+    except ValueError as error:
+        raise RetrievalInputError(f"does not fit power: {error}", field=name) from error
+    if extra:
+        raise RetrievalInputError(
+            f"has the dimensions {array.dims}, power has {power.dims}", field=name
+        )
 
 
 def _one_chunk(array: xr.DataArray) -> xr.DataArray:
@@ -153,74 +286,7 @@ def _one_chunk(array: xr.DataArray) -> xr.DataArray:
     return array
 
 
-def _solve(
-    power: _Block,
-    *others: _Block,
-    range: _Block,  # noqa: A002 - the field's word
-    method: Method,
-    has_variance: bool,
-    has_quality: bool,
-    variance: float | None,
-) -> tuple[_Block, ...]:
-    noise: Any = others[0] if has_variance else variance
-    carried = np.int32(0)
-    if has_quality:
-        bits = others[-1]
-        power = np.where((bits & EXCLUDED) != 0, np.nan, power)
-        carried = np.bitwise_or.reduce(bits, axis=-1) & np.int32(CARRIED)
-    result = _homogeneous.solve(power, range, variance=noise, method=method)
-    values = [getattr(result, name) for name in _VALUES]
-    return (*values, result.valid_bins, result.quality | carried)
-
-
-def tail_mean(
-    power: xr.DataArray,
-    *,
-    start: float | None = None,
-    variance: xr.DataArray | None = None,
-) -> xr.Dataset:
-    """Average the far bins of a signal; see `lidarops.retrieve.background.tail_mean`.
-
-    Parameters
-    ----------
-    power : xr.DataArray
-        With dimension ``range`` and its coordinate in m.
-    start : float, optional
-        m; nearest bin to average. The last tenth of the bins where absent.
-    variance : xr.DataArray, optional
-        Of the noise of `power`.
-
-    Returns
-    -------
-    xr.Dataset
-        ``background``, ``background_standard_error`` and ``quality_flag`` over the other
-        dimensions.
-
-    Raises
-    ------
-    RetrievalInputError
-        As the function it maps.
-    """
-    arrays = [power] if variance is None else [power, variance]
-    outputs = xr.apply_ufunc(
-        _tail_mean,
-        *[_one_chunk(array) for array in arrays],
-        input_core_dims=[["range"]] * len(arrays),
-        output_core_dims=[[]] * 3,
-        kwargs={"range": _distance(power), "start": start},
-        dask="parallelized",
-        output_dtypes=[np.float64, np.float64, np.int32],
-    )
-    names = ("background", "background_standard_error", "quality_flag")
-    return xr.Dataset(dict(zip(names, outputs, strict=True)))
-
-
-def _tail_mean(
-    power: _Block,
-    variance: _Block | None = None,
-    *,
-    range: _Block,  # noqa: A002 - the field's word
-    start: float | None,
-) -> tuple[_Block, _Block, _Block]:
-    found = background.tail_mean(power, range, start=start, variance=variance)
-    return found.background, found.background_standard_error, found.quality
+def _set_units(result: xr.Dataset, units: Mapping[str, str], power: xr.DataArray) -> None:
+    own = power.attrs.get("units", "1")
+    for name, pattern in units.items():
+        result[name].attrs["units"] = pattern.format(own).removeprefix("1 ")

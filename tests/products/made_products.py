@@ -39,6 +39,8 @@ def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> P
         scene=SCENE,
         steps=(
             Step("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
+            Step("background", "photon_532o", {"range": [1e4, 1.2e4]}, "the last tenth"),
+            Step("homogeneous", "photon_532o", {"method": "auto"}, "asked for"),
             Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
         ),
         left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),

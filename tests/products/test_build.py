@@ -175,12 +175,20 @@ def test_dates_are_those_of_data_or_release_or_environment(monkeypatch: pytest.M
         created()
 
 
-def test_history_tells_of_this_channel_only_one_line_a_step():
-    lines = build(homogeneous(), context()).attrs["history"].splitlines()
-    assert len(lines) == 3
+@pytest.mark.parametrize(
+    ("kind", "steps"),
+    [
+        (ProductKind.HOMOGENEOUS, ["read", "homogeneous"]),
+        (ProductKind.SIGNAL, ["read", "background"]),
+    ],
+)
+def test_history_tells_what_made_this_product_one_line_a_step(kind: ProductKind, steps: list[str]):
+    lines = build(MAKERS[kind](), context(kind)).attrs["history"].splitlines()
     assert all(line.startswith("2026-") and "lidarops" in line for line in lines)
-    assert "the product needs it" in lines[0]
-    assert "left out dark: photon counting has no dark signal" in lines[1]
+    *done, omitted, last = lines
+    assert [line.split()[1].rstrip(":") for line in done] == steps
+    assert "left out dark: photon counting has no dark signal" in omitted
+    assert f"wrote the {kind} product" in last
 
 
 def test_empty_metadata_still_says_something():

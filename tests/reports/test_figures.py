@@ -127,6 +127,15 @@ class TestRetrieval:
         assert legend_texts(upper).count("truth of the simulation") == 1
         assert not lines(figures.retrieval([homogeneous(time)]).axes[0], "truth-extinction")
 
+    def test_each_panel_tells_what_it_alone_shows(self):
+        time = times(START, 60, 300.0)
+        truth = truth_of(time)
+        truth["extinction"][:] = np.nan
+        upper, lower = figures.retrieval([homogeneous(time)], truth, **WHOSE).axes
+        assert "truth of the simulation" not in legend_texts(upper)
+        assert "truth of the simulation" in legend_texts(lower)
+        assert not set(legend_texts(upper)) & set(legend_texts(lower))
+
     def test_no_line_bridges_a_gap(self):
         time = np.concatenate([times(START, 20, 60.0), times(START + timedelta(hours=1), 20, 60.0)])
         product = homogeneous(time, flagged=0.0)
@@ -255,10 +264,17 @@ class TestQuicklook:
         low, high = figure.axes[0].get_ylim()
         np.testing.assert_allclose(beside.get_ylim(), [0.12 + 0.94 * low, 0.12 + 0.94 * high])
 
+    def test_share_with_care_is_that_of_the_product(self):
+        product = signal(times(START, 60, 60.0), gates=4000, gate=15.0)
+        share = ((product["quality_flag"].values & int(Quality.PILE_UP)) != 0).mean()
+        assert share > 0.0015
+        words = figures.alt_text(figures.quicklook([product]))
+        assert f"use {100 * share:.1f} % of gates with care (pile_up)" in words
+
     def test_far_noise_is_left_out_and_told(self):
         figure = figures.quicklook([signal(times(START, 60, 60.0), gates=4000, gate=15.0)])
         assert figure.axes[0].get_ylim()[1] < 30.0
-        assert "of 60 km, beyond noise prevails" in figures.alt_text(figure)
+        assert "of 60 km: noise prevails beyond" in figures.alt_text(figure)
 
 
 class TestFlags:

@@ -126,7 +126,7 @@ records = st.builds(
 
 @given(record=records)
 @settings(
-    max_examples=150,
+    max_examples=100,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
