@@ -385,6 +385,7 @@ def _retrieve_signal(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.D
     start, stop = steps[StepName.BACKGROUND].settings["range"]
     tail = labeled.tail_mean(
         conditioned["power"].sel(range=slice(start, stop)),
+        start=start,
         variance=conditioned["variance"].sel(range=slice(start, stop)),
     )
     result = labeled_signal.range_corrected(
@@ -393,7 +394,9 @@ def _retrieve_signal(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.D
     return result.assign(
         background=tail["background"],
         background_standard_error=tail["background_standard_error"],
-        quality_flag=conditioned["quality"],
+        # Without a background there is no signal above it.
+        quality_flag=conditioned["quality"]
+        | xr.where(tail["background"].isnull(), int(Quality.INPUT_MISSING), 0).astype("int32"),
     )
 
 

@@ -6,6 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from lidarops.cli import app
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -23,3 +26,14 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip("no real data here: set LIDAROPS_TEST_DATA")
     return root
+
+
+@pytest.fixture(scope="session")
+def demo_archive(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The simulated demo archive, written by the command line."""
+    archive = tmp_path_factory.mktemp("demo") / "raw"
+    result = CliRunner().invoke(
+        app, ["simulate", str(repository / "catalogs/demo.yaml"), "--archive", str(archive)]
+    )
+    assert result.exit_code == 0, result.output
+    return archive

@@ -6,8 +6,11 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import factories
+import fsspec
 import numpy as np
 import pytest
+import rawfiles
 import xarray as xr
 from typer.testing import CliRunner
 
@@ -15,19 +18,9 @@ from lidarops.campaign import Campaign, load
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.engine import run
+from lidarops.flags import Quality
 from lidarops.pipeline import prepare
 from lidarops.records import RunRecord, Status
-
-
-@pytest.fixture(scope="session")
-def demo_archive(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The simulated demo archive, written by the command line."""
-    archive = tmp_path_factory.mktemp("demo") / "raw"
-    result = CliRunner().invoke(
-        app, ["simulate", str(repository / "catalogs/demo.yaml"), "--archive", str(archive)]
-    )
-    assert result.exit_code == 0, result.output
-    return archive
 
 
 def _campaign(repository: Path, archive: Path, out: Path) -> Campaign:
@@ -192,3 +185,78 @@ def test_the_benchmark_reports_every_way_of_reading(demo_archive: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "header" in result.stdout
     assert "times floor" in result.stdout
+
+
+def test_a_profile_without_shots_is_flagged_and_the_rest_stands(tmp_path: Path) -> None:
+    for k in range(4):
+        data = rawfiles.content(k, bins=1000)
+        if k == 2:
+            data = data.replace(b" 000600 ", b" 000000 ")
+        rawfiles.write(tmp_path / "raw" / "coast" / f"h{k}", data)
+    wanted = {
+        "signal": {},
+        "homogeneous": {"channels": ["photon_532o", "analog_532o"], "sections": [[750, 4500]]},
+    }
+    campaign = factories.campaign(products=wanted).model_copy(
+        update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
+    )
+    record = run(campaign, prepare(campaign))
+    assert not record.failed
+    for product in record.scenes[0].products:
+        opened = xr.load_dataset(Path(record.products) / product.path)
+        flags = opened["quality_flag"].values
+        assert (flags[2] & Quality.INPUT_MISSING != 0).all()
+        assert (flags[[0, 1, 3]] & Quality.INPUT_MISSING == 0).all()
+
+
+def test_a_file_that_changes_after_cataloguing_is_refused(tmp_path: Path) -> None:
+    for k in range(3):
+        rawfiles.write(tmp_path / "raw" / "coast" / f"h{k}", rawfiles.content(k, bins=1000))
+    campaign = factories.campaign().model_copy(
+        update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
+    )
+    cut = prepare(campaign)
+    rawfiles.write(tmp_path / "raw" / "coast" / "h1", b"grown")
+    (tmp_path / "raw" / "coast" / "h2").unlink()
+    record = run(campaign, cut)
+    assert record.failed
+    assert record.scenes[0].error == ""
+    reasons = {granule.path: granule.reason for granule in record.scenes[0].refused}
+    assert set(reasons) == {"coast/h1", "coast/h2"}
+    assert "catalog" in reasons["coast/h1"]
+    assert record.scenes[0].products[0].values == 1
+
+
+def test_a_disk_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    rawfiles.write(tmp_path / "raw" / "coast" / "h0", rawfiles.content(0, bins=1000))
+    campaign = factories.campaign().model_copy(
+        update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
+    )
+    cut = prepare(campaign)
+    (tmp_path / "out" / "products").write_text("a file where a folder should be")
+    record = run(campaign, cut)
+    assert record.failed
+    assert "products" in record.scenes[0].error
+    assert not record.scenes[0].products
+
+
+def test_an_archive_behind_a_url_gives_the_same_products(
+    tmp_path: Path,
+) -> None:
+    memory = fsspec.filesystem("memory")
+    for k in range(3):
+        data = rawfiles.content(k, bins=1000, seed=k)
+        rawfiles.write(tmp_path / "raw" / "coast" / f"h{k}", data)
+        memory.pipe(f"/lidar-url/coast/h{k}", data)
+    hashes = []
+    try:
+        for where in (str(tmp_path / "raw"), "memory://lidar-url"):
+            out = tmp_path / f"out{len(hashes)}"
+            campaign = factories.campaign().model_copy(
+                update={"archive": where, "output": str(out)}
+            )
+            hashes.append(_hashes(run(campaign, prepare(campaign))))
+    finally:
+        memory.rm("/lidar-url", recursive=True)
+    assert hashes[0] == hashes[1]
+    assert hashes[0]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -59,6 +61,22 @@ class Section:
         return np.asarray((self.flag & int(Quality.rejecting())) != 0)
 
 
+class Verdict(StrEnum):
+    """What a comparison with the truth says of the stated standard errors."""
+
+    AS_STATED = "as stated"
+    BEYOND = "too many beyond 3"
+    UNDERSTATED = "errors understated"
+    OVERSTATED = "errors overstated"
+    SHARED = "profiles share an error"
+    NO_ERROR = "values without an error"
+
+    @property
+    def unsafe(self) -> bool:
+        """Whether a user would trust the values more than they deserve."""
+        return self in {Verdict.BEYOND, Verdict.UNDERSTATED, Verdict.NO_ERROR}
+
+
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """How unflagged values of one section compare with the truth."""
@@ -79,17 +97,25 @@ class Comparison:
     """Values without a flag and with a truth, but not finite with a positive standard error."""
 
     @property
-    def suspicious(self) -> bool:
-        """Whether more values lie beyond 3 standard errors than chance allows.
+    def verdict(self) -> Verdict:
+        """What the comparison says of the stated standard errors.
 
-        Chance allows the expected 0.27 percent and three times its Poisson spread, but at
-        least one value.
+        Chance allows the expected 0.27 percent beyond 3 and three times its Poisson spread, but
+        at least one value; 4 standard deviations of the spread of `count` normal errors,
+        1 / sqrt(2 count), around 1; and 5 of their mean, 1 / sqrt(count), around 0.
         """
-        if self.count == 0:
-            return self.without_error > 0
+        if self.without_error > 0:
+            return Verdict.NO_ERROR
         expected = 0.0027 * self.count
         beyond = round((1.0 - self.within_3) * self.count)
-        return self.without_error > 0 or beyond > max(1.0, expected + 3.0 * expected**0.5)
+        chance = 4.0 / math.sqrt(2.0 * self.count)
+        if beyond > max(1.0, expected + 3.0 * math.sqrt(expected)):
+            return Verdict.BEYOND
+        if self.spread > 1.0 + chance:
+            return Verdict.UNDERSTATED
+        if abs(self.bias) > 5.0 / math.sqrt(self.count):
+            return Verdict.SHARED
+        return Verdict.OVERSTATED if self.spread < 1.0 - chance else Verdict.AS_STATED
 
 
 def read_sections(

@@ -93,7 +93,8 @@ def largest_root(a: float, b: float, c: float) -> float:
     p = b - a * a / 3.0
     q = 2.0 * (a / 3.0) ** 3 - a * b / 3.0 + c
     discriminant = (p / 3.0) ** 3 + (0.5 * q) ** 2
-    if discriminant <= 0.0 and p < 0.0:
+    # Within rounding, a double root is real: as a single one it would be lost.
+    if discriminant <= 1e-13 * q * q and p < 0.0:
         radius = 2.0 * math.sqrt(-p / 3.0)
         cosine = min(max(3.0 * q / (p * radius), -1.0), 1.0)
         return radius * math.cos(math.acos(cosine) / 3.0) - a / 3.0
@@ -174,16 +175,24 @@ def _centre(p: Array) -> float:
 
 
 @_compiled
+def _coarse(value: float, step: float) -> float:
+    """Round to a multiple of a power of two, so that what it is subtracted from keeps its bits."""
+    return math.floor(value / step + 0.5) * step
+
+
+@_compiled
 def _solve_profile(
     p: Array, v: Array, t: Triples, poisson: float, gradient: Array, row: Array
 ) -> None:
     """Solve one loaded profile: the root about a rough centre, then one Newton step about it."""
-    centre, scale = _centre(p), 0.0
+    centre, largest = _centre(p), 0.0
     for i in range(p.size):
-        scale = max(scale, abs(p[i] - centre))
-    if scale == 0.0:
+        largest = max(largest, abs(p[i] - centre))
+    if largest == 0.0:
         row[STATUS], row[BACKGROUND] = CONSTANT, p[0]
         return
+    scale = math.ldexp(1.0, math.frexp(largest)[1])
+    centre = _coarse(centre, scale * 2.0**-20)
     for i in range(p.size):
         p[i] = (p[i] - centre) / scale
         v[i] /= scale * scale
@@ -191,6 +200,7 @@ def _solve_profile(
     unit = poisson / scale
     s = _coefficients(p, v, t, unit)
     x = largest_root(s.square / s.cubic, s.linear / s.cubic, s.constant / s.cubic)
+    x = _coarse(x, 2.0**-26)
     for i in range(p.size):
         p[i] -= x
     s = _coefficients(p, v, t, unit)

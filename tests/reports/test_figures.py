@@ -235,7 +235,7 @@ class TestQuicklook:
         np.testing.assert_allclose(edges[gap : gap + 2], [2.0, 4.0], atol=1e-6)
 
     def test_large_products_are_reduced(self):
-        product = signal(times(START, 3100, 20.0), gates=3000, gate=3.0)
+        product = signal(times(START, 1600, 20.0), gates=1700, gate=3.0)
         panel = figures.quicklook([product]).axes[0]
         rows, columns = panel.collections[0].get_array().shape
         assert rows <= 800

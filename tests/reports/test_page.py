@@ -84,8 +84,11 @@ def built(run, folder: Path, **options) -> Page:
 
 
 class TestSimulatedRun:
-    def test_holds_every_section_and_figure(self, simulated, tmp_path):
+    def test_holds_every_section_and_figure_and_is_the_same_again(self, simulated, tmp_path):
         found = built(simulated, tmp_path / "report")
+        again = page.build(simulated, tmp_path / "report-again").parent
+        for path in found.folder.iterdir():
+            assert path.read_bytes() == (again / path.name).read_bytes()
         for words in (
             "Demonstration campaign", "20240302T000000-1a2b", "0.1.0+abc123", "1 min 30 s",
             "What was processed", "What was left out", "What was flagged", "What was refused",
@@ -147,6 +150,7 @@ class TestSimulatedRun:
         found = built(replace(simulated, scenes=(scene,)), tmp_path / "report", figures=0)
         assert found.text.count("too many beyond 3") == 6
         assert "as stated" not in found.text
+        assert "errors understated" not in found.text
 
     def test_dark_offset_belongs_to_the_truth_unless_subtracted(self, simulated, tmp_path):
         truth = xr.load_dataset(simulated.truth)
@@ -166,12 +170,6 @@ class TestSimulatedRun:
         assert "run.json" not in built(simulated, tmp_path / "report", figures=0).links
         record.save(simulated, tmp_path / "report")
         assert "run.json" in built(simulated, tmp_path / "report", figures=0).links
-
-    def test_same_run_gives_the_same_page(self, simulated, tmp_path):
-        built(simulated, tmp_path / "report")
-        first = {path.name: path.read_bytes() for path in (tmp_path / "report").iterdir()}
-        built(simulated, tmp_path / "report")
-        assert first == {path.name: path.read_bytes() for path in (tmp_path / "report").iterdir()}
 
 
 class TestUnusableFiles:
@@ -313,7 +311,7 @@ class TestManyScenes:
 
     def test_figures_are_limited_and_the_rest_is_named(self, archive, tmp_path):
         time = times(START, 5, 60.0)
-        names = [f"photon_{300 + i}o" for i in range(5)]
+        names = [f"photon_{300 + i}o" for i in range(3)]
         products = tuple(
             replace(
                 archive.write(f"{name}.nc", signal(time, gates=50), ProductKind.SIGNAL),
@@ -322,9 +320,9 @@ class TestManyScenes:
             for name in names
         )
         run = run_record(archive.root, [outcome("s", products=products)])
-        found = built(run, tmp_path / "report", figures=2)
-        assert len(found.sources) == 3
-        assert "3 channels are not drawn" in found.text
+        found = built(run, tmp_path / "report", figures=1)
+        assert len(found.sources) == 2
+        assert "2 channels are not drawn" in found.text
         assert all(name in found.text for name in names)
 
     def test_more_sections_than_a_panel_holds(self, archive, tmp_path):
@@ -378,11 +376,11 @@ def test_every_text_is_escaped(nasty, archive, tmp_path):
 
 
 def test_every_title_can_be_drawn(archive, tmp_path):
-    runs = [nasty_run(nasty, archive) for nasty in NASTY[4:10]]
+    runs = [nasty_run(nasty, archive) for nasty in NASTY[5:9]]
     scenes = tuple(scene for run in runs for scene in run.scenes)
     found = built(run_record(archive.root, scenes), tmp_path / "report")
-    assert len(found.sources) == 7
-    assert len({found.target(source).resolve() for source in found.sources}) == 7
+    assert len(found.sources) == 5
+    assert len({found.target(source).resolve() for source in found.sources}) == 5
 
 
 def test_product_names_with_special_characters_are_linked(archive, tmp_path):

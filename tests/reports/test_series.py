@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.reports.series import compare, join, normalised_error, read_sections, thin
+from lidarops.reports.series import Verdict, compare, join, normalised_error, read_sections, thin
 
 
 def sections_of(product, truth=None, **options):
@@ -161,14 +161,28 @@ class TestCompare:
             assert abs(found.within_1 - 0.6827) < 4 * np.sqrt(0.2166 / found.count)
             assert found.bias == pytest.approx(score.mean())
             assert found.spread == pytest.approx(1.0, abs=4 / np.sqrt(2 * found.count))
-            assert not found.suspicious
+            assert found.verdict is Verdict.AS_STATED
 
-    def test_understated_errors_are_suspicious(self):
+    @pytest.mark.parametrize(
+        ("scale", "shift", "verdict"),
+        [
+            (1.0, 0.0, Verdict.AS_STATED),
+            (1.6, 0.0, Verdict.BEYOND),
+            (0.5, 0.0, Verdict.OVERSTATED),
+            (0.7, 0.6, Verdict.SHARED),
+            (0.0, 1.3, Verdict.UNDERSTATED),
+        ],
+    )
+    def test_verdict_on_the_standard_errors(self, scale, shift, verdict):
         time = times(START, 500, 30.0)
-        (section, _) = sections_of(homogeneous(time, flagged=0.0, scale=1.6), truth_of(time))
+        product = homogeneous(time, flagged=0.0, scale=scale)
+        product["extinction"] = (
+            product["extinction"] + shift * product["extinction_standard_error"]
+        ).assign_attrs(units="m-1")
+        (section, _) = sections_of(product, truth_of(time))
         found = compare(section, "extinction")
-        assert found.suspicious
-        assert found.spread == pytest.approx(1.6, rel=0.15)
+        assert found.verdict is verdict
+        assert verdict.unsafe == (verdict in (Verdict.BEYOND, Verdict.UNDERSTATED))
 
     @pytest.mark.parametrize("error", [0.0, -1.0, np.nan, np.inf])
     def test_values_without_a_standard_error_are_told(self, error):
@@ -178,7 +192,8 @@ class TestCompare:
         (section, _) = sections_of(product, truth_of(time))
         found = compare(section, "extinction")
         assert (found.count, found.without_error) == (9, 1)
-        assert found.suspicious
+        assert found.verdict is Verdict.NO_ERROR
+        assert found.verdict.unsafe
         assert np.isnan(normalised_error(section, "extinction")[4])
 
     def test_nothing_but_values_without_error(self):
@@ -188,7 +203,8 @@ class TestCompare:
         (section, _) = sections_of(product, truth_of(time))
         found = compare(section, "extinction")
         assert (found.count, found.without_error) == (0, 10)
-        assert found.suspicious
+        assert found.verdict is Verdict.NO_ERROR
+        assert found.verdict.unsafe
         assert np.isnan(found.within_3)
 
 
