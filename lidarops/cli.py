@@ -381,13 +381,14 @@ def _all_refused(record: RunRecord) -> list[Granule]:
 
 
 def _tell(record: RunRecord, page: Path) -> None:
-    table = _table("Products", "scene", "product", "values", "unflagged", "flags")
+    table = _table("Products", "scene", "kind", "channel", "values", "unflagged", "flags")
     for scene in record.scenes:
         for product in scene.products:
             flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
-            _row(table, scene.scene, product.path, product.values, product.unflagged, flags)
+            of = (scene.scene, product.kind.value, product.channel)
+            _row(table, *of, product.values, product.unflagged, flags)
         if scene.error:
-            _row(table, scene.scene, "none", "", "", scene.error)
+            _row(table, scene.scene, "none", "", "", "", scene.error)
     _show(table)
     _show(_refused_table(_all_refused(record)))
     typer.echo(f"products: {record.products}\nreport:   {page}")

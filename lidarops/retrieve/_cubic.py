@@ -96,7 +96,8 @@ def largest_root(a: float, b: float, c: float) -> float:
     # Within rounding, a double root is real: as a single one it would be lost.
     if discriminant <= 1e-13 * q * q and p < 0.0:
         radius = 2.0 * math.sqrt(-p / 3.0)
-        cosine = min(max(3.0 * q / (p * radius), -1.0), 1.0)
+        product = p * radius
+        cosine = min(max(3.0 * q / product, -1.0), 1.0) if product != 0.0 else 1.0
         return radius * math.cos(math.acos(cosine) / 3.0) - a / 3.0
     # The summand without cancellation, and the other from their product -p / 3.
     cube = 0.5 * abs(q) + math.sqrt(max(discriminant, 0.0))
@@ -175,6 +176,14 @@ def _centre(p: Array) -> float:
 
 
 @_compiled
+def _spread(p: Array, centre: float) -> float:
+    largest = 0.0
+    for i in range(p.size):
+        largest = max(largest, abs(p[i] - centre))
+    return largest
+
+
+@_compiled
 def _coarse(value: float, step: float) -> float:
     """Round to a multiple of a power of two, so that what it is subtracted from keeps its bits."""
     return math.floor(value / step + 0.5) * step
@@ -185,12 +194,11 @@ def _solve_profile(
     p: Array, v: Array, t: Triples, poisson: float, gradient: Array, row: Array
 ) -> None:
     """Solve one loaded profile: the root about a rough centre, then one Newton step about it."""
-    centre, largest = _centre(p), 0.0
-    for i in range(p.size):
-        largest = max(largest, abs(p[i] - centre))
-    if largest == 0.0:
+    if _spread(p, p[0]) == 0.0:
         row[STATUS], row[BACKGROUND] = CONSTANT, p[0]
         return
+    centre = _centre(p)
+    largest = _spread(p, centre)
     scale = math.ldexp(1.0, math.frexp(largest)[1])
     centre = _coarse(centre, scale * 2.0**-20)
     for i in range(p.size):

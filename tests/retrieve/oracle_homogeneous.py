@@ -92,8 +92,8 @@ def quartic_derivative(r, power, lag):
 
 def real_roots(coefficients):
     """Return the real roots of a polynomial, ascending."""
-    scaled = [c / coefficients[0] for c in coefficients]
-    roots = mp.polyroots(scaled, maxsteps=400, extraprec=400)
+    a, b, c, d = coefficients
+    roots = mp.polyroots([d / a, c / a, b / a, mp.mpf(1)], maxsteps=400, extraprec=400, asc=True)
     size = max(abs(root) for root in roots) + 1
     tiny = mp.mpf(10) ** (-mp.mp.dps // 3)
     return sorted(mp.re(root) for root in roots if abs(mp.im(root)) < tiny * size)
