@@ -242,7 +242,7 @@ def overview(
     Parameters
     ----------
     homogeneous : Dataset
-        Product of kind ``homogeneous`` of one day.
+        Product of kind ``homogeneous``; join the products of several scenes along time.
     truth : Dataset or None
         Of a simulated campaign.
     signal : Dataset or None

@@ -186,6 +186,7 @@ class TestUnusableFiles:
                 kind=ProductKind.SIGNAL,
             ),
             "empty.nc": write("empty.nc", signal(time), ProductKind.SIGNAL),
+            "rotten.nc": write("rotten.nc", signal(time), ProductKind.SIGNAL),
         }
         (archive.root / "gone.nc").unlink()
         (archive.root / "garbage.nc").write_bytes(b"\x00garbage")
@@ -193,6 +194,14 @@ class TestUnusableFiles:
         (archive.root / "cut.nc").write_bytes(whole[: len(whole) // 2])
         homogeneous(time).drop_vars("background").to_netcdf(archive.root / "foreign.nc")
         (archive.root / "empty.nc").write_bytes(b"")
+        # A file that opens well, whose data fail their checksum when they are read.
+        rotten = archive.root / "rotten.nc"
+        encoding = {"signal": {"fletcher32": True, "chunksizes": (6, 600)}}
+        signal(time).to_netcdf(rotten, encoding=encoding)
+        values = signal(time)["signal"].values.tobytes()
+        whole = rotten.read_bytes()
+        assert values in whole
+        rotten.write_bytes(whole.replace(values, b"\x01" * len(values)))
         scene = outcome("bad", products=tuple(kinds.values()))
         found = built(replace(simulated, scenes=(*simulated.scenes, scene)), tmp_path / "report")
         start = found.text.index("Files that this report could not use")
