@@ -408,6 +408,8 @@ def _retrieve_homogeneous(conditioned: xr.Dataset, steps: Mapping[str, Step]) ->
         variance=conditioned["variance"],
         quality=conditioned["quality"],
         method=settings["method"],
+        # An estimate scatters, and its scatter must not pass for misfit.
+        relative_variance=steps[StepName.NOISE].settings["method"] == "differences",
     )
 
 

@@ -266,29 +266,26 @@ def solve_profiles(
 
 @_compiled
 def _propagate_profile(
-    extinction: float, b: float, range_: Array, variance: Array, gradient: Array, row: Array
+    b: float, phi: Array, range_: Array, variance: Array, gradient: Array, row: Array
 ) -> None:
     """Propagate the noise of the bins of one profile, through its background too."""
-    start = range_[0]
-    norm = slope = first = whole = 0.0
-    for i in range(range_.size):
-        phi = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction * (range_[i] - start))
-        norm += phi * phi / variance[i]
-        first += phi * phi / variance[i] * range_[i]
-        whole += phi / variance[i]
-    centroid = first / norm
-    tilted = 0.0
-    for i in range(range_.size):
-        phi = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction * (range_[i] - start))
+    norm = moment = 0.0
+    for i in range(phi.size):
+        norm += phi[i] * phi[i] / variance[i]
+        moment += phi[i] * phi[i] / variance[i] * range_[i]
+    centroid = moment / norm
+    slope = whole = tilted = 0.0
+    for i in range(phi.size):
         lever = -2.0 * (range_[i] - centroid)
-        slope += lever * lever * phi * phi / variance[i]
-        tilted += lever * phi / variance[i]
+        slope += lever * lever * phi[i] * phi[i] / variance[i]
+        whole += phi[i] / variance[i]
+        tilted += lever * phi[i] / variance[i]
     row[:] = 0.0
-    for i in range(range_.size):
-        phi = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction * (range_[i] - start))
+    for i in range(phi.size):
+        weighted = phi[i] / variance[i]
         lever = -2.0 * (range_[i] - centroid)
-        of_extinction = (lever * phi / variance[i] - tilted * gradient[i]) / (b * slope)
-        of_logarithm = (phi / variance[i] - whole * gradient[i]) / (b * norm)
+        of_extinction = (lever * weighted - tilted * gradient[i]) / (b * slope)
+        of_logarithm = (weighted - whole * gradient[i]) / (b * norm)
         of_logarithm += 2.0 * centroid * of_extinction
         row[0] += gradient[i] * gradient[i] * variance[i]
         row[1] += of_logarithm * of_logarithm * variance[i]
@@ -319,8 +316,10 @@ def propagate(
         Gets the variance of the background, the relative variance of the amplitude and the
         variance of the extinction.
     """
-    start = range_[0]
+    start, phi = range_[0], np.empty(range_.size)
     for k in range(extinction.size):
+        for i in range(phi.size):
+            phi[i] = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction[k] * (range_[i] - start))
         b = amplitude[k] * math.exp(-2.0 * extinction[k] * start) / start**2
         noise = variance[k % variance.shape[0]]
-        _propagate_profile(extinction[k], b, range_, noise, gradients[k], out[k])
+        _propagate_profile(b, phi, range_, noise, gradients[k], out[k])

@@ -43,6 +43,7 @@ def homogeneous(
     variance: xr.DataArray | float | None = None,
     quality: xr.DataArray | None = None,
     method: str = "auto",
+    relative_variance: bool = False,
 ) -> xr.Dataset:
     """Retrieve background, amplitude and extinction of sections of range.
 
@@ -61,6 +62,9 @@ def homogeneous(
         INCOMPLETE_OVERLAP of its bins.
     method : {"auto", "direct", "cubic"}
         See `lidarops.retrieve.homogeneous.solve`.
+    relative_variance : bool
+        Whether `variance` holds up to a factor, which each section then finds for itself: for a
+        variance that was estimated from the same data.
 
     Returns
     -------
@@ -78,7 +82,8 @@ def homogeneous(
     distance = _distance(power)
     edges = _edges(sections)
     inputs = _Inputs.gather(power, variance, quality)
-    parts = [_section(inputs, distance, near, far, method) for near, far in edges]
+    settings = {"method": method, "relative": relative_variance}
+    parts = [_section(inputs, distance, (near, far), settings) for near, far in edges]
     others = [dim for dim in power.dims if dim != "range"]
     result: xr.Dataset = xr.concat(parts, dim="section").transpose(*others, "section")
     _set_units(result, _SECTION, power)
@@ -192,8 +197,12 @@ def _on_blocks(
 
 
 def _section(
-    inputs: _Inputs, distance: npt.NDArray[np.float64], near: float, far: float, method: str
+    inputs: _Inputs,
+    distance: npt.NDArray[np.float64],
+    edges: tuple[float, float],
+    settings: Mapping[str, Any],
 ) -> xr.Dataset:
+    near, far = edges
     inside = np.flatnonzero((distance >= near) & (distance < far))
     if inside.size < FEWEST_BINS:
         raise RetrievalInputError(
@@ -203,8 +212,8 @@ def _section(
             remedy=f"choose sections that hold at least {FEWEST_BINS}, better 50, bins",
         )
     bins = slice(int(inside[0]), int(inside[-1]) + 1)
-    settings = {"range": distance[bins], "method": method}
-    outputs = inputs.isel(bins).map(_solve, len(_SECTION), 2, settings)
+    of_section = {"range": distance[bins], **settings}
+    outputs = inputs.isel(bins).map(_solve, len(_SECTION), 2, of_section)
     names = (*_SECTION, "valid_bins", "quality_flag")
     return xr.Dataset(dict(zip(names, outputs, strict=True)))
 
@@ -216,12 +225,17 @@ def _solve(
     *,
     range: _Block,  # noqa: A002 - the field's word
     method: str,
+    relative: bool,
 ) -> tuple[_Block, ...]:
     carried = np.int32(0)
     if quality is not None:
         power = np.where((quality & EXCLUDED) != 0, np.nan, power)
         carried = np.bitwise_or.reduce(quality & CARRIED, axis=-1).astype(np.int32)
-    found = _homogeneous.solve(power, range, variance=variance, method=method)
+    weights = None
+    if relative and variance is not None:
+        with np.errstate(divide="ignore"):
+            variance, weights = None, 1.0 / np.asarray(variance)
+    found = _homogeneous.solve(power, range, variance=variance, weights=weights, method=method)
     values = tuple(getattr(found, name) for name in _SECTION)
     return (*values, found.valid_bins, found.quality | carried)
 

@@ -24,8 +24,12 @@ PARALYSIS = 0.5
 """Measured rate times dead time above which a rate cannot be corrected (`Quality.SATURATED`)."""
 NOISE_WINDOW = 0.1
 """Half-width, relative to range, of the window in which noise is smoothed."""
+WEIGHT_WINDOW = 0.3
+"""The same for the weights of the noise model."""
 MIN_NOISE_BINS = 16
-"""Smallest half-width of that window in bins."""
+"""Smallest half-width of such a window in bins."""
+LEAK = 0.05
+"""Largest share of the noise that the fall of the signal may fake in a third difference."""
 
 _EXTREMES = (np.iinfo(np.int32).min, -np.iinfo(np.int32).max, np.iinfo(np.int32).max)
 _UNUSABLE = int(Quality.INPUT_MISSING | Quality.SATURATED)
@@ -197,35 +201,53 @@ def _raw_quality(
     return quality
 
 
-def _windows(range: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:  # noqa: A002
+def _windows(
+    range: Array,  # noqa: A002 - the field's word
+    window: float,
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Return first and past-the-last bin of the smoothing window of each bin."""
     index = np.arange(range.size)
     spacing = float(np.min(np.abs(np.diff(range)))) if range.size > 1 else 1.0
-    half = np.maximum(np.abs(range) * (NOISE_WINDOW / spacing), MIN_NOISE_BINS).astype(np.intp)
+    half = np.maximum(np.abs(range) * (window / spacing), MIN_NOISE_BINS).astype(np.intp)
     # Symmetric up to the ends, so that a steep signal is not smoothed to one side.
     half = np.minimum(half, np.maximum(np.minimum(index, range.size - 1 - index), MIN_NOISE_BINS))
     return np.maximum(index - half, 0), np.minimum(index + half + 1, range.size)
 
 
-def _window_sums(values: Array, range: Array) -> Array:  # noqa: A002 - the field's word
-    first, past = _windows(range)
+def _window_sums(
+    values: Array,
+    range: Array,  # noqa: A002 - the field's word
+    window: float = NOISE_WINDOW,
+) -> Array:
+    first, past = _windows(range, window)
     sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
     total: Array = sums[..., past] - sums[..., first]
     return total
 
 
-def _window_bins(values: Array, range: Array) -> Array:  # noqa: A002 - the field's word
-    return _window_sums(np.isfinite(values).astype(np.float64), range)
+def _window_bins(
+    values: Array,
+    range: Array,  # noqa: A002 - the field's word
+    window: float = NOISE_WINDOW,
+) -> Array:
+    return _window_sums(np.isfinite(values).astype(np.float64), range, window)
 
 
-def smooth(values: Array, range: Array) -> Array:  # noqa: A002 - the field's word
-    """Average over a window of +- 10 % of range (at least 33 bins), passing over NaN.
+def smooth(
+    values: Array,
+    range: Array,  # noqa: A002 - the field's word
+    *,
+    window: float = NOISE_WINDOW,
+) -> Array:
+    """Average over a window that grows with range, at least 33 bins, passing over NaN.
 
     Parameters
     ----------
     values : (..., range) float
     range : (range,) float
         m.
+    window : float
+        Half-width of the window, relative to range.
 
     Returns
     -------
@@ -233,18 +255,24 @@ def smooth(values: Array, range: Array) -> Array:  # noqa: A002 - the field's wo
         NaN where the window holds no finite value.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        averages: Array = _window_sums(np.nan_to_num(values), range) / _window_bins(values, range)
+        sums = _window_sums(np.nan_to_num(values), range, window)
+        averages: Array = sums / _window_bins(values, range, window)
     return averages
 
 
 def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - the field's word
-    r"""Estimate the noise variance of each bin from third differences along range.
+    r"""Estimate the noise variance of an analog signal from third differences along range.
 
-    .. math:: v_i = \left\langle \frac{(P_{i-1} - 3 P_i + 3 P_{i+1} - P_{i+2})^2}{20} \right\rangle
+    Electronic noise is constant and shot noise follows the light, so that
 
-    averaged over +- 10 % of range. Exact for white noise; a signal that falls with the square
-    of range leaks less than its 3e-5th part at 100 bins from the lidar. Noise that is correlated
-    from bin to bin is underestimated.
+    .. math:: v(R) = a + b \, \overline{P}(R), \qquad
+              \left\langle \frac{(P_{i-1} - 3 P_i + 3 P_{i+1} - P_{i+2})^2}{20} \right\rangle
+              = a + b \, \overline{P}_i
+
+    is fitted by weighted least squares with :math:`a, b \ge 0`, one pair a profile: weights made
+    of two well-determined numbers do not follow the noise of the single bin. Exact for noise
+    that is white along range; noise that is correlated from bin to bin is underestimated. Bins
+    so near that the fall of the signal itself would be taken for noise are left out of the fit.
 
     Parameters
     ----------
@@ -261,7 +289,36 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
     third = power[..., 3:] - 3.0 * power[..., 2:-1] + 3.0 * power[..., 1:-2] - power[..., :-3]
     squares = np.full(power.shape, np.nan)
     squares[..., 1:-2] = third**2 / 20.0
-    return smooth(squares, range)
+    local = smooth(squares, range, window=WEIGHT_WINDOW)
+    mean = smooth(power, range)
+    spacing = np.abs(np.gradient(range)) if range.size > 1 else np.ones(1)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        # The third difference of R^-2 is 24 (h / R)^3 of the signal.
+        leak = (24.0 * (spacing / range) ** 3 * mean) ** 2 / 20.0
+        usable = np.isfinite(squares) & np.isfinite(mean) & (local > 0) & (leak < LEAK * local)
+        weight = np.where(usable, 1.0 / local**2, 0.0)
+        weight /= np.max(weight, axis=-1, keepdims=True)
+        a, b = _line(np.where(usable, mean, 0.0), np.where(usable, squares, 0.0), weight)
+        variance = a + b * np.maximum(mean, 0.0)
+    # Too few differences for a line, or a signal without noise: what there is, locally.
+    return np.where(np.isfinite(variance) & (variance > 0), variance, local)
+
+
+def _line(x: Array, y: Array, weight: Array) -> tuple[Array, Array]:
+    """Return intercept and slope of y over x, neither below zero; one pair a row."""
+    total = weight.sum(axis=-1, keepdims=True)
+    x_mean = (weight * x).sum(axis=-1, keepdims=True) / total
+    y_mean = (weight * y).sum(axis=-1, keepdims=True) / total
+    from_mean = x - x_mean
+    square = (weight * from_mean**2).sum(axis=-1, keepdims=True)
+    slope = (weight * from_mean * (y - y_mean)).sum(axis=-1, keepdims=True) / square
+    slope = np.where(slope > 0, slope, 0.0)
+    intercept = y_mean - slope * x_mean
+    # Through the origin, where the fit would have the noise vanish above zero light.
+    x_square = (weight * x**2).sum(axis=-1, keepdims=True)
+    through = (weight * x * y).sum(axis=-1, keepdims=True) / x_square
+    negative = intercept < 0
+    return np.where(negative, 0.0, intercept), np.where(negative, through, slope)
 
 
 def dark_mean(signals: Array) -> tuple[Array, Array]:

@@ -110,13 +110,20 @@ def test_largest_real_root_is_the_background_and_spread_decides_the_root_class()
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.floats(-100, 100), min_size=3, max_size=3))
-def test_largest_root_of_any_cubic_with_three_real_roots(roots):
+@given(st.floats(-100, 100), st.floats(0.1, 100), st.floats(0.0, 100))
+def test_largest_root_of_a_cubic_with_three_real_roots(largest, gap, further):
+    roots = (largest, largest - gap, largest - gap - further)
     a, c = -sum(roots), -np.prod(roots)
     b = roots[0] * roots[1] + roots[0] * roots[2] + roots[1] * roots[2]
-    found = _cubic.largest_root(a, b, c)
-    # A multiple root is known to the square or cube root of the rounding only.
-    assert found == pytest.approx(max(roots), abs=2e-3)
+    assert _cubic.largest_root(a, b, c) == pytest.approx(largest, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "c", "largest"),
+    [(7.0, 0.0, 0.0, 0.0), (-7.0, 0.0, 0.0, 7.0), (0.0, 0.0, 0.0, 0.0), (-3.0, 3.0, -1.0, 1.0)],
+)
+def test_largest_root_where_roots_coincide(a, b, c, largest):
+    assert _cubic.largest_root(a, b, c) == pytest.approx(largest, abs=1e-5)
 
 
 @given(st.floats(-50, 50), st.floats(-50, 50), st.floats(0.1, 50))
