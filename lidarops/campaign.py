@@ -122,7 +122,7 @@ class HomogeneousSettings(_Model):
 
     channels: list[str] = Field(min_length=1)
     sections: list[tuple[Metres, Metres]] = Field(min_length=1, description="m")
-    method: Literal["auto", "cubic"] = "auto"
+    method: Literal["auto", "direct", "cubic"] = "auto"
 
     @model_validator(mode="after")
     def _rising(self) -> Self:

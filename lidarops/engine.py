@@ -22,7 +22,7 @@ import xarray as xr
 from dask.base import compute
 
 from lidarops import __version__
-from lidarops.campaign import Campaign, as_settings
+from lidarops.campaign import Campaign, InstrumentFacts, as_settings
 from lidarops.catalog.store import Store
 from lidarops.errors import LidarOpsError, SceneError
 from lidarops.flags import Quality
@@ -74,6 +74,12 @@ class Job:
     scene: Scene
     plan: Plan
     profiles_per_chunk: int | None = None
+
+    @property
+    def facts(self) -> InstrumentFacts:
+        """What is known of the instrument at the time of the scene."""
+        instrument = self.campaign.instruments[self.scene.instrument]
+        return instrument.facts_at(self.scene.granules[0].start or self.scene.start)
 
 
 def run(
@@ -317,12 +323,23 @@ def _digest(scene: Scene, root: Path) -> tuple[Scene, tuple[InputRecord, ...], t
 
 
 def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]) -> xr.Dataset:
-    return open_archive(
+    archive = open_archive(
         list(granules),
         root=root,
         channels=channels,
         mask_and_scale=False,
         profiles_per_chunk=job.profiles_per_chunk,
+        header_position="ignore",
+    )
+    # What the campaign says of the pointing wins over the headers.
+    facts = job.facts
+    told = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
+    return archive.assign_coords(
+        {
+            name: xr.full_like(archive["zenith_angle"], angle)
+            for name, angle in told.items()
+            if angle is not None
+        }
     )
 
 
@@ -402,7 +419,7 @@ def _retrieve_signal(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.D
 
 def _retrieve_homogeneous(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
     settings = steps[StepName.HOMOGENEOUS].settings
-    return labeled.homogeneous(
+    result = labeled.homogeneous(
         conditioned["power"],
         sections=[(near, far) for near, far in settings["sections"]],
         variance=conditioned["variance"],
@@ -411,6 +428,8 @@ def _retrieve_homogeneous(conditioned: xr.Dataset, steps: Mapping[str, Step]) ->
         # An estimate scatters, and its scatter must not pass for misfit.
         relative_variance=steps[StepName.NOISE].settings["method"] == "differences",
     )
+    slanted = labeled.not_level(result, conditioned["zenith_angle"])
+    return result.assign(quality_flag=result["quality_flag"] | slanted)
 
 
 _RETRIEVALS: dict[ProductKind, Callable[[xr.Dataset, Mapping[str, Step]], xr.Dataset]] = {
@@ -429,7 +448,6 @@ def _context(
 ) -> build.Context:
     campaign = job.campaign
     instrument = campaign.instruments[scene.instrument]
-    facts = instrument.facts_at(scene.granules[0].start or scene.start)
     return build.Context(
         kind=kind,
         channel=channel.name,
@@ -455,7 +473,7 @@ def _context(
             plan=job.plan,
             settings={
                 "station": as_settings(campaign.stations[scene.station]),
-                "facts": as_settings(facts),
+                "facts": as_settings(job.facts),
                 "metadata": as_settings(campaign.metadata),
             },
             versions=provenance.package_versions(),

@@ -34,6 +34,7 @@ class Quality(IntFlag):
     NOT_HOMOGENEOUS = 1 << 11
     OUTLIER = 1 << 12
     NO_REAL_SOLUTION = 1 << 13
+    NOT_LEVEL = 1 << 14
 
     @property
     def description(self) -> str:
@@ -73,7 +74,10 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     Quality.NO_SIGNAL: (Severity.REJECT, "the profile is constant: it holds no backscatter"),
     Quality.LOW_SIGNAL: (
         Severity.REJECT,
-        "the backscattered signal is less than 5 times its standard error",
+        (
+            "the backscattered signal is less than 5 times its standard error, or so small that noise"
+            " may have moved the root of the cubic"
+        ),
     ),
     Quality.POORLY_DETERMINED: (
         Severity.REJECT,
@@ -93,5 +97,12 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     Quality.NO_REAL_SOLUTION: (
         Severity.REJECT,
         "the estimating equation has no admissible real root",
+    ),
+    Quality.NOT_LEVEL: (
+        Severity.REJECT,
+        (
+            "the path changes its height by more than 100 m along the section, so that extinction"
+            " cannot be told from backscatter that changes with height"
+        ),
     ),
 }

@@ -260,3 +260,20 @@ def test_an_archive_behind_a_url_gives_the_same_products(
         memory.rm("/lidar-url", recursive=True)
     assert hashes[0] == hashes[1]
     assert hashes[0]
+
+
+def test_the_campaign_knows_the_pointing_better_than_the_header(tmp_path: Path) -> None:
+    rawfiles.write(
+        tmp_path / "raw" / "coast" / "h0", rawfiles.content(0, bins=1000, zenith_angle=0.0)
+    )
+    for zenith_angle, level in ((90.0, True), (89.0, True), (85.0, False), (None, False)):
+        facts = {} if zenith_angle is None else {"zenith_angle": zenith_angle, "azimuth": 12.0}
+        campaign = factories.campaign(facts=[facts]).model_copy(
+            update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / f"{zenith_angle}")}
+        )
+        record = run(campaign, prepare(campaign))
+        (path,) = (product.path for product in record.scenes[0].products)
+        product = xr.load_dataset(Path(record.products) / path)
+        assert product["zenith_angle"] == (0.0 if zenith_angle is None else zenith_angle)
+        raised = (product["quality_flag"].values & Quality.NOT_LEVEL) != 0
+        assert raised.all() == (not level)

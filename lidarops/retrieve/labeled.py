@@ -19,6 +19,9 @@ EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMP
 CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
 """Bits of a bin that its section carries too."""
 FEWEST_BINS: Final = 4
+LEVEL: Final = 100.0
+"""m; largest change of height along a section that counts as level. Aerosol falls off with a
+scale height of 1 to 2 km, so that more fakes an extinction of more than some percent."""
 
 _METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
 _TAIL: Final = {"background": "{}", "background_standard_error": "{}"}
@@ -92,6 +95,31 @@ def homogeneous(
         section_range=("section", edges.mean(axis=1), {"units": "m"}),
         section_bounds=(("section", "nv"), edges, {"units": "m"}),
     )
+
+
+def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
+    r"""Return NOT_LEVEL for the sections along which a beam changes its height too much.
+
+    Backscatter that falls with height as :math:`e^{-z/H}` looks exactly like an additional
+    extinction of :math:`\cos\theta / 2H`: no residual tells, the geometry does.
+
+    Parameters
+    ----------
+    result : xr.Dataset
+        From `homogeneous`.
+    zenith_angle : xr.DataArray
+        degree, over the dimensions of `result` but ``section``, or fewer.
+
+    Returns
+    -------
+    xr.DataArray
+        Bits to be merged into ``quality_flag``.
+    """
+    length = result["section_bounds"].isel(nv=1) - result["section_bounds"].isel(nv=0)
+    climb = length * np.abs(np.cos(np.deg2rad(zenith_angle)))
+    # Compared so that an unknown angle is not taken for a level one.
+    bits: xr.DataArray = (~(climb <= LEVEL)).astype(np.int32) * np.int32(Quality.NOT_LEVEL)
+    return bits.drop_vars(bits.coords)
 
 
 def tail_mean(
