@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps
 
-.PHONY: demo test slow lint lock clean
+.PHONY: demo test lint lock clean
 
 # The demo's archive holds damaged files on purpose, for which the flow exits with 1.
 demo: .venv/.runtime
@@ -11,10 +11,7 @@ demo: .venv/.runtime
 	$(BIN)/python -m flows.reprocess catalogs/demo.yaml; test $$? -le 1
 
 test: .venv/.dev
-	$(BIN)/python -m pytest -m "not slow"
-
-slow: .venv/.dev
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

@@ -75,8 +75,8 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     Quality.LOW_SIGNAL: (
         Severity.REJECT,
         (
-            "the backscattered signal is less than 5 times its standard error, or so small that noise"
-            " may have moved the root of the cubic"
+            "the backscattered signal is less than 5 times its standard error,"
+            " or so small that noise may have moved the root of the cubic"
         ),
     ),
     Quality.POORLY_DETERMINED: (
