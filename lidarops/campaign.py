@@ -116,6 +116,12 @@ class SignalSettings(_Model):
         default=None, description="m; the last tenth of the bins where not given"
     )
 
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if self.background_range and self.background_range[0] >= self.background_range[1]:
+            raise ValueError("background_range must end farther than it starts")
+        return self
+
 
 class HomogeneousSettings(_Model):
     """The ``homogeneous`` product: background, amplitude and extinction of range sections."""

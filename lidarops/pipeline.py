@@ -12,6 +12,7 @@ from pathlib import Path
 from lidarops.campaign import Campaign
 from lidarops.catalog.scan import scan
 from lidarops.catalog.store import Store
+from lidarops.errors import SceneError
 from lidarops.records import RunRecord
 from lidarops.reports import page, record
 from lidarops.scenes import Cut, cut, select
@@ -43,7 +44,7 @@ def prepare(
     CatalogError
         If the archive or the catalog cannot be used.
     SceneError
-        If an instrument has no scene.
+        If there is no scene, or none of an instrument that is asked for.
     """
     store = Store(campaign.catalog_url, campaign.name)
     try:
@@ -52,6 +53,14 @@ def prepare(
     finally:
         store.close()
     chosen = select(everything.scenes, instruments=instruments, since=since, until=until)
+    if not chosen:
+        raise SceneError(
+            f"holds {len(everything.scenes)} scenes, none of which is asked for"
+            if everything.scenes
+            else "holds no good file that an instrument claims as a signal",
+            file=campaign.archive,
+            remedy="see lidarops catalog, the patterns of the campaign, --since and --until",
+        )
     return Cut(chosen, everything.set_aside)
 
 

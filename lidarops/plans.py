@@ -195,8 +195,11 @@ def _signal_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
         yield case.without(StepName.SIGNAL, "the campaign does not ask for it")
         return
     start, stop = case.signal.background_range or (0.9 * last, last)
-    if start >= last:
-        reason = f"background_range starts at {start:g} m, beyond the last bin at {last:g} m"
+    if (min(stop, last) - start) / case.channel.bin_width < MIN_SECTION_BINS:
+        reason = (
+            f"background_range {start:g}-{stop:g} m holds fewer than {MIN_SECTION_BINS} bins,"
+            f" which end at {last:g} m"
+        )
         yield case.without(StepName.SIGNAL, reason)
         return
     reason = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 
 import factories
@@ -18,6 +19,7 @@ from lidarops.campaign import Campaign, load
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.engine import run
+from lidarops.errors import SceneError
 from lidarops.flags import Quality
 from lidarops.pipeline import prepare
 from lidarops.records import RunRecord, Status
@@ -277,3 +279,15 @@ def test_the_campaign_knows_the_pointing_better_than_the_header(tmp_path: Path) 
         assert product["zenith_angle"] == (0.0 if zenith_angle is None else zenith_angle)
         raised = (product["quality_flag"].values & Quality.NOT_LEVEL) != 0
         assert raised.all() == (not level)
+
+
+def test_nothing_to_process_is_an_error_not_an_empty_run(tmp_path: Path) -> None:
+    rawfiles.write(tmp_path / "raw" / "dark" / "d0", rawfiles.content(0))
+    campaign = factories.campaign().model_copy(
+        update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
+    )
+    with pytest.raises(SceneError, match="no good file"):
+        prepare(campaign)
+    rawfiles.write(tmp_path / "raw" / "coast" / "h0", rawfiles.content(0))
+    with pytest.raises(SceneError, match="1 scenes"):
+        prepare(campaign, since=factories.DAY + timedelta(days=3))

@@ -87,3 +87,11 @@ def test_the_hash_follows_every_setting() -> None:
     other = factories.campaign(facts=[{"channels": {"photon_532o": {"dead_time": 5e-9}}}])
     assert plan(_scene(), other).hash != base.hash
     assert json.loads(json.dumps(base.as_dict()))["scene"] == base.scene
+
+
+@pytest.mark.parametrize("background", [[14_990, 16_000], [20_000, 30_000], [100, 101]])
+def test_a_background_without_bins_leaves_the_signal_out(background: list[float]) -> None:
+    wanted = {"signal": {"channels": ["photon_532o"], "background_range": background}}
+    result = plan(_scene(), factories.campaign(products=wanted))
+    assert "background_range" in _left_out(result, "photon_532o")["signal"]
+    assert "signal" not in _steps(result, "photon_532o")

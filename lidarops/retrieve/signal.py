@@ -65,7 +65,8 @@ def analog(
 
     with counts :math:`n`, shots :math:`N`, bits :math:`b`, input range :math:`U_{max}` in V and
     dark signal :math:`D` in mV. A bin at full scale, :math:`n \ge N (2^b - 1)`, is SATURATED; a
-    bin at an extreme of the integer type, or of a profile without shots, is INPUT_MISSING.
+    bin at an extreme of the integer type, or of a profile without shots or of zeros alone, is
+    INPUT_MISSING.
 
     Parameters
     ----------
@@ -195,7 +196,9 @@ def _raw_quality(
             remedy="counts are (..., time, range), shots (..., time), range (range,)",
         )
     quality = np.zeros(counts.shape, dtype=np.int32)
-    missing = np.isin(counts, _EXTREMES) | (shots <= 0)
+    # A recorder that is off writes zeros; light and electronics never do over a whole profile.
+    dead = ~counts.any(axis=-1, keepdims=True)
+    missing = np.isin(counts, _EXTREMES) | (shots <= 0) | dead
     quality[missing] |= np.int32(Quality.INPUT_MISSING)
     quality[..., range < full_overlap_range] |= np.int32(Quality.INCOMPLETE_OVERLAP)
     return quality

@@ -66,8 +66,14 @@ def test_photon_variance_matches_the_scatter_of_poisson_counts() -> None:
 
 
 def test_zero_counts_do_not_claim_certainty() -> None:
-    result = signal.photon(np.zeros((1, 400), np.int32), SHOTS, RANGE, bin_width=7.5)
-    assert (result.variance > 0).all()
+    counts = np.zeros((2, 400), np.int32)
+    counts[0, 7] = 1
+    result = signal.photon(counts, np.full(2, 600), RANGE, bin_width=7.5)
+    assert (result.variance[0] > 0).all()
+    assert not result.quality[0].any()
+    # Not a single count in a profile: the recorder was off.
+    assert (result.quality[1] == Quality.INPUT_MISSING).all()
+    assert np.isnan(result.power[1]).all()
 
 
 def test_paralysed_counters_are_masked() -> None:
