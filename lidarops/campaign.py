@@ -297,6 +297,13 @@ def load(
     except ValidationError as error:
         raise CampaignError(_explain(error, tree), file=path) from error
     base = path.resolve().parent
+    if "://" in str(output or campaign.output):
+        raise CampaignError(
+            "is a URL; catalog, products and reports are written to a folder",
+            file=path,
+            field="output",
+            remedy="give a folder, and copy the products from there",
+        )
     chosen = archive or os.environ.get(ARCHIVE_VARIABLE)
     return campaign.model_copy(
         update={

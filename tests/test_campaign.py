@@ -50,6 +50,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
         ('files: "h*"', 'files: "../h*"', "inside the archive"),
         ('files: "h*"', 'files: "/h*"', "inside the archive"),
         ("archive: raw", "archve: raw", "line 3: archve"),
+        ("output: out", "output: s3://bucket/out", "output: is a URL"),
         ("title: A small campaign", "title: [", "not valid YAML"),
         ("name: small", "name: !!python/object/apply:os.getcwd []", "not valid YAML"),
     ],
