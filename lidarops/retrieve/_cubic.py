@@ -130,14 +130,14 @@ def _difference_variance(p: Array, relative: Array) -> float:
 
 @_compiled
 def _fill_variance(
-    p: Array, relative: Array, known_variance: bool, poisson: bool, v: Array
+    p: Array, relative: Array, known_variance: bool, poisson: float, v: Array
 ) -> float:
     """Fill the variance of every bin; return its level, 0 where there is none."""
-    level = 1.0 if known_variance or poisson else _difference_variance(p, relative)
+    level = 1.0 if known_variance or poisson > 0.0 else _difference_variance(p, relative)
     if not math.isfinite(level):
         level = 0.0
     for i in range(v.size):
-        v[i] = max(p[i], 0.0) if poisson else level * relative[i]
+        v[i] = poisson * max(p[i], 0.0) if poisson > 0.0 else level * relative[i]
     return level
 
 
@@ -228,7 +228,7 @@ def solve_profiles(
     power: Any,
     variance: Array,
     known_variance: bool,
-    poisson: bool,
+    poisson: Array,
     t: Triples,
     gradients: Array,
     out: Array,
@@ -241,8 +241,8 @@ def solve_profiles(
     variance : (profile or 1, bin) float64
         Absolute, or relative where it is not known; not used for counts.
     known_variance : bool
-    poisson : bool
-        Whether the power are counts.
+    poisson : (profile or 1,) float64
+        Variance over mean where the power are counts, one over the number of shots; else 0.
     t : Triples
         Of `make_triples`.
     gradients : (profile or 1, bin) float64
@@ -255,71 +255,11 @@ def solve_profiles(
     p, v = np.empty(n), np.empty(n)
     for k in range(power.shape[0]):
         whole = _load(power[k], p)
-        level = _fill_variance(p, variance[k % variance.shape[0]], known_variance, poisson, v)
+        unit = poisson[k % poisson.size]
+        level = _fill_variance(p, variance[k % variance.shape[0]], known_variance, unit, v)
         if not (whole and _all_finite(v)):
             out[k, STATUS] = MISSING
             continue
-        _solve_profile(p, v, t, 1.0 if poisson else 0.0, gradients[k % gradients.shape[0]], out[k])
+        _solve_profile(p, v, t, unit, gradients[k % gradients.shape[0]], out[k])
         # Without a noise level nothing was subtracted, and there is no standard error.
         out[k, VARIANCE] *= level / level
-
-
-@_compiled
-def _propagate_profile(
-    b: float, phi: Array, range_: Array, variance: Array, gradient: Array, row: Array
-) -> None:
-    """Propagate the noise of the bins of one profile, through its background too."""
-    norm = moment = 0.0
-    for i in range(phi.size):
-        norm += phi[i] * phi[i] / variance[i]
-        moment += phi[i] * phi[i] / variance[i] * range_[i]
-    centroid = moment / norm
-    slope = whole = tilted = 0.0
-    for i in range(phi.size):
-        lever = -2.0 * (range_[i] - centroid)
-        slope += lever * lever * phi[i] * phi[i] / variance[i]
-        whole += phi[i] / variance[i]
-        tilted += lever * phi[i] / variance[i]
-    row[:] = 0.0
-    for i in range(phi.size):
-        weighted = phi[i] / variance[i]
-        lever = -2.0 * (range_[i] - centroid)
-        of_extinction = (lever * weighted - tilted * gradient[i]) / (b * slope)
-        of_logarithm = (weighted - whole * gradient[i]) / (b * norm)
-        of_logarithm += 2.0 * centroid * of_extinction
-        row[0] += gradient[i] * gradient[i] * variance[i]
-        row[1] += of_logarithm * of_logarithm * variance[i]
-        row[2] += of_extinction * of_extinction * variance[i]
-
-
-@_compiled
-def propagate(
-    extinction: Array,
-    amplitude: Array,
-    range_: Array,
-    variance: Array,
-    gradients: Array,
-    out: Array,
-) -> None:
-    """Propagate noise into what is fitted above a background from `solve_profiles`, to first order.
-
-    Parameters
-    ----------
-    extinction, amplitude : (profile,) float
-        m-1, power times m2: the weighted fit to the power less the background.
-    range_ : (bin,) float
-        m.
-    variance : (profile or 1, bin) float64
-    gradients : (profile, bin) float64
-        Derivatives of the background with respect to the power.
-    out : (profile, 3) float64
-        Gets the variance of the background, the relative variance of the amplitude and the
-        variance of the extinction.
-    """
-    start, phi = range_[0], np.empty(range_.size)
-    for k in range(extinction.size):
-        for i in range(phi.size):
-            phi[i] = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction[k] * (range_[i] - start))
-        b = amplitude[k] * math.exp(-2.0 * extinction[k] * start) / start**2
-        noise = variance[k % variance.shape[0]]
-        _propagate_profile(b, phi, range_, noise, gradients[k], out[k])

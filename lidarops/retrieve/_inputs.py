@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from enum import StrEnum
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ from lidarops.errors import RetrievalInputError
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+_Choice = TypeVar("_Choice", bound=StrEnum)
 
 SHORTEST_REACH = 100.0
 """m. No lidar section ends nearer, and every section in km ends nearer: a guard of units."""
@@ -151,6 +153,51 @@ def variance_rows(
             "is negative", field="variance", remedy="give squares of the power's unit"
         )
     return rows
+
+
+def profile_values(
+    values: npt.ArrayLike | None, name: str, leading: tuple[int, ...]
+) -> Array | None:
+    """Return one value per profile as (profile or 1,); None for None.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where they do not broadcast to the profiles, or are not finite.
+    """
+    if values is None:
+        return None
+    array = real_array(values, name).astype(np.float64, copy=False)
+    if array.size == 1:
+        flat = array.reshape(1)
+    else:
+        try:
+            flat = np.ascontiguousarray(np.broadcast_to(array, leading).reshape(_count(leading)))
+        except ValueError:
+            raise RetrievalInputError(
+                f"has the shape {array.shape}, which does not broadcast to the shape {leading} of"
+                " the profiles",
+                field=name,
+            ) from None
+    if not np.all(np.isfinite(flat)):
+        raise RetrievalInputError("is not finite", field=name)
+    return flat
+
+
+def choice(name: str, kind: type[_Choice], field: str) -> _Choice:
+    """Return the member of an enumeration of that name.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where there is none; the message lists them all.
+    """
+    try:
+        return kind(name)
+    except ValueError:
+        raise RetrievalInputError(
+            f"is {name!r}", field=field, remedy=f"choose one of {', '.join(kind)}"
+        ) from None
 
 
 def _count(leading: tuple[int, ...]) -> int:

@@ -8,14 +8,15 @@ which smooth misfit hardly touches, and the tests allow for the scatter of that 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
 from lidarops.flags import Quality
-from lidarops.retrieve import _direct
+from lidarops.retrieve import _estimate
+from lidarops.retrieve._estimate import Estimate
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -34,43 +35,6 @@ FEWEST_BENDS: Final = 5
 
 _BEND_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """What a solver knows of a batch of profiles, one value each, before it is judged.
-
-    Variances and energies are for noise of unit variance where the weights are relative.
-    """
-
-    status: Array
-    """`_direct.FITTED`, `EMPTY`, `CONSTANT` or `TOO_SHORT`."""
-    bins: Array
-    """Bins used."""
-    background: Array
-    amplitude: Array
-    extinction: Array
-    background_variance: Array
-    amplitude_relative_variance: Array
-    extinction_variance: Array
-    signal_energy: Array
-    """Squared amplitude over its variance at known extinction."""
-    misfit: Array
-    """Weighted sum of squared residuals."""
-    bends: Array
-    """Sum of squared second differences of the weighted residuals, and their number."""
-    bend_count: Array
-    largest: Array
-    """Largest weighted residual."""
-    trend: Array
-    """Energy of the residuals in shapes that the model lacks, and the number of shapes."""
-    trend_count: Array
-    rounding: Array
-    """Variance that the rounding of the power alone explains."""
-    mean_range: Array
-    """Weighted, m."""
-    bounded: Array
-    """1 where the extinction lies at a bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +57,34 @@ class _Limits:
     outlier: Array
 
 
-def judge(fit: Estimate, *, known_variance: bool) -> Verdict:
+class CommonLimits(NamedTuple):
+    """Beyond which values the tests fail, for profiles that share their number of bins."""
+
+    lowest_signal: float
+    largest_relative_error: float
+    least_misfit: float
+    most_misfit: float
+    curvature: float
+    outlier: float
+
+
+def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimits:
+    """Return the limits for profiles of `bins` bins without gaps.
+
+    Parameters
+    ----------
+    bins : int
+    shapes : int
+        Degrees of freedom of the curvature misfit.
+    known_variance : bool
+    """
+    of_kind = _known_limits if known_variance else _estimated_limits
+    one, bends, other = (np.array([float(count)]) for count in (bins, bins - 2, shapes))
+    tests = (float(limit[0]) for limit in of_kind(one, bends, other, 3))
+    return CommonLimits(LOWEST_SIGNAL, LARGEST_RELATIVE_ERROR, *tests)
+
+
+def judge(fit: Estimate, *, known_variance: bool, unknowns: int = 3) -> Verdict:
     """Judge a batch of fits.
 
     Parameters
@@ -101,11 +92,13 @@ def judge(fit: Estimate, *, known_variance: bool) -> Verdict:
     fit : Estimate
     known_variance : bool
         Whether the weights were inverse variances.
+    unknowns : int
+        Parameters that were fitted.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        noise = np.ones_like(fit.status) if known_variance else _estimated_noise(fit)
-        reduced = fit.misfit / _residual_dof(fit.bins) / noise
-        limits = _limits(fit, known_variance=known_variance)
+        noise = np.ones_like(fit.status) if known_variance else _estimated_noise(fit, unknowns)
+        reduced = fit.misfit / _residual_dof(fit.bins, unknowns) / noise
+        limits = _limits(fit, unknowns, known_variance=known_variance)
         tests = (
             (Quality.LOW_SIGNAL, fit.signal_energy / noise > LOWEST_SIGNAL**2),
             (Quality.POORLY_DETERMINED, _determined(fit, noise)),
@@ -118,22 +111,22 @@ def judge(fit: Estimate, *, known_variance: bool) -> Verdict:
         )
         # Passed, not failed, is asked for: what compares with NaN does not pass.
         quality = np.zeros(fit.status.shape, dtype=np.int32)
-        fitted = fit.status == _direct.FITTED
+        fitted = fit.status == _estimate.FITTED
         for bit, passed in tests:
             quality[fitted & ~passed] |= np.int32(bit)
-    quality[fit.status == _direct.CONSTANT] |= np.int32(Quality.NO_SIGNAL)
-    quality[fit.status == _direct.EMPTY] |= np.int32(Quality.INPUT_MISSING)
+    quality[fit.status == _estimate.CONSTANT] |= np.int32(Quality.NO_SIGNAL)
+    quality[fit.status == _estimate.EMPTY] |= np.int32(Quality.INPUT_MISSING)
     quality[(fit.bins > 0) & (fit.bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
     return Verdict(noise, reduced, quality)
 
 
-def _residual_dof(bins: Array) -> Array:
-    return np.maximum(bins - 3.0, 1.0)
+def _residual_dof(bins: Array, unknowns: int) -> Array:
+    return np.maximum(bins - unknowns, 1.0)
 
 
-def _estimated_noise(fit: Estimate) -> Array:
+def _estimated_noise(fit: Estimate, unknowns: int) -> Array:
     from_bends = fit.bends / (6.0 * fit.bend_count)
-    from_residuals = fit.misfit / _residual_dof(fit.bins)
+    from_residuals = fit.misfit / _residual_dof(fit.bins, unknowns)
     variance = np.where(fit.bend_count >= FEWEST_BENDS, from_bends, from_residuals)
     return np.maximum(variance, fit.rounding)
 
@@ -146,7 +139,7 @@ def _determined(fit: Estimate, noise: Array) -> npt.NDArray[np.bool_]:
     return determined
 
 
-def _limits(fit: Estimate, *, known_variance: bool) -> _Limits:
+def _limits(fit: Estimate, unknowns: int, *, known_variance: bool) -> _Limits:
     counts = [np.nan_to_num(count) for count in (fit.bins, fit.bend_count, fit.trend_count)]
     # Limits depend on counts alone, which most profiles share: evaluate each kind once.
     key = np.zeros(fit.status.shape, dtype=np.int64)
@@ -154,12 +147,13 @@ def _limits(fit: Estimate, *, known_variance: bool) -> _Limits:
         key = (key << 20) + count.astype(np.int64)
     _, sample, kind = np.unique(key, return_index=True, return_inverse=True)
     of_kinds = _known_limits if known_variance else _estimated_limits
-    limits = of_kinds(*(count[sample] for count in counts))
+    bins, bends, shapes = (count[sample] for count in counts)
+    limits = of_kinds(bins, bends, shapes, unknowns)
     return _Limits(*(limit[kind] for limit in limits))
 
 
-def _known_limits(bins: Array, _: Array, shapes: Array) -> tuple[Array, ...]:
-    dof = _residual_dof(bins)
+def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[Array, ...]:
+    dof = _residual_dof(bins, unknowns)
     return (
         special.chdtri(dof, 1.0 - 0.5 * FALSE_ALARM) / dof,
         special.chdtri(dof, 0.5 * FALSE_ALARM) / dof,
@@ -168,9 +162,9 @@ def _known_limits(bins: Array, _: Array, shapes: Array) -> tuple[Array, ...]:
     )
 
 
-def _estimated_limits(bins: Array, bends: Array, shapes: Array) -> tuple[Array, ...]:
+def _estimated_limits(bins: Array, bends: Array, shapes: Array, unknowns: int) -> tuple[Array, ...]:
     independent = bends >= FEWEST_BENDS
-    dof = np.where(independent, _BEND_DOF * bends, _residual_dof(bins))
+    dof = np.where(independent, _BEND_DOF * bends, _residual_dof(bins, unknowns))
     # The ratio of two estimates of one variance from the same residuals: the logarithm of its
     # quantile, 4.525 = 3.29 sqrt(17 / 9), with a term for short sections fitted to simulations.
     neighbours = bends + 2.0

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve import _cubic, _inputs
+from lidarops.retrieve import _counts, _cubic, _inputs
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -61,6 +61,7 @@ def cubic(
     lag: int | None = None,
     variance: npt.ArrayLike | None = None,
     statistics: str = "gauss",
+    shots: npt.ArrayLike | None = None,
 ) -> BackgroundResult:
     r"""Find the background of a homogeneous path without iteration.
 
@@ -89,7 +90,9 @@ def cubic(
         Noise variance in the square of the power's unit, broadcast against `power`. Where not
         given, one variance for the profile is estimated from differences along range.
     statistics : {"gauss", "poisson"}
-        "poisson" takes `power` as counts, which are their own variance.
+        "poisson" takes `power` as mean counts per shot, which are their own variance.
+    shots : (...) float, optional
+        Number of shots of which `power` is the mean count; 1 where not given. Needs "poisson".
 
     Returns
     -------
@@ -111,17 +114,24 @@ def cubic(
     grid = _inputs.range_grid(range)
     rows, leading = _inputs.profiles(power, grid)
     noise = _inputs.variance_rows(variance, grid, leading)
-    kind = _statistics(statistics)
-    if kind is Statistics.POISSON and variance is not None:
+    poisson = _inputs.choice(statistics, Statistics, "statistics") is Statistics.POISSON
+    if poisson and variance is not None:
         raise RetrievalInputError(
             "is given for counts, which are their own variance",
             field="variance",
             remedy="leave it out, or choose statistics='gauss'",
         )
-    if kind is Statistics.POISSON and np.any(rows < 0):
-        raise RetrievalInputError("holds negative counts", field="power")
+    if shots is not None and not poisson:
+        raise RetrievalInputError(
+            "is given for Gaussian noise", field="shots", remedy="choose statistics='poisson'"
+        )
     result = solve_cubic(
-        rows, grid.values, lag, noise, known_variance=variance is not None, kind=kind
+        rows,
+        grid.values,
+        lag,
+        noise,
+        known_variance=variance is not None,
+        shots=_counts.checked(rows, shots, leading) if poisson else None,
     )[0]
     return BackgroundResult(
         result.background.reshape(leading),
@@ -137,7 +147,7 @@ def solve_cubic(
     variance: Array,
     *,
     known_variance: bool,
-    kind: Statistics = Statistics.GAUSS,
+    shots: Array | None = None,
     want_gradients: bool = False,
 ) -> tuple[BackgroundResult, Array]:
     """Solve `cubic` on arrays that `lidarops.retrieve._inputs` has prepared.
@@ -150,7 +160,8 @@ def solve_cubic(
         m, ascending.
     lag : int, optional
     known_variance : bool
-    kind : Statistics
+    shots : (profile or 1,) float, optional
+        Where the power are mean counts of so many shots.
     want_gradients : bool
         Whether to return the derivatives of the backgrounds with respect to the power.
 
@@ -166,10 +177,9 @@ def solve_cubic(
     out = np.full((count, _cubic.COLUMNS), np.nan)
     gradients = np.zeros((count if want_gradients else 1, bins))
     if bins >= 3:
+        poisson = np.zeros(1) if shots is None else 1.0 / shots
         triples = _cubic.make_triples(range_, _checked_lag(lag, bins))
-        _cubic.solve_profiles(
-            power, variance, known_variance, kind is Statistics.POISSON, triples, gradients, out
-        )
+        _cubic.solve_profiles(power, variance, known_variance, poisson, triples, gradients, out)
     status = out[:, _cubic.STATUS]
     quality = np.zeros(count, dtype=np.int32)
     for code, bit in _QUALITY_OF_STATUS.items():
@@ -219,7 +229,7 @@ def tail_mean(
     grid = _inputs.range_grid(range)
     rows, leading = _inputs.profiles(power, grid)
     noise = _inputs.variance_rows(variance, grid, leading)
-    first = _first_of_tail(grid.values, start)
+    first = _first_of_tail(grid.values, start, "start")
     values = np.ascontiguousarray(rows[:, first:], dtype=np.float64)
     noise = np.broadcast_to(noise[:, first:], values.shape)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -231,30 +241,60 @@ def tail_mean(
             error = np.sqrt(scatter.sum(axis=-1) / (bins - 1) / bins)
         else:
             error = np.sqrt(np.where(valid, noise, 0.0).sum(axis=-1)) / bins
-    quality = np.zeros(bins.shape, dtype=np.int32)
-    quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
-    quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    quality = _tail_quality(bins)
     error[bins < 2 if variance is None else bins < 1] = np.nan
     return BackgroundResult(mean.reshape(leading), error.reshape(leading), quality.reshape(leading))
 
 
-def _first_of_tail(range_: Array, start: float | None) -> int:
+def solve_tail(
+    power: _inputs.Floats, range_: Array, start: float | None, noise: Array
+) -> tuple[BackgroundResult, Array]:
+    """Solve `tail_mean` on arrays that `lidarops.retrieve._inputs` has prepared.
+
+    Parameters
+    ----------
+    power : (profile, bin) float
+    range_ : (bin,) float
+        m, ascending.
+    start : float, optional
+        m.
+    noise : (profile or 1, bin) float
+        Variances or weights; where not positive and finite, a bin is passed over.
+
+    Returns
+    -------
+    BackgroundResult
+        (profile,); no standard errors, which follow from the gradients.
+    gradients : (profile, bin) float
+        Derivatives of the backgrounds with respect to the power.
+    """
+    first = _first_of_tail(range_, start, "tail_start")
+    gradients = np.zeros(power.shape)
+    usable = np.isfinite(power) & np.isfinite(noise) & (noise > 0)
+    bins = usable[:, first:].sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        gradients[:, first:] = usable[:, first:] / bins[:, np.newaxis]
+        values = np.where(usable[:, first:], power[:, first:].astype(np.float64), 0.0)
+        mean = values.sum(axis=-1) / bins
+    quality = _tail_quality(bins)
+    return BackgroundResult(mean, np.full(mean.shape, np.nan), quality), gradients
+
+
+def _tail_quality(bins: npt.NDArray[np.intp]) -> Flags:
+    quality = np.zeros(bins.shape, dtype=np.int32)
+    quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
+    quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    return quality
+
+
+def _first_of_tail(range_: Array, start: float | None, field: str) -> int:
     if start is None:
         return int(range_.size - max(range_.size // 10, 1))
     if not np.isfinite(start) or start > range_[-1]:
         raise RetrievalInputError(
-            f"is {start} m, but the range ends at {range_[-1]:g} m", field="start"
+            f"is {start} m, but the range ends at {range_[-1]:g} m", field=field
         )
     return int(np.searchsorted(range_, start, side="left"))
-
-
-def _statistics(name: str) -> Statistics:
-    try:
-        return Statistics(name)
-    except ValueError:
-        raise RetrievalInputError(
-            f"is {name!r}", field="statistics", remedy=f"choose one of {', '.join(Statistics)}"
-        ) from None
 
 
 def _checked_lag(lag: int | None, bins: int) -> int:

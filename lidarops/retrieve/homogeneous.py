@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve import _cubic, _direct, _inputs
-from lidarops.retrieve._verdict import Estimate, judge
-from lidarops.retrieve.background import solve_cubic
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
+from lidarops.retrieve import _counts, _dense, _inputs, _methods, _robust, _sections
+from lidarops.retrieve._problem import Array, Centre, Flags, Flat, Problem
+from lidarops.retrieve.background import Statistics
 
 LOWEST_EXTINCTION: Final = -0.3
 """Default lower bound, over the far end of the section. Where extinction approaches
 -1 / range, the shape stops falling and a second minimum appears."""
 HIGHEST_OPTICAL_DEPTH: Final = 60.0
 """Default upper bound, over the length of the section: the signal is gone after two bins."""
+MODEL_ERROR: Final = 0.05
+"""Default share of extinction + 1 / mean range that the model itself is trusted to."""
 _LARGEST_OPTICAL_DEPTH: Final = 300.0
 """Beyond this the exponential leaves the numbers that a computer has."""
 
@@ -31,17 +30,52 @@ class Method(StrEnum):
     """Ways to solve a homogeneous path."""
 
     AUTO = "auto"
+    COMPRESSED = "compressed"
+    FAST = "fast"
     DIRECT = "direct"
     CUBIC = "cubic"
+    LINEARIZED = "linearized"
+    KNOWN_BACKGROUND = "known_background"
+    KNOWN_EXTINCTION = "known_extinction"
+    TAIL_MEAN = "tail_mean"
+
+
+_SOLVERS: Final[dict[Method, Callable[[Problem], Flat]]] = {
+    Method.AUTO: _dense.compressed,
+    Method.COMPRESSED: _dense.compressed,
+    Method.FAST: _dense.fast,
+    Method.DIRECT: _methods.direct,
+    Method.CUBIC: _methods.cubic,
+    Method.LINEARIZED: _methods.linearized,
+    Method.KNOWN_BACKGROUND: _methods.known_background,
+    Method.KNOWN_EXTINCTION: _methods.known_extinction,
+    Method.TAIL_MEAN: _methods.tail_mean,
+}
+
+_NEEDS: Final[dict[str, set[Method]]] = {
+    "extinction": {Method.LINEARIZED, Method.KNOWN_EXTINCTION},
+    "background": {Method.KNOWN_BACKGROUND},
+}
+"""Arguments that these methods need and no other takes."""
+_TAKES: Final[dict[str, set[Method]]] = {
+    "background_standard_error": {Method.KNOWN_BACKGROUND},
+    "centre": {Method.LINEARIZED},
+    "lag": {Method.CUBIC},
+    "tail_start": {Method.TAIL_MEAN},
+}
+"""Arguments that these methods take and no other."""
 
 
 @dataclass(frozen=True, slots=True)
 class HomogeneousResult:
     """What a homogeneous path was found to be, with the leading axes of the power.
 
+    Where sections were asked for, they are the last axis.
+
     Standard errors are conditional on the model. What changes the profile along the model's own
     shapes leaves no trace in the residuals: backscatter that falls along the path as
     ``exp(-R / H)`` is taken for 1 / (2 H) of extinction, on a vertical path as on any other.
+    `extinction_model_error` is an allowance for that, apart from the random error.
     """
 
     background: Array
@@ -53,31 +87,19 @@ class HomogeneousResult:
     extinction: Array
     """m-1."""
     extinction_standard_error: Array
+    """m-1; random error alone."""
+    extinction_model_error: Array
+    """m-1; `model_error` times (absolute extinction + 1 / mean range)."""
+    signal_to_noise: Array
+    """Amplitude over its standard error at known extinction, with the sign of the amplitude."""
     reduced_chi2: Array
     """1 where the residuals are noise; relative to the estimated noise without a variance."""
+    curvature_misfit: Array
+    """Energy of the residuals in the smooth shapes that the model lacks, over the noise: a
+    chi-square of the compressed methods; NaN for the others."""
     valid_bins: Flags
     quality: Flags
     """Bits of `lidarops.flags.Quality`; 0 where no test failed."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Problem:
-    power: _inputs.Floats
-    """(profile, bin)."""
-    range: Array
-    """m, ascending."""
-    noise: Array
-    """(profile or 1, bin): variances or relative weights."""
-    known_variance: bool
-    bounds: tuple[float, float]
-    """m-1."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Solution:
-    estimate: Estimate
-    quality: Flags
-    """What the solver itself has to say."""
 
 
 def solve(
@@ -88,6 +110,17 @@ def solve(
     weights: npt.ArrayLike | None = None,
     method: str = "auto",
     extinction_bounds: tuple[float, float] | None = None,
+    extinction: npt.ArrayLike | None = None,
+    background: npt.ArrayLike | None = None,
+    background_standard_error: npt.ArrayLike | None = None,
+    centre: str | None = None,
+    lag: int | None = None,
+    tail_start: float | None = None,
+    statistics: str = "gauss",
+    shots: npt.ArrayLike | None = None,
+    sections: Sequence[tuple[float, float]] | None = None,
+    robust_passes: int = 0,
+    model_error: float = MODEL_ERROR,
 ) -> HomogeneousResult:
     r"""Find background, amplitude and extinction of a homogeneous path.
 
@@ -105,18 +138,44 @@ def solve(
     weights : (..., range) float, optional
         Inverse variances up to a common factor, in place of `variance`. Bins whose weight is
         not positive and finite are left out.
-    method : {"auto", "direct", "cubic"}
-        "direct" is the least-squares solution by a fixed number of closed-form steps: the best
-        of 24 extinctions with background and amplitude eliminated (variable projection), the
-        vertex of a parabola through it, five Newton steps. It takes gaps, weights and any
-        spacing, and reaches the least possible scatter. "cubic" takes the background of
-        `lidarops.retrieve.background.cubic`, then fits amplitude and extinction to what is
-        above it; it needs a uniform range without gaps and scatters 1.3 to 3 times as much,
-        with standard errors that say so. "auto" chooses "direct".
+    method : str
+        One of the methods of the notes below.
     extinction_bounds : (float, float), optional
         Lowest and highest extinction in m-1; -0.3 / (last range) and 60 / (last - first range)
         where not given. The lower one keeps a second, unphysical minimum near -1 / (last
-        range) out; it is negative so that noise about zero is not clipped.
+        range) out, which is too narrow to be found by all means if it is let in; it is
+        negative so that noise about zero is not clipped.
+    extinction : (...) float, optional
+        m-1. The prior of "linearized"; taken as exact by "known_extinction".
+    background : (...) float, optional
+        For "known_background", in the unit of the power.
+    background_standard_error : (...) float, optional
+        Of the given background, which must not stem from the same bins; 0 where not given.
+    centre : {"centroid", "zero"}, optional
+        The range about which "linearized" expands; the centroid of information where not given.
+    lag : int, optional
+        Of "cubic"; `lidarops.retrieve.background.default_lag` where not given.
+    tail_start : float, optional
+        m; "tail_mean" averages the bins from here on, the last tenth where not given.
+    statistics : {"gauss", "poisson"}
+        "poisson" says that `power` are mean counts per shot. The weights must then be given,
+        and those of a mean profile (`mean_profile_variance`): weights from the counts of the
+        profile itself bias the fit, and weights pooled over whatever happens to be in one call
+        would make a result depend on its neighbours.
+    shots : (...) float, optional
+        Number of shots of which `power` is the mean count; 1 where not given. Needs "poisson".
+    sections : sequence of (float, float), optional
+        m; each section holds the bins with near <= R < far and is solved on its own. The
+        result gets a last axis, section.
+    robust_passes : int
+        How often to leave out the bins that are more than 4 standard deviations of the noise
+        off the fit, and to fit again; 2 suffice for a cloud or spikes. What is left out raises
+        OUTLIER. The standard deviation is not less than the median deviation tells, so that a
+        bad fit does not shed most of its bins. Not with "cubic", which takes no gaps.
+    model_error : float
+        Share of extinction + 1 / mean range that is stated as `extinction_model_error`. In
+        random violations of the model that no test on residuals could see, 5 percent covered
+        most of the excess error.
 
     Returns
     -------
@@ -141,12 +200,70 @@ def solve(
     Raises
     ------
     RetrievalInputError
-        For arguments whose shapes, units or values cannot be right.
+        For arguments whose shapes, units or values cannot be right, or that the method does not
+        take.
+
+    Notes
+    -----
+    auto
+        "compressed".
+    compressed
+        The least-squares solution from 11 linear functionals of the profile, which hold all but
+        a millionth of what it says of the extinction: within 0.01 standard errors of "direct" in
+        a twentieth of its time. For profiles without gaps on a uniform range with weights that
+        all share; profiles that are not (and sections of less than 32 bins) are given to
+        "direct", one by one. Here NOT_HOMOGENEOUS is a test of `curvature_misfit`, the energy
+        of the functionals that the model leaves over.
+    fast
+        The same from 7 functionals: up to 0.4 percent more scatter, within 0.3 standard errors
+        of "direct". With a known variance the residuals are not looked at: no `reduced_chi2`,
+        no POOR_FIT, no OUTLIER.
+    direct
+        The least-squares solution by a fixed number of closed-form steps: the best of 24
+        extinctions with background and amplitude eliminated (variable projection, golub1973),
+        the vertex of a parabola through it, five Newton steps. It takes gaps, weights and any
+        spacing, and reaches the least possible scatter.
+    cubic
+        The background of `lidarops.retrieve.background.cubic` (bobrovsky2024, corrected there),
+        then amplitude and extinction fitted to what is above it. No start value and no search,
+        but a uniform range without gaps, a signal that starts well above the noise, and 1.3 to
+        3 times the least possible scatter, which its standard errors state.
+    linearized
+        Linear least squares for three unknowns about a prior extinction (potapova2023):
+
+        .. math:: P \approx P^* + [B + G (R - R_c)] R^{-2} e^{-2 \sigma_0 R},
+            \qquad \sigma = \sigma_0 - G / 2B
+
+        Three linear equations, one Gauss-Newton step of the full problem: for a prior that is
+        known to some percent, as from a neighbouring profile. What the neglected term of second
+        order does is estimated and part of the standard errors. By default R_c is the centroid
+        of information, where B and G are independent. The paper expands about R_c = 0
+        (centre="zero"), where B is extrapolated: from a prior 20 percent low, the error at
+        strong extinction is 6 to 8 times larger, that at weak extinction about the same. There
+        the estimate of the neglected term falls short too: of priors that are off by up to a
+        factor of 2, 1 to 3 percent of what is accepted is off by more than 4 standard errors,
+        0.01 percent about the centroid.
+    known_background
+        Amplitude and extinction above a given background, by converged least squares; the
+        paper's (5), in two unknowns, is one step of it. For a background that is measured
+        elsewhere, as before the laser fires: at weak extinction, the scatter is 3 to 11
+        times less than with three unknowns. The error of the background is propagated.
+    known_extinction
+        Background and amplitude by linear least squares at a given extinction, the paper's (4),
+        weighted here. The extinction is taken as exact, with a standard error of 0; the others
+        are conditional on it. The paper takes this background into (5) and finds two unknowns
+        more accurate than three: true only for a background that the profile itself did not
+        tell. Otherwise the two steps in turn just descend towards the least-squares solution,
+        slowly, with its errors.
+    tail_mean
+        Background as mean of the far bins, then as "known_background", with its noise
+        propagated. For comparison only: what is left of the signal in the tail is part of the
+        background: a bias of many standard errors, which POOR_FIT tells in part. Over random
+        paths, a third of what is accepted is off by more than 4 standard errors.
 
     References
     ----------
-    golub1973 (variable projection); bobrovsky2024 (cubic); potapova2023 (linearised step, here
-    about the centroid of information, not about range zero).
+    golub1973; bobrovsky2024; potapova2023.
 
     Examples
     --------
@@ -156,128 +273,190 @@ def solve(
     >>> float(np.round(solve(power, distance).extinction, 12))
     3e-05
     """
+    way = _inputs.choice(method, Method, "method")
+    _check_arguments(
+        way,
+        {
+            "extinction": extinction,
+            "background": background,
+            "background_standard_error": background_standard_error,
+            "centre": centre,
+            "lag": lag,
+            "tail_start": tail_start,
+        },
+    )
     grid = _inputs.range_grid(range)
     rows, leading = _inputs.profiles(power, grid)
-    if variance is not None and weights is not None:
-        raise RetrievalInputError(
-            "is given together with variance", field="weights", remedy="give one of the two"
-        )
-    if variance is not None:
-        noise = _inputs.variance_rows(variance, grid, leading)
-    else:
-        noise = _inputs.noise_rows(weights, "weights", grid, leading)
-    problem = _Problem(
+    noise, known_variance = _noise(variance, weights, grid, leading)
+    error = _inputs.profile_values(background_standard_error, "background_standard_error", leading)
+    if error is not None and np.any(error < 0):
+        raise RetrievalInputError("is negative", field="background_standard_error")
+    problem = Problem(
         power=rows,
         range=grid.values,
         noise=noise,
-        known_variance=variance is not None,
-        bounds=_bounds(extinction_bounds, grid.values),
-    )
-    solution = _SOLVERS[_method(method)](problem)
-    return _result(solution, problem, leading)
-
-
-def _solve_direct(problem: _Problem) -> _Solution:
-    background = np.full(1, np.nan)
-    return _Solution(_estimate(problem, background), np.zeros(1, dtype=np.int32))
-
-
-def _solve_cubic(problem: _Problem) -> _Solution:
-    """Take the background from the cubic and propagate its error into the rest."""
-    with np.errstate(divide="ignore"):
-        variance = problem.noise if problem.known_variance else 1.0 / problem.noise
-    found, gradients = solve_cubic(
-        problem.power,
-        problem.range,
-        None,
-        variance,
-        known_variance=problem.known_variance,
-        want_gradients=True,
-    )
-    fit = _estimate(problem, found.background)
-    errors = np.empty((fit.extinction.size, 3))
-    _cubic.propagate(
-        np.ascontiguousarray(fit.extinction),
-        np.ascontiguousarray(fit.amplitude),
-        problem.range,
-        variance,
-        gradients,
-        errors,
-    )
-    fit = replace(
-        fit,
-        status=np.where(np.isnan(found.background), np.nan, fit.status),
-        background=found.background,
-        background_variance=errors[:, 0],
-        amplitude_relative_variance=errors[:, 1],
-        extinction_variance=errors[:, 2],
-    )
-    return _Solution(fit, found.quality)
-
-
-def _estimate(problem: _Problem, background: Array) -> Estimate:
-    """Run the kernel, with the background fitted where `background` is NaN."""
-    table = np.full((problem.power.shape[0], len(_direct.COLUMNS)), np.nan)
-    # Half a unit in the last place, as a standard deviation, and what the kernel itself loses.
-    rounding = 0.3 * np.finfo(problem.power.dtype).eps + 8.0 * np.finfo(np.float64).eps
-    _direct.solve_profiles(
-        problem.power,
-        problem.noise,
-        problem.known_variance,
-        background,
-        float(rounding),
-        _direct.make_grid(problem.range, problem.bounds),
-        table,
-    )
-    return Estimate(**dict(zip(_direct.COLUMNS, table.T, strict=True)))
-
-
-_SOLVERS: Final[dict[Method, Callable[[_Problem], _Solution]]] = {
-    Method.AUTO: _solve_direct,
-    Method.DIRECT: _solve_direct,
-    Method.CUBIC: _solve_cubic,
-}
-
-
-def _result(solution: _Solution, problem: _Problem, leading: tuple[int, ...]) -> HomogeneousResult:
-    fit = solution.estimate
-    verdict = judge(fit, known_variance=problem.known_variance)
-    fitted, constant = fit.status == _direct.FITTED, fit.status == _direct.CONSTANT
-
-    def shaped(values: Array, where: npt.NDArray[np.bool_], other: float = np.nan) -> Array:
-        return np.where(where, values, other).reshape(leading)
-
-    with np.errstate(invalid="ignore", over="ignore"):
-        background_error = np.sqrt(fit.background_variance * verdict.noise)
-        relative_error = np.sqrt(fit.amplitude_relative_variance * verdict.noise)
-        amplitude_error = np.abs(fit.amplitude) * relative_error
-        extinction_error = np.sqrt(fit.extinction_variance * verdict.noise)
-    return HomogeneousResult(
-        background=shaped(fit.background, fitted | constant),
-        background_standard_error=shaped(
-            background_error, fitted | (constant & problem.known_variance)
+        known_variance=known_variance,
+        bounds=(np.nan, np.nan),
+        extinction=_prior(extinction, grid.values, leading),
+        background=_inputs.profile_values(background, "background", leading),
+        background_variance=None if error is None else error**2,
+        shots=_shots(
+            statistics, shots, rows, leading, weighted=variance is not None or weights is not None
         ),
-        amplitude=np.where(constant.reshape(leading), 0.0, shaped(fit.amplitude, fitted)),
-        amplitude_standard_error=shaped(amplitude_error, fitted),
-        extinction=shaped(fit.extinction, fitted),
-        extinction_standard_error=shaped(extinction_error, fitted),
-        reduced_chi2=shaped(verdict.reduced_chi2, fitted),
-        valid_bins=np.nan_to_num(fit.bins).astype(np.int32).reshape(leading),
-        quality=(verdict.quality | solution.quality).reshape(leading),
+        lag=lag,
+        centre=_inputs.choice(centre or Centre.CENTROID, Centre, "centre"),
+        tail_start=tail_start,
     )
+    solver = _robust.Robust(_SOLVERS[way], _passes(robust_passes, way))
+    found = [
+        solver(problem.cut(bins, _bounds(extinction_bounds, grid.values[bins])))
+        for bins in _sections.bins_of(sections, grid.values)
+    ]
+    shape = leading if sections is None else (*leading, len(found))
+    return _result(found, shape, _share(model_error))
 
 
-def _method(name: str) -> Method:
-    try:
-        return Method(name)
-    except ValueError:
+def mean_profile_variance(
+    power: npt.ArrayLike,
+    shots: npt.ArrayLike = 1.0,
+) -> Array:
+    """Return the variance of photon counts, from the mean profile of a block.
+
+    Weights from a profile's own counts favour the bins that happen to be low, and bias the fit.
+    Those of the mean profile of a block that shares its scale do not, and are as good: over a
+    dynamic range of 1e4 the scatter is within 2 percent of the least possible one.
+
+    The mean profile is averaged along range only as far as it takes to hold 1000 counts, at most
+    over 15 bins, so that steep strong signals keep their shape. Choose the block once and pass
+    the result with every part of it: the solver does not pool on its own, since results would
+    then depend on how an archive is cut.
+
+    Parameters
+    ----------
+    power : (..., range) float
+        Mean counts per shot. Bins that are not finite are passed over.
+    shots : (...) float
+        Number of shots of which each profile is the mean count.
+
+    Returns
+    -------
+    (..., range) float
+        Variance of `power`: the mean profile over the number of shots; (range,) for one number
+        of shots. NaN where no profile has a finite value.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where counts are negative or shots not positive.
+    """
+    return _counts.mean_profile_variance(power, shots)
+
+
+def _noise(
+    variance: npt.ArrayLike | None,
+    weights: npt.ArrayLike | None,
+    grid: _inputs.RangeGrid,
+    leading: tuple[int, ...],
+) -> tuple[Array, bool]:
+    if variance is None:
+        return _inputs.noise_rows(weights, "weights", grid, leading), False
+    if weights is not None:
         raise RetrievalInputError(
-            f"is {name!r}", field="method", remedy=f"choose one of {', '.join(Method)}"
-        ) from None
+            "is given together with variance", field="weights", remedy="give one of the two"
+        )
+    return _inputs.variance_rows(variance, grid, leading), True
+
+
+def _shots(
+    statistics: str,
+    shots: npt.ArrayLike | None,
+    power: _inputs.Floats,
+    leading: tuple[int, ...],
+    *,
+    weighted: bool,
+) -> Array | None:
+    """Return the shots of each profile, None for Gaussian noise."""
+    if _inputs.choice(statistics, Statistics, "statistics") is Statistics.GAUSS:
+        if shots is not None:
+            raise RetrievalInputError(
+                "is given for Gaussian noise", field="shots", remedy="choose statistics='poisson'"
+            )
+        return None
+    if not weighted:
+        raise RetrievalInputError(
+            "is missing for counts",
+            field="variance",
+            remedy="give mean_profile_variance(power, shots) of the whole block",
+        )
+    return _counts.checked(power, shots, leading)
+
+
+def _prior(
+    extinction: npt.ArrayLike | None, range_: Array, leading: tuple[int, ...]
+) -> Array | None:
+    values = _inputs.profile_values(extinction, "extinction", leading)
+    limit = _LARGEST_OPTICAL_DEPTH / _length(range_)
+    if values is not None and np.any(np.abs(values) > limit):
+        raise RetrievalInputError(
+            f"holds values up to {np.max(np.abs(values)):g} m-1: it must be in m-1",
+            field="extinction",
+            remedy=f"stay within +-{limit:g} m-1 (300 over the length)",
+        )
+    return values
+
+
+def _check_arguments(method: Method, given: Mapping[str, object]) -> None:
+    for name, value in given.items():
+        takers = (_NEEDS | _TAKES)[name]
+        if value is not None and method not in takers:
+            raise RetrievalInputError(
+                f"is not taken by the method {str(method)!r}",
+                field=name,
+                remedy=f"leave it out, or choose {' or '.join(sorted(takers))}",
+            )
+        if value is None and name in _NEEDS and method in takers:
+            raise RetrievalInputError(f"is needed by the method {str(method)!r}", field=name)
+
+
+def _passes(passes: int, method: Method) -> int:
+    if passes < 0:
+        raise RetrievalInputError(f"is {passes}", field="robust_passes", remedy="give 0 or more")
+    if passes and method is Method.CUBIC:
+        raise RetrievalInputError(
+            f"is {passes}, but the cubic takes no gaps",
+            field="robust_passes",
+            remedy="choose another method",
+        )
+    return passes
+
+
+def _share(model_error: float) -> float:
+    if not (np.isfinite(model_error) and model_error >= 0):
+        raise RetrievalInputError(
+            f"is {model_error}", field="model_error", remedy="give a fraction, such as 0.05"
+        )
+    return float(model_error)
+
+
+def _result(found: Sequence[Flat], shape: tuple[int, ...], model_error: float) -> HomogeneousResult:
+    columns = {
+        field.name: _stacked([getattr(flat, field.name) for flat in found]).reshape(shape)
+        for field in fields(Flat)
+    }
+    scale = np.abs(columns["extinction"]) + 1.0 / columns.pop("mean_range")
+    return HomogeneousResult(**columns, extinction_model_error=model_error * scale)
+
+
+def _stacked(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    return columns[0] if len(columns) == 1 else np.stack(columns, axis=-1)
+
+
+def _length(range_: Array) -> float:
+    return float(range_[-1] - range_[0]) if range_.size > 1 else 1.0
 
 
 def _bounds(bounds: tuple[float, float] | None, range_: Array) -> tuple[float, float]:
-    length = float(range_[-1] - range_[0]) if range_.size > 1 else 1.0
+    length = _length(range_)
     if bounds is None:
         return LOWEST_EXTINCTION / float(range_[-1]), HIGHEST_OPTICAL_DEPTH / length
     lowest, highest = (float(bound) for bound in bounds)

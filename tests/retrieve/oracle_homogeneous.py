@@ -97,3 +97,75 @@ def real_roots(coefficients):
     size = max(abs(root) for root in roots) + 1
     tiny = mp.mpf(10) ** (-mp.mp.dps // 3)
     return sorted(mp.re(root) for root in roots if abs(mp.im(root)) < tiny * size)
+
+
+def linear_step(r, power, weights, prior, centre):
+    """Return background, amplitude and extinction after one linear step from a prior.
+
+    The normal equations of potapova2023, weighted, solved by a general routine; the centroid is
+    found as the origin at which shape and slope, cleared of the background, are orthogonal.
+    """
+    root = np.sqrt(weights)
+
+    def cleared(column):
+        return root * (column - np.sum(weights * column) / np.sum(weights))
+
+    shape = signal_from(r, r[0], prior)
+    origin = 0.0
+    if centre == "centroid":
+        origin = cleared(shape * r) @ cleared(shape) / (cleared(shape) @ cleared(shape))
+    length = r[-1] - r[0]
+    design = np.stack([np.ones_like(r), shape, shape * (r - origin) / length], axis=1)
+    (background, b, g), *_ = np.linalg.lstsq(design * root[:, None], power * root, rcond=None)
+    step = -g / length / (2 * b)
+    height = b * r[0] ** 2 * np.exp(2 * prior * r[0]) * np.exp(2 * step * origin)
+    return background, height, prior + step
+
+
+def published_background(r, power, extinction):
+    """Return the background at a given extinction by equation (4) of potapova2023, as printed."""
+    x, n = np.exp(-2 * extinction * r), r.size
+    square, first = np.sum(x**2 / r**4), np.sum(x / r**2)
+    return (square * np.sum(power) - first * np.sum(power * x / r**2)) / (n * square - first**2)
+
+
+TABLE_SIGNAL = 17.0
+"""Signal at 2.5 km, in units of the noise, with which noise alone explains the published bias."""
+TABLE_BIAS = ((1000.0, 10.2), (4000.0, 2.7), (6000.0, 1.4), (8000.0, 0.8))
+"""bobrovsky2024, table 1: length of a section from 2.5 km, and the bias of its background in units
+of the noise where the background is 370 (the paper does not say)."""
+
+
+def table_profiles(start, length, count, seed):
+    """Return range and profiles like those of the tables of bobrovsky2024; background 370."""
+    r = np.arange(start, start + length + 1.0, 15.0)
+    extinction = 3e-5
+    height = TABLE_SIGNAL * (2500.0 / start) ** 2 * np.exp(-2 * extinction * (start - 2500.0))
+    noise = np.random.default_rng(seed).normal(size=(count, r.size))
+    return r, 370.0 + signal(r, height, extinction) + noise
+
+
+def brute_force(r, power, bounds, count=1201):
+    """Return the least sum of squares on a dense grid of extinctions, and its extinction.
+
+    Background and amplitude are eliminated at every node; about the best one, the grid is made
+    dense three times more.
+    """
+    length = r[-1] - r[0]
+    low, high = np.array(bounds) * length
+
+    def losses(depths):
+        shapes = signal_from(r, r[0], depths[:, np.newaxis] / length)
+        centred = shapes - shapes.mean(axis=1, keepdims=True)
+        norms = np.maximum(np.sum(centred**2, axis=1), 1e-300)
+        height = centred @ (power - power.mean()) / norms
+        residuals = power - power.mean() - height[:, np.newaxis] * centred
+        return np.sum(residuals**2, axis=1)
+
+    depths = np.sinh(np.linspace(np.arcsinh(low / 0.3), np.arcsinh(high / 0.3), count)) * 0.3
+    for _ in range(4):
+        found = losses(depths)
+        k = int(np.argmin(found))
+        least, best = found[k], depths[k] / length
+        depths = np.linspace(depths[max(k - 1, 0)], depths[min(k + 1, depths.size - 1)], 101)
+    return least, best

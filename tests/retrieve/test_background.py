@@ -53,11 +53,27 @@ def test_root_keeps_its_digits(start, length, bins, ratio, digits, lag):
 
 
 def test_root_keeps_its_digits_on_a_long_grid():
-    r = section(2500.0, 8000.0, 1024)
-    power = 25.0 + signal(r, 1.0, 0.03 * KM)
-    with mp.workdps(50):
-        exact = real_roots(quartic_derivative(r, power, 341))[-1]
-        assert abs(mp.mpf(float(without_noise(power, r, 341).background)) - exact) < 1e-12
+    for bins, lag in ((1024, 341), (4096, 1), (4096, 1365)):
+        r = section(2500.0, 8000.0, bins)
+        power = 25.0 + signal(r, 1.0, 0.03 * KM)
+        with mp.workdps(40):
+            exact = real_roots(quartic_derivative(r, power, lag))[-1]
+            assert abs(mp.mpf(float(without_noise(power, r, lag).background)) - exact) < 1e-12
+
+
+def test_root_keeps_its_digits_on_random_sections():
+    rng = np.random.default_rng(9)
+    for _ in range(60):
+        bins = int(rng.integers(7, 300))
+        lag = int(rng.integers(max(bins // 8, 1), (bins - 1) // 2 + 1))
+        r = section(rng.uniform(1000.0, 12000.0), rng.uniform(1500.0, 9000.0), bins)
+        ratio = 10 ** rng.uniform(-1, 6)
+        power = ratio + signal(r, 1.0, 10 ** rng.uniform(-2, -0.5) * KM)
+        with mp.workdps(45):
+            exact = real_roots(quartic_derivative(r, power, lag))[-1]
+            error = abs(mp.mpf(float(without_noise(power, r, lag).background)) - exact)
+        # Of a power rounded to float64, the root can only be so near as the rounding of itself.
+        assert error < (1e-12 if ratio < 1e4 else 1e-10) + np.spacing(ratio)
 
 
 def test_float32_profiles_are_solved_in_double_precision():
@@ -83,9 +99,9 @@ def spurious_distances(r, lag, extinction):
 def test_largest_real_root_is_the_background_and_spread_decides_the_root_class():
     rng = np.random.default_rng(1)
     seen = {True: 0, False: 0}
-    with mp.workdps(60):
-        for _ in range(120):
-            bins = int(rng.integers(7, 40))
+    with mp.workdps(50):
+        for _ in range(1150):
+            bins = int(rng.integers(7, 20))
             lag = int(rng.integers(1, (bins - 1) // 2 + 1))
             # Exactly uniform, so that the identity of the triples is exact.
             start, step = int(rng.integers(500, 12000)), int(rng.integers(5, 400))
@@ -95,7 +111,7 @@ def test_largest_real_root_is_the_background_and_spread_decides_the_root_class()
             shape = [mp.e ** (-2 * extinction * (x - r[0])) * (r[0] / x) ** 2 for x in r]
             power = [background + value for value in shape]
             roots = real_roots(quartic_derivative(r, power, lag))
-            assert abs(roots[-1] - background) < mp.mpf(10) ** -18
+            assert abs(roots[-1] - background) < mp.mpf(10) ** -15
 
             distances, weights = spurious_distances(r, lag, extinction)
             total = sum(weights)
@@ -106,7 +122,8 @@ def test_largest_real_root_is_the_background_and_spread_decides_the_root_class()
                 three = spread < 1 / mp.sqrt(8)
                 seen[bool(three)] += 1
                 assert (len(roots) == 3) == three
-    assert min(seen.values()) >= 5
+    assert sum(seen.values()) >= 1000
+    assert min(seen.values()) >= 100
 
 
 @settings(max_examples=200, deadline=None)
@@ -210,16 +227,6 @@ def test_counts_are_their_own_variance():
     assert 0.93 < np.mean(covered) < 0.97
 
 
-def test_lag_of_one_without_correction_reproduces_the_bias_of_the_published_table():
-    # bobrovsky2024, table 1: 1, 4, 6, 8 km from 2.5 km, in tenths of the noise; truth 37.0.
-    rng = np.random.default_rng(5)
-    for length, expected in ((1000.0, 10.2), (4000.0, 2.7), (6000.0, 1.4), (8000.0, 0.8)):
-        r = np.arange(2500.0, 2500.0 + length + 1.0, 15.0)
-        power = 370.0 + signal(r, 17.0, 0.03 * KM) + rng.normal(size=(400, r.size))
-        uncorrected = cubic(power, r, lag=1, variance=0.0).background
-        assert np.mean(uncorrected) - 370.0 == pytest.approx(expected, abs=0.3)
-
-
 def test_lost_roots_are_flagged():
     rng = np.random.default_rng(6)
     noise = 370.0 + rng.normal(size=(3000, LONG.size))
@@ -237,7 +244,7 @@ def test_gradient_is_that_of_finite_differences():
     def solve(rows):
         out = np.full((len(rows), _cubic.COLUMNS), np.nan)
         gradients = np.zeros_like(rows)
-        _cubic.solve_profiles(rows, variance, True, False, triples, gradients, out)
+        _cubic.solve_profiles(rows, variance, True, np.zeros(1), triples, gradients, out)
         return out[:, _cubic.BACKGROUND], gradients
 
     step = 1e-4

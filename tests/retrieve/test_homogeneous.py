@@ -43,6 +43,15 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
+def alike(found, expected):
+    """The same up to what other sums and single-precision residuals leave, in standard errors."""
+    for name in ("background", "amplitude", "extinction"):
+        apart = np.abs(getattr(found, name) - getattr(expected, name))
+        assert np.all(apart < 0.01 * getattr(expected, f"{name}_standard_error"))
+    np.testing.assert_allclose(found.reduced_chi2, expected.reduced_chi2, rtol=1e-3)
+    np.testing.assert_array_equal(found.quality, expected.quality)
+
+
 # Exactness ----------------------------------------------------------------------------------
 
 
@@ -476,9 +485,9 @@ def test_forms_of_input():
         power.astype(np.longdouble),
     ):
         same(solve(form, LONG, variance=1.0), expected)
-    same(solve(power.astype(np.float32), LONG, variance=1.0), expected)
+    alike(solve(power.astype(np.float32), LONG, variance=1.0), expected)
     same(solve(power, LONG, variance=np.ones((1, 225), np.float32)), expected)
-    same(solve(power, LONG, variance=np.ones((4, 1))), expected)
+    alike(solve(power, LONG, variance=np.ones((4, 1))), expected)
     same(solve(power[:, ::-1], LONG[::-1], variance=np.ones(225)[::-1]), expected)
     assert np.array_equal(frozen, power)
     assert solve(power[:0], LONG).extinction.shape == (0,)
@@ -521,7 +530,7 @@ def test_descending_range_turns_variance_too():
         ({"variance": "1"}, "variance", "real numbers"),
         ({"weights": np.ones(7)}, "weights", "broadcast"),
         ({"variance": 1.0, "weights": 1.0}, "weights", "one of the two"),
-        ({"method": "klett"}, "method", "auto, direct, cubic"),
+        ({"method": "klett"}, "method", "auto, compressed, fast, direct, cubic"),
         ({"extinction_bounds": (1.0, 0.0)}, "extinction_bounds", "rising"),
         ({"extinction_bounds": (0.0, np.nan)}, "extinction_bounds", "rising"),
         ({"extinction_bounds": (-1.0, 1.0)}, "extinction_bounds", "300"),
@@ -537,9 +546,9 @@ def test_arguments_that_cannot_be_right_are_refused(arguments, field, words):
 # The cubic ----------------------------------------------------------------------------------
 
 
-def test_auto_is_direct():
+def test_auto_is_compressed():
     power = clean(5)
-    same(solve(power, LONG, variance=1.0), solve(power, LONG, variance=1.0, method="direct"))
+    same(solve(power, LONG, variance=1.0), solve(power, LONG, variance=1.0, method="compressed"))
     same(solve(power, LONG), solve(power, LONG, method=Method.AUTO))
 
 

@@ -1,0 +1,253 @@
+"""Compiled projection of a profile on background and amplitude at one extinction.
+
+Background and amplitude are linear, so that least squares of a homogeneous path is a problem in
+extinction alone: the variable projection of `golub1973`.
+
+Everything is scaled: ``x = (R - R_0) / L`` with the length L of the section, extinction as
+``tau = extinction * L``, the shape ``phi = exp(-2 tau x) (R_0 / R)^2``, the power less a reference
+and over a power of two, the weights over a power of two.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+NODES: Final = 24
+NODE_SCALE: Final = 0.3
+"""Nodes are uniform in ``asinh(tau / NODE_SCALE)``."""
+BLOCK: Final = 16
+"""Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
+
+# Reassociation lets sums vectorise; NaN and infinity keep their meaning.
+_SUMS: Final = {"reassoc", "contract", "nsz"}
+# Inlining by force spares the reference counts of arrays that pass from function to function.
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+summing = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
+finding = numba.njit(
+    cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={*_SUMS, "nnan"}
+)
+
+
+class Grid(NamedTuple):
+    """What all profiles of a call share, in the scaled variables."""
+
+    x: Array
+    envelope: Array
+    """``(R_0 / R)^2``."""
+    step: float
+    """Spacing of x where it is uniform, else 0."""
+    first: float
+    """First node as ``asinh(tau / NODE_SCALE)``."""
+    spacing: float
+    nodes: Array
+    shapes: Array
+    """phi of every node, (node, bin)."""
+    start: float
+    """R_0, m."""
+    length: float
+    """L, m."""
+
+
+class Scratch(NamedTuple):
+    z: Array
+    w: Array
+    phi: Array
+    residual: Array
+    pull: Array
+    used: Array
+    fine: Array
+    lengths: Array
+    tests: tuple[Array, Array, Array, Array]
+
+
+class Point(NamedTuple):
+    """The linear fit at one extinction, and the derivatives of its objective."""
+
+    b: float
+    mean_z: float
+    mean_phi: float
+    mean_t: float
+    centroid: float
+    norm: float
+    slope_norm: float
+    gradient: float
+    curvature: float
+
+
+def make_grid(range_: Array, bounds: tuple[float, float]) -> Grid:
+    """Tabulate what the profiles of a call share.
+
+    Parameters
+    ----------
+    range_ : (bin,) float
+        m, ascending.
+    bounds : (float, float)
+        Lowest and highest extinction, m-1.
+    """
+    length = float(range_[-1] - range_[0]) if range_.size > 1 else 1.0
+    x = (range_ - range_[0]) / length
+    step = 1.0 / max(range_.size - 1, 1)
+    rounding = 4.0 * np.finfo(np.float64).eps * range_[-1] / length
+    uniform = bool(np.all(np.abs(x - step * np.arange(range_.size)) <= rounding))
+    x = np.concatenate([x, np.ones(-range_.size % BLOCK)])
+    lowest, highest = bounds[0] * length, bounds[1] * length
+    first, last = math.asinh(lowest / NODE_SCALE), math.asinh(highest / NODE_SCALE)
+    nodes = NODE_SCALE * np.sinh(np.linspace(first, last, NODES))
+    nodes[0], nodes[-1] = lowest, highest
+    envelope = (range_[0] / (range_[0] + length * x)) ** 2
+    return Grid(
+        x=x,
+        envelope=envelope,
+        step=step if uniform else 0.0,
+        first=first,
+        spacing=(last - first) / (NODES - 1),
+        nodes=nodes,
+        shapes=np.exp(-2.0 * nodes[:, np.newaxis] * x) * envelope,
+        start=float(range_[0]),
+        length=length,
+    )
+
+
+@compiled
+def make_scratch(n: int) -> Scratch:
+    return Scratch(
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(BLOCK),
+        np.zeros(NODES),
+        (np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)),
+    )
+
+
+@finding
+def largest_of(values: Array) -> float:
+    largest = 0.0
+    for i in range(values.size):
+        largest = max(largest, abs(values[i]))
+    return largest
+
+
+@compiled
+def power_of_two(value: float) -> float:
+    return math.ldexp(1.0, math.frexp(value)[1])
+
+
+@compiled
+def multiply(values: Array, factor: float) -> None:
+    for i in range(values.size):
+        values[i] *= factor
+
+
+@summing
+def product(a: Array, b: Array) -> float:
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@summing
+def total_of(values: Array) -> float:
+    total = 0.0
+    for i in range(values.size):
+        total += values[i]
+    return total
+
+
+@compiled
+def _shape(tau: float, x: Array, envelope: Array, step: float, phi: Array, fine: Array) -> None:
+    n = phi.size
+    if step == 0.0:
+        for i in range(n):
+            phi[i] = math.exp(-2.0 * tau * x[i]) * envelope[i]
+        return
+    # Two short geometric series instead of many exponentials: few roundings, no long chain.
+    ratio = math.exp(-2.0 * tau * step)
+    fine[0] = 1.0
+    for j in range(1, BLOCK):
+        fine[j] = fine[j - 1] * ratio
+    coarse = 1.0
+    ratio = math.exp(-2.0 * BLOCK * tau * step)
+    for k in range(0, n, BLOCK):
+        block, falling = phi[k : k + BLOCK], envelope[k : k + BLOCK]
+        for j in range(BLOCK):
+            block[j] = coarse * fine[j] * falling[j]
+        coarse *= ratio
+
+
+@summing
+def _moments(x: Array, w: Array, z: Array, phi: Array) -> tuple[float, float, float, float, float]:
+    s1 = s2 = sz = x1 = x2 = 0.0
+    for i in range(z.size):
+        weighted = w[i] * phi[i]
+        square = weighted * phi[i]
+        s1 += weighted
+        s2 += square
+        sz += weighted * z[i]
+        x1 += weighted * x[i]
+        x2 += square * x[i]
+    return s1, s2, sz, x1, x2
+
+
+@summing
+def _gradients(
+    x: Array,
+    w: Array,
+    z: Array,
+    phi: Array,
+    mean_phi: float,
+    mean_z: float,
+    b: float,
+    centroid: float,
+    mean_t: float,
+) -> tuple[float, float, float, float, float]:
+    """Return the products of residual, shape and its slope that a Newton step needs."""
+    rt = tt = rh = r0 = r1 = 0.0
+    for i in range(z.size):
+        lever = -2.0 * (x[i] - centroid)
+        first = lever * phi[i]
+        centred = phi[i] - mean_phi
+        slope = first - mean_t
+        residual = w[i] * (z[i] - mean_z - b * centred)
+        rt += residual * slope
+        tt += w[i] * slope * slope
+        rh += residual * lever * first
+        r0 += residual
+        r1 += residual * centred
+    return rt, tt, rh, r0, r1
+
+
+@compiled
+def evaluate(tau: float, g: Grid, s: Scratch, w0: float, wz: float, free: float) -> Point:
+    x, w, z, phi = g.x, s.w, s.z, s.phi
+    _shape(tau, x, g.envelope, g.step, phi, s.fine)
+    s1, s2, sz, x1, x2 = _moments(x, w, z, phi)
+    mean_phi, mean_z = free * s1 / w0, free * wz / w0
+    norm = s2 - s1 * mean_phi
+    # About the information centroid, amplitude and extinction are uncorrelated.
+    centroid = (x2 - mean_phi * x1) / norm
+    mean_t = -2.0 * free * (x1 - centroid * s1) / w0
+    b = (sz - mean_phi * wz) / norm
+    rt, tt, rh, r0, r1 = _gradients(x, w, z, phi, mean_phi, mean_z, b, centroid, mean_t)
+    return Point(
+        b + r1 / norm,
+        mean_z + free * r0 / w0,
+        mean_phi,
+        mean_t,
+        centroid,
+        norm,
+        tt,
+        b * rt,
+        b * b * tt - rt * rt / norm - b * rh,
+    )

@@ -1,0 +1,102 @@
+"""Compiled propagation of noise into what is fitted above a background from elsewhere."""
+
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+HUGE: Final = 1e300
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_compiled
+def fill_weights(power: Any, noise: Array, is_variance: bool, weights: Array) -> None:
+    for i in range(weights.size):
+        weight = 1.0 / noise[i] if is_variance else noise[i]
+        usable = abs(np.float64(power[i])) < HUGE and 0.0 < weight < HUGE
+        weights[i] = weight if usable else 0.0
+
+
+@_compiled
+def _propagate_profile(
+    b: float,
+    phi: Array,
+    range_: Array,
+    weights: Array,
+    gradient: Array,
+    row: Array,
+) -> None:
+    """Fill the random variances of one profile, and what its background does to the rest."""
+    norm = moment = 0.0
+    for i in range(phi.size):
+        norm += phi[i] * phi[i] * weights[i]
+        moment += phi[i] * phi[i] * weights[i] * range_[i]
+    centroid = moment / norm
+    slope = whole = tilted = 0.0
+    for i in range(phi.size):
+        lever = -2.0 * (range_[i] - centroid)
+        slope += lever * lever * phi[i] * phi[i] * weights[i]
+        whole += phi[i] * weights[i]
+        tilted += lever * phi[i] * weights[i]
+    row[:] = 0.0
+    row[4] = -tilted / (b * slope)
+    row[3] = -whole / (b * norm) + 2.0 * centroid * row[4]
+    for i in range(phi.size):
+        if weights[i] == 0.0:
+            continue
+        weighted = phi[i] * weights[i]
+        lever = -2.0 * (range_[i] - centroid)
+        of_extinction = lever * weighted / (b * slope)
+        of_logarithm = weighted / (b * norm) + 2.0 * centroid * of_extinction
+        of_extinction += row[4] * gradient[i]
+        of_logarithm += row[3] * gradient[i]
+        row[0] += gradient[i] * gradient[i] / weights[i]
+        row[1] += of_logarithm * of_logarithm / weights[i]
+        row[2] += of_extinction * of_extinction / weights[i]
+
+
+@_compiled
+def propagate(
+    power: Any,
+    noise: Array,
+    is_variance: bool,
+    extinction: Array,
+    amplitude: Array,
+    range_: Array,
+    gradients: Array,
+    out: Array,
+) -> None:
+    """Propagate noise to first order, through a background that depends on the power too.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    noise : (profile or 1, bin) float64
+        Variances or weights, as the fit had them.
+    is_variance : bool
+    extinction, amplitude : (profile,) float
+        m-1, power times m2: the weighted fit to the power less the background.
+    range_ : (bin,) float
+        m.
+    gradients : (profile or 1, bin) float64
+        Derivatives of the background with respect to the power.
+    out : (profile, 5) float64
+        Gets the variance of the background, the relative variance of the amplitude and the
+        variance of the extinction; then the derivatives of the logarithm of the amplitude and
+        of the extinction with respect to the background.
+    """
+    start, phi, weights = range_[0], np.empty(range_.size), np.empty(range_.size)
+    for k in range(extinction.size):
+        for i in range(phi.size):
+            phi[i] = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction[k] * (range_[i] - start))
+        b = amplitude[k] * math.exp(-2.0 * extinction[k] * start) / start**2
+        fill_weights(power[k], noise[k % noise.shape[0]], is_variance, weights)
+        _propagate_profile(b, phi, range_, weights, gradients[k % gradients.shape[0]], out[k])
