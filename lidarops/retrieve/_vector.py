@@ -141,7 +141,6 @@ def _projection(rows: int, vectors: int) -> Any:
     def project(  # type: ignore[no-untyped-def]
         context, values, stride, matrix, terms, out, ahead, ahead_step
     ):
-        del context, values, stride, matrix, terms, out, ahead, ahead_step
         signature = types.void(*[types.intp] * 7)
 
         def generate(target: Any, b: Any, _: Any, arguments: Any) -> Any:
@@ -183,7 +182,6 @@ def _residual_pass(*, single: bool) -> Any:
     def residual_pass(  # type: ignore[no-untyped-def]
         context, row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
     ):
-        del context, row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
         arguments = [types.intp] * 5 + [types.float64] * 6 + [types.intp]
         signature = types.UniTuple(types.float64, 2)(*arguments)
 
@@ -267,7 +265,6 @@ def residuals(
 def _single(  # type: ignore[no-untyped-def]
     like, row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
 ):
-    del like
     return _residuals_32(
         row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
     )
@@ -276,7 +273,6 @@ def _single(  # type: ignore[no-untyped-def]
 def _double(  # type: ignore[no-untyped-def]
     like, row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
 ):
-    del like
     return _residuals_64(
         row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
     )
@@ -286,5 +282,4 @@ def _double(  # type: ignore[no-untyped-def]
 def _residuals(  # type: ignore[no-untyped-def]
     like, row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
 ):
-    del row, tail, steps, envelope, root, e1, e2, e4, e8, amplitude, background, out
     return _single if like.dtype == types.float32 else _double
