@@ -23,7 +23,7 @@ _UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
 
 
 def compressed(problem: Problem) -> Flat:
-    """Solve by 11 functionals of each profile; what has gaps goes to the direct fit."""
+    """Solve by 11 functionals of each profile, and by Newton steps what has gaps."""
     return _solve(problem, DEFAULT_SIZE, with_residuals=True)
 
 
@@ -33,9 +33,11 @@ def fast(problem: Problem) -> Flat:
 
 
 def _solve(problem: Problem, size: int, *, with_residuals: bool) -> Flat:
+    if not _is_regular(problem):
+        return _methods.direct(problem)
     tables = _tables(problem, size)
     if tables is None:
-        return _methods.direct(problem)
+        return _methods.masked(problem)
     count, bins = problem.power.shape
     out = np.empty((len(_compressed.RESULTS), count))
     quality, state = np.empty(count, np.int32), np.empty(count, np.int64)
@@ -63,17 +65,21 @@ def _solve(problem: Problem, size: int, *, with_residuals: bool) -> Flat:
     routed = np.flatnonzero(state == _compressed.ROUTED)
     if routed.size == 0:
         return found
-    return found.updated(routed, _methods.direct(problem.select(routed, problem.power[routed])))
+    return found.updated(routed, _methods.masked(problem.select(routed, problem.power[routed])))
+
+
+def _is_regular(problem: Problem) -> bool:
+    """Return whether the range is uniform, and the section neither short nor thin."""
+    range_ = problem.range
+    if range_.size < FEWEST_BINS or range_[-1] - range_[0] < THINNEST * range_[0]:
+        return False
+    even = np.linspace(range_[0], range_[-1], range_.size)
+    return bool(np.max(np.abs(range_ - even)) <= _UNIFORM * range_[-1])
 
 
 def _tables(problem: Problem, size: int) -> Tables | None:
     """Return the tables, or None where profiles of this kind have none."""
-    if problem.noise.shape[0] > 1 or problem.range.size < FEWEST_BINS:
-        return None
-    if problem.range[-1] - problem.range[0] < THINNEST * problem.range[0]:
-        return None
-    even = np.linspace(problem.range[0], problem.range[-1], problem.range.size)
-    if np.max(np.abs(problem.range - even)) > _UNIFORM * problem.range[-1]:
+    if not problem.common_noise:
         return None
     weights = _weights(problem)
     if not np.all((weights > 0.0) & (weights < _compressed.HUGE)):

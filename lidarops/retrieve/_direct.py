@@ -237,7 +237,7 @@ def _fit(g: Grid, s: Scratch, free: float, kind: int, tau: float, row: Array) ->
 
 
 @compiled
-def _unscale(g: Grid, reference: float, scale: float, unit: float, row: Array) -> None:
+def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> None:
     """Turn a row from the scaled variables into SI units; noise terms into units of the noise."""
     energy = scale * (scale * unit)
     sign = math.copysign(1.0, row[AMPLITUDE])
@@ -286,7 +286,7 @@ def _solve_profile(
     multiply(s.z, 1.0 / scale)
     row[STATUS] = FITTED
     _fit(g, s, 0.0 if given else 1.0, kind, extinction * g.length, row)
-    _unscale(g, reference, scale, unit, row)
+    unscale(g, reference, scale, unit, row)
 
 
 @compiled

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve import _direct, _linearized, _propagation
+from lidarops.retrieve import _direct, _linearized, _masked, _propagation
 from lidarops.retrieve._estimate import COLUMNS, CONSTANT, FITTED, Estimate
 from lidarops.retrieve._problem import Array, Centre, Flags, Flat, Problem
 from lidarops.retrieve._projection import make_grid
@@ -31,6 +31,29 @@ class _Given:
 def direct(problem: Problem) -> Flat:
     """Solve by least squares for all three unknowns."""
     return _flat(_estimate(problem), problem)
+
+
+def masked(problem: Problem) -> Flat:
+    """Solve as `direct` does, in fewer passes over the bins where the range is uniform."""
+    plan = _masked.make_plan(problem.range, problem.bounds)
+    count = problem.power.shape[0]
+    table, solved = np.empty((count, len(COLUMNS))), np.empty(count, np.bool_)
+    with np.errstate(divide="ignore"):
+        weights = 1.0 / problem.noise if problem.known_variance else problem.noise
+    _masked.solve_profiles(
+        problem.power,
+        weights,
+        not problem.known_variance,
+        _rounding(problem),
+        plan,
+        table,
+        solved,
+    )
+    others = np.flatnonzero(~solved)
+    if others.size:
+        rest = problem.select(others, problem.power[others])
+        table[others] = _table(rest, np.full(1, np.nan), _direct.FREE, np.full(1, np.nan))
+    return _flat(Estimate(**dict(zip(COLUMNS, table.T, strict=True))), problem)
 
 
 def linearized(problem: Problem) -> Flat:
@@ -133,22 +156,35 @@ def _estimate(
     extinction: Array | None = None,
 ) -> Estimate:
     """Run the kernel, with the background fitted where it is NaN."""
-    table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
-    # Half a unit in the last place, as a standard deviation, and what the kernel itself loses.
-    rounding = 0.3 * np.finfo(problem.power.dtype).eps + 8.0 * np.finfo(np.float64).eps
     nowhere = np.full(1, np.nan)
+    table = _table(
+        problem,
+        nowhere if background is None else background,
+        kind,
+        nowhere if extinction is None else extinction,
+    )
+    return Estimate(**dict(zip(COLUMNS, table.T, strict=True)))
+
+
+def _table(problem: Problem, background: Array, kind: int, extinction: Array) -> Array:
+    table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
     _direct.solve_profiles(
         problem.power,
         problem.noise,
         problem.known_variance,
-        nowhere if background is None else background,
+        background,
         kind,
-        nowhere if extinction is None else extinction,
-        float(rounding),
+        extinction,
+        _rounding(problem),
         make_grid(problem.range, problem.bounds),
         table,
     )
-    return Estimate(**dict(zip(COLUMNS, table.T, strict=True)))
+    return table
+
+
+def _rounding(problem: Problem) -> float:
+    """Half a unit in the last place, as a standard deviation, and what the kernels lose."""
+    return 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
 
 
 def _flat(

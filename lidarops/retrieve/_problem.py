@@ -35,6 +35,9 @@ class Problem:
     noise: Array
     """(profile or 1, bin): variances or weights; a bin is left out where that is not positive
     and finite."""
+    common_noise: bool
+    """Whether `noise` was given for all profiles at once. That a batch of one profile has one row
+    of noise does not make it common: what solves a profile must not depend on its batch."""
     known_variance: bool
     """Whether `noise` holds variances, else weights up to a common factor."""
     bounds: tuple[float, float]

@@ -173,8 +173,105 @@ project_6_8 = _projection(rows=6, vectors=2)
 products of 6 rows of float64 `values`, `stride` bytes apart, with the (terms, 8) `matrix`, each
 summed over the terms in their order; while at it, fetch memory from the address `ahead`."""
 project_4_12 = _projection(rows=4, vectors=3)
+project_1_32 = _projection(rows=1, vectors=8)
+project_1_16 = _projection(rows=1, vectors=4)
 project_1_8 = _projection(rows=1, vectors=2)
 project_1_4 = _projection(rows=1, vectors=1)
+
+
+class _Walk:
+    """A pass over bins in steps of `LANES`, with the shape ``e1**i * envelope[i]`` at each."""
+
+    def __init__(self, b: Any, arrays: Sequence[Any], steps: Any, e1: Any, e4: Any) -> None:
+        self.v = v = _Lanes(b, _DOUBLE, LANES, f"v{LANES}f64")
+        self._b, self._e4 = b, e4
+        decay = b.fmul(v.where(v.splat(e1), 1), v.where(v.splat(b.fmul(e1, e1)), 2))
+        self._loop = _Loop(b, steps)
+        self._factor = self._loop.carried(_DOUBLE, ir.Constant(_DOUBLE, 1.0))
+        at = b.mul(self._loop.index, _integer(8 * LANES))
+        *self.values, fall = (v.load(b.add(address, at)) for address in arrays)
+        self.phi = b.fmul(b.fmul(v.splat(self._factor), decay), fall)
+
+    def totals(self, terms: Sequence[tuple[Any, Any]], peak: Any = None) -> list[Any]:
+        """End the pass; return the sums of products and the largest of `peak`, as doubles."""
+        pairs = []
+        for one, other in terms:
+            total = self._loop.carried(self.v.type, self.v.zero)
+            pairs.append((total, self.v.fma(one, other, total)))
+        largest = self._loop.carried(self.v.type, self.v.zero)
+        highest = largest if peak is None else self.v.larger(peak, largest)
+        steps = [(self._factor, self._b.fmul(self._factor, self._e4)), (largest, highest)]
+        self._loop.close([*steps, *pairs])
+        folded = [self.v.fold(total, self._b.fadd) for _, total in pairs]
+        return folded if peak is None else [*folded, self.v.fold(highest, self.v.larger)]
+
+
+@intrinsic
+def _step_sums(  # type: ignore[no-untyped-def]
+    context, x, w, z, envelope, steps, e1, e4, level, amplitude, mean, centre
+):
+    """Return the nine sums of a Newton step at ``z = level + amplitude * e1**i * envelope[i]``.
+
+    With phi the shape, d = phi - mean, g = phi * (x - centre) and r the residual, the weighted
+    sums of d, d d, g, g d, g g, r, r d, r g, r g (x - centre), each over `steps` steps of `LANES`
+    bins; `x`, `w`, `z` and `envelope` are addresses of float64.
+    """
+    signature = types.UniTuple(types.float64, 9)(*[types.intp] * 5, *[types.float64] * 6)
+
+    def generate(target: Any, b: Any, _: Any, given: Any) -> Any:
+        x, w, z, envelope, steps, e1, e4, *others = given
+        v = _Lanes(b, _DOUBLE, LANES, f"v{LANES}f64")
+        level, amplitude, mean, centre = (v.splat(other) for other in others)
+        walk = _Walk(b, (x, w, z, envelope), steps, e1, e4)
+        here, weight, value = walk.values
+        d, lever = b.fsub(walk.phi, mean), b.fsub(here, centre)
+        g = b.fmul(walk.phi, lever)
+        r = v.fma(b.fneg(amplitude), walk.phi, b.fsub(value, level))
+        wd, wg, wr = (b.fmul(weight, part) for part in (d, g, r))
+        wrg = b.fmul(wr, g)
+        one = ir.Constant(v.type, [1.0] * LANES)
+        of_shapes = [(wd, one), (wd, d), (wg, one), (wg, d), (wg, g)]
+        totals = walk.totals([*of_shapes, (wr, one), (wr, d), (wrg, one), (wrg, lever)])
+        return target.make_tuple(b, signature.return_type, totals)
+
+    return signature, generate
+
+
+@intrinsic
+def _bend_sums(  # type: ignore[no-untyped-def]
+    context, x, w, z, envelope, steps, e1, e4, level, amplitude, mean, centre
+):
+    """Return the sums that tell of misfit and of shapes which the model lacks.
+
+    With the terms of `step_sums` and p = phi (x - centre)^2, q = phi^2, the weighted sums of p,
+    p d, p g, q, q d, q g, p p, p q, q q, p r, q r, r r, and the largest weighted r r.
+    """
+    signature = types.UniTuple(types.float64, 13)(*[types.intp] * 5, *[types.float64] * 6)
+
+    def generate(target: Any, b: Any, _: Any, given: Any) -> Any:
+        x, w, z, envelope, steps, e1, e4, *others = given
+        v = _Lanes(b, _DOUBLE, LANES, f"v{LANES}f64")
+        level, amplitude, mean, centre = (v.splat(other) for other in others)
+        walk = _Walk(b, (x, w, z, envelope), steps, e1, e4)
+        here, weight, value = walk.values
+        d, lever = b.fsub(walk.phi, mean), b.fsub(here, centre)
+        g = b.fmul(walk.phi, lever)
+        r = v.fma(b.fneg(amplitude), walk.phi, b.fsub(value, level))
+        p, q = b.fmul(g, lever), b.fmul(walk.phi, walk.phi)
+        wp, wq = b.fmul(weight, p), b.fmul(weight, q)
+        one = ir.Constant(v.type, [1.0] * LANES)
+        of_model = [(part, other) for part in (wp, wq) for other in (one, d, g)]
+        wr = b.fmul(weight, r)
+        of_rest = [(wp, p), (wp, q), (wq, q), (wp, r), (wq, r), (wr, r)]
+        totals = walk.totals([*of_model, *of_rest], b.fmul(wr, r))
+        return target.make_tuple(b, signature.return_type, totals)
+
+    return signature, generate
+
+
+# Compiled code gives no context, which type checkers do not know.
+step_sums: Any = _step_sums
+bend_sums: Any = _bend_sums
 
 
 def _residual_pass(*, single: bool) -> Any:

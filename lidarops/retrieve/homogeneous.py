@@ -211,8 +211,8 @@ def solve(
         The least-squares solution from 11 linear functionals of the profile, which hold all but
         a millionth of what it says of the extinction: within 0.01 standard errors of "direct" in
         a twentieth of its time. For profiles without gaps on a uniform range with weights that
-        all share; profiles that are not (and sections of less than 32 bins) are given to
-        "direct", one by one. Here NOT_HOMOGENEOUS is a test of `curvature_misfit`, the energy
+        all share; others get the same answer, within 1e-4 standard errors of "direct", by Newton
+        steps over their bins; sections of less than 32 bins are given to "direct". Here NOT_HOMOGENEOUS is a test of `curvature_misfit`, the energy
         of the functionals that the model leaves over.
     fast
         The same from 7 functionals: up to 0.4 percent more scatter, within 0.3 standard errors
@@ -295,6 +295,7 @@ def solve(
         power=rows,
         range=grid.values,
         noise=noise,
+        common_noise=np.ndim(weights if variance is None else variance) <= 1,
         known_variance=known_variance,
         bounds=(np.nan, np.nan),
         extinction=_prior(extinction, grid.values, leading),
