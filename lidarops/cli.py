@@ -87,18 +87,28 @@ def _main(
 
 @app.command()
 @_plainly
-def simulate(campaign: CampaignFile, archive: ArchiveOption = None, out: OutOption = None) -> None:
+def simulate(
+    campaign: CampaignFile,
+    archive: ArchiveOption = None,
+    out: OutOption = None,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+) -> None:
     """Write a simulated campaign of raw Licel files, with its truth.
 
-    Example: lidarops simulate catalogs/demo.yaml
+    Example: lidarops simulate catalogs/demo.yaml --workers 2
     """
+    from contextlib import nullcontext
+
     from lidarops.campaign import load
+    from lidarops.engine import local_client
     from lidarops.products.write import write_plain
-    from lidarops.simulate.campaign import simulate as run_simulation
+    from lidarops.simulate.campaign import carry_out, plan
 
     settings = load(campaign, archive=archive, output=out)
-    with _bar("simulate", None) as advance:
-        simulated = run_simulation(settings, progress=advance)
+    planned = plan(settings)
+    cluster = nullcontext() if workers == 1 else local_client(workers)
+    with _bar("simulate", len(planned.paths)) as advance, cluster as client:
+        simulated = carry_out(planned, client=client, progress=advance)
     write_plain(simulated.truth, settings.truth_path)
     typer.echo(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
 
@@ -251,19 +261,42 @@ def inspect(
 @app.command()
 @_plainly
 def bench(
-    what: Annotated[str, typer.Argument(help="throughput", metavar="WHAT")],
-    files: Annotated[list[Path], typer.Argument(help="Raw files of one layout.")],
-    repeats: Annotated[int, typer.Option(min=1, max=100, help="Counted repeats.")] = 7,
+    what: Annotated[str, typer.Argument(help="accuracy or throughput", metavar="WHAT")],
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="Raw files of one layout, for the case reader.")
+    ] = None,
+    case: Annotated[str | None, typer.Option(help="homogeneous or reader.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A minute at most.")] = False,
+    repeats: Annotated[
+        int | None, typer.Option(min=1, max=100, help="Counted repeats of each timing.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of page and JSON.")] = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Measure speed on this machine against floors measured in the same run.
+    """Measure errors against the least possible ones, or speed against a floor of the same run.
+
+    Example: lidarops bench accuracy --case homogeneous --quick --out bench
 
     Example: lidarops bench throughput demo/raw/coast/h*.*0
     """
-    from lidarops.bench import throughput
+    from lidarops.bench import cases, results
 
-    if what != "throughput":
-        raise CampaignError(f"no benchmark {what!r}", remedy="choose: throughput")
-    _show(_bench_table(throughput.reader(files, repeats=repeats)))
+    today = datetime.now(UTC).date().isoformat()
+    with _bar("bench", None) as advance:
+        effort = cases.Effort(quick=quick, repeats=repeats, date=today, progress=advance)
+        finding = cases.run(what, case, files or [], effort)
+    page = None if out is None else cases.write(finding, out)
+    if as_json:
+        typer.echo(json.dumps(results.plain(finding.result), indent=1))
+        return
+    for part in finding.report.parts:
+        for found in part.tables:
+            table = _table(found.title, *found.columns)
+            for cells in found.rows:
+                _row(table, *cells)
+            _show(table)
+    if page is not None:
+        typer.echo(f"report: {page}")
 
 
 def _store(campaign: Campaign) -> Store:
@@ -349,19 +382,6 @@ def _plan_table(title: str, plan: Plan) -> Table:
         _row(table, step.channel, step.name, settings or "yes", step.reason)
     for left in plan.left_out:
         _row(table, left.channel, left.name, "left out", left.reason)
-    return table
-
-
-def _bench_table(rows: list[Any]) -> Table:
-    table = _table("Throughput, one core, CPU time", "what", "files/s", "MB/s", "times floor")
-    for row in rows:
-        _row(
-            table,
-            row.name,
-            f"{row.files_per_second:,.0f}",
-            f"{row.megabytes_per_second:,.0f}",
-            f"{row.times_floor:.2f}",
-        )
     return table
 
 

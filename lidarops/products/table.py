@@ -453,6 +453,7 @@ _SIGNAL = Layout(
 
 _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
+_OF_EXTINCTION = ("extinction_model_error", *_OF_FIT)
 
 _HOMOGENEOUS = Layout(
     title="Extinction of homogeneous range sections",
@@ -485,10 +486,22 @@ _HOMOGENEOUS = Layout(
             long_name="extinction coefficient of air and aerosol together",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean section: mean",
-            ancillaries=_OF_FIT,
+            ancillaries=_OF_EXTINCTION,
             uncertain=True,
             comment="Molecules and particles together, at the wavelength of the channel."
             f" {_NO_NAME}",
+        ),
+        Row(
+            name="extinction_model_error",
+            dims=_SECTIONS,
+            dtype="f4",
+            units="m-1",
+            long_name="systematic error of the extinction coefficient to allow for",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            comment="Apart from the random error in extinction_standard_error: 5 percent of"
+            " extinction + 1 / range. In random violations of the model that no test on the"
+            f" residuals can see, it covered most of the excess error. {_NO_NAME}",
         ),
         Row(
             name="amplitude",

@@ -28,6 +28,7 @@ from lidarops.retrieve._vector import (
     STRIDE,
     project_1_4,
     project_1_8,
+    project_1_12,
     project_4_12,
     project_6_8,
     residuals,
@@ -46,9 +47,10 @@ _EDGE: Final = 1.02
 _MOVES: Final = 5
 HUGE: Final = 1e140
 _TINY: Final = 1e-140
-_CANCELLED: Final = 3e-15
-"""Squared share of the signal that the curvature misfit cannot see: it is the small difference
-of two sums of K squares."""
+CURVATURES: Final = 7
+"""Functionals in which misfit is looked for: further ones hold more noise than misfit."""
+_INTERPOLATED: Final = 1e-22
+"""Squared error of the direction of a shape, from the polynomials of the tables."""
 _OK: Final = 0
 _CONSTANT: Final = 1
 ROUTED: Final = 2
@@ -151,8 +153,8 @@ def _scratch(power: Any, root: Any, envelope: Any, lanes: int) -> _Scratch:
         np.zeros(BLOCK),
         np.zeros((8, BLOCK)),
         np.zeros((_FOUND, BLOCK)),
-        np.zeros(8),
-        np.ones(_tables.DEGREE + 1),
+        np.zeros(12),
+        np.ones(_tables.DEGREE + 2),
         root,
         envelope,
         np.zeros(STRIDE, power.dtype),
@@ -189,17 +191,13 @@ def _project(block: Any, tables: Tables, s: _Scratch) -> None:
 
 @_compiled
 def _classify(tables: Tables, s: _Scratch) -> None:
-    """Set aside what cannot be solved here, so that only numbers go on; turn signals upright.
-
-    The squared length of y waits where the curvature misfit is made of it.
-    """
+    """Set aside what cannot be solved here, so that only numbers go on; turn signals upright."""
     size = tables.size
     for p in range(BLOCK):
         y = s.y[p]
         norm = 0.0
         for j in range(size):
             norm += y[j] * y[j]
-        s.found[_CURVATURE, p] = norm
         norm *= tables.unit
         usable = abs(s.reference[p]) < HUGE and abs(y[size]) < HUGE
         state = _OK
@@ -306,7 +304,7 @@ def _settle(tables: Tables, s: _Scratch) -> None:
 def _read_scalars(tables: Tables, s: _Scratch) -> None:
     """Evaluate what the results need at the extinctions found."""
     last, row, powers = tables.centres.size - 1, s.row, s.powers
-    out = row.ctypes.data
+    out, terms = row.ctypes.data, powers.size - 1
     for p in range(BLOCK):
         t, cell = s.t[p], s.cell[p]
         at_end = (cell == 0 and t <= -1.0) or (cell == last and t >= 1.0)
@@ -317,8 +315,8 @@ def _read_scalars(tables: Tables, s: _Scratch) -> None:
         square = t * t
         powers[1], powers[2], powers[3] = t, square, square * t
         powers[4], powers[5], powers[6] = square * square, square * square * t, square**3
-        here = tables.scalars.ctypes.data + 64 * powers.size * cell
-        project_1_8(powers.ctypes.data, 8, here, powers.size, out, out, 0)
+        here = tables.scalars.ctypes.data + 64 * terms * cell
+        project_1_8(powers.ctypes.data, 8, here, terms, out, out, 0)
         for j in range(8):
             s.scalars[j, p] = row[j]
 
@@ -345,8 +343,29 @@ def _estimate(tables: Tables, s: _Scratch) -> None:
         found[_TAU_ERROR, p] = error
         found[_B_ERROR, p] = math.sqrt(1.0 / (size * size) + lever * lever)
         found[_P_ERROR, p] = math.sqrt(level + shape * shape + slope * slope)
-        norm = found[_CURVATURE, p]
-        found[_CURVATURE, p] = (norm - size * size) - _CANCELLED * norm
+
+
+@_compiled
+def _seek_curvature(tables: Tables, s: _Scratch) -> None:
+    """Fill the energy of the first functionals that the model leaves over."""
+    lanes, terms, row, powers = s.y.shape[1], s.f.shape[0], s.row, s.powers
+    out = row.ctypes.data
+    for p in range(BLOCK):
+        t, size = s.t[p], s.found[_F, p]
+        square = t * t
+        powers[1], powers[2], powers[3] = t, square, square * t
+        powers[4], powers[5] = square * square, square * square * t
+        powers[6], powers[7] = square**3, square**3 * t
+        here = tables.directions.ctypes.data + 8 * terms * lanes * s.cell[p]
+        if lanes == 8:
+            project_1_8(powers.ctypes.data, 8, here, terms, out, out, 0)
+        else:
+            project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
+        energy = 0.0
+        for j in range(CURVATURES):
+            rest = s.y[p, j] - size * row[j]
+            energy += rest * rest
+        s.found[_CURVATURE, p] = energy - _INTERPOLATED * size * size
 
 
 @_compiled
@@ -484,6 +503,7 @@ def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: Co
     _settle(tables, s)
     _read_scalars(tables, s)
     _estimate(tables, s)
+    _seek_curvature(tables, s)
     _place_background(tables, s)
     if mode.with_residuals:
         _look_back(block, s, not mode.known_variance)

@@ -51,7 +51,7 @@ def _solve(problem: Problem, size: int, *, with_residuals: bool) -> Flat:
             with_residuals,
             0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * np.finfo(np.float64).eps,
         ),
-        common_limits(bins, size - 2, known_variance=problem.known_variance),
+        common_limits(bins, _compressed.CURVATURES - 2, known_variance=problem.known_variance),
         out,
         quality,
         state,

@@ -57,7 +57,7 @@ from lidarops.retrieve._projection import (
 
 Array = npt.NDArray[np.float64]
 
-STEPS: Final = 5
+STEPS: Final = 7
 """Newton steps after the start, which is good to some hundredths of the spacing of nodes."""
 HUGE: Final = 1e300
 TINY: Final = 1e-280

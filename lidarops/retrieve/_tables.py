@@ -56,6 +56,8 @@ class Tables(NamedTuple):
     """(cell, K, 4): q and h dq/dtau at the centre of the cell, h its half width, zeros."""
     slopes: Array
     """(cell, K, 8): q at the centre, then the polynomial of h dq/dtau."""
+    directions: Array
+    """(cell, power, lanes): polynomials of q."""
     scalars: Array
     """(cell, power, 8): polynomials of what the results need beside y."""
     steepness: Array
@@ -231,6 +233,10 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
     slopes = np.empty((CELLS, size, order + 1))
     slopes[:, :, 0] = middle.direction
     slopes[:, :, 1:] = np.einsum("ij,cjk->cki", matrix, turning)
+    # F is q . y, so that the integral of the slopes is the direction itself.
+    directions = np.zeros((CELLS, order + 1, columns.shape[1]))
+    directions[:, :, :size] = np.swapaxes(slopes, 1, 2)
+    directions[:, 1:] /= np.arange(1, order + 1)[:, np.newaxis]
     starts = np.zeros((CELLS, size, 4))
     starts[:, :, :2] = slopes[:, :, :2]
     scalars = np.einsum("ij,cjk->cik", matrix, at.scalars.reshape(CELLS, order, -1))
@@ -243,6 +249,7 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
         columns=columns,
         starts=starts,
         slopes=slopes,
+        directions=directions,
         scalars=np.ascontiguousarray(scalars.astype(np.float64)),
         steepness=steepness.astype(np.float64),
         centres=centres.astype(np.float64),

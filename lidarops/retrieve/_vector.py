@@ -175,6 +175,7 @@ summed over the terms in their order; while at it, fetch memory from the address
 project_4_12 = _projection(rows=4, vectors=3)
 project_1_32 = _projection(rows=1, vectors=8)
 project_1_16 = _projection(rows=1, vectors=4)
+project_1_12 = _projection(rows=1, vectors=3)
 project_1_8 = _projection(rows=1, vectors=2)
 project_1_4 = _projection(rows=1, vectors=1)
 

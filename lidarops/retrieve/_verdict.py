@@ -21,7 +21,7 @@ from lidarops.retrieve._estimate import Estimate
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
-FALSE_ALARM: Final = 5e-4
+FALSE_ALARM: Final = 4e-4
 """Rate at which one test flags a profile that is as it should be."""
 LOWEST_SIGNAL: Final = 5.0
 """Amplitude over its standard error at known extinction."""
@@ -166,9 +166,9 @@ def _estimated_limits(bins: Array, bends: Array, shapes: Array, unknowns: int) -
     independent = bends >= FEWEST_BENDS
     dof = np.where(independent, _BEND_DOF * bends, _residual_dof(bins, unknowns))
     # The ratio of two estimates of one variance from the same residuals: the logarithm of its
-    # quantile, 4.525 = 3.29 sqrt(17 / 9), with a term for short sections fitted to simulations.
+    # quantile, 4.611 = 3.353 sqrt(17 / 9), with a term for short sections fitted to simulations.
     neighbours = bends + 2.0
-    ratio = np.exp(4.525 / np.sqrt(neighbours) + 7.3 / neighbours)
+    ratio = np.exp(4.611 / np.sqrt(neighbours) + 7.3 / neighbours)
     return (
         np.zeros_like(bins),
         np.where(independent, ratio, np.inf),

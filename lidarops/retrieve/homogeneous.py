@@ -191,7 +191,7 @@ def solve(
         its degrees of freedom allow (POOR_FIT), the residuals are free of the shapes of
         backscatter that bends along the path and of a detector that is not linear
         (NOT_HOMOGENEOUS), and none is beyond 5 standard deviations (OUTLIER); each of these
-        three at a false-alarm rate of 5e-4. Fewer than 8 bins are TOO_FEW_BINS, fewer than 4
+        three at a false-alarm rate of 4e-4. Fewer than 8 bins are TOO_FEW_BINS, fewer than 4
         give NaN; none at all is INPUT_MISSING. A constant profile is NO_SIGNAL: its value is
         the background, the amplitude is 0 and the extinction NaN.
 
@@ -211,9 +211,10 @@ def solve(
         The least-squares solution from 11 linear functionals of the profile, which hold all but
         a millionth of what it says of the extinction: within 0.01 standard errors of "direct" in
         a twentieth of its time. For profiles without gaps on a uniform range with weights that
-        all share; others get the same answer, within 1e-4 standard errors of "direct", by Newton
-        steps over their bins; sections of less than 32 bins are given to "direct". Here NOT_HOMOGENEOUS is a test of `curvature_misfit`, the energy
-        of the functionals that the model leaves over.
+        all share. Other profiles get the same answer, within 1e-4 standard errors of "direct",
+        by Newton steps over their bins; sections of less than 32 bins are given to "direct".
+        Here NOT_HOMOGENEOUS is a test of `curvature_misfit`, the energy of the functionals
+        that the model leaves over.
     fast
         The same from 7 functionals: up to 0.4 percent more scatter, within 0.3 standard errors
         of "direct". With a known variance the residuals are not looked at: no `reduced_chi2`,
@@ -221,7 +222,7 @@ def solve(
     direct
         The least-squares solution by a fixed number of closed-form steps: the best of 24
         extinctions with background and amplitude eliminated (variable projection, golub1973),
-        the vertex of a parabola through it, five Newton steps. It takes gaps, weights and any
+        the vertex of a parabola through it, seven Newton steps. It takes gaps, weights and any
         spacing, and reaches the least possible scatter.
     cubic
         The background of `lidarops.retrieve.background.cubic` (bobrovsky2024, corrected there),
@@ -295,7 +296,7 @@ def solve(
         power=rows,
         range=grid.values,
         noise=noise,
-        common_noise=np.ndim(weights if variance is None else variance) <= 1,
+        common_noise=np.ndim(np.asarray(weights if variance is None else variance)) <= 1,
         known_variance=known_variance,
         bounds=(np.nan, np.nan),
         extinction=_prior(extinction, grid.values, leading),

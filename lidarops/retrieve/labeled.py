@@ -31,6 +31,7 @@ _SECTION: Final = {
     "amplitude_standard_error": "{} m2",
     "extinction": "m-1",
     "extinction_standard_error": "m-1",
+    "extinction_model_error": "m-1",
     "reduced_chi2": "1",
 }
 """Variables and their units, in terms of the unit of the power."""
@@ -63,8 +64,8 @@ def homogeneous(
         Bits of `lidarops.flags.Quality` of each bin. Missing, saturated and incompletely
         overlapping bins are left out; a section carries SATURATED, PILE_UP and
         INCOMPLETE_OVERLAP of its bins.
-    method : {"auto", "direct", "cubic"}
-        See `lidarops.retrieve.homogeneous.solve`.
+    method : str
+        See `lidarops.retrieve.homogeneous.solve`; one that needs nothing but the power.
     relative_variance : bool
         Whether `variance` holds up to a factor, which each section then finds for itself: for a
         variance that was estimated from the same data.
@@ -73,8 +74,8 @@ def homogeneous(
     -------
     xr.Dataset, (..., section)
         ``background``, ``amplitude``, ``extinction``, each with ``_standard_error``,
-        ``reduced_chi2``, ``valid_bins`` and ``quality_flag``, with the coordinates ``section``,
-        ``section_range`` (its middle) and ``section_bounds``; as lazy as the input, and the same
+        ``extinction_model_error``, ``reduced_chi2``, ``valid_bins`` and ``quality_flag``, with
+        the coordinates ``section``, ``section_range`` (its middle) and ``section_bounds``; as lazy as the input, and the same
         to the last bit for any chunking.
 
     Raises

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import math
 import re
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-import numpy as np
 import xarray as xr
 
-from lidarops.campaign import Campaign
+from lidarops.campaign import Campaign, Station
 from lidarops.errors import CampaignError
 from lidarops.records import DetectionMode, Role
-from lidarops.simulate.files import (
-    FileTruth,
-    Site,
-    channel_name,
-    dead_time,
-    simulate_file,
-)
-from lidarops.simulate.settings import SimulationSettings
+from lidarops.simulate.files import Simulator
+from lidarops.simulate.settings import DamageKind, SimulationSettings
+from lidarops.simulate.site import Order, Site, channel_name, dead_time
+from lidarops.simulate.truth import FileTruth, TruthTable
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 Progress = Callable[[int], None]
+
+_BATCH: Final = 64
+"""Files that one worker writes at a time."""
+
+_QUEUE: Final = 4
+"""Batches that wait for each worker: the work to come is never listed as a whole."""
+
+_FLAT: Final = 300e3
+"""m, up to which stations may share air that changes along the ground."""
 
 _PATTERN = re.compile(r"(?P<folder>(?:[^*?\[\]/]+/)*)(?P<prefix>[A-Za-z][A-Za-z_]{0,9})\*")
 
@@ -41,7 +51,40 @@ class SimulatedCampaign:
     """What a perfect retrieval would find; see `simulate`."""
 
 
-def simulate(campaign: Campaign, *, progress: Progress | None = None) -> SimulatedCampaign:
+@dataclass(frozen=True, slots=True)
+class SimulationPlan:
+    """Every file that a simulation will write."""
+
+    campaign: Campaign
+    sites: tuple[Site, ...]
+    orders: tuple[tuple[Order, ...], ...]
+    """Of each site, dark files first, then in time."""
+    paths: tuple[str, ...]
+    """In the archive, by site and in the same order."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """Files of one instrument that are written together, and their rows in the truth."""
+
+    site: Site
+    orders: tuple[Order, ...]
+    rows: tuple[int | None, ...]
+    """None for dark files."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """What became of a batch."""
+
+    files: int
+    size: int
+    truths: tuple[tuple[int, FileTruth], ...]
+
+
+def simulate(
+    campaign: Campaign, *, client: Client | None = None, progress: Progress | None = None
+) -> SimulatedCampaign:
     """Write the raw files of a simulated campaign into its archive.
 
     Parameters
@@ -49,22 +92,32 @@ def simulate(campaign: Campaign, *, progress: Progress | None = None) -> Simulat
     campaign : Campaign
         With a `simulation`. Each simulated instrument needs ``files: <folder>/<prefix>*`` (and
         such `dark_files`, where it has any): folder and prefix name the files to be written.
+    client : distributed.Client, optional
+        Whose workers write the files, all into the same folder; this process where not given.
     progress : callable, optional
         Called with the number of files done since the last call.
 
     Returns
     -------
     SimulatedCampaign
-        Its `truth` has one dimension, ``granule`` (signal files, damaged ones included), and
+        Its `truth` has one row (dimension ``granule``) for each signal file, damaged ones
+        included:
 
-        - ``path``, ``instrument``, ``time`` (middle of the file, UTC);
-        - ``extinction`` (m-1; NaN where the path is not homogeneous), ``homogeneous`` (0 or 1);
-        - ``damage`` (empty for good files), ``refused`` (1 where a correct reader must refuse);
+        - ``path``, ``instrument``, ``time`` (middle of the file, UTC, by the true time);
+        - ``zenith_angle``, ``azimuth`` (degree), ``clock_error`` (s), ``energy`` (of the laser,
+          relative);
+        - ``extinction`` (m-1; NaN where the path is not homogeneous, or not the same for all
+          channels), ``homogeneous`` (0 or 1);
+        - ``damage`` (empty for good files), ``handling`` (what a correct chain does with it),
+          ``refused`` (1 where a correct reader must refuse);
         - per channel ``background_<channel>`` (sky light, MHz before dead time, or mV without
           the dark offset), ``amplitude_<channel>`` (B of P = P* + B R^-2 exp(-2 sigma R), MHz m2
           or mV m2) and for analog ``dark_offset_<channel>`` (mV): P* is the background where
           dark files were subtracted, background plus dark offset where not. NaN where the
-          instrument has no such channel or the path is not homogeneous.
+          instrument has no such channel or the path is not homogeneous;
+        - for instruments that do not look along homogeneous paths ``profile_extinction_<key>``,
+          ``profile_backscatter_<key>`` and ``profile_optical_depth_<key>`` (profile, wavelength,
+          range), with the rows they belong to in ``profile_granule_<key>``.
 
     Raises
     ------
@@ -77,10 +130,21 @@ def simulate(campaign: Campaign, *, progress: Progress | None = None) -> Simulat
     -----
     A file of the same name is overwritten, complete under its final name or not at all. Nothing
     is removed: files of other names that match the patterns of a simulated instrument would mix
-    with the simulation unseen, so the archive is refused.
+    with the simulation unseen, so the archive is refused. The bytes of a file depend on the seed,
+    its instrument and its number alone, never on order, batches or workers. Memory holds the
+    names of the files and their truth.
     """
-    sites = _sites(campaign)
-    archive = Path(campaign.archive)
+    return carry_out(plan(campaign), client=client, progress=progress)
+
+
+def plan(campaign: Campaign) -> SimulationPlan:
+    """Return which files `simulate` would write, after checking that it can.
+
+    Raises
+    ------
+    CampaignError
+        As `simulate`, but for what is in the archive.
+    """
     if "://" in campaign.archive:
         raise CampaignError(
             "a simulation is written to a local folder",
@@ -88,23 +152,96 @@ def simulate(campaign: Campaign, *, progress: Progress | None = None) -> Simulat
             field="archive",
             remedy="give a path",
         )
-    orders = [(site, role, index) for site in sites for role, index in _order(site)]
-    paths = tuple(site.name_of(role, index) for site, role, index in orders)
-    _refuse_strangers(archive, sites, frozenset(paths))
-    for folder in {path.rpartition("/")[0] for path in paths}:
-        (archive / folder).mkdir(parents=True, exist_ok=True)
+    sites = _sites(campaign)
+    orders = tuple(tuple(site.orders()) for site in sites)
+    for site, own in zip(sites, orders, strict=True):
+        _check_air(site)
+        _check_facts(site, own)
+    return SimulationPlan(campaign, tuple(sites), orders, _paths(sites, orders))
 
+
+def carry_out(
+    planned: SimulationPlan, *, client: Client | None = None, progress: Progress | None = None
+) -> SimulatedCampaign:
+    """Write the files of a plan; see `simulate`."""
+    archive = Path(planned.campaign.archive)
+    _refuse_strangers(archive, planned.sites, frozenset(planned.paths))
+    for folder in {path.rpartition("/")[0] for path in planned.paths}:
+        (archive / folder).mkdir(parents=True, exist_ok=True)
+    rows = sum(order.role is Role.SIGNAL for own in planned.orders for order in own)
+    table = TruthTable(rows, {site.key: Simulator(site).grid for site in planned.sites})
     size = 0
-    granules: list[FileTruth] = []
-    for site, role, index in orders:
-        content, truth = simulate_file(site, role, index)
+    work = _batches(planned)
+    done = _serial(work, archive) if client is None else _distributed(work, archive, client)
+    for written in done:
+        size += written.size
+        for row, truth in written.truths:
+            table.add(row, truth)
+        if progress:
+            progress(written.files)
+    told = table.dataset(planned.campaign.name)
+    return SimulatedCampaign(archive, planned.paths, size, told)
+
+
+def _batches(planned: SimulationPlan) -> Iterator[_Batch]:
+    row = 0
+    for site, orders in zip(planned.sites, planned.orders, strict=True):
+        for first in range(0, len(orders), _BATCH):
+            chosen = orders[first : first + _BATCH]
+            rows: list[int | None] = []
+            for order in chosen:
+                rows.append(row if order.role is Role.SIGNAL else None)
+                row += order.role is Role.SIGNAL
+            yield _Batch(site, chosen, tuple(rows))
+
+
+def _serial(work: Iterable[_Batch], archive: Path) -> Iterator[_Written]:
+    simulator: Simulator | None = None
+    for batch in work:
+        if simulator is None or simulator.site is not batch.site:
+            simulator = Simulator(batch.site)
+        for order, row in zip(batch.orders, batch.rows, strict=True):
+            yield _write(simulator, [(order, row)], archive)
+
+
+def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Iterator[_Written]:
+    from distributed import as_completed  # noqa: PLC0415 - takes a second to import
+
+    workers = max(1, len(client.scheduler_info()["workers"]))
+    waiting = iter(work)
+    futures = [_submit(client, batch, archive) for batch in islice(waiting, _QUEUE * workers)]
+    stream = as_completed(futures)
+    try:
+        for future in stream:
+            yield future.result()
+            future.release()
+            for batch in islice(waiting, 1):
+                stream.add(_submit(client, batch, archive))
+    finally:
+        client.cancel(list(stream.futures))
+
+
+def _submit(client: Client, batch: _Batch, archive: Path) -> Future[_Written]:
+    return client.submit(_write_batch, batch, archive, pure=False)
+
+
+def _write_batch(batch: _Batch, archive: Path) -> _Written:
+    work = list(zip(batch.orders, batch.rows, strict=True))
+    return _write(Simulator(batch.site), work, archive)
+
+
+def _write(
+    simulator: Simulator, work: Sequence[tuple[Order, int | None]], archive: Path
+) -> _Written:
+    size = 0
+    truths = []
+    for order, row in work:
+        content, truth = simulator.file(order)
         _place(archive / truth.path, content)
         size += len(content)
-        if role is Role.SIGNAL:
-            granules.append(truth)
-        if progress:
-            progress(1)
-    return SimulatedCampaign(archive, paths, size, _truth(campaign, granules))
+        if row is not None:
+            truths.append((row, truth))
+    return _Written(len(work), size, tuple(truths))
 
 
 def _sites(campaign: Campaign) -> list[Site]:
@@ -145,25 +282,86 @@ def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Site:
             remedy=f"known: {known}",
         )
     instrument = campaign.instruments[key]
+    simulated = settings.instruments[key]
     patterns = {Role.SIGNAL: instrument.files}
-    if settings.instruments[key].acquisition.dark_files:
+    if simulated.acquisition.dark_files:
         patterns[Role.DARK] = instrument.dark_files
     places = {role: _place_of(key, role, given) for role, given in patterns.items()}
-    site = Site(
+    station = campaign.stations[instrument.station]
+    return Site(
         key=key,
         settings=settings,
         instrument=instrument,
-        station=campaign.stations[instrument.station],
+        station=station,
+        origin=station if simulated.air else _origin(campaign, settings),
         folder={role: folder for role, (folder, _) in places.items()},
         prefix={role: prefix for role, (_, prefix) in places.items()},
+        damage={damage.index: damage.kind for damage in simulated.damage},
     )
-    # All that can be wrong with the facts is said before the first file is written.
-    for role, index in _order(site):
-        for detector in site.simulated.detectors:
-            if detector.photon is not None:
-                name = channel_name(DetectionMode.PHOTON, detector)
-                dead_time(site, site.start_of(role, index), name)
-    return site
+
+
+def _origin(campaign: Campaign, settings: SimulationSettings) -> Station:
+    key = settings.origin or next(iter(campaign.stations))
+    if key not in campaign.stations:
+        raise CampaignError(
+            f"station {key!r} is not in the campaign",
+            field="simulation.origin",
+            remedy=f"known: {', '.join(sorted(campaign.stations))}",
+        )
+    return campaign.stations[key]
+
+
+def _check_air(site: Site) -> None:
+    air = site.settings.air_of(site.key)
+    east, north, _ = site.position
+    away = math.hypot(east, north)
+    if away > _FLAT and (air.gradients or air.plumes or air.turbulence):
+        raise CampaignError(
+            f"stands {away / 1e3:.0f} km from the origin of air that changes along the ground:"
+            f" the Earth is flat here, which holds up to {_FLAT / 1e3:.0f} km",
+            field=f"simulation.instruments.{site.key}",
+            remedy="give it an atmosphere of its own, or simulation.origin a nearer station",
+        )
+
+
+def _check_facts(site: Site, orders: Iterable[Order]) -> None:
+    """Say all that can be wrong with the facts before the first file is written."""
+    field = f"instruments.{site.key}.facts"
+    if site.simulated.pointing is not None:
+        if not site.dialect.holds_azimuth:
+            raise CampaignError(
+                f"headers of the {site.simulated.acquisition.dialect} dialect do not hold where"
+                " a scan looks",
+                field=f"simulation.instruments.{site.key}.acquisition.dialect",
+                remedy="scan with the dialect licel",
+            )
+        if any(fact.zenith_angle is not None for fact in site.instrument.facts):
+            raise CampaignError(
+                "give one zenith angle for a lidar that scans, and the facts win over headers",
+                field=f"{field}.zenith_angle",
+                remedy="leave zenith_angle and azimuth out",
+            )
+    counted = [
+        channel_name(DetectionMode.PHOTON, detector)
+        for detector in site.simulated.detectors
+        if detector.photon is not None
+    ]
+    for order in orders:
+        start = site.start_of(order.role, order.index)
+        for name in counted:
+            dead_time(site, start, name)
+        if site.damage_of(order.index) is DamageKind.ZENITH_MINUS_90:
+            _check_vertical(site, order)
+
+
+def _check_vertical(site: Site, order: Order) -> None:
+    facts = site.instrument.facts_at(site.start_of(order.role, order.index))
+    if site.pointing_of(order, facts)[0] and facts.zenith_angle is None:
+        raise CampaignError(
+            f"file {order.index} does not look up: zenith_minus_90 would make it wrong unseen",
+            field=f"simulation.instruments.{site.key}.damage",
+            remedy="damage a vertical file in this way, or give zenith_angle in the facts",
+        )
 
 
 def _place_of(key: str, role: Role, patterns: list[str]) -> tuple[str, str]:
@@ -178,15 +376,22 @@ def _place_of(key: str, role: Role, patterns: list[str]) -> tuple[str, str]:
     return match["folder"], match["prefix"]
 
 
-def _order(site: Site) -> Iterator[tuple[Role, int]]:
-    """Yield every file of an instrument."""
-    for index in range(site.simulated.acquisition.dark_files):
-        yield Role.DARK, index
-    for index in range(site.settings.files(site.key)):
-        yield Role.SIGNAL, index
+def _paths(sites: Sequence[Site], orders: Sequence[Sequence[Order]]) -> tuple[str, ...]:
+    paths: dict[str, None] = {}
+    for site, own in zip(sites, orders, strict=True):
+        for order in own:
+            path = site.path_of(order)
+            if path in paths:
+                raise CampaignError(
+                    f"two files of {site.key} would have the name {path}",
+                    field=f"simulation.instruments.{site.key}.acquisition",
+                    remedy="take files at longer intervals, or let the clock jump by another step",
+                )
+            paths[path] = None
+    return tuple(paths)
 
 
-def _refuse_strangers(archive: Path, sites: list[Site], expected: frozenset[str]) -> None:
+def _refuse_strangers(archive: Path, sites: Sequence[Site], expected: frozenset[str]) -> None:
     for site in sites:
         for role, folder in site.folder.items():
             found = (archive / folder).glob(f"{site.prefix[role]}*")
@@ -209,65 +414,3 @@ def _place(path: Path, content: bytes) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _truth(campaign: Campaign, files: list[FileTruth]) -> xr.Dataset:
-    extinction = np.array([file.extinction for file in files])
-    damage = [file.damage for file in files]
-    truth = xr.Dataset(
-        {
-            "path": _row([file.path for file in files], "path of the raw file in the archive"),
-            "instrument": _row([file.instrument for file in files], "instrument"),
-            "time": _row(
-                np.array([f.time.replace(tzinfo=None) for f in files], dtype="datetime64[ns]"),
-                "middle of the file, UTC",
-            ),
-            "extinction": _row(
-                extinction, "extinction coefficient of air, all of the homogeneous path", "m-1"
-            ),
-            "homogeneous": _row(
-                np.isfinite(extinction).astype(np.int8), "1 where the path is homogeneous", "1"
-            ),
-            "damage": _row(
-                ["" if kind is None else kind.value for kind in damage],
-                "what is wrong with the raw file; empty where nothing is",
-            ),
-            "refused": _row(
-                np.array([kind is not None and kind.refused for kind in damage], dtype=np.int8),
-                "1 where a correct reader must refuse the raw file",
-                "1",
-            ),
-        },
-        attrs={
-            "title": f"Truth of the simulated campaign {campaign.name}",
-            "comment": "P = P* + B R^-2 exp(-2 sigma R) beyond full overlap, with sigma in"
-            " extinction and B in amplitude. P* is the background (sky light) where dark files"
-            " were subtracted, background plus dark_offset where not. Photon counting: rates"
-            " before dead time.",
-        },
-    )
-    for name in sorted({name for file in files for name in file.channels}):
-        for quantity, (long_name, units) in _quantities(name).items():
-            values = [
-                getattr(file.channels[name], quantity) if name in file.channels else np.nan
-                for file in files
-            ]
-            truth[f"{quantity}_{name}"] = _row(np.array(values), long_name, units)
-    return truth
-
-
-def _quantities(channel: str) -> dict[str, tuple[str, str]]:
-    mode, _, label = channel.partition("_")
-    analog = mode == DetectionMode.ANALOG
-    units = "mV" if analog else "MHz"
-    told = {
-        "background": (f"sky light, {mode} {label}", units),
-        "amplitude": (f"amplitude B of the backscattered signal, {mode} {label}", f"{units} m2"),
-    }
-    dark = {"dark_offset": (f"signal without any light, {mode} {label}", units)}
-    return told | dark if analog else told
-
-
-def _row(values: object, long_name: str, units: str = "") -> tuple[str, object, dict[str, str]]:
-    attrs = {"long_name": long_name} | ({"units": units} if units else {})
-    return "granule", values, attrs

@@ -1,22 +1,32 @@
-"""Files as archives hold them: truncated, empty, foreign, absurd."""
+"""Files as archives hold them: truncated, empty, foreign, absurd, or merely odd."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lidarops.simulate.settings import DamageKind
+from lidarops.raw.licel import Dataset, parse_header
+from lidarops.records import DetectionMode
+from lidarops.simulate.settings_files import DamageKind
 
 FOREIGN_NAME: Final = "log.txt"
 """What follows the prefix of the raw files in the name of a foreign file."""
+
+Damage = Callable[[bytes, np.random.Generator], bytes]
 
 _LOG: Final = "".join(
     f"2000-01-01 {hour:02d}:00:00 laser energy {150 - hour:d} mJ, room {20 + hour % 3:d} C\r\n"
     for hour in range(24)
 ).encode()
+_SITE: Final = re.compile(rb"(?<=\r\n ).*?(?= \d\d/\d\d/\d{4} )")
+_PLACE: Final = re.compile(rb"(:\d\d \d\d/\d\d/\d{4} \d\d:\d\d:\d\d \S+) (\S+ \S+) (\S+)([^\r]*)")
+_DATASET: Final = re.compile(rb"(?<=\r\n )[01] \d \d \d{5} [^\r]*")
+_SURPLUS: Final = 1000
+_LONG_SITE: Final = b"Demonstration site"
 
 
 def damaged(kind: DamageKind, content: bytes, random: np.random.Generator) -> bytes:
@@ -25,10 +35,11 @@ def damaged(kind: DamageKind, content: bytes, random: np.random.Generator) -> by
     Parameters
     ----------
     kind : DamageKind
+        What only concerns names (renamed, duplicate, foreign) leaves a good file as it is.
     content : bytes
         Of a good Licel file.
     random : numpy.random.Generator
-        For garbage.
+        For garbage, and for where a glitch is.
     """
     return _DAMAGE[kind](content, random)
 
@@ -45,30 +56,162 @@ def _garbage(content: bytes, random: np.random.Generator) -> bytes:
     return random.bytes(len(content))
 
 
-def _negative_bins(content: bytes, _: np.random.Generator) -> bytes:
-    return re.sub(rb"(\r\n [01] \d \d )\d{5} ", rb"\g<1>-0005 ", content, count=1)
-
-
-def _impossible_position(content: bytes, _: np.random.Generator) -> bytes:
-    # Impossible in either order of the coordinates.
-    place = rb"(:\d\d \d\d/\d\d/\d{4} \d\d:\d\d:\d\d \S+) \S+ \S+"
-    return re.sub(place, rb"\g<1> 0987.6 0765.4", content, count=1)
-
-
 def _foreign(_: bytes, __: np.random.Generator) -> bytes:
     return _LOG
+
+
+def _surplus(content: bytes, random: np.random.Generator) -> bytes:
+    return content + random.bytes(_SURPLUS)
 
 
 def _no_final_newline(content: bytes, _: np.random.Generator) -> bytes:
     return content.removesuffix(b"\r\n")
 
 
-_DAMAGE: Final[Mapping[DamageKind, Callable[[bytes, np.random.Generator], bytes]]] = {
+def _unchanged(content: bytes, _: np.random.Generator) -> bytes:
+    return content
+
+
+def _in_header(edit: Callable[[bytes], bytes]) -> Damage:
+    """Return a damage that changes the text of the header and nothing else."""
+
+    def change(content: bytes, _: np.random.Generator) -> bytes:
+        start = parse_header(content).data_start
+        return edit(content[:start]) + content[start:]
+
+    return change
+
+
+def _negative_bins(header: bytes) -> bytes:
+    return re.sub(rb"(\r\n [01] \d \d )\d{5} ", rb"\g<1>-0005 ", header, count=1)
+
+
+def _too_many_bins(header: bytes) -> bytes:
+    def twice(match: re.Match[bytes]) -> bytes:
+        return b"%s%05d " % (match[1], 2 * int(match[2]))
+
+    return re.sub(rb"(\r\n [01] \d \d )(\d{5}) ", twice, header, count=1)
+
+
+def _impossible_position(header: bytes) -> bytes:
+    # Impossible in either order of the coordinates.
+    return _PLACE.sub(rb"\g<1> 0987.6 0765.4 \g<3>\g<4>", header, count=1)
+
+
+def _long_site(header: bytes) -> bytes:
+    return _SITE.sub(_LONG_SITE, header, count=1)
+
+
+def _blank_site(header: bytes) -> bytes:
+    return _SITE.sub(lambda site: b" " * len(site[0]), header, count=1)
+
+
+def _zenith_minus_90(header: bytes) -> bytes:
+    return _PLACE.sub(rb"\g<1> \g<2> -90\g<4>", header, count=1)
+
+
+def _wide_line(header: bytes) -> bytes:
+    def widened(match: re.Match[bytes]) -> bytes:
+        after = match[4].split()
+        weather = b" 30.0 1013.0" if after else b" 00 30.0 1013.0"
+        told = match[4].rstrip() + (b"" if len(after) > 1 else weather)
+        return b"%s %s %s%s" % (match[1], match[2], match[3], told.ljust(30))
+
+    return _PLACE.sub(widened, header, count=1)
+
+
+def _decimal_comma(header: bytes) -> bytes:
+    name, _, rest = header.partition(b"\r\n")
+    return name + b"\r\n" + re.sub(rb"(?<=\d)\.(?=\d)", b",", rest)
+
+
+def _zero_voltage(header: bytes) -> bytes:
+    return _datasets(header, 5, b"0000")
+
+
+def _datasets(header: bytes, column: int, token: bytes) -> bytes:
+    """Replace one value of every dataset line by another of the same length."""
+
+    def change(match: re.Match[bytes]) -> bytes:
+        tokens = match[0].split(b" ")
+        tokens[column] = token
+        return b" ".join(tokens)
+
+    return _DATASET.sub(change, header)
+
+
+def _in_counts(edit: Callable[[Dataset, NDArray[np.int32], np.random.Generator], None]) -> Damage:
+    """Return a damage that changes the counts of channels and nothing else."""
+
+    def change(content: bytes, random: np.random.Generator) -> bytes:
+        changed = bytearray(content)
+        for dataset, counts in _channels(changed):
+            edit(dataset, counts, random)
+        return bytes(changed)
+
+    return change
+
+
+def _channels(content: bytearray) -> Iterator[tuple[Dataset, NDArray[np.int32]]]:
+    header = parse_header(bytes(content))
+    for dataset in header.channels:
+        yield dataset, np.frombuffer(content, "<i4", dataset.bins, dataset.offset or 0)
+
+
+def _glitch(dataset: Dataset, counts: NDArray[np.int32], random: np.random.Generator) -> None:
+    if dataset.full_scale is not None:
+        counts[_somewhere(counts, random)] = min(3 * dataset.full_scale, np.iinfo(np.int32).max)
+
+
+def _largest(_: Dataset, counts: NDArray[np.int32], random: np.random.Generator) -> None:
+    counts[_somewhere(counts, random)] = np.iinfo(np.int32).max
+
+
+def _somewhere(counts: NDArray[np.int32], random: np.random.Generator) -> int:
+    # In the part of the range that retrievals look at.
+    return int(random.integers(counts.size // 10, counts.size // 4))
+
+
+def _dead_photon(dataset: Dataset, counts: NDArray[np.int32], _: np.random.Generator) -> None:
+    if dataset.mode is DetectionMode.PHOTON:
+        counts[:] = 0
+
+
+def _saturation(dataset: Dataset, counts: NDArray[np.int32], _: np.random.Generator) -> None:
+    if dataset.full_scale is not None:
+        counts[: counts.size // 4] = dataset.full_scale
+
+
+def _nothing(_: Dataset, counts: NDArray[np.int32], __: np.random.Generator) -> None:
+    counts[:] = 0
+
+
+def _zero_shots(content: bytes, random: np.random.Generator) -> bytes:
+    without = _in_counts(_nothing)(content, random)
+    return _in_header(lambda header: _datasets(header, 13, b"000000"))(without, random)
+
+
+_DAMAGE: Final[Mapping[DamageKind, Damage]] = {
     DamageKind.TRUNCATED: _truncated,
     DamageKind.EMPTY: _empty,
     DamageKind.GARBAGE: _garbage,
-    DamageKind.NEGATIVE_BINS: _negative_bins,
-    DamageKind.IMPOSSIBLE_POSITION: _impossible_position,
+    DamageKind.NEGATIVE_BINS: _in_header(_negative_bins),
+    DamageKind.TOO_MANY_BINS: _in_header(_too_many_bins),
+    DamageKind.IMPOSSIBLE_POSITION: _in_header(_impossible_position),
     DamageKind.FOREIGN: _foreign,
+    DamageKind.SURPLUS: _surplus,
     DamageKind.NO_FINAL_NEWLINE: _no_final_newline,
+    DamageKind.GLITCH: _in_counts(_glitch),
+    DamageKind.DEAD_PHOTON: _in_counts(_dead_photon),
+    DamageKind.LONG_SITE: _in_header(_long_site),
+    DamageKind.BLANK_SITE: _in_header(_blank_site),
+    DamageKind.ZENITH_MINUS_90: _in_header(_zenith_minus_90),
+    DamageKind.WIDE_LINE: _in_header(_wide_line),
+    DamageKind.DECIMAL_COMMA: _in_header(_decimal_comma),
+    DamageKind.SATURATION: _in_counts(_saturation),
+    DamageKind.ZERO_SHOTS: _zero_shots,
+    DamageKind.RENAMED: _unchanged,
+    DamageKind.ZERO_VOLTAGE: _in_header(_zero_voltage),
+    DamageKind.LARGEST_INTEGER: _in_counts(_largest),
+    DamageKind.DUPLICATE: _unchanged,
 }

@@ -1,134 +1,81 @@
-"""One simulated raw file: its name, its bytes and the truth behind it."""
+"""One simulated raw file: its bytes and the truth behind it."""
 
 from __future__ import annotations
 
 import math
-import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.campaign import Instrument, InstrumentFacts, Station, channel_facts
-from lidarops.constants import LICEL_DISCRIMINATOR_STEP
-from lidarops.errors import CampaignError
-from lidarops.raw.licel import Dataset, DatasetKind, Laser, encode, new_dataset, new_header
+from lidarops.campaign import InstrumentFacts, channel_facts
+from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSECOND
+from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset
 from lidarops.records import DetectionMode, Role
-from lidarops.simulate.damage import FOREIGN_NAME, damaged
-from lidarops.simulate.instrument import Counts, Photoelectrons, count_photons, digitise, release
-from lidarops.simulate.paths import path_at
-from lidarops.simulate.settings import (
-    Acquisition,
-    DamageKind,
-    Detector,
-    HorizontalPath,
-    SimulatedInstrument,
-    SimulationSettings,
+from lidarops.simulate import fast
+from lidarops.simulate.air import Air, Beam, Path
+from lidarops.simulate.damage import damaged
+from lidarops.simulate.dialects import Occasion, header_of, spelled
+from lidarops.simulate.echo import echo
+from lidarops.simulate.instrument import (
+    BRIGHTEST,
+    Photoelectrons,
+    count_photons,
+    digitise,
+    release,
+    seen_from,
 )
+from lidarops.simulate.settings import Acquisition, AnalogRecorder, DamageKind, Detector
 from lidarops.simulate.signal import backscatter_signal, bin_centres
+from lidarops.simulate.site import Order, Site, channel_name, dead_time, modes, random_stream
 from lidarops.simulate.sun import sky_brightness, solar_elevation
+from lidarops.simulate.truth import ChannelTruth, FileTruth, Grid, ProfileTruth
 
 Array = NDArray[np.float64]
+AnyCounts = NDArray[np.signedinteger[Any]]
+Key = tuple[object, ...]
+Kept = TypeVar("Kept")
+
+_KEPT: Final = 64
+"""Paths that are kept for the files to come."""
+
+_STEP: Final = timedelta(minutes=10)
+"""In which the air changes where an archive is simulated fast."""
 
 
-@dataclass(frozen=True, slots=True)
-class Site:
-    """One simulated instrument: what is simulated, what the campaign knows of it, where it is."""
+class _Ranges(NamedTuple):
+    """The bins of a channel; see `bin_centres`."""
 
-    key: str
-    """Of the instrument in the campaign."""
-    settings: SimulationSettings
-    instrument: Instrument
-    station: Station
-    folder: Mapping[Role, str]
-    """Folder of the files in the archive, with a final slash where it is not the root."""
-    prefix: Mapping[Role, str]
-    """First letters of the file names."""
-
-    @property
-    def simulated(self) -> SimulatedInstrument:
-        """What is simulated."""
-        return self.settings.instruments[self.key]
-
-    def damage_of(self, index: int) -> DamageKind | None:
-        """Return what is wrong with the signal file `index`."""
-        kinds = {damage.index: damage.kind for damage in self.simulated.damage}
-        return kinds.get(index)
-
-    def start_of(self, role: Role, index: int) -> datetime:
-        """Return when a file starts."""
-        if role is Role.DARK:
-            return self.settings.start_of_dark(self.key, index)
-        return self.settings.start_of(self.key, index)
-
-    def name_of(self, role: Role, index: int) -> str:
-        """Return the path of a file in the archive.
-
-        Names are Licel's: prefix, two digits of the year, month in hexadecimal, day, hour, and
-        after the point minute, second and hundredths of a second, all of the stop time.
-        """
-        if role is Role.SIGNAL and self.damage_of(index) is DamageKind.FOREIGN:
-            return self.folder[role] + self.prefix[role] + FOREIGN_NAME
-        stop = self.start_of(role, index) + self.duration
-        name = f"{self.prefix[role]}{stop:%y}{stop.month:X}{stop:%d%H.%M%S}00"
-        return self.folder[role] + name
-
-    @property
-    def duration(self) -> timedelta:
-        """Duration of a file."""
-        return timedelta(seconds=self.simulated.acquisition.duration)
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelTruth:
-    """What a retrieval should find in one channel of one file."""
-
-    extinction: float
-    """m-1; NaN where the path is not homogeneous."""
-    background: float
-    """Sky light: MHz before dead time, or mV without the dark offset."""
-    amplitude: float
-    """B of P = P* + B R^-2 exp(-2 sigma R), MHz m2 or mV m2; NaN where not homogeneous."""
-    dark_offset: float
-    """mV; NaN for photon counting."""
-
-
-@dataclass(frozen=True, slots=True)
-class FileTruth:
-    """What is known of one simulated file."""
-
-    path: str
-    """In the archive, with forward slashes."""
-    instrument: str
-    time: datetime
-    """Middle of the file."""
-    channels: Mapping[str, ChannelTruth]
-    damage: DamageKind | None
-
-    @property
-    def extinction(self) -> float:
-        """The extinction, m-1, that all channels see; NaN where the path is not homogeneous."""
-        return next(iter(self.channels.values())).extinction
+    bins: int
+    bin_width: float
+    offset: float
 
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
     """What is the same for all channels of one file."""
 
-    site: Site
-    role: Role
+    order: Order
+    acquisition: Acquisition
+    start: datetime
     middle: datetime
     facts: InstrumentFacts
+    zenith_angle: float
+    azimuth: float | None
     sun: float
     """Elevation of the sun, degree."""
-
-    @property
-    def zenith_angle(self) -> float:
-        if self.facts.zenith_angle is not None:
-            return self.facts.zenith_angle
-        return 90.0 if isinstance(self.site.simulated, HorizontalPath) else 0.0
+    energy: float
+    """Of the laser, relative."""
+    hours: float
+    """Since the start of the campaign."""
+    line: Beam
+    air: datetime
+    """When the air is as the file sees it."""
+    state: tuple[object, ...]
+    """Of the air."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,198 +86,341 @@ class _Light:
     sky: float
     extinction: float
     amplitude: float
+    exposure: float
+    """Time for which a bin is open in all shots together, microseconds."""
+    electrons: Photoelectrons | None
+    """None where they are not drawn one by one."""
 
 
-def channel_name(mode: DetectionMode, detector: Detector) -> str:
-    """Return the name of a channel, as the reader of raw files makes it from the header."""
-    return f"{mode.value}_{detector.label}"
+@dataclass(frozen=True, slots=True)
+class _Beam:
+    """The signal of a laser at full energy, MHz of photoelectrons."""
+
+    signal: Array
+    extinction: float
+    """m-1; NaN where the path is not homogeneous."""
+    amplitude: float
 
 
-def modes(detector: Detector) -> tuple[DetectionMode, ...]:
-    """Return how a detector is read, in the order of the datasets in a file."""
-    analog = () if detector.analog is None else (DetectionMode.ANALOG,)
-    photon = () if detector.photon is None else (DetectionMode.PHOTON,)
-    return analog + photon
-
-
-def random_stream(seed: int, key: str, role: Role, index: int) -> np.random.Generator:
-    """Return the random numbers of one file: the same whatever else is simulated, and when."""
-    words = [seed, zlib.crc32(f"{key}/{role.value}".encode()), index]
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
-
-
-def dead_time(site: Site, start: datetime, channel: str) -> float:
-    """Return the dead time of a photon counter at the start of a file, s, from the campaign.
-
-    Raises
-    ------
-    CampaignError
-        Where the facts of the instrument give none.
-    """
-    known = channel_facts(site.instrument.facts_at(start), channel).dead_time
-    if known is None:
-        raise CampaignError(
-            f"the facts give no dead time at {start:%Y-%m-%d %H:%M} UTC",
-            field=f"instruments.{site.key}.facts.channels.{channel}.dead_time",
-            remedy="give one, in s: the simulation takes it from the facts",
-        )
-    return known
-
-
-def simulate_file(site: Site, role: Role, index: int) -> tuple[bytes, FileTruth]:
-    """Simulate one raw file.
+class Simulator:
+    """Simulates the files of one instrument.
 
     Parameters
     ----------
     site : Site
-    role : Role
-        A dark file has the telescope covered: offset and noise only.
-    index : int
-        From 0, among the files of that role.
-
-    Returns
-    -------
-    content : bytes
-        The same whichever other files are simulated before, beside or without this one.
-    truth : FileTruth
-
-    Raises
-    ------
-    CampaignError
-        Where the campaign gives no dead time for a photon counter.
-    RawFormatError
-        Where a number does not fit the headers of raw files.
     """
-    random = random_stream(site.settings.seed, site.key, role, index)
-    start = site.start_of(role, index)
-    moment = _Moment(
-        site=site,
-        role=role,
-        middle=start + site.duration / 2,
-        facts=site.instrument.facts_at(start),
-        sun=solar_elevation(start + site.duration / 2, *_position(site)),
-    )
-    channels: dict[str, tuple[Dataset, Counts, ChannelTruth]] = {}
-    for number, detector in enumerate(site.simulated.detectors):
-        channels |= _read_out(moment, start, detector, number, random)
-    path = site.name_of(role, index)
-    header = new_header(
-        name=path.rpartition("/")[2],
-        site=site.instrument.station,
-        start=start,
-        stop=start + site.duration,
-        altitude=site.station.altitude,
-        longitude=site.station.longitude,
-        latitude=site.station.latitude,
-        zenith_angle=moment.zenith_angle,
-        azimuth=moment.facts.azimuth,
-        datasets=[dataset for dataset, _, _ in channels.values()],
-        lasers=_lasers(site),
-    )
-    content = encode(header, {name: counts for name, (_, counts, _) in channels.items()})
-    damage = site.damage_of(index) if role is Role.SIGNAL else None
-    truth = FileTruth(
-        path=path,
-        instrument=site.key,
-        time=moment.middle,
-        channels={name: known for name, (_, _, known) in channels.items()},
-        damage=damage,
-    )
-    return (content if damage is None else damaged(damage, content, random)), truth
 
-
-def _position(site: Site) -> tuple[float, float]:
-    return site.station.latitude, site.station.longitude
-
-
-def _lasers(site: Site) -> tuple[Laser, Laser]:
-    acquisition = site.simulated.acquisition
-    return Laser(acquisition.shots, acquisition.repetition_rate), Laser(0, 0.0)
-
-
-def _read_out(
-    moment: _Moment,
-    start: datetime,
-    detector: Detector,
-    number: int,
-    random: np.random.Generator,
-) -> dict[str, tuple[Dataset, Counts, ChannelTruth]]:
-    site, acquisition = moment.site, moment.site.simulated.acquisition
-    # Outputs with the same trigger delay share their photoelectrons, bin by bin.
-    released: dict[float, Photoelectrons] = {}
-    channels = {}
-    for mode in modes(detector):
-        name = channel_name(mode, detector)
-        offset = channel_facts(moment.facts, name).range_offset or 0.0
-        light = _light(moment, detector, offset)
-        if offset not in released:
-            released[offset] = release(
-                light.rate,
-                shots=acquisition.shots,
-                bin_width=acquisition.bin_width,
-                random=random,
-            )
-        if mode is DetectionMode.ANALOG and detector.analog is not None:
-            counts = digitise(released[offset], detector.analog, random=random)
-            unit, dark_offset = detector.analog.gain, detector.analog.dark_offset
-        else:
-            lost = dead_time(site, start, name)
-            counts = count_photons(released[offset], dead_time=lost, random=random)
-            unit, dark_offset = 1.0, math.nan
-        truth = ChannelTruth(
-            extinction=light.extinction,
-            background=unit * light.sky,
-            amplitude=unit * light.amplitude,
-            dark_offset=dark_offset,
+    def __init__(self, site: Site) -> None:
+        self.site = site
+        self._datasets: dict[tuple[int, float, int], tuple[Dataset, ...]] = {}
+        self._paths: dict[Key, Path] = {}
+        self._beams: dict[Key, _Beam] = {}
+        self._position = site.position
+        self._air = Air(
+            site.settings.air_of(site.key),
+            altitude=site.origin.altitude,
+            start=site.settings.start,
+            seed=site.settings.seed,
         )
-        channels[name] = _dataset(acquisition, detector, mode, number), counts, truth
-    return channels
+        self.grid = _grid(site)
+
+    def file(self, order: Order) -> tuple[bytes, FileTruth]:
+        """Simulate one raw file.
+
+        Parameters
+        ----------
+        order : Order
+            A dark file has the telescope covered: offset and noise only.
+
+        Returns
+        -------
+        content : bytes
+            The same whichever other files are simulated before, beside or without this one.
+        truth : FileTruth
+
+        Raises
+        ------
+        CampaignError
+            Where the campaign gives no dead time for a photon counter.
+        RawFormatError
+            Where a number does not fit the headers of raw files.
+        """
+        site = self.site
+        random = random_stream(site.settings.seed, site.key, order.role, order.index)
+        moment = self._moment(order, random)
+        channels: dict[str, tuple[AnyCounts, ChannelTruth]] = {}
+        for detector in site.simulated.detectors:
+            channels |= self._read_out(moment, detector, random)
+        header = self._header(moment)
+        content = encode(header, {name: counts for name, (counts, _) in channels.items()})
+        damage = site.damage_of(order.index) if order.role is Role.SIGNAL else None
+        if damage is not None:
+            content = damaged(damage, content, random)
+        return content, FileTruth(
+            path=site.path_of(order),
+            instrument=site.key,
+            time=moment.middle,
+            zenith_angle=moment.zenith_angle,
+            azimuth=math.nan if moment.azimuth is None else moment.azimuth,
+            clock_error=site.simulated.acquisition.clock_error(moment.start)[1].total_seconds(),
+            energy=moment.energy,
+            channels={name: known for name, (_, known) in channels.items()},
+            damage=damage if order.twin or damage is not DamageKind.DUPLICATE else None,
+            profile=self._profile(moment, [known for _, known in channels.values()]),
+        )
+
+    def _moment(self, order: Order, random: np.random.Generator) -> _Moment:
+        site = self.site
+        start = site.start_of(order.role, order.index)
+        middle = start + site.duration_of(order) / 2
+        hours = (middle - site.settings.start).total_seconds() / 3600.0
+        facts = site.instrument.facts_at(start)
+        zenith, azimuth = site.pointing_of(order, facts)
+        air = self._when(middle)
+        return _Moment(
+            order=order,
+            acquisition=site.acquisition_of(order.role, order.index),
+            start=start,
+            middle=middle,
+            facts=facts,
+            zenith_angle=zenith,
+            azimuth=azimuth,
+            sun=solar_elevation(middle, site.station.latitude, site.station.longitude),
+            energy=self._energy(hours, random),
+            hours=hours,
+            line=Beam(*self._position, zenith, azimuth or 0.0),
+            air=air,
+            state=self._air.state(air),
+        )
+
+    def _energy(self, hours: float, random: np.random.Generator) -> float:
+        drift = self.site.simulated.laser
+        jitter = drift.jitter * random.standard_normal() if drift.jitter else 0.0
+        return max((1.0 + drift.per_hour * hours) * (1.0 + jitter), 0.0)
+
+    def _header(self, moment: _Moment) -> Header:
+        site, acquisition = self.site, moment.acquisition
+        _, error = site.simulated.acquisition.clock_error(moment.start)
+        start = moment.start + error
+        occasion = Occasion(
+            start=start,
+            stop=start + site.duration_of(moment.order),
+            zenith_angle=moment.zenith_angle,
+            azimuth=moment.azimuth,
+            shots=acquisition.shots,
+            repetition_rate=acquisition.repetition_rate,
+        )
+        name = site.name_of(moment.order)
+        return header_of(site.dialect, name, site.place, occasion, self._lines(acquisition))
+
+    def _lines(self, acquisition: Acquisition) -> tuple[Dataset, ...]:
+        key = acquisition.bins, acquisition.bin_width, acquisition.shots
+        if key not in self._datasets:
+            self._datasets[key] = tuple(
+                _dataset(self.site, acquisition, detector, mode, number)
+                for number, detector in enumerate(self.site.simulated.detectors)
+                for mode in modes(detector)
+            )
+        return self._datasets[key]
+
+    def _read_out(
+        self, moment: _Moment, detector: Detector, random: np.random.Generator
+    ) -> dict[str, tuple[AnyCounts, ChannelTruth]]:
+        lights = self._lights(moment, detector, random)
+        channels = {}
+        for mode in modes(detector):
+            name = channel_name(mode, detector)
+            light = lights[_offset(moment, name)]
+            if mode is DetectionMode.ANALOG and detector.analog is not None:
+                recorder = _drifted(detector.analog, moment.hours)
+                counts = self._digitised(light, recorder, moment, random)
+                unit, dark_offset = recorder.gain, recorder.dark_offset
+            else:
+                lost = dead_time(self.site, moment.start, name)
+                counts = self._counted(light, lost, random)
+                unit, dark_offset = 1.0, math.nan
+            channels[name] = (
+                counts,
+                ChannelTruth(
+                    extinction=light.extinction,
+                    background=unit * light.sky,
+                    amplitude=unit * light.amplitude,
+                    dark_offset=dark_offset,
+                ),
+            )
+        return channels
+
+    def _lights(
+        self, moment: _Moment, detector: Detector, random: np.random.Generator
+    ) -> dict[float, _Light]:
+        """Return what falls on the recorders of a detector, by their range offset.
+
+        They see the same photoelectrons, each in its own bins.
+        """
+        offsets = sorted(
+            {_offset(moment, channel_name(mode, detector)) for mode in modes(detector)}
+        )
+        bins, bin_width = grid_of(moment.acquisition, detector)
+        first, fast_mode = offsets[0], self.site.settings.fast
+        if len(offsets) == 1 or fast_mode:
+            return {
+                offset: self._light(moment, detector, _Ranges(bins, bin_width, offset), random)
+                for offset in offsets
+            }
+        more = math.ceil((offsets[-1] - first) / bin_width) + 1
+        whole = self._light(moment, detector, _Ranges(bins + more, bin_width, first), random)
+        lights = {}
+        for offset in offsets:
+            start = (offset - first) / bin_width
+            electrons = seen_from(
+                cast("Photoelectrons", whole.electrons), start, bins, random=random
+            )
+            lights[offset] = replace(whole, rate=electrons.rate, electrons=electrons)
+        return lights
+
+    def _digitised(
+        self, light: _Light, recorder: AnalogRecorder, moment: _Moment, random: np.random.Generator
+    ) -> AnyCounts:
+        if light.electrons is not None:
+            return digitise(light.electrons, recorder, random=random)
+        return fast.record(
+            light.rate,
+            recorder,
+            dark_offset=recorder.dark_offset,
+            exposure=light.exposure,
+            shots=moment.acquisition.shots,
+            random=random,
+        )
+
+    def _counted(self, light: _Light, lost: float, random: np.random.Generator) -> AnyCounts:
+        if light.electrons is not None:
+            return count_photons(light.electrons, dead_time=lost, random=random)
+        return fast.count(light.rate, exposure=light.exposure, dead_time=lost, random=random)
+
+    def _light(
+        self, moment: _Moment, detector: Detector, ranges: _Ranges, random: np.random.Generator
+    ) -> _Light:
+        bins, bin_width, _ = ranges
+        shots = moment.acquisition.shots
+        if moment.order.role is Role.DARK:
+            rate, glow, extinction, amplitude = np.zeros(bins), 0.0, math.nan, math.nan
+        else:
+            beam = self._beam(moment, detector, ranges)
+            sky = detector.background
+            glow = sky.night + (sky.day - sky.night) * sky_brightness(moment.sun)
+            rate = np.minimum(moment.energy * beam.signal + glow, BRIGHTEST)
+            extinction, amplitude = beam.extinction, moment.energy * beam.amplitude
+        electrons = None
+        if not self.site.settings.fast:
+            electrons = release(rate, shots=shots, bin_width=bin_width, random=random)
+        exposure = shots * bin_width / LICEL_RANGE_PER_MICROSECOND
+        return _Light(rate, glow, extinction, amplitude, exposure, electrons)
+
+    def _beam(self, moment: _Moment, detector: Detector, ranges: _Ranges) -> _Beam:
+        full = moment.facts.full_overlap_range
+        key = detector.label, full, ranges, moment.line, moment.state
+        if key in self._beams:
+            return self._beams[key]
+        path = self._path(moment, detector.wavelength * 1e-9, ranges)
+        distance = bin_centres(*ranges)
+        constant = detector.system_constant
+        pulse = self.site.simulated.pulse
+        if pulse is None:
+            signal = backscatter_signal(
+                distance,
+                extinction=path.extinction,
+                backscatter=path.backscatter,
+                system_constant=constant,
+                full_overlap_range=full,
+            )
+        else:
+            signal = echo(distance, path, pulse, system_constant=constant, full_overlap_range=full)
+        told = math.nan, math.nan
+        if path.homogeneous:
+            told = float(path.extinction[0]), constant * float(path.backscatter[0])
+        return _kept(self._beams, key, _Beam(signal, *told))
+
+    def _path(self, moment: _Moment, wavelength: float, ranges: _Ranges) -> Path:
+        key = wavelength, ranges, moment.line, moment.state
+        if key in self._paths:
+            return self._paths[key]
+        path = self._air.along(moment.line, bin_centres(*ranges), moment.air, wavelength)
+        return _kept(self._paths, key, path)
+
+    def _when(self, middle: datetime) -> datetime:
+        start = self.site.settings.start
+        if not self.site.settings.fast:
+            return middle
+        return start + (middle - start) // _STEP * _STEP
+
+    def _profile(self, moment: _Moment, channels: Sequence[ChannelTruth]) -> ProfileTruth | None:
+        order, grid = moment.order, self.grid
+        told = all(math.isfinite(channel.extinction) for channel in channels)
+        if order.role is Role.DARK or told or order.index % grid.every or grid.stops.size < 2:
+            return None
+        ranges = _Ranges(int(grid.stops[-1]), grid.bin_width, 0.0)
+        paths = [self._path(moment, wavelength, ranges) for wavelength in grid.wavelengths]
+        extinction = np.stack([path.extinction for path in paths])
+        backscatter = np.stack([path.backscatter for path in paths])
+        return ProfileTruth(grid.mean(extinction), grid.mean(backscatter), grid.depth(extinction))
 
 
-def _light(moment: _Moment, detector: Detector, offset: float) -> _Light:
-    site, acquisition = moment.site, moment.site.simulated.acquisition
-    if moment.role is Role.DARK:
-        return _Light(np.zeros(acquisition.bins), 0.0, math.nan, math.nan)
-    wavelength = detector.wavelength * 1e-9
-    distance = bin_centres(acquisition.bins, acquisition.bin_width, offset)
-    path = path_at(
-        site.simulated,
-        moment=moment.middle,
-        wavelength=wavelength,
-        distance=distance,
-        zenith_angle=moment.zenith_angle,
-        station_altitude=site.station.altitude,
+def _offset(moment: _Moment, channel: str) -> float:
+    return channel_facts(moment.facts, channel).range_offset or 0.0
+
+
+def _kept(cache: dict[Key, Kept], key: Key, value: Kept) -> Kept:
+    if len(cache) >= _KEPT:
+        cache.clear()
+    cache[key] = value
+    return value
+
+
+def _drifted(recorder: AnalogRecorder, hours: float) -> AnalogRecorder:
+    if not recorder.dark_drift:
+        return recorder
+    offset = max(recorder.dark_offset + recorder.dark_drift * hours, 0.0)
+    return recorder.model_copy(update={"dark_offset": offset})
+
+
+def grid_of(acquisition: Acquisition, detector: Detector) -> tuple[int, float]:
+    """Return bins and bin width (m) of a detector."""
+    return detector.bins or acquisition.bins, detector.bin_width or acquisition.bin_width
+
+
+def _grid(site: Site) -> Grid:
+    settings, acquisition = site.settings, site.simulated.acquisition
+    grids = [grid_of(acquisition, detector) for detector in site.simulated.detectors]
+    bin_width = min(width for _, width in grids)
+    bins = int(max(bins * width for bins, width in grids) // bin_width)
+    cells = min(settings.truth.cells, bins)
+    return Grid(
+        instrument=site.key,
+        wavelengths=tuple(sorted({d.wavelength * 1e-9 for d in site.simulated.detectors})),
+        bin_width=bin_width,
+        stops=np.rint(np.linspace(0, bins, cells + 1)).astype(np.intp),
+        every=-(-settings.files(site.key) // settings.truth.profiles),
     )
-    signal = backscatter_signal(
-        distance,
-        extinction=path.extinction,
-        backscatter=path.backscatter,
-        system_constant=detector.system_constant,
-        full_overlap_range=moment.facts.full_overlap_range,
-    )
-    sky = detector.background
-    glow = sky.night + (sky.day - sky.night) * sky_brightness(moment.sun)
-    if not path.homogeneous:
-        return _Light(signal + glow, glow, math.nan, math.nan)
-    amplitude = detector.system_constant * float(path.backscatter[0])
-    return _Light(signal + glow, glow, float(path.extinction[0]), amplitude)
 
 
 def _dataset(
-    acquisition: Acquisition, detector: Detector, mode: DetectionMode, number: int
+    site: Site, acquisition: Acquisition, detector: Detector, mode: DetectionMode, number: int
 ) -> Dataset:
     analog = detector.analog if mode is DetectionMode.ANALOG else None
     level = 0 if detector.photon is None else detector.photon.discriminator_level
-    return new_dataset(
+    bins, bin_width = grid_of(acquisition, detector)
+    dataset = new_dataset(
         kind=DatasetKind.PHOTON if analog is None else DatasetKind.ANALOG,
         wavelength=detector.wavelength * 1e-9,
         polarisation=detector.polarisation,
-        bins=acquisition.bins,
-        bin_width=acquisition.bin_width,
+        bins=bins,
+        bin_width=bin_width,
         shots=acquisition.shots,
+        laser=site.dialect.laser,
         high_voltage=detector.high_voltage,
         adc_bits=0 if analog is None else analog.adc_bits,
         input_range=0.0 if analog is None else analog.adc_range * 1e-3,
         discriminator=level * LICEL_DISCRIMINATOR_STEP,
         device=f"BC{number}" if analog is None else f"BT{number}",
     )
+    return spelled(site.dialect, dataset)

@@ -1,9 +1,16 @@
-"""The elastic lidar equation forward: optical properties along a beam to photoelectron rate."""
+"""The lidar equation forward: optical properties along a beam to photoelectron rate.
+
+Signals here belong to a pulse that is short against the bin; `lidarops.simulate.pulse` has those
+of a pulse of any length and shape.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lidarops.simulate import _checks
+from lidarops.simulate.overlap import Overlap, SineOverlap
 
 Array = NDArray[np.float64]
 
@@ -18,17 +25,8 @@ def bin_centres(bins: int, bin_width: float, offset: float = 0.0) -> Array:
 
 
 def overlap(distance: Array, full_overlap_range: float) -> Array:
-    r"""Return the overlap of beam and field of view, 0 at the lidar and 1 at full overlap.
-
-    Notes
-    -----
-    :math:`O(R) = \sin^2(\pi R / 2 R_f)` up to the range of full overlap :math:`R_f`, exactly 1
-    beyond: smooth at both ends, and of second order at R = 0, where :math:`R^{-2}` diverges.
-    """
-    if full_overlap_range <= 0.0:
-        return np.where(distance > 0.0, 1.0, 0.0)
-    fraction = np.clip(distance / full_overlap_range, 0.0, 1.0)
-    return np.where(fraction < 1.0, np.sin(0.5 * np.pi * fraction) ** 2, 1.0)
+    """Return the overlap of beam and field of view: see `SineOverlap`."""
+    return SineOverlap(full_overlap_range)(distance)
 
 
 def optical_depth(distance: Array, extinction: Array) -> Array:
@@ -37,7 +35,7 @@ def optical_depth(distance: Array, extinction: Array) -> Array:
     Parameters
     ----------
     distance : ndarray, m, shape (bins,)
-        Bin centres, equally spaced.
+        Bin centres, ascending.
     extinction : ndarray, m-1, shape (bins,)
         At the bin centres.
 
@@ -54,28 +52,77 @@ def optical_depth(distance: Array, extinction: Array) -> Array:
     return depth
 
 
+def transmission(distance: Array, extinction: Array) -> Array:
+    """Return the one-way transmission to each bin centre by the law of Beer and Lambert, 1.
+
+    References
+    ----------
+    `vasylkivskyi2022`, equation 13.
+    """
+    transmitted: Array = np.exp(-optical_depth(distance, extinction))
+    return transmitted
+
+
+def isotropic_backscatter(number_density: Array | float, cross_section: float) -> Array:
+    r"""Return the backscatter of isotropic scatterers of one kind, m-1 sr-1.
+
+    Parameters
+    ----------
+    number_density : ndarray or float, m-3
+    cross_section : float, m2
+        Total cross section of scattering.
+
+    Notes
+    -----
+    :math:`\beta = N \sigma^s / 4 \pi`.
+
+    References
+    ----------
+    `vasylkivskyi2022`, equation 16.
+    """
+    _checks.not_negative("cross_section", cross_section, "m2")
+    density = np.asarray(number_density, dtype=np.float64)
+    _checks.profile("number_density", np.atleast_1d(density), np.atleast_1d(density).shape, "m-3")
+    return density * (cross_section / (4.0 * np.pi))
+
+
 def backscatter_signal(
     distance: Array,
     *,
     extinction: Array,
     backscatter: Array,
     system_constant: float,
-    full_overlap_range: float,
+    full_overlap_range: float = 0.0,
+    overlap: Overlap | None = None,
+    returning_extinction: Array | None = None,
 ) -> Array:
-    r"""Return the rate of photoelectrons from elastic backscatter at the bin centres, MHz.
+    r"""Return the signal of backscatter at the bin centres, in the unit of the system constant.
 
     Parameters
     ----------
     distance : ndarray, m, shape (bins,)
         Range of the bin centres. Bins at or before the lidar (R <= 0) hold no signal.
     extinction : ndarray, m-1, shape (bins,)
+        At the wavelength of the laser.
     backscatter : ndarray, m-1 sr-1, shape (bins,)
+        From the wavelength of the laser into that of the detector.
     system_constant : float, MHz m3 sr
+        Or W m3 sr, for a power; see `lidarops.simulate.lidar.Lidar`.
     full_overlap_range : float, m
+        Of `SineOverlap`, where no overlap is given.
+    overlap : Overlap, optional
+    returning_extinction : ndarray, m-1, shape (bins,), optional
+        At the wavelength of the detector, where the scattering changes it (Raman); that of the
+        laser where not given.
+
+    Raises
+    ------
+    SimulationInputError
+        Where a property is negative or not finite.
 
     Notes
     -----
-    .. math:: P(R) = K O(R) \beta(R) R^{-2} \exp(-2 \tau(R))
+    .. math:: P(R) = K O(R) \beta(R) R^{-2} \exp(-\tau_L(R) - \tau_\lambda(R))
 
     at the bin centre, for a pulse that is short against the bin. Against the mean over the bin
     it is low by :math:`((1/R + \sigma)^2 + 1/(2 R^2)) \Delta R^2 / 6` of itself: 1.6e-4 at 300 m
@@ -83,10 +130,17 @@ def backscatter_signal(
 
     References
     ----------
-    `vasylkivskyi2022`, equation 15, attached to the bin centre.
+    `vasylkivskyi2022`, equations 15 and 22 (23, where both wavelengths are one), attached to the
+    bin centre.
     """
+    _checks.profile("extinction", extinction, distance.shape, "m-1")
+    _checks.profile("backscatter", backscatter, distance.shape, "m-1 sr-1")
+    if returning_extinction is not None:
+        _checks.profile("returning_extinction", returning_extinction, distance.shape, "m-1")
+    both_ways = extinction + (extinction if returning_extinction is None else returning_extinction)
     positive = distance > 0.0
     safe = np.where(positive, distance, 1.0)
-    gathered = overlap(distance, full_overlap_range) * backscatter / safe**2
-    transmitted = np.exp(-2.0 * optical_depth(distance, extinction))
+    shape = overlap or SineOverlap(full_overlap_range)
+    gathered = shape(distance) * backscatter / safe**2
+    transmitted = np.exp(-optical_depth(distance, both_ways))
     return np.where(positive, system_constant * gathered * transmitted, 0.0)

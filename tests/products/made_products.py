@@ -114,6 +114,7 @@ def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset
         {
             "extinction": (dims, extinction),
             "extinction_standard_error": (dims, np.abs(extinction) * 0.05),
+            "extinction_model_error": (dims, np.abs(extinction) * 0.05 + 1e-5),
             "amplitude": (dims, rng.uniform(1e7, 1e12, shape)),
             "amplitude_standard_error": (dims, rng.uniform(1e5, 1e9, shape)),
             "background": (dims, rng.uniform(0.1, 2.0, shape)),

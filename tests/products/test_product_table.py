@@ -80,6 +80,7 @@ def test_what_has_no_standard_name_is_what_the_table_does_not_know():
         ProductKind.HOMOGENEOUS: {
             "extinction",
             "extinction_standard_error",
+            "extinction_model_error",
             "amplitude",
             "amplitude_standard_error",
             "background",

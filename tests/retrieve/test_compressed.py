@@ -10,7 +10,7 @@ from oracle_homogeneous import GEOMETRIES, lowest_errors, section, signal
 from scipy import stats
 
 from lidarops.flags import Quality
-from lidarops.retrieve import _dense, _vector
+from lidarops.retrieve import _compressed, _vector
 from lidarops.retrieve._tables import make_tables
 from lidarops.retrieve.homogeneous import HomogeneousResult, solve
 
@@ -253,7 +253,7 @@ def test_curvature_misfit_is_chi_square(height, method):
     power = 370.0 + signal(LONG, height, 0.03 * KM)
     power = power + np.random.default_rng(4).normal(size=(20_000, 225))
     found = solve(power, LONG, variance=1.0, method=method)
-    dof = {"compressed": _dense.DEFAULT_SIZE, "fast": _dense.FAST_SIZE}[method] - 2
+    dof = _compressed.CURVATURES - 2
     assert np.mean(found.curvature_misfit) == pytest.approx(dof, rel=0.02)
     assert stats.kstest(found.curvature_misfit, stats.chi2(dof).cdf).pvalue > 1e-4
 

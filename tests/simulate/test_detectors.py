@@ -1,143 +1,28 @@
-"""Detectors against event-by-event and shot-by-shot simulation."""
+"""Both outputs of one detector together: shared photoelectrons, lags, laser, extreme cases."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from lidarops.simulate.instrument import count_photons, digitise, release
-from lidarops.simulate.settings import AnalogRecorder
+from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.instrument import (
+    Digitiser,
+    Laser,
+    count_photons,
+    digitise,
+    release,
+    seen_from,
+)
+from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 BIN_WIDTH = 7.5
-BIN_TIME = 50e-9
-
-
-def _events(rate, dead_time, windows, seed):
-    """Counts of photoelectrons and of what a counter registers, in windows of one bin."""
-    random = np.random.default_rng(seed)
-    span = windows * BIN_TIME
-    arrivals = np.sort(random.random(random.poisson(rate * span)) * span)
-    registered, last = [], -1.0
-    for arrival in arrivals.tolist():
-        if arrival - last >= dead_time:
-            registered.append(arrival)
-            last = arrival
-    edges = np.arange(windows + 1) * BIN_TIME
-    return np.histogram(arrivals, edges)[0], np.histogram(registered, edges)[0]
-
-
-@pytest.mark.parametrize(("rate", "dead_time"), [(20e6, 4e-9), (30e6, 4e-9), (80e6, 3e-9)])
-def test_dead_time_agrees_with_single_events(rate, dead_time):
-    windows = 400_000
-    released, registered = _events(rate, dead_time, windows, seed=11)
-    shots, bins = 500, 40_000
-    random = np.random.default_rng(12)
-    light = release(np.full(bins, rate * 1e-6), shots=shots, bin_width=BIN_WIDTH, random=random)
-    counted = count_photons(light, dead_time=dead_time, random=random)
-
-    error = np.hypot(
-        registered.std() / registered.mean() / np.sqrt(windows),
-        counted.std() / counted.mean() / np.sqrt(bins),
-    )
-    assert counted.mean() / shots == pytest.approx(registered.mean(), rel=4 * error)
-    # Windows of different shots are independent, so the variance of their sum adds up.
-    assert counted.var() / shots == pytest.approx(registered.var(), rel=0.035)
-    expected = np.cov(released, registered)[0, 1]
-    assert np.cov(light.number, counted)[0, 1] / shots == pytest.approx(expected, rel=0.03)
-
-
-@pytest.mark.parametrize("rate", [0.02, 0.3, 2.0, 25.0, 200.0])
-def test_mean_and_variance_of_renewal_theory(rate):
-    shots, bins, dead_time = 600, 200_000, 4e-9
-    random = np.random.default_rng(5)
-    light = release(np.full(bins, rate), shots=shots, bin_width=BIN_WIDTH, random=random)
-    counted = count_photons(light, dead_time=dead_time, random=random)
-    load = rate * 1e6 * dead_time
-    mean = rate * light.exposure / (1 + load)
-    variance = rate * light.exposure / (1 + load) ** 3
-    assert counted.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(variance / bins))
-    # The standard error of a variance is larger for few counts, where the kurtosis is 1 / mean.
-    assert counted.var() == pytest.approx(variance, rel=4.5 * np.sqrt((2 + 1 / mean) / bins) + 2e-3)
-    assert np.all((counted >= 0) & (counted <= light.number))
-
-
-def test_two_photoelectrons_coincide_as_often_as_they_must():
-    # Two events at random in the exposure: lost with probability 2 tau / T to first order.
-    shots, bins, dead_time = 1, 400_000, 1e-9
-    random = np.random.default_rng(6)
-    light = release(np.full(bins, 40.0), shots=shots, bin_width=BIN_WIDTH, random=random)
-    pairs = light.number == 2
-    lost = 1 - count_photons(light, dead_time=dead_time, random=random)[pairs].mean() / 2
-    expected = dead_time / BIN_TIME
-    assert lost == pytest.approx(expected, abs=4 * np.sqrt(expected / pairs.sum()))
-
-
-def test_without_light_nothing_is_counted():
-    random = np.random.default_rng(0)
-    light = release(np.zeros(100), shots=600, bin_width=BIN_WIDTH, random=random)
-    assert not count_photons(light, dead_time=4e-9, random=random).any()
-
-
-def _shot_by_shot(rate, recorder, shots, bins, seed):
-    """Every sample of every shot, with gamma-distributed charges, rounded and clipped."""
-    random = np.random.default_rng(seed)
-    number = random.poisson(rate * 1e6 * BIN_TIME, (shots, bins))
-    spread = recorder.excess_noise - 1.0
-    charge = random.gamma(number / spread, spread)
-    voltage = recorder.gain * charge / (BIN_TIME * 1e6)
-    voltage += recorder.dark_offset + recorder.noise * random.standard_normal((shots, bins))
-    top = 2**recorder.adc_bits - 1
-    return np.clip(np.rint(voltage / recorder.step), 0, top).sum(axis=0)
-
-
-RECORDER = AnalogRecorder(gain=0.05, noise=0.3, dark_offset=3.0, adc_range=100, excess_noise=1.3)
-
-
-@pytest.mark.parametrize("rate", [0.0, 3.0, 40.0])
-def test_the_digitiser_agrees_with_single_shots(rate):
-    shots, bins = 400, 4000
-    oracle = _shot_by_shot(rate, RECORDER, shots, bins, seed=21)
-    random = np.random.default_rng(22)
-    light = release(np.full(bins * 10, rate), shots=shots, bin_width=BIN_WIDTH, random=random)
-    summed = digitise(light, RECORDER, random=random)
-    error = oracle.std() / np.sqrt(bins)
-    assert summed.mean() == pytest.approx(oracle.mean(), abs=4.5 * error)
-    assert summed.var() == pytest.approx(oracle.var(), rel=4.5 * np.sqrt(2.2 / bins))
-    expected = (RECORDER.gain * rate + RECORDER.dark_offset) / RECORDER.step
-    assert summed.mean() / shots == pytest.approx(expected, abs=4.5 * error / shots)
-
-
-def test_half_a_step_of_noise_is_enough_to_average_out_the_steps():
-    # Gaussian noise on an offset between two steps, where the rounding is most biased.
-    recorder = AnalogRecorder(
-        gain=1.0, noise=0.5 * 100 / 4096, dark_offset=10.25 * 100 / 4096, adc_range=100
-    )
-    shots, bins = 2000, 3000
-    oracle = _shot_by_shot(0.0, recorder, shots, bins, seed=31)
-    bias = oracle.mean() / shots - 10.25
-    assert abs(bias) < np.exp(-2 * np.pi**2 * 0.25) / np.pi + 4 * 0.58 / np.sqrt(shots * bins)
-    random = np.random.default_rng(32)
-    light = release(np.zeros(bins * 10), shots=shots, bin_width=BIN_WIDTH, random=random)
-    assert digitise(light, recorder, random=random).var() == pytest.approx(oracle.var(), rel=0.15)
-
-
-@pytest.mark.parametrize("above", [-2.0, 0.0, 1.0, 20.0])
-def test_near_full_scale_some_shots_are_clipped(above):
-    # Electronic noise only: a rate so high that the noise of one shot is nearly that.
-    recorder = AnalogRecorder(gain=1e-4, noise=0.5, dark_offset=100 + above * 0.5, adc_range=100)
-    shots, bins = 300, 3000
-    oracle = _shot_by_shot(0.0, recorder, shots, bins, seed=41)
-    random = np.random.default_rng(42)
-    light = release(np.zeros(bins * 10), shots=shots, bin_width=BIN_WIDTH, random=random)
-    summed = digitise(light, recorder, random=random)
-    assert summed.max() <= shots * 4095
-    assert summed.mean() == pytest.approx(
-        oracle.mean(), abs=4.5 * oracle.std() / np.sqrt(bins) + 15
-    )
-    if above < 10:
-        assert summed.std() == pytest.approx(oracle.std(), rel=0.08)
-    else:
-        assert np.all(summed == shots * 4095)
+DEAD_TIME = 4e-9
+RECORDER = Digitiser(gain=0.05, noise=0.3, dark_offset=3.0, adc_range=100, excess_noise=1.3)
 
 
 def test_both_outputs_see_the_same_photoelectrons():
@@ -145,8 +30,8 @@ def test_both_outputs_see_the_same_photoelectrons():
     random = np.random.default_rng(51)
     light = release(np.full(bins, rate), shots=shots, bin_width=BIN_WIDTH, random=random)
     analog = digitise(light, RECORDER, random=random)
-    photon = count_photons(light, dead_time=4e-9, random=random)
-    load = rate * 1e6 * 4e-9
+    photon = count_photons(light, dead_time=DEAD_TIME, random=random)
+    load = rate * 1e6 * DEAD_TIME
     steps = RECORDER.gain / RECORDER.step / light.exposure * shots
     variance = steps**2 * RECORDER.excess_noise * rate * light.exposure
     variance += shots * ((RECORDER.noise / RECORDER.step) ** 2 + 1 / 12)
@@ -154,3 +39,179 @@ def test_both_outputs_see_the_same_photoelectrons():
     expected = shared / np.sqrt(variance * rate * light.exposure / (1 + load) ** 3)
     assert np.corrcoef(analog, photon)[0, 1] == pytest.approx(expected, abs=0.015)
     assert expected > 0.5
+
+
+def _profile(bins, offset=0.0):
+    distance = bin_centres(bins, BIN_WIDTH, offset)
+    signal = backscatter_signal(
+        distance,
+        extinction=np.full(bins, 1e-4),
+        backscatter=np.full(bins, 2e-6),
+        system_constant=5e12,
+        full_overlap_range=400.0,
+    )
+    return signal + 2.0
+
+
+def _lag(first, second, bins, reach=14):
+    """Lag of the noise of `second` behind that of `first`, by the peak of the correlation."""
+    noise = [x - x.mean(axis=0) for x in (first, second)]
+    noise = [x / x.std(axis=0) for x in noise]
+    inside = slice(reach, bins - reach)
+    lags = np.arange(-reach, reach + 1)
+    score = np.array([
+        (noise[0][:, inside] * noise[1][:, reach + k : bins - reach + k]).mean() for k in lags
+    ])  # fmt: skip
+    peak = int(np.argmax(score))
+    around = slice(peak - 1, peak + 2)
+    # The photoelectrons of a bin spread over two, so the centroid of the peak is the lag.
+    weight = np.where(score[around] > 0.25 * score[peak], score[around], 0.0)
+    others = np.delete(score, np.arange(peak - 2, peak + 3))
+    assert score[peak] > 5 * np.abs(others).max()
+    return lags[around] @ weight / weight.sum()
+
+
+@pytest.mark.parametrize("lag", [0.0, 3.0, -2.0, 2.4, 8.6, 9.9])
+def test_the_lag_of_two_recorders_is_in_their_noise(lag):
+    # The axis begins 12 bins before the pulse leaves; the analog bins come `lag` bins late.
+    bins, shots, files, lead = 900, 600, 80, 12
+    axis = _profile(bins + 2 * lead, offset=-lead * BIN_WIDTH)
+    random = np.random.default_rng(61)
+    photon, analog = [], []
+    for _ in range(files):
+        light = release(axis, shots=shots, bin_width=BIN_WIDTH, random=random)
+        early = seen_from(light, lead, bins, random=random)
+        late = seen_from(light, lead - lag, bins, random=random)
+        photon.append(count_photons(early, dead_time=DEAD_TIME, random=random))
+        analog.append(digitise(late, RECORDER, random=random))
+    found = _lag(np.array(photon, float), np.array(analog, float), bins)
+    assert found == pytest.approx(lag, abs=0.2)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.floats(0, 10), st.integers(0, 2**32))
+def test_a_cut_bin_loses_no_photoelectrons(first, seed):
+    random = np.random.default_rng(seed)
+    light = release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=random)
+    seen = seen_from(light, first, 40, random=random)
+    assert seen.number.shape == seen.rate.shape == (40,)
+    assert np.all(seen.number >= 0)
+    whole = int(np.floor(first + 1e-9))
+    outer = light.number[whole : whole + 41].sum()
+    inner = light.number[whole + 1 : whole + 40].sum()
+    assert inner <= seen.number.sum() <= outer
+    np.testing.assert_allclose(
+        seen.rate, np.interp(first + np.arange(40), np.arange(60), light.rate), rtol=0.12, atol=1.0
+    )
+
+
+def test_a_shifted_recorder_sees_the_light_of_its_own_bins():
+    # Poisson numbers in bins cut anew have the mean of the bins themselves.
+    bins, first = 300, 20.35
+    random = np.random.default_rng(71)
+    total = np.zeros(bins)
+    axis, own = _profile(400), _profile(400, offset=0.35 * BIN_WIDTH)[20 : 20 + bins]
+    for _ in range(400):
+        light = release(axis, shots=600, bin_width=BIN_WIDTH, random=random)
+        seen = seen_from(light, first, bins, random=random)
+        total += seen.number
+    expected = own * 400 * 600 * 0.05
+    error = (total - expected) / np.sqrt(expected)
+    # The straight line within a bin leaves 3e-4 of the signal where it bends most.
+    bend = 3e-4 * np.sqrt(expected)
+    assert np.all(np.abs(error) < 4.5 + bend)
+    assert error.std() < 1.4
+    np.testing.assert_allclose(seen.rate, own, rtol=1e-3)
+
+
+def test_recorders_off_the_axis_are_refused_by_name():
+    random = np.random.default_rng(0)
+    light = release(np.ones(50), shots=5, bin_width=BIN_WIDTH, random=random)
+    for first, bins in ((-0.5, 10), (41, 10), (40.5, 10), (0, 0), (np.nextafter(40, 50), 11)):
+        with pytest.raises(SimulationInputError, match="first"):
+            seen_from(light, first, bins, random=random)
+    assert seen_from(light, 40, 10, random=random).number.size == 10
+
+
+def test_a_whole_lag_draws_nothing():
+    random, other = np.random.default_rng(5), np.random.default_rng(5)
+    light = release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=random)
+    release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=other)
+    np.testing.assert_array_equal(
+        seen_from(light, 7.0, 40, random=random).number, light.number[7:47]
+    )
+    assert random.random() == other.random()
+
+
+def _file(seed):
+    random = np.random.default_rng(seed)
+    light = release(_profile(400), shots=600, bin_width=BIN_WIDTH, random=random)
+    first, second = (seen_from(light, start, 350, random=random) for start in (12.0, 3.4))
+    counts = count_photons(first, dead_time=DEAD_TIME, random=random)
+    return counts.tobytes() + digitise(second, RECORDER, random=random).tobytes()
+
+
+def test_the_same_seed_gives_the_same_bytes_on_any_thread():
+    alone = [_file(seed) for seed in range(24)]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(_file, range(24))) == alone
+        assert list(pool.map(_file, reversed(range(24)))) == alone[::-1]
+    assert len(set(alone)) == 24
+
+
+def test_the_energy_of_a_laser_drifts_and_jitters():
+    random = np.random.default_rng(81)
+    assert Laser(per_hour=-0.1).energy(2.0, 600, random) == pytest.approx(0.8)
+    assert Laser(per_hour=-0.1).energy(20.0, 600, random) == 0.0
+    energies = [Laser(shot_jitter=0.1).energy(0.0, 100, random) for _ in range(4000)]
+    assert np.mean(energies) == pytest.approx(1.0, abs=4.5 * 0.01 / 4000**0.5)
+    assert np.std(energies) == pytest.approx(0.01, rel=0.06)
+    both = Laser(shot_jitter=0.1, file_jitter=0.03)
+    energies = [both.energy(0.0, 100, random) for _ in range(4000)]
+    assert np.std(energies) == pytest.approx(np.hypot(0.01, 0.03), rel=0.06)
+    for change in ({"per_hour": np.nan}, {"file_jitter": -0.1}, {"shot_jitter": 3.0}):
+        with pytest.raises(SimulationInputError, match=next(iter(change))):
+            Laser(**change)
+
+
+def test_jitter_of_shots_is_one_factor_for_a_file():
+    # Shot by shot against the factor: variance and covariance of two bins.
+    random = np.random.default_rng(91)
+    shots, files, mean, jitter = 50, 4000, np.array([40.0, 15.0]), 0.2
+    energy = 1 + jitter * random.standard_normal((files, shots, 1))
+    single = random.poisson(np.maximum(energy, 0) * mean).sum(axis=1)
+    laser = Laser(shot_jitter=jitter)
+    rate = [laser.energy(0.0, shots, random) * mean / 0.05 for _ in range(files)]
+    ours = np.array([
+        release(r, shots=shots, bin_width=BIN_WIDTH, random=random).number for r in rate
+    ])  # fmt: skip
+    expected, found = np.cov(single.T), np.cov(ours.T)
+    np.testing.assert_allclose(found, expected, rtol=0.13)
+    assert found[0, 1] > 0.3 * found[1, 1]
+
+
+def test_a_thick_cloud_hides_what_is_above():
+    # 10 /km from 3 km on.
+    bins, shots = 1000, 600
+    distance = bin_centres(bins, BIN_WIDTH)
+    extinction = np.where((distance > 3000) & (distance < 3500), 1e-2, 5e-5)
+    signal = backscatter_signal(
+        distance,
+        extinction=extinction,
+        backscatter=np.where(extinction > 1e-3, 5e-4, 1e-6),
+        system_constant=5e12,
+        full_overlap_range=400.0,
+    )
+    random = np.random.default_rng(101)
+    light = release(signal, shots=shots, bin_width=BIN_WIDTH, random=random)
+    photon = count_photons(light, dead_time=DEAD_TIME, random=random)
+    analog = digitise(light, RECORDER, random=random)
+    above = distance > 3550
+    assert signal[above].max() * RECORDER.gain < 1e-3 * RECORDER.step
+    assert signal[distance < 3000][-1] > 0.3
+    assert photon[above].sum() < 10
+    offset = RECORDER.dark_offset / RECORDER.step * shots
+    spread = np.sqrt(shots * ((RECORDER.noise / RECORDER.step) ** 2 + 1 / 12))
+    rest = analog[above] - offset
+    assert rest.mean() == pytest.approx(0.0, abs=4.5 * spread / np.sqrt(above.sum()))
+    assert rest.std() == pytest.approx(spread, rel=0.15)

@@ -11,8 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarops.simulate.signal import backscatter_signal, bin_centres, optical_depth, overlap
-from lidarops.simulate.sun import sky_brightness, solar_elevation
+from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.lidar import Lidar
+from lidarops.simulate.overlap import GeometricalOverlap, SineOverlap, TabulatedOverlap, vanishes
+from lidarops.simulate.pulse import GaussianPulse, RectangularPulse
+from lidarops.simulate.signal import (
+    backscatter_signal,
+    bin_centres,
+    isotropic_backscatter,
+    optical_depth,
+    overlap,
+    transmission,
+)
+from lidarops.simulate.sun import sky_brightness, sky_radiance, solar_elevation
 
 
 @pytest.mark.parametrize("extinction", [1e-5, 2e-4, 2e-3])
@@ -35,6 +46,46 @@ def test_a_homogeneous_path_is_the_integral_over_each_bin(extinction):
         second = ((near + extinction) ** 2 + near**2 / 2) * width**2 / 6
         assert signal[index] == pytest.approx(exact * (1 - second), rel=0.01 * second + 1e-12)
         assert second < 0.06 * width * near
+        # Equation 15 at the bin centre, from 300 m on.
+        assert abs(signal[index] / exact - 1) <= 4e-4
+
+
+def test_light_that_changes_its_wavelength_is_attenuated_by_both():
+    distance = bin_centres(500, 7.5)
+    out, back = np.full(500, 3e-4), np.full(500, 2e-4)
+    both = {"system_constant": 1e12, "full_overlap_range": 200.0, "backscatter": np.ones(500)}
+    raman = backscatter_signal(distance, extinction=out, returning_extinction=back, **both)
+    elastic = backscatter_signal(distance, extinction=out, **both)
+    np.testing.assert_allclose(raman / elastic, np.exp(1e-4 * distance), rtol=1e-12)
+    np.testing.assert_allclose(
+        elastic,
+        1e12 * overlap(distance, 200.0) / distance**2 * transmission(distance, out) ** 2,
+        rtol=1e-12,
+    )
+
+
+def test_isotropic_scatterers_of_one_kind():
+    # 1e12 m-3 of 1e-16 m2: an extinction of 0.1 /km with a lidar ratio of 4 pi.
+    assert isotropic_backscatter(1e12, 1e-16) * 4 * math.pi == pytest.approx(1e-4)
+    with pytest.raises(SimulationInputError, match="cross_section"):
+        isotropic_backscatter(1e12, -1e-16)
+    with pytest.raises(SimulationInputError, match="number_density"):
+        isotropic_backscatter(np.array([1.0, -1.0]), 1e-16)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"extinction": -1e-4}, {"backscatter": -1e-6}, {"returning_extinction": np.inf}],
+)
+def test_air_that_does_not_exist_is_refused_by_name(change):
+    air = {"extinction": 1e-4, "backscatter": 1e-6, "returning_extinction": 1e-4} | change
+    with pytest.raises(SimulationInputError, match=next(iter(change))):
+        backscatter_signal(
+            bin_centres(9, 7.5),
+            system_constant=1e12,
+            full_overlap_range=9.0,
+            **{name: np.full(9, value) for name, value in air.items()},
+        )
 
 
 def test_optical_depth_of_a_layered_path():
@@ -75,6 +126,172 @@ def test_overlap_is_complete_at_the_stated_range_and_not_before():
     np.testing.assert_array_equal(overlap(distance, 0.0), [0, 0, 1, 1, 1, 1, 1])
 
 
+TELESCOPES = {
+    "coaxial": {"separation": 0.0, "obstruction_radius": 0.03},
+    "biaxial": {"separation": 0.25},
+    "tilted": {"separation": 0.25, "tilt": 2e-4},
+}
+
+
+@pytest.mark.parametrize("telescope", TELESCOPES)
+def test_the_geometrical_overlap_is_that_of_single_rays(telescope):
+    geometry = {
+        "aperture_radius": 0.1, "field_of_view": 1e-3, "beam_radius": 0.01, "divergence": 2e-4,
+        "separation": 0.0, "tilt": 0.0, "obstruction_radius": 0.0,
+    } | TELESCOPES[telescope]  # fmt: skip
+    shape = GeometricalOverlap(**geometry)
+    random = np.random.default_rng(1)
+    rays = 400_000
+    inner, outer = geometry["obstruction_radius"] ** 2, geometry["aperture_radius"] ** 2
+    radius = np.sqrt(inner + (outer - inner) * random.random(rays))
+    angle = 2 * np.pi * random.random(rays)
+    aperture = radius * np.exp(1j * angle)
+    for distance in (30.0, 150.0, 300.0, 600.0, 1500.0, 8000.0):
+        width = math.hypot(0.01, 2e-4 * distance) / 2
+        beam = geometry["separation"] - geometry["tilt"] * distance
+        beam = beam + width * (random.standard_normal(rays) + 1j * random.standard_normal(rays))
+        passed = (np.abs(beam - aperture) < 5e-4 * distance).mean()
+        error = math.sqrt(max(passed * (1 - passed), 1e-6) / rays)
+        assert shape(np.array([distance]))[0] == pytest.approx(passed, abs=4.5 * error + 2e-3)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        SineOverlap(300.0),
+        TabulatedOverlap((50.0, 90.0, 300.0), (0.1, 0.6, 1.0)),
+        *(
+            GeometricalOverlap(0.1, 1e-3, 0.01, 2e-4, **{"separation": 0.0} | TELESCOPES[name])
+            for name in TELESCOPES
+        ),
+    ],
+)
+def test_every_overlap_vanishes_with_the_square_of_the_range(shape):
+    near = np.array([-5.0, 0.0, 1e-3, 1e-2, 1e-1])
+    values = shape(near)
+    assert np.all(values[:2] == 0)
+    assert vanishes(shape)
+    far = shape(np.geomspace(1e-3, 2e4, 4000))
+    assert np.all((far >= 0) & (far <= 1))
+    assert far.max() > 0.5
+    if values[2] > 0:
+        assert values[3] / values[2] == pytest.approx(100, rel=1e-3)
+    assert not vanishes(SineOverlap(0.0))
+
+
+def test_a_measured_overlap_goes_through_its_points():
+    ranges, values = (50.0, 90.0, 300.0), (0.1, 0.6, 1.0)
+    shape = TabulatedOverlap(ranges, values)
+    np.testing.assert_allclose(shape(np.array(ranges)), values)
+    assert shape(np.array([25.0]))[0] == pytest.approx(0.025)
+    assert shape(np.array([5000.0]))[0] == pytest.approx(1.0, rel=1e-12)
+    for wrong in (
+        ((50.0, 40.0), (0.1, 1.0)), ((-5.0, 40.0), (0.1, 1.0)), ((5.0, 40.0), (0.1, 1.1)),
+        ((5.0, 40.0), (-0.1, 1.0)), ((5.0,), (1.0,)), ((5.0, 40.0), (0.1, 0.5, 1.0)),
+    ):  # fmt: skip
+        with pytest.raises(SimulationInputError):
+            TabulatedOverlap(*wrong)
+
+
+def _lidar(**changes):
+    return Lidar(
+        **{
+            "energy": 0.1,
+            "repetition_rate": 10.0,
+            "aperture_diameter": 0.3,
+            "wavelength": 532e-9,
+            "optical_efficiency": 0.3,
+            "quantum_efficiency": 0.2,
+            "bin_width": 7.5,
+            "full_overlap_range": 400.0,
+            "field_of_view": 1e-3,
+            "filter_bandwidth": 1e-9,
+        }
+        | changes
+    )
+
+
+def test_the_photons_of_a_lidar_are_those_of_its_laser():
+    lidar = _lidar()
+    # 100 mJ at 532 nm are 2.678e17 photons; from 1 km, 1e-6 m-1 sr-1 sends 7.5e-12 of them per
+    # metre of telescope squared and bin: counted by hand, photon by photon.
+    photons = 0.1 / 3.7339e-19
+    area = math.pi * 0.15**2
+    per_shot = photons * 1e-6 * 7.5 * area / 1000.0**2 * 0.3 * 0.2
+    rate = lidar.rate(
+        np.array([1000.0, 1007.5]), extinction=np.zeros(2), backscatter=np.full(2, 1e-6)
+    )
+    # 7.5 m are 50 ns by the nominal 150 m per microsecond, 7e-4 more by the speed of light.
+    assert rate[0] == pytest.approx(per_shot / 0.05, rel=1e-3)
+    power = lidar.power(
+        np.array([1000.0, 1007.5]), extinction=np.zeros(2), backscatter=np.full(2, 1e-6)
+    )
+    assert power[0] == pytest.approx(rate[0] * 1e6 / 0.2 * 3.7339e-19, rel=1e-4)
+    assert lidar.shots(60.0) == 600
+    # Equation 23 for a rectangular pulse: power times duration times c / 2.
+    pulse = RectangularPulse(20e-9)
+    peak = 0.1 / pulse.duration * area * 0.3 * 299_792_458.0 * pulse.duration / 2
+    assert lidar.power_constant == pytest.approx(peak)
+
+
+def test_what_a_lidar_sees_scales_as_it_must():
+    base = _lidar().system_constant
+    assert _lidar(energy=0.2).system_constant == pytest.approx(2 * base)
+    assert _lidar(aperture_diameter=0.6).system_constant == pytest.approx(4 * base)
+    assert _lidar(obstruction_diameter=0.15).system_constant == pytest.approx(0.75 * base)
+    assert _lidar(quantum_efficiency=0.1).system_constant == pytest.approx(base / 2)
+    # More photons of less energy come back.
+    raman = _lidar(detected_wavelength=607e-9)
+    assert raman.system_constant == pytest.approx(base * 607 / 532)
+    sky = _lidar().background_rate(1e8)
+    assert _lidar(field_of_view=2e-3).background_rate(1e8) == pytest.approx(4 * sky)
+    assert _lidar(filter_bandwidth=0.5e-9).background_rate(1e8) == pytest.approx(sky / 2)
+    # 0.1 W m-2 sr-1 nm-1 on 0.0707 m2 and 7.85e-7 sr, of which 6 per cent are counted.
+    expected = 0.1 * 0.070686 * 7.854e-7 * 0.06 / 3.7339e-19 * 1e-6
+    assert sky == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_pulse_of_a_lidar_smears_a_cloud():
+    path = np.arange(0.5, 3000.0, 0.5)
+    cloud = np.where(path > 1500, 1e-4, 1e-9)
+    distance = bin_centres(350, 7.5)
+    air = {"extinction": np.zeros(path.size), "backscatter": cloud, "path": path}
+    short = _lidar().rate(distance, **air)
+    smeared = _lidar(pulse=GaussianPulse(200e-9)).rate(distance, **air)
+    rise = [np.flatnonzero(s > 0.9 * s[distance > 1500].max())[0] for s in (short, smeared)]
+    assert rise[1] >= rise[0] + 3
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"aperture_diameter": 0.0}, "aperture_diameter"),
+        ({"energy": -1.0}, "energy"),
+        ({"energy": 100e3}, "energy"),
+        ({"wavelength": 532.0}, r"wavelength.*5\.32e-07 m"),
+        ({"detected_wavelength": 607.0}, r"detected_wavelength"),
+        ({"quantum_efficiency": 20.0}, "quantum_efficiency"),
+        ({"optical_efficiency": 0.0}, "optical_efficiency"),
+        ({"bin_width": 0.0}, "bin_width"),
+        ({"field_of_view": 1.0}, "field_of_view"),
+        ({"filter_bandwidth": 1.0}, "filter_bandwidth"),
+        ({"repetition_rate": 0.0}, "repetition_rate"),
+        ({"full_overlap_range": -1.0}, "full_overlap_range"),
+        ({"obstruction_diameter": 0.3}, "obstruction_diameter"),
+        ({"energy": math.nan}, "energy"),
+    ],
+)
+def test_lidars_that_nobody_built_are_refused_by_name(change, told):
+    with pytest.raises(SimulationInputError, match=told):
+        _lidar(**change)
+
+
+def test_a_pulse_longer_than_the_range_is_refused():
+    lidar = _lidar(pulse=RectangularPulse(10e-6))
+    with pytest.raises(SimulationInputError, match="pulse"):
+        lidar.rate(bin_centres(100, 7.5), extinction=np.zeros(100), backscatter=np.ones(100))
+
+
 def _almanac_elevation(moment: datetime, latitude: float, longitude: float) -> float:
     """Low-precision formulas of the Astronomical Almanac: right to 0.01 degree."""
     days = (moment - datetime(2000, 1, 1, 12, tzinfo=UTC)) / timedelta(days=1)
@@ -102,7 +319,7 @@ def _almanac_elevation(moment: datetime, latitude: float, longitude: float) -> f
 def test_the_sun_stands_where_the_almanac_says(quarter, latitude, longitude):
     moment = datetime(2024, 1, 1, tzinfo=UTC) + timedelta(minutes=15 * quarter)
     ours = solar_elevation(moment, latitude, longitude)
-    assert ours == pytest.approx(_almanac_elevation(moment, latitude, longitude), abs=5.0)
+    assert ours == pytest.approx(_almanac_elevation(moment, latitude, longitude), abs=0.5)
 
 
 def test_the_sky_is_brightest_at_the_zenith_and_falls_through_twilight():
@@ -113,3 +330,38 @@ def test_the_sky_is_brightest_at_the_zenith_and_falls_through_twilight():
     assert np.all(np.diff(brightness) > 0)
     # No step at the horizon.
     assert sky_brightness(1e-9) == pytest.approx(sky_brightness(-1e-9), rel=1e-6)
+
+
+@pytest.mark.parametrize("wavelength", [355e-9, 532e-9, 1064e-9])
+def test_the_radiance_of_the_sky_is_one_of_clear_days(wavelength):
+    # Integrated over layers: what each sends down, after the sun and before the ground.
+    elevation, aerosol = 40.0, 0.1
+    mu = math.sin(math.radians(elevation))
+    inverse = (wavelength * 1e6) ** -2
+    air = 0.008569 * inverse**2 * (1 + 0.0113 * inverse + 0.00013 * inverse**2)
+    # Optical depths of air as of other fits.
+    assert air == pytest.approx({355e-9: 0.594, 532e-9: 0.1113, 1064e-9: 0.00674}[wavelength], 0.01)
+    depth = (np.arange(20_000) + 0.5) / 20_000 * (air + aerosol)
+    down = np.exp(-depth / mu) * np.exp(-(air + aerosol - depth))
+    henyey = (1 - 0.65**2) / (1 + 0.65**2 - 1.3 * mu) ** 1.5
+    phase = (0.75 * (1 + mu**2) * air + henyey * aerosol) / (air + aerosol) / (4 * math.pi)
+    # The black body's part of the 1361 W m-2 of the Sun.
+    x = 0.014387769 / (wavelength * 5772.0)
+    sun = 1361.0 * 15 / math.pi**4 * x**4 / math.expm1(x) / wavelength
+    expected = sun * phase * down.mean() * (air + aerosol)
+    assert sky_radiance(elevation, wavelength) == pytest.approx(expected, rel=0.01)
+    # 0.005 to 0.2 W m-2 sr-1 nm-1 by day.
+    assert 3e6 < sky_radiance(elevation, wavelength) < 2e8
+
+
+def test_the_radiance_follows_the_sun_without_steps():
+    elevations = np.linspace(-20, 90, 1101)
+    radiance = np.array([sky_radiance(e, 532e-9) for e in elevations])
+    assert np.all(np.diff(radiance) > 0)
+    assert np.all(np.diff(np.log(radiance)) < 0.3)
+    assert sky_radiance(-18, 532e-9) < 1e-5 * sky_radiance(30, 532e-9)
+    assert _lidar().sky_rate(-18) < 1e-3
+    assert 1 < _lidar().sky_rate(30) < 1000
+    for wrong in ((100.0, 532e-9), (10.0, 532.0), (math.nan, 532e-9)):
+        with pytest.raises(SimulationInputError):
+            sky_radiance(*wrong)

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from small_campaign import FAST, SLOW
 
-from lidarops.errors import CampaignError, RawFormatError
+from lidarops.errors import CampaignError
 from lidarops.raw import licel
 from lidarops.records import Role
 from lidarops.simulate.campaign import simulate
-from lidarops.simulate.files import random_stream
-from lidarops.simulate.settings import DamageKind
+from lidarops.simulate.site import random_stream
 
 
 def _contents(root):
@@ -109,7 +108,8 @@ def test_files_are_named_and_headed_as_licel_does(small):
 
 def test_the_truth_has_its_schema(small):
     truth = simulate(small()).truth
-    assert dict(truth.sizes) == {"granule": 24}
+    profiles = {"profile_hill_lidar": 4, "wavelength_hill_lidar": 2, "range_hill_lidar": 64}
+    assert dict(truth.sizes) == {"granule": 24} | profiles
     assert list(truth["path"].values[:1]) == ["coast/h24C3123.510000"]
     assert set(truth["instrument"].values) == {"coast-lidar", "hill-lidar"}
     assert truth["time"].values[0] == np.datetime64("2024-12-31T23:50:30")
@@ -126,7 +126,7 @@ def test_the_truth_has_its_schema(small):
     assert np.all(truth["dark_offset_analog_532o"].values[coast] == 3.0)
     assert "dark_offset_photon_532o" not in truth
     assert not truth["refused"].values.any()
-    assert all("long_name" in variable.attrs for variable in truth.data_vars.values())
+    assert all("long_name" in variable.attrs for variable in truth.variables.values())
 
 
 def _expected(truth, index, channel, distance):
@@ -203,53 +203,6 @@ def test_a_trigger_delay_of_the_facts_shifts_a_channel(small):
     assert late == pytest.approx(1, abs=0.02)
 
 
-ALL_DAMAGE = [{"kind": kind.value, "index": 2 * i} for i, kind in enumerate(DamageKind)]
-
-
-def test_damaged_files_are_refused_and_others_are_not(small):
-    result = simulate(small(lambda t: _simulated(t)["coast-lidar"].update(damage=ALL_DAMAGE)))
-    truth = result.truth
-    assert (truth["damage"].values != "").sum() == len(DamageKind)
-    assert truth["refused"].values.sum() == len(DamageKind) - 1
-    for path, refused in zip(truth["path"].values, truth["refused"].values, strict=True):
-        file = result.archive / str(path)
-        if refused:
-            with pytest.raises(RawFormatError, match=re.escape(file.name)):
-                licel.read_header(file).position()
-        else:
-            assert licel.read_header(file).position() in {(54.4, 10.2), (47.8, 11.0)}
-
-
-def test_damage_is_what_it_is_called(small):
-    clean = simulate(small(archive="clean"))
-    result = simulate(
-        small(lambda t: _simulated(t)["coast-lidar"].update(damage=ALL_DAMAGE), archive="damaged")
-    )
-    for number, kind in enumerate(DamageKind):
-        path = str(result.truth["path"].values[2 * number])
-        good = (clean.archive / str(clean.truth["path"].values[2 * number])).read_bytes()
-        bad = (result.archive / path).read_bytes()
-        if kind is DamageKind.FOREIGN:
-            assert path == "coast/hlog.txt"
-            assert bad.isascii()
-        elif kind is DamageKind.NO_FINAL_NEWLINE:
-            assert bad + b"\r\n" == good
-        elif kind is DamageKind.TRUNCATED:
-            assert good.startswith(bad)
-            assert 500 < len(bad) < len(good) - 1000
-        elif kind is DamageKind.EMPTY:
-            assert bad == b""
-        elif kind is DamageKind.NEGATIVE_BINS:
-            assert len(bad) == len(good)
-            assert bad == good.replace(b" 00600 ", b" -0005 ", 1)
-        elif kind is DamageKind.IMPOSSIBLE_POSITION:
-            assert bad.partition(b"\r\n\r\n")[2] == good.partition(b"\r\n\r\n")[2]
-            assert b" 0987.6 0765.4 90.0" in bad
-        else:
-            assert len(bad) == len(good)
-            assert b"coast" not in bad[:500]
-
-
 def test_a_blinding_signal_saturates_but_does_not_crash(small):
     def blind(tree):
         coast = _simulated(tree)["coast-lidar"]
@@ -263,7 +216,7 @@ def test_a_blinding_signal_saturates_but_does_not_crash(small):
     header, values = _signals(result.archive, str(result.truth["path"].values[0]))
     analog = header.channels[0]
     assert values["analog_532o"][0] == pytest.approx(analog.full_scale * analog.scale)
-    assert values["photon_532o"][0] == pytest.approx(1e-6 / SLOW, rel=1e-3)
+    assert values["photon_532o"][0] == pytest.approx(1e-6 / SLOW, rel=0.02)
 
 
 def test_progress_counts_every_file(small):

@@ -1,0 +1,297 @@
+"""How accurate the solvers of a homogeneous path are, against the least possible error."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.bench.homogeneous import (
+    QUANTITIES,
+    Array,
+    Estimates,
+    Scenario,
+    Way,
+    background_bias,
+    difficulty,
+    least_errors,
+    methods,
+    scenarios,
+)
+from lidarops.bench.peers import peers
+from lidarops.bench.timing import Machine, machine
+from lidarops.retrieve.background import cubic
+from lidarops.retrieve.homogeneous import Method
+
+PROFILES: Final = 20_000
+QUICK_PROFILES: Final = 4_000
+_SLOW: Final = "scipy"
+"""Ways whose names begin so are too slow for every profile."""
+_SLOW_SHARE: Final = 40
+_WARM: Final = 64
+_TWO_SIDED: Final = 1.959963984540054
+"""Standard deviations that hold 95 percent of a normal distribution."""
+
+_PAPER_LENGTHS: Final = ((2500.0, (1e3, 2e3, 4e3, 6e3, 8e3)), (10500.0, (1e3, 2e3, 2.5e3)))
+_PAPER_STEP: Final = 15.0
+_PAPER_SIGNAL: Final = 17.0
+_PAPER_EXTINCTION: Final = 3e-5
+_AVERAGED: Final = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A figure from random profiles, with its Monte Carlo standard error."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors of one unknown over the profiles that were not rejected."""
+
+    rmse: Measured
+    """Over the Cramér-Rao bound."""
+    bias: Measured
+    """Over the Cramér-Rao bound."""
+    coverage: Measured
+    """Share of profiles whose truth is within 1.96 stated standard errors."""
+    rmse_of_all: float
+    """As `rmse`, over every profile with a value, rejected or not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one way to solve did with one scenario."""
+
+    way: str
+    profiles: int
+    flagged: float
+    """Share of profiles with any quality bit."""
+    rejected: float
+    """Share of profiles with a quality bit that says not to use the value."""
+    nanoseconds: float
+    """CPU time a profile, of one run."""
+    scores: Mapping[str, Score]
+    """By unknown; without those that the way was given, or rejected throughout."""
+    distances: Mapping[str, float]
+    """Largest difference from the direct method over the Cramér-Rao bound, by unknown, over the
+    profiles that neither rejects; without those that the way was given."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One scenario with what all ways did with it."""
+
+    scenario: Scenario
+    difficulty: float
+    """Least standard error of extinction over extinction + 1 / mean range."""
+    least_errors: Mapping[str, float]
+    outcomes: tuple[Outcome, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """Mean error of the background on the signals of bobrovsky2024, tables 1 and 2."""
+
+    start: float
+    """m."""
+    length: float
+    """m."""
+    averaged: int
+    """Profiles averaged before they are solved."""
+    lag_1: Measured
+    """Of the cubic with a lag of one bin, without correction for the noise, in noise units."""
+    compressed: Measured
+    """Of `solve`, in noise units; every profile, flagged or not."""
+    scatter: float
+    """Standard deviation of the latter."""
+    expected: float
+    """Second-order bias of least squares."""
+    flagged: float
+    """Share of profiles that `solve` flags."""
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """The accuracy benchmark."""
+
+    date: str
+    machine: Machine
+    cases: tuple[Case, ...]
+    offsets: tuple[Offset, ...]
+
+
+def measure(
+    *,
+    quick: bool = False,
+    date: str = "",
+    profiles: int | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> Accuracy:
+    """Solve simulated profiles by every method of `solve` and by iterative peers.
+
+    Parameters
+    ----------
+    quick : bool
+        8 scenarios, fewer profiles.
+    date : str
+        When it is run, as it is to be stated.
+    profiles : int, optional
+        Of each scenario; the peers of scipy get a fortieth of them, at least 16.
+    progress : callable
+        Is given 1 after each scenario.
+    """
+    count = profiles or (QUICK_PROFILES if quick else PROFILES)
+    ways = {**methods(), **peers()}
+    cases = []
+    for seed, scenario in enumerate(scenarios(quick=quick)):
+        cases.append(_case(scenario, ways, scenario.powers(count, seed)))
+        progress(1)
+    return Accuracy(date, machine(), tuple(cases), tuple(offsets(count)))
+
+
+def offsets(count: int) -> list[Offset]:
+    """Return the errors of background on the signals of the published tables.
+
+    The tables do not state the signal: 17 times the noise at 2.5 km, bins of 15 m and an
+    extinction of 0.03 km-1 reproduce how the published background falls with the length.
+    """
+    fade = np.exp(-2 * _PAPER_EXTINCTION * (10500.0 - 2500.0)) * (2500.0 / 10500.0) ** 2
+    signals = {2500.0: _PAPER_SIGNAL, 10500.0: float(_PAPER_SIGNAL * fade)}
+    paths = [
+        Scenario(
+            start,
+            length,
+            _PAPER_EXTINCTION,
+            signals[start],
+            bins=round(length / _PAPER_STEP) + 1,
+        )
+        for start, lengths in _PAPER_LENGTHS
+        for length in lengths
+    ]
+    return [
+        _offset(path, averaged, count, seed)
+        for averaged in (1, _AVERAGED)
+        for seed, path in enumerate(paths)
+    ]
+
+
+def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
+    # The mean of white noise is white noise: powers in units of its standard deviation.
+    scale = float(np.sqrt(averaged))
+    louder = Scenario(
+        path.start,
+        path.length,
+        path.extinction,
+        path.signal * scale,
+        background=path.background * scale,
+        bins=path.bins,
+    )
+    power = louder.powers(count, seed)
+    # A variance of 0 is taken for no noise, which leaves its bias in, as published.
+    published = cubic(power, louder.range, lag=1, variance=0.0).background
+    found = methods()[Method.COMPRESSED](power, louder)
+    ours = found.values["background"]
+    return Offset(
+        start=path.start,
+        length=path.length,
+        averaged=averaged,
+        lag_1=_mean((published - louder.background) / scale),
+        compressed=_mean((ours - louder.background) / scale),
+        scatter=float(np.nanstd(ours)) / scale,
+        expected=background_bias(louder) / scale,
+        flagged=float(found.flagged.mean()),
+    )
+
+
+def _case(scenario: Scenario, ways: Mapping[str, Way], power: Any) -> Case:
+    least = least_errors(scenario)
+    converged = ways[Method.DIRECT](power, scenario)
+    outcomes = [
+        _outcome(name, way, scenario, power, least, converged) for name, way in ways.items()
+    ]
+    return Case(scenario, difficulty(scenario), least, tuple(outcomes))
+
+
+def _outcome(
+    name: str,
+    way: Way,
+    scenario: Scenario,
+    power: Any,
+    least: Mapping[str, float],
+    converged: Estimates,
+) -> Outcome:
+    if name.startswith(_SLOW):
+        power = power[: max(len(power) // _SLOW_SHARE, 16)]
+    way(power[:_WARM], scenario)
+    begin = time.process_time()
+    found = way(power, scenario)
+    spent = time.process_time() - begin
+    scores = {
+        quantity: score
+        for quantity in QUANTITIES
+        if (score := _score(found, quantity, scenario.truth[quantity], least[quantity]))
+    }
+    return Outcome(
+        way=name,
+        profiles=len(power),
+        flagged=float(found.flagged.mean()),
+        rejected=float(found.rejected.mean()),
+        nanoseconds=1e9 * spent / len(power),
+        scores=scores,
+        distances={
+            quantity: _distance(found, converged, quantity) / least[quantity] for quantity in scores
+        },
+    )
+
+
+def _score(found: Estimates, quantity: str, truth: float, least: float) -> Score | None:
+    error = (found.values[quantity] - truth) / least
+    stated = found.standard_errors[quantity] / least
+    finite = np.isfinite(error)
+    kept = finite & ~found.rejected
+    if kept.sum() < 2 or not np.any(stated[kept] > 0):
+        return None
+    squares = error[kept] ** 2
+    rmse = float(np.sqrt(squares.mean()))
+    inside = np.abs(error[kept]) <= _TWO_SIDED * stated[kept]
+    return Score(
+        rmse=Measured(rmse, _mean(squares).error / (2 * rmse)),
+        bias=_mean(error[kept]),
+        coverage=_share(inside),
+        rmse_of_all=float(np.sqrt(np.mean(error[finite] ** 2))),
+    )
+
+
+def _distance(found: Estimates, converged: Estimates, quantity: str) -> float:
+    count = len(found.rejected)
+    kept = ~found.rejected & ~converged.rejected[:count]
+    between = np.abs(found.values[quantity] - converged.values[quantity][:count])[kept]
+    return float(np.nanmax(between, initial=0.0))
+
+
+def _mean(values: Array) -> Measured:
+    finite = values[np.isfinite(values)]
+    return Measured(float(finite.mean()), float(finite.std() / np.sqrt(finite.size)))
+
+
+def _share(inside: npt.NDArray[np.bool_]) -> Measured:
+    # Where all or none are inside, half a profile keeps the error from being zero.
+    share = (inside.sum() + 0.5) / (inside.size + 1)
+    return Measured(float(inside.mean()), float(np.sqrt(share * (1 - share) / inside.size)))
+
+
+def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[Case, Outcome]]:
+    """Return what one way did, scenario by scenario."""
+    return [
+        (case, outcome)
+        for case in accuracy.cases
+        for outcome in case.outcomes
+        if outcome.way == way
+    ]

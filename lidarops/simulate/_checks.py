@@ -1,0 +1,71 @@
+"""Refusal of input that no lidar has, by the name of the argument."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.errors import LidarOpsError
+
+SHORTEST: Final = 1.0e-7
+"""m. Shorter wavelengths than 100 nm do not pass air."""
+LONGEST: Final = 2.0e-5
+"""m."""
+
+
+class SimulationInputError(LidarOpsError, ValueError):
+    """A lidar, a pulse or an atmosphere that cannot be simulated."""
+
+
+def positive(field: str, value: float, unit: str = "") -> None:
+    """Refuse what is not a positive, finite number."""
+    if not (math.isfinite(value) and value > 0.0):
+        raise _refusal(field, value, unit, "be positive and finite")
+
+
+def not_negative(field: str, value: float, unit: str = "") -> None:
+    """Refuse what is negative or not finite."""
+    if not (math.isfinite(value) and value >= 0.0):
+        raise _refusal(field, value, unit, "be finite and not negative")
+
+
+def between(field: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Refuse what is not from `low` to `high`."""
+    if not low <= value <= high:
+        raise _refusal(field, value, unit, f"lie between {low:g} and {high:g}")
+
+
+def wavelength_in_metres(field: str, value: float) -> None:
+    """Refuse wavelengths out of the optical window; most often they are in nm."""
+    if SHORTEST <= value <= LONGEST:
+        return
+    remedy = f"{value:g} nm are {value * 1e-9:g} m" if 100.0 <= value <= 20_000.0 else None
+    raise SimulationInputError(
+        f"a wavelength must lie between {SHORTEST:g} and {LONGEST:g} m, not {value:g}",
+        field=field,
+        remedy=remedy,
+    )
+
+
+def profile(field: str, values: NDArray[np.float64], shape: tuple[int, ...], unit: str) -> None:
+    """Refuse profiles of another shape, or with values that are negative or not finite."""
+    if values.shape != shape:
+        raise SimulationInputError(f"has shape {values.shape}, not {shape}", field=field)
+    # NaN passes neither comparison.
+    if not (values.min(initial=0.0) >= 0.0 and values.max(initial=0.0) < np.inf):
+        where = int(np.argmin(np.isfinite(values) & (values >= 0.0)))
+        raise _refusal(f"{field}[{where}]", float(values[where]), unit, "not be negative or NaN")
+
+
+def ascending(field: str, values: NDArray[np.float64]) -> None:
+    """Refuse a grid that does not ascend."""
+    if values.ndim != 1 or values.size < 2 or not np.all(np.diff(values) > 0.0):
+        raise SimulationInputError("must be one axis of at least 2 ascending values", field=field)
+
+
+def _refusal(field: str, value: Any, unit: str, rule: str) -> SimulationInputError:
+    told = f"{value:g} {unit}".rstrip()
+    return SimulationInputError(f"must {rule}, not {told}", field=field)

@@ -1,0 +1,462 @@
+r"""Digitisers: what is recorded of the photoelectrons, in steps.
+
+One sample of one shot is the charge of its photoelectrons, an offset and electronic noise,
+rounded to a step. For a voltage v (in steps) with the characteristic function
+:math:`\phi(\omega) = E[e^{i \omega v}]` the rounding error e = round(v) - v has the moments
+
+.. math:: E[e] = \sum_k \frac{(-1)^k}{\pi k} \Im\phi(2 \pi k), \quad
+          E[e^2] = \frac{1}{12} + \sum_k \frac{(-1)^k}{\pi^2 k^2} \Re\phi(2 \pi k), \quad
+          E[v e] = \sum_k \frac{(-1)^k}{\pi k} \Im(-i \phi'(2 \pi k))
+
+(`widrow2008`). Here phi is that of a compound Poisson distribution of gamma-distributed charges
+plus Gaussian noise, so the moments hold for few photoelectrons and for noise far below a step,
+where the steps do not average out over shots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, erfc, exp, pi, sin, sqrt
+from typing import Any, Final, Protocol
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.simulate import _checks
+from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons
+
+FastCounts = NDArray[np.int32]
+
+LEAST_NOISE: Final = 0.02
+"""Steps. With less, the sums over shots would need more harmonics than they have digits."""
+_NEGLIGIBLE: Final = 20.0
+"""Of a harmonic: exp(-20) = 2e-9 steps."""
+_NEGLIGIBLE_FAST: Final = 9.2
+"""1e-4 steps."""
+_FAR: Final = 8.0
+"""Deviations from the ends of the scale at which nothing is clipped."""
+_MANY: Final = 50.0
+"""Photoelectrons in a sample whose sum of charges is as good as normal."""
+
+
+class Recorder(Protocol):
+    """An analog recorder: `Digitiser`, or the settings of one."""
+
+    @property
+    def gain(self) -> float:
+        """Voltage for a rate of photoelectrons, mV per MHz."""
+
+    @property
+    def step(self) -> float:
+        """Least significant bit, mV."""
+
+    @property
+    def noise(self) -> float:
+        """Electronic noise of one sample of one shot, mV."""
+
+    @property
+    def excess_noise(self) -> float:
+        """Mean square of the charge over the square of its mean."""
+
+    @property
+    def dark_offset(self) -> float:
+        """Voltage without any light, mV."""
+
+    @property
+    def adc_bits(self) -> int:
+        """Of the digitiser."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Digitiser:
+    """An analog recorder."""
+
+    gain: float
+    """mV per MHz of photoelectrons."""
+    noise: float
+    """Electronic noise of one sample of one shot, mV."""
+    dark_offset: float
+    """mV, without any light."""
+    excess_noise: float = 1.2
+    """Mean square of the charge over the square of its mean, at least 1."""
+    dark_drift: float = 0.0
+    """mV per hour, of the dark offset."""
+    adc_range: float = 500.0
+    """mV at full scale."""
+    adc_bits: int = 12
+
+    def __post_init__(self) -> None:
+        _checks.positive("gain", self.gain, "mV MHz-1")
+        _checks.not_negative("noise", self.noise, "mV")
+        _checks.not_negative("dark_offset", self.dark_offset, "mV")
+        _checks.between("excess_noise", self.excess_noise, 1.0, 10.0)
+        _checks.between("dark_drift", self.dark_drift, -1e3, 1e3, "mV h-1")
+        _checks.positive("adc_range", self.adc_range, "mV")
+        _checks.between("adc_bits", self.adc_bits, 4, 20)
+
+    @property
+    def step(self) -> float:
+        """Least significant bit, mV."""
+        return self.adc_range / 2.0**self.adc_bits
+
+    def offset_at(self, hours: float) -> float:
+        """Return the dark offset (mV) some hours after the start, not below 0."""
+        return max(self.dark_offset + self.dark_drift * hours, 0.0)
+
+
+def slow_baseline(bins: int, bin_time: float, *, amplitude: float, decay: float) -> Array:
+    """Return the recovery of the electronics from the flash, mV, shape (bins,).
+
+    Parameters
+    ----------
+    bins : int
+    bin_time : float, s
+    amplitude : float, mV
+        At the start of the recorder; negative for an undershoot.
+    decay : float, s
+        In which it falls to 1/e.
+
+    Notes
+    -----
+    It is in dark files as in others, so it leaves with their subtraction; the mean of the last
+    bins leaves a distortion of the near ones.
+    """
+    _checks.positive("bin_time", bin_time, "s")
+    _checks.positive("decay", decay, "s")
+    time = (np.arange(bins, dtype=np.float64) + 0.5) * bin_time
+    baseline: Array = amplitude * np.exp(-time / decay)
+    return baseline
+
+
+def digitise(
+    released: Photoelectrons,
+    recorder: Recorder,
+    *,
+    random: np.random.Generator,
+    offset: float | None = None,
+    baseline: Array | None = None,
+) -> Counts:
+    r"""Return the sum over shots of what a digitiser makes of the photoelectrons.
+
+    Parameters
+    ----------
+    released : Photoelectrons
+    recorder : Recorder
+    random : numpy.random.Generator
+    offset : float, mV, optional
+        Dark offset in place of the recorder's, where it drifts.
+    baseline : ndarray, mV, shape (bins,), optional
+        Added to the dark offset; see `slow_baseline`.
+
+    Returns
+    -------
+    ndarray of int, shape (bins,)
+        Digitiser steps summed over shots, 0 to shots times full scale; 0 without shots.
+
+    Raises
+    ------
+    SimulationInputError
+        Where the electronic noise is less than `LEAST_NOISE` steps.
+
+    Notes
+    -----
+    One sample of one shot has the mean "gain times rate plus dark offset" plus the bias of the
+    rounding. Its noise is the shot noise of the photoelectrons (the same that the counter sees),
+    the spread of their charge (`excess_noise`), electronic noise and that of the rounding, with
+    which the sum is regressed on the photoelectrons. Samples are clipped at both ends of the
+    scale one by one: near them the mean and the variance are those of a censored normal
+    distribution, or of a mixture of them over the numbers of photoelectrons where these are few,
+
+    .. math:: \mathrm{E}[\min(v, F)] = \mu \Phi(z) + F (1 - \Phi(z)) - s \phi(z),
+              \quad z = (F - \mu) / s
+
+    so that a bin of which only some shots are clipped is too low, as in a real instrument,
+    though its sum is below full scale.
+    """
+    if released.shots == 0:
+        return np.zeros(released.number.shape, dtype=np.int64)
+    sample = _sample(recorder, released.bin_time)
+    dark = _dark(recorder, released.rate.shape, offset, baseline)
+    top = 2**recorder.adc_bits - 1
+    noise = random.standard_normal(released.rate.size)
+    total: Counts = _recorded(
+        released.rate, released.number, noise, dark, *sample, float(released.shots), float(top)
+    )
+    return total
+
+
+def digitise_fast(
+    rate: Array,
+    recorder: Recorder,
+    *,
+    shots: int,
+    bin_time: float,
+    random: np.random.Generator,
+    offset: float | None = None,
+    baseline: Array | None = None,
+) -> FastCounts:
+    """Return sums over shots of the same mean and variance with Gaussian noise, one draw a bin.
+
+    Parameters
+    ----------
+    rate : ndarray, MHz, shape (bins,)
+        Expected rate of photoelectrons.
+    recorder : Recorder
+    shots : int
+    bin_time : float, s
+        For which a bin is open after one shot.
+    random : numpy.random.Generator
+    offset, baseline
+        As of `digitise`.
+
+    Notes
+    -----
+    The bias of the rounding is right to 1e-4 steps.
+    """
+    if shots == 0:
+        return np.zeros(rate.shape, dtype=np.int32)
+    top = 2**recorder.adc_bits - 1
+    noise = random.standard_normal(rate.size, dtype=np.float32)
+    dark = _dark(recorder, rate.shape, offset, baseline)
+    total: FastCounts = _drawn(
+        rate, noise, dark, *_sample(recorder, bin_time, _NEGLIGIBLE_FAST), float(shots), float(top)
+    )
+    return total
+
+
+def sample_moments(
+    rate: Array, recorder: Recorder, *, bin_time: float, baseline: Array | None = None
+) -> tuple[Array, Array]:
+    """Return mean and variance of one sample of one shot, steps, before it is clipped.
+
+    Parameters
+    ----------
+    rate : ndarray, MHz, shape (bins,)
+    recorder : Recorder
+    bin_time : float, s
+    baseline : ndarray, mV, shape (bins,), optional
+    """
+    dark = _dark(recorder, rate.shape, None, baseline)
+    both = _moments_of(rate, dark, *_sample(recorder, bin_time))
+    return both[0], both[1]
+
+
+def sum_voltage(total: NDArray[Any], recorder: Recorder, *, shots: int) -> Array:
+    """Return sums over shots as a voltage, mV: NaN without shots, when nothing was measured."""
+    if shots <= 0:
+        return np.full(total.shape, np.nan)
+    voltage: Array = total * (recorder.step / shots)
+    return voltage
+
+
+def _dark(
+    recorder: Recorder, shape: tuple[int, ...], offset: float | None, baseline: Array | None
+) -> Array:
+    """Return the voltage without light, steps."""
+    dark = np.full(shape, recorder.dark_offset if offset is None else offset)
+    if baseline is not None:
+        if baseline.shape != shape:
+            raise SimulationInputError(f"has shape {baseline.shape}, not {shape}", field="baseline")
+        dark += baseline
+    return dark / recorder.step
+
+
+def _sample(
+    recorder: Recorder, bin_time: float, negligible: float = _NEGLIGIBLE
+) -> tuple[float, float, float, float, NDArray[np.float64], NDArray[np.complex128]]:
+    """Return what is the same for all bins, with the harmonics of one photoelectron's charge."""
+    unit = recorder.gain / recorder.step / (bin_time * 1e6)
+    spread, still = recorder.excess_noise - 1.0, recorder.noise / recorder.step
+    if still < LEAST_NOISE:
+        raise SimulationInputError(
+            f"of {recorder.noise:g} mV is {still:g} digitiser steps, less than {LEAST_NOISE:g}",
+            field="noise",
+            remedy=f"give at least {LEAST_NOISE * recorder.step:g} mV",
+        )
+    most = int(sqrt(negligible / (2.0 * pi**2)) / still)
+    omega = 2.0 * pi * np.arange(1, most + 1)
+    gauss = np.exp(-0.5 * (omega * still) ** 2)
+    inner = 1.0 - 1j * omega * unit * spread
+    power = -np.log(inner) / spread if spread > 0.0 else 1j * omega * unit
+    charge = np.exp(power)
+    slope = 1j * unit * charge / inner
+    harmonics = np.stack([charge, slope])
+    return 1e6 * bin_time, unit, spread, still, gauss, harmonics
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rounded(
+    events: float,
+    dark: float,
+    unit: float,
+    spread: float,
+    still: float,
+    gauss: Any,
+    harmonics: Any,
+) -> tuple[float, float, float]:
+    """Return mean and variance of a rounded sample, and its covariance with the voltage."""
+    mean = unit * events + dark
+    variance = (1.0 + spread) * unit * unit * events + still * still
+    bias, square, product = 0.0, 1.0 / 12.0, 0.0
+    sign = 1.0
+    for k in range(gauss.size):
+        sign = -sign
+        order = pi * (k + 1)
+        charge = harmonics[0, k]
+        size = gauss[k] * exp(events * (charge.real - 1.0))
+        if size < 1e-9:
+            continue
+        angle = events * charge.imag + 2.0 * order * dark
+        real, imag = size * cos(angle), size * sin(angle)
+        # d ln phi / d omega, of which -i times phi is E[v exp(i omega v)].
+        along = events * harmonics[1, k].real - 2.0 * order * still * still
+        across = events * harmonics[1, k].imag + dark
+        bias += sign / order * imag
+        square += sign / order**2 * real
+        product += sign / order * (across * imag - along * real)
+    covariance = product - mean * bias
+    rounded = variance + 2.0 * covariance + square - bias * bias
+    return mean + bias, max(rounded, 0.0), variance + covariance
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _beyond(z: float) -> tuple[float, float]:
+    """Return the mean of (y - z)+ of a standard normal y, and the chance that y is beyond z."""
+    tail = 0.5 * erfc(z / sqrt(2.0))
+    return exp(-0.5 * z * z) / sqrt(2.0 * pi) - z * tail, tail
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _censored(mean: float, deviation: float, top: float) -> tuple[float, float]:
+    """Return mean and variance of a normal voltage clipped to 0..top."""
+    if deviation <= 0.0:
+        return min(max(mean, 0.0), top), 0.0
+    high, low = (top - mean) / deviation, mean / deviation
+    if min(high, low) > _FAR:
+        return mean, deviation * deviation
+    if high < -_FAR or low < -_FAR:
+        return (top if high < low else 0.0), 0.0
+    above, over = _beyond(high)
+    below, under = _beyond(low)
+    shift = below - above
+    second = 1.0 - over - under + high * high * over + low * low * under
+    second -= (high * exp(-0.5 * high * high) + low * exp(-0.5 * low * low)) / sqrt(2.0 * pi)
+    return mean + deviation * shift, max(second - shift * shift, 0.0) * deviation * deviation
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mixed(
+    events: float, dark: float, unit: float, spread: float, still: float, top: float
+) -> tuple[float, float]:
+    """Return mean and variance of a clipped voltage of few photoelectrons, number by number."""
+    mean, square = 0.0, 0.0
+    chance = exp(-events)
+    for number in range(int(events + 10.0 * sqrt(events)) + 12):
+        deviation = sqrt(still * still + spread * unit * unit * number)
+        centre, variance = _censored(dark + unit * number, deviation, top)
+        mean += chance * centre
+        square += chance * (variance + centre * centre)
+        chance *= events / (number + 1.0)
+    return mean, max(square - mean * mean, 0.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _clipped(
+    mean: float,
+    rounded: float,
+    events: float,
+    dark: float,
+    unit: float,
+    spread: float,
+    still: float,
+    top: float,
+) -> tuple[float, float]:
+    """Return the mean of a sample clipped to 0..top, and the part of its deviation that stays."""
+    reach = _FAR * sqrt(rounded)
+    # Photoelectrons only add to the voltage in the dark.
+    above, below = mean + reach > top, dark < _FAR * still + 0.5 and mean < reach + 0.5
+    if not (above or below):
+        return mean, 1.0
+    if rounded <= 0.0:
+        return min(max(mean, 0.0), top), 1.0
+    if events > _MANY:
+        centre, variance = _censored(mean, sqrt(rounded), top)
+        return centre, sqrt(variance / rounded)
+    whole = (1.0 + spread) * unit * unit * events + still * still
+    centre, variance = _mixed(events, dark, unit, spread, still, top)
+    return centre + mean - unit * events - dark, sqrt(variance / whole)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _recorded(
+    rate: Any,
+    number: Any,
+    noise: Any,
+    dark: Any,
+    window: float,
+    unit: float,
+    spread: float,
+    still: float,
+    gauss: Any,
+    harmonics: Any,
+    shots: float,
+    top: float,
+) -> Any:
+    total = np.empty_like(number)
+    for i in range(number.size):
+        events = rate[i] * window
+        mean, rounded, covariance = _rounded(events, dark[i], unit, spread, still, gauss, harmonics)
+        variance = (1.0 + spread) * unit * unit * events + still * still
+        slope = covariance / variance
+        own = max(rounded - slope * covariance, 0.0) + (slope * still) ** 2
+        charge = slope * slope * unit * unit * spread * number[i]
+        light = slope * unit * (number[i] - events * shots)
+        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, still, top)
+        value = shots * centre + kept * (light + sqrt(charge + shots * own) * noise[i])
+        total[i] = int(min(max(value, 0.0), shots * top) + 0.5)
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _drawn(
+    rate: Any,
+    noise: Any,
+    dark: Any,
+    window: float,
+    unit: float,
+    spread: float,
+    still: float,
+    gauss: Any,
+    harmonics: Any,
+    shots: float,
+    top: float,
+) -> Any:
+    total = np.empty(rate.size, np.int32)
+    for i in range(rate.size):
+        events = rate[i] * window
+        mean, rounded, _ = _rounded(events, dark[i], unit, spread, still, gauss, harmonics)
+        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, still, top)
+        value = shots * centre + kept * sqrt(rounded * shots) * noise[i]
+        total[i] = int(min(max(value, 0.0), shots * top) + 0.5)
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _moments_of(
+    rate: Any,
+    dark: Any,
+    window: float,
+    unit: float,
+    spread: float,
+    still: float,
+    gauss: Any,
+    harmonics: Any,
+) -> Any:
+    both = np.empty((2, rate.size))
+    for i in range(rate.size):
+        both[0, i], both[1, i], _ = _rounded(
+            rate[i] * window, dark[i], unit, spread, still, gauss, harmonics
+        )
+    return both

@@ -1,0 +1,220 @@
+"""Photon counters with dead time: what is counted of the photoelectrons."""
+
+from __future__ import annotations
+
+from math import exp, expm1, sqrt
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.simulate import _checks
+from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons
+
+FastCounts = NDArray[np.int32]
+
+
+def count_photons(
+    released: Photoelectrons,
+    *,
+    dead_time: float,
+    random: np.random.Generator,
+    paralyzable: bool = False,
+) -> Counts:
+    r"""Return what a counter with dead time counts of the photoelectrons.
+
+    Parameters
+    ----------
+    released : Photoelectrons
+    dead_time : float, s
+    random : numpy.random.Generator
+    paralyzable : bool
+        Whether a lost photoelectron prolongs the dead time. Such a counter counts fewer above a
+        rate of 1 / dead_time, so that two rates give the same counts.
+
+    Returns
+    -------
+    ndarray of int, shape (bins,)
+        Counts summed over shots; 0 where there were no shots.
+
+    Notes
+    -----
+    Of N events in the exposure T each finds on average
+    :math:`x = ((N - 1) (1 - a) + N_- a) \tau / T` others in the dead time before it, where
+    :math:`a = \tau / 2 t` of a dead time lies in the bin before, with :math:`N_-` events, if a
+    bin lasts t. The number of lost events is drawn as :math:`L \sim \mathrm{Binomial}(m, p)`,
+    m rounded up or down at random so that its mean is right, with
+
+    .. math:: m p = N \frac{x}{1 + x}, \quad
+              p = x \frac{3 + 3 x + x^2 - a (x + 4) / 3 + 2 a^2}{(1 + x)^3}
+
+    for a non-paralyzable counter, and for a paralyzable one
+
+    .. math:: m p = N (1 - e^{-x}), \quad
+              p = 1 - e^{-x} + (1 - 2 a + 2 a^2) \frac{x^2 e^{-2 x}}{1 - e^{-x}}
+
+    At a steady rate n and x = n tau this makes N - L a count with the mean and the variance of
+    the theory of renewal processes, with the terms of short bins: see `counter_moments`. Counts
+    are integers from 0 to N at any rate, where a rounded Gaussian would lose the dead time of
+    weak signals in the rounding.
+
+    References
+    ----------
+    `cox1962`.
+    """
+    _checks.not_negative("dead_time", dead_time, "s")
+    if released.shots == 0 or dead_time == 0.0:
+        return released.number.copy()
+    exposure = released.exposure * 1e-6
+    counted: Counts = _registered(
+        released.number, dead_time / exposure, _before(dead_time, released.bin_time), paralyzable,
+        random,
+    )  # fmt: skip
+    return counted
+
+
+def count_fast(
+    rate: Array,
+    *,
+    shots: int,
+    bin_time: float,
+    dead_time: float,
+    random: np.random.Generator,
+    paralyzable: bool = False,
+) -> FastCounts:
+    """Return counts of the right mean and variance with Gaussian noise, one draw a bin.
+
+    Parameters
+    ----------
+    rate : ndarray, MHz, shape (bins,)
+        Expected rate of photoelectrons.
+    shots : int
+    bin_time : float, s
+        For which a bin is open after one shot.
+    dead_time : float, s
+    random : numpy.random.Generator
+    paralyzable : bool
+
+    Notes
+    -----
+    For many counts; few have the right mean and variance but are not Poisson, and none are
+    shared with an analog recorder.
+    """
+    _checks.not_negative("dead_time", dead_time, "s")
+    noise = random.standard_normal(rate.size, dtype=np.float32)
+    exposure = shots * bin_time * 1e6
+    before = 2.0 * _before(dead_time, bin_time)
+    counts: FastCounts = _drawn(rate, noise, exposure, dead_time * 1e6, before, paralyzable)
+    return counts
+
+
+def counter_moments(
+    rate: Array, *, bin_time: float, dead_time: float, paralyzable: bool = False
+) -> tuple[Array, Array]:
+    r"""Return mean and variance of the counts of one shot.
+
+    Parameters
+    ----------
+    rate : ndarray, MHz, shape (bins,)
+        Steady from bin to bin.
+    bin_time, dead_time : float, s
+    paralyzable : bool
+
+    Notes
+    -----
+    With x = n tau and y = 1 + x, in a bin that lasts t, :math:`n t / y` and
+    :math:`n t / y^3 + x^2 (y^2 + 2 y + 3) / 6 y^4` for a non-paralyzable counter, the variance
+    to the constant of its expansion for long t; :math:`n t e^{-x}` and
+    :math:`n t e^{-x} (1 - 2 x e^{-x} (1 - \tau / 2 t))` for a paralyzable one, exact for
+    :math:`\tau \le t`.
+
+    References
+    ----------
+    `cox1962`.
+    """
+    before = 2.0 * _before(dead_time, bin_time)
+    both = _moments_of(rate, bin_time * 1e6, dead_time * 1e6, before, paralyzable)
+    return both[0], both[1]
+
+
+def count_rate(counts: NDArray[Any], *, shots: int, bin_time: float) -> Array:
+    """Return counts as a rate, MHz: NaN without shots, when nothing was measured."""
+    exposure = shots * bin_time * 1e6
+    if exposure <= 0.0:
+        return np.full(counts.shape, np.nan)
+    rate: Array = counts / exposure
+    return rate
+
+
+def _before(dead_time: float, bin_time: float) -> float:
+    """Return the part of the dead time before an event that lies in the bin before."""
+    if dead_time <= bin_time:
+        return 0.5 * dead_time / bin_time
+    return 1.0 - 0.5 * bin_time / dead_time
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _loss(x: float, before: float, paralyzable: Any) -> tuple[float, float]:
+    """Return the lost share of the events, and the chance of a trial to be lost."""
+    if paralyzable:
+        lost = -expm1(-x)
+        edge = 1.0 - 2.0 * before * (1.0 - before)
+        return lost, lost + edge * x * x * exp(-2.0 * x) / lost
+    y = 1.0 + x
+    edge = before * ((x + 4.0) / 3.0 - 2.0 * before)
+    return x / y, x * (3.0 + 3.0 * x + x * x - edge) / (y * y * y)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _registered(number: Any, per: float, before: float, paralyzable: Any, random: Any) -> Any:
+    counted = np.empty_like(number)
+    previous = number[0] if number.size else 0
+    for i in range(number.size):
+        released = number[i]
+        x = per * (max(released - 1, 0) * (1.0 - before) + previous * before)
+        previous = released
+        counted[i] = released
+        if released == 0 or x <= 0.0:
+            continue
+        lost, chance = _loss(x, before, paralyzable)
+        whole = min(int(released * lost / chance + random.random()), released)
+        if whole > 0:
+            counted[i] -= random.binomial(whole, min(chance, 1.0))
+    return counted
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _moments(rate: float, dead_time: float, before: float, paralyzable: Any) -> tuple[float, float]:
+    """Return mean and variance of the counts per time."""
+    x = rate * dead_time
+    if paralyzable:
+        mean = rate * exp(-x)
+        # An event in the window of length t sees those before it in pairs within t only.
+        return mean, mean * (1.0 - 2.0 * x * exp(-x) * (1.0 - 0.5 * before))
+    y = 1.0 + x
+    edge = before * x * (y * y + 2.0 * y + 3.0) / (6.0 * y**4)
+    return rate / y, rate * (1.0 / y**3 + edge)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _moments_of(
+    rate: Any, exposure: float, dead_time: float, before: float, paralyzable: Any
+) -> Any:
+    both = np.empty((2, rate.size))
+    for i in range(rate.size):
+        mean, variance = _moments(rate[i], dead_time, before, paralyzable)
+        both[0, i], both[1, i] = mean * exposure, variance * exposure
+    return both
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _drawn(
+    rate: Any, noise: Any, exposure: float, dead_time: float, before: float, paralyzable: Any
+) -> Any:  # fmt: skip
+    counts = np.empty(rate.size, np.int32)
+    for i in range(rate.size):
+        mean, variance = _moments(rate[i], dead_time, before, paralyzable)
+        value = mean * exposure + sqrt(variance * exposure) * noise[i]
+        counts[i] = int(value + 0.5) if value > 0.0 else 0
+    return counts

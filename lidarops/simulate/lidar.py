@@ -1,0 +1,199 @@
+"""What a lidar sees: from laser, telescope and detector to the rate of photoelectrons."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.constants import LICEL_RANGE_PER_MICROSECOND, SPEED_OF_LIGHT
+from lidarops.simulate import _checks
+from lidarops.simulate.overlap import Overlap, SineOverlap
+from lidarops.simulate.pulse import Pulse, pulsed_signal
+from lidarops.simulate.sun import sky_radiance
+
+Array = NDArray[np.float64]
+
+PLANCK: Final = 6.62607015e-34
+"""J s, exact (SI)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lidar:
+    """A monostatic lidar with one detector.
+
+    Raises
+    ------
+    SimulationInputError
+        Where a number is not one of a lidar: no aperture, wavelengths in nm, efficiencies above 1.
+    """
+
+    energy: float
+    """J, of one pulse."""
+    repetition_rate: float
+    """Hz."""
+    aperture_diameter: float
+    """m, of the telescope."""
+    wavelength: float
+    """m, of the laser."""
+    optical_efficiency: float
+    """Part of the photons on the aperture, within the field of view, that reach the detector."""
+    quantum_efficiency: float
+    """Photoelectrons per photon on the detector."""
+    bin_width: float
+    """m."""
+    full_overlap_range: float = 0.0
+    """m, where no overlap is given."""
+    field_of_view: float
+    """rad, full angle."""
+    filter_bandwidth: float
+    """m, of the interference filter."""
+    pulse: Pulse | None = None
+    """None for a pulse without length."""
+    overlap: Overlap | None = None
+    obstruction_diameter: float = 0.0
+    """m, of the secondary mirror."""
+    detected_wavelength: float | None = None
+    """m, where scattering changes it (Raman)."""
+
+    def __post_init__(self) -> None:
+        _checks.between("energy", self.energy, 1e-12, 1e3, "J")
+        _checks.between("repetition_rate", self.repetition_rate, 1e-3, 1e7, "Hz")
+        _checks.positive("aperture_diameter", self.aperture_diameter, "m")
+        _checks.between("aperture_diameter", self.aperture_diameter, 1e-3, 50.0, "m")
+        _checks.wavelength_in_metres("wavelength", self.wavelength)
+        if self.detected_wavelength is not None:
+            _checks.wavelength_in_metres("detected_wavelength", self.detected_wavelength)
+        for name in ("optical_efficiency", "quantum_efficiency"):
+            _checks.positive(name, getattr(self, name))
+            _checks.between(name, getattr(self, name), 0.0, 1.0)
+        _checks.between("bin_width", self.bin_width, 1e-3, 1e4, "m")
+        _checks.not_negative("full_overlap_range", self.full_overlap_range, "m")
+        _checks.between("field_of_view", self.field_of_view, 1e-6, 0.5, "rad")
+        _checks.between("filter_bandwidth", self.filter_bandwidth, 1e-13, 1e-6, "m")
+        limit = self.aperture_diameter * (1.0 - 1e-9)
+        _checks.between("obstruction_diameter", self.obstruction_diameter, 0.0, limit, "m")
+
+    @property
+    def area(self) -> float:
+        """Area that collects light, m2."""
+        return 0.25 * math.pi * (self.aperture_diameter**2 - self.obstruction_diameter**2)
+
+    @property
+    def returning_wavelength(self) -> float:
+        """Wavelength at the detector, m."""
+        return self.detected_wavelength or self.wavelength
+
+    @property
+    def photon_energy(self) -> float:
+        """Energy of a photon at the detector, J."""
+        return PLANCK * SPEED_OF_LIGHT / self.returning_wavelength
+
+    @property
+    def power_constant(self) -> float:
+        r"""K of the power on the detector, W m3 sr: :math:`E A \eta c / 2` (`vasylkivskyi2022`)."""
+        return self.energy * self.area * self.optical_efficiency * 0.5 * SPEED_OF_LIGHT
+
+    @property
+    def system_constant(self) -> float:
+        """K of the rate of photoelectrons, MHz m3 sr."""
+        return self.power_constant * self.photoelectrons_per_joule * 1e-6
+
+    @property
+    def photoelectrons_per_joule(self) -> float:
+        """Photoelectrons for the energy of light on the detector, J-1."""
+        return self.quantum_efficiency / self.photon_energy
+
+    @property
+    def bin_time(self) -> float:
+        """Time for which a bin is open after one shot, s, at 150 m per microsecond."""
+        return self.bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
+
+    def shots(self, duration: float) -> int:
+        """Return the number of shots in a time (s)."""
+        _checks.not_negative("duration", duration, "s")
+        return int(duration * self.repetition_rate + 1e-9)
+
+    def background_rate(self, radiance: float) -> float:
+        r"""Return the rate of photoelectrons from the sky, MHz.
+
+        Parameters
+        ----------
+        radiance : float, W m-2 sr-1 m-1
+            Spectral radiance of the sky at the detected wavelength, per metre of wavelength.
+
+        Notes
+        -----
+        :math:`L A \pi (\theta / 2)^2 \Delta\lambda \eta / (h c / \lambda)`.
+        """
+        _checks.not_negative("radiance", radiance, "W m-2 sr-1 m-1")
+        solid_angle = math.pi * (0.5 * self.field_of_view) ** 2
+        power = radiance * self.area * solid_angle * self.filter_bandwidth * self.optical_efficiency
+        return power * self.photoelectrons_per_joule * 1e-6
+
+    def sky_rate(self, solar_elevation: float) -> float:
+        """Return the rate of photoelectrons from the clear zenith sky, MHz, right to a factor of 3.
+
+        Parameters
+        ----------
+        solar_elevation : float, degree
+        """
+        return self.background_rate(sky_radiance(solar_elevation, self.returning_wavelength))
+
+    def rate(
+        self,
+        distance: Array,
+        *,
+        extinction: Array,
+        backscatter: Array,
+        returning_extinction: Array | None = None,
+        path: Array | None = None,
+        resolution: float | None = None,
+    ) -> Array:
+        """Return the mean rate of photoelectrons in the bins, MHz; see `pulsed_signal`."""
+        return self.system_constant * self._signal(
+            distance, extinction, backscatter, returning_extinction, path, resolution
+        )
+
+    def power(
+        self,
+        distance: Array,
+        *,
+        extinction: Array,
+        backscatter: Array,
+        returning_extinction: Array | None = None,
+        path: Array | None = None,
+        resolution: float | None = None,
+    ) -> Array:
+        """Return the mean power on the detector in the bins, W; see `pulsed_signal`.
+
+        Times `bin_time` it is the energy of `vasylkivskyi2022`, equation 14.
+        """
+        return self.power_constant * self._signal(
+            distance, extinction, backscatter, returning_extinction, path, resolution
+        )
+
+    def _signal(
+        self,
+        distance: Array,
+        extinction: Array,
+        backscatter: Array,
+        returning: Array | None,
+        path: Array | None,
+        resolution: float | None,
+    ) -> Array:
+        return pulsed_signal(
+            distance,
+            extinction=extinction,
+            backscatter=backscatter,
+            system_constant=1.0,
+            pulse=self.pulse,
+            bin_width=self.bin_width,
+            overlap=self.overlap or SineOverlap(self.full_overlap_range),
+            returning_extinction=returning,
+            path=path,
+            resolution=resolution,
+        )

@@ -1,0 +1,448 @@
+r"""Signals of laser pulses of any shape and length, seen by a detector that integrates over bins.
+
+A pulse of power E F(t) returns from a range R at the time t = 2 R / c of the clock, together
+with the light of its later parts from nearer ranges:
+
+.. math:: P(R) = K \int \beta(R') T(R') O(R') F(2 (R - R') / c) \frac{dR'}{R'^2} \frac{2}{c}
+
+(`vasylkivskyi2022`, 20, with K = E A eta c / 2). A detector that integrates over a bin makes the
+pulse longer by the bin. The integral is a sum over cells of the pulse; each cell from R_a to R_b
+is taken at the geometric mean of its edges with the weight :math:`(R_b - R_a) / (R_a R_b)`, which
+is the integral of :math:`R^{-2}` itself: a rectangular pulse gives the near-range factor
+:math:`(c \tau / 2) / [R (R - c \tau / 2)]` to the last digits, at any range behind the pulse.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Final, Protocol
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PPoly
+from scipy.special import ndtr
+
+from lidarops.constants import SPEED_OF_LIGHT
+from lidarops.simulate import _checks
+from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.overlap import Overlap, SineOverlap, vanishes
+
+Array = NDArray[np.float64]
+
+_FWHM: Final = 2.0 * math.sqrt(2.0 * math.log(2.0))
+_MOST_CELLS: Final = 100_000
+_CELLS_OF_PULSE: Final = 32
+_CELLS_OF_BIN: Final = 8
+_DECAYS: Final = 16.0
+
+
+class Origin(Enum):
+    """To what of the pulse the time zero of the recorder, and so the range, belongs."""
+
+    LEADING_EDGE = "leading edge"
+    PEAK = "peak"
+
+
+class Pulse(Protocol):
+    """Power of a laser pulse over time, of unit energy, in a clock whose zero is range 0."""
+
+    @property
+    def start(self) -> float:
+        """Time before which no energy leaves, s."""
+
+    @property
+    def stop(self) -> float:
+        """Time after which no energy leaves, s."""
+
+    def passed(self, time: Array) -> Array:
+        """Return the part of the energy that has left by a time (s), from 0 to 1."""
+
+    def passed_integral(self, time: Array) -> Array:
+        """Return the integral of `passed` up to a time, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class RectangularPulse:
+    """Constant power for a time; its leading edge leaves at time zero."""
+
+    duration: float
+    """s."""
+
+    def __post_init__(self) -> None:
+        _checks.between("duration", self.duration, 1e-15, 1e-3, "s")
+
+    @property
+    def start(self) -> float:
+        """Time before which no energy leaves, s."""
+        return 0.0
+
+    @property
+    def stop(self) -> float:
+        """Time after which no energy leaves, s."""
+        return self.duration
+
+    def passed(self, time: Array) -> Array:
+        """Return the part of the energy that has left by a time (s)."""
+        return np.clip(time / self.duration, 0.0, 1.0)
+
+    def passed_integral(self, time: Array) -> Array:
+        """Return the integral of `passed` up to a time, s."""
+        inside = np.clip(time, 0.0, self.duration)
+        after = np.clip(time - self.duration, 0.0, None)
+        return 0.5 * inside**2 / self.duration + after
+
+
+@dataclass(frozen=True, slots=True)
+class GaussianPulse:
+    """A Gaussian, cut at `reach` standard deviations from its peak on both sides."""
+
+    fwhm: float
+    """s, full width at half maximum of the power."""
+    origin: Origin = Origin.LEADING_EDGE
+    """Where time zero lies: at the leading cut or at the peak."""
+    reach: float = 3.0
+    """Standard deviations."""
+
+    def __post_init__(self) -> None:
+        _checks.between("fwhm", self.fwhm, 1e-15, 1e-3, "s")
+        _checks.between("reach", self.reach, 1.0, 8.0)
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the uncut Gaussian, s."""
+        return self.fwhm / _FWHM
+
+    @property
+    def peak(self) -> float:
+        """Time of the highest power, s."""
+        return 0.0 if self.origin is Origin.PEAK else self.reach * self.deviation
+
+    @property
+    def start(self) -> float:
+        """Time before which no energy leaves, s."""
+        return self.peak - self.reach * self.deviation
+
+    @property
+    def stop(self) -> float:
+        """Time after which no energy leaves, s."""
+        return self.peak + self.reach * self.deviation
+
+    def passed(self, time: Array) -> Array:
+        """Return the part of the energy that has left by a time (s)."""
+        z = np.clip((time - self.peak) / self.deviation, -self.reach, self.reach)
+        cut = ndtr(-self.reach)
+        part: Array = (ndtr(z) - cut) / (1.0 - 2.0 * cut)
+        return part
+
+    def passed_integral(self, time: Array) -> Array:
+        """Return the integral of `passed` up to a time, s."""
+        reach, cut = self.reach, ndtr(-self.reach)
+        z = np.clip((time - self.peak) / self.deviation, -reach, reach)
+        low = -reach * cut + _density(np.array(reach))
+        inside = (z * ndtr(z) + _density(z) - low - cut * (z + reach)) / (1.0 - 2.0 * cut)
+        whole: Array = self.deviation * inside + np.clip(time - self.stop, 0.0, None)
+        return whole
+
+
+@dataclass(frozen=True, slots=True)
+class ExponentialPulse:
+    """Full power at time zero, exponential decay from there on, cut after 16 decay times."""
+
+    decay: float
+    """s, in which the power falls to 1/e."""
+
+    def __post_init__(self) -> None:
+        _checks.between("decay", self.decay, 1e-15, 1e-3, "s")
+
+    @property
+    def start(self) -> float:
+        """Time before which no energy leaves, s."""
+        return 0.0
+
+    @property
+    def stop(self) -> float:
+        """Time after which no energy leaves, s."""
+        return _DECAYS * self.decay
+
+    def passed(self, time: Array) -> Array:
+        """Return the part of the energy that has left by a time (s)."""
+        u = np.clip(time / self.decay, 0.0, _DECAYS)
+        part: Array = np.expm1(-u) / math.expm1(-_DECAYS)
+        return part
+
+    def passed_integral(self, time: Array) -> Array:
+        """Return the integral of `passed` up to a time, s."""
+        u = np.clip(time / self.decay, 0.0, _DECAYS)
+        inside = (u + np.expm1(-u)) / -math.expm1(-_DECAYS)
+        whole: Array = self.decay * inside + np.clip(time - self.stop, 0.0, None)
+        return whole
+
+
+@dataclass(frozen=True)
+class TabulatedPulse:
+    """A measured pulse: power straight between its points, in any unit, nothing outside."""
+
+    times: tuple[float, ...]
+    """s, ascending, in the clock whose zero is range 0."""
+    power: tuple[float, ...]
+    """Not negative; scaled to unit energy."""
+    _passed: PPoly = field(init=False, repr=False, compare=False)
+    _integral: PPoly = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        times, power = np.array(self.times, dtype=float), np.array(self.power, dtype=float)
+        _checks.ascending("times", times)
+        _checks.profile("power", power, times.shape, "")
+        energy = np.trapezoid(power, times)
+        _checks.positive("power", float(energy))
+        _checks.between("times", float(times[-1] - times[0]), 1e-15, 1e-3, "s")
+        slope = np.diff(power) / np.diff(times)
+        passed = PPoly(np.stack([slope, power[:-1]]) / energy, times).antiderivative()
+        object.__setattr__(self, "_passed", passed)
+        object.__setattr__(self, "_integral", passed.antiderivative())
+
+    @property
+    def start(self) -> float:
+        """Time before which no energy leaves, s."""
+        return self.times[0]
+
+    @property
+    def stop(self) -> float:
+        """Time after which no energy leaves, s."""
+        return self.times[-1]
+
+    def passed(self, time: Array) -> Array:
+        """Return the part of the energy that has left by a time (s)."""
+        part: Array = self._passed(np.clip(time, self.start, self.stop))
+        return part
+
+    def passed_integral(self, time: Array) -> Array:
+        """Return the integral of `passed` up to a time, s."""
+        inside = self._integral(np.clip(time, self.start, self.stop))
+        whole: Array = inside + np.clip(time - self.stop, 0.0, None)
+        return whole
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """What a pulse and a bin make of a point at range 0, in cells."""
+
+    edges: Array
+    """m behind the range of the clock, ascending, shape (cells + 1,)."""
+    density: Array
+    """m-1, of the energy in each cell; the sum of density times cell is 1."""
+
+
+def response(
+    pulse: Pulse | None, *, bin_width: float | None = None, resolution: float | None = None
+) -> Response:
+    """Return the energy of a pulse over range, convolved with a bin.
+
+    Parameters
+    ----------
+    pulse : Pulse, optional
+        None for a pulse without length.
+    bin_width : float, m, optional
+        Over which the detector integrates, centred on the range; None for the power of the
+        moment.
+    resolution : float, m, optional
+        Longest cell; an eighth of the bin, or 1/32 of the pulse, where not given.
+
+    Raises
+    ------
+    SimulationInputError
+        Where there is neither pulse nor bin, or a length is not positive.
+    """
+    start, stop = (0.0, 0.0) if pulse is None else (pulse.start, pulse.stop)
+    start, stop = 0.5 * SPEED_OF_LIGHT * start, 0.5 * SPEED_OF_LIGHT * stop
+    if bin_width is not None:
+        _checks.positive("bin_width", bin_width, "m")
+    elif pulse is None:
+        raise SimulationInputError("needs a pulse, a bin width or both", field="pulse")
+    half = 0.5 * (bin_width or 0.0)
+    if resolution is None:
+        resolution = bin_width / _CELLS_OF_BIN if bin_width else (stop - start) / _CELLS_OF_PULSE
+    _checks.positive("resolution", resolution, "m")
+    span = stop - start + 2.0 * half
+    # A pulse of whole cells must not get one more for the last digit of its length.
+    cells = max(math.ceil(span / resolution * (1.0 - 1e-12)), 1)
+    _checks.between("resolution", cells, 1, _MOST_CELLS, "cells")
+    edges = np.linspace(start - half, stop + half, cells + 1)
+    return Response(edges, np.diff(_passed(pulse, edges, half)) / (span / cells))
+
+
+def _passed(pulse: Pulse | None, edges: Array, half: float) -> Array:
+    """Return the part of the energy of pulse and bin in front of each edge."""
+    to_time = 2.0 / SPEED_OF_LIGHT
+    if pulse is None:
+        part: Array = (edges - edges[0]) / (edges[-1] - edges[0])
+    elif half == 0.0:
+        part = pulse.passed(edges * to_time)
+    else:
+        after = pulse.passed_integral((edges + half) * to_time)
+        before = pulse.passed_integral((edges - half) * to_time)
+        part = (after - before) / (2.0 * half * to_time)
+    part[0], part[-1] = 0.0, 1.0
+    return part
+
+
+def pulsed_signal(
+    distance: Array,
+    *,
+    extinction: Array,
+    backscatter: Array,
+    system_constant: float,
+    pulse: Pulse | None,
+    bin_width: float | None = None,
+    full_overlap_range: float = 0.0,
+    overlap: Overlap | None = None,
+    returning_extinction: Array | None = None,
+    path: Array | None = None,
+    resolution: float | None = None,
+) -> Array:
+    """Return the signal of a pulse of any shape, in the unit of the system constant.
+
+    Parameters
+    ----------
+    distance : ndarray, m, shape (bins,)
+        Ranges (c / 2 times the time) at which the signal is wanted: bin centres.
+    extinction : ndarray, m-1, shape (points,)
+        At the wavelength of the laser.
+    backscatter : ndarray, m-1 sr-1, shape (points,)
+    system_constant : float, MHz m3 sr or W m3 sr
+    pulse : Pulse, optional
+        None for a pulse without length.
+    bin_width : float, m, optional
+        Over which the detector takes the mean; None for the power at the range itself.
+    full_overlap_range : float, m
+        Of `SineOverlap`, where no overlap is given.
+    overlap : Overlap, optional
+    returning_extinction : ndarray, m-1, shape (points,), optional
+        At the wavelength of the detector (Raman); that of the laser where not given.
+    path : ndarray, m, shape (points,), optional
+        Ranges of the optical properties, straight between them and constant outside; `distance`
+        where not given.
+    resolution : float, m, optional
+        Longest cell of the quadrature, see `response`.
+
+    Raises
+    ------
+    SimulationInputError
+        Where a property is negative, the pulse is as long as the range, or the pulse still
+        leaves while light returns from ranges where the overlap does not vanish with the square
+        of the range, so that the signal would be infinite.
+
+    References
+    ----------
+    `vasylkivskyi2022`, equations 10, 14 and 20.
+    """
+    shape = overlap or SineOverlap(full_overlap_range)
+    cells = response(pulse, bin_width=bin_width, resolution=resolution)
+    _refuse_near(distance, cells, shape)
+    grid = distance if path is None else path
+    points = _points(grid, extinction, backscatter, returning_extinction)
+    if isinstance(shape, SineOverlap):
+        full, seen = shape.full_overlap_range, np.empty((0, 0))
+    else:
+        full, seen = math.nan, shape(_positions(distance, cells.edges))
+    signal: Array = _summed(distance, cells.edges, cells.density, *points, full, seen)
+    return system_constant * signal
+
+
+def _refuse_near(distance: Array, cells: Response, shape: Overlap) -> None:
+    _checks.ascending("distance", distance)
+    if cells.edges[-1] >= distance[-1]:
+        raise SimulationInputError(
+            f"is as long as the range: {cells.edges[-1]:g} m of {distance[-1]:g} m",
+            field="pulse",
+            remedy="give a shorter pulse (in s) or a longer range",
+        )
+    reached = (distance > cells.edges[0]) & (distance <= cells.edges[-1])
+    if reached.any() and not vanishes(shape):
+        raise SimulationInputError(
+            f"must vanish with the square of the range, or the signal within the pulse"
+            f" ({cells.edges[-1]:g} m) is infinite",
+            field="overlap",
+            remedy="give a full_overlap_range, or ranges behind the pulse",
+        )
+
+
+def _points(
+    path: Array, extinction: Array, backscatter: Array, returning: Array | None
+) -> tuple[Array, Array, Array, Array]:
+    """Return range, extinction both ways, optical depth both ways and backscatter from R = 0."""
+    _checks.ascending("path", path)
+    _checks.profile("extinction", extinction, path.shape, "m-1")
+    _checks.profile("backscatter", backscatter, path.shape, "m-1 sr-1")
+    if returning is not None:
+        _checks.profile("returning_extinction", returning, path.shape, "m-1")
+    ahead = path > 0.0
+    if not ahead.any():
+        raise SimulationInputError("has no range in front of the lidar", field="path")
+    both = extinction + (extinction if returning is None else returning)
+    grid = np.concatenate([[0.0], path[ahead]])
+    both = both[ahead][np.r_[0, 0 : ahead.sum()]]
+    depth = np.concatenate([[0.0], np.cumsum(0.5 * (both[1:] + both[:-1]) * np.diff(grid))])
+    return grid, both, depth, backscatter[ahead][np.r_[0, 0 : ahead.sum()]]
+
+
+def _positions(distance: Array, edges: Array) -> Array:
+    """Return where `_summed` takes each cell, shape (bins, cells)."""
+    far = distance[:, None] - edges[:-1]
+    near = distance[:, None] - edges[1:]
+    return np.where(near > 0.0, np.sqrt(np.abs(near * far)), 0.5 * np.maximum(far, 0.0))
+
+
+def _density(z: Array) -> Array:
+    density: Array = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
+    return density
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _summed(
+    distance: Any,
+    edges: Any,
+    density: Any,
+    grid: Any,
+    both: Any,
+    depth: Any,
+    backscatter: Any,
+    full: float,
+    seen: Any,
+) -> Any:
+    signal = np.zeros(distance.size)
+    inverse = 1.0 / (grid[1:] - grid[:-1])
+    last = grid.size - 2
+    k = 0
+    for j in range(distance.size):
+        total = 0.0
+        for i in range(density.size):
+            far, near = distance[j] - edges[i], distance[j] - edges[i + 1]
+            if far <= 0.0 or density[i] == 0.0:
+                continue
+            if near > 0.0:
+                square = near * far
+                r, weight = math.sqrt(square), (edges[i + 1] - edges[i]) / square
+            else:  # the lidar lies in the cell: overlap over R^2 is even there
+                r = 0.5 * far
+                weight = far / r**2
+            while k < last and grid[k + 1] < r:
+                k += 1
+            while k > 0 and grid[k] > r:
+                k -= 1
+            x = r - grid[k]
+            part = min(x * inverse[k], 1.0)
+            inside = min(x, grid[k + 1] - grid[k])
+            slope = both[k + 1] - both[k]
+            tau = depth[k] + inside * (both[k] + 0.5 * slope * part) + (x - inside) * both[k + 1]
+            value = backscatter[k] + (backscatter[k + 1] - backscatter[k]) * part
+            if seen.size:
+                value *= seen[j, i]
+            elif r < full:
+                value *= math.sin(0.5 * math.pi * r / full) ** 2
+            total += density[i] * weight * value * math.exp(-tau)
+        signal[j] = total
+    return signal

@@ -1,0 +1,65 @@
+"""What the models of a simulation share."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+
+def _utc(value: datetime) -> datetime:
+    return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+def _whole_seconds(value: datetime) -> datetime:
+    if value.microsecond:
+        raise ValueError("must be a whole second: the headers of raw files hold no fractions")
+    return value
+
+
+Instant = Annotated[datetime, AfterValidator(_utc), AfterValidator(_whole_seconds)]
+NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
+Hour = Annotated[float, Field(ge=0, lt=24, allow_inf_nan=False)]
+Extinction = Annotated[float, Field(ge=0, le=1.0, allow_inf_nan=False)]
+"""m-1. A cloud has 0.1; 1 would be 1000 per km, so that a value in km-1 is found out."""
+Length = Annotated[float, Field(gt=0, le=1e7, allow_inf_nan=False)]
+Azimuth = Annotated[float, Field(ge=0, lt=360, allow_inf_nan=False)]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+
+
+class Model(BaseModel):
+    """A part of the settings: frozen, and without keys that nobody knows."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Period(Model):
+    """A time interval, from its start up to its stop."""
+
+    start: Instant
+    stop: Instant
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.stop <= self.start:
+            raise ValueError("stop must be later than start")
+        return self
+
+    def overlaps(self, start: datetime, stop: datetime) -> bool:
+        """Whether anything between `start` and `stop` lies in the period."""
+        return start < self.stop and stop > self.start
+
+
+class DiurnalCourse(Model):
+    """A quantity that follows the hour of the day (UTC) as a cosine."""
+
+    minimum: NotNegative
+    maximum: NotNegative
+    hour_of_maximum: Hour = 5.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.maximum < self.minimum:
+            raise ValueError("maximum must not be less than minimum")
+        return self

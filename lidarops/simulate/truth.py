@@ -1,0 +1,276 @@
+"""What a perfect retrieval would find in a simulated campaign, column by column."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.records import DetectionMode
+from lidarops.simulate.settings_files import DamageKind, Handling
+
+Array = NDArray[np.float64]
+
+_SAME = 1e-9
+"""Relative difference below which two extinctions are the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelTruth:
+    """What a retrieval should find in one channel of one file."""
+
+    extinction: float
+    """m-1; NaN where the path is not homogeneous."""
+    background: float
+    """Sky light: MHz before dead time, or mV without the dark offset."""
+    amplitude: float
+    """B of P = P* + B R^-2 exp(-2 sigma R), MHz m2 or mV m2; NaN where not homogeneous."""
+    dark_offset: float
+    """mV; NaN for photon counting."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileTruth:
+    """The air on the beam of one file, coarse in range."""
+
+    extinction: NDArray[np.float32]
+    """m-1, mean over each cell, shape (wavelengths, cells)."""
+    backscatter: NDArray[np.float32]
+    """m-1 sr-1, mean over each cell."""
+    optical_depth: NDArray[np.float32]
+    """1, from the lidar to the far end of each cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class FileTruth:
+    """What is known of one simulated file."""
+
+    path: str
+    """In the archive, with forward slashes."""
+    instrument: str
+    time: datetime
+    """Middle of the file, by the true time."""
+    zenith_angle: float
+    azimuth: float
+    """NaN where nobody knows it."""
+    clock_error: float
+    """s, clock of the computer minus true time."""
+    energy: float
+    """Of the laser, relative to its energy at the start."""
+    channels: Mapping[str, ChannelTruth]
+    damage: DamageKind | None
+    profile: ProfileTruth | None = None
+
+    @property
+    def extinction(self) -> float:
+        """The extinction, m-1, that all channels see; NaN where they do not see one."""
+        values = [channel.extinction for channel in self.channels.values()]
+        first = values[0]
+        alike = all(abs(value - first) <= _SAME * first for value in values)
+        return first if alike else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Where the truth of an instrument's profiles is told."""
+
+    instrument: str
+    wavelengths: tuple[float, ...]
+    """m"""
+    bin_width: float
+    """m, of the bins that the cells are made of."""
+    stops: NDArray[np.intp]
+    """Where cells start and end, in bins from 0, shape (cells + 1,)."""
+    every: int
+    """A profile of every how many files."""
+
+    @property
+    def suffix(self) -> str:
+        """The instrument in the names of variables, which hold no hyphens."""
+        return self.instrument.replace("-", "_")
+
+    @property
+    def edges(self) -> Array:
+        """Where cells start and end, m."""
+        return self.stops.astype(np.float64) * self.bin_width
+
+    def mean(self, values: Array) -> NDArray[np.float32]:
+        """Return the mean over every cell of values in bins, shape (wavelengths, bins)."""
+        sums = np.add.reduceat(values, self.stops[:-1], axis=-1)
+        return (sums / np.diff(self.stops)).astype(np.float32)
+
+    def depth(self, extinction: Array) -> NDArray[np.float32]:
+        """Return the optical depth from the lidar to the end of every cell."""
+        depth = np.cumsum(extinction * self.bin_width, axis=-1)
+        return depth[:, self.stops[1:] - 1].astype(np.float32)
+
+
+class TruthTable:
+    """The truth of a campaign: one row a granule, filled in any order.
+
+    Parameters
+    ----------
+    rows : int
+        Granules.
+    grids : sequence of Grid
+        Of the instruments.
+    """
+
+    def __init__(self, rows: int, grids: Mapping[str, Grid]) -> None:
+        self._grids = grids
+        self._paths = np.full(rows, "", dtype=object)
+        self._instruments = np.full(rows, "", dtype=object)
+        self._damage = np.full(rows, "", dtype=object)
+        self._times = np.full(rows, np.datetime64("NaT"), dtype="datetime64[ns]")
+        self._facts = {name: np.full(rows, np.nan) for name in _FACTS}
+        self._channels: dict[tuple[str, str], Array] = {}
+        self._profiles: dict[str, dict[int, ProfileTruth]] = {key: {} for key in grids}
+
+    def add(self, row: int, truth: FileTruth) -> None:
+        """Fill one row."""
+        self._paths[row] = truth.path
+        self._instruments[row] = truth.instrument
+        self._damage[row] = "" if truth.damage is None else truth.damage.value
+        self._times[row] = np.datetime64(truth.time.replace(tzinfo=None), "ns")
+        for name, column in self._facts.items():
+            column[row] = getattr(truth, name)
+        for channel, known in truth.channels.items():
+            for quantity in _quantities(channel):
+                self._column(channel, quantity)[row] = getattr(known, quantity)
+        if truth.profile is not None:
+            self._profiles[truth.instrument][row] = truth.profile
+
+    def _column(self, channel: str, quantity: str) -> Array:
+        key = channel, quantity
+        if key not in self._channels:
+            self._channels[key] = np.full(self._paths.size, np.nan)
+        return self._channels[key]
+
+    def dataset(self, campaign: str) -> xr.Dataset:
+        """Return the truth as a dataset; see `lidarops.simulate.campaign.simulate`."""
+        handling = {"": ""} | {kind.value: kind.handling.value for kind in DamageKind}
+        extinction = self._facts["extinction"]
+        told = [handling[str(kind)] for kind in self._damage]
+        truth = xr.Dataset(
+            {
+                "path": _row(self._text(self._paths), "path of the raw file in the archive"),
+                "instrument": _row(self._text(self._instruments), "instrument"),
+                "time": _row(self._times, "middle of the file, UTC"),
+                **{
+                    name: _row(self._facts[name], *about)
+                    for name, about in _FACTS.items()
+                    if name == "extinction" or np.isfinite(self._facts[name]).any()
+                },
+                "homogeneous": _row(
+                    np.isfinite(extinction).astype(np.int8), "1 where the path is homogeneous", "1"
+                ),
+                "damage": _row(
+                    self._text(self._damage),
+                    "what is wrong with the raw file; empty where nothing is",
+                ),
+                "handling": _row(
+                    self._text(np.array(told, dtype=object)),
+                    "what a correct chain does with a damaged raw file: "
+                    + ", ".join(handling.value for handling in Handling),
+                ),
+                "refused": _row(
+                    np.array([each == Handling.REFUSE for each in told], dtype=np.int8),
+                    "1 where a correct reader must refuse the raw file",
+                    "1",
+                ),
+            },
+            attrs={
+                "title": f"Truth of the simulated campaign {campaign}",
+                "comment": "P = P* + B R^-2 exp(-2 sigma R) beyond full overlap, with sigma in"
+                " extinction and B in amplitude. P* is the background (sky light) where dark files"
+                " were subtracted, background plus dark_offset where not. Photon counting: rates"
+                " before dead time.",
+            },
+        )
+        for (channel, quantity), column in sorted(self._channels.items()):
+            truth[f"{quantity}_{channel}"] = _row(column, *_quantities(channel)[quantity])
+        for key, profiles in self._profiles.items():
+            if profiles:
+                truth = truth.merge(_profiles(self._grids[key], profiles))
+        return truth
+
+    @staticmethod
+    def _text(values: NDArray[np.object_]) -> NDArray[np.str_]:
+        return values.astype(str)
+
+
+_FACTS = {
+    "extinction": ("extinction coefficient of air, all of the homogeneous path", "m-1"),
+    "zenith_angle": ("zenith angle of the beam, 0 = up", "degree"),
+    "azimuth": ("azimuth of the beam, clockwise from north", "degree"),
+    "clock_error": ("clock of the instrument minus true time", "s"),
+    "energy": ("energy of the laser, relative to its energy at the start", "1"),
+}
+
+
+def _quantities(channel: str) -> dict[str, tuple[str, str]]:
+    mode, _, label = channel.partition("_")
+    analog = mode == DetectionMode.ANALOG
+    units = "mV" if analog else "MHz"
+    told = {
+        "extinction": (f"extinction coefficient of the homogeneous path, {label}", "m-1"),
+        "background": (f"sky light, {mode} {label}", units),
+        "amplitude": (f"amplitude B of the backscattered signal, {mode} {label}", f"{units} m2"),
+    }
+    dark = {"dark_offset": (f"signal without any light, {mode} {label}", units)}
+    return told | dark if analog else told
+
+
+def _profiles(grid: Grid, profiles: Mapping[int, ProfileTruth]) -> xr.Dataset:
+    rows = sorted(profiles)
+    about = grid.suffix
+    dims = (f"profile_{about}", f"wavelength_{about}", f"range_{about}")
+    coordinates = {
+        f"wavelength_{about}": (dims[1], np.array(grid.wavelengths), _told("wavelength", "m")),
+        f"range_{about}": (
+            dims[2],
+            0.5 * (grid.edges[1:] + grid.edges[:-1]),
+            _told("middle of a range cell, from the lidar", "m"),
+        ),
+    }
+    far = "far end of a range cell, from the lidar"
+    return xr.Dataset(
+        {
+            f"profile_granule_{about}": (
+                dims[0],
+                np.array(rows, dtype=np.int32),
+                _told("which granule the profile belongs to, from 0", "1"),
+            ),
+            f"range_end_{about}": (dims[2], grid.edges[1:], _told(far, "m")),
+            **{
+                f"profile_{name}_{about}": (
+                    dims,
+                    np.stack([getattr(profiles[row], name) for row in rows]),
+                    _told(long_name, units),
+                )
+                for name, (long_name, units) in _PROFILES.items()
+            },
+        },
+        coordinates,
+    )
+
+
+_PROFILES = {
+    "extinction": ("extinction coefficient of air, mean over a range cell", "m-1"),
+    "backscatter": ("backscatter coefficient of air, mean over a range cell", "m-1 sr-1"),
+    "optical_depth": ("optical depth of air from the lidar to the end of a range cell", "1"),
+}
+
+
+def _told(long_name: str, units: str) -> dict[str, str]:
+    return {"long_name": long_name, "units": units}
+
+
+def _row(values: object, long_name: str, units: str = "") -> tuple[str, object, dict[str, str]]:
+    attrs = {"long_name": long_name} | ({"units": units} if units else {})
+    return "granule", values, attrs

@@ -1,0 +1,127 @@
+"""The campaigns in catalogs/: each can be simulated, read and retrieved from."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from lidarops.campaign import Campaign, load
+from lidarops.errors import CampaignError
+from lidarops.raw import licel
+from lidarops.raw.archive import open_archive
+from lidarops.simulate.campaign import simulate
+
+
+def _short(repository, tmp_path, name, **settings):
+    campaign = load(repository / f"catalogs/{name}.yaml", archive=tmp_path / "raw")
+    simulation = campaign.simulation.model_copy(update=settings)
+    return campaign.model_copy(update={"simulation": simulation})
+
+
+def test_a_scan_comes_over_the_zenith(repository, tmp_path):
+    campaign = _short(repository, tmp_path, "scan", duration=40 * 60)
+    result = simulate(campaign)
+    west, east = [90, 85, 80, 75, 70, 60, 45, 30], [0, 30, 45, 60, 70, 75, 80, 85, 90]
+    cycle = [(zenith, 270) for zenith in west] + [(zenith, 90) for zenith in east]
+    expected = [cycle[index % 17] for index in range(40)]
+    opened = open_archive(result.archive / "plain", channels=["photon_532o"])
+    signal = opened.isel(time=np.isin(opened["time"].values, result.truth["time"].values))
+    assert signal.sizes["time"] == 40
+    np.testing.assert_array_equal(signal["zenith_angle"], [zenith for zenith, _ in expected])
+    np.testing.assert_array_equal(signal["azimuth"], [azimuth for _, azimuth in expected])
+    np.testing.assert_array_equal(result.truth["zenith_angle"], signal["zenith_angle"])
+    np.testing.assert_array_equal(result.truth["azimuth"], signal["azimuth"])
+    # The beam along the ground sees one extinction.
+    level = result.truth["zenith_angle"].values == 90
+    np.testing.assert_array_equal(result.truth["homogeneous"].values == 1, level)
+    assert np.isfinite(result.truth["extinction"].values[level]).all()
+
+
+def test_both_sides_of_a_layered_sky_are_alike(repository, tmp_path):
+    result = simulate(_short(repository, tmp_path, "scan", duration=17 * 60))
+    truth = result.truth
+    depth = truth["profile_optical_depth_plain_scanner"].isel(wavelength_plain_scanner=0).values
+    rows = truth["profile_granule_plain_scanner"].values
+    zenith, azimuth = truth["zenith_angle"].values[rows], truth["azimuth"].values[rows]
+    far = truth["range_end_plain_scanner"].values
+    # To the same height, which lies in the free atmosphere, the optical depth is that of the
+    # zenith over the cosine; the boundary layer grows meanwhile.
+    height = 2000.0
+    vertical = np.interp(height, far, depth[(zenith == 0)][0])
+    for angle in (30, 45, 60):
+        sides = [depth[(zenith == angle) & (azimuth == side)][0] for side in (90, 270)]
+        for side in sides:
+            slant = np.interp(height / math.cos(math.radians(angle)), far, side)
+            assert slant * math.cos(math.radians(angle)) == pytest.approx(vertical, rel=0.05)
+
+
+def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
+    campaign = _short(repository, tmp_path, "network")
+    result = simulate(campaign)
+    truth = result.truth
+    directions = {"west": 90, "east": 330, "north": 210}
+    for name, azimuth in directions.items():
+        opened = open_archive(result.archive / name)
+        assert opened.sizes["time"] == 120
+        assert set(opened["zenith_angle"].values) == {90}
+        assert set(opened["azimuth"].values) == {azimuth}
+        station = campaign.stations[name]
+        assert float(opened["longitude"]) == pytest.approx(station.longitude, abs=1e-6)
+        assert float(opened["latitude"]) == pytest.approx(station.latitude, abs=1e-6)
+
+    def extinction(name):
+        return truth[f"profile_extinction_{name}_lidar"].isel({f"wavelength_{name}_lidar": 0})
+
+    # The beam of the eastern lidar ends where the northern lidar stands, and the beam of the
+    # northern one where the western lidar stands: there they see the same air.
+    side = 4003.0
+    for first, second, smooth in (("west", "east", 0.12), ("east", "north", 0.12)):
+        there = truth[f"range_{first}_lidar"].values
+        away = extinction(first).values[:, np.argmin(np.abs(there - side))]
+        near = extinction(second).values[:, 0]
+        assert np.abs(np.log(away / near)).mean() < smooth
+        assert np.corrcoef(np.log(away), np.log(near))[0, 1] > 0.5
+    # Haze is thicker in the west.
+    west = extinction("west").values.mean(axis=0)
+    assert west[0] > west[40]
+
+
+def test_an_archive_of_four_stations(repository, tmp_path):
+    campaign = _short(repository, tmp_path, "archive", duration=1800)
+    result = simulate(campaign)
+    refused = dict(zip(result.truth["path"].values, result.truth["refused"].values, strict=True))
+    sites = {"manaus": "Manaus", "saopaulo": "Sao Paul", "pilar": "LidarPi", "golmud": "Golmud"}
+    seen = set()
+    for path in result.paths:
+        if refused[path]:
+            continue
+        header = licel.read_header(result.archive / path)
+        seen.add(path.partition("/")[0])
+        assert header.site == sites[path.partition("/")[0]]
+        assert header.zenith_angle == 0
+    assert seen == sites.keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t["simulation"].update(origin="nowhere"), "nowhere"),
+        (lambda t: t["stations"]["north"].update(latitude=-47), "flat"),
+        (lambda t: t["instruments"]["west-lidar"]["facts"][0].update(zenith_angle=90), "scans"),
+        (
+            lambda t: t["simulation"]["instruments"]["west-lidar"]["acquisition"].update(
+                dialect="pilar"
+            ),
+            "where a scan looks",
+        ),
+    ],
+)
+def test_what_a_network_cannot_be_is_told(repository, tmp_path, change, said):
+    campaign = load(repository / "catalogs/network.yaml", archive=tmp_path / "raw")
+    tree = campaign.model_dump()
+    change(tree)
+    with pytest.raises(CampaignError, match=said):
+        simulate(Campaign.model_validate(tree))
+    assert not (tmp_path / "raw").exists()

@@ -1,0 +1,92 @@
+"""Bytes and truth do not depend on who writes the files, how many at a time, or in which order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from lidarops.cli import app
+from lidarops.engine import local_client
+from lidarops.errors import CampaignError
+from lidarops.simulate import campaign as module
+from lidarops.simulate.campaign import plan, simulate
+from lidarops.simulate.files import Simulator
+
+
+def _contents(root):
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in sorted(Path(root).rglob("*"))
+        if path.is_file()
+    }
+
+
+def _scenery(tree):
+    """Chance everywhere: drifting lasers, random damage, random air."""
+    for instrument in tree["simulation"]["instruments"].values():
+        instrument["laser"] = {"per_hour": -0.05, "jitter": 0.05}
+        instrument["random_damage"] = {"fraction": 0.3, "kinds": ["garbage", "duplicate", "glitch"]}
+
+
+def test_two_processes_write_what_one_writes(small, monkeypatch):
+    alone = small(_scenery, archive="alone")
+    first = simulate(alone)
+    expected = _contents(first.archive)
+    monkeypatch.setattr(module, "_BATCH", 3)
+    steps = []
+    with local_client(2) as client:
+        second = simulate(small(_scenery, archive="shared"), client=client, progress=steps.append)
+        assert _contents(second.archive) == expected
+        assert second.truth.identical(first.truth)
+        assert second.paths == first.paths
+        assert second.size == first.size == sum(map(len, expected.values()))
+        assert sum(steps) == len(first.paths)
+
+        # What a worker finds wrong is said as it is said here.
+        def unwritable(tree):
+            tree["stations"]["coast"]["altitude"] = 8000
+            tree["instruments"]["coast-lidar"]["station"] = "coast"
+            tree["stations"]["coast"]["name"] = "\u6e2f"
+            tree["simulation"]["instruments"]["coast-lidar"]["acquisition"]["dialect"] = "pilar"
+
+        with pytest.raises(ValueError, match="Latin-1"):
+            simulate(small(unwritable, archive="bad"), client=client)
+
+
+def test_any_order_gives_the_same_files(small):
+    campaign = small(_scenery)
+    simulate(campaign)
+    written = _contents(campaign.archive)
+    for site in module._sites(campaign):
+        simulator = Simulator(site)
+        for order in reversed(list(site.orders())):
+            content, truth = simulator.file(order)
+            assert content == written[truth.path]
+            # The same once more, from the same simulator.
+            assert simulator.file(order)[0] == content
+
+
+def test_the_files_are_known_before(small):
+    campaign = small(_scenery)
+    assert plan(campaign).paths == simulate(campaign).paths
+    with pytest.raises(CampaignError, match="no simulation"):
+        plan(small(lambda tree: tree.pop("simulation")))
+
+
+def test_the_command_line_writes_the_same_with_workers(small, tmp_path):
+    campaign = small(_scenery, archive="called")
+    expected = _contents(simulate(campaign).archive)
+    file = tmp_path / "small.yaml"
+    file.write_text(yaml.safe_dump(campaign.model_dump(mode="json", exclude_defaults=True)))
+    for workers in ("1", "2"):
+        folder = tmp_path / f"by-{workers}"
+        arguments = ["simulate", str(file), "--archive", str(folder), "--workers", workers]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+        assert f"{len(expected)} raw files" in result.output
+        found = _contents(folder)
+        assert found.pop("truth.nc")
+        assert found == expected
