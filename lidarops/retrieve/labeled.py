@@ -75,8 +75,8 @@ def homogeneous(
     xr.Dataset, (..., section)
         ``background``, ``amplitude``, ``extinction``, each with ``_standard_error``,
         ``extinction_model_error``, ``reduced_chi2``, ``valid_bins`` and ``quality_flag``, with
-        the coordinates ``section``, ``section_range`` (its middle) and ``section_bounds``; as lazy as the input, and the same
-        to the last bit for any chunking.
+        the coordinates ``section``, ``section_range`` (its middle) and ``section_bounds``; as
+        lazy as the input, and the same to the last bit for any chunking.
 
     Raises
     ------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import exp, expm1, sqrt
-from typing import Any
+from typing import Any, Final
 
 import numba
 import numpy as np
@@ -13,6 +13,9 @@ from lidarops.simulate import _checks
 from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons
 
 FastCounts = NDArray[np.int32]
+
+_FAINT: Final = 1.0e-5
+"""Events in a dead time, below which the digits of a variance cancel."""
 
 
 def count_photons(
@@ -40,24 +43,25 @@ def count_photons(
 
     Notes
     -----
-    Of N events in the exposure T each finds on average
-    :math:`x = ((N - 1) (1 - a) + N_- a) \tau / T` others in the dead time before it, where
-    :math:`a = \tau / 2 t` of a dead time lies in the bin before, with :math:`N_-` events, if a
-    bin lasts t. The number of lost events is drawn as :math:`L \sim \mathrm{Binomial}(m, p)`,
-    m rounded up or down at random so that its mean is right, with
+    Of N events in the exposure T each finds on average :math:`x_0 = (N - 1) \tau / T` others in
+    a dead time. Of that before it, a = tau / 2 t lies in the bin before if a bin lasts t, with
+    :math:`N_-` events of which :math:`C_-` were counted. What counts is
 
-    .. math:: m p = N \frac{x}{1 + x}, \quad
-              p = x \frac{3 + 3 x + x^2 - a (x + 4) / 3 + 2 a^2}{(1 + x)^3}
+    .. math:: x = \frac{(1 - a) x_0 + a r}{1 - a r}, \quad r = C_- \tau / T
 
-    for a non-paralyzable counter, and for a paralyzable one
+    for a non-paralyzable counter, which is blind after what it counted, and
+    :math:`x = (1 - a) x_0 + a N_- \tau / T` for a paralyzable one, which is so after every event;
+    in steady light both are that of one bin alone. The number of lost events is drawn as
+    :math:`L \sim \mathrm{Binomial}(m, p)` with the mean :math:`m p = N x / (1 + x)`, or
+    :math:`N (1 - e^{-x})`, m rounded up or down at random so that it is right. The chance p
+    follows from the variance that the counts must have in steady light beyond what N and the
+    bin before give them: for a paralyzable counter
 
-    .. math:: m p = N (1 - e^{-x}), \quad
-              p = 1 - e^{-x} + (1 - 2 a + 2 a^2) \frac{x^2 e^{-2 x}}{1 - e^{-x}}
+    .. math:: p = 1 - e^{-x} + (1 - 2 a + 2 a^2) \frac{x^2 e^{-2 x}}{1 - e^{-x}}
 
-    At a steady rate n and x = n tau this makes N - L a count with the mean and the variance of
-    the theory of renewal processes, with the terms of short bins: see `counter_moments`. Counts
-    are integers from 0 to N at any rate, where a rounded Gaussian would lose the dead time of
-    weak signals in the rounding.
+    So mean and variance are those of `counter_moments`, and counts are integers from 0 to N at
+    any rate, where a rounded Gaussian would lose the dead time of weak signals in the rounding.
+    Dead times longer than a bin reach back by one bin only.
 
     References
     ----------
@@ -149,9 +153,7 @@ def count_rate(counts: NDArray[Any], *, shots: int, bin_time: float) -> Array:
 
 def _before(dead_time: float, bin_time: float) -> float:
     """Return the part of the dead time before an event that lies in the bin before."""
-    if dead_time <= bin_time:
-        return 0.5 * dead_time / bin_time
-    return 1.0 - 0.5 * bin_time / dead_time
+    return 0.5 * min(dead_time / bin_time, 1.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -162,19 +164,27 @@ def _loss(x: float, before: float, paralyzable: Any) -> tuple[float, float]:
         edge = 1.0 - 2.0 * before * (1.0 - before)
         return lost, lost + edge * x * x * exp(-2.0 * x) / lost
     y = 1.0 + x
-    edge = before * ((x + 4.0) / 3.0 - 2.0 * before)
-    return x / y, x * (3.0 + 3.0 * x + x * x - edge) / (y * y * y)
+    if x < _FAINT:
+        return x / y, 3.0 * x
+    variance = (1.0 + before * x * (y * y + 2.0 * y + 3.0) / (3.0 * y)) / y**3
+    own = 1.0 + (1.0 - before) * x
+    left = variance * (1.0 - (before * x / own) ** 2) - 1.0 / (y * own) ** 2
+    return x / y, min(max(1.0 - left * y / x, x / y), 1.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _registered(number: Any, per: float, before: float, paralyzable: Any, random: Any) -> Any:
     counted = np.empty_like(number)
-    previous = number[0] if number.size else 0
     for i in range(number.size):
         released = number[i]
-        x = per * (max(released - 1, 0) * (1.0 - before) + previous * before)
-        previous = released
         counted[i] = released
+        x = per * max(released - 1, 0)
+        # The bin before the first is taken to be as bright.
+        if i > 0 and paralyzable:
+            x = (1.0 - before) * x + before * per * number[i - 1]
+        elif i > 0:
+            blind = before * min(per * counted[i - 1], 1.0)
+            x = ((1.0 - before) * x + blind) / (1.0 - blind)
         if released == 0 or x <= 0.0:
             continue
         lost, chance = _loss(x, before, paralyzable)

@@ -15,20 +15,28 @@ from lidarops.campaign import InstrumentFacts, channel_facts
 from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSECOND
 from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset
 from lidarops.records import DetectionMode, Role
-from lidarops.simulate import fast
 from lidarops.simulate.air import Air, Beam, Path
 from lidarops.simulate.damage import damaged
 from lidarops.simulate.dialects import Occasion, header_of, spelled
 from lidarops.simulate.echo import echo
 from lidarops.simulate.instrument import (
     BRIGHTEST,
+    Laser,
     Photoelectrons,
+    count_fast,
     count_photons,
     digitise,
+    digitise_fast,
     release,
     seen_from,
 )
-from lidarops.simulate.settings import Acquisition, AnalogRecorder, DamageKind, Detector
+from lidarops.simulate.settings import (
+    Acquisition,
+    AnalogRecorder,
+    DamageKind,
+    Detector,
+    PhotonCounter,
+)
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.site import Order, Site, channel_name, dead_time, modes, random_stream
 from lidarops.simulate.sun import sky_brightness, solar_elevation
@@ -86,8 +94,8 @@ class _Light:
     sky: float
     extinction: float
     amplitude: float
-    exposure: float
-    """Time for which a bin is open in all shots together, microseconds."""
+    bin_time: float
+    """s for which a bin is open after one shot."""
     electrons: Photoelectrons | None
     """None where they are not drawn one by one."""
 
@@ -175,28 +183,31 @@ class Simulator:
         middle = start + site.duration_of(order) / 2
         hours = (middle - site.settings.start).total_seconds() / 3600.0
         facts = site.instrument.facts_at(start)
+        acquisition = site.acquisition_of(order.role, order.index)
         zenith, azimuth = site.pointing_of(order, facts)
         air = self._when(middle)
         return _Moment(
             order=order,
-            acquisition=site.acquisition_of(order.role, order.index),
+            acquisition=acquisition,
             start=start,
             middle=middle,
             facts=facts,
             zenith_angle=zenith,
             azimuth=azimuth,
             sun=solar_elevation(middle, site.station.latitude, site.station.longitude),
-            energy=self._energy(hours, random),
+            energy=self._energy(hours, acquisition.shots, random),
             hours=hours,
             line=Beam(*self._position, zenith, azimuth or 0.0),
             air=air,
             state=self._air.state(air),
         )
 
-    def _energy(self, hours: float, random: np.random.Generator) -> float:
+    def _energy(self, hours: float, shots: int, random: np.random.Generator) -> float:
         drift = self.site.simulated.laser
-        jitter = drift.jitter * random.standard_normal() if drift.jitter else 0.0
-        return max((1.0 + drift.per_hour * hours) * (1.0 + jitter), 0.0)
+        laser = Laser(
+            per_hour=drift.per_hour, file_jitter=drift.jitter, shot_jitter=drift.shot_jitter
+        )
+        return laser.energy(hours, shots, random)
 
     def _header(self, moment: _Moment) -> Header:
         site, acquisition = self.site, moment.acquisition
@@ -237,7 +248,8 @@ class Simulator:
                 unit, dark_offset = recorder.gain, recorder.dark_offset
             else:
                 lost = dead_time(self.site, moment.start, name)
-                counts = self._counted(light, lost, random)
+                counter = detector.photon or PhotonCounter()
+                counts = self._counted(light, counter, lost, moment, random)
                 unit, dark_offset = 1.0, math.nan
             channels[name] = (
                 counts,
@@ -283,19 +295,34 @@ class Simulator:
     ) -> AnyCounts:
         if light.electrons is not None:
             return digitise(light.electrons, recorder, random=random)
-        return fast.record(
+        return digitise_fast(
             light.rate,
             recorder,
-            dark_offset=recorder.dark_offset,
-            exposure=light.exposure,
             shots=moment.acquisition.shots,
+            bin_time=light.bin_time,
             random=random,
         )
 
-    def _counted(self, light: _Light, lost: float, random: np.random.Generator) -> AnyCounts:
+    def _counted(
+        self,
+        light: _Light,
+        counter: PhotonCounter,
+        lost: float,
+        moment: _Moment,
+        random: np.random.Generator,
+    ) -> AnyCounts:
         if light.electrons is not None:
-            return count_photons(light.electrons, dead_time=lost, random=random)
-        return fast.count(light.rate, exposure=light.exposure, dead_time=lost, random=random)
+            return count_photons(
+                light.electrons, dead_time=lost, random=random, paralyzable=counter.paralyzable
+            )
+        return count_fast(
+            light.rate,
+            shots=moment.acquisition.shots,
+            bin_time=light.bin_time,
+            dead_time=lost,
+            random=random,
+            paralyzable=counter.paralyzable,
+        )
 
     def _light(
         self, moment: _Moment, detector: Detector, ranges: _Ranges, random: np.random.Generator
@@ -313,8 +340,8 @@ class Simulator:
         electrons = None
         if not self.site.settings.fast:
             electrons = release(rate, shots=shots, bin_width=bin_width, random=random)
-        exposure = shots * bin_width / LICEL_RANGE_PER_MICROSECOND
-        return _Light(rate, glow, extinction, amplitude, exposure, electrons)
+        bin_time = bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
+        return _Light(rate, glow, extinction, amplitude, bin_time, electrons)
 
     def _beam(self, moment: _Moment, detector: Detector, ranges: _Ranges) -> _Beam:
         full = moment.facts.full_overlap_range

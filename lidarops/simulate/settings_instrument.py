@@ -14,6 +14,9 @@ class PhotonCounter(Model):
     """The photon-counting output of a detector. Its dead time is a fact of the campaign."""
 
     discriminator_level: int = Field(default=8, ge=1, le=63, description="Licel level")
+    paralyzable: bool = Field(
+        default=False, description="whether a lost photon prolongs the dead time"
+    )
 
 
 class AnalogRecorder(Model):
@@ -43,13 +46,12 @@ class AnalogRecorder(Model):
 
     @model_validator(mode="after")
     def _noise_dithers(self) -> Self:
-        # The sum over shots is drawn from its mean and variance. Rounding leaves the mean of
-        # one shot alone only when noise spreads it over neighbouring steps; at half a step the
-        # mean is off by at most exp(-2 pi^2 / 4) / pi = 0.0023 steps.
-        if self.noise < 0.5 * self.step:
+        # Below half a step, rounding does not average out over shots. That is simulated too, down
+        # to what its Fourier series can say.
+        if self.noise < 0.02 * self.step:
             raise ValueError(
-                f"noise of {self.noise:g} mV is less than half a digitiser step"
-                f" ({self.step:g} mV): quantisation would not average out over shots"
+                f"noise of {self.noise:g} mV is less than 0.02 digitiser steps"
+                f" of {self.step:g} mV: no recorder is so quiet"
             )
         if self.dark_offset < 6 * self.noise:
             raise ValueError(
@@ -142,13 +144,16 @@ class Detector(Model):
 
 
 class LaserDrift(Model):
-    """How the energy of the laser changes: steadily, and from file to file."""
+    """How the energy of the laser changes: steadily, from file to file, from shot to shot."""
 
     per_hour: float = Field(
         default=0.0, ge=-0.5, le=0.5, description="relative change of the energy in an hour"
     )
     jitter: float = Field(
         default=0.0, ge=0, le=0.3, description="relative standard deviation from file to file"
+    )
+    shot_jitter: float = Field(
+        default=0.0, ge=0, le=0.5, description="relative standard deviation from shot to shot"
     )
 
 

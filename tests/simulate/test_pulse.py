@@ -190,6 +190,24 @@ def test_every_shape_is_its_integral(name, far):
     assert ours == pytest.approx(exact, rel=3e-5)
 
 
+def test_properties_are_straight_between_their_points():
+    # Two points only: extinction and backscatter rise linearly, the optical depth as R^2.
+    distance = np.array([500.0, 1500.0, 2900.0, 3500.0])
+    ours = pulsed_signal(
+        distance,
+        extinction=np.array([0.0, 2e-3]),
+        backscatter=np.array([1e-6, 4e-6]),
+        system_constant=1.0,
+        pulse=RectangularPulse(1e-9),
+        path=np.array([1e-9, 3000.0]),
+    )
+    middle = distance - HALF_C * 0.5e-9
+    inside = np.minimum(middle, 3000.0)
+    tau = 2e-3 * inside**2 / 6000.0 + 2e-3 * (middle - inside)
+    expected = (1e-6 + 1e-9 * inside) / middle**2 * np.exp(-2 * tau)
+    np.testing.assert_allclose(ours, expected, rtol=1e-6)
+
+
 def test_a_detector_takes_the_mean_over_its_bin():
     distance = np.array([200.0, 600.0, 3000.0])
     pulse = GaussianPulse(20e-9)

@@ -83,8 +83,8 @@ def test_a_campaign_that_cannot_be_simulated_is_told(small, change, said):
 
 
 def test_models_refuse_what_physics_refuses():
-    with pytest.raises(ValidationError, match="half a digitiser step"):
-        AnalogRecorder(gain=0.1, noise=0.01, dark_offset=3.0, adc_range=500)
+    with pytest.raises(ValidationError, match="digitiser steps"):
+        AnalogRecorder(gain=0.1, noise=0.001, dark_offset=3.0, adc_range=500)
     with pytest.raises(ValidationError, match="clip noise at zero"):
         AnalogRecorder(gain=0.1, noise=0.5, dark_offset=1.0)
     with pytest.raises(ValidationError, match="darker than night"):
