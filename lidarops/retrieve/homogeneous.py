@@ -84,6 +84,8 @@ class HomogeneousResult:
     amplitude: Array
     """B of ``P = P* + B R^-2 exp(-2 extinction R)``, in the unit of the power times m2."""
     amplitude_standard_error: Array
+    """Relative to first order: B is extrapolated to range zero, and above some 30 percent of it
+    the interval holds for its logarithm rather than for B."""
     extinction: Array
     """m-1."""
     extinction_standard_error: Array
@@ -210,7 +212,8 @@ def solve(
     compressed
         The least-squares solution from 11 linear functionals of the profile, which hold all but
         a millionth of what it says of the extinction: within 0.01 standard errors of "direct" in
-        a twentieth of its time. For profiles without gaps on a uniform range with weights that
+        a fifteenth of its time; where the signal is gone within some bins and weak, rarely (1 of
+        10,000 at an optical depth of 40) half a standard error apart. For profiles without gaps on a uniform range with weights that
         all share. Other profiles get the same answer, within 1e-4 standard errors of "direct",
         by Newton steps over their bins; sections of less than 32 bins are given to "direct".
         Here NOT_HOMOGENEOUS is a test of `curvature_misfit`, the energy of the functionals

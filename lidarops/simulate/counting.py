@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import exp, expm1, sqrt
+from math import exp, expm1, log, sqrt
 from typing import Any, Final
 
 import numba
@@ -50,8 +50,12 @@ def count_photons(
     .. math:: x = \frac{(1 - a) x_0 + a r}{1 - a r}, \quad r = C_- \tau / T
 
     for a non-paralyzable counter, which is blind after what it counted, and
-    :math:`x = (1 - a) x_0 + a N_- \tau / T` for a paralyzable one, which is so after every event;
-    in steady light both are that of one bin alone. The number of lost events is drawn as
+
+    .. math:: e^{-x} = (1 - 2 a) e^{-x_0} + 2 a \frac{e^{-x_-} - e^{-x_0}}{x_0 - x_-},
+              \quad x_- = N_- \tau / T
+
+    for a paralyzable one, which is so after every event; in steady light both are that of one
+    bin alone. The number of lost events is drawn as
     :math:`L \sim \mathrm{Binomial}(m, p)` with the mean :math:`m p = N x / (1 + x)`, or
     :math:`N (1 - e^{-x})`, m rounded up or down at random so that it is right. The chance p
     follows from the variance that the counts must have in steady light beyond what N and the
@@ -173,6 +177,14 @@ def _loss(x: float, before: float, paralyzable: Any) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _busy(own: float, previous: float, part: float) -> float:
+    """Return -ln of the chance that no event was in the dead time before, `part` of a bin."""
+    low, step = min(own, previous), abs(own - previous)
+    mean = -expm1(-step) / step if step > _FAINT else 1.0 - 0.5 * step
+    return low - log((1.0 - part) * exp(low - own) + part * mean)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _registered(number: Any, per: float, before: float, paralyzable: Any, random: Any) -> Any:
     counted = np.empty_like(number)
     for i in range(number.size):
@@ -181,7 +193,7 @@ def _registered(number: Any, per: float, before: float, paralyzable: Any, random
         x = per * max(released - 1, 0)
         # The bin before the first is taken to be as bright.
         if i > 0 and paralyzable:
-            x = (1.0 - before) * x + before * per * number[i - 1]
+            x = _busy(x, per * number[i - 1], 2.0 * before)
         elif i > 0:
             blind = before * min(per * counted[i - 1], 1.0)
             x = ((1.0 - before) * x + blind) / (1.0 - blind)

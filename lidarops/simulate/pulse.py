@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 _FWHM: Final = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _MOST_CELLS: Final = 100_000
 _CELLS_OF_PULSE: Final = 32
-_CELLS_OF_BIN: Final = 8
+_CELLS_OF_BIN: Final = 5
 _DECAYS: Final = 16.0
 
 
@@ -249,7 +249,7 @@ def response(
         Over which the detector integrates, centred on the range; None for the power of the
         moment.
     resolution : float, m, optional
-        Longest cell; an eighth of the bin, or 1/32 of the pulse, where not given.
+        Longest cell; a fifth of the bin, or 1/32 of the pulse, where not given.
 
     Raises
     ------
