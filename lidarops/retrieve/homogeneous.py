@@ -212,12 +212,12 @@ def solve(
     compressed
         The least-squares solution from 11 linear functionals of the profile, which hold all but
         a millionth of what it says of the extinction: within 0.01 standard errors of "direct" in
-        a fifteenth of its time; where the signal is gone within some bins and weak, rarely (1 of
-        10,000 at an optical depth of 40) half a standard error apart. For profiles without gaps on a uniform range with weights that
-        all share. Other profiles get the same answer, within 1e-4 standard errors of "direct",
-        by Newton steps over their bins; sections of less than 32 bins are given to "direct".
-        Here NOT_HOMOGENEOUS is a test of `curvature_misfit`, the energy of the functionals
-        that the model leaves over.
+        a fifteenth of its time. (Where a weak signal is gone within some bins, at an optical
+        depth of 40, one profile in 10,000 was half a standard error apart.) For profiles without
+        gaps on a uniform range with weights that all share. Other profiles get the same answer,
+        within 1e-4 standard errors of "direct", by Newton steps over their bins; sections of
+        less than 32 bins are given to "direct". Here NOT_HOMOGENEOUS is a test of
+        `curvature_misfit`, the energy of the functionals that the model leaves over.
     fast
         The same from 7 functionals: up to 0.4 percent more scatter, within 0.3 standard errors
         of "direct". With a known variance the residuals are not looked at: no `reduced_chi2`,
