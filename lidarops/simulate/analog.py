@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons
+from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, possible_rate
 
 FastCounts = NDArray[np.int32]
 
@@ -35,6 +35,10 @@ _NEGLIGIBLE: Final = 20.0
 """Of a harmonic: exp(-20) = 2e-9 steps."""
 _NEGLIGIBLE_FAST: Final = 9.2
 """1e-4 steps."""
+_HIGHEST: Final = 1.0e6
+"""mV, of anything electronic."""
+_LARGEST: Final = 2**31 - 1
+"""Of 32 bits."""
 _FAR: Final = 8.0
 """Deviations from the ends of the scale at which nothing is clipped."""
 _MANY: Final = 50.0
@@ -125,6 +129,7 @@ def slow_baseline(bins: int, bin_time: float, *, amplitude: float, decay: float)
     """
     _checks.positive("bin_time", bin_time, "s")
     _checks.positive("decay", decay, "s")
+    _checks.between("amplitude", amplitude, -_HIGHEST, _HIGHEST, "mV")
     time = (np.arange(bins, dtype=np.float64) + 0.5) * bin_time
     baseline: Array = amplitude * np.exp(-time / decay)
     return baseline
@@ -158,7 +163,8 @@ def digitise(
     Raises
     ------
     SimulationInputError
-        Where the electronic noise is less than `LEAST_NOISE` steps.
+        Where the electronic noise is less than `LEAST_NOISE` steps, or offset or baseline are
+        not finite.
 
     Notes
     -----
@@ -211,13 +217,27 @@ def digitise_fast(
     offset, baseline
         As of `digitise`.
 
+    Raises
+    ------
+    SimulationInputError
+        As of `digitise`, and where a rate, a time or the number of shots is negative or NaN, or
+        the sums do not fit into 32 bits.
+
     Notes
     -----
     The bias of the rounding is right to 1e-4 steps.
     """
+    rate = _checked(rate, bin_time)
+    _checks.not_negative("shots", shots)
     if shots == 0:
         return np.zeros(rate.shape, dtype=np.int32)
     top = 2**recorder.adc_bits - 1
+    if shots * top > _LARGEST:
+        raise SimulationInputError(
+            f"of {shots} with {recorder.adc_bits} bits do not fit into 32 bits",
+            field="shots",
+            remedy="take fewer shots, or digitise",
+        )
     noise = random.standard_normal(rate.size, dtype=np.float32)
     dark = _dark(recorder, rate.shape, offset, baseline)
     total: FastCounts = _drawn(
@@ -238,6 +258,7 @@ def sample_moments(
     bin_time : float, s
     baseline : ndarray, mV, shape (bins,), optional
     """
+    rate = _checked(rate, bin_time)
     dark = _dark(recorder, rate.shape, None, baseline)
     both = _moments_of(rate, dark, *_sample(recorder, bin_time))
     return both[0], both[1]
@@ -251,14 +272,23 @@ def sum_voltage(total: NDArray[Any], recorder: Recorder, *, shots: int) -> Array
     return voltage
 
 
+def _checked(rate: Array, bin_time: float) -> Array:
+    _checks.positive("bin_time", bin_time, "s")
+    return possible_rate(rate)
+
+
 def _dark(
     recorder: Recorder, shape: tuple[int, ...], offset: float | None, baseline: Array | None
 ) -> Array:
     """Return the voltage without light, steps."""
+    if offset is not None:
+        _checks.between("offset", offset, -_HIGHEST, _HIGHEST, "mV")
     dark = np.full(shape, recorder.dark_offset if offset is None else offset)
     if baseline is not None:
         if baseline.shape != shape:
             raise SimulationInputError(f"has shape {baseline.shape}, not {shape}", field="baseline")
+        if not np.all(np.abs(baseline) <= _HIGHEST):
+            raise SimulationInputError("is not finite", field="baseline")
         dark += baseline
     return dark / recorder.step
 

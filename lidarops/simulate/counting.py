@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.simulate import _checks
-from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons
+from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, possible_rate
 
 FastCounts = NDArray[np.int32]
 
+_LARGEST: Final = 2**31 - 1
+"""Of 32 bits."""
 _FAINT: Final = 1.0e-5
 """Events in a dead time, below which the digits of a variance cancel."""
 
@@ -104,14 +107,28 @@ def count_fast(
     random : numpy.random.Generator
     paralyzable : bool
 
+    Raises
+    ------
+    SimulationInputError
+        Where a rate, a time or the number of shots is negative or NaN, or the counts do not fit
+        into 32 bits.
+
     Notes
     -----
     For many counts; few have the right mean and variance but are not Poisson, and none are
     shared with an analog recorder.
     """
-    _checks.not_negative("dead_time", dead_time, "s")
-    noise = random.standard_normal(rate.size, dtype=np.float32)
+    rate = _checked(rate, bin_time, dead_time)
+    _checks.not_negative("shots", shots)
     exposure = shots * bin_time * 1e6
+    most = exposure * min(rate.max(initial=0.0), 1e-6 / dead_time if dead_time else np.inf)
+    if most + 10.0 * sqrt(most) > _LARGEST:
+        raise SimulationInputError(
+            f"of {shots} give {most:.3g} counts, more than 32 bits hold",
+            field="shots",
+            remedy="take fewer shots, or count_photons",
+        )
+    noise = random.standard_normal(rate.size, dtype=np.float32)
     before = 2.0 * _before(dead_time, bin_time)
     counts: FastCounts = _drawn(rate, noise, exposure, dead_time * 1e6, before, paralyzable)
     return counts
@@ -141,6 +158,7 @@ def counter_moments(
     ----------
     `cox1962`.
     """
+    rate = _checked(rate, bin_time, dead_time)
     before = 2.0 * _before(dead_time, bin_time)
     both = _moments_of(rate, bin_time * 1e6, dead_time * 1e6, before, paralyzable)
     return both[0], both[1]
@@ -153,6 +171,12 @@ def count_rate(counts: NDArray[Any], *, shots: int, bin_time: float) -> Array:
         return np.full(counts.shape, np.nan)
     rate: Array = counts / exposure
     return rate
+
+
+def _checked(rate: Array, bin_time: float, dead_time: float) -> Array:
+    _checks.positive("bin_time", bin_time, "s")
+    _checks.not_negative("dead_time", dead_time, "s")
+    return possible_rate(rate)
 
 
 def _before(dead_time: float, bin_time: float) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate import pulse as shapes
-from lidarops.simulate.air import Path
+from lidarops.simulate.atmosphere import Path
 from lidarops.simulate.settings import Pulse
 from lidarops.simulate.signal import bin_centres
 

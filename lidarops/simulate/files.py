@@ -15,7 +15,7 @@ from lidarops.campaign import InstrumentFacts, channel_facts
 from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSECOND
 from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset
 from lidarops.records import DetectionMode, Role
-from lidarops.simulate.air import Air, Beam, Path
+from lidarops.simulate.atmosphere import Air, Beam, Path
 from lidarops.simulate.damage import damaged
 from lidarops.simulate.dialects import Occasion, header_of, spelled
 from lidarops.simulate.echo import echo

@@ -77,6 +77,8 @@ class Laser:
         A shot that is stronger is so in all its bins, so that the jitter of shots is one factor
         for the file, with the standard deviation of the mean over its shots.
         """
+        _checks.between("hours", hours, -1e6, 1e6, "h")
+        _checks.not_negative("shots", shots)
         spread = sqrt(self.file_jitter**2 + self.shot_jitter**2 / max(shots, 1))
         jitter = spread * random.standard_normal() if spread > 0.0 else 0.0
         return max((1.0 + self.per_hour * hours) * (1.0 + jitter), 0.0)

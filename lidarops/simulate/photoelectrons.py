@@ -38,6 +38,19 @@ class Photoelectrons:
         return self.shots * self.bin_time * 1e6
 
 
+def possible_rate(rate: Array) -> Array:
+    """Return a rate of photoelectrons (MHz) cut at `BRIGHTEST`.
+
+    Raises
+    ------
+    SimulationInputError
+        Where it is negative or NaN.
+    """
+    rate = np.minimum(rate, BRIGHTEST)
+    _checks.profile("rate", rate, rate.shape, "MHz")
+    return rate
+
+
 def release(
     rate: Array, *, shots: int, bin_width: float, random: np.random.Generator
 ) -> Photoelectrons:
@@ -62,8 +75,7 @@ def release(
     _checks.not_negative("shots", shots)
     _checks.positive("bin_width", bin_width, "m")
     bin_time = bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
-    rate = np.minimum(rate, BRIGHTEST)
-    _checks.profile("rate", rate, rate.shape, "MHz")
+    rate = possible_rate(rate)
     number = random.poisson(rate * (shots * bin_time * 1e6))
     return Photoelectrons(rate=rate, number=number, shots=shots, bin_time=bin_time)
 

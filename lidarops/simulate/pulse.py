@@ -339,6 +339,7 @@ def pulsed_signal(
     ----------
     `vasylkivskyi2022`, equations 10, 14 and 20.
     """
+    _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
     shape = overlap or SineOverlap(full_overlap_range)
     cells = response(pulse, bin_width=bin_width, resolution=resolution)
     _refuse_near(distance, cells, shape)

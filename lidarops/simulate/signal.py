@@ -6,13 +6,19 @@ of a pulse of any length and shape.
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.simulate import _checks
+from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.overlap import Overlap, SineOverlap
 
 Array = NDArray[np.float64]
+
+_FARTHEST: Final = 1.0e9
+"""m, of any lidar: the Moon."""
 
 
 def bin_centres(bins: int, bin_width: float, offset: float = 0.0) -> Array:
@@ -21,6 +27,9 @@ def bin_centres(bins: int, bin_width: float, offset: float = 0.0) -> Array:
     A bin holds what returns while it is open, so its signal belongs to its centre; at its start
     the lidar equation would be off by bin_width / R.
     """
+    _checks.not_negative("bins", bins)
+    _checks.positive("bin_width", bin_width, "m")
+    _checks.between("offset", offset, -_FARTHEST, _FARTHEST, "m")
     return (np.arange(bins, dtype=np.float64) + 0.5) * bin_width + offset
 
 
@@ -118,7 +127,7 @@ def backscatter_signal(
     Raises
     ------
     SimulationInputError
-        Where a property is negative or not finite.
+        Where a property is negative or not finite, or the ranges do not ascend.
 
     Notes
     -----
@@ -133,6 +142,8 @@ def backscatter_signal(
     `vasylkivskyi2022`, equations 15 and 22 (23, where both wavelengths are one), attached to the
     bin centre.
     """
+    _refuse_axis(distance)
+    _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
     _checks.profile("extinction", extinction, distance.shape, "m-1")
     _checks.profile("backscatter", backscatter, distance.shape, "m-1 sr-1")
     if returning_extinction is not None:
@@ -144,3 +155,10 @@ def backscatter_signal(
     gathered = shape(distance) * backscatter / safe**2
     transmitted = np.exp(-optical_depth(distance, both_ways))
     return np.where(positive, system_constant * gathered * transmitted, 0.0)
+
+
+def _refuse_axis(distance: Array) -> None:
+    if distance.ndim != 1 or distance.size > 1:
+        _checks.ascending("distance", distance)
+    if not np.all(np.abs(distance[-1:]) <= _FARTHEST):
+        raise SimulationInputError(f"ends at {distance[-1]:g} m", field="distance")

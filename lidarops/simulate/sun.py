@@ -8,6 +8,7 @@ from typing import Final
 
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate import _checks
+from lidarops.simulate._checks import SimulationInputError
 
 _TWILIGHT_AT_HORIZON: Final = 0.02
 _DEGREES_PER_DECADE: Final = 3.0
@@ -30,6 +31,11 @@ def solar_elevation(moment: datetime, latitude: float, longitude: float) -> floa
     latitude, longitude : float, degree
         North and east positive.
 
+    Raises
+    ------
+    SimulationInputError
+        Where the time has no zone, or the place is not on Earth.
+
     Notes
     -----
     :math:`\sin h = \sin\phi \sin\delta + \cos\phi \cos\delta \cos H` with the declination
@@ -40,6 +46,12 @@ def solar_elevation(moment: datetime, latitude: float, longitude: float) -> floa
     ----------
     `spencer1971`.
     """
+    if moment.utcoffset() is None:
+        raise SimulationInputError(
+            f"of {moment} has no time zone", field="moment", remedy="add tzinfo=UTC"
+        )
+    _checks.between("latitude", latitude, -90.0, 90.0, "degree")
+    _checks.between("longitude", longitude, -360.0, 360.0, "degree")
     utc = moment.astimezone(UTC)
     hours = utc.hour + utc.minute / 60.0 + utc.second / 3600.0
     days = utc.timetuple().tm_yday - 1 + (hours - 12.0) / 24.0

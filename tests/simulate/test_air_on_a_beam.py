@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from lidarops.simulate.air import Air, Beam
+from lidarops.simulate.atmosphere import Air, Beam
 from lidarops.simulate.settings import AtmosphereSettings
 
 START = datetime(2025, 6, 1, tzinfo=UTC)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import expon, norm, uniform
 
 from lidarops.constants import SPEED_OF_LIGHT
-from lidarops.simulate.air import Path
+from lidarops.simulate.atmosphere import Path
 from lidarops.simulate.campaign import simulate
 from lidarops.simulate.echo import echo
 from lidarops.simulate.settings import Pulse

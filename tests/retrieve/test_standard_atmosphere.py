@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
-from lidarops.simulate.atmosphere import number_density, us_standard
-from lidarops.simulate.scattering import (
+from lidarops.retrieve.molecular import (
     king_factor,
-    molecular_extinction,
     molecular_lidar_ratio,
+    number_density,
     rayleigh_cross_section,
+    us_standard,
 )
 
 
@@ -68,7 +68,7 @@ def test_rayleigh_scattering_of_the_column(wavelength, cross_section, depth):
     relative = 1.5e-3 if infrared else 5e-4
     assert rayleigh_cross_section(wavelength) == pytest.approx(cross_section, rel=relative)
     z = np.linspace(0.0, 80e3, 20_001)
-    column = np.trapezoid(molecular_extinction(z, wavelength), z)
+    column = np.trapezoid(number_density(*us_standard(z)), z) * rayleigh_cross_section(wavelength)
     assert column == pytest.approx(depth, rel=relative)
 
 

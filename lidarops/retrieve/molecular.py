@@ -1,0 +1,522 @@
+"""The clear atmosphere: how many molecules it holds, and how they scatter.
+
+Pressure and temperature are those of the US Standard Atmosphere 1976 or of a sounding; Rayleigh
+scattering follows from the number of molecules in a volume.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lidarops.errors import RetrievalInputError
+
+Array = NDArray[np.float64]
+
+BOLTZMANN_CONSTANT: Final = 1.380649e-23
+"""J K-1, exact (SI)."""
+
+SEA_LEVEL_PRESSURE: Final = 101_325.0
+"""Pa (`us1976`)."""
+
+LOWEST: Final = -5_000.0
+"""m, where the standard atmosphere begins here."""
+
+HIGHEST: Final = 84_000.0
+"""m. Above, the mean molar mass of air falls and the formula here no longer holds."""
+
+CARBON_DIOXIDE: Final = 360e-6
+"""Mole fraction of the fit of `bodhaine1999`; 420 ppm raise the cross section by 3e-5."""
+
+# The constants of `us1976`: they define the standard and are not to be modernised.
+_GRAVITY: Final = 9.80665
+_MOLAR_MASS: Final = 0.0289644
+_GAS_CONSTANT: Final = 8.31432
+_EARTH_RADIUS: Final = 6_356_766.0
+_BASE: Final = np.array([0.0, 11e3, 20e3, 32e3, 47e3, 51e3, 71e3])  # geopotential m
+_LAPSE: Final = np.array([-6.5e-3, 0.0, 1.0e-3, 2.8e-3, 0.0, -2.8e-3, -2.0e-3])  # K m-1
+_BASE_TEMPERATURE: Final = np.concatenate(
+    [[288.15], 288.15 + np.cumsum(np.diff(_BASE) * _LAPSE[:-1])]
+)
+
+_MOLECULES: Final = 2.546899e25
+"""m-3 at 288.15 K and 1013.25 hPa, where the refractive index holds (`bodhaine1999`)."""
+
+_COLDEST: Final = 120.0
+_WARMEST: Final = 350.0
+"""K; no air below 84 km is colder or warmer."""
+
+_SURFACE: Final = 9_000.0
+"""m, up to which there is ground for a profile to begin at."""
+
+
+def _pressure_ratio(layer: NDArray[np.intp], rise: Array) -> Array:
+    base, lapse = _BASE_TEMPERATURE[layer], _LAPSE[layer]
+    scale = _GRAVITY * _MOLAR_MASS / _GAS_CONSTANT
+    isothermal = lapse == 0.0
+    slope = np.where(isothermal, 1.0, lapse)
+    return np.where(
+        isothermal,
+        np.exp(-scale * rise / base),
+        np.power(base / (base + slope * rise), scale / slope),
+    )
+
+
+_BASE_PRESSURE: Final = SEA_LEVEL_PRESSURE * np.concatenate(
+    [[1.0], np.cumprod(_pressure_ratio(np.arange(_BASE.size - 1), np.diff(_BASE)))]
+)
+
+
+def us_standard(altitude: ArrayLike) -> tuple[Array, Array]:
+    r"""Return pressure and temperature of the US Standard Atmosphere 1976.
+
+    Parameters
+    ----------
+    altitude : array_like, m
+        Geometric altitude above mean sea level, any shape, -5 to 84 km.
+
+    Returns
+    -------
+    pressure : ndarray, Pa
+    temperature : ndarray, K
+
+    Raises
+    ------
+    RetrievalInputError
+        If an altitude is not finite or lies outside the standard.
+
+    Notes
+    -----
+    Geopotential height :math:`H = r_0 z / (r_0 + z)`; in layers of constant lapse rate
+    :math:`L_b` the hydrostatic equation gives
+    :math:`p = p_b (T_b / (T_b + L_b (H - H_b)))^{g_0 M_0 / (R^* L_b)}`.
+
+    References
+    ----------
+    `us1976`, equations 18, 23, 33a and 33b.
+    """
+    z = np.asarray(altitude, dtype=np.float64)
+    if not np.all((z >= LOWEST) & (z <= HIGHEST)):
+        raise RetrievalInputError(
+            "the US Standard Atmosphere is defined here from -5 to 84 km",
+            field="altitude",
+            remedy="give metres above mean sea level",
+        )
+    height = _EARTH_RADIUS * z / (_EARTH_RADIUS + z)
+    layer = np.maximum(np.searchsorted(_BASE, height, side="right") - 1, 0)
+    rise = height - _BASE[layer]
+    pressure = _BASE_PRESSURE[layer] * _pressure_ratio(layer, rise)
+    return pressure, _BASE_TEMPERATURE[layer] + _LAPSE[layer] * rise
+
+
+def number_density(pressure: Array, temperature: Array) -> Array:
+    """Return the molecules in a volume of ideal gas, m-3, from Pa and K."""
+    return pressure / (BOLTZMANN_CONSTANT * temperature)
+
+
+def _wave_number_squared(wavelength: ArrayLike) -> Array:
+    micrometres = np.asarray(wavelength, dtype=np.float64) * 1e6
+    if not np.all((micrometres >= 0.23) & (micrometres <= 4.0)):
+        raise RetrievalInputError(
+            "the refractive index of air is known from 0.23 to 4 micrometres",
+            field="wavelength",
+            remedy="give metres: 532e-9, not 532",
+        )
+    return micrometres**-2.0
+
+
+def _refractivity(s2: Array) -> Array:
+    """Return n - 1 of dry air at 288.15 K and 1013.25 hPa (`bodhaine1999`, 17 to 19)."""
+    at_300_ppm = 1e-8 * (8060.51 + 2480990.0 / (132.274 - s2) + 17455.7 / (39.32957 - s2))
+    return at_300_ppm * (1.0 + 0.54 * (CARBON_DIOXIDE - 300e-6))
+
+
+def king_factor(wavelength: ArrayLike) -> Array:
+    """Return the King correction of dry air for depolarisation, 1.
+
+    Parameters
+    ----------
+    wavelength : array_like, m
+
+    References
+    ----------
+    `bodhaine1999`, equations 5, 6 and 23.
+    """
+    s2 = _wave_number_squared(wavelength)
+    nitrogen = 1.034 + 3.17e-4 * s2
+    oxygen = 1.096 + 1.385e-3 * s2 + 1.448e-4 * s2**2
+    dioxide = 100.0 * CARBON_DIOXIDE
+    parts = 78.084 * nitrogen + 20.946 * oxygen + 0.934 * 1.00 + dioxide * 1.15
+    return np.asarray(parts / (78.084 + 20.946 + 0.934 + dioxide))
+
+
+def rayleigh_cross_section(wavelength: ArrayLike) -> Array:
+    r"""Return the total scattering cross section of a molecule of dry air, m2.
+
+    Parameters
+    ----------
+    wavelength : array_like, m
+
+    Raises
+    ------
+    RetrievalInputError
+        If a wavelength is outside 0.23 to 4 micrometres.
+
+    Notes
+    -----
+    .. math:: \sigma = \frac{24 \pi^3 (n^2 - 1)^2}{\lambda^4 N^2 (n^2 + 2)^2} F_K
+
+    The fits of `bucholtz1995` are 0.05 to 0.2 percent smaller from 0.3 to 1.1 micrometres.
+
+    References
+    ----------
+    `bodhaine1999`, equation 2; the King factor :math:`F_K` is `king_factor`.
+    """
+    index2 = (1.0 + _refractivity(_wave_number_squared(wavelength))) ** 2
+    lorentz = ((index2 - 1.0) / (index2 + 2.0)) ** 2
+    length = np.asarray(wavelength, dtype=np.float64)
+    return np.asarray(
+        24.0 * np.pi**3 * lorentz / (length**4 * _MOLECULES**2) * king_factor(wavelength)
+    )
+
+
+def molecular_lidar_ratio(wavelength: ArrayLike) -> Array:
+    r"""Return extinction over backscatter of air, sr: near 8 pi / 3.
+
+    Parameters
+    ----------
+    wavelength : array_like, m
+
+    Notes
+    -----
+    With the depolarisation :math:`\rho = 6 (F_K - 1) / (3 + 7 F_K)` and
+    :math:`\gamma = \rho / (2 - \rho)` the phase function gives
+    :math:`S = \frac{8 \pi}{3} \frac{1 + 2 \gamma}{1 + \gamma}`: the whole spectrum of
+    molecular scattering, rotational Raman lines included.
+
+    References
+    ----------
+    `bucholtz1995`, equations 10 to 12.
+    """
+    factor = king_factor(wavelength)
+    rho = 6.0 * (factor - 1.0) / (3.0 + 7.0 * factor)
+    gamma = rho / (2.0 - rho)
+    return np.asarray(8.0 * np.pi / 3.0 * (1.0 + 2.0 * gamma) / (1.0 + gamma))
+
+
+class Extrapolation(StrEnum):
+    """What a profile says of altitudes that it does not reach."""
+
+    SCALED_STANDARD = "scaled_standard"
+    """The US Standard Atmosphere, scaled to meet the pressure and temperature of its end."""
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MolecularProfile:
+    """Pressure and temperature of the air over altitude, and how its molecules scatter.
+
+    Between levels the logarithm of pressure and the temperature are linear in altitude. Above
+    84 km there is nothing: less than 1e-5 of the air at the ground is left there.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where the levels are not air: altitude that does not rise or is in km or feet, pressure
+        in hPa, temperature in Celsius, or levels that contradict the hydrostatic equation by
+        more than a tenth.
+    """
+
+    altitude: Array
+    """m above mean sea level, ascending."""
+    pressure: Array
+    """Pa."""
+    temperature: Array
+    """K."""
+    extrapolation: Extrapolation = Extrapolation.SCALED_STANDARD
+
+    def __post_init__(self) -> None:
+        for name in ("altitude", "pressure", "temperature"):
+            object.__setattr__(self, name, _levels(name, getattr(self, name)))
+        object.__setattr__(self, "extrapolation", _extrapolation(self.extrapolation))
+        for name in ("pressure", "temperature"):
+            if getattr(self, name).size != self.altitude.size:
+                raise RetrievalInputError(
+                    f"has {getattr(self, name).size} levels, altitude has {self.altitude.size}",
+                    field=name,
+                )
+        _check_altitude(self.altitude)
+        _check_temperature(self.temperature)
+        _check_pressure(self.altitude, self.pressure)
+        _check_balance(self.altitude, self.pressure, self.temperature)
+
+    @classmethod
+    def us_standard(cls, altitude: ArrayLike | None = None) -> Self:
+        """Return the US Standard Atmosphere 1976.
+
+        Parameters
+        ----------
+        altitude : array_like, m, optional
+            Ascending, -5 to 84 km; every 100 m and where the lapse rate changes where not given,
+            so that the number of molecules is interpolated to 6e-6.
+        """
+        if altitude is None:
+            bends = _EARTH_RADIUS * _BASE / (_EARTH_RADIUS - _BASE)
+            altitude = np.union1d(np.linspace(LOWEST, HIGHEST, 891), bends)
+        return cls(np.asarray(altitude, dtype=np.float64), *us_standard(altitude))
+
+    @classmethod
+    def from_profile(
+        cls,
+        altitude: ArrayLike,
+        pressure: ArrayLike,
+        temperature: ArrayLike,
+        *,
+        pressure_unit: str | None = None,
+        extrapolation: Extrapolation = Extrapolation.SCALED_STANDARD,
+    ) -> Self:
+        """Return the profile of a sounding or a model.
+
+        Parameters
+        ----------
+        altitude : array_like, m
+            Above mean sea level, ascending.
+        pressure : array_like
+        temperature : array_like, K
+        pressure_unit : {"Pa", "hPa"}, optional
+            Told from the lowest level where not given: near 1013 it is hPa, near 101300 Pa.
+            A unit that is given must agree with it.
+        extrapolation : Extrapolation
+
+        Raises
+        ------
+        RetrievalInputError
+            Where the lowest pressure is neither near that of the standard atmosphere in Pa nor
+            in hPa, or anything else is not air.
+        """
+        z, p = _levels("altitude", altitude), _levels("pressure", pressure)
+        _check_altitude(z)
+        scale = _UNITS[_unit(float(z[0]), float(p[0]), pressure_unit)]
+        return cls(z, p * scale, _levels("temperature", temperature), extrapolation)
+
+    def at(self, altitude: ArrayLike) -> tuple[Array, Array]:
+        """Return pressure (Pa) and temperature (K).
+
+        Parameters
+        ----------
+        altitude : array_like, m
+            Above mean sea level, any shape, -5 to 84 km.
+
+        Raises
+        ------
+        RetrievalInputError
+            Outside -5 to 84 km; outside the levels where `extrapolation` is refused.
+        """
+        z = np.asarray(altitude, dtype=np.float64)
+        pressure = np.exp(np.interp(z, self.altitude, np.log(self.pressure)))
+        temperature = np.interp(z, self.altitude, self.temperature)
+        inside = (z >= self.altitude[0]) & (z <= self.altitude[-1])
+        if np.all(inside):
+            return np.asarray(pressure), np.asarray(temperature)
+        if self.extrapolation is Extrapolation.REFUSED or not np.all(np.isfinite(z)):
+            raise RetrievalInputError(
+                f"the molecular profile reaches from {self.altitude[0]:g} to"
+                f" {self.altitude[-1]:g} m",
+                field="altitude",
+                remedy="give a longer profile, or allow its extrapolation",
+            )
+        standard = us_standard(z)
+        ends = us_standard(np.clip(z, self.altitude[0], self.altitude[-1]))
+        return (
+            np.where(inside, pressure, pressure * (standard[0] / ends[0])),
+            np.where(inside, temperature, temperature * (standard[1] / ends[1])),
+        )
+
+    def number_density(self, altitude: ArrayLike) -> Array:
+        """Return molecules per volume, m-3; 0 above 84 km.
+
+        Parameters
+        ----------
+        altitude : array_like, m
+            Above mean sea level, any shape.
+        """
+        z = np.asarray(altitude, dtype=np.float64)
+        below = number_density(*self.at(np.minimum(z, HIGHEST)))
+        return np.asarray(np.where(z <= HIGHEST, below, 0.0))
+
+    def extinction(self, altitude: ArrayLike, wavelength: float) -> Array:
+        """Return the extinction by molecules, m-1.
+
+        Parameters
+        ----------
+        altitude : array_like, m
+            Above mean sea level, any shape.
+        wavelength : float, m
+        """
+        return self.number_density(altitude) * rayleigh_cross_section(wavelength)
+
+    def backscatter(self, altitude: ArrayLike, wavelength: float) -> Array:
+        """Return the backscatter by molecules, m-1 sr-1.
+
+        Parameters
+        ----------
+        altitude : array_like, m
+            Above mean sea level, any shape.
+        wavelength : float, m
+        """
+        return self.extinction(altitude, wavelength) / molecular_lidar_ratio(wavelength)
+
+    def column(self, bottom: float, top: float) -> float:
+        """Return the molecules above a unit of area between two altitudes, m-2.
+
+        Parameters
+        ----------
+        bottom, top : float, m
+            Above mean sea level.
+
+        Raises
+        ------
+        RetrievalInputError
+            Where the top is not higher than the bottom.
+
+        Notes
+        -----
+        Gauss quadrature of two nodes in every 50 m: 1e-6 of the integral of the interpolation.
+        """
+        if not (math.isfinite(bottom) and bottom < top < math.inf):
+            raise RetrievalInputError(f"{top:g} m is not higher than {bottom:g} m", field="top")
+        edges = np.linspace(bottom, top, math.ceil((top - bottom) / 50.0) + 1)
+        half = np.diff(edges) / 2.0
+        middle, offset = edges[:-1] + half, half / math.sqrt(3.0)
+        nodes = self.number_density(np.stack([middle - offset, middle + offset]))
+        return float(np.sum(nodes * half))
+
+    def optical_depth(self, wavelength: float, *, bottom: float = 0.0, top: float = 80e3) -> float:
+        """Return the molecular optical depth between two altitudes, 1.
+
+        Parameters
+        ----------
+        wavelength : float, m
+        bottom, top : float, m
+            Above mean sea level.
+        """
+        return self.column(bottom, top) * float(rayleigh_cross_section(wavelength))
+
+
+_UNITS: Final = {"Pa": 1.0, "hPa": 100.0}
+
+
+def _extrapolation(name: str) -> Extrapolation:
+    try:
+        return Extrapolation(name)
+    except ValueError:
+        raise RetrievalInputError(
+            f"is {name!r}",
+            field="extrapolation",
+            remedy=f"choose one of {', '.join(Extrapolation)}",
+        ) from None
+
+
+def _levels(field: str, values: ArrayLike) -> Array:
+    try:
+        levels = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise RetrievalInputError("is not an array of numbers", field=field) from None
+    if levels.ndim != 1 or levels.size < 2:
+        raise RetrievalInputError("needs at least 2 levels on one axis", field=field)
+    if not np.all(np.isfinite(levels)):
+        raise RetrievalInputError(
+            "has values that are not finite", field=field, remedy="leave such levels out"
+        )
+    levels.setflags(write=False)
+    return levels
+
+
+def _check_altitude(altitude: Array) -> None:
+    if not np.all(np.diff(altitude) > 0.0):
+        raise RetrievalInputError(
+            "must rise from level to level", field="altitude", remedy="sort the levels"
+        )
+    if altitude[0] < LOWEST or altitude[-1] > HIGHEST:
+        raise RetrievalInputError(
+            f"reaches from {altitude[0]:g} to {altitude[-1]:g} m",
+            field="altitude",
+            remedy="give metres above mean sea level, -5 to 84 km",
+        )
+
+
+def _check_temperature(temperature: Array) -> None:
+    low, high = float(temperature.min()), float(temperature.max())
+    if low >= _COLDEST and high <= _WARMEST:
+        return
+    celsius = low >= -100.0 and high <= 60.0
+    raise RetrievalInputError(
+        f"reaches from {low:g} to {high:g}, which is not air in K",
+        field="temperature",
+        remedy="this looks like Celsius: add 273.15" if celsius else "give K",
+    )
+
+
+def _unit(altitude: float, pressure: float, named: str | None) -> str:
+    """Return the unit of a pressure, from its size at an altitude."""
+    if named is not None and named not in _UNITS:
+        raise RetrievalInputError(
+            f"is {named!r}", field="pressure_unit", remedy=f"choose one of {', '.join(_UNITS)}"
+        )
+    # Weather changes the pressure of the ground by a tenth, that of the stratosphere by half.
+    slack = 1.25 if altitude <= _SURFACE else 2.0
+    standard = float(us_standard(altitude)[0])
+    for unit, scale in _UNITS.items():
+        if standard / slack <= pressure * scale <= standard * slack:
+            if named is None or named == unit:
+                return unit
+            raise RetrievalInputError(
+                f"{pressure:g} at {altitude:g} m is {unit}, not {named}", field="pressure_unit"
+            )
+    raise RetrievalInputError(
+        f"{pressure:g} at {altitude:g} m is neither Pa nor hPa: the standard atmosphere has"
+        f" {standard:.0f} Pa there",
+        field="pressure",
+        remedy="check the unit of pressure, and that altitude is m above mean sea level",
+    )
+
+
+def _check_pressure(altitude: Array, pressure: Array) -> None:
+    if not (pressure[-1] > 0.0 and np.all(np.diff(pressure) < 0.0)):
+        raise RetrievalInputError("must be positive and fall with altitude", field="pressure")
+    if _unit(float(altitude[0]), float(pressure[0]), None) != "Pa":
+        raise RetrievalInputError(
+            f"{pressure[0]:g} at {altitude[0]:g} m is hPa",
+            field="pressure",
+            remedy="multiply by 100, or use from_profile",
+        )
+
+
+def _check_balance(altitude: Array, pressure: Array, temperature: Array) -> None:
+    """Refuse levels whose distances do not follow from pressure and temperature."""
+    mean = (temperature[:-1] + temperature[1:]) / 2.0
+    scale = _GAS_CONSTANT / (_MOLAR_MASS * _GRAVITY)
+    expected = np.cumsum(-scale * mean * np.diff(np.log(pressure)))
+    rise = altitude[1:] - altitude[0]
+    # 200 m: soundings round pressure to a tenth of hPa, which is much where little is left.
+    wrong = np.abs(expected - rise) > 0.1 * expected + 200.0
+    if not np.any(wrong):
+        return
+    level = int(np.argmax(wrong))
+    ratio = float(expected[-1] / rise[-1])
+    remedy = "check the units of altitude, pressure and temperature"
+    if 800.0 < ratio < 1200.0:
+        remedy = "this looks like km: give m"
+    elif 0.25 < ratio < 0.36:
+        remedy = "this looks like feet: give m"
+    raise RetrievalInputError(
+        f"is {rise[level]:.0f} m from the lowest level to level {level + 1}, but pressure and"
+        f" temperature make it {expected[level]:.0f} m",
+        field="altitude",
+        remedy=remedy,
+    )

@@ -1,0 +1,106 @@
+"""The simulator refuses what would otherwise become a wrong number without a word."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from lidarops.retrieve.molecular import us_standard
+from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.analog import Digitiser, digitise_fast, slow_baseline
+from lidarops.simulate.atmosphere import Air
+from lidarops.simulate.counting import count_fast, counter_moments
+from lidarops.simulate.settings import AtmosphereSettings
+from lidarops.simulate.signal import backscatter_signal, bin_centres
+from lidarops.simulate.sun import solar_elevation
+
+BIN_TIME = 50e-9
+RECORDER = Digitiser(gain=0.1, noise=0.3, dark_offset=3.0)
+
+
+def count(rate, shots=600, dead_time=4e-9, bin_time=BIN_TIME):
+    random = np.random.Generator(np.random.Philox(1))
+    return count_fast(
+        np.asarray(rate, dtype=np.float64),
+        shots=shots,
+        bin_time=bin_time,
+        dead_time=dead_time,
+        random=random,
+    )
+
+
+def digitise(rate, shots=600, recorder=RECORDER):
+    random = np.random.Generator(np.random.Philox(1))
+    return digitise_fast(
+        np.asarray(rate, dtype=np.float64),
+        recorder,
+        shots=shots,
+        bin_time=BIN_TIME,
+        random=random,
+    )
+
+
+@pytest.mark.parametrize("record", [count, digitise])
+@pytest.mark.parametrize("rate", [[1.0, np.nan], [1.0, -1.0]])
+def test_a_rate_that_is_none_is_not_recorded(record, rate):
+    with pytest.raises(SimulationInputError, match="rate"):
+        record(rate)
+
+
+@pytest.mark.parametrize("record", [count, digitise])
+def test_shots_are_counted_up(record):
+    with pytest.raises(SimulationInputError, match="shots"):
+        record([1.0], shots=-5)
+
+
+@pytest.mark.parametrize("record", [count, digitise])
+def test_counts_never_wrap(record):
+    # 2**31 shots of the strongest light: the sum does not fit into the word of a Licel file.
+    with pytest.raises(SimulationInputError, match="32 bits"):
+        record([250.0], shots=2**31)
+    assert record([250.0], shots=600).min() > 0
+
+
+def test_moments_of_no_rate_are_refused():
+    with pytest.raises(SimulationInputError, match="rate"):
+        counter_moments(np.array([np.nan]), dead_time=4e-9, bin_time=BIN_TIME)
+
+
+def test_a_naive_clock_is_refused():
+    with pytest.raises(SimulationInputError, match="time zone"):
+        solar_elevation(datetime(2024, 6, 21, 12), 49.0, 36.0)  # noqa: DTZ001
+    assert solar_elevation(datetime(2024, 6, 21, 9, 36, tzinfo=UTC), 49.0, 36.0) > 60.0
+    with pytest.raises(SimulationInputError, match="latitude"):
+        solar_elevation(datetime(2024, 6, 21, tzinfo=UTC), 149.0, 36.0)
+
+
+def test_ranges_that_are_none_are_refused():
+    with pytest.raises(SimulationInputError, match="bin_width"):
+        bin_centres(10, -7.5)
+    r = bin_centres(10, 7.5)
+    with pytest.raises(SimulationInputError, match="distance"):
+        backscatter_signal(r[::-1], extinction=r * 0, backscatter=r * 0, system_constant=1.0)
+    with pytest.raises(SimulationInputError, match="amplitude"):
+        slow_baseline(10, BIN_TIME, amplitude=np.nan, decay=1e-5)
+
+
+def test_air_beyond_the_sounding_thins_as_the_standard_does():
+    levels = np.array([0.0, 3000.0, 12_000.0])
+    pressure, temperature = us_standard(levels)
+    settings = AtmosphereSettings.model_validate(
+        {
+            "sounding": {
+                "altitude": levels.tolist(),
+                "pressure": (0.98 * pressure).tolist(),
+                "temperature": temperature.tolist(),
+            }
+        }
+    )
+    start = datetime(2024, 6, 21, tzinfo=UTC)
+    air = Air(settings, altitude=0.0, start=start, seed=1)
+    clear = Air(AtmosphereSettings(), altitude=0.0, start=start, seed=1)
+    high = np.array([12_000.0, 20_000.0, 30_000.0, 83_000.0])
+    ratio = air.molecules(high, 532e-9) / clear.molecules(high, 532e-9)
+    np.testing.assert_allclose(ratio, 0.98, rtol=1e-9)
