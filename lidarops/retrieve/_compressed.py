@@ -44,7 +44,9 @@ _LONGEST_LEAP: Final = 20.0
 """Cells that the first step may cross."""
 _EDGE: Final = 1.02
 """Half widths from the centre of a cell beyond which its polynomial is left for the next one's."""
-_MOVES: Final = 5
+_MOVES: Final = 40
+"""From cell to cell, one and a half at most; thin sections start some 20 cells off. What has not
+settled then is routed to others."""
 HUGE: Final = 1e140
 _TINY: Final = 1e-140
 CURVATURES: Final = 7
@@ -297,7 +299,10 @@ def _settle(tables: Tables, s: _Scratch) -> None:
                     _enter(tables, s, p, cell)
                     moved = True
         if not moved:
-            break
+            return
+    for p in range(BLOCK):
+        if abs(s.t[p]) > _EDGE and 0 < s.cell[p] < last and s.state[p] == _OK:
+            s.state[p] = ROUTED
 
 
 @_compiled

@@ -224,6 +224,16 @@ def _solve_profile(
 
 
 @_compiled
+def _all_alike(variance: Array) -> bool:
+    """Whether all bins are noisy, or none is: a variance of 0 among others says nothing."""
+    noisy = variance[0] > 0.0
+    for value in variance:
+        if not (value > 0.0 if noisy else value == 0.0):
+            return False
+    return True
+
+
+@_compiled
 def solve_profiles(
     power: Any,
     variance: Array,
@@ -256,8 +266,9 @@ def solve_profiles(
     for k in range(power.shape[0]):
         whole = _load(power[k], p)
         unit = poisson[k % poisson.size]
-        level = _fill_variance(p, variance[k % variance.shape[0]], known_variance, unit, v)
-        if not (whole and _all_finite(v)):
+        relative = variance[k % variance.shape[0]]
+        level = _fill_variance(p, relative, known_variance, unit, v)
+        if not (whole and _all_finite(v) and (unit > 0.0 or _all_alike(relative))):
             out[k, STATUS] = MISSING
             continue
         _solve_profile(p, v, t, unit, gradients[k % gradients.shape[0]], out[k])

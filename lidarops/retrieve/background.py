@@ -98,8 +98,9 @@ def cubic(
     -------
     BackgroundResult
         The standard error follows from the implicit derivative of the root with respect to the
-        power of each bin. INPUT_MISSING where a bin is not finite, TOO_FEW_BINS below 8 bins
-        (NaN below 3), NO_SIGNAL where the profile is constant, LOW_SIGNAL where the noise may
+        power of each bin. INPUT_MISSING where a bin is not finite, or its variance is 0 where
+        that of others is not; TOO_FEW_BINS below 8 bins (NaN below 3), NO_SIGNAL where the
+        profile is constant, LOW_SIGNAL where the noise may
         have moved the minimum to another root, NO_REAL_SOLUTION where the root is no minimum.
 
     Raises
@@ -213,8 +214,9 @@ def tail_mean(
     start : float, optional
         m; bins from here on are averaged, the last tenth of the bins where not given.
     variance : (..., range) float, optional
-        Noise variance in the square of the power's unit, broadcast against `power`; where not
-        given, the scatter of the averaged bins tells it.
+        Noise variance in the square of the power's unit, broadcast against `power`; bins where
+        it is not finite, or 0 and that of others is not, are passed over. Where not given, the
+        scatter of the averaged bins tells it.
 
     Returns
     -------
@@ -234,6 +236,8 @@ def tail_mean(
     noise = np.broadcast_to(noise[:, first:], values.shape)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         valid = np.isfinite(values) & np.isfinite(noise)
+        # A variance of 0 among others says nothing; that of all bins says that there is no noise.
+        valid &= (noise > 0) | ~np.any(noise > 0, axis=-1, keepdims=True)
         bins = valid.sum(axis=-1)
         mean = np.where(valid, values, 0.0).sum(axis=-1) / bins
         if variance is None:

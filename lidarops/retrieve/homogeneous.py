@@ -424,21 +424,25 @@ def _check_arguments(method: Method, given: Mapping[str, object]) -> None:
 
 
 def _passes(passes: int, method: Method) -> int:
-    if passes < 0:
-        raise RetrievalInputError(f"is {passes}", field="robust_passes", remedy="give 0 or more")
+    if not isinstance(passes, int | np.integer) or passes < 0:
+        raise RetrievalInputError(
+            f"is {passes!r}", field="robust_passes", remedy="give 0, 1, 2 or more passes"
+        )
     if passes and method is Method.CUBIC:
         raise RetrievalInputError(
             f"is {passes}, but the cubic takes no gaps",
             field="robust_passes",
             remedy="choose another method",
         )
-    return passes
+    return int(passes)
 
 
 def _share(model_error: float) -> float:
-    if not (np.isfinite(model_error) and model_error >= 0):
+    if not isinstance(model_error, int | float | np.number) or not (
+        np.isfinite(model_error) and model_error >= 0
+    ):
         raise RetrievalInputError(
-            f"is {model_error}", field="model_error", remedy="give a fraction, such as 0.05"
+            f"is {model_error!r}", field="model_error", remedy="give a fraction, such as 0.05"
         )
     return float(model_error)
 
@@ -464,11 +468,12 @@ def _bounds(bounds: tuple[float, float] | None, range_: Array) -> tuple[float, f
     length = _length(range_)
     if bounds is None:
         return LOWEST_EXTINCTION / float(range_[-1]), HIGHEST_OPTICAL_DEPTH / length
-    lowest, highest = (float(bound) for bound in bounds)
     limit = _LARGEST_OPTICAL_DEPTH / length
+    pair = _inputs.real_array(bounds, "extinction_bounds")
+    lowest, highest = pair.tolist() if pair.shape == (2,) else (np.nan, np.nan)
     if not -limit <= lowest < highest <= limit:
         raise RetrievalInputError(
-            f"is ({lowest:g}, {highest:g}) m-1",
+            f"is {bounds} m-1",
             field="extinction_bounds",
             remedy=f"give two rising values within +-{limit:g} m-1 (300 over the length)",
         )

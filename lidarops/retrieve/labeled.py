@@ -180,6 +180,10 @@ class _Inputs:
             number = variance
         if quality is not None:
             arrays["quality"] = quality
+            if quality.dtype.kind not in "iu":
+                raise RetrievalInputError(
+                    f"holds {quality.dtype}", field="quality", remedy="give bits as integers"
+                )
         for name, array in arrays.items():
             _check_dimensions(array, power, name)
         return cls({name: _one_chunk(array) for name, array in arrays.items()}, number)
@@ -303,7 +307,10 @@ def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:
 
 
 def _edges(sections: Sequence[tuple[float, float]]) -> npt.NDArray[np.float64]:
-    edges = np.asarray(sections, dtype=np.float64)
+    try:
+        edges = np.asarray(sections, dtype=np.float64)
+    except (TypeError, ValueError):
+        edges = np.empty(0)
     if edges.ndim != 2 or edges.shape[1] != 2 or not np.all(edges[:, 0] < edges[:, 1]):
         raise RetrievalInputError(
             f"is {sections!r}", field="sections", remedy="give pairs (near, far) in m, near first"

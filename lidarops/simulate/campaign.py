@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import xarray as xr
 
 from lidarops.campaign import Campaign, Station
-from lidarops.errors import CampaignError
+from lidarops.errors import CampaignError, CatalogError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator
 from lidarops.simulate.settings import DamageKind, SimulationSettings
@@ -167,7 +167,7 @@ def carry_out(
     archive = Path(planned.campaign.archive)
     _refuse_strangers(archive, planned.sites, frozenset(planned.paths))
     for folder in {path.rpartition("/")[0] for path in planned.paths}:
-        (archive / folder).mkdir(parents=True, exist_ok=True)
+        _make(archive / folder)
     rows = sum(order.role is Role.SIGNAL for own in planned.orders for order in own)
     table = TruthTable(rows, {site.key: Simulator(site).grid for site in planned.sites})
     size = 0
@@ -181,6 +181,18 @@ def carry_out(
             progress(written.files)
     told = table.dataset(planned.campaign.name)
     return SimulatedCampaign(archive, planned.paths, size, told)
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CatalogError(
+            f"cannot be made: {error.strerror}",
+            file=folder,
+            field="archive",
+            remedy="give a folder that can be written",
+        ) from error
 
 
 def _batches(planned: SimulationPlan) -> Iterator[_Batch]:

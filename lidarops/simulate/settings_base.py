@@ -18,7 +18,29 @@ def _whole_seconds(value: datetime) -> datetime:
     return value
 
 
-Instant = Annotated[datetime, AfterValidator(_utc), AfterValidator(_whole_seconds)]
+def _of_the_laser(value: datetime) -> datetime:
+    if not 1960 <= value.year <= 2200:
+        raise ValueError("is not of the age of lasers: give a year from 1960 to 2200")
+    return value
+
+
+def _four_characters(value: float) -> float:
+    written = f"{value:.2f}"[:4] if value < 100 else f"{value:04.0f}"
+    if abs(float(written) - value) > 1e-12 * value:
+        raise ValueError(
+            f"{value:g} does not fit into the four characters of a raw header, such as 7.5 or 3.75"
+        )
+    return value
+
+
+Instant = Annotated[
+    datetime,
+    AfterValidator(_utc),
+    AfterValidator(_whole_seconds),
+    AfterValidator(_of_the_laser),
+]
+BinWidth = Annotated[float, Field(ge=0.5, le=150), AfterValidator(_four_characters)]
+"""m."""
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Hour = Annotated[float, Field(ge=0, lt=24, allow_inf_nan=False)]
 Extinction = Annotated[float, Field(ge=0, le=1.0, allow_inf_nan=False)]

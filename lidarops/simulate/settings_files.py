@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.simulate.settings_base import Azimuth, Instant, Model, Period
+from lidarops.simulate.settings_base import Azimuth, BinWidth, Instant, Model, Period
 
 DialectName = Literal["licel", "manaus", "saopaulo", "pilar", "golmud"]
 
@@ -148,7 +148,7 @@ class Change(Model):
 
     at: Instant
     bins: int | None = Field(default=None, ge=16, le=16_384)
-    bin_width: float | None = Field(default=None, ge=0.5, le=150, description="m")
+    bin_width: BinWidth | None = Field(default=None, description="m")
     shots: int | None = Field(default=None, ge=1, le=999_999)
 
 
@@ -159,7 +159,7 @@ class Acquisition(Model):
     shots: int = Field(default=600, ge=1, le=999_999, description="laser shots in a file")
     repetition_rate: float = Field(default=10.0, gt=0, le=10_000, description="Hz")
     bins: int = Field(default=2000, ge=16, le=16_384)
-    bin_width: float = Field(default=7.5, ge=0.5, le=150, description="m")
+    bin_width: BinWidth = Field(default=7.5, description="m")
     dark_files: int = Field(
         default=0,
         ge=0,

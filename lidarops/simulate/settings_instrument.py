@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.simulate.settings_base import Model, NotNegative
+from lidarops.simulate.settings_base import BinWidth, Model, NotNegative
 
 
 class PhotonCounter(Model):
@@ -36,7 +36,7 @@ class AnalogRecorder(Model):
     dark_drift: float = Field(
         default=0.0, ge=-100, le=100, description="mV per hour, of the dark offset"
     )
-    adc_range: float = Field(default=500.0, gt=0, le=10_000, description="mV at full scale")
+    adc_range: float = Field(default=500.0, ge=1, le=10_000, description="mV at full scale")
     adc_bits: int = Field(default=12, ge=8, le=16)
 
     @property
@@ -113,9 +113,7 @@ class Detector(Model):
     photon: PhotonCounter | None = None
     analog: AnalogRecorder | None = None
     bins: int | None = Field(default=None, ge=16, le=16_384, description="where not the others'")
-    bin_width: float | None = Field(
-        default=None, ge=0.5, le=150, description="m, where not the others'"
-    )
+    bin_width: BinWidth | None = Field(default=None, description="m, where not the others'")
 
     @property
     def label(self) -> str:

@@ -395,3 +395,19 @@ def test_tail_mean_does_not_depend_on_its_batch():
 def test_tail_must_begin_within_the_range(start):
     with pytest.raises(RetrievalInputError, match="range ends at 6000 m"):
         tail_mean(np.ones(50), section(1000.0, 5000.0, 50), start=start)
+
+
+def test_a_bin_whose_variance_says_nothing_is_not_used():
+    r = np.arange(100, 400) * 7.5
+    power = 10.0 + 1e7 * r**-2.0 * np.exp(-2e-4 * r)
+    power[150], power[-3] = 1000.0, 1000.0
+    for bad in (0.0, np.inf, np.nan):
+        variance = np.full(r.size, 0.01)
+        variance[[150, -3]] = bad
+        found = cubic(power, r, variance=variance)
+        assert np.isnan(found.background)
+        assert found.quality == Quality.INPUT_MISSING
+        tail = tail_mean(power, r, variance=variance)
+        keep = np.delete(power[-30:], -3)
+        assert tail.background == pytest.approx(keep.mean(), rel=1e-12)
+        assert tail.background_standard_error == pytest.approx(0.1 / np.sqrt(29), rel=1e-12)

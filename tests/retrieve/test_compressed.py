@@ -322,3 +322,27 @@ def test_what_has_no_tables_is_solved_all_the_same(method):
         found = solve(power, r, variance=1.0, method=method)
         exact = solve(power, r, variance=1.0, method="direct")
         np.testing.assert_array_equal(found.extinction, exact.extinction)
+
+
+@pytest.mark.parametrize(
+    ("start", "length", "step", "extinction", "amplitude"),
+    [
+        (10_000.0, 200.0, 3.75, 5e-6, 3e5),
+        (5000.0, 200.0, 6.06, 1e-6, 3e4),
+        (5000.0, 200.0, 6.06, -1e-5, 1e5),
+        (6000.0, 300.0, 3.75, 1e-5, 1e5),
+        (10_000.0, 110.0, 2.5, 3e-5, 1e6),
+    ],
+)
+def test_a_thin_section_settles_far_from_where_it_starts(
+    start, length, step, extinction, amplitude
+):
+    r = np.arange(start, start + length, step)
+    shape = (start / r) ** 2 * np.exp(-2.0 * extinction * (r - start))
+    noise = np.random.default_rng(5).normal(size=(400, r.size))
+    power = 50.0 + amplitude * shape + noise
+    for method in ("auto", "fast"):
+        found = solve(power, r, variance=1.0, method=method)
+        exact = solve(power, r, variance=1.0, method="direct")
+        off = np.abs(found.extinction - exact.extinction) / exact.extinction_standard_error
+        assert off.max() < (0.01 if method == "auto" else 0.1)

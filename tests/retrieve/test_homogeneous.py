@@ -604,3 +604,20 @@ def test_cubic_method_says_where_it_cannot():
     assert found.quality[3] & Quality.LOW_SIGNAL
     with pytest.raises(RetrievalInputError, match="uniform"):
         solve(power, LONG + np.sin(np.arange(225)), method="cubic")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("robust_passes", 1.5),
+        ("robust_passes", np.nan),
+        ("model_error", "x"),
+        ("extinction_bounds", (0.0, 1e-4, 1e-3)),
+        ("extinction_bounds", (None, 1e-3)),
+    ],
+)
+def test_an_argument_of_the_wrong_kind_is_named(name, value):
+    r = np.arange(1000.0, 3000.0, 7.5)
+    with pytest.raises(RetrievalInputError) as caught:
+        solve(1e6 / r**2, r, **{name: value})
+    assert caught.value.field == name

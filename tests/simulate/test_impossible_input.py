@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from lidarops.errors import CatalogError
 from lidarops.retrieve.molecular import us_standard
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.analog import Digitiser, digitise_fast, slow_baseline
 from lidarops.simulate.atmosphere import Air
+from lidarops.simulate.campaign import simulate
 from lidarops.simulate.counting import count_fast, counter_moments
-from lidarops.simulate.settings import AtmosphereSettings
+from lidarops.simulate.settings import AtmosphereSettings, SimulationSettings
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.sun import solar_elevation
 
@@ -104,3 +108,48 @@ def test_air_beyond_the_sounding_thins_as_the_standard_does():
     high = np.array([12_000.0, 20_000.0, 30_000.0, 83_000.0])
     ratio = air.molecules(high, 532e-9) / clear.molecules(high, 532e-9)
     np.testing.assert_allclose(ratio, 0.98, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ({"bin_width": 7.5}, {"bin_width": 7.49481145}, "four characters"),
+        ({"adc_range": 500}, {"adc_range": 1e-5}, "adc_range"),
+        ({"start": "2024-06-21"}, {"start": "9999-12-31"}, "age of lasers"),
+    ],
+)
+def test_what_a_raw_file_cannot_hold_is_named_before_anything_is_written(old, new, message):
+    told = {
+        "seed": 1,
+        "start": "2024-06-21T00:00:00Z",
+        "duration": 600,
+        "instruments": {
+            "one": {
+                "kind": "vertical",
+                "acquisition": {"bin_width": 7.5},
+                "detectors": [
+                    {
+                        "wavelength": 532,
+                        "signal_rate": 20,
+                        "background": {"night": 0.02, "day": 10},
+                        "analog": {"gain": 0.05, "noise": 0.3, "dark_offset": 3, "adc_range": 500},
+                    }
+                ],
+            }
+        },
+    }
+    SimulationSettings.model_validate(told)
+    text = json.dumps(told)
+    (key, good), (_, bad) = *old.items(), *new.items()
+    good_text, bad_text = (json.dumps(value).strip('"') for value in (good, bad))
+    changed = text.replace(f'"{key}": {good_text}', f'"{key}": {bad_text}')
+    changed = changed.replace(f'"{key}": "{good_text}', f'"{key}": "{bad_text}')
+    assert changed != text
+    with pytest.raises(ValidationError, match=message):
+        SimulationSettings.model_validate(json.loads(changed))
+
+
+def test_an_archive_that_cannot_be_made_is_named(tmp_path, small):
+    (tmp_path / "raw").write_text("a file")
+    with pytest.raises(CatalogError, match="cannot be made"):
+        simulate(small(archive="raw/deeper"))
