@@ -20,6 +20,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PrivateAttr,
     ValidationError,
     model_validator,
 )
@@ -40,7 +41,7 @@ def _as_list(value: Any) -> Any:
 
 def _clean_pattern(value: str) -> str:
     if value.startswith(("/", "~")) or ".." in value.split("/"):
-        raise ValueError(f"pattern {value!r} must stay inside the archive: relative, without '..'")
+        raise ValueError(f"{value!r} must stay inside its folder: relative, without '..'")
     return value
 
 
@@ -59,6 +60,8 @@ Instant = Annotated[datetime, AfterValidator(_utc)]
 Patterns = Annotated[
     list[Annotated[str, AfterValidator(_clean_pattern)]], BeforeValidator(_as_list), Field()
 ]
+Inside = Annotated[str, AfterValidator(_clean_pattern)]
+"""Path relative to the campaign file, and below it."""
 Identifier = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$", max_length=40)]
 Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -87,7 +90,15 @@ class ChannelFacts(_Model):
         default=None, ge=-500, le=500, description="m added to the range of every bin"
     )
     noise_variance: float | None = Field(
-        default=None, gt=0, description="analog noise variance of one profile, mV^2"
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="analog noise variance of one profile, mV^2",
+    )
+    lag: Annotated[float, Field(ge=-100, le=100)] | Literal["estimate"] | None = Field(
+        default=None,
+        description="bins by which an analog record lies farther than the photon counting one"
+        " of the same light, or 'estimate'",
     )
 
 
@@ -99,6 +110,13 @@ class InstrumentFacts(_Model):
     zenith_angle: float | None = Field(default=None, ge=0, le=180, description="degree")
     azimuth: float | None = Field(default=None, ge=0, lt=360, description="degree")
     full_overlap_range: Metres = Field(default=0.0, description="m")
+    overlap_profile: Inside | None = Field(
+        default=None, description="CSV or NetCDF file of range (m) and overlap (0 to 1)"
+    )
+    molecular_profile: Inside | None = Field(
+        default=None,
+        description="CSV or NetCDF file of altitude (m), pressure (Pa or hPa), temperature (K)",
+    )
     channels: dict[str, ChannelFacts] = {}
 
     @model_validator(mode="after")
@@ -138,11 +156,54 @@ class HomogeneousSettings(_Model):
         return self
 
 
+class ReferenceSettings(_Model):
+    """Where the air is taken as free of aerosol."""
+
+    lowest: Metres = Field(default=3000.0, description="m above the station")
+    highest: Metres = Field(default=12_000.0, description="m above the station")
+    width: float = Field(default=1000.0, ge=100, le=20_000, description="m")
+    scattering_ratio: float = Field(default=1.0, ge=1, le=10)
+    relative_error: float = Field(
+        default=0.02, ge=0, le=1, description="standard error of the scattering ratio, relative"
+    )
+
+    @model_validator(mode="after")
+    def _holds_a_window(self) -> Self:
+        if self.highest - self.lowest < self.width:
+            raise ValueError("highest must lie at least width above lowest")
+        return self
+
+
+class ElasticSettings(_Model):
+    """The ``elastic`` product: backscatter and extinction of aerosol, from a lidar ratio."""
+
+    channels: list[str] = Field(
+        min_length=1,
+        description="glued_532o joins analog_532o and photon_532o, which the files must hold",
+    )
+    lidar_ratio: Annotated[float, Field(ge=1, le=200)] = Field(default=50.0, description="sr")
+    lidar_ratio_standard_error: float = Field(default=10.0, ge=0, le=100, description="sr")
+    average: Annotated[timedelta, BeforeValidator(_as_interval)] = timedelta(minutes=30)
+    background: Literal["known_shape", "tail_mean"] = "known_shape"
+    reference: ReferenceSettings = ReferenceSettings()
+    molecular_relative_error: float = Field(
+        default=0.01, ge=0, le=1, description="standard error of the density of the air, relative"
+    )
+
+    @model_validator(mode="after")
+    def _divides_day(self) -> Self:
+        seconds = self.average.total_seconds()
+        if seconds < 1 or 86400 % seconds:
+            raise ValueError("average must be at least 1 s and divide a day: 5min, 30min, 2h")
+        return self
+
+
 class Products(_Model):
     """Which products of an instrument are wanted, with which settings."""
 
     signal: SignalSettings | None = None
     homogeneous: HomogeneousSettings | None = None
+    elastic: ElasticSettings | None = None
 
 
 class Instrument(_Model):
@@ -218,6 +279,7 @@ class Campaign(_Model):
     instruments: dict[Identifier, Instrument] = Field(min_length=1)
     scenes: Scenes = Scenes()
     simulation: SimulationSettings | None = None
+    _folder: str = PrivateAttr(default=".")
 
     @model_validator(mode="after")
     def _known_stations(self) -> Self:
@@ -229,6 +291,11 @@ class Campaign(_Model):
                     f" known: {known}"
                 )
         return self
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the campaign file, which the paths of profiles start from."""
+        return Path(self._folder)
 
     @property
     def catalog_url(self) -> str:
@@ -288,6 +355,13 @@ def load(
         raw = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise CampaignError(f"is not valid YAML: {error}", file=path) from error
+    # A date that no calendar has, and nesting that no person writes.
+    except (ValueError, RecursionError) as error:
+        raise CampaignError(
+            f"holds something that is not YAML: {error}",
+            file=path,
+            remedy="look for a date such as 2024-02-30; quote what is no date",
+        ) from error
     if not isinstance(raw, dict):
         raise CampaignError(
             "is not a mapping", file=path, remedy="see catalogs/demo.yaml for an example"
@@ -305,7 +379,7 @@ def load(
             remedy="give a folder, and copy the products from there",
         )
     chosen = archive or os.environ.get(ARCHIVE_VARIABLE)
-    return campaign.model_copy(
+    loaded = campaign.model_copy(
         update={
             "archive": _located(str(chosen), Path.cwd())
             if chosen
@@ -315,6 +389,8 @@ def load(
             else _located(campaign.output, base),
         }
     )
+    loaded._folder = str(base)  # noqa: SLF001 - set once, here
+    return loaded
 
 
 def _located(location: str, base: Path) -> str:

@@ -15,18 +15,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import dask.config
 import xarray as xr
-from dask.base import compute
 
-from lidarops import __version__
+from lidarops import __version__, steps
+from lidarops.ancillary import Ancillaries
 from lidarops.campaign import Campaign, InstrumentFacts, as_settings
 from lidarops.catalog.store import Store
 from lidarops.errors import LidarOpsError, SceneError
 from lidarops.flags import Quality
-from lidarops.plans import StepName, plan
+from lidarops.plans import StepName, glued_channels, plan
 from lidarops.products import build, provenance, write
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
@@ -45,7 +45,6 @@ from lidarops.records import (
     Status,
     Step,
 )
-from lidarops.retrieve import labeled, labeled_signal
 from lidarops.scenes import Cut
 
 if TYPE_CHECKING:
@@ -271,14 +270,14 @@ def _process(job: Job, root: Path) -> SceneOutcome:
         return replace(failed, error="no granule of the scene can be read")
     channels = list(dict.fromkeys(step.channel for step in wanted))
     with dask.config.set(scheduler="synchronous"):
-        archive = _open(job, usable.granules, root, channels)
-        dark = _open_dark(job, usable, root)
+        bench = _bench(job, usable, root)
+        inputs += bench.ancillaries.inputs
         products = tuple(
             product
             for channel in channels
-            for product in _channel_products(job, usable, inputs, archive, dark, channel, clock)
+            for product in _channel_products(job, usable, inputs, bench, channel, clock)
         )
-    return replace(failed, products=products, seconds=clock.laps)
+    return replace(failed, products=products, inputs=inputs, seconds=clock.laps)
 
 
 class _Clock:
@@ -343,99 +342,43 @@ def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]
     )
 
 
-def _open_dark(job: Job, scene: Scene, root: Path) -> dict[str, xr.Dataset]:
-    """Average the dark files of each channel whose plan subtracts them."""
-    channels = [step.channel for step in job.plan.steps if step.name == StepName.DARK]
-    if not channels or not scene.dark:
-        return {}
-    archive = _open(job, scene.dark, root, channels)
-    return {channel: labeled_signal.dark_mean(archive, channel) for channel in channels}
+def _bench(job: Job, scene: Scene, root: Path) -> steps.Bench:
+    """Open what the steps of a scene work on: of the raw files only the channels they read."""
+    read = dict.fromkeys(step.channel for step in job.plan.steps if step.name == StepName.READ)
+    present = {channel.name for channel in scene.layout}
+    subtracted = [step.channel for step in job.plan.steps if step.name == StepName.DARK]
+    return steps.Bench(
+        plan=job.plan,
+        archive=_open(job, scene.granules, root, [name for name in read if name in present]),
+        dark=_open(job, scene.dark, root, subtracted) if subtracted and scene.dark else None,
+        ancillaries=Ancillaries.read(job.campaign.folder, job.plan),
+        station_altitude=job.campaign.stations[scene.station].altitude,
+    )
 
 
 def _channel_products(
     job: Job,
     scene: Scene,
     inputs: tuple[InputRecord, ...],
-    archive: xr.Dataset,
-    dark: Mapping[str, xr.Dataset],
+    bench: steps.Bench,
     name: str,
     clock: _Clock,
 ) -> Iterator[ProductRecord]:
-    steps = {step.name: step for step in job.plan.steps if step.channel == name}
-    layout = next(channel for channel in scene.layout if channel.name == name)
-    conditioned = labeled_signal.condition(
-        archive,
-        name,
-        dead_time=_setting(steps, StepName.DEAD_TIME, "dead_time"),
-        noise_variance=_setting(steps, StepName.NOISE, "noise_variance"),
-        dark=dark.get(name),
-        range_offset=_setting(steps, StepName.RANGE_OFFSET, "range_offset") or 0.0,
-        full_overlap_range=_setting(steps, StepName.OVERLAP, "full_overlap_range") or 0.0,
-    )
-    geometry = archive[[v for v in _GEOMETRY if v in archive]]
-    shots = archive[f"{name}_shots"]
-    lazy = {
-        kind: retrieve(conditioned, steps).assign(shots=shots).assign_coords(geometry.variables)
-        for kind, retrieve in _RETRIEVALS.items()
-        if kind in steps
-    }
-    # Together, so that products of one channel share one reading of the files.
-    computed = dict(zip(lazy, compute(*lazy.values()), strict=True))
+    layout = _layout(job, scene, name)
+    computed = steps.carry_out(bench, name)
     clock.lap("retrieve")
     for kind, data in computed.items():
-        context = _context(job, scene, kind, layout, steps, inputs)
+        context = _context(job, scene, kind, layout, bench.steps(name), inputs)
         path = build.product_path(context)
         written = write.write(build.build(data, context), job.campaign.products_root / path)
         clock.lap("write")
         yield _record(kind, name, path, written, data)
 
 
-_GEOMETRY = ("time", "time_bnds", "zenith_angle", "azimuth")
-
-
-def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
-    step = steps.get(name)
-    return None if step is None else step.settings.get(key)
-
-
-def _retrieve_signal(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
-    start, stop = steps[StepName.BACKGROUND].settings["range"]
-    tail = labeled.tail_mean(
-        conditioned["power"].sel(range=slice(start, stop)),
-        start=start,
-        variance=conditioned["variance"].sel(range=slice(start, stop)),
-    )
-    result = labeled_signal.range_corrected(
-        conditioned, tail["background"], tail["background_standard_error"]
-    )
-    return result.assign(
-        background=tail["background"],
-        background_standard_error=tail["background_standard_error"],
-        # Without a background there is no signal above it.
-        quality_flag=conditioned["quality"]
-        | xr.where(tail["background"].isnull(), int(Quality.INPUT_MISSING), 0).astype("int32"),
-    )
-
-
-def _retrieve_homogeneous(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
-    settings = steps[StepName.HOMOGENEOUS].settings
-    result = labeled.homogeneous(
-        conditioned["power"],
-        sections=[(near, far) for near, far in settings["sections"]],
-        variance=conditioned["variance"],
-        quality=conditioned["quality"],
-        method=settings["method"],
-        # An estimate scatters, and its scatter must not pass for misfit.
-        relative_variance=steps[StepName.NOISE].settings["method"] == "differences",
-    )
-    slanted = labeled.not_level(result, conditioned["zenith_angle"])
-    return result.assign(quality_flag=result["quality_flag"] | slanted)
-
-
-_RETRIEVALS: dict[ProductKind, Callable[[xr.Dataset, Mapping[str, Step]], xr.Dataset]] = {
-    ProductKind.SIGNAL: _retrieve_signal,
-    ProductKind.HOMOGENEOUS: _retrieve_homogeneous,
-}
+def _layout(job: Job, scene: Scene, name: str) -> ChannelLayout:
+    instrument = job.campaign.instruments[scene.instrument]
+    known = (*scene.layout, *glued_channels(scene, instrument))
+    return next(channel for channel in known if channel.name == name)
 
 
 def _context(
@@ -443,7 +386,7 @@ def _context(
     scene: Scene,
     kind: ProductKind,
     channel: ChannelLayout,
-    steps: Mapping[str, Step],
+    planned: Mapping[str, Step],
     inputs: tuple[InputRecord, ...],
 ) -> build.Context:
     campaign = job.campaign
@@ -452,7 +395,7 @@ def _context(
         kind=kind,
         channel=channel.name,
         mode=DetectionMode(channel.mode),
-        wavelength=steps[StepName.READ].settings["wavelength"],
+        wavelength=planned[StepName.READ].settings["wavelength"],
         station_key=scene.station,
         station=campaign.stations[scene.station],
         instrument_key=scene.instrument,

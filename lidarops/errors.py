@@ -66,6 +66,10 @@ class CampaignError(LidarOpsError, ValueError):
     """A campaign file that is missing, unreadable or inconsistent."""
 
 
+class AncillaryError(LidarOpsError, ValueError):
+    """A sounding or overlap file that is missing, unreadable or holds something else."""
+
+
 class CatalogError(LidarOpsError):
     """A catalog or archive that cannot be opened, read or written."""
 

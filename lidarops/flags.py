@@ -35,6 +35,11 @@ class Quality(IntFlag):
     OUTLIER = 1 << 12
     NO_REAL_SOLUTION = 1 << 13
     NOT_LEVEL = 1 << 14
+    BACKGROUND_UNCERTAIN = 1 << 15
+    NO_GLUING = 1 << 16
+    CLOUD = 1 << 17
+    NO_REFERENCE = 1 << 18
+    UNSTABLE_INVERSION = 1 << 19
 
     @property
     def description(self) -> str:
@@ -60,11 +65,17 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     Quality.INPUT_MISSING: (Severity.REJECT, "the raw data are missing or not finite"),
     Quality.SATURATED: (
         Severity.REJECT,
-        "the digitiser is at full scale or the photon counter is paralysed",
+        (
+            "the digitiser is at full scale, in some shots at least, or the photon counter is"
+            " paralysed"
+        ),
     ),
     Quality.PILE_UP: (
         Severity.CARE,
-        "the dead-time effect on the count rate exceeds 10 percent",
+        (
+            "the dead-time effect on the count rate exceeds 10 percent, or 1 percent where the"
+            " dead time is not known"
+        ),
     ),
     Quality.INCOMPLETE_OVERLAP: (
         Severity.REJECT,
@@ -104,5 +115,31 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
             "the path changes its height by more than 100 m along the section, so that extinction"
             " cannot be told from backscatter that changes with height"
         ),
+    ),
+    Quality.BACKGROUND_UNCERTAIN: (
+        Severity.CARE,
+        (
+            "the far range does not look like air without aerosol, so that signal may be left in"
+            " the background"
+        ),
+    ),
+    Quality.NO_GLUING: (
+        Severity.REJECT,
+        "no range where analog and photon counting signals are both linear: they are not joined",
+    ),
+    Quality.CLOUD: (
+        Severity.CARE,
+        (
+            "in a cloud, or behind one as seen from where the inversion starts, where the lidar"
+            " ratio of aerosol does not hold"
+        ),
+    ),
+    Quality.NO_REFERENCE: (
+        Severity.REJECT,
+        "no range window passes the tests of air without aerosol, so that nothing is calibrated",
+    ),
+    Quality.UNSTABLE_INVERSION: (
+        Severity.REJECT,
+        "the inversion divides by nearly nothing, or lies beyond what its boundary value reaches",
     ),
 }

@@ -6,14 +6,15 @@ Every rule gives its reason in words that a user can check against the campaign 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, TypeVar
 
 from lidarops.campaign import (
     Campaign,
     ChannelFacts,
+    ElasticSettings,
     HomogeneousSettings,
     Instrument,
     InstrumentFacts,
@@ -24,7 +25,14 @@ from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, Scene,
 
 MIN_SECTION_BINS = 8
 
-_Settings = TypeVar("_Settings", SignalSettings, HomogeneousSettings)
+GLUED = "glued_"
+"""Prefix of the channels that join ``analog_`` and ``photon_`` ones of the same light."""
+STEEPEST = 80.0
+"""degree; largest zenith angle at which a beam reaches air without aerosol."""
+STEADY = 0.05
+"""degree; by which the zenith angle of a beam that stands still may differ between files."""
+
+_Settings = TypeVar("_Settings", SignalSettings, HomogeneousSettings, ElasticSettings)
 
 
 class StepName(StrEnum):
@@ -36,9 +44,16 @@ class StepName(StrEnum):
     DARK = "dark"
     DEAD_TIME = "dead_time"
     NOISE = "noise"
+    LAG = "lag"
+    GLUE = "glue"
     BACKGROUND = "background"
     SIGNAL = "signal"
     HOMOGENEOUS = "homogeneous"
+    AVERAGE = "average"
+    MOLECULAR = "molecular"
+    KNOWN_SHAPE = "known_shape"
+    REFERENCE = "reference"
+    ELASTIC = "elastic"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +68,10 @@ class _Case:
     """Set where the channel's ``signal`` product is wanted."""
     homogeneous: HomogeneousSettings | None
     """Set where the channel's ``homogeneous`` product is wanted."""
+    elastic: ElasticSettings | None
+    """Set where the channel's ``elastic`` product is wanted."""
+    glued: tuple[str, ...]
+    """Channels that this one is joined into."""
 
     def step(self, name: StepName, reason: str, **settings: Any) -> Step:
         return Step(name.value, self.channel.name, settings, reason)
@@ -79,11 +98,48 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
     # A scene never straddles an edge of a validity period, so its first granule speaks for all.
     facts = instrument.facts_at(scene.granules[0].start or scene.start)
     steps: list[Step] = []
-    left_out = list(_absent(scene, instrument))
-    for channel in scene.layout:
+    left_out = [*_absent(scene, instrument), *_strange_facts(scene, facts)]
+    for channel in (*scene.layout, *glued_channels(scene, instrument)):
         for decision in _channel(scene, channel, instrument, facts):
             (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
     return Plan(scene.id, tuple(steps), tuple(left_out))
+
+
+def glued_channels(scene: Scene, instrument: Instrument) -> tuple[ChannelLayout, ...]:
+    """Return the channels that a scene gets by joining analog and photon counting ones.
+
+    Parameters
+    ----------
+    scene : Scene
+    instrument : Instrument
+        Whose products ask for channels named ``glued_`` and a label.
+
+    Returns
+    -------
+    tuple of ChannelLayout
+        Those of which the files hold both parts on one range grid; in photon counting units.
+    """
+    present = {channel.name: channel for channel in scene.layout}
+    found = []
+    for name in sorted(_asked_glued(instrument)):
+        analog, photon = (present.get(part) for part in parts_of(name))
+        if analog and photon and analog.bin_width == photon.bin_width:
+            found.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
+    return tuple(found)
+
+
+def parts_of(glued: str) -> tuple[str, str]:
+    """Return the names of the analog and the photon counting part of a glued channel."""
+    label = glued.removeprefix(GLUED)
+    return f"analog_{label}", f"photon_{label}"
+
+
+def _asked_glued(instrument: Instrument) -> set[str]:
+    products = instrument.products
+    asked = [*(products.elastic.channels if products.elastic else [])]
+    if products.signal is not None and products.signal.channels != "all":
+        asked += products.signal.channels
+    return {name for name in asked if name.startswith(GLUED)}
 
 
 def wavelength(channel: ChannelLayout, known: ChannelFacts) -> float:
@@ -93,52 +149,98 @@ def wavelength(channel: ChannelLayout, known: ChannelFacts) -> float:
 
 def _absent(scene: Scene, instrument: Instrument) -> Iterator[LeftOut]:
     """Name the channels that the campaign wants and the files lack."""
-    present = [channel.name for channel in scene.layout]
+    channels = {channel.name: channel for channel in scene.layout}
+    made = [channel.name for channel in glued_channels(scene, instrument)]
+    products = instrument.products
     for kind, wanted in (
-        (StepName.SIGNAL, instrument.products.signal),
-        (StepName.HOMOGENEOUS, instrument.products.homogeneous),
+        (StepName.SIGNAL, products.signal),
+        (StepName.HOMOGENEOUS, products.homogeneous),
+        (StepName.ELASTIC, products.elastic),
     ):
         names: Sequence[str] = [] if wanted is None or wanted.channels == "all" else wanted.channels
         for name in names:
-            if name not in present:
-                reason = f"the files hold no such channel, only {', '.join(present)}"
-                yield LeftOut(kind.value, name, reason)
+            if kind is StepName.HOMOGENEOUS and name.startswith(GLUED):
+                yield LeftOut(kind.value, name, "each record is fitted with its own background")
+            elif name not in channels and name not in made:
+                yield LeftOut(kind.value, name, _why_absent(name, channels))
+
+
+def _strange_facts(scene: Scene, facts: InstrumentFacts) -> Iterator[LeftOut]:
+    """Name the channels of which the campaign tells facts, and which the files lack."""
+    present = [channel.name for channel in scene.layout]
+    for name in facts.channels:
+        if name not in present:
+            reason = f"facts of a channel that the files do not hold, only {', '.join(present)}"
+            yield LeftOut(StepName.READ.value, name, reason)
+
+
+def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
+    if name.startswith(GLUED):
+        parts = parts_of(name)
+        if set(parts) <= set(channels):
+            widths = [f"{channels[part].bin_width:g} m" for part in parts]
+            return f"its parts have bins of {' and '.join(widths)}"
+        missing = [part for part in parts if part not in channels]
+        return f"the files hold no {' and no '.join(missing)} to join"
+    return f"the files hold no such channel, only {', '.join(channels)}"
 
 
 def _channel(
     scene: Scene, channel: ChannelLayout, instrument: Instrument, facts: InstrumentFacts
 ) -> Iterator[Step | LeftOut]:
     products = instrument.products
+    made = [glued.name for glued in glued_channels(scene, instrument)]
+    joined = channel.name in made
     case = _Case(
         scene=scene,
         channel=channel,
         facts=facts,
         known=channel_facts(facts, channel.name),
         signal=_wanted(products.signal, channel),
-        homogeneous=_wanted(products.homogeneous, channel),
+        homogeneous=None if joined else _wanted(products.homogeneous, channel),
+        elastic=_wanted(products.elastic, channel),
+        glued=tuple(name for name in made if channel.name in parts_of(name)),
     )
-    if case.signal is None and case.homogeneous is None:
+    asked = list(_asked(case))
+    if not asked:
         yield case.without(StepName.READ, "no product of the campaign asks for this channel")
         return
-    if math.isnan(wavelength(channel, case.known)):
+    known = channel_facts(facts, parts_of(channel.name)[1]) if joined else case.known
+    if math.isnan(wavelength(channel, known)):
         reason = "the header's wavelength is implausible and the campaign's facts give none"
         yield case.without(StepName.READ, reason)
         return
     last = channel.bins * channel.bin_width
     yield case.step(
-        StepName.READ,
-        "asked for by " + " and ".join(kind for kind in _asked(case)),
-        wavelength=wavelength(channel, case.known),
+        StepName.READ, "asked for by " + " and ".join(asked), wavelength=wavelength(channel, known)
     )
-    yield from _conditioning(case)
+    yield from _glue_rules(case) if joined else _conditioning(case)
     yield from _signal_rules(case, last)
     yield from _homogeneous_rules(case, last)
+    yield from _elastic_rules(case, last)
+
+
+def _glue_rules(case: _Case) -> Iterator[Step | LeftOut]:
+    analog, photon = parts_of(case.channel.name)
+    lag = channel_facts(case.facts, analog).lag
+    if lag is None:
+        reason = "the campaign gives no lag and asks for no estimate; headers say 0"
+        yield case.without(StepName.LAG, reason)
+    elif lag == "estimate":
+        reason = "the campaign asks for an estimate, from noise that both records share"
+        yield case.step(StepName.LAG, reason, method="estimate")
+    else:
+        yield case.step(StepName.LAG, "given by the campaign", method="given", lag=lag)
+    reason = "the campaign asks for the joined channel"
+    yield case.step(StepName.GLUE, reason, analog=analog, photon=photon)
 
 
 def _wanted(settings: _Settings | None, channel: ChannelLayout) -> _Settings | None:
-    if settings is None or settings.channels == "all" or channel.name in settings.channels:
-        return settings
-    return None
+    if settings is None:
+        return None
+    # All channels of the files: a joined one is made where it is asked for by name.
+    everything = settings.channels == "all" and not channel.name.startswith(GLUED)
+    return settings if everything or channel.name in settings.channels else None
 
 
 def _asked(case: _Case) -> Iterator[str]:
@@ -146,11 +248,22 @@ def _asked(case: _Case) -> Iterator[str]:
         yield "signal"
     if case.homogeneous is not None:
         yield "homogeneous"
+    if case.elastic is not None:
+        yield "elastic"
+    yield from case.glued
 
 
 def _conditioning(case: _Case) -> Iterator[Step | LeftOut]:
     photon = case.channel.mode is DetectionMode.PHOTON
-    if case.facts.full_overlap_range > 0:
+    if case.facts.overlap_profile:
+        reason = "given by the campaign; nearer bins are flagged and not retrieved from"
+        yield case.step(
+            StepName.OVERLAP,
+            reason,
+            full_overlap_range=case.facts.full_overlap_range,
+            overlap_profile=case.facts.overlap_profile,
+        )
+    elif case.facts.full_overlap_range > 0:
         reason = "nearer bins are flagged and not retrieved from"
         yield case.step(StepName.OVERLAP, reason, full_overlap_range=case.facts.full_overlap_range)
     else:
@@ -186,8 +299,14 @@ def _dark_rule(case: _Case) -> Step | LeftOut:
         return case.without(StepName.DARK, "dark counts are part of the photon background")
     if not case.scene.dark:
         return case.without(StepName.DARK, "no dark files within 24 h of the scene")
-    reason = f"{len(case.scene.dark)} dark files within 24 h of the scene"
-    return case.step(StepName.DARK, reason, files=len(case.scene.dark))
+    told = f"{len(case.scene.dark)} dark files within 24 h of the scene"
+    times = [granule.start for granule in case.scene.dark if granule.start]
+    profiles = [granule.start for granule in case.scene.granules if granule.start]
+    if min(times) < max(profiles) and min(profiles) < max(times):
+        reason, method = f"{told}, before and after it: interpolated in time", "interpolated"
+    else:
+        reason, method = f"{told}, on one side of it: the nearest", "nearest"
+    return case.step(StepName.DARK, reason, files=len(case.scene.dark), method=method)
 
 
 def _signal_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
@@ -231,3 +350,70 @@ def _homogeneous_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
         yield case.step(
             StepName.HOMOGENEOUS, reason, method=case.homogeneous.method, sections=sections
         )
+
+
+def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
+    """Decide on the steps of the ``elastic`` product of a channel, whose bins end at `last` m."""
+    settings = case.elastic
+    if settings is None:
+        yield case.without(StepName.ELASTIC, "the campaign does not ask for it")
+        return
+    zenith, reason = _steady_zenith(case)
+    stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
+    window = settings.reference
+    bottom, top = window.lowest * stretch, min(window.highest * stretch, last)
+    if not reason and top - bottom < window.width * stretch:
+        reason = (
+            f"the bins end at {last:g} m, nearer than a reference window of {window.width:g} m"
+            f" above {window.lowest:g} m"
+        )
+    if reason:
+        yield case.without(StepName.ELASTIC, reason)
+        return
+    seconds = settings.average.total_seconds()
+    yield case.step(StepName.AVERAGE, "noise of a single profile is too large", seconds=seconds)
+    source = case.facts.molecular_profile
+    if source:
+        yield case.step(StepName.MOLECULAR, "given by the campaign", molecular_profile=source)
+    else:
+        reason = "the campaign gives no molecular_profile: US Standard Atmosphere 1976"
+        yield case.step(StepName.MOLECULAR, reason)
+    if settings.background == "known_shape":
+        reason = "the far range is taken as air without aerosol, and tested for it"
+        yield case.step(StepName.KNOWN_SHAPE, reason)
+    else:
+        reason = "the campaign asks for tail_mean: signal left in the far range biases it"
+        yield case.without(StepName.KNOWN_SHAPE, reason)
+    reason = "candidates within the campaign's limits are tested against the shape of air"
+    yield case.step(
+        StepName.REFERENCE,
+        reason,
+        lowest=bottom,
+        highest=top,
+        width=window.width * stretch,
+        scattering_ratio=window.scattering_ratio,
+        relative_error=window.relative_error,
+    )
+    yield case.step(
+        StepName.ELASTIC,
+        "the campaign asks for it",
+        lidar_ratio=settings.lidar_ratio,
+        lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
+        molecular_relative_error=settings.molecular_relative_error,
+    )
+
+
+def _steady_zenith(case: _Case) -> tuple[float, str]:
+    """Return the zenith angle of a beam that stands still, or why there is none."""
+    if case.facts.zenith_angle is not None:
+        angles = [case.facts.zenith_angle]
+    else:
+        told = [granule.zenith_angle for granule in case.scene.granules]
+        if any(angle is None for angle in told):
+            return math.nan, "neither headers nor campaign tell the zenith angle"
+        angles = [angle for angle in told if angle is not None]
+    if max(angles) - min(angles) > STEADY:
+        return math.nan, f"the beam moves, from {min(angles):g} to {max(angles):g} degree"
+    if max(angles) > STEEPEST:
+        return math.nan, f"at {max(angles):g} degree the beam reaches no air without aerosol"
+    return max(angles), ""

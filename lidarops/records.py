@@ -24,10 +24,12 @@ class DetectionMode(StrEnum):
 
 
 class Role(StrEnum):
-    """What a raw file is for."""
+    """What a file is for."""
 
     SIGNAL = "signal"
     DARK = "dark"
+    MOLECULAR = "molecular"
+    OVERLAP = "overlap"
 
 
 class Status(StrEnum):
@@ -42,6 +44,7 @@ class ProductKind(StrEnum):
 
     SIGNAL = "signal"
     HOMOGENEOUS = "homogeneous"
+    ELASTIC = "elastic"
 
 
 @dataclass(frozen=True, slots=True)

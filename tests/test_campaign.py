@@ -47,11 +47,12 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
     [
         ("latitude: 46.4", "latitude: 146.4", r"line 6: stations\.coast\.latitude"),
         ("station: coast", "station: cost", "known: coast"),
-        ('files: "h*"', 'files: "../h*"', "inside the archive"),
-        ('files: "h*"', 'files: "/h*"', "inside the archive"),
+        ('files: "h*"', 'files: "../h*"', "inside its folder"),
+        ('files: "h*"', 'files: "/h*"', "inside its folder"),
         ("archive: raw", "archve: raw", "line 3: archve"),
         ("output: out", "output: s3://bucket/out", "output: is a URL"),
         ("title: A small campaign", "title: [", "not valid YAML"),
+        ("title: A small campaign", "title: 2024-02-30", "not YAML"),
         ("name: small", "name: !!python/object/apply:os.getcwd []", "not valid YAML"),
     ],
 )

@@ -96,9 +96,10 @@ def scan(campaign: Campaign, store: Store, *, progress: Progress | None = None) 
             owners = [claim for claim in claims if claim.pattern.match(file.path)]
             if not owners:
                 continue
-            seen.add(file.path)
+            path = _printable(file.path)
+            seen.add(path)
             key = "+".join(owner.scan_key for owner in owners)[:16]
-            before = known.get(file.path)
+            before = known.get(path)
             if before == (file.size, file.mtime_ns, key):
                 continue
             added += before is None
@@ -157,13 +158,15 @@ def _granule(file: RawFile, owners: list[_Claim], campaign: Campaign, source: _S
     owner = owners[0]
     # Refused until its header has been read.
     granule = Granule(
-        path=file.path,
+        path=_printable(file.path),
         size=file.size,
         mtime_ns=file.mtime_ns,
         instrument=owner.instrument,
         role=owner.role,
         status=Status.REFUSED,
     )
+    if granule.path != file.path:
+        return replace(granule, reason="has a name that is not UTF-8 (rename it)")
     rivals = sorted({claim.instrument for claim in owners} - {owner.instrument})
     if rivals:
         claimants = f"{owner.instrument} and {', '.join(rivals)}"
@@ -180,6 +183,11 @@ def _granule(file: RawFile, owners: list[_Claim], campaign: Campaign, source: _S
         return replace(granule, reason=str(error).removeprefix(f"{file.path}: "))
     except OSError as error:
         return replace(granule, reason=f"cannot be read: {error.strerror or error}")
+
+
+def _printable(path: str) -> str:
+    """Return a path that can be stored and shown: names may hold bytes that are no text."""
+    return path.encode("utf-8", "backslashreplace").decode()
 
 
 def _accept(granule: Granule, header: licel.Header, campaign: Campaign) -> Granule:

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.products import table
+from lidarops.products import rows, table
 from lidarops.products.context import Context, product_path
 from lidarops.products.discovery import global_attributes
 from lidarops.products.intake import (
@@ -25,7 +25,7 @@ from lidarops.products.intake import (
 )
 from lidarops.products.locate import Coordinate, locate
 from lidarops.products.provenance import prov_json
-from lidarops.products.table import Layout, Row, attributes
+from lidarops.products.rows import Layout, Row, attributes
 from lidarops.records import DetectionMode
 
 __all__ = ["Context", "bitround", "build", "product_path"]
@@ -91,7 +91,7 @@ def _place(coordinates: list[Coordinate], mode: DetectionMode) -> dict[str, xr.V
         row = found.row
         variables[row.name] = xr.Variable(found.dims, found.values, attributes(row, mode=mode))
         if row.bounds and found.bounds is not None:
-            variables[row.bounds] = xr.Variable((*found.dims, table.BOUNDS_DIM), found.bounds)
+            variables[row.bounds] = xr.Variable((*found.dims, rows.BOUNDS_DIM), found.bounds)
     return variables
 
 
@@ -103,6 +103,8 @@ def _measured(
     check_flags(judged, flags)
     variables = {}
     for row in layout.variables:
+        if row.optional and row.name not in source:
+            continue
         values = source.take(row.name, row.dims)
         check_range(row, values)
         if row.dtype.startswith("i"):
@@ -111,7 +113,7 @@ def _measured(
             stored = _rounded(row, values)
             if row.dims == judged.dims:
                 check_flagged(row, stored, flags)
-            stored[~np.isfinite(stored)] = table.FILL_VALUE
+            stored[~np.isfinite(stored)] = rows.FILL_VALUE
         listed = tuple(
             found.row.name
             for found in coordinates
@@ -158,10 +160,10 @@ def bitround(values: Values, bits: int) -> Values:
 
 
 def _about(layout: Layout, context: Context, *, profiles: bool) -> dict[str, xr.Variable]:
-    station = table.station(profiles=profiles)
+    station = rows.station(profiles=profiles)
     texts = {
         station: context.station.name or context.station_key,
-        table.PROVENANCE: prov_json(context.provenance),
+        rows.PROVENANCE: prov_json(context.provenance),
     }
     variables = {
         row.name: xr.Variable(
@@ -170,6 +172,6 @@ def _about(layout: Layout, context: Context, *, profiles: bool) -> dict[str, xr.
         for row, text in texts.items()
     }
     if layout.rounded:
-        row = table.QUANTIZATION
+        row = rows.QUANTIZATION
         variables[row.name] = xr.Variable((), np.int32(0), attributes(row, mode=context.mode))
     return variables

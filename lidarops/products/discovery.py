@@ -12,7 +12,7 @@ import numpy as np
 from lidarops import __version__
 from lidarops.products.context import Context
 from lidarops.products.provenance import product_date, product_id
-from lidarops.products.table import CONVENTIONS, STANDARD_NAME_TABLE, Layout
+from lidarops.products.rows import CONVENTIONS, STANDARD_NAME_TABLE, Layout
 from lidarops.records import DetectionMode, LeftOut, Step
 
 

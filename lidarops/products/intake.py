@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.table import Layout, Row
+from lidarops.products.rows import Layout, Row
 
 Values = npt.NDArray[Any]
 

@@ -12,7 +12,7 @@ from lidarops.errors import ProductError
 from lidarops.products.context import Context
 from lidarops.products.discovery import Extents
 from lidarops.products.intake import Intake, Values, check_range, whole_numbers
-from lidarops.products.table import BOUNDS_DIM, Layout, Row
+from lidarops.products.rows import BOUNDS_DIM, Layout, Row
 
 NEAR_VERTICAL: Final = 10.0
 """degree. A beam within this angle of the vertical makes profiles in the sense of CF chapter 9."""

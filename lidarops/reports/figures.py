@@ -19,7 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lidarops.flags import Quality, Severity
-from lidarops.reports import panels
+from lidarops.reports import panels, profile_panels
+from lidarops.reports.profiles import Profile
 from lidarops.reports.raster import COLUMNS, Raster, read_raster
 from lidarops.reports.series import QUANTITIES, Section, compare, join, read_sections
 from lidarops.reports.timeaxis import Times, time_axis
@@ -184,6 +185,71 @@ def draw_quicklook(rasters: Sequence[Raster], *, title: str = "") -> Figure:
     panels.time_ticks([upper, lower], axis)
     return _described(
         figure, f"{title}: range-corrected signal against time and range, and background. {words}."
+    )
+
+
+def backscatter_quicklook(products: Sequence[xr.Dataset], *, title: str = "") -> Figure:
+    """Draw attenuated backscatter against time and range, with clouds, and the background.
+
+    Parameters
+    ----------
+    products : sequence of Dataset
+        Kind ``elastic``, of one instrument and channel; may be lazy.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+        As `quicklook`, with a triangle at the base of the lowest cloud.
+
+    Raises
+    ------
+    ProductError
+        Where a product is not of this kind.
+    """
+    rasters = [read_raster(p, quantity="attenuated_backscatter") for p in products]
+    return draw_backscatter(rasters, title=title)
+
+
+def draw_backscatter(rasters: Sequence[Raster], *, title: str = "") -> Figure:
+    """Draw rasters of attenuated backscatter; see `backscatter_quicklook`."""
+    figure, (upper, lower) = _stack((3.9, 1.2), title)
+    axis = time_axis(_middles(rasters))
+    words = panels.image(figure, upper, axis, rasters, "attenuated\nbackscatter")
+    panels.background(lower, axis, rasters)
+    panels.time_ticks([upper, lower], axis)
+    return _described(
+        figure, f"{title}: attenuated backscatter against time and range, and background. {words}."
+    )
+
+
+def error_budget(profile: Profile, *, title: str = "") -> Figure:
+    """Draw one mean profile of backscatter, and what its error is made of.
+
+    Parameters
+    ----------
+    profile : Profile
+        From `lidarops.reports.profiles.clearest_profile`.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+    """
+    figure = Figure(figsize=(10.0, 5.4), dpi=DPI, layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    moment = str(profile.time.astype("datetime64[s]")).replace("T", " ") + " UTC"
+    panels.title(figure, f"{title}, {moment}, lidar ratio {profile.lidar_ratio:g} sr")
+    profile_panels.backscatter(left, profile)
+    profile_panels.error_budget(right, profile)
+    for panel in (left, right):
+        panels.legend(panel, columns=2)
+    bottom, top = (edge / 1e3 for edge in profile.reference)
+    return _described(
+        figure,
+        f"{title}: backscatter of particles against range at {moment} with its standard error,"
+        f" and the errors by noise, background, reference, lidar ratio and molecules. Reference"
+        f" window {bottom:.3g} to {top:.3g} km.",
     )
 
 

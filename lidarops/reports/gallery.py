@@ -18,6 +18,7 @@ from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
 from lidarops.reports import figures, panels
+from lidarops.reports.profiles import clearest_profile
 from lidarops.reports.raster import COLUMNS, Raster, read_raster
 from lidarops.reports.record import write_atomically
 from lidarops.reports.series import QUANTITIES, Comparison, Section, compare, join, read_sections
@@ -28,7 +29,7 @@ FIGURES: Final = 40
 _FLAG_ROWS: Final = 40
 _DARK_STEP: Final = "dark"
 """Name of the step of a plan that subtracts dark files."""
-_KINDS: Final = (ProductKind.HOMOGENEOUS, ProductKind.SIGNAL)
+_KINDS: Final = (ProductKind.HOMOGENEOUS, ProductKind.ELASTIC, ProductKind.SIGNAL)
 # What opening and reading a damaged or foreign file has been seen to raise.
 _UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, ProductError)
 
@@ -180,7 +181,11 @@ def _draw(
     if group.kind is ProductKind.HOMOGENEOUS:
         if not full or truth is not None:
             yield from _homogeneous(group, record, truth, gallery, full=full)
-    elif not full:
+    elif full:
+        return
+    elif group.kind is ProductKind.ELASTIC:
+        yield from _elastic(group, record, gallery)
+    else:
         yield from _signal(group, record, gallery)
 
 
@@ -236,6 +241,44 @@ def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:
 
 
 def _signal(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Drawn]:
+    rasters = _rasters(group, record, gallery, "signal")
+    if rasters:
+        yield _Drawn(
+            f"signal_{group.instrument}_{group.channel}",
+            f"Range-corrected signal and background: {group.label};"
+            f" {counted(len(rasters), 'scene')}.",
+            figures.render(figures.draw_quicklook(rasters, title=group.label)),
+        )
+
+
+def _elastic(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Drawn]:
+    rasters = _rasters(group, record, gallery, "attenuated_backscatter")
+    if rasters:
+        yield _Drawn(
+            f"elastic_{group.instrument}_{group.channel}",
+            f"Attenuated backscatter, clouds and background: {group.label};"
+            f" {counted(len(rasters), 'scene')}.",
+            figures.render(figures.draw_backscatter(rasters, title=group.label)),
+        )
+    for _, product in group.members:
+        path = Path(record.products) / product.path
+        try:
+            with _opened(path) as opened:
+                profile = clearest_profile(opened)
+        except _UNREADABLE:
+            # Already told when its raster was read.
+            continue
+        if profile is not None:
+            yield _Drawn(
+                f"profile_{group.instrument}_{group.channel}",
+                f"The profile of a scene with most unflagged gates, and its error budget:"
+                f" {group.label}.",
+                figures.render(figures.error_budget(profile, title=group.label)),
+            )
+            return
+
+
+def _rasters(group: _Group, record: RunRecord, gallery: Gallery, quantity: str) -> list[Raster]:
     root = Path(record.products)
     sizes: dict[str, int] = {}
     for _, product in group.members:
@@ -246,19 +289,14 @@ def _signal(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Dra
             reason = _reason(root / product.path, error)
             gallery.problems.append(Problem(product.path, reason))
     rasters: list[Raster] = []
+    profiles = -(-sum(sizes.values()) // COLUMNS)
     for path in sizes:
         try:
             with _opened(root / path) as opened:
-                rasters.append(read_raster(opened, profiles=-(-sum(sizes.values()) // COLUMNS)))
+                rasters.append(read_raster(opened, quantity=quantity, profiles=profiles))
         except _UNREADABLE as error:
             gallery.problems.append(Problem(path, _reason(root / path, error)))
-    if rasters:
-        yield _Drawn(
-            f"signal_{group.instrument}_{group.channel}",
-            f"Range-corrected signal and background: {group.label};"
-            f" {counted(len(rasters), 'scene')}.",
-            figures.render(figures.draw_quicklook(rasters, title=group.label)),
-        )
+    return rasters
 
 
 def _flags(record: RunRecord, folder: Path) -> Picture | None:

@@ -46,7 +46,11 @@ _DECADES: Final = 4.0
 """Most decades of a colour scale."""
 _REJECT_COLOR: Final = "#000000"
 _AXIS_UNITS: Final = {"extinction": ("km$^{-1}$", 1.0e3)}
-_SIGNAL_UNITS: Final = {"mV m2": "mV m$^2$", "MHz m2": "MHz m$^2$"}
+_IMAGE_UNITS: Final = {
+    "mV m2": "mV m$^2$",
+    "MHz m2": "MHz m$^2$",
+    "m-1 sr-1": "m$^{-1}$ sr$^{-1}$",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +322,13 @@ def scores(panel: Axes, axis: TimeAxis, sections: Sequence[Section], quantity: s
 # Signals -------------------------------------------------------------------------------------
 
 
-def image(figure: Figure, panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> str:
+def image(
+    figure: Figure,
+    panel: Axes,
+    axis: TimeAxis,
+    rasters: Sequence[Raster],
+    label: str = "range-corrected\nsignal",
+) -> str:
     """Draw rasters into a panel with a colour bar; return what is seen, in words."""
     full = max(float(raster.edges[-1]) for raster in rasters)
     reach = max(raster.reach for raster in rasters)
@@ -330,12 +340,13 @@ def image(figure: Figure, panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]
     meshes = _signal(panel, axis, cut)
     if meshes:
         bar = figure.colorbar(meshes[0], ax=panel, pad=0.01, extend="both", fraction=0.05)
-        units = _SIGNAL_UNITS.get(cut[0].units, cut[0].units)
-        bar.set_label(f"range-corrected\nsignal ({units})")
+        units = _IMAGE_UNITS.get(cut[0].units, cut[0].units)
+        bar.set_label(f"{label} ({units})")
     else:
         nothing(panel, "no usable signal above zero")
     for raster in cut:
         _rejected(panel, axis, raster)
+    _cloud_bases(panel, axis, cut)
     _altitude_axis(panel, rasters)
     return _notes(panel, rasters, far, full)
 
@@ -364,6 +375,24 @@ def _rejected(panel: Axes, axis: TimeAxis, raster: Raster) -> None:
         mesh.set_gid("flagged-signal")
 
 
+def _cloud_bases(panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> None:
+    known = [(r.start + (r.stop - r.start) / 2, r.clouds) for r in rasters]
+    time = np.concatenate([middle[np.isfinite(base)] for middle, base in known])
+    base = np.concatenate([base[np.isfinite(base)] for _, base in known])
+    if base.size:
+        panel.plot(
+            axis.x(time),
+            base / 1e3,
+            linestyle="none",
+            marker="v",
+            markersize=4.5,
+            markerfacecolor="white",
+            markeredgecolor="black",
+            markeredgewidth=0.8,
+            gid="cloud-base",
+        )
+
+
 def _blocks(
     panel: Axes,
     axis: TimeAxis,
@@ -390,6 +419,21 @@ def _notes(panel: Axes, rasters: Sequence[Raster], far: float, full: float) -> s
         names = [bit_name(bit) for bit in bits & Quality.rejecting() & ~Quality.INPUT_MISSING]
         notes.append(f"black: flagged {', '.join(names)}")
         handles.append(Patch(color=_REJECT_COLOR, label=_wrapped(f"flagged: {', '.join(names)}")))
+    clouds = sum(int(np.isfinite(raster.clouds).sum()) for raster in rasters)
+    if clouds:
+        label = f"base of the lowest cloud or dense layer, in {clouds} columns"
+        notes.append(f"triangles: {label}")
+        handles.append(
+            Line2D(
+                [],
+                [],
+                linestyle="none",
+                marker="v",
+                markerfacecolor="white",
+                markeredgecolor="black",
+                label=label,
+            )
+        )
     if far < full:
         notes.append(f"shown to {far / 1e3:.3g} of {full / 1e3:.3g} km: noise prevails beyond")
     care = share_with_care(rasters)

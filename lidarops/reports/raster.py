@@ -1,4 +1,4 @@
-"""Signal products as images small enough to draw, read in blocks of bounded memory."""
+"""Signals and backscatter as images small enough to draw, read in blocks of bounded memory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.C
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """A signal product reduced to block means over time and range.
+    """A quantity of a product reduced to block means over time and range.
 
     Sums are kept, not means, so that rows can be merged further without loss.
     """
@@ -48,7 +48,7 @@ class Raster:
     edges: Floats
     """(row + 1,) Edges of the rows along range, m."""
     total: Sums
-    """(column, row) Sum of the range-corrected signal over gates that are not rejected."""
+    """(column, row) Sum of the quantity over gates that are not rejected."""
     variance: Sums
     """(column, row) Variance of that sum."""
     used: Sums
@@ -65,6 +65,8 @@ class Raster:
     """(column,) Mean."""
     background_error: Floats
     """(column,) Standard error of that mean."""
+    clouds: Floats
+    """(column,) Range of the lowest cloud base, m; NaN where there is none."""
     units: str
     background_units: str
     bits: Quality
@@ -116,6 +118,7 @@ class Raster:
             profiles=self.profiles,
             background=self.background,
             background_error=self.background_error,
+            clouds=self.clouds,
             units=self.units,
             background_units=self.background_units,
             bits=self.bits,
@@ -123,13 +126,15 @@ class Raster:
         )
 
 
-def read_raster(product: xr.Dataset, *, profiles: int = 0) -> Raster:
-    """Reduce one signal product to block means.
+def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int = 0) -> Raster:
+    """Reduce one quantity of a product to block means.
 
     Parameters
     ----------
     product : Dataset
-        Kind ``signal``, dims (time, range); may be lazy: it is read block by block.
+        Dims (time, range); may be lazy: it is read block by block.
+    quantity : str, optional
+        A variable of the product that has a standard error.
     profiles : int, optional
         Profiles to a column; as many as give `COLUMNS` columns where 0. Columns never reach
         across a gap in time.
@@ -144,7 +149,7 @@ def read_raster(product: xr.Dataset, *, profiles: int = 0) -> Raster:
     ProductError
         Where a variable is missing or has other dims, or nothing was measured.
     """
-    _check(product)
+    _check(product, quantity)
     if not product.indexes["time"].is_monotonic_increasing:
         product = product.sortby("time")
     time = product["time"].values.astype("datetime64[ns]")
@@ -152,7 +157,7 @@ def read_raster(product: xr.Dataset, *, profiles: int = 0) -> Raster:
     size = profiles or -(-time.size // COLUMNS)
     columns = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(time)])
     rows = np.arange(0, span.size, -(-span.size // _READ_ROWS))
-    parts = list(_reduced(product, columns, rows))
+    parts = list(_reduced(product, quantity, columns, rows))
     background, background_error = _background(product, columns)
     start, stop = _column_edges(time, columns)
     return Raster(
@@ -168,7 +173,8 @@ def read_raster(product: xr.Dataset, *, profiles: int = 0) -> Raster:
         profiles=np.diff([*columns, time.size]),
         background=background,
         background_error=background_error,
-        units=str(product["signal"].attrs.get("units", "")),
+        clouds=_clouds(product, columns),
+        units=str(product[quantity].attrs.get("units", "")),
         background_units=str(product["background"].attrs.get("units", "")),
         bits=Quality(int(np.bitwise_or.reduce([part.bits for part in parts]))),
         altitude=_altitude(product, span),
@@ -186,7 +192,7 @@ class _Part:
 
 
 def _reduced(
-    product: xr.Dataset, columns: NDArray[np.intp], rows: NDArray[np.intp]
+    product: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
 ) -> Iterator[_Part]:
     gates = product.sizes["range"]
     edges = [*columns, product.sizes["time"]]
@@ -196,19 +202,21 @@ def _reduced(
         while last < columns.size and (edges[last + 1] - edges[first]) * gates * 8 <= _READ_BYTES:
             last += 1
         part = product.isel(time=slice(int(edges[first]), int(edges[last])))
-        yield _sums(part, columns[first:last] - edges[first], rows)
+        yield _sums(part, quantity, columns[first:last] - edges[first], rows)
         first = last
 
 
-def _sums(part: xr.Dataset, columns: NDArray[np.intp], rows: NDArray[np.intp]) -> _Part:
+def _sums(
+    part: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
+) -> _Part:
     def total(values: Floats | NDArray[np.bool_]) -> Sums:
         if values.dtype == np.bool_ and not values.any():
             return np.zeros((columns.size, rows.size), dtype=np.float32)
         by_row = np.add.reduceat(values.astype(np.float64, copy=False), rows, axis=1)
         return np.asarray(np.add.reduceat(by_row, columns, axis=0), dtype=np.float32)
 
-    signal = part["signal"].values.astype(np.float64)
-    error = part["signal_standard_error"].values.astype(np.float64)
+    signal = part[quantity].values.astype(np.float64)
+    error = part[f"{quantity}_standard_error"].values.astype(np.float64)
     flag = _flags(part)
     rejected = (flag & _REJECTED) != 0
     good = np.isfinite(signal) & ~rejected & ((flag & int(Quality.INPUT_MISSING)) == 0)
@@ -241,6 +249,14 @@ def _background(product: xr.Dataset, columns: NDArray[np.intp]) -> tuple[Floats,
     return total / some + none, np.sqrt(variance) / some + none
 
 
+def _clouds(product: xr.Dataset, columns: NDArray[np.intp]) -> Floats:
+    if "cloud_base_range" not in product:
+        return np.full(columns.size, np.nan)
+    base = product["cloud_base_range"].values.astype(np.float64)
+    lowest = np.minimum.reduceat(np.where(np.isfinite(base), base, np.inf), columns)
+    return np.where(np.isfinite(lowest), lowest, np.nan)
+
+
 def _column_edges(time: Times, columns: NDArray[np.intp]) -> tuple[Times, Times]:
     """Let neighbouring columns touch, and give the last before a gap its usual width."""
     half = usual_step(time) / 2
@@ -269,13 +285,13 @@ def _altitude(product: xr.Dataset, span: Floats) -> tuple[float, float] | None:
     return float(values[0] - slope * span[0]), float(slope)
 
 
-def _check(product: xr.Dataset) -> None:
+def _check(product: xr.Dataset, quantity: str) -> None:
     both = ("time", "range")
-    names = ("signal", "signal_standard_error", "quality_flag")
+    names = (quantity, f"{quantity}_standard_error", "quality_flag")
     along_time = dict.fromkeys(("time", "background", "background_standard_error"), ("time",))
     require(product, along_time | {"range": ("range",)} | dict.fromkeys(names, both))
     if product.sizes["time"] < 1 or product.sizes["range"] < 2:
-        raise ProductError("holds no profile of at least 2 gates", field="signal")
+        raise ProductError("holds no profile of at least 2 gates", field=quantity)
 
 
 def share_with_care(rasters: Sequence[Raster]) -> float:

@@ -227,7 +227,7 @@ def _solve_profile(
 def _all_alike(variance: Array) -> bool:
     """Whether all bins are noisy, or none is: a variance of 0 among others says nothing."""
     noisy = variance[0] > 0.0
-    for value in variance:
+    for value in variance:  # noqa: SIM110 - compiled
         if not (value > 0.0 if noisy else value == 0.0):
             return False
     return True

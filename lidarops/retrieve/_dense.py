@@ -17,8 +17,9 @@ FEWEST_BINS: Final = 32
 """Below, the direct fit is as fast, and a basis of 11 shapes is most of the profile."""
 DEFAULT_SIZE: Final = 11
 FAST_SIZE: Final = 7
-THINNEST: Final = 0.008
-"""Length over first range, below which the shapes are straight lines to the digits of a table."""
+THINNEST: Final = 0.15
+"""Length over first range, below which shapes are so nearly straight lines that the cells of a
+table are too coarse for them."""
 _UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
 
 

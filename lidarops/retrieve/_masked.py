@@ -69,6 +69,8 @@ _DEEPEST: Final = 0.5
 """Optical depth that may be missing there."""
 CONVERGED: Final = 1e-7
 """Size of a step, over extinction, whose square is nothing: no other follows."""
+CLOSE: Final = 1e-3
+"""Size of the step before it: where steps fall as their squares do, none is so small at once."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 _finding = numba.njit(
@@ -446,16 +448,20 @@ def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bo
     before, sums = after, (0.0,) * 9
     arrays = g.x.ctypes.data, s.w.ctypes.data, s.z.ctypes.data, g.envelope.ctypes.data
     steps = g.x.size // LANES
-    moved = math.inf
+    moved, settled = math.inf, False
     for k in range(MOST_PASSES):
         # The first steps may be small by chance: they start from the amplitude of the node.
-        if k > 2 and moved < CONVERGED * (abs(after.tau) + g.scale):
+        if k > 2 and settled:
             break
-        before = after
+        before, last = after, moved
         e1, e4 = _decays(g, before.tau)
         sums = step_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
         after = _step(before, sums, whole, bounds)
         moved = abs(after.tau - before.tau)
+        size = abs(after.tau) + g.scale
+        # A step about a centre that lies nowhere is small whatever is left to go.
+        strayed = abs(after.centre - before.centre) > 0.1 * (1.0 + abs(after.centre))
+        settled = moved < CONVERGED * size and last < CLOSE * size and not strayed
     _describe(g, before, after, sums, whole, row)
     e1, e4 = _decays(g, before.tau)
     bent = bend_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
@@ -472,9 +478,7 @@ def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bo
     # Seen from far behind the start of the section, shapes are too much alike for these sums.
     if g.x[first] > _LATEST or after.tau * g.x[first] > _DEEPEST:
         return False
-    return moved < CONVERGED * (abs(after.tau) + g.scale) and math.isfinite(
-        row[EXTINCTION_VARIANCE] + row[MISFIT] + row[TREND]
-    )
+    return settled and math.isfinite(row[EXTINCTION_VARIANCE] + row[MISFIT] + row[TREND])
 
 
 @_summing

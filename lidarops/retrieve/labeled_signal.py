@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import xarray as xr
 
 from lidarops.records import DetectionMode
 from lidarops.retrieve import signal
+from lidarops.retrieve.dark import DarkProfile
+from lidarops.retrieve.dark import profile as dark_profile
 from lidarops.retrieve.signal import Signal
 
 _PARTS = ("power", "variance", "quality")
@@ -22,7 +25,7 @@ def condition(
     *,
     dead_time: float | None = None,
     noise_variance: float | None = None,
-    dark: xr.Dataset | None = None,
+    dark: Dark | None = None,
     range_offset: float = 0.0,
     full_overlap_range: float = 0.0,
 ) -> xr.Dataset:
@@ -38,8 +41,8 @@ def condition(
         s; photon counting only.
     noise_variance : float, optional
         mV^2; analog only.
-    dark : xr.Dataset, optional
-        From `dark_mean`; analog only.
+    dark : Dark, optional
+        From `dark_of`; analog only.
     range_offset : float
         m, added to the range of every bin.
     full_overlap_range : float
@@ -70,10 +73,8 @@ def condition(
         inputs.append(archive[f"{channel}_input_range"])
         settings |= {"adc_bits": counts.attrs["adc_bits"], "noise_variance": noise_variance}
         if dark is not None:
-            settings |= {
-                "dark": dark["mean"].to_numpy(),
-                "dark_variance": dark["variance"].to_numpy(),
-            }
+            inputs.append(archive["time"].astype(np.int64).drop_vars(archive["time"].coords))
+            settings["dark"] = dark
     parts = xr.apply_ufunc(
         _photon if photon else _analog,
         *inputs,
@@ -91,8 +92,27 @@ def condition(
     return result
 
 
-def dark_mean(archive: xr.Dataset, channel: str) -> xr.Dataset:
-    """Average the dark files of one analog channel.
+@dataclass(frozen=True, slots=True)
+class Dark:
+    """The dark signals of one analog channel, and how they serve a profile."""
+
+    signals: npt.NDArray[np.float64]
+    """(dark, range), mV."""
+    times: npt.NDArray[np.datetime64]
+    """(dark,)"""
+    method: str
+
+    def at(self, times: npt.NDArray[np.datetime64]) -> DarkProfile:
+        """Return dark signal and variance at times; see `lidarops.retrieve.dark.profile`."""
+        return dark_profile(self.signals, self.times, times, method=self.method)
+
+    def variance(self, times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.float64]:
+        """Return the variance of the dark signal at times, (time, range), mV2."""
+        return self.at(times).variance
+
+
+def dark_of(archive: xr.Dataset, channel: str, *, method: str) -> Dark:
+    """Read the dark files of one analog channel.
 
     Parameters
     ----------
@@ -100,15 +120,16 @@ def dark_mean(archive: xr.Dataset, channel: str) -> xr.Dataset:
         The dark files, as `lidarops.open_archive(..., mask_and_scale=False)` gives them.
     channel : str
         Name of the channel.
+    method : {"nearest", "interpolated"}
+        See `lidarops.retrieve.dark.profile`.
 
     Returns
     -------
-    xr.Dataset
-        ``mean`` (mV) and ``variance`` of the mean (mV2) over range, in memory.
+    Dark
+        In memory.
     """
     power = condition(archive, channel, noise_variance=0.0)["power"]
-    mean, variance = signal.dark_mean(power.to_numpy())
-    return xr.Dataset({"mean": ("range", mean), "variance": ("range", variance)})
+    return Dark(power.to_numpy(), archive["time"].to_numpy(), method)
 
 
 def range_corrected(
@@ -148,9 +169,27 @@ _Block = npt.NDArray[Any]
 
 
 def _analog(
-    counts: _Block, shots: _Block, input_range: _Block, **settings: Any
+    counts: _Block,
+    shots: _Block,
+    input_range: _Block,
+    times: _Block | None = None,
+    *,
+    dark: Dark | None = None,
+    **settings: Any,
 ) -> tuple[_Block, _Block, _Block]:
-    return _tuple(signal.analog(counts, shots, input_range=input_range, **settings))
+    if dark is None or times is None:
+        return _tuple(signal.analog(counts, shots, input_range=input_range, **settings))
+    found = dark.at(times.astype("datetime64[ns]"))
+    return _tuple(
+        signal.analog(
+            counts,
+            shots,
+            input_range=input_range,
+            dark=found.dark,
+            dark_variance=found.variance,
+            **settings,
+        )
+    )
 
 
 def _photon(counts: _Block, shots: _Block, **settings: Any) -> tuple[_Block, _Block, _Block]:
@@ -170,10 +209,11 @@ def _range_corrected(
     range: _Block,  # noqa: A002
 ) -> tuple[_Block, _Block]:
     result = signal.range_corrected(
-        Signal(power, variance, np.zeros(power.shape, np.int32)),
+        Signal(power, variance, np.empty(0, np.int32)),
         range,
         background=background,
         background_variance=error**2,
+        dtype=np.float32,
     )
     # The noise is far above the 24 bits of float32, and a day of profiles fits in memory.
-    return result.power.astype(np.float32), np.sqrt(result.variance).astype(np.float32)
+    return result.power, np.sqrt(result.variance, out=result.variance)

@@ -1,12 +1,15 @@
 """From raw counts to a clean signal with known noise: arrays in, arrays out.
 
 The last axis is range, the one before it time. Signals are in mV (analog) and MHz (photon
-counting), as the field has them; everything else is SI.
+counting), as the field has them; everything else is SI. Any layout, byte order and type of
+integers or floats is taken; masked entries are missing. A profile gives the same bits whatever
+profiles come with it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,34 +17,45 @@ import numpy.typing as npt
 from lidarops.constants import DEFAULT_DEAD_TIME, LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.retrieve import _inputs
+from lidarops.retrieve import _signal_kernels as kernels
+from lidarops.retrieve._frozen import frozen
+from lidarops.retrieve._inputs import Floats
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
 PILE_UP_CORRECTION = 0.1
 """Relative dead-time correction above which `Quality.PILE_UP` is raised."""
+PILE_UP_LEFT = 0.01
+"""The same where no dead time is known, so that nothing is corrected."""
+NEAR_FULL_SCALE = 0.5
+"""Share of full scale from which on a bin is looked at for shots that were clipped."""
+CLIPPING = 3.5
+"""Standard deviations of a shot below full scale within which clipping shifts a mean: there by
+6e-5 of that deviation."""
 PARALYSIS = 0.5
 """Measured rate times dead time above which a rate cannot be corrected (`Quality.SATURATED`)."""
 NOISE_WINDOW = 0.1
 """Half-width, relative to range, of the window in which noise is smoothed."""
 WEIGHT_WINDOW = 0.3
 """The same for the weights of the noise model."""
-MIN_NOISE_BINS = 16
-"""Smallest half-width of such a window in bins."""
+MIN_NOISE_BINS = kernels.BLOCK
+"""Smallest half-width of such a window in bins: 16."""
 LEAK = 0.05
 """Largest share of the noise that the fall of the signal may fake in a third difference."""
 
-_EXTREMES = (np.iinfo(np.int32).min, -np.iinfo(np.int32).max, np.iinfo(np.int32).max)
-_UNUSABLE = int(Quality.INPUT_MISSING | Quality.SATURATED)
+_Number = TypeVar("_Number", bound=np.generic)
+_COUNT_LIMITS = np.iinfo(np.int32)
 
 
 @dataclass(frozen=True, slots=True)
 class Signal:
     """A signal with the variance of its noise and its quality, all of one shape."""
 
-    power: Array
+    power: Floats
     """mV or MHz; NaN where `quality` holds INPUT_MISSING or SATURATED."""
-    variance: Array
+    variance: Floats
     """Of the noise, in the square of the signal's unit."""
     quality: Flags
     """Bits of `lidarops.flags.Quality`."""
@@ -64,9 +78,10 @@ def analog(
     .. math:: U = \frac{n \cdot 1000\, U_{max}}{N \, 2^{b}} - D
 
     with counts :math:`n`, shots :math:`N`, bits :math:`b`, input range :math:`U_{max}` in V and
-    dark signal :math:`D` in mV. A bin at full scale, :math:`n \ge N (2^b - 1)`, is SATURATED; a
-    bin at an extreme of the integer type, or of a profile without shots or of zeros alone, is
-    INPUT_MISSING.
+    dark signal :math:`D` in mV. A bin at full scale, :math:`n \ge N (2^b - 1)`, is SATURATED, and
+    one so near to it that single shots reached it: within 3.5 standard deviations of a shot. A
+    bin at an extreme of the integer type, or of a profile without shots or of zeros alone, or
+    without a finite input range or dark signal, is INPUT_MISSING.
 
     Parameters
     ----------
@@ -78,8 +93,9 @@ def analog(
     adc_bits : int
     input_range : (..., time) float
         V.
-    dark, dark_variance : (range,) float, optional
-        Mean of the dark files in mV, and the variance of that mean in mV^2.
+    dark, dark_variance : (range,) or (..., time, range) float, optional
+        Mean of the dark files in mV, and the variance of that mean in mV^2; one for all profiles,
+        or one for each.
     noise_variance : float, optional
         mV^2, of one profile; estimated from the profile (`difference_variance`) where absent.
     full_overlap_range : float
@@ -90,28 +106,73 @@ def analog(
     Signal
         In mV.
 
+    Raises
+    ------
+    RetrievalInputError
+        For counts that are no 32-bit integers, shapes that do not fit, a range that is not finite
+        or has a bin twice, a noise variance that is negative or not finite.
+
     References
     ----------
     licel2023
     """
-    fired = np.asarray(shots, dtype=np.float64)[..., np.newaxis]
-    quality = _raw_quality(counts, fired, range, full_overlap_range)
-    quality[counts >= fired * (2.0**adc_bits - 1.0)] |= np.int32(Quality.SATURATED)
+    grid = _grid(range)
+    summed = _counts(counts, grid, shots)
+    leading = summed.shape[:-1]
+    fired = _per_profile(shots, "shots", leading)
     with np.errstate(divide="ignore", invalid="ignore"):
-        step = np.asarray(input_range)[..., np.newaxis] * 1000.0 / (fired * 2.0**adc_bits)
-        power: Array = counts * step
-    if dark is not None:
-        power -= dark
-    power[(quality & _UNUSABLE) != 0] = np.nan
-    if noise_variance is None:
-        variance = difference_variance(power, range)
-    else:
-        variance = np.full(power.shape, noise_variance)
-        if dark_variance is not None:
-            variance += dark_variance
+        step = _per_profile(input_range, "input_range", leading) * 1000.0 / (fired * 2.0**adc_bits)
+    power, quality = np.empty(summed.shape), np.empty(summed.shape, np.int32)
+    kernels.voltage_profiles(
+        frozen(_rows(summed)),
+        frozen(fired),
+        frozen(step),
+        frozen(fired * (2.0**adc_bits - 1.0)),
+        frozen(_per_bin(dark, "dark", summed.shape)),
+        _overlap_bits(grid, full_overlap_range),
+        _rows(power),
+        _rows(quality),
+    )
     # Rounding to whole counts is noise too, and all there is where a signal stands still.
-    variance = np.maximum(variance, step**2 / 12.0)
+    rounding = step**2 / 12.0
+    top = fired * (2.0**adc_bits - 1.0)
+    if noise_variance is None:
+        variance = _estimated_variance(power, grid, rounding)
+        _flag_clipped(power, quality, _Scale(summed, step, top, fired), variance)
+        return Signal(power, variance, quality)
+    _refuse_unless(
+        0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2"
+    )
+    known = noise_variance + _per_bin(dark_variance, "dark_variance", summed.shape)
+    variance = np.maximum(known, rounding[:, np.newaxis]).reshape(power.shape)
+    _flag_clipped(power, quality, _Scale(summed, step, top, fired), variance)
     return Signal(power, variance, quality)
+
+
+class _Scale(NamedTuple):
+    """Summed counts of profiles, and what they are counted against."""
+
+    counts: npt.NDArray[np.int32]
+    """(..., time, range)"""
+    step: Array
+    """(profile,), mV of the mean for one count of the sum."""
+    top: Array
+    """(profile,), counts at full scale."""
+    shots: Array
+    """(profile,)"""
+
+
+def _flag_clipped(power: Array, quality: Flags, scale: _Scale, variance: Array) -> None:
+    """Mark the bins of which some shots reached full scale though their mean did not."""
+    rows, noise = _rows(scale.counts), _rows(variance)
+    fired = (scale.shots > 0)[:, np.newaxis]
+    profile, bins = np.nonzero(fired & (rows > NEAR_FULL_SCALE * scale.top[:, np.newaxis]))
+    one_shot = np.sqrt(noise[profile, bins] * scale.shots[profile])
+    room = (scale.top[profile] - rows[profile, bins]) * scale.step[profile]
+    clipped = room < CLIPPING * one_shot
+    where = profile[clipped], bins[clipped]
+    _rows(power)[where] = np.nan
+    _rows(quality)[where] |= np.int32(Quality.SATURATED)
 
 
 def photon(
@@ -133,8 +194,8 @@ def photon(
     (renewal statistics: :math:`\mathrm{var}(n) = n (1 - m\tau)^2`). The variance is evaluated on
     the rate smoothed over +- 10 % of range, so that the weights made of it do not follow the
     noise of the single bin. PILE_UP where the correction exceeds 10 %, SATURATED where
-    :math:`m \tau > 0.5`; both are judged with 4 ns where no dead time is known, and then nothing
-    is corrected.
+    :math:`m \tau > 0.5`. Where no dead time is known nothing is corrected; both are judged with
+    4 ns then, and PILE_UP is raised where 1 % is left uncorrected.
 
     Parameters
     ----------
@@ -155,85 +216,178 @@ def photon(
     Signal
         In MHz.
 
+    Raises
+    ------
+    RetrievalInputError
+        For counts that are no 32-bit integers, shapes that do not fit, a range that is not finite
+        or has a bin twice, a bin width or dead time that cannot be right.
+
     References
     ----------
     licel2023
     """
-    fired = np.asarray(shots, dtype=np.float64)[..., np.newaxis]
-    quality = _raw_quality(counts, fired, range, full_overlap_range)
-    quality[counts < 0] |= np.int32(Quality.INPUT_MISSING)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        exposure = fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)
-        rate: Array = counts / exposure
-    load = rate * ((dead_time or DEFAULT_DEAD_TIME) * 1e6)
-    with np.errstate(invalid="ignore"):
-        quality[load > PARALYSIS] |= np.int32(Quality.SATURATED)
-        quality[load / (1.0 - np.minimum(load, PARALYSIS)) > PILE_UP_CORRECTION] |= np.int32(
-            Quality.PILE_UP
-        )
-    bad = (quality & _UNUSABLE) != 0
-    rate[bad] = np.nan
-    live = np.ones_like(rate) if dead_time is None else 1.0 - rate * (dead_time * 1e6)
-    power = rate / live
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # A window without a single count has a rate below one count, not a certain zero.
-        floor = 1.0 / (exposure * _window_bins(power, range))
-        expected = np.maximum(smooth(power, range), floor)
-        variance = expected / (exposure * smooth(live, range))
+    grid = _grid(range)
+    summed = _counts(counts, grid, shots)
+    leading = summed.shape[:-1]
+    fired = _per_profile(shots, "shots", leading)
+    _refuse_unless(0.0 < bin_width < np.inf, bin_width, "bin_width", "a positive width in m")
+    dead = 0.0 if dead_time is None else dead_time
+    _refuse_unless(0.0 <= dead < np.inf, dead, "dead_time", "a time in s")
+    power, variance = np.empty(summed.shape), np.empty(summed.shape)
+    quality = np.empty(summed.shape, np.int32)
+    kernels.photon_profiles(
+        frozen(_rows(summed)),
+        frozen(fired),
+        frozen(fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)),
+        kernels.Counter(
+            dead_time=dead * 1e6,
+            judged=(dead or DEFAULT_DEAD_TIME) * 1e6,
+            paralysis=PARALYSIS,
+            pile_up=PILE_UP_LEFT if dead_time is None else PILE_UP_CORRECTION,
+        ),
+        _overlap_bits(grid, full_overlap_range),
+        _windows(grid, NOISE_WINDOW),
+        kernels.scratch(grid.size),
+        _rows(power),
+        _rows(variance),
+        _rows(quality),
+    )
     return Signal(power, variance, quality)
 
 
-def _raw_quality(
-    counts: npt.NDArray[np.int32],
-    shots: Array,
-    range: Array,  # noqa: A002 - the field's word
-    full_overlap_range: float,
-) -> Flags:
-    if counts.shape[-1] != range.shape[-1] or counts.shape[:-1] != shots.shape[:-1]:
+def _refuse_unless(good: bool, value: float, name: str, wanted: str) -> None:  # noqa: FBT001
+    if not good:
+        raise RetrievalInputError(f"is {value}", field=name, remedy=f"give {wanted}")
+
+
+def _grid(range: npt.ArrayLike) -> Array:  # noqa: A002 - the field's word
+    grid = _inputs.real_array(range, "range").astype(np.float64)
+    if grid.ndim != 1 or grid.size == 0:
         raise RetrievalInputError(
-            f"counts {counts.shape}, shots {shots.shape[:-1]} and range {range.shape} do not fit",
+            f"has the shape {grid.shape}", field="range", remedy="give one value in m per bin"
+        )
+    if not np.isfinite(grid).all() or not np.diff(grid).all():
+        raise RetrievalInputError(
+            "is not finite, or two bins have the same", field="range", remedy="give centres in m"
+        )
+    return grid
+
+
+def _counts(counts: npt.ArrayLike, grid: Array, shots: npt.ArrayLike) -> npt.NDArray[np.int32]:
+    """Return counts as they are, but of the one type that the kernels know."""
+    if isinstance(counts, np.ma.MaskedArray):
+        masked = np.ma.getmaskarray(counts)
+        counts = np.where(masked, _COUNT_LIMITS.min, counts.data.astype(np.int64))
+    array = np.asarray(counts)
+    if array.shape[-1:] != grid.shape or array.shape[:-1] != np.shape(shots):
+        raise RetrievalInputError(
+            f"counts {array.shape}, shots {np.shape(shots)} and range {grid.shape} do not fit",
             field="counts",
             remedy="counts are (..., time, range), shots (..., time), range (range,)",
         )
-    quality = np.zeros(counts.shape, dtype=np.int32)
-    # A recorder that is off writes zeros; light and electronics never do over a whole profile.
-    dead = ~counts.any(axis=-1, keepdims=True)
-    missing = np.isin(counts, _EXTREMES) | (shots <= 0) | dead
-    quality[missing] |= np.int32(Quality.INPUT_MISSING)
-    quality[..., range < full_overlap_range] |= np.int32(Quality.INCOMPLETE_OVERLAP)
-    return quality
+    # Other integers pass where no count is too large.
+    if not np.can_cast(array.dtype, np.int32) and not (
+        array.dtype.kind in "iu" and np.array_equal(array, array.astype(np.int32))
+    ):
+        raise RetrievalInputError(
+            f"holds {array.dtype} that is no 32-bit count",
+            field="counts",
+            remedy="open the archive with mask_and_scale=False",
+        )
+    return np.require(array, np.int32, "A")
 
 
-def _windows(
-    range: Array,  # noqa: A002 - the field's word
-    window: float,
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Return first and past-the-last bin of the smoothing window of each bin."""
-    index = np.arange(range.size)
-    spacing = float(np.min(np.abs(np.diff(range)))) if range.size > 1 else 1.0
-    half = np.maximum(np.abs(range) * (window / spacing), MIN_NOISE_BINS).astype(np.intp)
+def _per_profile(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
+    """Return one value for every profile, flat."""
+    array = np.require(_inputs.real_array(values, name), np.float64, "A")
+    try:
+        return np.broadcast_to(array, leading).reshape(-1)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, which does not broadcast to the shape {leading} of the"
+            " profiles",
+            field=name,
+        ) from None
+
+
+def _per_bin(values: npt.ArrayLike | None, name: str, shape: tuple[int, ...]) -> Array:
+    """Return one value for every bin, (profile or 1, bin); zeros for None."""
+    if values is None:
+        return np.zeros((1, shape[-1]))
+    array = np.require(_inputs.real_array(values, name), np.float64, "A")
+    if array.shape not in (shape, shape[-1:]):
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, the counts {shape}",
+            field=name,
+            remedy="give it over range, or over all axes of the counts",
+        )
+    return _rows(array)
+
+
+def _profiles(values: npt.ArrayLike, name: str, bins: int) -> Array:
+    array = _inputs.real_array(values, name)
+    if array.shape[-1:] != (bins,):
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, but range has {bins} bins",
+            field=name,
+            remedy="the last axis is range",
+        )
+    return np.require(array, np.float64, "A")
+
+
+def _rows(array: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
+    """Return an array as (profile, bin)."""
+    return array.reshape(int(np.prod(array.shape[:-1], dtype=np.int64)), array.shape[-1])
+
+
+def _overlap_bits(grid: Array, full_overlap_range: float) -> Flags:
+    _refuse_unless(
+        full_overlap_range < np.inf, full_overlap_range, "full_overlap_range", "a range in m"
+    )
+    near = grid < full_overlap_range
+    return frozen(np.where(near, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0)))
+
+
+def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kernels.Windows:
+    """Return the smoothing window of each bin; `ends` are bins that never hold a value."""
+    size = grid.size
+    index = np.arange(size)
+    spacing = float(np.min(np.abs(np.diff(grid)))) if size > 1 else 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = np.nan_to_num(np.abs(grid) * (window / spacing))
+    half = np.clip(reach, MIN_NOISE_BINS, max(size, MIN_NOISE_BINS)).astype(np.intp)
     # Symmetric up to the ends, so that a steep signal is not smoothed to one side.
-    half = np.minimum(half, np.maximum(np.minimum(index, range.size - 1 - index), MIN_NOISE_BINS))
-    return np.maximum(index - half, 0), np.minimum(index + half + 1, range.size)
+    half = np.minimum(half, np.maximum(np.minimum(index, size - 1 - index), MIN_NOISE_BINS))
+    first, past = np.maximum(index - half, 0), np.minimum(index + half + 1, size)
+    bins = np.minimum(past, size - ends[1]) - np.maximum(first, ends[0])
+    past[past == size] = -(-size // kernels.BLOCK) * kernels.BLOCK
+    return kernels.Windows(
+        frozen(first.astype(np.uint32)),
+        frozen(past.astype(np.uint32)),
+        frozen(np.maximum(bins, 0).astype(np.float64)),
+    )
 
 
-def _window_sums(
-    values: Array,
-    range: Array,  # noqa: A002 - the field's word
-    window: float = NOISE_WINDOW,
-) -> Array:
-    first, past = _windows(range, window)
-    sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
-    total: Array = sums[..., past] - sums[..., first]
-    return total
+def _noise(grid: Array) -> kernels.Noise:
+    spacing = np.abs(np.gradient(grid)) if grid.size > 1 else np.ones(1)
+    with np.errstate(divide="ignore"):
+        # The third difference of R^-2 is 24 (h / R)^3 of the signal.
+        leak = 24.0 * (spacing / grid) ** 3 / np.sqrt(20.0 * LEAK)
+    return kernels.Noise(
+        narrow=_windows(grid, NOISE_WINDOW),
+        # A third difference needs a bin before and two behind.
+        wide=_windows(grid, WEIGHT_WINDOW, ends=(1, 2)),
+        leak=frozen(leak),
+    )
 
 
-def _window_bins(
-    values: Array,
-    range: Array,  # noqa: A002 - the field's word
-    window: float = NOISE_WINDOW,
-) -> Array:
-    return _window_sums(np.isfinite(values).astype(np.float64), range, window)
+def _estimated_variance(power: Array, grid: Array, least: Array) -> Array:
+    rows, variance = _rows(power), np.empty(power.shape)
+    each = np.broadcast_to(least, rows.shape[:1])
+    kernels.noise_profiles(
+        frozen(rows), _noise(grid), frozen(each), kernels.scratch(grid.size), _rows(variance)
+    )
+    return variance
 
 
 def smooth(
@@ -255,11 +409,22 @@ def smooth(
     Returns
     -------
     (..., range) float
-        NaN where the window holds no finite value.
+        NaN where the window holds no finite value. Good to some 20 roundings of the mean of
+        absolute values within the window, whatever the near range holds.
+
+    Raises
+    ------
+    RetrievalInputError
+        For shapes that do not fit, a range that is not finite or has a bin twice, a window that
+        is negative or not finite.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        sums = _window_sums(np.nan_to_num(values), range, window)
-        averages: Array = sums / _window_bins(values, range, window)
+    grid = _grid(range)
+    _refuse_unless(0.0 <= window < np.inf, window, "window", "a share of range")
+    rows = _profiles(values, "values", grid.size)
+    averages = np.empty(rows.shape)
+    kernels.smooth_profiles(
+        frozen(_rows(rows)), _windows(grid, window), kernels.scratch(grid.size), _rows(averages)
+    )
     return averages
 
 
@@ -288,76 +453,24 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
     -------
     (..., range) float
         In the square of the unit of `power`; NaN where no difference is finite.
+
+    Raises
+    ------
+    RetrievalInputError
+        For shapes that do not fit, a range that is not finite or has a bin twice.
     """
-    third = power[..., 3:] - 3.0 * power[..., 2:-1] + 3.0 * power[..., 1:-2] - power[..., :-3]
-    squares = np.full(power.shape, np.nan)
-    squares[..., 1:-2] = third**2 / 20.0
-    local = smooth(squares, range, window=WEIGHT_WINDOW)
-    mean = smooth(power, range)
-    spacing = np.abs(np.gradient(range)) if range.size > 1 else np.ones(1)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        # The third difference of R^-2 is 24 (h / R)^3 of the signal.
-        leak = (24.0 * (spacing / range) ** 3 * mean) ** 2 / 20.0
-        usable = np.isfinite(squares) & np.isfinite(mean) & (local > 0) & (leak < LEAK * local)
-        weight = np.where(usable, 1.0 / local**2, 0.0)
-        weight /= np.max(weight, axis=-1, keepdims=True)
-        a, b = _line(np.where(usable, mean, 0.0), np.where(usable, squares, 0.0), weight)
-        variance = a + b * np.maximum(mean, 0.0)
-    # Too few differences for a line, or a signal without noise: what there is, locally.
-    return np.where(np.isfinite(variance) & (variance > 0), variance, local)
-
-
-def _line(x: Array, y: Array, weight: Array) -> tuple[Array, Array]:
-    """Return intercept and slope of y over x, neither below zero; one pair a row."""
-    total = weight.sum(axis=-1, keepdims=True)
-    x_mean = (weight * x).sum(axis=-1, keepdims=True) / total
-    y_mean = (weight * y).sum(axis=-1, keepdims=True) / total
-    from_mean = x - x_mean
-    square = (weight * from_mean**2).sum(axis=-1, keepdims=True)
-    slope = (weight * from_mean * (y - y_mean)).sum(axis=-1, keepdims=True) / square
-    slope = np.where(slope > 0, slope, 0.0)
-    intercept = y_mean - slope * x_mean
-    # Through the origin, where the fit would have the noise vanish above zero light.
-    x_square = (weight * x**2).sum(axis=-1, keepdims=True)
-    through = (weight * x * y).sum(axis=-1, keepdims=True) / x_square
-    negative = intercept < 0
-    return np.where(negative, 0.0, intercept), np.where(negative, through, slope)
-
-
-def dark_mean(signals: Array) -> tuple[Array, Array]:
-    """Average dark profiles.
-
-    Parameters
-    ----------
-    signals : (time, range) float
-        mV; NaN is passed over.
-
-    Returns
-    -------
-    mean : (range,) float
-        mV, NaN where no profile is finite.
-    variance : (range,) float
-        Of that mean, from the scatter of the profiles; pooled over the bins where a bin has
-        fewer than two finite values.
-    """
-    finite = np.isfinite(signals)
-    count = finite.sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(finite, signals, 0.0).sum(axis=0) / count
-        residual = np.where(finite, signals - mean, 0.0)
-        scatter = (residual**2).sum(axis=0) / (count - 1)
-    known = count > 1
-    pooled = float(scatter[known].mean()) if known.any() else 0.0
-    scatter = np.where(known, scatter, pooled)
-    return np.where(count > 0, mean, np.nan), scatter / np.maximum(count, 1)
+    grid = _grid(range)
+    rows = _profiles(power, "power", grid.size)
+    return _estimated_variance(rows, grid, np.zeros(1))
 
 
 def range_corrected(
     signal: Signal,
     range: Array,  # noqa: A002 - the field's word
     *,
-    background: Array,
-    background_variance: Array,
+    background: npt.ArrayLike,
+    background_variance: npt.ArrayLike,
+    dtype: npt.DTypeLike = np.float64,
 ) -> Signal:
     r"""Subtract the background and multiply with the square of range.
 
@@ -371,13 +484,38 @@ def range_corrected(
         m.
     background, background_variance : (...) float
         In the unit of the signal and its square.
+    dtype : {float64, float32}
+        Of power and variance; the arithmetic is that of float64.
 
     Returns
     -------
     Signal
         In mV m2 or MHz m2. Negative values stay: clipping would bias every mean.
+
+    Raises
+    ------
+    RetrievalInputError
+        For shapes that do not fit, a range that is not finite or has a bin twice, another dtype.
     """
-    square = range**2
-    power = (signal.power - background[..., np.newaxis]) * square
-    variance = (signal.variance + background_variance[..., np.newaxis]) * square**2
-    return Signal(power, variance, signal.quality)
+    grid = _grid(range)
+    kind = np.dtype(dtype)
+    if kind not in (np.float32, np.float64):
+        raise RetrievalInputError(f"is {kind}", field="dtype", remedy="choose float32 or float64")
+    powers = _profiles(signal.power, "power", grid.size)
+    variances = _profiles(signal.variance, "variance", grid.size)
+    if variances.shape != powers.shape:
+        raise RetrievalInputError(
+            f"has the shape {variances.shape}, the power {powers.shape}", field="variance"
+        )
+    leading = powers.shape[:-1]
+    result = Signal(np.empty(powers.shape, kind), np.empty(powers.shape, kind), signal.quality)
+    kernels.range_corrected_profiles(
+        frozen(_rows(powers)),
+        frozen(_rows(variances)),
+        frozen(_per_profile(background, "background", leading)),
+        frozen(_per_profile(background_variance, "background_variance", leading)),
+        frozen(grid**2),
+        _rows(result.power),
+        _rows(result.variance),
+    )
+    return result

@@ -194,3 +194,20 @@ def test_campaigns_share_a_database(campaign: Campaign, store: Store) -> None:
     other = Store(campaign.catalog_url, "other")
     assert other.granules() == []
     other.close()
+
+
+def test_a_name_that_is_no_text_is_refused_and_the_rest_goes_on(
+    campaign: Campaign, store: Store
+) -> None:
+    root = _fill(campaign)
+    odd = os.fsencode(root / "coast") + b"/h\xff"
+    try:
+        with open(odd, "wb") as file:  # noqa: PTH123 - a Path holds no bytes
+            file.write(rawfiles.content(9))
+    except OSError:
+        pytest.skip("the file system takes no such name")
+    assert scan(campaign, store) == ScanSummary(7, 7, 0, 0, 0, 1)
+    (refused,) = store.granules(status=Status.REFUSED)
+    assert refused.path == "coast/h\\udcff"
+    assert "not UTF-8" in refused.reason
+    assert scan(campaign, store) == ScanSummary(7, 0, 0, 7, 0, 1)

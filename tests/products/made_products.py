@@ -41,6 +41,7 @@ def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> P
             Step("read", "photon_532o", {"wavelength": 5.32e-7}, "the product needs it"),
             Step("background", "photon_532o", {"range": [1e4, 1.2e4]}, "the last tenth"),
             Step("homogeneous", "photon_532o", {"method": "auto"}, "asked for"),
+            Step("elastic", "photon_532o", {"lidar_ratio": 50.0}, "asked for"),
             Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
         ),
         left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
@@ -156,4 +157,55 @@ def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     )
 
 
-MAKERS = {ProductKind.SIGNAL: signal, ProductKind.HOMOGENEOUS: homogeneous}
+def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
+    """An elastic retrieval, as `lidarops.retrieve.labeled_elastic.elastic` gives it."""
+    rng = np.random.default_rng(3)
+    dims = ("time", "range")
+    shape = (profiles, bins)
+    flags = np.zeros(shape, np.int32)
+    flags[:, :3] = Quality.INCOMPLETE_OVERLAP
+    flags[-1] |= np.int32(Quality.NO_REFERENCE)
+    flags[0, 5:] |= np.int32(Quality.CLOUD)
+    missing = (flags & int(Quality.INCOMPLETE_OVERLAP | Quality.NO_REFERENCE)) != 0
+    scales = {
+        "backscatter": 1e-6,
+        "extinction": 5e-5,
+        "scattering_ratio": 2.0,
+        "attenuated_backscatter": 2e-6,
+    }
+    gates = {}
+    for name, scale in scales.items():
+        gates[name] = rng.normal(scale, 0.1 * scale, shape)
+        gates[f"{name}_standard_error"] = np.full(shape, 0.1 * scale)
+    for cause in ("noise", "background", "reference", "lidar_ratio", "molecular"):
+        gates[f"backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
+    window = np.where(np.arange(profiles) < profiles - 1, 200.0, np.nan)
+    return xr.Dataset(
+        {
+            **{name: (dims, np.where(missing, np.nan, values)) for name, values in gates.items()},
+            "molecular_backscatter": ("range", np.linspace(1.5e-6, 1e-6, bins)),
+            "molecular_extinction": ("range", np.linspace(1.3e-5, 1e-5, bins)),
+            "lidar_ratio": ((), 50.0),
+            "lidar_ratio_standard_error": ((), 10.0),
+            "reference_bottom": ("time", window),
+            "reference_top": ("time", window + 50.0),
+            "cloud_base_range": ("time", np.where(np.arange(profiles) == 0, 40.0, np.nan)),
+            "background": ("time", rng.uniform(0.1, 2.0, profiles)),
+            "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
+            "glue_slope": ("time", np.full(profiles, 20.0)),
+            "glue_slope_standard_error": ("time", np.full(profiles, 0.1)),
+            "glue_bottom": ("time", np.full(profiles, 100.0)),
+            "glue_top": ("time", np.full(profiles, 150.0)),
+            "quality_flag": (dims, flags),
+            "profiles": ("time", np.full(profiles, 10, np.int32)),
+            "shots": ("time", np.full(profiles, 6000, np.int32)),
+        },
+        coords={**clock(profiles, **beam), "range": ("range", 7.5 * (np.arange(bins) + 0.5))},
+    )
+
+
+MAKERS = {
+    ProductKind.SIGNAL: signal,
+    ProductKind.HOMOGENEOUS: homogeneous,
+    ProductKind.ELASTIC: elastic,
+}

@@ -11,7 +11,8 @@ from compliance_checker.cfunits import Unit
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.table import LAYOUTS, PROVENANCE, Coverage, Row, attributes, station, units
+from lidarops.products.rows import PROVENANCE, Coverage, Row, attributes, station, units
+from lidarops.products.table import LAYOUTS
 from lidarops.records import DetectionMode, ProductKind
 
 ROWS = [
@@ -65,7 +66,11 @@ def test_every_unit_is_one_and_no_placeholder_is_left(
         Unit(found["units"].split(" since ")[0])
 
 
+_CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular")
+
+
 def test_what_has_no_standard_name_is_what_the_table_does_not_know():
+    gluing = {"glue_slope", "glue_slope_standard_error", "glue_bottom", "glue_top"}
     unnamed = {
         kind: {row.name for row in layout.variables if not row.standard_name}
         for kind, layout in LAYOUTS.items()
@@ -76,6 +81,19 @@ def test_what_has_no_standard_name_is_what_the_table_does_not_know():
             "signal_standard_error",
             "background",
             "background_standard_error",
+            *gluing,
+        },
+        ProductKind.ELASTIC: {
+            *(f"backscatter_error_{cause}" for cause in _CAUSES),
+            "molecular_backscatter",
+            "molecular_extinction",
+            "reference_bottom",
+            "reference_top",
+            "cloud_base_range",
+            "background",
+            "background_standard_error",
+            "profiles",
+            *gluing,
         },
         ProductKind.HOMOGENEOUS: {
             "extinction",

@@ -5,24 +5,28 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import shutil
 import signal as signals
 import stat
 import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import netCDF4
 import numpy as np
 import pytest
+import scipy.io
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 from made_products import MAKERS, context, homogeneous, signal
 
 from lidarops.errors import ProductError
 from lidarops.products import write as writer
 from lidarops.products.build import build
-from lidarops.products.write import CHUNK_BYTES, chunk_sizes, write, write_plain
+from lidarops.products.write import BULK_BYTES, CHUNK_BYTES, chunk_sizes, write, write_plain
 from lidarops.records import ProductKind
 
 HERE = Path(__file__).parent
@@ -61,6 +65,127 @@ def test_what_is_written_is_what_is_read(product: xr.Dataset, tmp_path: Path):
             assert set(stored[name].attrs) == set(variable.attrs)
         assert set(stored.attrs) == set(product.attrs)
         assert stored.attrs["institution"] == "Université d'Été"
+
+
+def of_noise(profiles: int = 299, bins: int = 2000) -> xr.Dataset:
+    """A signal product of several chunks, the last of them cut; its standard errors vary too."""
+    rng = np.random.default_rng(5)
+    data = signal(profiles, bins)
+    level = np.exp(-np.arange(bins) / 500) * rng.uniform(0.5, 2, (profiles, 1)) * 1e6
+    error = np.sqrt(level) * 10
+    found = build(
+        data.assign(
+            signal=data["signal"].copy(data=rng.normal(level, error)),
+            signal_standard_error=data["signal"].copy(
+                data=error * rng.normal(1, 0.05, error.shape)
+            ),
+        ),
+        context(ProductKind.SIGNAL),
+    )
+    assert found["signal"].nbytes > CHUNK_BYTES
+    return found
+
+
+def assert_stored(path: Path, expected: xr.Dataset) -> None:
+    """Compare bytes, as plain netCDF reads them."""
+    with netCDF4.Dataset(path) as file:
+        file.set_auto_mask(False)
+        file.set_auto_scale(False)
+        file.set_auto_chartostring(False)
+        assert list(file.variables) == [str(name) for name in expected.variables]
+        for name, variable in expected.variables.items():
+            assert file[name].shape == variable.shape, name
+            native = variable.values.astype(variable.dtype.newbyteorder("="))
+            assert file[name][...].tobytes() == native.tobytes(), name
+
+
+def test_large_variables_are_read_as_they_were_by_every_library(tmp_path: Path):
+    product = of_noise()
+    path = tmp_path / "product.nc"
+    write(product, path)
+    assert_stored(path, product)
+    with xr.open_dataset(path, decode_cf=False) as stored:
+        xr.testing.assert_equal(stored, product)
+    with h5py.File(path) as file:
+        for name, variable in product.variables.items():
+            assert file[name][...].tobytes() == variable.values.tobytes()
+
+
+@pytest.mark.skipif(shutil.which("nccopy") is None, reason="needs the netCDF utilities")
+def test_tools_of_another_netcdf_read_large_variables(tmp_path: Path):
+    product = of_noise()
+    write(product, tmp_path / "product.nc")
+    nccopy = [shutil.which("nccopy"), "-k", "classic"]
+    subprocess.run([*nccopy, tmp_path / "product.nc", tmp_path / "classic.nc"], check=True)
+    with scipy.io.netcdf_file(tmp_path / "classic.nc", mmap=False) as file:
+        assert file.dimensions["time"] is None
+        for name, variable in product.variables.items():
+            stored = file.variables[name].data
+            assert stored.astype(variable.dtype).tobytes() == variable.values.tobytes(), name
+
+
+def test_files_are_hardly_larger_than_netcdf_makes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    product = of_noise()
+    written = write(product, tmp_path / "product.nc")
+    monkeypatch.setattr(writer, "BULK_BYTES", math.inf)
+    assert written.size <= 1.05 * write(product, tmp_path / "plain.nc").size
+    assert_stored(tmp_path / "plain.nc", product)
+
+
+def test_a_file_may_be_continued(tmp_path: Path):
+    product = of_noise()
+    path = tmp_path / "product.nc"
+    write(product, path)
+    with netCDF4.Dataset(path, "a") as file:
+        file["time"][299:310] = 0.0
+        assert file["signal"].shape == (310, 2000)
+        # The rest of the last chunk lay in the file all the time.
+        assert file["signal"][299:].mask.all()
+        assert (file["quality_flag"][299:310].filled() == netCDF4.default_fillvals["i4"]).all()
+        file["signal"][305] = 1.0
+    with netCDF4.Dataset(path) as file:
+        np.testing.assert_array_equal(file["signal"][:299].data, product["signal"])
+        np.testing.assert_array_equal(file["signal"][305], 1.0)
+        assert file["signal"][306].mask.all()
+
+
+@settings(deadline=None, max_examples=25)
+@given(data=st.data())
+def test_arrays_of_any_type_layout_and_size_are_kept(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+):
+    dtype = data.draw(st.sampled_from(["<f4", ">f4", "<f8", ">f8", "<i4", ">i2", "i1", "S1"]))
+    rows = data.draw(st.integers(1, 3)) * BULK_BYTES // np.dtype(dtype).itemsize // 100
+    pattern = data.draw(npst.arrays(dtype, (7, 11)))
+    values = np.resize(pattern, (rows + data.draw(st.integers(0, 2)), 100))
+    if data.draw(st.booleans()):
+        values = np.asfortranarray(values)
+    values.setflags(write=False)
+    fill_value = {"_FillValue": values.dtype.type(5)} if values.dtype.kind != "S" else {}
+    dims = data.draw(st.permutations(["time", "range"]))
+    dataset = xr.Dataset({"x": (dims, values, fill_value), "y": 1.0})
+    dataset.encoding["unlimited_dims"] = data.draw(st.sampled_from([(), ("time",), ("range",)]))
+    path = tmp_path_factory.mktemp("any") / "any.nc"
+    write(dataset, path)
+    assert_stored(path, dataset)
+    assert write(dataset, path) == write(dataset.copy(deep=True), path)
+
+
+@pytest.mark.parametrize("name", ["time", "range", "сигнал", "x"])
+def test_large_variables_may_have_any_name(name: str, tmp_path: Path):
+    # A variable called like a dimension that is not its own has another name in HDF5.
+    variables = {
+        "x": xr.Variable(("time", "range"), np.ones((2, 2))),
+        name: xr.Variable("time", np.arange(BULK_BYTES, dtype="f8")[: 2 if name == "x" else None]),
+    }
+    variables["x"] = xr.Variable(("time", "range"), np.ones((variables[name].size, 2)))
+    dataset = xr.Dataset(variables)
+    dataset.encoding["unlimited_dims"] = ("time",)
+    write_plain(dataset, tmp_path / "any.nc")
+    write(dataset, tmp_path / "any.nc")
+    assert_stored(tmp_path / "any.nc", dataset)
 
 
 @pytest.mark.parametrize("kind", list(ProductKind))
@@ -137,41 +262,52 @@ def run(script: str, *arguments: str, **environment: str) -> subprocess.Complete
 SHA = """
 import sys
 from made_products import MAKERS, context
-from test_write import truth
+from test_write import of_noise, truth
 from lidarops.products.build import build
 from lidarops.products.write import write, write_plain
 for kind, maker in MAKERS.items():
     print(write(build(maker(zenith=[0, 1, 2, 3, 4]), context(kind)), sys.argv[1]).sha256)
+print(write(of_noise(), sys.argv[1]).sha256)
 print(write_plain(truth(), sys.argv[1]).sha256)
 """
 
 
 def test_bytes_are_equal_in_any_process_at_any_time(tmp_path: Path):
-    first = run(SHA, str(tmp_path / "a.nc"), PYTHONHASHSEED="1", TZ="Asia/Tokyo")
+    # MALLOC_PERTURB_ shows memory that goes into the file without having been set.
+    one = {"PYTHONHASHSEED": "1", "TZ": "Asia/Tokyo", "MALLOC_PERTURB_": "85"}
+    two = {"PYTHONHASHSEED": "2", "TZ": "UTC", "MALLOC_PERTURB_": "170"}
+    first = run(SHA, str(tmp_path / "a.nc"), **one)
     (tmp_path / "elsewhere").mkdir()
-    second = run(SHA, str(tmp_path / "elsewhere" / "b.nc"), PYTHONHASHSEED="2", TZ="UTC")
+    second = run(SHA, str(tmp_path / "elsewhere" / "b.nc"), **two)
     assert first.returncode == 0, first.stderr
     hashes = first.stdout.split()
-    assert len(set(hashes)) == 3
+    assert len(set(hashes)) == len(MAKERS) + 2
     assert hashes == second.stdout.split()
 
 
 THREADS = """
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from made_products import context, signal
-from lidarops.products.build import build
+from pathlib import Path
+import h5py
+from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
+from test_write import assert_stored, of_noise
 from lidarops.products.write import write
-from lidarops.records import ProductKind
-product = build(signal(40, 2000), context(ProductKind.SIGNAL))
+product = of_noise(150)
 def work(number):
-    return write(product, f"{sys.argv[1]}/{number}.nc").sha256
+    path = f"{sys.argv[1]}/{number}.nc"
+    sha256 = write(product, path).sha256
+    with NETCDF4_PYTHON_LOCK:
+        assert_stored(Path(path), product)
+        with h5py.File(path) as file:
+            assert (file["signal"][...] == product["signal"].values).all()
+    return sha256
 with ThreadPoolExecutor(4) as pool:
     print(len(set(pool.map(work, range(16)))))
 """
 
 
-def test_threads_may_write_at_once(tmp_path: Path):
+def test_threads_may_write_at_once_and_read_under_the_lock(tmp_path: Path):
     done = run(THREADS, str(tmp_path))
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.strip() == "1"
@@ -227,18 +363,19 @@ def test_a_killed_process_leaves_no_product(tmp_path: Path):
 
 FULL = """
 import resource, signal, sys
-from made_products import context, signal as make
+from test_write import of_noise
 from lidarops.errors import ProductError
-from lidarops.products.build import build
 from lidarops.products.write import write
-from lidarops.records import ProductKind
-product = build(make(50, 4000), context(ProductKind.SIGNAL))
+product = of_noise()
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, resource.RLIM_INFINITY))
-try:
-    write(product, sys.argv[1])
-except ProductError as error:
-    print(error)
+# Nothing; enough for some variables, for all but their data, for half of these; all.
+for room in (100, 10_000, 100_000, 1_000_000, resource.RLIM_INFINITY):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+    try:
+        write(product, sys.argv[1])
+        print("written")
+    except ProductError as error:
+        print(error)
 """
 
 
@@ -246,9 +383,13 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path):
     path = tmp_path / "product.nc"
     done = run(FULL, str(path))
     assert done.returncode == 0, done.stderr[-2000:]
-    assert str(path) in done.stdout
-    assert "disk has space" in done.stdout
-    assert list(tmp_path.iterdir()) == []
+    *full, last = done.stdout.splitlines()
+    assert len(full) == 4
+    for line in full:
+        assert str(path) in line
+        assert "disk has space" in line
+    assert last == "written"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_folder_that_cannot_be_is_an_error(product: xr.Dataset, tmp_path: Path):
@@ -294,6 +435,9 @@ def test_dask_arrays_are_refused(function, product: xr.Dataset, tmp_path: Path):
     [
         (np.array(["text"]), "NetCDF cannot hold"),
         (np.array(["2026-01-01"], "datetime64[ns]"), "NetCDF cannot hold"),
+        (np.ones(9999, np.float16), "NetCDF cannot hold"),
+        (np.array([b"text"]), "NetCDF cannot hold"),
+        (np.array([1j]), "NetCDF cannot hold"),
         (np.zeros(0), "empty"),
     ],
 )

@@ -125,3 +125,17 @@ def test_bits_do_not_depend_on_the_batch():
         part = solve(power[rows], r, variance=variance[rows])
         np.testing.assert_array_equal(part.extinction, whole.extinction[rows])
         np.testing.assert_array_equal(part.quality, whole.quality[rows])
+
+
+def test_a_step_that_is_small_by_chance_does_not_end_the_search():
+    r = np.linspace(704.7309, 869.1879, 225)
+    extinction = 0.0204685 / 164.457
+    shape = (r[0] / r) ** 2 * np.exp(-2.0 * extinction * (r - r[0]))
+    for seed in range(4):
+        noise = np.random.default_rng(seed).normal(size=(4000, r.size))
+        power = 1e6 + 54_205.0 * shape + noise
+        power[:, :35] = np.nan
+        found = solve(power, r, variance=1.0)
+        exact = solve(power, r, variance=1.0, method="direct")
+        off = np.abs(found.extinction - exact.extinction) / exact.extinction_standard_error
+        assert off.max() < 0.01

@@ -1,14 +1,18 @@
-"""Counts to signals: against formulas written out by hand and against Monte Carlo."""
+"""Counts to signals: by hand, by Monte Carlo, and against plain numpy and exact sums."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import oracle_signal
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.retrieve import _signal_kernels as kernels
 from lidarops.retrieve import homogeneous, signal
 
 RANGE = (np.arange(400) + 0.5) * 7.5
@@ -24,14 +28,41 @@ def test_analog_voltage_of_known_counts() -> None:
 
 def test_full_scale_and_integer_extremes_are_masked() -> None:
     counts = np.full((1, 400), 1000, np.int32)
-    counts[0, :4] = [600 * 4095, 600 * 4095 - 1, 2**31 - 1, -(2**31)]
-    result = signal.analog(counts, SHOTS, RANGE, adc_bits=12, input_range=np.array([0.5]))
+    counts[0, :4] = [600 * 4095, 600 * 4000, 2**31 - 1, -(2**31)]
+    result = signal.analog(
+        counts, SHOTS, RANGE, adc_bits=12, input_range=np.array([0.5]), noise_variance=1e-4
+    )
     assert result.quality[0, 0] == Quality.SATURATED
     assert result.quality[0, 1] == 0
     assert result.quality[0, 2] & Quality.INPUT_MISSING
     assert result.quality[0, 3] & Quality.INPUT_MISSING
     assert np.isnan(result.power[0, [0, 2, 3]]).all()
     assert np.isfinite(result.power[0, [1, 4]]).all()
+
+
+def test_a_mean_of_shots_of_which_some_were_clipped_is_masked() -> None:
+    rng = np.random.default_rng(8)
+    shots, top, spread = 400, 4095.0, 200.0
+    level = np.full(1200, 2000.0)
+    level[:400], level[400:800] = 3600.0, 3200.0
+    counts = np.zeros((1, level.size), np.int32)
+    for _ in range(shots):
+        shot = level + rng.normal(0.0, spread, level.size)
+        counts[0] += np.rint(np.clip(shot, 0.0, top)).astype(np.int32)
+    result = signal.analog(
+        counts,
+        np.array([shots]),
+        7.5 * np.arange(1.0, level.size + 1),
+        adc_bits=12,
+        input_range=np.array([0.5]),
+    )
+    # 2.5, 4.5 and 10 deviations of a shot below full scale.
+    for part, clipped in ((slice(420), True), (slice(420, 780), False), (slice(820, None), False)):
+        saturated = (result.quality[0, part] & Quality.SATURATED) != 0
+        assert saturated.mean() > 0.9 if clipped else not saturated.any()
+    step = 500.0 / 4096.0
+    bias = np.nanmean(result.power[0, 420:780]) / step - 3200.0
+    assert abs(bias) < 4.0 * spread / np.sqrt(shots * 360)
 
 
 def test_no_shots_is_missing_input_not_infinity() -> None:
@@ -138,29 +169,207 @@ def test_smoothing_keeps_constants_and_passes_over_nan() -> None:
     assert np.isnan(signal.smooth(np.full((1, 400), np.nan), RANGE)).all()
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_rows_do_not_depend_on_their_neighbours(seed: int) -> None:
+def _analog(counts, shots, range=RANGE, **settings):  # noqa: A002
+    volts = np.full(np.shape(shots), 0.5)
+    return signal.analog(counts, shots, range, adc_bits=12, input_range=volts, **settings)
+
+
+def _photon(counts, shots, range=RANGE, **settings):  # noqa: A002
+    return signal.photon(counts, shots, range, bin_width=7.5, **settings)
+
+
+def _assert_same_bits(one, other) -> None:
+    np.testing.assert_array_equal(one.power, other.power)
+    np.testing.assert_array_equal(one.variance, other.variance)
+    np.testing.assert_array_equal(one.quality, other.quality)
+
+
+def _damaged(counts, rng):
+    """Strike out bins, stretches of bins and whole profiles."""
+    counts = np.asarray(counts, np.int32)
+    counts[0, rng.integers(0, counts.shape[1], 9)] = 2**31 - 1
+    counts[1, 7:60] = -(2**31)
+    counts[2] = 0
+    counts[3] = 2**31 - 1
+    counts[4, rng.random(counts.shape[1]) < 0.6] = -(2**31) + 1
+    return counts
+
+
+def _light(range):  # noqa: A002
+    return (1000.0 / (range + 50.0)) ** 2 * np.exp(-2e-4 * range)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 7), dead_time=st.sampled_from([None, 3e-9])
+)
+def test_bits_depend_neither_on_neighbours_nor_on_order(seed, cut, dead_time) -> None:
     rng = np.random.default_rng(seed)
-    counts = rng.poisson(50, (5, 400)).astype(np.int32)
-    counts[2] = 2**31 - 1
-    whole = signal.photon(counts, np.full(5, 600), RANGE, bin_width=7.5, dead_time=3e-9)
-    for row in range(5):
-        alone = signal.photon(counts[row : row + 1], SHOTS, RANGE, bin_width=7.5, dead_time=3e-9)
-        np.testing.assert_array_equal(alone.power[0], whole.power[row])
-        np.testing.assert_array_equal(alone.variance[0], whole.variance[row])
+    counts = _damaged(rng.poisson(600 * 0.05 * (1 + 20 * _light(RANGE)), (7, 400)), rng)
+    shots = rng.integers(0, 4, 7) * 300
+    order = rng.permutation(7)
+    for convert in (_analog, lambda *all: _photon(*all, dead_time=dead_time)):
+        whole = convert(counts, shots, RANGE)
+        for rows in (slice(0, cut), slice(cut, 7), order):
+            part = convert(counts[rows], shots[rows], RANGE)
+            _assert_same_bits(
+                part,
+                signal.Signal(whole.power[rows], whole.variance[rows], whole.quality[rows]),
+            )
 
 
-def test_dark_mean_and_its_variance() -> None:
-    rng = np.random.default_rng(8)
-    profiles = 5.0 + rng.normal(0, 0.2, (50, 400))
-    profiles[3, 7] = np.nan
-    mean, variance = signal.dark_mean(profiles)
-    assert mean == pytest.approx(5.0, abs=0.15)
-    assert variance.mean() == pytest.approx(0.04 / 50, rel=0.05)
-    assert np.isfinite(mean).all()
-    single_mean, single_variance = signal.dark_mean(profiles[:1])
-    np.testing.assert_array_equal(single_mean, profiles[0])
-    assert (single_variance == 0).all()
+def _assert_agree(result, expected) -> None:
+    np.testing.assert_array_equal(result.power, expected.power)
+    np.testing.assert_array_equal(result.quality, expected.quality)
+    np.testing.assert_allclose(result.variance, expected.variance, rtol=1e-9, atol=0.0)
+
+
+@pytest.mark.parametrize("bins", [1, 2, 3, 4, 16, 17, 31, 33, 50, 1000, 4096])
+@pytest.mark.parametrize("offset", [0.0, -37.5, 450.0])
+def test_analog_agrees_with_plain_numpy(bins: int, offset: float) -> None:
+    rng = np.random.default_rng(bins)
+    distance = (np.arange(bins) + 0.5) * 7.5 + offset
+    volts = 2.0 + 60.0 * _light(np.abs(distance)) + rng.normal(0, 0.15, (8, bins))
+    counts = _damaged(np.minimum(volts * 600 * 4096 / 500, 600 * 4095), rng)
+    shots = np.array([600, 600, 600, 600, 600, 600, 0, 599])
+    volt = np.full(8, 0.5)
+    settings = {"adc_bits": 12, "full_overlap_range": 200.0}
+    for chosen in (settings, settings | {"dark": rng.normal(0, 0.1, bins)}):
+        _assert_agree(
+            signal.analog(counts, shots, distance, input_range=volt, **chosen),
+            oracle_signal.analog(counts, shots, distance, input_range=volt, **chosen),
+        )
+    known = settings | {"noise_variance": 1e-3, "dark_variance": rng.random(bins) * 1e-2}
+    _assert_agree(
+        signal.analog(counts, shots, distance, input_range=volt, **known),
+        oracle_signal.analog(counts, shots, distance, input_range=volt, **known),
+    )
+
+
+@pytest.mark.parametrize("bins", [1, 16, 17, 33, 1000, 4096])
+@pytest.mark.parametrize("dead_time", [None, 0.0, 2e-9, 4e-9])
+def test_photon_agrees_with_plain_numpy(bins: int, dead_time: float | None) -> None:
+    rng = np.random.default_rng(bins)
+    distance = (np.arange(bins) + 0.5) * 7.5 - 20.0
+    rate = 0.3 + 150.0 * _light(np.abs(distance))
+    counts = _damaged(rng.poisson(30.0 * rate / (1.0 + rate * 3e-3), (8, bins)), rng)
+    counts[5, 1:90:7] = -3
+    shots = np.array([600, 600, 600, 600, 600, 600, 0, 599])
+    settings = {"bin_width": 7.5, "dead_time": dead_time, "full_overlap_range": 200.0}
+    _assert_agree(
+        signal.photon(counts, shots, distance, **settings),
+        oracle_signal.photon(counts, shots, distance, **settings),
+    )
+
+
+@pytest.mark.parametrize("decades", [0, 6, 9])
+def test_near_range_does_not_take_the_digits_of_the_far_range(decades: int) -> None:
+    rng = np.random.default_rng(decades)
+    distance = (np.arange(4096) + 0.5) * 7.5
+    values = rng.normal(1.0, 1.0, 4096) * 10.0 ** np.linspace(decades, 0.0, 4096)
+    values[:30] *= 10.0**decades
+    first, past = oracle_signal.windows(distance, 0.1)
+    inside = [values[a:b] for a, b in zip(first, past, strict=True)]
+    exact = np.array([math.fsum(window) / window.size for window in inside])
+    size = np.array([math.fsum(np.abs(window)) / window.size for window in inside])
+    error = np.abs(signal.smooth(values, distance) - exact)
+    whole = (4096 / kernels.BLOCK) ** 2 * 2.0**-106 * np.abs(values).sum() / (past - first)
+    assert (error <= (kernels.BLOCK + 3) * 2.0**-53 * size + whole).all()
+    if decades > 0:
+        # What differences of one running sum, as in the oracle, would lose.
+        lost = np.abs(oracle_signal.smooth(values, distance) - exact)
+        assert lost.max() > 1e-10 * size[np.argmax(lost)]
+
+
+def test_noise_of_light_that_stands_still_has_no_slope() -> None:
+    # 18 bins: every window with a difference holds all of them, so that one mean is fitted.
+    power = np.random.default_rng(2).normal(5.0, 1.0, (20, 18))
+    variance = signal.difference_variance(power, RANGE[:18])
+    assert (np.ptp(variance, axis=-1) == 0.0).all()
+
+
+def test_windows_never_leave_the_profile() -> None:
+    values = np.arange(400.0)
+    for window in (1e300, 1e308):
+        # Both ends as far from the bin as the nearer end of the profile, or 16 bins.
+        average = signal.smooth(values, RANGE * 1e-300, window=window)
+        np.testing.assert_allclose(average[16:-16], values[16:-16])
+        assert average[0] == np.mean(values[:17])
+        assert average[-1] == np.mean(values[-17:])
+
+
+def test_every_layout_of_the_input_gives_the_same_bits() -> None:
+    rng = np.random.default_rng(4)
+    counts = rng.poisson(300, (6, 400)).astype(np.int32)
+    shots = np.full(6, 600)
+    frozen = counts.copy()
+    frozen.setflags(write=False)
+    unaligned = np.zeros(counts.nbytes + 1, np.uint8)[1:].view(np.int32).reshape(counts.shape)
+    unaligned[:] = counts
+    spread = np.zeros((12, 800), np.int32)
+    spread[::2, ::2] = counts
+    forms = [
+        frozen,
+        unaligned,
+        spread[::2, ::2],
+        np.asfortranarray(counts),
+        counts.astype(">i4"),
+        counts.astype(np.uint16),
+        counts.astype(np.int64),
+        np.ma.masked_array(counts),
+    ]
+    for convert in (_analog, _photon):
+        plain = convert(counts, shots)
+        for form in forms:
+            _assert_same_bits(convert(form, shots.astype(">i2"), RANGE.astype(">f8")), plain)
+    power = _analog(counts, shots).power
+    for values in (power.astype(">f8"), np.asfortranarray(power), power[::-1][::-1]):
+        np.testing.assert_array_equal(signal.smooth(values, RANGE), signal.smooth(power, RANGE))
+    # Else users would wait for the compiler again and again.
+    assert len(kernels.voltage_profiles.signatures) == 1
+    assert len(kernels.photon_profiles.signatures) == 1
+    assert len(kernels.noise_profiles.signatures) == 1
+    assert len(kernels.smooth_profiles.signatures) == 1
+
+
+def test_leading_axes_are_kept() -> None:
+    counts = np.random.default_rng(9).poisson(300, (2, 3, 400)).astype(np.int32)
+    for convert in (_analog, _photon):
+        result = convert(counts, np.full((2, 3), 600))
+        assert result.power.shape == result.variance.shape == result.quality.shape == (2, 3, 400)
+        alone = convert(counts[1, 2], np.array(600))
+        np.testing.assert_array_equal(alone.variance, result.variance[1, 2])
+        assert convert(counts[:0], np.zeros((0, 3))).power.shape == (0, 3, 400)
+
+
+def test_each_profile_may_have_a_dark_signal_of_its_own() -> None:
+    rng = np.random.default_rng(10)
+    counts = rng.poisson(3000, (2, 3, 400)).astype(np.int32)
+    dark, spread = rng.random((2, 3, 400)) * 1e-3, rng.random((2, 3, 400))
+    for known in ({}, {"noise_variance": 1e-3}):
+        shots = np.full((2, 3), 600)
+        whole = _analog(counts, shots, dark=dark, dark_variance=spread, **known)
+        one = _analog(
+            counts[1, 2], np.array(600), dark=dark[1, 2], dark_variance=spread[1, 2], **known
+        )
+        _assert_same_bits(
+            one, signal.Signal(whole.power[1, 2], whole.variance[1, 2], whole.quality[1, 2])
+        )
+    np.testing.assert_array_equal(whole.variance, np.maximum(1e-3 + spread, whole.variance.min()))
+
+
+def test_nothing_is_missing_without_a_flag() -> None:
+    counts = np.full((2, 400), 1000, np.int32)
+    dark = np.zeros(400)
+    dark[5] = np.nan
+    volts = np.array([0.5, np.nan])
+    result = signal.analog(
+        counts, np.full(2, 600), RANGE, adc_bits=12, input_range=volts, dark=dark
+    )
+    np.testing.assert_array_equal(np.isnan(result.power), result.quality != 0)
+    assert (np.flatnonzero(result.quality[0]) == [5]).all()
+    assert (result.quality[1] & Quality.INPUT_MISSING).all()
+    masked = np.ma.masked_array(counts, np.arange(400) == np.zeros((2, 1)))
+    assert (_photon(masked, np.full(2, 600)).quality[:, 0] == Quality.INPUT_MISSING).all()
 
 
 def test_range_correction_carries_both_variances() -> None:
@@ -172,6 +381,66 @@ def test_range_correction_carries_both_variances() -> None:
     # 30 MHz less 40 MHz: negative, and not clipped.
     assert result.power[0] == pytest.approx(-10.0 * RANGE**2)
     assert result.variance[0] == pytest.approx((raw.variance[0] + 0.25) * RANGE**4)
+
+
+def test_range_correction_in_float32_is_that_of_float64_rounded() -> None:
+    counts = np.random.default_rng(1).poisson(900, (3, 400)).astype(np.int32)
+    raw = _photon(counts, np.full(3, 600))
+    levels = {"background": np.array([1.0, 2.0, np.nan]), "background_variance": 0.1}
+    double = signal.range_corrected(raw, RANGE, **levels)
+    single = signal.range_corrected(raw, RANGE, **levels, dtype=np.float32)
+    assert single.power.dtype == single.variance.dtype == np.float32
+    np.testing.assert_array_equal(single.power, double.power.astype(np.float32))
+    np.testing.assert_array_equal(single.variance, double.variance.astype(np.float32))
+    assert np.isnan(double.power[2]).all()
+    # From float32 too, as products hold it.
+    from_single = signal.Signal(
+        raw.power.astype(np.float32), raw.variance.astype(np.float32), raw.quality
+    )
+    again = signal.range_corrected(from_single, RANGE, **levels)
+    np.testing.assert_allclose(again.power[:2], double.power[:2], rtol=1e-5)
+    with pytest.raises(RetrievalInputError, match="float32 or float64"):
+        signal.range_corrected(raw, RANGE, **levels, dtype=np.float16)
+
+
+_COUNTS = np.ones((1, 400), np.int32)
+
+
+@pytest.mark.parametrize(
+    ("field", "call"),
+    [
+        ("counts", lambda: _photon(_COUNTS.astype(float), SHOTS)),
+        ("counts", lambda: _photon(_COUNTS.astype(np.int64) << 40, SHOTS)),
+        ("counts", lambda: _photon(_COUNTS, np.array([600, 600]))),
+        ("range", lambda: _photon(_COUNTS, SHOTS, np.where(RANGE > 99, RANGE, np.nan))),
+        ("range", lambda: _photon(_COUNTS, SHOTS, np.full(400, 7.5))),
+        ("range", lambda: _photon(_COUNTS, SHOTS, RANGE[np.newaxis])),
+        ("dark", lambda: _analog(_COUNTS, SHOTS, dark=np.zeros(399))),
+        ("dark_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=1.0, dark_variance=[1.0])),
+        ("power", lambda: signal.difference_variance(np.zeros(399), RANGE)),
+        ("values", lambda: signal.smooth(np.zeros(399), RANGE)),
+        ("window", lambda: signal.smooth(np.zeros(400), RANGE, window=np.nan)),
+        ("window", lambda: signal.smooth(np.zeros(400), RANGE, window=-1.0)),
+        ("bin_width", lambda: signal.photon(_COUNTS, SHOTS, RANGE, bin_width=0.0)),
+        ("dead_time", lambda: _photon(_COUNTS, SHOTS, dead_time=-4e-9)),
+        ("noise_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=np.nan)),
+        ("full_overlap_range", lambda: _photon(_COUNTS, SHOTS, full_overlap_range=np.nan)),
+        (
+            "background",
+            lambda: signal.range_corrected(
+                _photon(_COUNTS, SHOTS), RANGE, background=[1.0, 2.0], background_variance=0.0
+            ),
+        ),
+        (
+            "input_range",
+            lambda: signal.analog(_COUNTS, SHOTS, RANGE, adc_bits=12, input_range=np.ones(2)),
+        ),
+    ],
+)
+def test_what_cannot_be_right_is_refused(field, call) -> None:
+    with pytest.raises(RetrievalInputError) as refused:
+        call()
+    assert refused.value.field == field
 
 
 def test_shapes_that_do_not_fit_are_named() -> None:

@@ -1,0 +1,442 @@
+"""What a variable of a product is, and the attributes that follow from it.
+
+A row says what a variable is; its CF and ACDD attributes follow from the row. The row of a
+standard error follows from the row of its quantity. Standard names are those of the CF table
+v93; a quantity that the table does not know has none, because none is better than a wrong one
+(`cf111`, section 3.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+
+from lidarops import __version__
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.records import DetectionMode
+
+CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
+STANDARD_NAME_TABLE: Final = "CF Standard Name Table v93"
+FILL_VALUE: Final = np.float32(9.969209968386869e36)
+"""The netCDF default fill value of floats, on float data only."""
+TIME_UNITS: Final = "seconds since 1970-01-01 00:00:00"
+"""One epoch for all files, so that tools which do not decode time can still join them."""
+BOUNDS_DIM: Final = "nv"
+
+_SIGNAL_UNITS: Final = {DetectionMode.ANALOG: "mV", DetectionMode.PHOTON: "MHz"}
+_ERROR_BITS: Final = 8
+"""Significant bits of the standard error of a rounded quantity: 0.2 percent at worst."""
+NO_NAME: Final = f"No standard name of the {STANDARD_NAME_TABLE} means this quantity."
+
+
+class Coverage(StrEnum):
+    """ISO 19115-1 coverage content types (`acdd13`)."""
+
+    PHYSICAL = "physicalMeasurement"
+    QUALITY = "qualityInformation"
+    AUXILIARY = "auxiliaryInformation"
+    REFERENCE = "referenceInformation"
+    COORDINATE = "coordinate"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What one variable of a product is."""
+
+    name: str
+    dims: tuple[str, ...]
+    dtype: str
+    """numpy type code as stored; ``S1`` for text."""
+    long_name: str
+    coverage: Coverage
+    units: str | None = None
+    """May hold ``{signal}``: mV in analog detection, MHz in photon counting."""
+    standard_name: str | None = None
+    axis: str | None = None
+    positive: str | None = None
+    bounds: str | None = None
+    """Name of the variable of the cell limits; it has one dimension more and no attributes."""
+    cell_methods: str | None = None
+    valid_min: float | None = None
+    valid_max: float | None = None
+    ancillaries: tuple[str, ...] = ()
+    significant_bits: int | None = None
+    """Bits of the mantissa that are kept; None keeps all."""
+    uncertain: bool = False
+    """Whether ``<name>_standard_error`` stands beside it."""
+    optional: bool = False
+    """Whether a product may lack it."""
+    follows_beam: bool = False
+    """Whether ``time`` becomes the first dimension where the beam moves."""
+    flags: Quality | None = None
+    """The bits that a flag variable can carry."""
+    cf_role: str | None = None
+    algorithm: str | None = None
+    comment: str | None = None
+
+    def standard_error(self) -> Row:
+        """Return the row of this quantity's standard error."""
+        return replace(
+            self,
+            name=f"{self.name}_standard_error",
+            long_name=f"standard error of {self.long_name}",
+            coverage=Coverage.QUALITY,
+            standard_name=self.standard_name and f"{self.standard_name} standard_error",
+            cell_methods=None,
+            valid_min=0.0,
+            valid_max=None,
+            ancillaries=(),
+            significant_bits=self.significant_bits and _ERROR_BITS,
+            uncertain=False,
+            comment=None if self.standard_name else NO_NAME,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """What a kind of product holds, and what is said of the whole."""
+
+    title: str
+    summary: str
+    keywords: tuple[str, ...]
+    processing_level: str
+    references: tuple[str, ...]
+    comment: str
+    sampled: str
+    """The dimension besides time."""
+    unused_steps: frozenset[str]
+    """Steps of a scene's plan that other kinds need and this one does not."""
+    coordinates: tuple[Row, ...]
+    data: tuple[Row, ...]
+
+    @property
+    def variables(self) -> tuple[Row, ...]:
+        """Data rows, each followed by the row of its standard error where it has one."""
+        return tuple(_with_errors(self.data))
+
+    @property
+    def rounded(self) -> bool:
+        """Whether any variable is stored with fewer significant bits than it has."""
+        return any(row.significant_bits for row in self.variables)
+
+    def row(self, name: str) -> Row:
+        """Return the row of a variable or coordinate.
+
+        Raises
+        ------
+        ProductError
+            If the layout has no such variable.
+        """
+        rows = {row.name: row for row in (*self.coordinates, *self.variables)}
+        if name not in rows:
+            raise ProductError(
+                "is no variable of this kind of product",
+                field=name,
+                remedy=f"the variables are {', '.join(rows)}",
+            )
+        return rows[name]
+
+
+def _with_errors(rows: tuple[Row, ...]) -> Iterator[Row]:
+    for row in rows:
+        if row.uncertain:
+            error = row.standard_error()
+            yield replace(row, ancillaries=(error.name, *row.ancillaries))
+            yield error
+        else:
+            yield row
+
+
+def attributes(
+    row: Row, *, mode: DetectionMode, coordinates: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Return the attributes of a variable, in the order in which they are written.
+
+    Parameters
+    ----------
+    row : Row
+    mode : DetectionMode
+        Settles the unit of the signal.
+    coordinates : tuple of str
+        Auxiliary coordinates that the product holds for this variable.
+
+    Returns
+    -------
+    dict of str to str, numpy scalar or numpy array
+    """
+    stored = np.dtype(row.dtype)
+    limit = stored.type if stored.kind in "if" else None
+    found: dict[str, Any] = {
+        "standard_name": row.standard_name,
+        "long_name": row.long_name,
+        "units": units(row, mode),
+        "axis": row.axis,
+        "positive": row.positive,
+        "bounds": row.bounds,
+        "cell_methods": row.cell_methods,
+        "valid_min": None if row.valid_min is None or limit is None else limit(row.valid_min),
+        "valid_max": None if row.valid_max is None or limit is None else limit(row.valid_max),
+        "coverage_content_type": row.coverage.value,
+        "ancillary_variables": " ".join(row.ancillaries) or None,
+        "coordinates": " ".join(coordinates) or None,
+        "cf_role": row.cf_role,
+        "algorithm": row.algorithm,
+        "implementation": row.algorithm and f"lidarops {__version__} (numpy)",
+        "_FillValue": FILL_VALUE if _has_fill(row) else None,
+        "_Encoding": "utf-8" if stored.kind == "S" else None,
+    }
+    if row.significant_bits is not None:
+        found["quantization"] = QUANTIZATION.name
+        found["quantization_nsb"] = np.int32(row.significant_bits)
+    if row.flags is not None:
+        found |= _flag_attributes(row.flags, stored)
+    found["comment"] = (
+        " ".join(text for text in (found.get("comment"), row.comment) if text) or None
+    )
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def units(row: Row, mode: DetectionMode) -> str | None:
+    """Return the unit of a variable in a channel of the given mode."""
+    return row.units and row.units.format(signal=_SIGNAL_UNITS[mode])
+
+
+def _has_fill(row: Row) -> bool:
+    return np.dtype(row.dtype).kind == "f" and row.coverage is not Coverage.COORDINATE
+
+
+def _flag_attributes(flags: Quality, stored: np.dtype[Any]) -> dict[str, Any]:
+    bits = list(flags)
+    return {
+        "flag_masks": np.array([int(bit) for bit in bits], dtype=stored),
+        "flag_meanings": " ".join(str(bit.name).lower() for bit in bits),
+        "comment": "0: no test failed. "
+        + "; ".join(
+            f"{str(bit.name).lower()} ({bit.severity.name.lower()}): {bit.description}"
+            for bit in bits
+        )
+        + ". reject: do not use the value; care: the value stands, its uncertainty may be"
+        " understated.",
+    }
+
+
+TIME = Row(
+    name="time",
+    dims=("time",),
+    dtype="f8",
+    units=TIME_UNITS,
+    standard_name="time",
+    long_name="middle of the averaging interval, UTC",
+    coverage=Coverage.COORDINATE,
+    axis="T",
+    bounds="time_bnds",
+)
+RANGE = Row(
+    name="range",
+    dims=("range",),
+    dtype="f8",
+    units="m",
+    long_name="distance from the lidar along the beam, centre of the range bin",
+    coverage=Coverage.COORDINATE,
+    bounds="range_bnds",
+)
+SECTION = Row(
+    name="section",
+    dims=("section",),
+    dtype="i4",
+    units="1",
+    long_name="number of the range section",
+    coverage=Coverage.COORDINATE,
+)
+SECTION_RANGE = Row(
+    name="section_range",
+    dims=("section",),
+    dtype="f8",
+    units="m",
+    long_name="distance from the lidar along the beam, middle of the range section",
+    coverage=Coverage.COORDINATE,
+    bounds="section_bounds",
+)
+
+
+def altitude(along: str, bounds: str | None = None) -> Row:
+    """Return the row of the altitude of values along a dimension."""
+    return Row(
+        name="altitude",
+        dims=(along,),
+        dtype="f4",
+        units="m",
+        standard_name="altitude",
+        long_name="altitude of the sounded air above the geoid",
+        coverage=Coverage.COORDINATE,
+        axis="Z",
+        positive="up",
+        bounds=bounds,
+        follows_beam=True,
+        comment="Station altitude + range x cos(zenith angle): straight beam over a flat Earth."
+        " Curvature adds (range x sin(zenith angle))^2 / 12742 km.",
+    )
+
+
+PLACE = (
+    Row(
+        name="zenith_angle",
+        dims=(),
+        dtype="f8",
+        units="degree",
+        standard_name="zenith_angle",
+        long_name="zenith angle of the beam, 0 = up",
+        coverage=Coverage.COORDINATE,
+        valid_min=0.0,
+        valid_max=180.0,
+        follows_beam=True,
+    ),
+    Row(
+        name="azimuth",
+        dims=(),
+        dtype="f8",
+        units="degree",
+        standard_name="direction_of_radial_vector_away_from_instrument",
+        long_name="azimuth of the beam, clockwise from north",
+        coverage=Coverage.COORDINATE,
+        follows_beam=True,
+    ),
+    Row(
+        name="latitude",
+        dims=(),
+        dtype="f8",
+        units="degrees_north",
+        standard_name="latitude",
+        long_name="latitude of the station",
+        coverage=Coverage.COORDINATE,
+        valid_min=-90.0,
+        valid_max=90.0,
+    ),
+    Row(
+        name="longitude",
+        dims=(),
+        dtype="f8",
+        units="degrees_east",
+        standard_name="longitude",
+        long_name="longitude of the station",
+        coverage=Coverage.COORDINATE,
+        valid_min=-180.0,
+        valid_max=180.0,
+    ),
+    Row(
+        name="station_altitude",
+        dims=(),
+        dtype="f8",
+        units="m",
+        standard_name="surface_altitude",
+        long_name="altitude of the station above the geoid",
+        coverage=Coverage.COORDINATE,
+    ),
+    Row(
+        name="wavelength",
+        dims=(),
+        dtype="f8",
+        units="nm",
+        standard_name="radiation_wavelength",
+        long_name="wavelength of the channel",
+        coverage=Coverage.COORDINATE,
+        valid_min=0.0,
+    ),
+)
+_STATION = Row(
+    name="station",
+    dims=("station_strlen",),
+    dtype="S1",
+    standard_name="platform_name",
+    long_name="name of the station",
+    coverage=Coverage.REFERENCE,
+)
+QUANTIZATION: Final = Row(
+    name="quantization_info",
+    dims=(),
+    dtype="i4",
+    long_name="how values were rounded to fewer significant bits",
+    coverage=Coverage.REFERENCE,
+    algorithm="bitround",
+)
+"""The container that CF-1.12, section 8.4, describes; the value means nothing."""
+PROVENANCE: Final = Row(
+    name="provenance",
+    dims=("provenance_strlen",),
+    dtype="S1",
+    long_name="inputs, plan, settings and software of this product as W3C PROV-JSON",
+    coverage=Coverage.REFERENCE,
+)
+
+
+GLUING: Final = (
+    Row(
+        name="glue_slope",
+        dims=("time",),
+        dtype="f4",
+        units="MHz mV-1",
+        long_name="photon counting rate for an analog signal, from where both are linear",
+        coverage=Coverage.AUXILIARY,
+        optional=True,
+        uncertain=True,
+        comment=f"Missing where there is no such range. {NO_NAME}",
+    ),
+    *(
+        Row(
+            name=f"glue_{end}",
+            dims=("time",),
+            dtype="f4",
+            units="m",
+            long_name=f"range at which the window that joins both signals {verb}",
+            coverage=Coverage.AUXILIARY,
+            optional=True,
+            comment=f"Nearer the signal is analog, farther photon counting. {NO_NAME}",
+        )
+        for end, verb in (("bottom", "begins"), ("top", "ends"))
+    ),
+)
+"""Of channels that are made of an analog and a photon counting one."""
+
+
+def shots(*, of: str) -> Row:
+    """Return the row of the number of laser shots."""
+    return Row(
+        name="shots",
+        dims=("time",),
+        dtype="i4",
+        units="1",
+        standard_name="number_of_observations",
+        long_name=f"number of laser shots of {of}",
+        coverage=Coverage.AUXILIARY,
+        cell_methods="time: sum",
+        valid_min=0.0,
+    )
+
+
+def quality(dims: tuple[str, ...], flags: Quality) -> Row:
+    """Return the row of the quality bits of a kind of product."""
+    return Row(
+        name="quality_flag",
+        dims=dims,
+        dtype="i4",
+        units="1",
+        standard_name="quality_flag",
+        long_name="quality of the value, one bit for each failed test",
+        coverage=Coverage.QUALITY,
+        flags=flags,
+    )
+
+
+def coordinates(along: tuple[Row, ...], altitude: Row) -> tuple[Row, ...]:
+    """Return the coordinates of a kind of product: time, along the beam, place."""
+    return (TIME, *along, altitude, *PLACE)
+
+
+def station(*, profiles: bool) -> Row:
+    """Return the row of the station's name, which identifies the series where it is one."""
+    return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION

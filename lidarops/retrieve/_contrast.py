@@ -1,0 +1,205 @@
+"""Compiled search for steep rises of a profile above the shape of air."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+HUGE: Final = 1e300
+_TOP: Final = 2.0
+"""Standard errors above the level below the base under which a layer has ended."""
+_SEEN: Final = 3.0
+"""Standard errors that a signal above a layer must exceed to be one."""
+_LITTLE: Final = 0.1
+"""Share of the level below a layer that must be visible where its opacity is judged."""
+_FAINT: Final = 0.01
+"""Share below which a signal is none, where noise would let even less be seen."""
+
+_ROUNDING: Final = 1e-9
+"""Relative rise that is none but the rounding of sums."""
+
+BASE, TOP, CONTRAST, SIGNAL = 0, 1, 2, 3
+FIELDS: Final = 4
+POWER, SHAPE, VARIANCE, COUNT = 0, 1, 2, 3
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_compiled
+def _usable(power: float, variance: float) -> bool:
+    return abs(power) < HUGE and 0.0 <= variance < HUGE
+
+
+@_compiled
+def _accumulate(power: Any, variance: Array, shape: Array, sums: Array) -> None:
+    """Sum from the far end on, so that sums over far bins keep their digits."""
+    signal = air = noise = count = 0.0
+    sums[:, power.size] = 0.0
+    for j in range(power.size):
+        i = power.size - 1 - j
+        if _usable(power[i], variance[i]):
+            signal += np.float64(power[i])
+            air += shape[i]
+            noise += variance[i]
+            count += 1.0
+        sums[POWER, i], sums[SHAPE, i], sums[VARIANCE, i], sums[COUNT, i] = (
+            signal,
+            air,
+            noise,
+            count,
+        )
+
+
+@_compiled
+def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
+    """Return the ratio to air over some bins and its variance; NaN where few hold data."""
+    if first < 0 or stop >= sums.shape[1]:
+        return np.nan, np.nan
+    count = sums[COUNT, first] - sums[COUNT, stop]
+    shape = sums[SHAPE, first] - sums[SHAPE, stop]
+    if 2.0 * count < stop - first or not shape > 0.0:
+        return np.nan, np.nan
+    ratio = (sums[POWER, first] - sums[POWER, stop]) / shape
+    return ratio, (sums[VARIANCE, first] - sums[VARIANCE, stop]) / (shape * shape)
+
+
+@_compiled
+def _rise(sums: Array, i: int, length: int, contrast: float) -> float:
+    """Return by how many standard errors the ratio to air rises by more than a factor."""
+    first, stop = i - length, i + length
+    if first < 0 or stop >= sums.shape[1]:
+        return 0.0
+    # Most bins end here, before anything is divided.
+    below = (sums[POWER, first] - sums[POWER, i]) * (sums[SHAPE, i] - sums[SHAPE, stop])
+    above = (sums[POWER, i] - sums[POWER, stop]) * (sums[SHAPE, first] - sums[SHAPE, i])
+    if not above > contrast * below:
+        return 0.0
+    low, low_variance = _mean(sums, first, i)
+    high, high_variance = _mean(sums, i, stop)
+    excess = high - contrast * low
+    variance = high_variance + contrast * contrast * low_variance
+    if not excess > _ROUNDING * high:
+        return 0.0
+    return excess / math.sqrt(variance) if variance > 0.0 else HUGE
+
+
+@_compiled
+def _steepest(
+    sums: Array,
+    start: int,
+    reach: int,
+    lengths: npt.NDArray[np.int64],
+    contrast: float,
+    threshold: float,
+) -> tuple[int, int]:
+    """Return where the shortest length that shows a rise shows it best, and that length."""
+    stop = min(start + reach + 1, int(sums.shape[1]) - 1)
+    for length in lengths:
+        best, highest = start, 0.0
+        for i in range(start, stop):
+            rise = _rise(sums, i, length, contrast)
+            if rise > highest:
+                best, highest = i, rise
+        if highest >= threshold:
+            break
+    return best, length
+
+
+@_compiled
+def _find(
+    sums: Array, start: int, lengths: npt.NDArray[np.int64], contrast: float, threshold: float
+) -> tuple[int, int]:
+    """Return the bin at which the next layer begins, and the length that shows it; or -1."""
+    for i in range(start, sums.shape[1] - 1):
+        for length in lengths:
+            if _rise(sums, i, length, contrast) >= threshold:
+                return _steepest(sums, i, length, lengths, contrast, threshold)
+    return -1, 0
+
+
+@_compiled
+def _end(sums: Array, base: int, length: int) -> int:
+    """Return the first bin from which on the ratio to air is back at its level below a base."""
+    level, level_variance = _mean(sums, base - length, base)
+    bins = int(sums.shape[1]) - 1
+    for i in range(base + 1, bins):
+        ratio, variance = _mean(sums, i, min(i + length, bins))
+        if not ratio > level + _TOP * math.sqrt(variance + level_variance):
+            return i
+    return bins
+
+
+@_compiled
+def _is_opaque(sums: Array, first: int, length: int, level: float) -> bool:
+    """Return whether little of a level of air is left where that would be seen.
+
+    The farthest of adjoining windows decides, as a signal may fade within a layer for long.
+    """
+    for share in (_LITTLE, 1.0):
+        seen, decided = False, False
+        for i in range(first, sums.shape[1] - length, length):
+            ratio, variance = _mean(sums, i, i + length)
+            error = _SEEN * math.sqrt(max(variance, 0.0))
+            if share * level > error:
+                seen, decided = ratio > max(error, _FAINT * level), True
+        if decided:
+            return not seen
+    return True
+
+
+@_compiled
+def detect(
+    power: Any,
+    variance: Array,
+    shape: Array,
+    lengths: npt.NDArray[np.int64],
+    contrast: float,
+    threshold: float,
+    layers: Any,
+    out: Array,
+    opaque: Any,
+) -> None:
+    """Find the layers of every profile.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    variance, shape : (profile or 1, bin) float64
+    lengths : (scale,) int64
+        Bins that are averaged below and above a base, ascending.
+    contrast : float
+        Least factor by which the ratio to air rises.
+    threshold : float
+        Standard errors of the rise beyond that factor.
+    layers : (profile, bin) bool
+        As False; gets the bins between base and top of every layer.
+    out : (profile, `FIELDS`) float64
+        As NaN; gets first bin of the lowest layer, first bin above it, ratio to air above its
+        base over that below, and the standard errors of its rise.
+    opaque : (profile,) bool
+        Gets whether the air above the highest layer is hidden.
+    """
+    sums = np.empty((4, power.shape[1] + 1))
+    for k in range(power.shape[0]):
+        noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
+        _accumulate(power[k], noise, air, sums)
+        end, level = 0, 0.0
+        while True:
+            base, length = _find(sums, end, lengths, contrast, threshold)
+            if base < 0:
+                break
+            end = _end(sums, base, length)
+            layers[k, base:end] = True
+            if math.isnan(out[k, BASE]):
+                level = _mean(sums, base - length, base)[0]
+                ratio = _mean(sums, base, base + length)[0]
+                out[k, BASE], out[k, TOP] = base, end
+                out[k, CONTRAST] = ratio / level if level > 0.0 else np.inf
+                out[k, SIGNAL] = _rise(sums, base, length, contrast)
+        opaque[k] = end > 0 and _is_opaque(sums, end, lengths[-1], level)

@@ -1,0 +1,48 @@
+"""Compiled correlation of two noises over many lags."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _product(first: Any, second: Any) -> float:
+    total = 0.0
+    for i in range(second.size):
+        total += first[i] * second[i]
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_products(
+    first: Array,
+    second: Array,
+    reach: int,
+    edges: npt.NDArray[np.intp],
+    sums: Array,
+) -> None:
+    """Add the products of `first`, moved by each lag, and `second` to the sums of their parts.
+
+    Parameters
+    ----------
+    first, second : (channel, time, bin) float64
+    reach : int
+        Lags from minus this to this, in bins.
+    edges : (part + 1,) int
+        Bins of `second` where the parts begin and end, at least `reach` from both ends.
+    sums : (channel, part, lag) float64
+    """
+    for c in range(first.shape[0]):
+        for t in range(first.shape[1]):
+            x, y = first[c, t], second[c, t]
+            for p in range(edges.size - 1):
+                part = y[edges[p] : edges[p + 1]]
+                for j in range(2 * reach + 1):
+                    start = edges[p] + j - reach
+                    sums[c, p, j] += _product(x[start : start + part.size], part)

@@ -1,0 +1,481 @@
+r"""Compiled inversion of the two-component lidar equation, with its first-order errors.
+
+With the particle lidar ratio :math:`S`, the power :math:`P` and the molecular backscatter and
+extinction :math:`\beta_m, \alpha_m`, let :math:`g = R^2 e^{2 E}` with
+:math:`E(R) = \int_{R_0}^{R} (\alpha_m - S \beta_m)` and :math:`q = g P`. Then the total
+backscatter is :math:`\beta = q / D`, :math:`D(R) = D_c - 2 \int_{R_c}^{R} S q`: linear in the
+power above and below, so that the first-order errors are exact sums.
+"""
+
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Codes = npt.NDArray[np.uint8]
+
+HUGE: Final = 1e300
+
+# What `trace_path` writes, row by row.
+GAIN, RATIO, AIR, SHAPE = 0, 1, 2, 3
+DEPTH, DEPTH_RATIO, DEPTH_AIR = 4, 5, 6
+GAIN_RATIO, SOURCE_RATIO = 7, 8
+GAIN_AIR, SOURCE_AIR, OWN_AIR = 9, 10, 11
+COLUMN, COLUMN_AIR, RATIO_ERROR, AIR_ERROR = 12, 13, 14, 15
+PATH_ROWS: Final = 16
+
+# What `invert` writes for each bin, and for each profile.
+BACKSCATTER, ATTENUATED, ATTENUATED_ERROR = 0, 1, 2
+NOISE, BACKGROUND, REFERENCE, LIDAR_RATIO, MOLECULAR = 3, 4, 5, 6, 7
+FIELDS: Final = 8
+CONSTANT, CONSTANT_ERROR = 0, 1
+SCALARS: Final = 2
+
+# What is known of the denominator of each bin while a profile is solved: its value, derivative
+# with respect to the power of the bin, variance by the other bins, changes by the causes, and how
+# much its square exceeds what its errors ask for; its inverse, and the total backscatter.
+DENOMINATOR, OWN_SHARE, OTHERS, BY_OFFSET, BY_RATIO, BY_AIR, CERTAINTY = 0, 1, 2, 3, 4, 5, 6
+INVERSE, TOTAL = 7, 8
+WORK_ROWS: Final = 9
+
+# The state of a bin.
+MISSING, VALID, UNSTABLE = 0, 1, 2
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_compiled
+def trace_path(
+    range_: Array,
+    backscatter: Array,
+    extinction: Array,
+    lidar_ratio: Array,
+    scattering_ratio: float,
+    ratio_error: Array,
+    air_error: Array,
+    path: Array,
+) -> None:
+    """Integrate what does not depend on the power, by trapezoids from the first bin on.
+
+    Parameters
+    ----------
+    range_, backscatter, extinction, lidar_ratio : (bin,) float64
+        m, m-1 sr-1 and m-1 of the air, sr of the particles.
+    scattering_ratio : float
+        In the reference window.
+    ratio_error, air_error : (bin,) float64
+        sr; relative. Each is one error of that shape, common to all bins.
+    path : (`PATH_ROWS`, bin) float64
+        Gets the rows that this module names.
+    """
+    e = u = u_ratio = u_air = b_ratio = e_air = 0.0
+    column, column_air = extinction[0] * range_[0], extinction[0] * air_error[0] * range_[0]
+    for i in range(range_.size):
+        if i > 0:
+            half = 0.5 * (range_[i] - range_[i - 1])
+            s0, s1, m0, m1 = lidar_ratio[i - 1], lidar_ratio[i], backscatter[i - 1], backscatter[i]
+            a0, a1, r0, r1 = air_error[i - 1], air_error[i], ratio_error[i - 1], ratio_error[i]
+            e += half * (extinction[i - 1] - s0 * m0 + extinction[i] - s1 * m1)
+            e_air += half * ((extinction[i - 1] - s0 * m0) * a0 + (extinction[i] - s1 * m1) * a1)
+            b_ratio += half * (r0 * m0 + r1 * m1)
+            u += half * scattering_ratio * (s0 * m0 + s1 * m1)
+            u_ratio += half * scattering_ratio * (r0 * m0 + r1 * m1)
+            u_air += half * scattering_ratio * (s0 * m0 * a0 + s1 * m1 * a1)
+            column += half * (extinction[i - 1] + extinction[i])
+            column_air += half * (extinction[i - 1] * a0 + extinction[i] * a1)
+        path[GAIN, i] = range_[i] ** 2 * math.exp(2.0 * e)
+        path[RATIO, i] = lidar_ratio[i]
+        path[AIR, i] = backscatter[i]
+        path[SHAPE, i] = scattering_ratio * backscatter[i] * math.exp(-2.0 * u) / path[GAIN, i]
+        path[DEPTH, i], path[DEPTH_RATIO, i], path[DEPTH_AIR, i] = u, u_ratio, u_air
+        path[GAIN_RATIO, i] = -2.0 * b_ratio
+        path[SOURCE_RATIO, i] = ratio_error[i] - 2.0 * b_ratio * lidar_ratio[i]
+        path[GAIN_AIR, i] = 2.0 * e_air
+        path[SOURCE_AIR, i] = 2.0 * e_air * lidar_ratio[i]
+        path[OWN_AIR, i] = backscatter[i] * air_error[i]
+        path[COLUMN, i], path[COLUMN_AIR, i] = column, column_air
+        path[RATIO_ERROR, i], path[AIR_ERROR, i] = ratio_error[i], air_error[i]
+
+
+@_compiled
+def _usable(power: float, variance: float) -> bool:
+    return abs(power) < HUGE and 0.0 <= variance < HUGE
+
+
+@_compiled
+def _calibrate(power: Any, variance: Array, window: Any, path: Array, out: Array) -> int:
+    """Compare the summed power of the window with what its scattering ratio makes expected.
+
+    Returns
+    -------
+    int
+        The bin in the middle of the window, from which the integrals start; -1 where none is.
+        `out` gets the denominator there, the weight of a bin of the window in it, the variance
+        and the number of bins, and the relative changes of the expectation with the scattering
+        ratio, the lidar ratio and the air.
+    """
+    count, signal, shape, noise = 0, 0.0, 0.0, 0.0
+    with_ratio = with_lidar_ratio = with_air = 0.0
+    for i in range(path.shape[1]):
+        if not (window[i] and _usable(power[i], variance[i])):
+            continue
+        h = path[SHAPE, i]
+        count += 1
+        signal += power[i]
+        shape += h
+        noise += variance[i]
+        with_ratio += h * (1.0 - 2.0 * path[DEPTH, i])
+        with_lidar_ratio -= h * (2.0 * path[DEPTH_RATIO, i] + path[GAIN_RATIO, i])
+        with_air += h * (path[AIR_ERROR, i] - 2.0 * path[DEPTH_AIR, i] - path[GAIN_AIR, i])
+    if not (shape > 0.0 and signal > 0.0):
+        return -1
+    seen, centre = 0, -1
+    for i in range(path.shape[1]):
+        if window[i] and _usable(power[i], variance[i]):
+            if seen == count // 2:
+                centre = i
+                break
+            seen += 1
+    weight = math.exp(-2.0 * path[DEPTH, centre]) / shape
+    out[0], out[1], out[2], out[3] = signal * weight, weight, noise * weight * weight, count
+    out[4] = with_ratio / shape + 2.0 * path[DEPTH, centre]
+    out[5] = with_lidar_ratio / shape + 2.0 * path[DEPTH_RATIO, centre]
+    out[6] = with_air / shape + 2.0 * path[DEPTH_AIR, centre]
+    return centre
+
+
+@_compiled
+def _integrate(
+    power: Any,
+    variance: Array,
+    window: Any,
+    range_: Array,
+    path: Array,
+    way: int,
+    calibration: Array,
+    longest_gap: float,
+    work: Array,
+    state: Codes,
+) -> None:
+    """Integrate from the reference bin on, the first one here, away from the lidar (`way` 1).
+
+    With `way` -1, all arrays along range are turned. Bins that are reached become `VALID`.
+    """
+    d_start, weight, rest, count = calibration[0], calibration[1], calibration[2], calibration[3]
+    passed = integral = shadow = shadow_ratio = shadow_air = half = 0.0
+    twice, last = 2.0 * way, -1
+    at_last = source = source_gain = source_ratio = source_air = noise = share_last = 0.0
+    for i in range(range_.size):
+        p, v = np.float64(power[i]), variance[i]
+        if not _usable(p, v):
+            continue
+        g, s, here = path[GAIN, i], path[RATIO, i], range_[i]
+        q = g * p
+        of_gain, of_power = s * g, s * q
+        of_ratio, of_air = q * path[SOURCE_RATIO, i], q * path[SOURCE_AIR, i]
+        if last >= 0:
+            step = abs(here - at_last)
+            if i - last > 1 and step > longest_gap:
+                break
+            half = 0.5 * step
+            share = share_last - twice * half * source_gain
+            passed += noise * share * share
+            integral += half * (source + of_power)
+            shadow += half * (source_gain + of_gain)
+            shadow_ratio += half * (source_ratio + of_ratio)
+            shadow_air += half * (source_air + of_air)
+        slope = -twice * half * of_gain
+        if window[i]:
+            slope += weight
+            rest -= weight * weight * v
+        work[DENOMINATOR, i] = d_start - twice * integral
+        work[OWN_SHARE, i], work[OTHERS, i] = slope, passed + max(rest, 0.0)
+        work[BY_OFFSET, i] = count * weight - twice * shadow
+        work[BY_RATIO, i] = -d_start * calibration[5] - twice * shadow_ratio
+        work[BY_AIR, i] = -d_start * calibration[6] - twice * shadow_air
+        state[i] = VALID
+        last, at_last, noise, share_last = i, here, v, slope
+        source, source_gain, source_ratio, source_air = of_power, of_gain, of_ratio, of_air
+
+
+@_compiled
+def _divide(power: Any, gain: Array, air: Array, work: Array, out: Array) -> None:
+    d, inverse, total = work[DENOMINATOR], work[INVERSE], work[TOTAL]
+    for i in range(out.size):
+        inverse[i] = 1.0 / d[i]
+        total[i] = gain[i] * np.float64(power[i]) * inverse[i]
+        out[i] = total[i] - air[i]
+
+
+@_compiled
+def _propagate_noise(variance: Array, gain: Array, work: Array, out: Array) -> None:
+    inverse, total, share, others = work[INVERSE], work[TOTAL], work[OWN_SHARE], work[OTHERS]
+    for i in range(out.size):
+        own = gain[i] - total[i] * share[i]
+        square = own * own * variance[i] + total[i] * total[i] * others[i]
+        out[i] = math.sqrt(square) * inverse[i]
+
+
+@_compiled
+def _propagate_offset(offset: float, gain: Array, work: Array, out: Array) -> None:
+    inverse, total, change = work[INVERSE], work[TOTAL], work[BY_OFFSET]
+    for i in range(out.size):
+        out[i] = offset * (gain[i] - total[i] * change[i]) * inverse[i]
+
+
+@_compiled
+def _propagate_reference(change: float, work: Array, out: Array) -> None:
+    inverse, total = work[INVERSE], work[TOTAL]
+    for i in range(out.size):
+        out[i] = -total[i] * change * inverse[i]
+
+
+@_compiled
+def _propagate_path(gain: Array, change: Array, work: Array, out: Array) -> None:
+    """Propagate an error that changes the relative gain of a bin and the denominator."""
+    inverse, total = work[INVERSE], work[TOTAL]
+    for i in range(out.size):
+        out[i] = total[i] * (gain[i] - change[i] * inverse[i])
+
+
+@_compiled
+def _measure_certainty(
+    variance: Array,
+    by_reference: float,
+    offset: float,
+    path: Array,
+    least_square: float,
+    work: Array,
+) -> None:
+    """Compare denominators with their errors, without what changes the gain of a bin as much."""
+    d, share, others, certainty = work[DENOMINATOR], work[OWN_SHARE], work[OTHERS], work[CERTAINTY]
+    by_offset, by_ratio, by_air = work[BY_OFFSET], work[BY_RATIO], work[BY_AIR]
+    reference = by_reference * by_reference
+    for i in range(variance.size):
+        square = others[i] + share[i] * share[i] * variance[i] + reference
+        square += offset * offset * by_offset[i] * by_offset[i]
+        ratio = by_ratio[i] - d[i] * path[GAIN_RATIO, i]
+        air = by_air[i] - d[i] * path[GAIN_AIR, i]
+        square += ratio * ratio + air * air
+        certainty[i] = d[i] * d[i] - least_square * square
+
+
+@_compiled
+def _solve_bins(
+    power: Any,
+    variance: Array,
+    path: Array,
+    by_reference: float,
+    offset: float,
+    work: Array,
+    k: int,
+    out: Array,
+) -> None:
+    """Write the backscatter of all bins, and what each cause adds to it.
+
+    Loops without branches over few arrays are compiled to vectors; `_withhold` follows.
+    """
+    _divide(power, path[GAIN], path[AIR], work, out[BACKSCATTER, k])
+    _propagate_noise(variance, path[GAIN], work, out[NOISE, k])
+    _propagate_offset(offset, path[GAIN], work, out[BACKGROUND, k])
+    _propagate_reference(by_reference, work, out[REFERENCE, k])
+    _propagate_path(path[GAIN_RATIO], work[BY_RATIO], work, out[LIDAR_RATIO, k])
+    _propagate_path(path[GAIN_AIR], work[BY_AIR], work, out[MOLECULAR, k])
+    molecular, own = out[MOLECULAR, k], path[OWN_AIR]
+    for i in range(own.size):
+        molecular[i] -= own[i]
+
+
+@_compiled
+def _doubt(start: int, least: float, work: Array, state: Codes) -> int:
+    """Mark the bins that are not certain as `UNSTABLE`, and return the first `VALID` one."""
+    alive, first = True, -1
+    for i in range(state.size):
+        if state[i] == MISSING:
+            continue
+        # An unknown error of a cause, NaN, must not pass for a large one.
+        if work[DENOMINATOR, i] <= least or work[CERTAINTY, i] <= 0.0:
+            state[i] = UNSTABLE
+            alive = alive and i < start
+        elif not alive:
+            state[i] = UNSTABLE
+        elif first < 0:
+            first = i
+    return first
+
+
+@_compiled
+def _scale(
+    i: int,
+    variance: Array,
+    range_: Array,
+    path: Array,
+    by_reference: float,
+    offset: float,
+    work: Array,
+    out: Array,
+) -> tuple[float, float, float, float]:
+    """Return the lidar constant, and its relative errors: noise, background, all the others.
+
+    The extinction by particles of bin `i`, the nearest solved one, is taken to hold down to the
+    lidar.
+    """
+    d, g, reach = work[DENOMINATOR, i], path[GAIN, i], 2.0 * path[RATIO, i] * range_[i]
+    particles = out[BACKSCATTER, i]
+    total = particles + path[AIR, i]
+    constant = d * range_[i] ** 2 / g * math.exp(reach * particles + 2.0 * path[COLUMN, i])
+    # The logarithm changes by that of d, and by `reach` times the change of the backscatter.
+    damped = 1.0 - reach * total
+    own = damped * work[OWN_SHARE, i] + reach * g
+    noise = math.sqrt(damped * damped * work[OTHERS, i] + own * own * variance[i]) / d
+    background = work[BY_OFFSET, i] * offset / d + reach * out[BACKGROUND, i]
+    reference = by_reference / d + reach * out[REFERENCE, i]
+    ratio = work[BY_RATIO, i] / d - path[GAIN_RATIO, i] + reach * out[LIDAR_RATIO, i]
+    ratio += 2.0 * range_[i] * path[RATIO_ERROR, i] * particles
+    air = work[BY_AIR, i] / d - path[GAIN_AIR, i] + reach * out[MOLECULAR, i]
+    air += 2.0 * path[COLUMN_AIR, i]
+    return constant, noise, background, math.sqrt(reference**2 + ratio**2 + air**2)
+
+
+@_compiled
+def _attenuate(
+    power: Any,
+    variance: Array,
+    offset: float,
+    range_: Array,
+    scale: Any,
+    values: Array,
+    errors: Array,
+) -> None:
+    constant, noise, background, rest = scale
+    inverse, constant_error = 1.0 / constant, noise * noise + rest * rest
+    for i in range(range_.size):
+        factor = range_[i] * range_[i] * inverse
+        value = factor * np.float64(power[i])
+        common = factor * offset - value * background
+        square = factor * factor * variance[i] + value * value * constant_error
+        values[i] = value
+        errors[i] = math.sqrt(square + common * common)
+
+
+@_compiled
+def _withhold(
+    power: Any, variance: Array, calibrated: bool, state: Codes, k: int, out: Array
+) -> None:
+    others = 0
+    for i in range(state.size):
+        others |= state[i] ^ VALID
+    if others == 0:
+        return
+    for i in range(state.size):
+        if state[i] == VALID:
+            continue
+        out[BACKSCATTER, k, i] = np.nan
+        for field in (NOISE, BACKGROUND, REFERENCE, LIDAR_RATIO, MOLECULAR):
+            out[field, k, i] = np.nan
+        if not (calibrated and _usable(power[i], variance[i])):
+            out[ATTENUATED, k, i] = out[ATTENUATED_ERROR, k, i] = np.nan
+
+
+@_compiled
+def invert(
+    power: Any,
+    variance: Array,
+    window: Any,
+    range_: Array,
+    air: tuple[Array, Array, Array],
+    scattering_ratio: Array,
+    errors: tuple[Array, Array],
+    causes: Array,
+    limits: Array,
+    out: Array,
+    scalars: Array,
+    state: Codes,
+) -> None:
+    """Invert profiles, one after the other.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+        Free of background.
+    variance : (profile or 1, bin) float64
+    window : (profile or 1, bin) bool
+        Bins of the reference window.
+    range_ : (bin,) float64
+        m, ascending.
+    air : three of (profile or 1, bin) float64
+        Backscatter and extinction of the air, lidar ratio of the particles.
+    scattering_ratio : (profile or 1,) float64
+        In the reference window.
+    errors : two of (profile or 1, bin) float64
+        Of the lidar ratio in sr, and of the air, relative.
+    causes : (profile or 1, 2) float64
+        Standard error of the background, relative one of the scattering ratio.
+    limits : (3,) float64
+        m, the longest gap that is bridged; least share of the denominator at the reference;
+        least square of the denominator over its variance.
+    out : (`FIELDS`, profile, bin) float64
+        Gets what this module names, NaN where nothing is known.
+    scalars : (profile, `SCALARS`) float64
+        Gets the lidar constant and its standard error, NaN where not known.
+    state : (profile, bin) uint8
+        Gets the state of each bin.
+    """
+    varied = max(
+        air[0].shape[0], air[1].shape[0], air[2].shape[0], scattering_ratio.size,
+        errors[0].shape[0], errors[1].shape[0],
+    )  # fmt: skip
+    path = np.empty((PATH_ROWS, range_.size))
+    work, calibration = np.zeros((WORK_ROWS, range_.size)), np.empty(7)
+    for k in range(power.shape[0]):
+        if k == 0 or varied > 1:
+            trace_path(
+                range_,
+                air[0][k % air[0].shape[0]],
+                air[1][k % air[1].shape[0]],
+                air[2][k % air[2].shape[0]],
+                scattering_ratio[k % scattering_ratio.size],
+                errors[0][k % errors[0].shape[0]],
+                errors[1][k % errors[1].shape[0]],
+                path,
+            )
+        noise, inside = variance[k % variance.shape[0]], window[k % window.shape[0]]
+        cause = causes[k % causes.shape[0]]
+        scalars[k], state[k] = np.nan, MISSING
+        start = _calibrate(power[k], noise, inside, path, calibration)
+        nearest = -1
+        if start >= 0:
+            _integrate(
+                power[k, start:], noise[start:], inside[start:], range_[start:], path[:, start:],
+                1, calibration, limits[0], work[:, start:], state[k, start:],
+            )  # fmt: skip
+            _integrate(
+                power[k, start::-1], noise[start::-1], inside[start::-1], range_[start::-1],
+                path[:, start::-1], -1, calibration, limits[0], work[:, start::-1],
+                state[k, start::-1],
+            )  # fmt: skip
+            change = -calibration[0] * cause[1] * calibration[4]
+            _solve_bins(power[k], noise, path, change, cause[0], work, k, out)
+            _measure_certainty(noise, change, cause[0], path, limits[2], work)
+            nearest = _doubt(start, limits[1] * calibration[0], work, state[k])
+        if nearest >= 0:
+            scale = _scale(nearest, noise, range_, path, change, cause[0], work, out[:, k])
+            _attenuate(
+                power[k],
+                noise,
+                cause[0],
+                range_,
+                scale,
+                out[ATTENUATED, k],
+                out[ATTENUATED_ERROR, k],
+            )
+            scalars[k, CONSTANT] = scale[0]
+            relative = scale[1] ** 2 + scale[2] ** 2 + scale[3] ** 2
+            scalars[k, CONSTANT_ERROR] = scale[0] * math.sqrt(relative)
+        _withhold(power[k], noise, nearest >= 0, state[k], k, out)

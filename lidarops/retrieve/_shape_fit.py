@@ -1,0 +1,410 @@
+"""Compiled weighted least squares of a constant and a known shape, one profile at a time.
+
+Sums are centred on weighted means, so that a background 1e8 times the signal costs no digits
+of the signal. All sums of a profile run over its bins from near to far.
+"""
+
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+HUGE: Final = 1e300
+GROUPS: Final = 16
+"""Groups of neighbouring bins whose mean residuals are tested."""
+FEWEST_GROUPS: Final = 4
+SINGULAR: Final = 1e-14
+"""Squared contrast of the shape, relative to its mean, below which rounding is all there is."""
+
+BACKGROUND: Final = 0
+AMPLITUDE: Final = 1
+BACKGROUND_VARIANCE: Final = 2
+AMPLITUDE_VARIANCE: Final = 3
+COVARIANCE: Final = 4
+CHI2: Final = 5
+BINS: Final = 6
+CONDITION: Final = 7
+CURVATURE: Final = 8
+WAVES: Final = 9
+WINDOW: Final = 10
+ROUGHNESS: Final = 11
+CONSTANT: Final = 12
+COLUMNS: Final = 13
+
+
+class Noise(NamedTuple):
+    """What the weights are made of."""
+
+    variance: Array
+    """(profile or 1, bin), in the square of the power's unit; not used for counts."""
+    exposure: Array
+    """(profile or 1,), counts per unit of power; NaN for noise that is not Poisson's."""
+    known: bool
+    """Whether the variance is known, or only its shape."""
+
+
+class Limits(NamedTuple):
+    """What a window may show to be taken for free of aerosol."""
+
+    waves: float
+    """Chi-square of the means of `GROUPS` groups, two degrees of freedom gone."""
+    deviation: float
+    """Standard errors."""
+
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_summing = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}
+)
+
+
+@_summing
+def _sums(values: Array, phi: Array, weights: Array) -> Any:
+    """Return weight, mean shape, mean power, their centred sums."""
+    total = shape = power = 0.0
+    for i in range(weights.size):
+        total += weights[i]
+        shape += weights[i] * phi[i]
+        power += weights[i] * values[i]
+    shape /= total
+    power /= total
+    square = product = 0.0
+    for i in range(weights.size):
+        lever = weights[i] * (phi[i] - shape)
+        square += lever * (phi[i] - shape)
+        product += lever * (values[i] - power)
+    return total, shape, power, square, product
+
+
+@_summing
+def _bend(phi: Array, lever: Array, weights: Array, shape: float) -> Any:
+    """Return the sum of the shape tilted along range, and its product with the shape."""
+    bend = cross = 0.0
+    for i in range(weights.size):
+        tilted = weights[i] * phi[i] * lever[i]
+        bend += tilted
+        cross += tilted * (phi[i] - shape)
+    return bend, cross
+
+
+@_summing
+def _group(residuals: Array, phi: Array, lever: Array, weights: Array, tilt: Any) -> Any:
+    """Return chi-square, weight and sum of some residuals, norm and score of the curvature."""
+    bend, slope, shape = tilt
+    chi2 = weight = total = norm = score = 0.0
+    for i in range(weights.size):
+        own = phi[i] * lever[i] - bend - slope * (phi[i] - shape)
+        weighted = weights[i] * residuals[i]
+        chi2 += weighted * residuals[i]
+        weight += weights[i]
+        total += weighted
+        norm += weights[i] * own * own
+        score += weighted * own
+    return chi2, weight, total, norm, score
+
+
+@_compiled
+def _roughness(residuals: Array, weights: Array) -> float:
+    """Return the mean squared difference of neighbours over what their weights let expect."""
+    rough = before = last = 0.0
+    pairs = 0
+    for i in range(weights.size):
+        if weights[i] == 0.0:
+            continue
+        if last > 0.0:
+            step = residuals[i] - before
+            rough += step * step * (weights[i] * last) / (weights[i] + last)
+            pairs += 1
+        before, last = residuals[i], weights[i]
+    return rough / pairs if pairs > 0 else math.nan
+
+
+@_summing
+def _fill_counts(
+    weights: Array,
+    phi: Array,
+    usable: Array,
+    exposure: float,
+    background: float,
+    amplitude: float,
+) -> None:
+    for i in range(weights.size):
+        weights[i] = usable[i] * exposure / (background + amplitude * phi[i])
+
+
+@_compiled
+def _weigh_counts(
+    values: Array,
+    phi: Array,
+    usable: Array,
+    exposure: float,
+    bins: float,
+    weights: Array,
+) -> None:
+    """Weigh by the variance of counts as a fitted model has it, twice."""
+    weights[:] = usable
+    for _ in range(2):
+        _, shape, power, square, product = _sums(values, phi, weights)
+        amplitude = max(product / square, 0.0) if square > 0.0 else 0.0
+        background = power - amplitude * shape
+        # A background of nothing is known to its standard error only, and to a count at best.
+        level = max(power, 0.0) / (bins * exposure)
+        least = math.sqrt(level) + 1.0 / (bins * exposure)
+        _fill_counts(weights, phi, usable, exposure, max(background, least), amplitude)
+
+
+@_compiled
+def _test_residuals(
+    residuals: Array, phi: Array, lever: Array, weights: Array, sums: Any, row: Array
+) -> None:
+    """Fill the chi-square of all residuals and of their groups, and the curvature."""
+    total, shape, square = sums
+    bend, cross = _bend(phi, lever, weights, shape)
+    tilt = (bend / total, cross / square, shape)
+    chi2 = norm = score = waves = 0.0
+    groups = edge = 0
+    for group in range(GROUPS):
+        until = (group + 1) * weights.size // GROUPS
+        part = slice(edge, until)
+        parts = _group(residuals[part], phi[part], lever[part], weights[part], tilt)
+        chi2 += parts[0]
+        norm += parts[3]
+        score += parts[4]
+        if parts[1] > 0.0:
+            groups += 1
+            waves += parts[2] * parts[2] / parts[1]
+        edge = until
+    row[CHI2] = chi2
+    # The tilted shape may be nothing but a mixture of the shape and a constant.
+    least = SINGULAR * square * lever[-1] ** 2
+    row[CURVATURE] = score / math.sqrt(norm) if norm > least else 0.0
+    row[WAVES] = waves if groups >= FEWEST_GROUPS else 0.0
+
+
+@_summing
+def _subtract(values: Array, phi: Array, row: Array, residuals: Array) -> None:
+    background, amplitude = row[BACKGROUND], row[AMPLITUDE]
+    for i in range(residuals.size):
+        residuals[i] = values[i] - background - amplitude * phi[i]
+
+
+@_summing
+def _count(usable: Array) -> int:
+    bins = 0
+    for i in range(usable.size):
+        bins += 1 if usable[i] > 0.0 else 0
+    return bins
+
+
+@_compiled
+def _is_constant(values: Array, usable: Array) -> bool:
+    first = -1
+    for i in range(values.size):
+        if usable[i] == 0.0:
+            continue
+        if first < 0:
+            first = i
+        elif values[i] != values[first]:
+            return False
+    return True
+
+
+@_compiled
+def _fit(
+    values: Array,
+    phi: Array,
+    lever: Array,
+    usable: Array,
+    exposure: float,
+    known: bool,
+    weights: Array,
+    residuals: Array,
+    row: Array,
+) -> None:
+    """Fit one window of one profile; `usable` is 0 or the weight of the bin."""
+    row[:] = np.nan
+    bins = _count(usable)
+    row[BINS] = bins
+    row[CONSTANT] = _is_constant(values, usable)
+    if bins == 0:
+        return
+    if exposure > 0.0:
+        _weigh_counts(values, phi, usable, exposure, float(bins), weights)
+    else:
+        weights[:] = usable
+    total, shape, power, square, product = _sums(values, phi, weights)
+    if not square > SINGULAR * total * shape * shape:
+        row[CONDITION] = np.inf
+        return
+    row[AMPLITUDE] = product / square
+    row[BACKGROUND] = power - row[AMPLITUDE] * shape
+    row[AMPLITUDE_VARIANCE] = 1.0 / square
+    row[COVARIANCE] = -shape / square
+    row[BACKGROUND_VARIANCE] = 1.0 / total + shape * shape / square
+    row[CONDITION] = math.sqrt(row[BACKGROUND_VARIANCE] * total)
+    _subtract(values, phi, row, residuals)
+    sums = (total, shape, square)
+    _test_residuals(residuals, phi, lever, weights, sums, row)
+    if not known:
+        row[ROUGHNESS] = _roughness(residuals, weights)
+
+
+@_compiled
+def _level(row: Array, known: bool) -> float:
+    """Return the variance that a weight of one stands for, as differences of bins show it."""
+    return 1.0 if known else row[ROUGHNESS]
+
+
+@_compiled
+def _passes(row: Array, limits: Limits, known: bool) -> bool:
+    level = _level(row, known)
+    straight = abs(row[CURVATURE]) <= limits.deviation * math.sqrt(level)
+    calm = row[WAVES] <= limits.waves * level
+    return bool(straight and calm)
+
+
+@_compiled
+def _choose(rows: Array, limits: Limits, known: bool) -> int:
+    """Return the longest window that passes and agrees with all shorter ones, or the shortest."""
+    shortest = rows.shape[0] - 1
+    for k in range(shortest):
+        if not (rows[k, BINS] > 0 and _passes(rows[k], limits, known)):
+            continue
+        agrees = True
+        for j in range(k + 1, rows.shape[0]):
+            # The difference of nested fits has the difference of their variances.
+            gap = rows[j, BACKGROUND_VARIANCE] - rows[k, BACKGROUND_VARIANCE]
+            step = rows[j, BACKGROUND] - rows[k, BACKGROUND]
+            if step * step > limits.deviation**2 * gap * _level(rows[k], known):
+                agrees = False
+        if agrees:
+            return int(k)
+    return int(shortest)
+
+
+@_summing
+def _prepare(
+    power: Any,
+    shape: Array,
+    mask: Array,
+    variance: Array,
+    usable: Array,
+    values: Array,
+    scaled: Array,
+) -> float:
+    """Copy what can be used, the shape over its mean, and return that mean."""
+    total = count = 0.0
+    for i in range(values.size):
+        weight = 1.0 / variance[i]
+        value = np.float64(power[i])
+        good = (abs(value) < HUGE) & (shape[i] > 0.0) & (shape[i] < HUGE)
+        good &= (weight > 0.0) & (weight < HUGE) & (mask[i] > 0.0)
+        usable[i] = weight if good else 0.0
+        values[i] = value if good else 0.0
+        scaled[i] = shape[i] if good else 0.0
+        total += scaled[i]
+        count += 1.0 if good else 0.0
+    unit = total / count if total > 0.0 else 1.0
+    for i in range(values.size):
+        scaled[i] /= unit
+    return unit
+
+
+@_compiled
+def _tilt(range_: Array, lever: Array) -> None:
+    for i in range(range_.size):
+        lever[i] = range_[i] - range_[0]
+
+
+@_compiled
+def fill_pasts(power: Any, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
+    """Lower the bins past each window to the one past its last usable bin.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    mask : (profile or 1, bin) float64
+    pasts : (profile,) int
+    """
+    for k in range(pasts.size):
+        allowed = mask[k % mask.shape[0]]
+        past = pasts[k]
+        while past > 0 and not (abs(power[k, past - 1]) < HUGE and allowed[past - 1] > 0.0):
+            past -= 1
+        pasts[k] = past
+
+
+@_compiled
+def fit_profiles(
+    power: Any,
+    shape: Array,
+    range_: Array,
+    mask: Array,
+    noise: Noise,
+    firsts: npt.NDArray[np.intp],
+    pasts: npt.NDArray[np.intp],
+    limits: Limits,
+    out: Array,
+) -> None:
+    """Fit every profile in its windows, and keep the fit of one.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    shape, mask : (profile or 1, bin) float64
+        Bins are passed over where the mask is 0.
+    range_ : (bin,) float64
+        m, ascending.
+    noise : Noise
+    firsts : (profile or 1, window) int
+        First bins of nested windows, the longest first.
+    pasts : (profile or 1,) int
+    limits : Limits
+    out : (profile, COLUMNS) float64
+    """
+    count, bins = power.shape
+    windows = firsts.shape[1]
+    usable, values, scaled = np.empty(bins), np.empty(bins), np.empty(bins)
+    weights, residuals, lever = np.empty(bins), np.empty(bins), np.empty(bins)
+    rows = np.empty((windows, COLUMNS))
+    for k in range(count):
+        exposure = noise.exposure[k % noise.exposure.shape[0]]
+        first_of = firsts[k % firsts.shape[0]]
+        past = pasts[k % pasts.shape[0]]
+        full = slice(first_of[0], max(past, first_of[0]))
+        unit = _prepare(
+            power[k][full],
+            shape[k % shape.shape[0]][full],
+            mask[k % mask.shape[0]][full],
+            noise.variance[k % noise.variance.shape[0]][full],
+            usable[full],
+            values[full],
+            scaled[full],
+        )
+        for j in range(windows):
+            part = slice(first_of[j], max(past, first_of[j]))
+            _tilt(range_[part], lever[part])
+            _fit(
+                values[part],
+                scaled[part],
+                lever[part],
+                usable[part],
+                exposure,
+                noise.known,
+                weights[part],
+                residuals[part],
+                rows[j],
+            )
+            rows[j, WINDOW] = j
+        chosen = _choose(rows, limits, noise.known) if windows > 1 else 0
+        out[k] = rows[chosen]
+        out[k, AMPLITUDE] /= unit
+        out[k, AMPLITUDE_VARIANCE] /= unit * unit
+        out[k, COVARIANCE] /= unit

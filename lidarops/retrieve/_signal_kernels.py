@@ -1,0 +1,526 @@
+"""Counts to signals with known noise, one profile at a time, in a few passes within the cache.
+
+What is smoothed along range is a sum over a window that grows with range. Differences of one
+running sum would lose, in the far range, the digits that the near range took: the light falls by
+six orders of magnitude between them. So the running sums start anew every `BLOCK` bins, and a
+window is the tail of its first block, the whole blocks within, and the head of its last one. No
+window is shorter than a block, so that these three do not overlap, and only the sums of whole
+blocks, which carry what rounding took from them, are differences. The error of an average stays
+below ``(BLOCK + 3) 2^-53`` of the mean of absolute values within the window, plus
+``(bins / BLOCK)^2 2^-106`` of the sum of those of the profile over the bins of the window.
+
+Every sum has a fixed order within its profile: the bits of a result depend on nothing else.
+"""
+
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.flags import Quality
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
+Indices = npt.NDArray[np.uint32]
+
+BLOCK: Final = 16
+"""Bins between two starts of the running sums; windows have at least one more."""
+
+_LOWEST: Final = np.iinfo(np.int32).min
+_HIGHEST: Final = np.iinfo(np.int32).max
+_FLAT: Final = 1e-12
+"""Relative spread below which values differ by rounding alone."""
+_MISSING: Final = int(Quality.INPUT_MISSING)
+_SATURATED: Final = int(Quality.SATURATED)
+_PILE_UP: Final = int(Quality.PILE_UP)
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_finding = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
+_summing = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}
+)
+
+
+class Windows(NamedTuple):
+    """The smoothing window of each bin."""
+
+    first: Indices
+    past: Indices
+    """Behind the last bin; where that is the last of the profile, the end of its block."""
+    bins: Array
+    """Number of values in the window of a profile without gaps."""
+
+
+class Noise(NamedTuple):
+    """What the noise model needs to know of the range grid."""
+
+    narrow: Windows
+    """In which the signal is smoothed."""
+    wide: Windows
+    """In which squared third differences are."""
+    leak: Array
+    """Root of the least variance at which the fall of a signal of 1 may pass for noise."""
+
+
+class _Sums(NamedTuple):
+    """Running sums over the bins of one profile, filled up with zeros to whole blocks."""
+
+    values: Array
+    head: Array
+    """From the start of the block to before the bin."""
+    tail: Array
+    """From the bin to the end of the block."""
+    high: Array
+    """Over the blocks before this one."""
+    low: Array
+    """What rounding took from `high`."""
+    finite: npt.NDArray[np.int64]
+    """1 where `values` counts."""
+    counts: npt.NDArray[np.int64]
+    """Photons, or finite values, before the bin."""
+    bins: Array
+    """Number of finite values in the window, where the profile has gaps."""
+
+
+class Scratch(NamedTuple):
+    """Memory for one profile, which stays in the cache."""
+
+    sums: _Sums
+    mean: Array
+    local: Array
+    weight: Array
+
+
+def scratch(bins: int) -> Scratch:
+    """Return memory for profiles of that many bins."""
+    blocks = -(-bins // BLOCK)
+    padded = blocks * BLOCK
+    sums = _Sums(
+        np.zeros(padded),
+        np.zeros(padded + 1),
+        np.zeros(padded),
+        np.zeros(blocks + 1),
+        np.zeros(blocks + 1),
+        np.zeros(padded, np.int64),
+        np.zeros(padded + 1, np.int64),
+        np.zeros(bins),
+    )
+    return Scratch(sums, np.zeros(bins), np.zeros(bins), np.zeros(bins))
+
+
+@_compiled
+def _load(values: Array, s: _Sums) -> bool:
+    """Take what is finite of a profile; return whether all is."""
+    found = 0
+    for i in range(values.size):
+        finite = abs(values[i]) < math.inf
+        s.values[i] = values[i] if finite else 0.0
+        s.finite[i] = 1 if finite else 0
+        found += s.finite[i]
+    return bool(found == values.size)
+
+
+@_compiled
+def _load_squares(power: Array, s: _Sums) -> bool:
+    """Take the third differences, squared and scaled to the variance of white noise."""
+    for i in (0, max(power.size - 2, 0), power.size - 1):
+        s.values[i] = 0.0
+        s.finite[i] = 0
+    found = 0
+    for i in range(power.size - 3):
+        third = power[i + 3] - 3.0 * power[i + 2] + 3.0 * power[i + 1] - power[i]
+        square = third * third / 20.0
+        finite = square < math.inf
+        s.values[i + 1] = square if finite else 0.0
+        s.finite[i + 1] = 1 if finite else 0
+        found += s.finite[i + 1]
+    return bool(found == power.size - 3)
+
+
+@_compiled
+def _accumulate(s: _Sums) -> None:
+    """Fill the running sums."""
+    high = low = 0.0
+    for block in range(s.high.size - 1):
+        start = block * BLOCK
+        end = start + BLOCK - 1
+        total = back = 0.0
+        for i in range(BLOCK):
+            s.head[start + i] = total
+            total += s.values[start + i]
+            back += s.values[end - i]
+            s.tail[end - i] = back
+        s.high[block], s.low[block] = high, low
+        # What the addition rounds off, exactly (Knuth).
+        summed = high + total
+        part = summed - high
+        low += (high - (summed - part)) + (total - part)
+        high = summed
+    s.high[-1], s.low[-1] = high, low
+
+
+@_compiled
+def _count_finite(s: _Sums) -> None:
+    before = 0
+    for i in range(s.finite.size):
+        s.counts[i] = before
+        before += s.finite[i]
+    s.counts[-1] = before
+
+
+@_compiled
+def _window_counts(counts: npt.NDArray[np.int64], windows: Windows, out: Array) -> None:
+    for i in range(out.size):
+        out[i] = np.float64(counts[windows.past[i]] - counts[windows.first[i]])
+
+
+@_compiled
+def _window_sum(s: _Sums, first: np.uint32, past: np.uint32) -> float:
+    after, last = first // np.uint32(BLOCK) + np.uint32(1), past // np.uint32(BLOCK)
+    whole = (s.high[last] - s.high[after]) + (s.low[last] - s.low[after])
+    return float((s.tail[first] + s.head[past]) + whole)
+
+
+@_compiled
+def _averages(s: _Sums, windows: Windows, complete: bool, out: Array) -> None:
+    """Average the loaded values over windows."""
+    _accumulate(s)
+    if complete:
+        for i in range(out.size):
+            out[i] = _window_sum(s, windows.first[i], windows.past[i]) / windows.bins[i]
+        return
+    _count_finite(s)
+    for i in range(out.size):
+        first, past = windows.first[i], windows.past[i]
+        out[i] = _window_sum(s, first, past) / np.float64(s.counts[past] - s.counts[first])
+
+
+@_compiled
+def _bins(s: _Sums, windows: Windows, complete: bool) -> Array:
+    """Return the number of finite values in each window."""
+    if complete:
+        return windows.bins
+    _count_finite(s)
+    _window_counts(s.counts, windows, s.bins)
+    return s.bins
+
+
+@_finding
+def _lowest(values: Array) -> float:
+    lowest = math.inf
+    for i in range(values.size):
+        lowest = min(lowest, values[i])
+    return lowest
+
+
+@_compiled
+def _weigh(s: Scratch, leak: Array) -> None:
+    """Weight squared differences by the inverse square of their mean, at most 1."""
+    for i in range(leak.size):
+        mean, local = s.mean[i], s.local[i]
+        faked = leak[i] * mean
+        usable = (s.sums.finite[i] != 0) & (abs(mean) < math.inf) & (local > 0.0)
+        s.weight[i] = local if usable & (faked * faked < local) else math.inf
+    lowest = _lowest(s.weight)
+    for i in range(leak.size):
+        share = lowest / s.weight[i]
+        s.weight[i] = share * share
+
+
+@_summing
+def _means(x: Array, y: Array, weight: Array) -> tuple[float, float]:
+    total = of_x = of_y = 0.0
+    for i in range(weight.size):
+        w = weight[i]
+        total += w
+        of_x += w * (x[i] if w > 0.0 else 0.0)
+        of_y += w * y[i]
+    return of_x / total, of_y / total
+
+
+@_summing
+def _moments(
+    x: Array, y: Array, weight: Array, x_mean: float, y_mean: float
+) -> tuple[float, float, float, float]:
+    square = product = from_zero = through = 0.0
+    for i in range(weight.size):
+        w = weight[i]
+        value = x[i] if w > 0.0 else 0.0
+        distance = value - x_mean
+        square += w * distance * distance
+        product += w * distance * (y[i] - y_mean)
+        from_zero += w * value * value
+        through += w * value * y[i]
+    return square, product, from_zero, through
+
+
+@_compiled
+def _line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
+    """Return intercept and slope of y over x, neither below zero; NaN without weights."""
+    x_mean, y_mean = _means(x, y, weight)
+    square, product, from_zero, through = _moments(x, y, weight, x_mean, y_mean)
+    slope = product / square
+    if not (slope > 0.0) & (square > _FLAT * _FLAT * from_zero):
+        slope = 0.0
+    intercept = y_mean - slope * x_mean
+    if intercept < 0.0:
+        # Through the origin, where the fit would have the noise vanish above zero light.
+        return 0.0, through / from_zero
+    return intercept, slope
+
+
+@_compiled
+def _estimate(power: Array, noise: Noise, least: float, s: Scratch, out: Array) -> None:
+    complete = _load(power, s.sums)
+    _averages(s.sums, noise.narrow, complete, s.mean)
+    complete = _load_squares(power, s.sums)
+    _averages(s.sums, noise.wide, complete, s.local)
+    _weigh(s, noise.leak)
+    a, b = _line(s.mean, s.sums.values[: power.size], s.weight)
+    for i in range(power.size):
+        mean = s.mean[i]
+        variance = a + b * (0.0 if mean < 0.0 else mean)
+        # Too few differences for a line, or a signal without noise: what there is, locally.
+        variance = variance if (variance > 0.0) & (variance < math.inf) else s.local[i]
+        out[i] = least if variance < least else variance
+
+
+@_compiled
+def _is_off(counts: npt.NDArray[np.int32]) -> bool:
+    """Return whether there is not a single count.
+
+    A recorder that is off writes zeros; light and electronics never do over a whole profile.
+    """
+    bits = np.int32(0)
+    for i in range(counts.size):
+        bits |= counts[i]
+    return bool(bits == 0)
+
+
+@_compiled
+def _voltage(
+    counts: npt.NDArray[np.int32],
+    missing: bool,
+    step: float,
+    full: float,
+    dark: Array,
+    overlap: Flags,
+    power: Array,
+    quality: Flags,
+) -> None:
+    for i in range(counts.size):
+        count = counts[i]
+        value = count * step - dark[i]
+        extreme = (count == _LOWEST) | (count == -_HIGHEST) | (count == _HIGHEST)
+        lost = missing | extreme | (not abs(value) < math.inf)
+        saturated = np.float64(count) >= full
+        power[i] = math.nan if lost | saturated else value
+        quality[i] = overlap[i] | (_MISSING if lost else 0) | (_SATURATED if saturated else 0)
+
+
+@_compiled
+def voltage_profiles(
+    counts: npt.NDArray[np.int32],
+    shots: Array,
+    step: Array,
+    full: Array,
+    dark: Array,
+    overlap: Flags,
+    power: Array,
+    quality: Flags,
+) -> None:
+    """Turn summed ADC counts into voltage.
+
+    Parameters
+    ----------
+    counts : (profile, bin) int32
+    shots, step, full : (profile,) float64
+        mV per count, and the count from which the digitiser is at full scale.
+    dark : (profile or 1, bin) float64
+        mV.
+    overlap : (bin,) int32
+        INCOMPLETE_OVERLAP or 0.
+    power, quality : (profile, bin)
+        Get the signal.
+    """
+    for k in range(counts.shape[0]):
+        missing = (not shots[k] > 0.0) | _is_off(counts[k])
+        own = dark[k % dark.shape[0]]
+        _voltage(counts[k], missing, step[k], full[k], own, overlap, power[k], quality[k])
+
+
+@_compiled
+def noise_profiles(power: Array, noise: Noise, least: Array, s: Scratch, out: Array) -> None:
+    """Estimate the noise variance of every profile from third differences.
+
+    Parameters
+    ----------
+    power : (profile, bin) float64
+    noise : Noise
+    least : (profile,) float64
+        No variance is below.
+    s : Scratch
+    out : (profile, bin) float64
+        Gets the variance.
+    """
+    for k in range(power.shape[0]):
+        _estimate(power[k], noise, least[k], s, out[k])
+
+
+@_compiled
+def smooth_profiles(values: Array, windows: Windows, s: Scratch, out: Array) -> None:
+    """Average every profile over windows.
+
+    Parameters
+    ----------
+    values : (profile, bin) float64
+    windows : Windows
+    s : Scratch
+    out : (profile, bin) float64
+        Gets the averages of what is finite.
+    """
+    for k in range(values.shape[0]):
+        complete = _load(values[k], s.sums)
+        _averages(s.sums, windows, complete, out[k])
+
+
+class Counter(NamedTuple):
+    """How a photon counter answers to light."""
+
+    dead_time: float
+    """Microseconds; 0 corrects nothing."""
+    judged: float
+    """Dead time by which pile-up and paralysis are judged."""
+    paralysis: float
+    """Measured rate times dead time above which the counter is SATURATED."""
+    pile_up: float
+    """Relative correction above which there is PILE_UP."""
+
+
+@_compiled
+def _rate(
+    counts: npt.NDArray[np.int32],
+    missing: bool,
+    exposure: float,
+    counter: Counter,
+    overlap: Flags,
+    s: _Sums,
+    power: Array,
+    quality: Flags,
+) -> bool:
+    """Fill power and quality of a profile, and load it; return whether it has no gaps."""
+    found = 0
+    for i in range(counts.size):
+        count = counts[i]
+        rate = count / exposure
+        load = rate * counter.judged
+        saturated = load > counter.paralysis
+        piled = load / (1.0 - (counter.paralysis if saturated else load)) > counter.pile_up
+        lost = missing | (count < 0) | (count == _HIGHEST)
+        bad = lost | saturated
+        value = rate / (1.0 - rate * counter.dead_time)
+        power[i] = math.nan if bad else value
+        s.values[i] = 0.0 if bad else value
+        s.finite[i] = 0 if bad else 1
+        found += s.finite[i]
+        bits = overlap[i] | (_MISSING if lost else 0) | (_SATURATED if saturated else 0)
+        quality[i] = bits | (_PILE_UP if piled else 0)
+    return bool(found == counts.size)
+
+
+@_compiled
+def _photons(counts: npt.NDArray[np.int32], windows: Windows, s: _Sums, out: Array) -> None:
+    """Count what is not masked in each window, which is exact."""
+    before = 0
+    for i in range(counts.size):
+        s.counts[i] = before
+        before += counts[i] * s.finite[i]
+    for i in range(counts.size, s.counts.size):
+        s.counts[i] = before
+    _window_counts(s.counts, windows, out)
+
+
+@_compiled
+def _photon_variance(
+    exposure: float, dead_time: float, photons: Array, bins: Array, mean: Array, out: Array
+) -> None:
+    for i in range(out.size):
+        # A window without a single count has a rate below one count, not a certain zero.
+        one = 1.0 / (exposure * bins[i])
+        measured = photons[i] * one
+        rate = mean[i] if dead_time > 0.0 else measured
+        expected = one if one > rate else rate
+        out[i] = expected / (exposure * (1.0 - measured * dead_time))
+
+
+@_compiled
+def photon_profiles(
+    counts: npt.NDArray[np.int32],
+    shots: Array,
+    exposure: Array,
+    counter: Counter,
+    overlap: Flags,
+    windows: Windows,
+    s: Scratch,
+    power: Array,
+    variance: Array,
+    quality: Flags,
+) -> None:
+    """Turn summed photon counts into a count rate with known noise.
+
+    Parameters
+    ----------
+    counts : (profile, bin) int32
+    shots, exposure : (profile,) float64
+        Microseconds of a bin, over all shots.
+    counter : Counter
+    overlap : (bin,) int32
+        INCOMPLETE_OVERLAP or 0.
+    windows : Windows
+    s : Scratch
+    power, variance, quality : (profile, bin)
+        Get the signal.
+    """
+    for k in range(counts.shape[0]):
+        missing = (not shots[k] > 0.0) | _is_off(counts[k])
+        complete = _rate(
+            counts[k], missing, exposure[k], counter, overlap, s.sums, power[k], quality[k]
+        )
+        bins = _bins(s.sums, windows, complete)
+        if counter.dead_time > 0.0:
+            _averages(s.sums, windows, complete, s.mean)
+        _photons(counts[k], windows, s.sums, s.local)
+        _photon_variance(exposure[k], counter.dead_time, s.local, bins, s.mean, variance[k])
+
+
+@_compiled
+def range_corrected_profiles(
+    power: Array,
+    variance: Array,
+    background: Array,
+    background_variance: Array,
+    square: Array,
+    out_power: Any,
+    out_variance: Any,
+) -> None:
+    """Subtract the background and multiply with the square of range.
+
+    Parameters
+    ----------
+    power, variance : (profile, bin) float64
+    background, background_variance : (profile,) float64
+    square : (bin,) float64
+        m^2.
+    out_power, out_variance : (profile, bin) float32 or float64
+        Get the result.
+    """
+    for k in range(power.shape[0]):
+        level, spread = background[k], background_variance[k]
+        for i in range(square.size):
+            out_power[k, i] = (power[k, i] - level) * square[i]
+            out_variance[k, i] = (variance[k, i] + spread) * (square[i] * square[i])

@@ -1,0 +1,340 @@
+"""The background of a profile whose far range is free of aerosol: a fit of the molecular shape."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve import _inputs, _shape_fit
+from lidarops.retrieve._frozen import frozen
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
+Booleans = npt.NDArray[np.bool_]
+
+START_SHARES: Final = (0.3, 0.4, 0.5, 0.6, 0.7)
+"""Where the windows begin that are tried when none is given, over the farthest usable range."""
+FEWEST_BINS: Final = 8
+FALSE_ALARM: Final = 1e-4
+"""Probability that either test of the residuals says `poor_fit` where the shape is right."""
+REJECTION: Final = 1e-2
+"""The same for leaving a window out that might be chosen."""
+NEGATIVE: Final = 3.0
+"""Standard errors below zero from which on an amplitude is called negative."""
+LARGEST_CONDITION: Final = 30.0
+"""Standard error of the background over that of the mean of the same bins."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownShapeResult:
+    """Backgrounds and amplitudes, one of each for every profile, and what speaks against them."""
+
+    background: Array
+    """In the unit of the power; NaN where it could not be found."""
+    background_standard_error: Array
+    amplitude: Array
+    """Power over shape."""
+    amplitude_standard_error: Array
+    covariance: Array
+    """Of background and amplitude; negative."""
+    chi2: Array
+    """Sum of the squared residuals over their variances; over 1 where no variance is known."""
+    degrees_of_freedom: npt.NDArray[np.int64]
+    """Bins less 2; never below 0."""
+    condition: Array
+    """Standard error of the background over that of the mean of the same bins: 1 where the shape
+    dies away in the window, infinite where it cannot be told from a constant."""
+    curvature: Array
+    """Slope of the residuals, relative to the shape, along range, in standard errors: above 0
+    where the signal falls less than the shape."""
+    waves: Array
+    """Chi-square of the mean residuals of 16 equal parts of the window; 14 are expected."""
+    start: Array
+    """m, range of the first bin of the window."""
+    stop: Array
+    """m, range of the last bin of the window."""
+    poor_fit: Booleans
+    """The residuals vary systematically along range: the window is not free of aerosol, the
+    shape is not that of the air, or the noise is not white along range."""
+    singular: Booleans
+    """The window is too short for the shape to differ from a constant (`LARGEST_CONDITION`):
+    another method has to give the background."""
+    quality: Flags
+    """INPUT_MISSING, TOO_FEW_BINS, NO_SIGNAL (all bins of a window alike, but for counts: no noise
+    is like that), NEGATIVE_AMPLITUDE, NOT_HOMOGENEOUS (where `poor_fit`)."""
+
+
+def molecular_shape(
+    backscatter: npt.ArrayLike,
+    extinction: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+) -> Array:
+    r"""Return the shape of the signal from air alone.
+
+    .. math:: \varphi(R) = \frac{\beta(R)}{R^2} \exp\left(-2 \int_0^R \alpha \, dr\right)
+
+    by trapezoids from the first bin on; nearer, the extinction is taken as that of the first bin.
+
+    Parameters
+    ----------
+    backscatter : (..., range) float
+        m-1 sr-1.
+    extinction : (..., range) float
+        m-1.
+    range : (range,) float
+        m.
+
+    Returns
+    -------
+    (..., range) float
+        m-3 sr-1.
+
+    References
+    ----------
+    vasylkivskyi2022
+    """
+    beta = _inputs.real_array(backscatter, "backscatter").astype(np.float64)
+    alpha = _inputs.real_array(extinction, "extinction").astype(np.float64)
+    grid = _inputs.range_grid(range)
+    alpha, beta = grid.turn(alpha), grid.turn(beta)
+    depth = np.empty(alpha.shape)
+    depth[..., :1] = alpha[..., :1] * grid.values[0]
+    slices = 0.5 * (alpha[..., 1:] + alpha[..., :-1]) * np.diff(grid.values)
+    depth[..., 1:] = depth[..., :1] + np.cumsum(slices, axis=-1)
+    shape: Array = grid.turn(beta * np.exp(-2.0 * depth) / grid.values**2)
+    return shape
+
+
+def solve(
+    power: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+    shape: npt.ArrayLike,
+    *,
+    variance: npt.ArrayLike | None = None,
+    exposure: npt.ArrayLike | None = None,
+    start: npt.ArrayLike | None = None,
+    stop: npt.ArrayLike | None = None,
+    mask: npt.ArrayLike | None = None,
+    start_shares: Sequence[float] = START_SHARES,
+) -> KnownShapeResult:
+    r"""Fit background and amplitude of a signal whose shape is known, by weighted least squares.
+
+    .. math:: P(R) = b + C \varphi(R), \qquad
+              C = \frac{\sum w (\varphi - \bar\varphi)(P - \bar P)}
+                       {\sum w (\varphi - \bar\varphi)^2}, \qquad
+              b = \bar P - C \bar\varphi
+
+    with weighted means and :math:`w = 1 / v`; it is potapova2023's equation (4) with the
+    molecular shape in place of that of a homogeneous path. Nothing iterates.
+
+    The variance of counts is that of the fitted model, :math:`v = (b + C \varphi) / E`, from two
+    fixed passes after an unweighted one: weights made of the counts themselves would follow
+    their noise and put the background too low.
+
+    Parameters
+    ----------
+    power : (..., range) float
+        Any unit; bins that are not finite are passed over.
+    range : (range,) float
+        m.
+    shape : (..., range) float
+        Any unit, broadcast against `power`; bins where it is not positive and finite are passed
+        over. See `molecular_shape`.
+    variance : (..., range) float, optional
+        Noise variance in the square of the power's unit, broadcast against `power`. It must not
+        follow the noise of the single bin. Where neither it nor `exposure` is given, all bins
+        weigh the same and the residuals tell the level.
+    exposure : (...) float, optional
+        For Poisson counts: counts per unit of power. That is the number of shots where power is
+        a mean count per shot, and shots times bin time in microseconds where it is in MHz.
+    start, stop : (...) float, optional
+        m, ends of the window. Where `start` is not given, windows from each of `start_shares`
+        of the farthest usable range are tried. The longest one is taken whose residuals show
+        neither curvature nor waves, and whose background agrees with those of all shorter ones
+        (each at 1 % false alarms); the shortest where there is none.
+    mask : (..., range) bool, optional
+        True where a bin may be used; broadcast against `power`.
+    start_shares : sequence of float
+        Ascending, each between 0 and 1.
+
+    Returns
+    -------
+    KnownShapeResult
+        With the leading axes of `power`. The standard errors are those of the noise; what an
+        untrue shape does to the background is not in them, but in `curvature` and `waves`.
+
+    Raises
+    ------
+    RetrievalInputError
+        For arguments that cannot be right.
+
+    References
+    ----------
+    potapova2023, golub1973
+    """
+    grid = _inputs.range_grid(range)
+    rows, leading = _inputs.profiles(power, grid)
+    rows = frozen(rows)
+    shapes = frozen(_inputs.noise_rows(shape, "shape", grid, leading))
+    allowed = _mask_rows(mask, grid, leading)
+    noise = _noise(variance, exposure, grid, leading)
+    pasts = _pasts(rows, allowed, stop, grid.values, leading)
+    firsts = _firsts(start, start_shares, pasts, grid.values, leading)
+    out = np.full((len(rows), _shape_fit.COLUMNS), np.nan)
+    limits = _limits(REJECTION)
+    _shape_fit.fit_profiles(
+        rows, shapes, frozen(grid.values), allowed, noise, firsts, pasts, limits, out
+    )
+    window = np.nan_to_num(out[:, _shape_fit.WINDOW]).astype(np.intp)
+    first = np.take_along_axis(
+        np.broadcast_to(firsts, (len(rows), firsts.shape[1])), window[:, np.newaxis], axis=1
+    )[:, 0]
+    if exposure is not None:
+        # No light may well be no count over a whole window.
+        out[:, _shape_fit.CONSTANT] = 0.0
+    return _result(out, noise.known, grid.values, first, pasts, leading)
+
+
+def _noise(
+    variance: npt.ArrayLike | None,
+    exposure: npt.ArrayLike | None,
+    grid: _inputs.RangeGrid,
+    leading: tuple[int, ...],
+) -> _shape_fit.Noise:
+    if variance is not None and exposure is not None:
+        raise RetrievalInputError(
+            "is given for counts, which tell their own variance",
+            field="variance",
+            remedy="leave out either the variance or the exposure",
+        )
+    counts = _inputs.profile_values(exposure, "exposure", leading)
+    if counts is not None and np.any(counts <= 0):
+        raise RetrievalInputError(
+            "is not positive", field="exposure", remedy="mask profiles without shots"
+        )
+    return _shape_fit.Noise(
+        frozen(_inputs.variance_rows(variance, grid, leading)),
+        frozen(np.full(1, np.nan) if counts is None else counts),
+        variance is not None or counts is not None,
+    )
+
+
+def _mask_rows(
+    mask: npt.ArrayLike | None, grid: _inputs.RangeGrid, leading: tuple[int, ...]
+) -> Array:
+    if mask is None:
+        return frozen(np.ones((1, grid.size)))
+    allowed = np.asarray(mask)
+    if allowed.dtype != np.bool_:
+        raise RetrievalInputError(
+            f"holds {allowed.dtype}", field="mask", remedy="give True where a bin may be used"
+        )
+    return frozen(_inputs.noise_rows(allowed.astype(np.float64), "mask", grid, leading))
+
+
+def _pasts(
+    rows: _inputs.Floats,
+    allowed: Array,
+    stop: npt.ArrayLike | None,
+    range_: Array,
+    leading: tuple[int, ...],
+) -> npt.NDArray[np.intp]:
+    """Return the bin past the window of each profile: past its last usable one, or its stop."""
+    pasts = np.full(len(rows), range_.size, dtype=np.intp)
+    stops = _inputs.profile_values(stop, "stop", leading)
+    if stops is not None:
+        pasts[:] = np.searchsorted(range_, stops, side="right")
+    _shape_fit.fill_pasts(rows, allowed, pasts)
+    return pasts
+
+
+def _firsts(
+    start: npt.ArrayLike | None,
+    shares: Sequence[float],
+    pasts: npt.NDArray[np.intp],
+    range_: Array,
+    leading: tuple[int, ...],
+) -> npt.NDArray[np.intp]:
+    """Return the first bins of the windows, (profile or 1, window)."""
+    starts = _inputs.profile_values(start, "start", leading)
+    if starts is not None:
+        if np.any(starts > range_[-1]):
+            raise RetrievalInputError(
+                f"lies beyond the range, which ends at {range_[-1]:g} m", field="start"
+            )
+        return np.searchsorted(range_, starts, side="left").astype(np.intp)[:, np.newaxis]
+    tried = np.asarray(shares, dtype=np.float64)
+    inside = tried.size > 0 and tried[0] > 0 and tried[-1] < 1
+    if not inside or np.any(np.diff(tried) <= 0):
+        raise RetrievalInputError(
+            f"are {tuple(shares)}", field="start_shares", remedy="let them rise within 0 and 1"
+        )
+    farthest = range_[np.maximum(pasts - 1, 0)]
+    return np.searchsorted(range_, farthest[:, np.newaxis] * tried, side="left").astype(np.intp)
+
+
+def _limits(false_alarm: float) -> _shape_fit.Limits:
+    """Return the limits of the two tests that together raise so many false alarms."""
+    each = 0.5 * false_alarm
+    waves = special.chdtri(_shape_fit.GROUPS - 2.0, each)
+    return _shape_fit.Limits(float(waves), float(-special.ndtri(0.5 * each)))
+
+
+def _result(
+    out: Array,
+    known: bool,  # noqa: FBT001 - an internal function
+    range_: Array,
+    first: npt.NDArray[np.intp],
+    pasts: npt.NDArray[np.intp],
+    leading: tuple[int, ...],
+) -> KnownShapeResult:
+    bins = out[:, _shape_fit.BINS].astype(np.int64)
+    freedom = np.maximum(bins - 2, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level = np.ones(len(out)) if known else out[:, _shape_fit.CHI2] / freedom
+        rough = np.ones(len(out)) if known else out[:, _shape_fit.ROUGHNESS]
+        curvature = out[:, _shape_fit.CURVATURE] / np.sqrt(rough)
+        waves = out[:, _shape_fit.WAVES] / rough
+        amplitude_error = np.sqrt(out[:, _shape_fit.AMPLITUDE_VARIANCE] * level)
+        limits = _limits(FALSE_ALARM)
+        poor = (np.abs(curvature) > limits.deviation) | (waves > limits.waves)
+        negative = out[:, _shape_fit.AMPLITUDE] < -NEGATIVE * amplitude_error
+    condition = out[:, _shape_fit.CONDITION]
+    lost = (bins > 0) & ~np.isfinite(out[:, _shape_fit.BACKGROUND])
+    singular = (condition > LARGEST_CONDITION) | lost
+    quality = np.zeros(len(out), dtype=np.int32)
+    quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
+    quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    constant = (bins >= FEWEST_BINS) & (out[:, _shape_fit.CONSTANT] > 0)
+    quality[constant] |= np.int32(Quality.NO_SIGNAL)
+    quality[negative] |= np.int32(Quality.NEGATIVE_AMPLITUDE)
+    quality[poor] |= np.int32(Quality.NOT_HOMOGENEOUS)
+    empty = bins == 0
+    start = np.where(empty, np.nan, range_[np.minimum(first, range_.size - 1)])
+    stop = np.where(empty, np.nan, range_[np.maximum(pasts - 1, 0)])
+    return KnownShapeResult(
+        background=out[:, _shape_fit.BACKGROUND].reshape(leading),
+        background_standard_error=np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE] * level).reshape(
+            leading
+        ),
+        amplitude=out[:, _shape_fit.AMPLITUDE].reshape(leading),
+        amplitude_standard_error=amplitude_error.reshape(leading),
+        covariance=(out[:, _shape_fit.COVARIANCE] * level).reshape(leading),
+        chi2=out[:, _shape_fit.CHI2].reshape(leading),
+        degrees_of_freedom=freedom.reshape(leading),
+        condition=condition.reshape(leading),
+        curvature=curvature.reshape(leading),
+        waves=waves.reshape(leading),
+        start=start.reshape(leading),
+        stop=stop.reshape(leading),
+        poor_fit=poor.reshape(leading),
+        singular=singular.reshape(leading),
+        quality=quality.reshape(leading),
+    )

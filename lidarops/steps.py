@@ -1,0 +1,265 @@
+"""The steps of a plan, carried out for one channel: raw counts in, what its products hold out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from dask.base import compute
+
+from lidarops.ancillary import Ancillaries
+from lidarops.flags import Quality
+from lidarops.plans import GLUED, StepName
+from lidarops.records import Plan, ProductKind, Step
+from lidarops.retrieve import (
+    labeled,
+    labeled_average,
+    labeled_elastic,
+    labeled_glue,
+    labeled_signal,
+)
+from lidarops.retrieve.molecular import MolecularProfile
+
+Array = npt.NDArray[np.float64]
+
+_GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What the steps of all channels of a scene work on."""
+
+    plan: Plan
+    archive: xr.Dataset
+    """Raw counts of the scene, lazy."""
+    dark: xr.Dataset | None
+    """Raw counts of its dark files, lazy."""
+    ancillaries: Ancillaries
+    station_altitude: float
+    """m above mean sea level."""
+
+    def steps(self, channel: str) -> Mapping[str, Step]:
+        """Return the steps of a channel by name."""
+        return {step.name: step for step in self.plan.steps if step.channel == channel}
+
+
+def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
+    """Carry out the steps of a channel.
+
+    Parameters
+    ----------
+    bench : Bench
+    channel : str
+
+    Returns
+    -------
+    dict of ProductKind to xr.Dataset
+        In memory, with the variables of `lidarops.products.table` and the geometry of the beam.
+
+    Raises
+    ------
+    LidarOpsError
+        Where the data cannot be what the plan says.
+    """
+    steps = bench.steps(channel)
+    source = _Glued(bench, channel) if channel.startswith(GLUED) else _Plain(bench, channel)
+    lazy: dict[ProductKind, xr.Dataset] = {}
+    if StepName.SIGNAL in steps:
+        lazy[ProductKind.SIGNAL] = _signal(source.profiles(), steps, bench.ancillaries)
+    if StepName.HOMOGENEOUS in steps:
+        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(source.profiles(), steps)
+    for kind, data in lazy.items():
+        lazy[kind] = data.assign(shots=source.shots).assign_coords(source.geometry.variables)
+    if StepName.ELASTIC in steps:
+        lazy[ProductKind.ELASTIC] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
+    # Together, so that products of one channel share one reading of the files.
+    found = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
+    if ProductKind.ELASTIC in found:
+        averages = source.joined(found[ProductKind.ELASTIC])
+        found[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
+    return found
+
+
+class _Plain:
+    """A channel of the files."""
+
+    def __init__(self, bench: Bench, channel: str) -> None:
+        self._channel = channel
+        archive, steps = bench.archive, bench.steps(channel)
+        self._dark = None
+        if bench.dark is not None and StepName.DARK in steps:
+            method = steps[StepName.DARK].settings["method"]
+            self._dark = labeled_signal.dark_of(bench.dark, channel, method=method)
+        self._conditioned = labeled_signal.condition(
+            archive,
+            channel,
+            dead_time=_setting(steps, StepName.DEAD_TIME, "dead_time"),
+            noise_variance=_setting(steps, StepName.NOISE, "noise_variance"),
+            dark=self._dark,
+            range_offset=_setting(steps, StepName.RANGE_OFFSET, "range_offset") or 0.0,
+            full_overlap_range=_setting(steps, StepName.OVERLAP, "full_overlap_range") or 0.0,
+        )
+        self.geometry = archive[[name for name in _GEOMETRY if name in archive]]
+        self.shots = archive[f"{channel}_shots"]
+
+    def profiles(self) -> xr.Dataset:
+        """Return power, variance and quality of every profile."""
+        return self._conditioned
+
+    def averages(self, seconds: float) -> xr.Dataset:
+        """Return means over intervals of the clock, of every part of the channel."""
+        conditioned = self._conditioned.assign_coords(self.geometry.variables)
+        shared = None if self._dark is None else self._dark.variance
+        averages = labeled_average.clock_average(
+            conditioned, seconds=seconds, shots=self.shots, shared_variance=shared
+        )
+        angles = {
+            name: float(self.geometry[name][0])
+            for name in ("zenith_angle", "azimuth")
+            if name in self.geometry
+        }
+        return averages.assign_coords(angles)
+
+    def joined(self, averages: xr.Dataset) -> xr.Dataset:
+        """Return computed averages as one channel."""
+        return averages
+
+
+class _Glued:
+    """A channel made of an analog and a photon counting one."""
+
+    def __init__(self, bench: Bench, channel: str) -> None:
+        steps = bench.steps(channel)
+        parts = steps[StepName.GLUE].settings
+        self._analog = _Plain(bench, parts["analog"])
+        self._photon = _Plain(bench, parts["photon"])
+        self.geometry, self.shots = self._photon.geometry, self._photon.shots
+        self._lag = self._find_lag(steps.get(StepName.LAG))
+
+    def profiles(self) -> xr.Dataset:
+        """Return power, variance and quality of every profile."""
+        return labeled_glue.glue(self._analog.profiles(), self._photon.profiles(), lag=self._lag)
+
+    def averages(self, seconds: float) -> xr.Dataset:
+        """Return means over intervals of the clock, of every part of the channel."""
+        parts = {"analog": self._analog, "photon": self._photon}
+        named = [
+            part.averages(seconds).rename(
+                {name: f"{prefix}_{name}" for name in ("power", "variance", "quality")}
+            )
+            for prefix, part in parts.items()
+        ]
+        shortest = min(part.sizes["range"] for part in named)
+        analog, photon = (part.isel(range=slice(shortest)) for part in named)
+        only = analog[[f"analog_{name}" for name in ("power", "variance", "quality")]]
+        return photon.assign({name: (v.dims, v.data, v.attrs) for name, v in only.items()})
+
+    def joined(self, averages: xr.Dataset) -> xr.Dataset:
+        """Return computed averages as one channel."""
+        parts = [
+            averages.rename(
+                {f"{prefix}_{name}": name for name in ("power", "variance", "quality")}
+            )[["power", "variance", "quality"]]
+            for prefix in ("analog", "photon")
+        ]
+        glued = labeled_glue.glue(*parts, lag=self._lag)
+        parted = [name for name in averages if str(name) not in ("shots", "profiles")]
+        return averages.drop_vars(parted).assign(glued.variables)
+
+    def _find_lag(self, step: Step | None) -> float:
+        parts = self._analog.profiles(), self._photon.profiles()
+        if step is not None and step.settings["method"] == "estimate":
+            return labeled_glue.estimate_lag(*parts)
+        given = 0.0 if step is None else float(step.settings["lag"])
+        return given + labeled_glue.told_lag(*parts)
+
+
+def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
+    step = steps.get(name)
+    return None if step is None else step.settings.get(key)
+
+
+def _signal(
+    conditioned: xr.Dataset, steps: Mapping[str, Step], ancillaries: Ancillaries
+) -> xr.Dataset:
+    start, stop = steps[StepName.BACKGROUND].settings["range"]
+    tail = labeled.tail_mean(
+        conditioned["power"].sel(range=slice(start, stop)),
+        start=start,
+        variance=conditioned["variance"].sel(range=slice(start, stop)),
+    )
+    result = labeled_signal.range_corrected(
+        conditioned, tail["background"], tail["background_standard_error"]
+    )
+    quality = conditioned["quality"]
+    overlap = _overlap(steps, ancillaries, conditioned["range"].to_numpy())
+    if overlap is not None:
+        along = xr.DataArray(overlap.astype(np.float32), dims="range")
+        result /= along
+        quality |= along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
+    return result.assign(_gluing(conditioned)).assign(
+        background=tail["background"],
+        background_standard_error=tail["background_standard_error"],
+        # Without a background there is no signal above it.
+        quality_flag=quality
+        | tail["background"].isnull().astype("int32") * np.int32(Quality.INPUT_MISSING),
+    )
+
+
+def _gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return what is told of the joining of profiles, where they are joined."""
+    return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}
+
+
+def _homogeneous(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
+    settings = steps[StepName.HOMOGENEOUS].settings
+    result = labeled.homogeneous(
+        conditioned["power"],
+        sections=[(near, far) for near, far in settings["sections"]],
+        variance=conditioned["variance"],
+        quality=conditioned["quality"],
+        method=settings["method"],
+        # An estimate scatters, and its scatter must not pass for misfit.
+        relative_variance=steps[StepName.NOISE].settings["method"] == "differences",
+    )
+    slanted = labeled.not_level(result, conditioned["zenith_angle"])
+    return result.assign(quality_flag=result["quality_flag"] | slanted)
+
+
+def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+    settings = steps[StepName.ELASTIC].settings
+    window = steps[StepName.REFERENCE].settings
+    found = labeled_elastic.elastic(
+        averages,
+        molecules=_molecules(steps, bench.ancillaries),
+        wavelength=steps[StepName.READ].settings["wavelength"],
+        station_altitude=bench.station_altitude,
+        lidar_ratio=settings["lidar_ratio"],
+        lidar_ratio_standard_error=settings["lidar_ratio_standard_error"],
+        molecular_relative_error=settings["molecular_relative_error"],
+        reference=labeled_elastic.Reference(
+            lowest=window["lowest"],
+            highest=window["highest"],
+            width=window["width"],
+            scattering_ratio=window["scattering_ratio"],
+            relative_error=window["relative_error"],
+        ),
+        known_shape=StepName.KNOWN_SHAPE in steps,
+        overlap=_overlap(steps, bench.ancillaries, averages["range"].to_numpy()),
+    )
+    return found.assign(_gluing(averages))
+
+
+def _overlap(steps: Mapping[str, Step], ancillaries: Ancillaries, distance: Array) -> Array | None:
+    """Return the overlap at ranges where the campaign gives it."""
+    source = _setting(steps, StepName.OVERLAP, "overlap_profile")
+    return None if source is None else ancillaries.overlaps[source].at(distance)
+
+
+def _molecules(steps: Mapping[str, Step], ancillaries: Ancillaries) -> MolecularProfile:
+    source = steps[StepName.MOLECULAR].settings.get("molecular_profile")
+    return MolecularProfile.us_standard() if source is None else ancillaries.profiles[source]
