@@ -1,0 +1,293 @@
+"""Compiled solution of pentadiagonal systems: one sweep, with variances, 16 at a time.
+
+A system is the precision of the estimates of one profile plus a multiple of the penalty. The
+arithmetic of one lane does not depend on what the others hold.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+LANES: Final = 16
+PAD: Final = 2
+"""Rows of zeros at either end, which stand for what lies outside the bands."""
+_LOGARITHM_EVERY: Final = 4
+"""Pivots multiplied before a logarithm is taken; four of any admitted size do not overflow."""
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+def penalty(altitude: Array, station_altitude: float) -> Array:
+    r"""Return :math:`\int (d\alpha/dz)^2 dz` as the bands of a quadratic form in optical depth.
+
+    Extinction is the optical depth gained between neighbouring altitudes over their distance;
+    the first one is gained from the lidar, where the optical depth is zero.
+
+    Parameters
+    ----------
+    altitude : (height,) float
+        m, ascending.
+    station_altitude : float
+        m, below all of them.
+
+    Returns
+    -------
+    (3, height) float64
+        m-3: diagonal, first and second off-diagonal.
+    """
+    step = np.diff(altitude, prepend=station_altitude)
+    heights = step.size
+    bands = np.zeros((3, heights))
+    for k in range(heights - 1):
+        root = math.sqrt(2.0 / (step[k] + step[k + 1]))
+        row = (
+            root / step[k],
+            -root * (1.0 / step[k] + 1.0 / step[k + 1]),
+            root / step[k + 1],
+        )
+        # The row acts on the optical depths at k-1, k and k+1; that of the lidar is zero.
+        for i in range(3):
+            for j in range(i, 3):
+                if k - 1 + i >= 0:
+                    bands[j - i, k - 1 + i] += row[i] * row[j]
+    return bands
+
+
+@_compiled
+def multiply(bands: Array, vector: Array, out: Array) -> None:
+    """Multiply a vector by one symmetric pentadiagonal matrix of (3, height) bands."""
+    heights = vector.size
+    for k in range(heights):
+        out[k] = bands[0, k] * vector[k]
+    for k in range(heights - 1):
+        out[k] += bands[1, k] * vector[k + 1]
+        out[k + 1] += bands[1, k] * vector[k]
+    for k in range(heights - 2):
+        out[k] += bands[2, k] * vector[k + 2]
+        out[k + 2] += bands[2, k] * vector[k]
+
+
+@_compiled
+def multiply_rows(bands: Array, vectors: Array) -> Array:
+    """Multiply (profile, height) rows, each by its own matrix of (3, profile, height) bands."""
+    out = np.empty_like(vectors)
+    for t in range(vectors.shape[0]):
+        multiply(bands[:, t], vectors[t], out[t])
+    return out
+
+
+@_compiled
+def add_rows(values: Array, profile: Integers, share: Array, out: Array) -> None:
+    """Add (system, height) rows to those of their profiles, each with its share."""
+    for i in range(profile.size):
+        row = out[profile[i]]
+        for k in range(row.size):
+            row[k] += values[i, k] * share[i]
+
+
+@_compiled
+def _load(rows: Array, profile: Integers, first: int, work: Array) -> None:
+    """Transpose the rows of 16 systems into lanes; the last one fills lanes left over."""
+    chosen = np.empty(LANES, dtype=np.int64)
+    for j in range(LANES):
+        chosen[j] = profile[min(first + j, profile.size - 1)]
+    for k in range(rows.shape[1]):
+        lanes = work[k + PAD]
+        for j in range(LANES):
+            lanes[j] = rows[chosen[j], k]
+
+
+@_compiled
+def _store(work: Array, first: int, out: Array) -> None:
+    used = min(LANES, out.shape[0] - first)
+    rows = out[first : first + used]
+    for k in range(out.shape[1]):
+        lanes = work[k + PAD]
+        for j in range(used):
+            rows[j, k] = lanes[j]
+
+
+@_compiled
+def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
+    """Factor the systems as L D L' and substitute forward.
+
+    Parameters
+    ----------
+    o : (3, row, lane) float64
+        Bands of the precision.
+    b : (row, lane) float64
+        Right sides.
+    k : (3, height) float64
+        Bands of the penalty.
+    lam : (lane,) float64
+    f : (4, row, lane) float64
+        Gets the reciprocal pivots, the two off-diagonals of L, and the solution so far.
+    """
+    edge, far, farther = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
+    for i in range(PAD, b.shape[0] - PAD):
+        o0, o1, o2, right = o[0, i], o[1, i], o[2, i], b[i]
+        k0, k1, k2 = k[0, i - PAD], k[1, i - PAD], k[2, i - PAD]
+        near_l, far_l = f[1, i - 1], f[2, i - 2]
+        near_y, far_y = f[3, i - 1], f[3, i - 2]
+        d, l1, l2, y = f[0, i], f[1, i], f[2, i], f[3, i]
+        for j in range(LANES):
+            pivot = o0[j] + lam[j] * k0 - near_l[j] * edge[j] - far_l[j] * farther[j]
+            across = o1[j] + lam[j] * k1 - near_l[j] * far[j]
+            beyond = o2[j] + lam[j] * k2
+            inverse = 1.0 / pivot
+            d[j] = inverse
+            l1[j] = across * inverse
+            l2[j] = beyond * inverse
+            y[j] = right[j] - near_l[j] * near_y[j] - far_l[j] * far_y[j]
+            edge[j] = across
+            farther[j] = far[j]
+            far[j] = beyond
+
+
+@_compiled
+def _sweep_up(f: Array, c: Array) -> None:
+    """Substitute back, and invert within the bands (Takahashi's recursion).
+
+    Parameters
+    ----------
+    f : (4, row, lane) float64
+        From `_sweep_down`; the last gets the solutions.
+    c : (3, row, lane) float64
+        Gets the diagonal and the off-diagonals of the inverse.
+    """
+    for i in range(f.shape[1] - PAD - 1, PAD - 1, -1):
+        d, l1, l2, x = f[0, i], f[1, i], f[2, i], f[3, i]
+        x1, x2 = f[3, i + 1], f[3, i + 2]
+        c0, c1, c2 = c[0, i], c[1, i], c[2, i]
+        next0, next1, last0 = c[0, i + 1], c[1, i + 1], c[0, i + 2]
+        for j in range(LANES):
+            a, b = l1[j], l2[j]
+            second = -a * next1[j] - b * last0[j]
+            first = -a * next0[j] - b * next1[j]
+            x[j] = x[j] * d[j] - a * x1[j] - b * x2[j]
+            c2[j] = second
+            c1[j] = first
+            c0[j] = d[j] - a * first - b * second
+
+
+@_compiled
+def _work(heights: int) -> tuple[Array, Array, Array, Array]:
+    rows = heights + 2 * PAD
+    return (
+        np.zeros((3, rows, LANES)),
+        np.zeros((rows, LANES)),
+        np.zeros((4, rows, LANES)),
+        np.zeros((3, rows, LANES)),
+    )
+
+
+@_compiled
+def solve(
+    bands: Array, right: Array, stiffness: Array, profile: Integers, lam: Array, out: Array
+) -> None:
+    r"""Solve :math:`(\Omega + \lambda K) x = b`, with the inverse within the bands.
+
+    Parameters
+    ----------
+    bands : (3, profile, height) float64
+        Precision of each profile.
+    right : (profile, height) float64
+    stiffness : (3, height) float64
+        Bands of the penalty.
+    profile : (system,) int64
+        Which profile each system is of.
+    lam : (system,) float64
+    out : (4, system, height) float64
+        Gets the solution, the diagonal and the two off-diagonals of the inverse.
+    """
+    o, b, f, c = _work(right.shape[1])
+    lams = np.ones(LANES)
+    for first in range(0, profile.size, LANES):
+        _load_system(bands, right, profile, lam, first, o, b, lams)
+        _sweep_down(o, b, stiffness, lams, f)
+        _sweep_up(f, c)
+        _store(f[3], first, out[0])
+        for band in range(3):
+            _store(c[band], first, out[band + 1])
+
+
+@_compiled
+def _load_system(
+    bands: Array, right: Array, profile: Integers, lam: Array, first: int,
+    o: Array, b: Array, lams: Array,
+) -> None:  # fmt: skip
+    for band in range(3):
+        _load(bands[band], profile, first, o[band])
+    _load(right, profile, first, b)
+    for j in range(LANES):
+        lams[j] = lam[min(first + j, lam.size - 1)]
+
+
+@_compiled
+def _misfits(o: Array, b: Array, t: Array, f: Array, c: Array, total: Array) -> None:
+    """Sum over heights what `scores` gives, 16 systems at a time, into (4, lane) totals."""
+    total[:] = 0.0
+    product = np.ones(LANES)
+    likely, rss, free = total[0], total[1], total[2]
+    for i in range(PAD, b.shape[0] - PAD):
+        o0, o1, o2, right = o[0, i], o[1, i], o[2, i], b[i]
+        t0, t1, t2, x0, x1, x2 = t[i], t[i + 1], t[i + 2], f[3, i], f[3, i + 1], f[3, i + 2]
+        c0, c1, c2, d = c[0, i], c[1, i], c[2, i], f[0, i]
+        for j in range(LANES):
+            e0, e1, e2 = t0[j] - x0[j], t1[j] - x1[j], t2[j] - x2[j]
+            likely[j] += right[j] * e0
+            rss[j] += o0[j] * e0 * e0 + 2.0 * (o1[j] * e0 * e1 + o2[j] * e0 * e2)
+            free[j] += o0[j] * c0[j] + 2.0 * (o1[j] * c1[j] + o2[j] * c2[j])
+            product[j] *= d[j]
+        if (i - PAD) % _LOGARITHM_EVERY == 0:
+            for j in range(LANES):
+                total[3, j] -= math.log(product[j])
+                product[j] = 1.0
+    for j in range(LANES):
+        total[3, j] -= math.log(product[j])
+
+
+@_compiled
+def scores(
+    bands: Array,
+    right: Array,
+    estimates: Array,
+    stiffness: Array,
+    profile: Integers,
+    lam: Array,
+) -> Array:
+    r"""Return what the choice of :math:`\lambda` needs to know of each solution.
+
+    Parameters
+    ----------
+    bands, right, stiffness, profile, lam
+        As for `solve`, with right sides :math:`\Omega t`.
+    estimates : (profile, height) float64
+        :math:`t`, 0 where there is none.
+
+    Returns
+    -------
+    (4, system) float64
+        :math:`t'\Omega(t - x)`, :math:`(t - x)'\Omega(t - x)`, the effective degrees of freedom
+        :math:`tr C \Omega` and :math:`\ln|\Omega + \lambda K|`.
+    """
+    o, b, f, c = _work(right.shape[1])
+    t, lams, total = np.zeros_like(b), np.ones(LANES), np.zeros((4, LANES))
+    out = np.empty((4, profile.size))
+    for first in range(0, profile.size, LANES):
+        _load_system(bands, right, profile, lam, first, o, b, lams)
+        _load(estimates, profile, first, t)
+        _sweep_down(o, b, stiffness, lams, f)
+        _sweep_up(f, c)
+        _misfits(o, b, t, f, c, total)
+        for j in range(min(LANES, profile.size - first)):
+            out[:, first + j] = total[:, j]
+    return out
