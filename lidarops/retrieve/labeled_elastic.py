@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from lidarops.retrieve import known_shape as _known_shape
 from lidarops.retrieve import layers as _layers
 from lidarops.retrieve import reference as _reference
 from lidarops.retrieve.molecular import (
+    HIGHEST,
     MolecularProfile,
     molecular_lidar_ratio,
     rayleigh_cross_section,
@@ -24,6 +25,10 @@ from lidarops.retrieve.molecular import (
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
+LEAST_SHARE: Final = 0.1
+"""Of the bins, that must lie beyond a cloud for the background to be fitted there."""
+UNSEEN: Final = 1.5
+"""Standard errors of the window's mean that particles in it may add unseen: 3 in one of 20."""
 STEPS_PER_WINDOW: Final = 4
 """Candidates that begin within the width of one."""
 
@@ -125,29 +130,21 @@ def elastic(
     RetrievalInputError
         Where arguments cannot be right.
     """
-    # Ranges behind the lidar, which an offset may give, hold no light.
-    averages = averages.isel(range=averages["range"].to_numpy() > 0)
-    if overlap is not None:
-        overlap = overlap[overlap.size - averages.sizes["range"] :]
-    distance = averages["range"].to_numpy().astype(np.float64)
     climb = float(np.cos(np.deg2rad(averages["zenith_angle"])))
+    distance = averages["range"].to_numpy().astype(np.float64)
+    # Ranges behind the lidar, which an offset may give, hold no light, and those above the
+    # atmosphere no air.
+    inside = (distance > 0) & (station_altitude + climb * distance < HIGHEST)
+    averages, distance = averages.isel(range=inside), distance[inside]
+    overlap = None if overlap is None else overlap[inside]
     air = _air(molecules, station_altitude + climb * distance, distance, wavelength)
     quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
-    clear = _without_background(averages, distance, air, known_shape=known_shape)
-    variance = averages["variance"].to_numpy()
-    power = clear.power
-    if overlap is not None:
-        power, variance = power / overlap, variance / overlap**2
-        quality |= np.where(np.isnan(overlap), np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
-    power = np.where((quality & _WITHHELD) != 0, np.nan, power)
-    clouds = _layers.screen(
-        power,
-        distance,
-        variance,
-        molecular_attenuated=air.shape,
-        contrast=_cloud_contrast(wavelength),
-    )
+    prepared = _Prepared(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
+    clear, clouds = _cleared(prepared, known_shape=known_shape)
+    power, variance = clear.power, prepared.variance
     window = _window(power, distance, variance, air, reference, clouds.mask)
+    if not known_shape:
+        clear = _left_in_tail(clear, window, air)
     found = _elastic.solve(
         power,
         distance,
@@ -159,10 +156,11 @@ def elastic(
         variance=variance,
         background_standard_error=clear.background_standard_error,
         lidar_ratio_standard_error=lidar_ratio_standard_error,
-        reference_relative_error=reference.relative_error,
+        reference_relative_error=_reference_error(window, reference),
         molecular_relative_error=molecular_relative_error,
     )
-    quality |= _judged(found, window, clear) | _clouded(distance, window, clouds)
+    quality = prepared.quality
+    quality |= _judged(found, window, clear, quality) | _clouded(distance, window, clouds)
     gates = {name: np.where(found.valid, v, np.nan) for name, v in _gates(found).items()}
     return xr.Dataset(
         {
@@ -191,20 +189,87 @@ def _air(molecules: MolecularProfile, altitude: Array, distance: Array, waveleng
     return _Air(backscatter, extinction, shape)
 
 
+class _Prepared:
+    """Mean profiles as they are before the background is known."""
+
+    def __init__(
+        self,
+        averages: xr.Dataset,
+        distance: Array,
+        air: _Air,
+        quality: Flags,
+        overlap: Array | None,
+        contrast: float,
+    ) -> None:
+        self.distance, self.air, self.contrast = distance, air, contrast
+        self.overlap = np.ones(distance.size) if overlap is None else overlap
+        partial = np.where(np.isnan(self.overlap), int(Quality.INCOMPLETE_OVERLAP), 0)
+        self.quality = quality | partial.astype(np.int32)
+        self.raw, self.noise = averages["power"].to_numpy(), averages["variance"].to_numpy()
+        self.variance = self.noise / self.overlap**2
+
+    def without(self, background: Array) -> Array:
+        """Return the signal without background, as with full overlap."""
+        power = (self.raw - background[:, np.newaxis]) / self.overlap
+        return np.where((self.quality & _WITHHELD) != 0, np.nan, power)
+
+    def screened(self, power: Array) -> _layers.Layers:
+        """Return the clouds of a signal without background."""
+        return _layers.screen(
+            power,
+            self.distance,
+            self.variance,
+            molecular_attenuated=self.air.shape,
+            contrast=self.contrast,
+        )
+
+
+def _cleared(prepared: _Prepared, *, known_shape: bool) -> tuple[_Clear, _layers.Layers]:
+    """Return signals without background, and their clouds."""
+    clear = _without_background(prepared, np.ones_like(prepared.raw, bool), known_shape=known_shape)
+    clouds = prepared.screened(clear.power)
+    if not known_shape or not clouds.cloudy.any():
+        return clear, clouds
+    # What lies beyond a cloud has the shape of air again, but not what holds the cloud.
+    beyond = ~np.logical_or.accumulate(clouds.mask[:, ::-1], axis=-1)[:, ::-1]
+    enough = beyond.sum(axis=-1) >= LEAST_SHARE * prepared.distance.size
+    again = clouds.cloudy & enough
+    clear = _without_background(prepared, beyond | ~again[:, np.newaxis], known_shape=True)
+    return clear, prepared.screened(clear.power)
+
+
 def _without_background(
-    averages: xr.Dataset, distance: Array, air: _Air, *, known_shape: bool
+    prepared: _Prepared, usable: npt.NDArray[np.bool_], *, known_shape: bool
 ) -> _Clear:
-    power, variance = averages["power"].to_numpy(), averages["variance"].to_numpy()
-    tail = _background.tail_mean(power, distance, variance=variance)
+    raw, noise, r = prepared.raw, prepared.noise, prepared.distance
+    tail = _background.tail_mean(raw, r, variance=noise)
     background, error = tail.background, tail.background_standard_error
     uncertain = np.zeros(background.shape, dtype=bool)
     if known_shape:
-        fit = _known_shape.solve(power, distance, air.shape, variance=variance)
-        usable = ~fit.singular & np.isfinite(fit.background)
-        background = np.where(usable, fit.background, background)
-        error = np.where(usable, fit.background_standard_error, error)
-        uncertain = ~usable | fit.poor_fit
-    return _Clear(power - background[:, np.newaxis], background, error, uncertain)
+        fit = _known_shape.solve(raw, r, prepared.air.shape, variance=noise, mask=usable)
+        found = ~fit.singular & np.isfinite(fit.background)
+        background = np.where(found, fit.background, background)
+        # Noise that neighbouring bins share is larger than their differences tell.
+        excess = fit.chi2 / np.maximum(fit.degrees_of_freedom, 1)
+        scale = np.sqrt(np.maximum(np.nan_to_num(excess, nan=1.0), 1.0))
+        error = np.where(found, fit.background_standard_error * scale, error)
+        uncertain = ~found | fit.poor_fit
+    return _Clear(prepared.without(background), background, error, uncertain)
+
+
+def _left_in_tail(clear: _Clear, window: _reference.ReferenceWindow, air: _Air) -> _Clear:
+    """Doubt backgrounds of whose bins air alone makes more than their standard error."""
+    shape = air.shape[-max(air.shape.size // 10, 1) :].mean()
+    with np.errstate(invalid="ignore"):
+        biased = window.scale * shape > clear.background_standard_error
+    return replace(clear, uncertain=clear.uncertain | biased)
+
+
+def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:
+    """Return the relative error of the scattering ratio: assumed, and of particles not seen."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unseen = UNSEEN * window.scale_standard_error / window.scale
+    return np.hypot(reference.relative_error, np.nan_to_num(unseen, nan=0.0))
 
 
 def _window(
@@ -215,11 +280,10 @@ def _window(
     reference: Reference,
     clouds: npt.NDArray[np.bool_],
 ) -> _reference.ReferenceWindow:
+    highest = min(reference.highest, float(distance[-1]))
+    width = min(reference.width, highest - reference.lowest)
     candidates = _reference.candidate_windows(
-        reference.lowest,
-        min(reference.highest, float(distance[-1])),
-        reference.width,
-        reference.width / STEPS_PER_WINDOW,
+        reference.lowest, highest, width, reference.width / STEPS_PER_WINDOW
     )
     return _reference.choose(
         power,
@@ -238,13 +302,17 @@ def _cloud_contrast(wavelength: float) -> float:
 
 
 def _judged(
-    found: _elastic.ElasticResult, window: _reference.ReferenceWindow, clear: _Clear
+    found: _elastic.ElasticResult,
+    window: _reference.ReferenceWindow,
+    clear: _Clear,
+    quality: Flags,
 ) -> Flags:
     """Return what speaks against each value."""
     bits = np.zeros(found.valid.shape, dtype=np.int32)
     bits[~window.chosen] |= np.int32(Quality.NO_REFERENCE)
     bits[clear.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
-    bits[window.chosen[:, np.newaxis] & ~found.valid] |= np.int32(Quality.UNSTABLE_INVERSION)
+    lost = window.chosen[:, np.newaxis] & ~found.valid & ((quality & _WITHHELD) == 0)
+    bits[lost] |= np.int32(Quality.UNSTABLE_INVERSION)
     return bits
 
 
@@ -254,11 +322,11 @@ def _clouded(distance: Array, window: _reference.ReferenceWindow, clouds: _layer
     The inversion starts in the window, and what it meets behind a cloud rests on the lidar ratio
     of aerosol in the cloud.
     """
-    base = clouds.cloud_base_range[:, np.newaxis]
-    above = window.bottom[:, np.newaxis] > base
-    beyond = np.where(above, distance < window.bottom[:, np.newaxis], distance >= base)
-    hit = clouds.mask | (clouds.cloudy[:, np.newaxis] & beyond)
-    return hit.astype(np.int32) * np.int32(Quality.CLOUD)
+    bottom = np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
+    near, far = distance < bottom, distance >= bottom
+    above = np.logical_or.accumulate(clouds.mask & far, axis=-1)
+    below = np.logical_or.accumulate((clouds.mask & near)[:, ::-1], axis=-1)[:, ::-1]
+    return (above | below).astype(np.int32) * np.int32(Quality.CLOUD)
 
 
 def _gates(found: _elastic.ElasticResult) -> dict[str, Array]:

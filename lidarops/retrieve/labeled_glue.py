@@ -96,8 +96,7 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Data
     result = xr.Dataset(dict(zip(units, outputs, strict=True)))
     result = result.assign_coords(range=photon["range"])
     for name, unit in units.items():
-        if unit:
-            result[name].attrs["units"] = unit
+        result[name].attrs = {"units": unit} if unit else {}
     return result
 
 

@@ -1,0 +1,290 @@
+"""Compiled weights against outliers in a scan: a start that outliers cannot move, then two passes.
+
+The start is the repeated median over pairs of rays (`siegel1982`), which stands up to half of
+the rays being wrong, then the pair that most other rays agree with; Tukey's bisquare of
+studentised residuals follows. The number of passes is fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+START_WIDTH: Final = 5.0
+"""Standard errors beyond which a sample has no weight, about the start."""
+PASS_WIDTH: Final = 7.0
+"""The same about a weighted fit."""
+FEWEST_RAYS: Final = 4
+_CLOSEST: Final = 1e-3
+_KEPT: Final = 0.3
+_FEWEST_KEPT: Final = 3
+_GAUSS: Final = 1.4826
+_MEDIAN_OF: Final = 100_000
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+def clean_moments(width: float) -> tuple[float, float]:
+    """Return what the bisquare makes of normal residuals, so that it can be taken out.
+
+    Returns
+    -------
+    of_chi2, of_information : float
+        Ratios of the weighted sum of squares to the sum of weights, and of the reciprocal
+        variance of the estimate to the sum of weights, to first order for unit variance.
+    """
+    a = 1.0 / width**2
+    weight = 1.0 - 2.0 * a + 3.0 * a**2
+    square = 1.0 - 6.0 * a + 15.0 * a**2
+    psi = 1.0 - 12.0 * a + 90.0 * a**2 - 420.0 * a**3 + 945.0 * a**4
+    return square / weight, square**2 / psi / weight
+
+
+@_compiled
+def _median(values: Array, count: int) -> float:
+    """Return the median of the first values, which get sorted; few, so by insertion."""
+    for i in range(1, count):
+        value = values[i]
+        j = i - 1
+        while j >= 0 and values[j] > value:
+            values[j + 1] = values[j]
+            j -= 1
+        values[j + 1] = value
+    half = count // 2
+    return float(values[half] if count % 2 else 0.5 * (values[half - 1] + values[half]))
+
+
+@_compiled
+def _repeated_median(
+    y: Array, x: Array, count: int, closest: float, work: Array, slopes: Array
+) -> tuple[float, float]:
+    """Return slope and intercept of the line through the first points; NaN where undefined."""
+    found = 0
+    for i in range(count):
+        pairs = 0
+        for j in range(count):
+            if abs(x[j] - x[i]) > closest:
+                work[pairs] = (y[j] - y[i]) / (x[j] - x[i])
+                pairs += 1
+        if pairs > 0:
+            slopes[found] = _median(work, pairs)
+            found += 1
+    if found == 0:
+        return np.nan, np.nan
+    slope = _median(slopes, found)
+    for i in range(count):
+        work[i] = y[i] - slope * x[i]
+    return slope, _median(work, count)
+
+
+@_compiled
+def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
+    """Fill the residuals about repeated medians.
+
+    Parameters
+    ----------
+    y, noise : (profile, angle, altitude) float
+        0 and inf where there is no sample.
+    x : (angle, altitude) float
+    residuals : (profile, angle, altitude) float
+        NaN where there is no sample, or fewer than 4 rays.
+    """
+    profiles, angles, gates = y.shape
+    ys, xs, work, slopes = np.empty(angles), np.empty(angles), np.empty(angles), np.empty(angles)
+    for t in range(profiles):
+        for k in range(gates):
+            count = 0
+            low, high = np.inf, -np.inf
+            for a in range(angles):
+                residuals[t, a, k] = np.nan
+                if noise[t, a, k] < np.inf:
+                    ys[count], xs[count] = y[t, a, k], x[a, k]
+                    low, high = min(low, x[a, k]), max(high, x[a, k])
+                    count += 1
+            if count < FEWEST_RAYS or not high > low:
+                continue
+            slope, level = _repeated_median(ys, xs, count, _CLOSEST * (high - low), work, slopes)
+            for a in range(angles):
+                if noise[t, a, k] < np.inf:
+                    residuals[t, a, k] = y[t, a, k] - level - slope * x[a, k]
+
+
+@_compiled
+def _bounded_sum(y: Array, x: Array, unit: Array, slope: float, level: float) -> float:
+    """Return the sum of Tukey's bounded squares about a line, in units of each deviation."""
+    total = 0.0
+    for i in range(y.size):
+        share = ((y[i] - level - slope * x[i]) / (unit[i] * START_WIDTH)) ** 2
+        total += 1.0 - (1.0 - share) ** 3 if share < 1.0 else 1.0
+    return total
+
+
+@_compiled
+def _best_pair(y: Array, x: Array, unit: Array) -> tuple[float, float]:
+    """Return slope and level of the line with the least bounded sum: zero, or through two rays."""
+    best, slope, level = _bounded_sum(y, x, unit, 0.0, 0.0), 0.0, 0.0
+    closest = _CLOSEST * (np.max(x) - np.min(x))
+    for i in range(y.size):
+        for j in range(i):
+            if abs(x[i] - x[j]) > closest:
+                tilt = (y[i] - y[j]) / (x[i] - x[j])
+                total = _bounded_sum(y, x, unit, tilt, y[i] - tilt * x[i])
+                if total < best:
+                    best, slope, level = total, tilt, y[i] - tilt * x[i]
+    return slope, level
+
+
+@_compiled
+def pair_residuals(
+    y: Array, noise: Array, x: Array, inhomogeneity: Array, residuals: Array
+) -> None:
+    """Replace residuals by those about the pair of rays that most others agree with.
+
+    Repeated medians hold, but long paths have a long lever: where their line is off by little, it
+    is off by much there. Of it and the lines through all pairs, the one with the least bounded sum
+    of squares is taken, which knows how large a deviation may be.
+
+    Parameters
+    ----------
+    y, noise : (profile, angle, altitude) float
+        0 and inf where there is no sample.
+    x : (angle, altitude) float
+    inhomogeneity : (altitude,) float
+        Variance on top of the noise.
+    residuals : (profile, angle, altitude) float
+        About repeated medians; NaN where there is no sample, or fewer than 4 rays.
+    """
+    profiles, angles, gates = y.shape
+    rays = np.empty(angles, np.int64)
+    all_y, all_x, all_unit = np.empty(angles), np.empty(angles), np.empty(angles)
+    for t in range(profiles):
+        for k in range(gates):
+            count = 0
+            for a in range(angles):
+                if not math.isnan(residuals[t, a, k]):
+                    rays[count] = a
+                    all_y[count], all_x[count] = residuals[t, a, k], x[a, k]
+                    all_unit[count] = math.sqrt(noise[t, a, k] + inhomogeneity[k])
+                    count += 1
+            if count == 0:
+                continue
+            ys, xs, unit = all_y[:count], all_x[:count], all_unit[:count]
+            slope, level = _best_pair(ys, xs, unit)
+            for i in range(count):
+                residuals[t, rays[i], k] -= level + slope * xs[i]
+
+
+@_compiled
+def median_variance(residuals: Array, noise: Array, out: Array, rays: Array) -> None:
+    """Fill the variance that median residuals tell, less that of the noise, gate by gate.
+
+    Parameters
+    ----------
+    residuals, noise : (profile, angle, altitude) float
+    out, rays : (altitude,) float
+        The latter gets the number of samples; the former 0 where there is none.
+    """
+    profiles, angles, gates = residuals.shape
+    sizes, variances = np.empty(profiles * angles), np.empty(profiles * angles)
+    for k in range(gates):
+        count = fitted = 0
+        for t in range(profiles):
+            before = count
+            for a in range(angles):
+                if not math.isnan(residuals[t, a, k]):
+                    sizes[count] = abs(residuals[t, a, k])
+                    variances[count] = noise[t, a, k]
+                    count += 1
+            fitted += 1 if count > before else 0
+        rays[k] = count
+        out[k] = 0.0
+        if count > 2 * fitted:
+            scale = _GAUSS * np.median(sizes[:count])
+            spread = scale * scale * count / (count - 2 * fitted)
+            out[k] = max(spread - np.median(variances[:count]), 0.0)
+
+
+@_compiled
+def fill_weights(
+    residuals: Array,
+    leverages: Array,
+    noise: Array,
+    inhomogeneity: Array,
+    width: float,
+    keep: Array,
+) -> None:
+    """Fill the bisquare of the studentised residuals; 1 where it would leave too few rays.
+
+    A logarithm is skewed where detector noise dominates; the residual is measured as a relative
+    one there.
+
+    Parameters
+    ----------
+    residuals, leverages, noise : (profile, angle, altitude) float
+    inhomogeneity : (altitude,) float
+    width : float
+        Standard errors from which on the weight is 0.
+    keep : (profile, angle, altitude) float
+    """
+    profiles, angles, gates = residuals.shape
+    for t in range(profiles):
+        for k in range(gates):
+            kept = 0
+            for a in range(angles):
+                size = residuals[t, a, k]
+                if math.isnan(size):
+                    keep[t, a, k] = 1.0
+                    continue
+                variance = noise[t, a, k] + inhomogeneity[k]
+                if noise[t, a, k] > inhomogeneity[k]:
+                    size = math.expm1(min(size, 700.0))
+                leverage = min(leverages[t, a, k], 1.0 - 1e-9)
+                share = size * size / (variance * (1.0 - leverage) * width * width)
+                keep[t, a, k] = (1.0 - share) ** 2 if share < 1.0 else 0.0
+                kept += 1 if keep[t, a, k] > _KEPT else 0
+            if kept < _FEWEST_KEPT:
+                for a in range(angles):
+                    keep[t, a, k] = 1.0
+
+
+@_compiled
+def largest_residual(
+    residuals: Array, leverages: Array, noise: Array, inhomogeneity: Array
+) -> float:
+    """Return the largest studentised residual, in units that outliers do not stretch.
+
+    Parameters
+    ----------
+    residuals, leverages, noise : (profile, angle, altitude) float
+    inhomogeneity : (altitude,) float
+
+    Returns
+    -------
+    float
+        0 where there is no residual.
+    """
+    profiles, angles, gates = residuals.shape
+    stride = max(residuals.size // _MEDIAN_OF, 1)
+    sizes = np.empty(residuals.size // stride + 1)
+    count = seen = 0
+    largest = 0.0
+    for t in range(profiles):
+        for a in range(angles):
+            for k in range(gates):
+                free = 1.0 - leverages[t, a, k]
+                if free > 1e-9:
+                    variance = (noise[t, a, k] + inhomogeneity[k]) * free
+                    size = abs(residuals[t, a, k]) / math.sqrt(variance)
+                    largest = max(largest, size)
+                    if seen % stride == 0:
+                        sizes[count] = size
+                        count += 1
+                    seen += 1
+    unit = _GAUSS * np.median(sizes[:count]) if count > 0 else 1.0
+    return largest / min(unit, 1.0) if unit > 0.0 else largest

@@ -1,0 +1,506 @@
+r"""Compiled weighted regression of logarithms on slant path, one height at a time.
+
+The model is :math:`y_l = c - 2 x_l \tau + g \cdot d_l + e_l` with the slant path x, where rays
+lead to all sides also with a horizontal gradient g over the horizontal distance d, and with the
+variance :math:`v_l + s^2`: detector noise and what inhomogeneity of the air adds to it.
+"""
+
+# ruff: noqa: FBT001, FBT003 - compiled functions take no keyword-only arguments
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+TAU: Final = 0
+INFORMATION: Final = 1
+"""Inverse variance of the optical depth."""
+INTERCEPT: Final = 2
+INTERCEPT_VARIANCE: Final = 3
+CHI2: Final = 4
+"""Sum of the squared residuals over their variances."""
+FREEDOM: Final = 5
+"""Rays less unknowns; 0 where there is no fit."""
+TRACE: Final = 6
+"""Sum over rays of weight times one less leverage: what inhomogeneity adds to chi2."""
+SPAN: Final = 7
+"""Largest less smallest slant path."""
+SLOPE_EAST: Final = 8
+"""Change of the optical depth per unit of gradient that the fit does not know of."""
+SLOPE_NORTH: Final = 9
+SIDES: Final = 10
+"""Gradients fitted along: 0, 1 or 2."""
+SHARE: Final = 11
+"""What one unit of inhomogeneity variance is of the variance of the optical depth."""
+EXPECTED: Final = 12
+"""Expectation of chi2: the degrees of freedom, less where weights are reduced."""
+COLUMNS: Final = 13
+
+TILE: Final = 256
+_SAME_PATH: Final = 1e-20
+_OPPOSITE: Final = 1e-6
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_compiled
+def _fill_weights(
+    noise: Array, keep: Array, inhomogeneity: Array, first: int, last: int, weights: Array
+) -> None:
+    """Fill weights (angle, TILE) of the gates from `first` to before `last`."""
+    angles, width = noise.shape[0], last - first
+    added = inhomogeneity[first:last]
+    for a in range(angles):
+        row, of = weights[a, :width], noise[a, first:last]
+        for j in range(width):
+            row[j] = 1.0 / (of[j] + added[j])
+        if keep.shape[0] > 0:
+            kept = keep[a, first:last]
+            for j in range(width):
+                row[j] *= kept[j]
+
+
+@_compiled
+def _average_tile(y: Array, weights: Array, x: Array, first: int, last: int, sums: Array) -> None:
+    """Fill sums of weights, and weighted means of path and logarithm."""
+    width = last - first
+    sw, mx, my = sums[0, :width], sums[1, :width], sums[2, :width]
+    for j in range(width):
+        sw[j] = mx[j] = my[j] = 0.0
+    for a in range(x.shape[0]):
+        w, xs, ys = weights[a, :width], x[a, first:last], y[a, first:last]
+        for j in range(width):
+            sw[j] += w[j]
+            mx[j] += w[j] * xs[j]
+            my[j] += w[j] * ys[j]
+    for j in range(width):
+        inverse = 1.0 / sw[j] if sw[j] > 0.0 else 0.0
+        mx[j] *= inverse
+        my[j] *= inverse
+
+
+@_compiled
+def _fit_tile(
+    y: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
+) -> None:
+    """Fit the gates from `first` to before `last` with sums centred on the weighted means.
+
+    Parameters
+    ----------
+    y, x : (angle, altitude) float
+    weights : (angle, TILE) float
+    first, last : int
+    sums : (8, TILE) float
+        Gets sums of weights, means of path and logarithm, the inverse of the weighted squares of
+        the path, the slope and the share of inhomogeneity.
+    out : (COLUMNS, altitude) float
+    """
+    width = last - first
+    _average_tile(y, weights, x, first, last, sums)
+    sw, mx, my, sxx = sums[0, :width], sums[1, :width], sums[2, :width], sums[3, :width]
+    sxy, sww = sums[4, :width], sums[5, :width]
+    for j in range(width):
+        sxx[j] = sxy[j] = sww[j] = 0.0
+    for a in range(x.shape[0]):
+        w, xs, ys = weights[a, :width], x[a, first:last], y[a, first:last]
+        for j in range(width):
+            wx = w[j] * (xs[j] - mx[j])
+            sxx[j] += wx * (xs[j] - mx[j])
+            sxy[j] += wx * (ys[j] - my[j])
+            sww[j] += wx * wx
+    part = out[:, first:last]
+    for j in range(width):
+        fits = sxx[j] > _SAME_PATH * sw[j]
+        inverse = 1.0 / sxx[j] if fits else 0.0
+        tau = -0.5 * sxy[j] * inverse
+        part[TAU, j] = tau if fits else np.nan
+        part[INFORMATION, j] = 4.0 * sxx[j] if fits else 0.0
+        part[INTERCEPT, j] = my[j] + 2.0 * tau * mx[j] if fits else np.nan
+        part[INTERCEPT_VARIANCE, j] = 1.0 / sw[j] + mx[j] * mx[j] * inverse if fits else np.nan
+        part[SHARE, j] = sww[j] * inverse
+        sxx[j] = inverse
+        sxy[j] = -2.0 * tau
+
+
+@_compiled
+def _judge_tile(
+    y: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
+) -> None:
+    """Fill chi2 and what belongs to it from the sums that `_fit_tile` left.
+
+    Parameters
+    ----------
+    y, x, weights, first, last, sums, out
+        As in `_fit_tile`.
+    """
+    width = last - first
+    sw, mx, my, inverse = sums[0, :width], sums[1, :width], sums[2, :width], sums[3, :width]
+    slope, chi2, trace, rays = sums[4, :width], sums[5, :width], sums[6, :width], sums[7, :width]
+    for j in range(width):
+        chi2[j] = trace[j] = rays[j] = 0.0
+        sw[j] = 1.0 / sw[j] if sw[j] > 0.0 else 0.0
+    for a in range(x.shape[0]):
+        w, xs, ys = weights[a, :width], x[a, first:last], y[a, first:last]
+        for j in range(width):
+            dx = xs[j] - mx[j]
+            residual = ys[j] - my[j] - slope[j] * dx
+            chi2[j] += w[j] * residual * residual
+            trace[j] += w[j] * (1.0 - w[j] * (sw[j] + dx * dx * inverse[j]))
+            rays[j] += 1.0 if w[j] > 0.0 else 0.0
+    part = out[:, first:last]
+    for j in range(width):
+        on = inverse[j] > 0.0 and rays[j] > 2.0
+        part[CHI2, j] = chi2[j] if on else 0.0
+        part[FREEDOM, j] = rays[j] - 2.0 if on else 0.0
+        part[EXPECTED, j] = rays[j] - 2.0 if on else 0.0
+        part[TRACE, j] = trace[j] if on else 0.0
+
+
+@_compiled
+def _expect_tile(
+    keep: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
+) -> None:
+    """Fill the expectation of chi2 with reduced weights, from what `_judge_tile` left."""
+    expected = out[EXPECTED, first:last]
+    for j in range(last - first):
+        if expected[j] > 0.0:
+            expected[j] = 0.0
+            for a in range(x.shape[0]):
+                dx = x[a, first + j] - sums[1, j]
+                hat = weights[a, j] * (sums[0, j] + dx * dx * sums[3, j])
+                on = weights[a, j] > 0.0
+                expected[j] += keep[a, first + j] * (1.0 - hat) if on else 0.0
+
+
+@_compiled
+def fit_profiles(
+    y: Array, noise: Array, keep: Array, inhomogeneity: Array, x: Array, out: Array
+) -> None:
+    """Fit optical depth and intercept at every height of every profile.
+
+    Parameters
+    ----------
+    y, noise : (profile, angle, altitude) float
+        Logarithms and their variances; 0 and inf where there is none.
+    keep : (profile, angle or 0, altitude) float
+        Factors of the weights.
+    inhomogeneity : (altitude,) float
+        Variance of the logarithms that comes on top of the noise.
+    x : (angle, altitude) float
+        Slant path, finite.
+    out : (profile, COLUMNS, altitude) float
+        Gets optical depth, information and the rest, but for what hangs on horizontal distance.
+    """
+    count, angles, gates = y.shape
+    weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
+    for t in range(count):
+        for first in range(0, gates, TILE):
+            last = min(first + TILE, gates)
+            _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
+            _fit_tile(y[t], weights, x, first, last, sums, out[t])
+            _judge_tile(y[t], weights, x, first, last, sums, out[t])
+            if keep.shape[1] > 0:
+                _expect_tile(keep[t], weights, x, first, last, sums, out[t])
+
+
+@_compiled
+def fit_details(
+    y: Array,
+    noise: Array,
+    keep: Array,
+    inhomogeneity: Array,
+    x: Array,
+    d: Array,
+    out: Array,
+    residuals: Array,
+    leverages: Array,
+) -> None:
+    """Fit as `fit_profiles`, with all that `fit_gates` gives where it fits no gradient.
+
+    Parameters
+    ----------
+    y, noise, keep, inhomogeneity, x, out
+        As in `fit_profiles`.
+    d, residuals, leverages
+        As in `fit_gates`, with all profiles.
+    """
+    fit_profiles(y, noise, keep, inhomogeneity, x, out)
+    count, angles, gates = y.shape
+    weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
+    for t in range(count):
+        for first in range(0, gates, TILE):
+            last = min(first + TILE, gates)
+            _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
+            _fit_tile(y[t], weights, x, first, last, sums, out[t])
+            _lever_tile(weights, x, d, first, last, sums, out[t])
+            for a in range(angles):
+                for k in range(first, last):
+                    j = k - first
+                    fits = sums[3, j] > 0.0
+                    on = noise[t, a, k] < np.inf
+                    dx = x[a, k] - sums[1, j]
+                    left = y[t, a, k] - sums[2, j] - sums[4, j] * dx
+                    hat = weights[a, j] * (1.0 / sums[0, j] + dx * dx * sums[3, j])
+                    residuals[t, a, k] = left if on and fits else np.nan
+                    leverages[t, a, k] = (hat if fits else 1.0) if on else np.nan
+
+
+@_compiled
+def _lever_tile(
+    weights: Array, x: Array, d: Array, first: int, last: int, sums: Array, out: Array
+) -> None:
+    """Fill what hangs on the rays alone: span of paths, and what a gradient would do."""
+    for k in range(first, last):
+        j = k - first
+        low, high, east, north = np.inf, -np.inf, 0.0, 0.0
+        for a in range(x.shape[0]):
+            if weights[a, j] > 0.0:
+                low, high = min(low, x[a, k]), max(high, x[a, k])
+                wx = weights[a, j] * (x[a, k] - sums[1, j])
+                east += wx * d[0, a, k]
+                north += wx * d[1, a, k]
+        out[SPAN, k] = high - low if high >= low else 0.0
+        out[SLOPE_EAST, k] = -0.5 * east * sums[3, j]
+        out[SLOPE_NORTH, k] = -0.5 * north * sums[3, j]
+        out[SIDES, k] = 0.0
+
+
+@_compiled
+def surrounds(weights: Array, design: Array) -> bool:
+    """Tell whether no half turn around the zenith is free of rays with weight.
+
+    Parameters
+    ----------
+    weights : (angle,) float
+    design : (4, angle) float
+        Of which the first two rows lead east and north.
+    """
+    found = 0
+    turns = np.empty(weights.size)
+    for a in range(weights.size):
+        if weights[a] > 0.0 and math.hypot(design[0, a], design[1, a]) > 1e-9:
+            turns[found] = math.atan2(design[0, a], design[1, a])
+            found += 1
+    if found < 2:
+        return False
+    turns = np.sort(turns[:found])
+    widest = turns[0] + 2.0 * math.pi - turns[found - 1]
+    for i in range(1, found):
+        widest = max(widest, turns[i] - turns[i - 1])
+    return bool(widest <= math.pi + _OPPOSITE)
+
+
+@_compiled
+def _dot(weights: Array, first: Array, second: Array) -> float:
+    total = 0.0
+    for a in range(weights.size):
+        total += weights[a] * first[a] * second[a]
+    return total
+
+
+@_compiled
+def _orthogonal(
+    weights: Array, design: Array, sides: bool, q: Array, norm: Array, mean: Array
+) -> int:
+    """Fill orthogonal columns of one gate, and where the model's zero lies on them.
+
+    Parameters
+    ----------
+    weights : (angle,) float
+    design : (4, angle) float
+        East, north, path, ones.
+    sides : bool
+        Whether to include the gradients.
+    q : (3, angle) float
+        Gets the residuals of east, north and path, each after those before it; 0 if left out.
+    norm, mean : (3,) float
+        Get the squared lengths and the coordinates of x = 0, d = 0.
+
+    Returns
+    -------
+    int
+        Gradients included.
+    """
+    ones = design[3]
+    whole = _dot(weights, ones, ones)
+    lever = _dot(weights, design[0], design[0]) + _dot(weights, design[1], design[1])
+    included = 0
+    for c in range(3):
+        norm[c] = mean[c] = 0.0
+        q[c] = 0.0
+        if c < 2 and not sides:
+            continue
+        centre = _dot(weights, design[c], ones) / whole
+        least = 1e-12 * lever if c < 2 else _SAME_PATH * whole
+        for a in range(weights.size):
+            q[c, a] = design[c, a] - centre
+        mean[c] = -centre
+        for b in range(c):
+            if norm[b] > 0.0:
+                share = _dot(weights, q[b], q[c]) / norm[b]
+                for a in range(weights.size):
+                    q[c, a] -= share * q[b, a]
+                mean[c] -= share * mean[b]
+        norm[c] = _dot(weights, q[c], q[c])
+        if not norm[c] > least:
+            norm[c] = mean[c] = 0.0
+            q[c] = 0.0
+        elif c < 2:
+            included += 1
+    return included
+
+
+@_compiled
+def _span(weights: Array, path: Array) -> float:
+    low, high = np.inf, -np.inf
+    for a in range(weights.size):
+        if weights[a] > 0.0:
+            low, high = min(low, path[a]), max(high, path[a])
+    return high - low if high >= low else 0.0
+
+
+@_compiled
+def _slopes(weights: Array, design: Array, q: Array, norm: Array, mean: Array, out: Array) -> None:
+    """Fill what the fit of one gate says of the optical depth, its error and its leverage."""
+    whole = _dot(weights, design[3], design[3])
+    out[INTERCEPT_VARIANCE] = 1.0 / whole
+    for c in range(3):
+        if norm[c] > 0.0:
+            out[INTERCEPT_VARIANCE] += mean[c] * mean[c] / norm[c]
+    out[INFORMATION] = 4.0 * norm[2]
+    for a in range(weights.size):
+        out[SHARE] += (weights[a] * q[2, a]) ** 2
+    out[SHARE] /= norm[2]
+    if out[SIDES] == 0.0:
+        out[SLOPE_EAST] = -0.5 * _dot(weights, q[2], design[0]) / norm[2]
+        out[SLOPE_NORTH] = -0.5 * _dot(weights, q[2], design[1]) / norm[2]
+    out[SPAN] = _span(weights, design[2])
+
+
+@_compiled
+def fit_gate(
+    y: Array,
+    weights: Array,
+    keep: Array,
+    design: Array,
+    sides: bool,
+    q: Array,
+    residual: Array,
+    hat: Array,
+    out: Array,
+) -> None:
+    """Fit one gate, with gradients where `sides`; fill residuals and leverages.
+
+    Parameters
+    ----------
+    y : (angle,) float
+    weights, keep, residual, hat : (angle,) float
+        Weights, what they were reduced by; the latter two get values wherever there is a fit,
+        else NaN and 1.
+    design : (4, angle) float
+        East, north, path, ones.
+    sides : bool
+    q : (3, angle) float
+        Gets the orthogonal columns.
+    out : (COLUMNS,) float
+    """
+    norm, mean = np.empty(3), np.empty(3)
+    included = _orthogonal(weights, design, sides, q, norm, mean)
+    rays = np.count_nonzero(weights)
+    if included > 0 and rays <= 2 + included:
+        # Without a residual left, the gradient would cost the optical depth its check.
+        included = _orthogonal(weights, design, False, q, norm, mean)
+    out[:] = 0.0
+    out[TAU] = out[INTERCEPT] = out[INTERCEPT_VARIANCE] = np.nan
+    residual[:] = np.nan
+    hat[:] = 1.0
+    out[SIDES] = included
+    if norm[2] == 0.0:
+        return
+    _slopes(weights, design, q, norm, mean, out)
+    whole = _dot(weights, design[3], design[3])
+    middle = _dot(weights, y, design[3]) / whole
+    out[INTERCEPT] = middle
+    for a in range(weights.size):
+        residual[a] = y[a] - middle
+        hat[a] = weights[a] / whole
+    for c in range(3):
+        if norm[c] > 0.0:
+            slope = _dot(weights, q[c], residual) / norm[c]
+            out[INTERCEPT] += slope * mean[c]
+            out[TAU] = -0.5 * slope
+            for a in range(weights.size):
+                residual[a] -= slope * q[c, a]
+                hat[a] += weights[a] * q[c, a] * q[c, a] / norm[c]
+    out[FREEDOM] = rays - 2 - included
+    if out[FREEDOM] > 0.0:
+        for a in range(weights.size):
+            out[CHI2] += weights[a] * residual[a] * residual[a]
+            out[TRACE] += weights[a] * (1.0 - hat[a])
+            out[EXPECTED] += keep[a] * (1.0 - hat[a]) if weights[a] > 0.0 else 0.0
+
+
+@_compiled
+def fit_gates(
+    y: Array,
+    noise: Array,
+    keep: Array,
+    inhomogeneity: Array,
+    x: Array,
+    d: Array,
+    sides: bool,
+    out: Array,
+    residuals: Array,
+    leverages: Array,
+) -> None:
+    """Fit as `fit_profiles`, with gradients at gates whose rays surround the zenith.
+
+    Parameters
+    ----------
+    y, noise, keep, inhomogeneity, x, out
+        As in `fit_profiles`.
+    d : (2, angle, altitude) float
+        Horizontal distance over altitude, eastward and northward.
+    sides : bool
+        Whether the scan may know of gradients at all.
+    residuals, leverages : (profile or 0, angle, altitude) float
+        Get what the fit leaves of the logarithms (NaN where there is no sample) and the diagonal
+        of the hat matrix; not filled where they hold no profile.
+    """
+    count, angles, gates = y.shape
+    weights, before, kept, column = (
+        np.empty(angles),
+        np.empty(angles),
+        np.ones(angles),
+        np.empty(angles),
+    )
+    q, residual, hat = np.empty((3, angles)), np.empty(angles), np.empty(angles)
+    design, row = np.ones((4, angles)), np.empty(COLUMNS)
+    for t in range(count):
+        before[:] = 0.0
+        around = False
+        for k in range(gates):
+            changed = False
+            for a in range(angles):
+                weights[a] = 1.0 / (noise[t, a, k] + inhomogeneity[k])
+                if keep.shape[1] > 0:
+                    kept[a] = keep[t, a, k]
+                    weights[a] *= kept[a]
+                changed |= (weights[a] > 0.0) != (before[a] > 0.0)
+                before[a] = weights[a]
+                column[a] = y[t, a, k]
+                design[0, a], design[1, a], design[2, a] = d[0, a, k], d[1, a, k], x[a, k]
+            if sides and changed:
+                around = surrounds(weights, design)
+            fit_gate(column, weights, kept, design, around, q, residual, hat, row)
+            out[t, :, k] = row
+            if residuals.shape[0] > 0:
+                for a in range(angles):
+                    on = noise[t, a, k] < np.inf
+                    residuals[t, a, k] = residual[a] if on else np.nan
+                    leverages[t, a, k] = hat[a] if on else np.nan

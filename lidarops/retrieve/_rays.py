@@ -1,0 +1,323 @@
+"""Signals of the rays of a network: checked, averaged over blocks and condensed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve import _inputs, _point_weights
+from lidarops.retrieve._point_weights import Condensed, Layout
+from lidarops.retrieve.geometry import Network
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+Booleans = npt.NDArray[np.bool_]
+
+LOUDEST_GATE: Final = 0.3
+"""Relative standard error of a gate, of the mean of a block, beyond which a vertex is not used:
+what is positive by chance would be selected, and the logarithm turns noise into bias."""
+_OF_MEDIAN: Final = np.pi / 2.0
+"""Variance of a median over that of a mean."""
+_SMOOTHED: Final = 31
+"""Gates over which an estimated noise is averaged."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rays:
+    """All that the methods need to know of the signals."""
+
+    layout: Layout
+    exponent: Array
+    """(ray,)."""
+    data: Condensed
+    """Of the profiles."""
+    mean: Condensed
+    """Of the median signals of the blocks."""
+    block: Indices
+    """(profile,)."""
+    averaged: Indices
+    """(block,) profiles in the means."""
+    noise: Array
+    """(block,) relative standard error of a gate of a single profile, root mean square over the
+    gates about the vertices that are used."""
+    weak: Booleans
+    """(block, crossing) True where the signal is too weak to be used."""
+    leading: tuple[int, ...]
+
+
+def prepare(
+    power: npt.ArrayLike,
+    range_: npt.ArrayLike,
+    network: Network,
+    *,
+    variance: npt.ArrayLike | None,
+    overlap: npt.ArrayLike | None,
+    full_overlap_range: npt.ArrayLike | None,
+    exponent: npt.ArrayLike,
+    blocks: npt.ArrayLike | None,
+    gates: int,
+) -> Rays:
+    """Check and condense signals; arguments are those of `multiposition.solve`."""
+    grid, turn = _grids(range_, network.rays)
+    signal, leading = _signal(power, grid, turn=turn)
+    nearest, shape = _overlap(overlap, full_overlap_range, grid, turn=turn)
+    if not (isinstance(gates, int | np.integer) and 3 <= gates <= 99):
+        raise RetrievalInputError(f"is {gates}", field="gates", remedy="choose 3 to 99")
+    powers = _exponents(exponent, network.rays)
+    layout = _point_weights.lay_out(network, grid, shape, nearest, int(gates))
+    block, count = _blocks(blocks, leading)
+    members = [np.flatnonzero(block == b) for b in range(count)]
+    relative = variance is None
+    if variance is None:
+        rows, row = _estimated(signal, members), block
+    else:
+        rows, row = _variances(variance, signal.shape, turn=turn)
+    mean, mean_rows, single, averaged = _means(signal, rows, row, members, layout)
+    data = _point_weights.condense(signal, rows, row, powers, layout, relative=relative)
+    means = _point_weights.condense(
+        mean, mean_rows, np.arange(count), powers, layout, relative=relative
+    )
+    loudness = _loudness(mean, single, layout, relative=relative)
+    weak = ~(loudness <= LOUDEST_GATE**2) & (means.usable == 1)
+    with np.errstate(invalid="ignore"):
+        heard = np.where(weak | (means.usable == 0), np.nan, loudness)
+    means.usable[weak] = 0
+    data.usable[(means.usable == 0)[block]] = 0
+    return Rays(
+        layout, powers, data, means, block, averaged, np.sqrt(_row_means(heard)), weak, leading
+    )
+
+
+def _row_means(values: Array) -> Array:
+    finite = np.isfinite(values)
+    total = np.where(finite, values, 0.0).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(total / finite.sum(axis=1))
+
+
+def _grids(values: npt.ArrayLike, rays: int) -> tuple[Array, bool]:
+    """Return (ray, bin) ascending ranges, and whether they were descending."""
+    array = _inputs.real_array(values, "range").astype(np.float64)
+    if array.ndim == 1:
+        grid = _inputs.range_grid(array)
+        return np.tile(grid.values, (rays, 1)), grid.descending
+    if array.ndim != 2 or array.shape[0] != rays:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}",
+            field="range",
+            remedy=f"give (range,) or ({rays}, range), one row per ray",
+        )
+    for row in array:
+        known = np.isfinite(row)
+        if not known.any() or not known[: int(known.sum())].all():
+            raise RetrievalInputError("is not finite before the last bin of a ray", field="range")
+        if _inputs.range_grid(row[known]).descending:
+            raise RetrievalInputError("descends", field="range", remedy="turn it, and the power")
+    return np.ascontiguousarray(array), False
+
+
+def _signal(power: npt.ArrayLike, grid: Array, *, turn: bool) -> tuple[Array, tuple[int, ...]]:
+    array = _inputs.real_array(power, "power").astype(np.float64, copy=False)
+    if array.ndim < 2 or array.shape[-2:] != grid.shape:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}",
+            field="power",
+            remedy=f"its last two axes are ray and range, here {grid.shape}",
+        )
+    leading = array.shape[:-2]
+    flat = array[..., ::-1] if turn else array
+    count = int(np.prod(leading, dtype=np.int64))
+    flat = np.ascontiguousarray(flat.reshape(count, *grid.shape))
+    return np.where(np.isnan(grid), np.nan, flat), leading
+
+
+def _overlap(
+    overlap: npt.ArrayLike | None, nearest: npt.ArrayLike | None, grid: Array, *, turn: bool
+) -> tuple[Array, Array | None]:
+    """Return the nearest range of each ray and its overlap function, where there is one."""
+    if overlap is None and nearest is None:
+        raise RetrievalInputError(
+            "is not given, nor full_overlap_range",
+            field="overlap",
+            remedy="give one of them: an error of 1 percent in the overlap at the first vertex"
+            " changes extinction there by 5 percent",
+        )
+    limits = _inputs.real_array(0.0 if nearest is None else nearest, "full_overlap_range")
+    if limits.shape not in {(), (grid.shape[0],)} or not np.all(limits >= 0):
+        raise RetrievalInputError(
+            "is negative, NaN or of a wrong shape",
+            field="full_overlap_range",
+            remedy="give one range in m, or one per ray",
+        )
+    first = np.broadcast_to(limits, grid.shape[:1]).astype(np.float64)
+    if overlap is None:
+        return first, None
+    array = _inputs.real_array(overlap, "overlap").astype(np.float64)
+    if array.shape not in {grid.shape, grid.shape[1:]}:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}", field="overlap", remedy=f"give {grid.shape}"
+        )
+    if np.any(array < 0) or np.any(array > 1.5):
+        raise RetrievalInputError(
+            "is not between 0 and 1.5", field="overlap", remedy="give 1 for full overlap"
+        )
+    return first, np.broadcast_to(array[..., ::-1] if turn else array, grid.shape)
+
+
+def _exponents(exponent: npt.ArrayLike, rays: int) -> Array:
+    array = _inputs.real_array(exponent, "exponent").astype(np.float64)
+    if array.shape not in {(), (rays,)} or not np.all((array >= 0.1) & (array <= 10.0)):
+        raise RetrievalInputError(
+            "is not from 0.1 to 10, or of a wrong shape",
+            field="exponent",
+            remedy=f"give m of backscatter ~ extinction^(1/m): one, or one per ray ({rays})",
+        )
+    return np.broadcast_to(array, (rays,)).copy()
+
+
+def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Indices, int]:
+    count = int(np.prod(leading, dtype=np.int64))
+    if blocks is None:
+        return np.zeros(count, dtype=np.intp), min(count, 1)
+    labels = np.asarray(blocks)
+    if labels.shape != leading or labels.dtype.kind not in "iuUS":
+        raise RetrievalInputError(
+            f"has the shape {labels.shape} of {labels.dtype}",
+            field="blocks",
+            remedy=f"give one whole number or name per profile, {leading}",
+        )
+    found, inverse = np.unique(labels.reshape(count), return_inverse=True)
+    return inverse.reshape(count).astype(np.intp), int(found.size)
+
+
+def _variances(
+    variance: npt.ArrayLike, shape: tuple[int, ...], *, turn: bool
+) -> tuple[Array, Indices]:
+    array = _inputs.real_array(variance, "variance").astype(np.float64, copy=False)
+    if np.any(array < 0):
+        raise RetrievalInputError(
+            "is negative", field="variance", remedy="give squares of the power's unit"
+        )
+    if turn and array.ndim > 0:
+        array = array[..., ::-1]
+    shared = all(length == 1 for length in array.shape[:-2])
+    try:
+        if shared:
+            rows = np.broadcast_to(array.reshape(array.shape[-2:]), shape[1:])[np.newaxis]
+        else:
+            rows = array.reshape(-1, *array.shape[-2:])
+            rows = np.broadcast_to(rows, (shape[0], *shape[1:]))
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}",
+            field="variance",
+            remedy=f"give (..., ray, range), here (..., {shape[1]}, {shape[2]})",
+        ) from None
+    row = np.zeros(shape[0], dtype=np.intp) if shared else np.arange(shape[0])
+    return np.ascontiguousarray(rows), row
+
+
+def _estimated(signal: Array, members: list[Indices]) -> Array:
+    """Return (block, ray, bin) relative variances, from second differences along range."""
+    out = np.full((len(members), *signal.shape[1:]), np.nan)
+    if signal.shape[-1] < 3:
+        return out
+    with np.errstate(invalid="ignore", divide="ignore"):
+        logs = np.log(np.where(signal > 0, signal, np.nan))
+    squares = (logs[..., :-2] - 2.0 * logs[..., 1:-1] + logs[..., 2:]) ** 2 / 6.0
+    width = min(_SMOOTHED, squares.shape[-1])
+    for b, mine in enumerate(members):
+        known = np.isfinite(squares[mine])
+        total = np.where(known, squares[mine], 0.0).sum(axis=0)
+        number = known.sum(axis=0).astype(np.float64)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            smooth = _moving_sum(total, width) / _moving_sum(number, width)
+        out[b, :, 1:-1] = smooth
+        out[b, :, 0], out[b, :, -1] = smooth[:, 0], smooth[:, -1]
+    return out
+
+
+def _moving_sum(values: Array, width: int) -> Array:
+    """Return sums over a window that shrinks at the ends."""
+    size = values.shape[-1]
+    sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
+    centre = np.arange(size)
+    start = np.maximum(centre - width // 2, 0)
+    stop = np.minimum(centre + width // 2 + 1, size)
+    return np.asarray(sums[..., stop] - sums[..., start])
+
+
+def _means(
+    signal: Array, rows: Array, row: Indices, members: list[Indices], layout: Layout
+) -> tuple[Array, Array, Array, Indices]:  # fmt: skip
+    """Take medians of the signals of blocks; return variances, those of one profile, and numbers.
+
+    Medians, because a single wild gate must not spoil a block. The energy of a laser changes from
+    profile to profile, so that one with a gap on a ray would put a step there: it is left out.
+    """
+    shape = (len(members), *signal.shape[1:])
+    mean, spread, single = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
+    averaged = np.zeros(len(members), dtype=np.intp)
+    first, gates = layout.first_crossing, layout.weights.shape[1]
+    for ray in range(shape[1]):
+        if first[ray] == first[ray + 1]:
+            continue
+        low, high = layout.window[first[ray]], layout.window[first[ray + 1] - 1] + gates
+        whole = np.asarray(np.isfinite(signal[:, ray, low:high]).all(axis=1))
+        for b, mine in enumerate(members):
+            used = mine[whole[mine]]
+            if used.size == 0:
+                continue
+            mean[b, ray] = np.median(signal[used, ray], axis=0)
+            single[b, ray] = rows[row[used], ray].sum(axis=0) / used.size
+            spread[b, ray] = _OF_MEDIAN * single[b, ray] / used.size
+            averaged[b] = min(averaged[b], used.size) if averaged[b] else used.size
+    return mean, spread, single, averaged
+
+
+def _loudness(mean: Array, single: Array, layout: Layout, *, relative: bool) -> Array:
+    """Return (block, crossing) relative variances of a gate of one profile about a vertex."""
+    total, gates = layout.crossings.ray.size, layout.weights.shape[1]
+    out = np.zeros((mean.shape[0], total))
+    for c in range(total):
+        ray, gate = layout.crossings.ray[c], slice(layout.window[c], layout.window[c] + gates)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            level = mean[:, ray, gate].sum(axis=1) / gates
+            spread = single[:, ray, gate].sum(axis=1) / gates
+            out[:, c] = spread if relative else np.where(level > 0, spread / level**2, np.inf)
+    return out
+
+
+def average(
+    power: npt.ArrayLike, groups: npt.ArrayLike, variance: npt.ArrayLike | None
+) -> tuple[Array, Array | None]:
+    """Average signals of groups of profiles; see `multiposition.average`."""
+    signal = _inputs.real_array(power, "power").astype(np.float64, copy=False)
+    if signal.ndim != 3:
+        raise RetrievalInputError(
+            f"has the shape {signal.shape}", field="power", remedy="give (profile, ray, range)"
+        )
+    group, count = _blocks(groups, signal.shape[:1])
+    noise = None
+    if variance is not None:
+        rows, row = _variances(variance, signal.shape, turn=False)
+        noise = rows[row]
+    mean = np.full((count, *signal.shape[1:]), np.nan)
+    spread = None if noise is None else mean.copy()
+    known = np.isfinite(signal)
+    for g in range(count):
+        mine = np.flatnonzero(group == g)
+        present = known[mine].any(axis=0)
+        whole = np.asarray((known[mine] | ~present).all(axis=2))
+        for ray in range(signal.shape[1]):
+            used = mine[whole[:, ray]]
+            if used.size == 0:
+                continue
+            mean[g, ray] = signal[used, ray].sum(axis=0) / used.size
+            if spread is not None and noise is not None:
+                spread[g, ray] = noise[used, ray].sum(axis=0) / used.size**2
+    return mean, spread

@@ -1,0 +1,415 @@
+"""Extinction and visibility from several lidars that look into the same air.
+
+Where two rays cross, both lidars see the same extinction, whatever their constants and the
+lidar ratio are. Along a ray, a = (P R^2 / overlap)^m is proportional to extinction times
+exp(-2 m optical depth), if backscatter goes as extinction^(1/m) there; so that between a near
+vertex n and a far one v
+
+    a_n / extinction_n - a_v / extinction_v = 2 m (integral of a from n to v).
+
+Nothing in it needs calibration: a lidar's constant multiplies the whole row. The overlap does
+not cancel: an error of 1, 3 and 10 percent at the first vertex changes extinction there by 5, 14
+and 34 percent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve import _closed, _inputs, _network, _prior, _rays
+from lidarops.retrieve import geometry as rays_geometry
+from lidarops.retrieve import visibility as sight
+from lidarops.retrieve._point_weights import MISSING, NOT_POSITIVE
+from lidarops.retrieve.geometry import Cycle, Network
+
+Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
+
+DEFAULT_GATES: Final = 7
+DEFAULT_UNBIASED_MULTIPLIER: Final = 0.25
+"""Of the unbiased estimate: its noise is nearly least there, in fields of any kind."""
+_LEAST_PROBABILITY: Final = 1e-4
+_ILL_CONDITIONED: Final = 1.0 / 3.0
+
+
+class Method(StrEnum):
+    """How extinction is found. All but the network see one cycle, or one ray."""
+
+    NETWORK = "network"
+    """All rays and vertices at once, weighted by their full covariance."""
+    CYCLE = "cycle"
+    """The exact closed form of a cycle."""
+    MULTIPLIER = "multiplier"
+    """The closed form with a multiplier below 1: less noise, a known systematic error."""
+    UNBIASED = "unbiased"
+    """The same, with what is neglected put to the start vertex: no error in homogeneous air."""
+    SLOPE = "slope"
+    """Each ray for itself, as if homogeneous from vertex to vertex."""
+    KLETT = "klett"
+    """Each ray for itself, from the slope at the far end of a segment."""
+
+
+_HOMOGENEOUS: Final = frozenset({Method.MULTIPLIER, Method.UNBIASED, Method.SLOPE, Method.KLETT})
+
+
+class Prior(StrEnum):
+    """What a network is told about the field beforehand."""
+
+    BLOCK = "block"
+    """The mean field of the block of profiles, and how much profiles deviate from it."""
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VertexFlags:
+    """What is wrong with a value: (..., vertex) booleans each."""
+
+    ill_conditioned: Booleans
+    """Attenuation around the cycle, or what takes its place, is less than 3 standard errors."""
+    far_start: Booleans
+    """The start of the cycle is the far vertex of its ray."""
+    not_positive: Booleans
+    """The solution is negative."""
+    not_finite: Booleans
+    """There is no solution."""
+    uncertain: Booleans
+    """The standard error exceeds the value."""
+    signal_not_positive: Booleans
+    """A ray of the vertex has a gate before it that is zero or negative."""
+    signal_missing: Booleans
+    """A ray of the vertex has a gate before it that is not finite."""
+    weak_signal: Booleans
+    """A ray of the vertex is too noisy there, and was left out; the others stand."""
+    pole: Booleans
+    """The multiplier makes the determinant vanish or turn its sign: no value."""
+    unsettled: Booleans
+    """The last pass of the network still moved the solution."""
+    poor_fit: Booleans
+    """The rays disagree by more than their noise allows."""
+    not_homogeneous: Booleans
+    """The method takes the air for homogeneous, and the rays say that it is not."""
+    not_measured: Booleans
+    """Fewer than two rays have full overlap and range there."""
+
+    @property
+    def flagged(self) -> Booleans:
+        """Union of all but `weak_signal`, which does no harm where a value is left."""
+        union = np.zeros_like(self.far_start)
+        for field in fields(self):
+            if field.name != "weak_signal":
+                union = union | getattr(self, field.name)
+        return union
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MultiPositionResult:
+    """Extinction at the vertices of a network, with the leading axes of the power."""
+
+    extinction: Array
+    """(..., vertex) m-1; NaN at vertices that are near ones on no ray, and where there is none."""
+    extinction_standard_error: Array
+    """m-1."""
+    visibility: sight.VisibilityResult
+    """(..., vertex) m, at the wavelength of the lidars."""
+    flags: VertexFlags
+    near_vertex: Booleans
+    """(vertex,) True where extinction is reported."""
+    reduced_chi_square: Array
+    """(...) of the rays of the network, free of the prior; NaN for other methods, and where
+    nothing is left over."""
+    degrees_of_freedom: Array
+    """(...)."""
+    prior_deviation: Array
+    """(...) of ln extinction about the mean field; inf without prior, NaN without network."""
+    multiplier: Array
+    """(...) of the cycle; NaN for other methods."""
+    method: Method
+
+
+def average(
+    power: npt.ArrayLike, groups: npt.ArrayLike, *, variance: npt.ArrayLike | None = None
+) -> tuple[Array, Array | None]:
+    """Average the signals of groups of profiles, as should be done before they are solved.
+
+    A lidar's energy changes from profile to profile: a ray with a gap would put a step into the
+    mean, and is left out of it. Where no profile of a group has a gate, the mean has none.
+
+    Parameters
+    ----------
+    power : (profile, ray, range) float
+    groups : (profile,) int or str
+        Labels; groups come in their sorted order.
+    variance : (profile, ray, range) float, optional
+
+    Returns
+    -------
+    power : (group, ray, range) float64
+    variance : (group, ray, range) float64, or None where none is given
+        Of the mean.
+
+    Raises
+    ------
+    RetrievalInputError
+        For shapes that do not fit.
+    """
+    return _rays.average(power, groups, variance)
+
+
+def solve(
+    power: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+    network: Network,
+    *,
+    method: str = "network",
+    variance: npt.ArrayLike | None = None,
+    overlap: npt.ArrayLike | None = None,
+    full_overlap_range: npt.ArrayLike | None = None,
+    exponent: npt.ArrayLike = 1.0,
+    blocks: npt.ArrayLike | None = None,
+    prior: str = "block",
+    cycle: Cycle | None = None,
+    start: int | None = None,
+    multiplier: float | None = None,
+    gates: int = DEFAULT_GATES,
+    contrast: float = sight.MOR_CONTRAST,
+) -> MultiPositionResult:
+    """Find extinction and visibility where the rays of several lidars meet.
+
+    Average signals before (`average`), not results afterwards: noise makes these biased.
+
+    Parameters
+    ----------
+    power : (..., ray, range) float
+        Any unit, free of background. Each lidar has its own constant, which may change from
+        profile to profile.
+    range : (range,) or (ray, range) float
+        m.
+    network : Network
+        Of `lidarops.retrieve.geometry`, with as many rays.
+    method : {"network", "cycle", "multiplier", "unbiased", "slope", "klett"}
+    variance : (..., ray, range) float, optional
+        Noise variance in the square of the power's unit, broadcast against `power`; gates are
+        independent. Where not given, second differences along range tell it, block by block.
+    overlap : (ray, range) or (range,) float, optional
+        Overlap function, by which power is divided; gates below 0.5 are not used.
+    full_overlap_range : float or (ray,) float, optional
+        m; nearer gates are not used. One of the two is required.
+    exponent : float or (ray,) float
+        m of backscatter ~ extinction^(1/m) along a ray.
+    blocks : (...) int or str, optional
+        Labels of the profiles that are pooled, for the mean field and the multiplier; one block
+        where not given. A block's results depend on its own profiles only.
+    prior : {"block", "none"}
+        For the network. "none" solves each profile for itself; vertices that are not
+        determined are NaN.
+    cycle : Cycle, optional
+        For "cycle", "multiplier" and "unbiased"; that of `geometry.cycle` where not given.
+    start : int, optional
+        Vertex of the cycle to solve for alone, with the cycle turned to it; all near vertices
+        in turn where not given.
+    multiplier : float, optional
+        For "multiplier" (the best of each block where not given) and "unbiased" (0.25).
+    gates : int
+        Of the fit that gives the signal at a vertex.
+    contrast : float
+        Threshold of visibility.
+
+    Returns
+    -------
+    MultiPositionResult
+
+    Raises
+    ------
+    RetrievalInputError
+        For arguments that cannot be right.
+
+    References
+    ----------
+    drabenko2021, yegorov2008.
+    """
+    chosen = _inputs.choice(method, Method, "method")
+    told = _inputs.choice(prior, Prior, "prior")
+    _check_settings(chosen, multiplier, cycle, start)
+    sight.koschmieder_constant(contrast)
+    if network.vertices == 0:
+        raise RetrievalInputError(
+            "has no vertices: its rays do not meet",
+            field="network",
+            remedy="point the lidars at common volumes, or widen the tolerance of the geometry",
+        )
+    rays = _rays.prepare(
+        power, range, network, variance=variance, overlap=overlap,
+        full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, gates=gates,
+    )  # fmt: skip
+    if chosen is Method.NETWORK:
+        estimate, fit = _solve_network(rays, network.vertex, told)
+    else:
+        walk = None
+        if chosen not in {Method.SLOPE, Method.KLETT}:
+            walk = cycle if cycle is not None else rays_geometry.cycle(network, start=start)
+        estimate, fit = _solve_closed(rays, chosen, walk, multiplier, start), None
+    return _judged(rays, estimate, fit, chosen, contrast)
+
+
+def _solve_network(
+    rays: _rays.Rays, position: Array, prior: Prior
+) -> tuple[_closed.Estimate, _prior.Solution]:
+    layout = rays.layout
+    numbers = np.cumsum(layout.measured) - 1
+    vertex = numbers[layout.crossings.vertex].astype(np.intp)
+    position = position[layout.measured]
+    if prior is Prior.NONE or vertex.size == 0:
+        fit = _prior.solve_without_prior(rays.data, layout, vertex, rays.exponent, position)
+    else:
+        fit = _prior.solve_blocks(rays.data, layout, vertex, rays.exponent, position, rays.block)
+    shape = (rays.block.size, layout.vertices)
+    extinction, variance = np.full(shape, np.nan), np.full(shape, np.nan)
+    with np.errstate(over="ignore", under="ignore"):
+        extinction[:, layout.measured] = np.exp(fit.logarithm)
+        variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
+    none = np.zeros(shape, dtype=np.bool_)
+    with np.errstate(invalid="ignore"):
+        shaky = variance > (_ILL_CONDITIONED * extinction) ** 2
+    estimate = _closed.Estimate(
+        extinction, variance, shaky, none, np.zeros(shape[1], dtype=np.bool_),
+        np.full(shape[0], np.nan),
+    )  # fmt: skip
+    return estimate, fit
+
+
+def _solve_closed(
+    rays: _rays.Rays,
+    method: Method,
+    cycle: Cycle | None,
+    multiplier: float | None,
+    start: int | None,
+) -> _closed.Estimate:
+    if cycle is None:
+        return _closed.by_single_rays(rays, far_end=method is Method.KLETT)
+    if method is Method.CYCLE:
+        multiplier = 1.0
+    elif method is Method.UNBIASED and multiplier is None:
+        multiplier = DEFAULT_UNBIASED_MULTIPLIER
+    return _closed.by_cycle(
+        rays, cycle, multiplier, unbiased=method is Method.UNBIASED, only_start=start is not None
+    )
+
+
+def _judged(
+    rays: _rays.Rays,
+    estimate: _closed.Estimate,
+    fit: _prior.Solution | None,
+    method: Method,
+    contrast: float,
+) -> MultiPositionResult:
+    """Report extinction at near vertices, and flag it."""
+    shape = estimate.extinction.shape
+    near = rays.layout.near_vertex | estimate.far_start
+    with np.errstate(invalid="ignore"):
+        finite = np.isfinite(estimate.variance)
+        finite &= np.abs(estimate.extinction) < sight.LARGEST_EXTINCTION
+        positive = finite & (estimate.extinction > 0)
+        uncertain = estimate.variance > estimate.extinction**2
+    extinction = np.where(positive & near, estimate.extinction, np.nan)
+    error = np.sqrt(np.where(positive & near, estimate.variance, np.nan))
+    none = np.zeros(shape[0], dtype=np.bool_)
+    chi_square, freedom = np.full(shape[0], np.nan), np.full(shape[0], np.nan)
+    deviation, unsettled, poor = np.full(shape[0], np.nan), none, none
+    if fit is not None:
+        freedom, deviation = fit.degrees_of_freedom, fit.deviation
+        with np.errstate(invalid="ignore", divide="ignore"):
+            chi_square = np.where(freedom > 0, fit.chi_square / freedom, np.nan)
+        poor = _improbable(fit.chi_square, freedom)
+        poor |= _improbable(fit.prior_chi_square, fit.prior_degrees_of_freedom)
+        unsettled = fit.status == _network.UNSETTLED
+    flags = VertexFlags(
+        ill_conditioned=estimate.weak_attenuation & finite,
+        far_start=np.broadcast_to(estimate.far_start, shape),
+        not_positive=finite & ~positive,
+        not_finite=~finite,
+        uncertain=uncertain,
+        signal_not_positive=_lost(rays, NOT_POSITIVE),
+        signal_missing=_lost(rays, MISSING),
+        weak_signal=_by_vertex(rays, rays.weak[rays.block]),
+        pole=estimate.pole,
+        unsettled=np.broadcast_to(unsettled[:, np.newaxis], shape),
+        poor_fit=np.broadcast_to(poor[..., np.newaxis], shape),
+        not_homogeneous=(
+            _closed.inhomogeneous(rays, estimate)
+            if method in _HOMOGENEOUS
+            else np.zeros(shape, dtype=np.bool_)
+        ),
+        not_measured=np.broadcast_to(~rays.layout.measured, shape),
+    )
+    leading = rays.leading
+    shaped = VertexFlags(
+        **{
+            f.name: getattr(flags, f.name).reshape(*leading, shape[1]).copy()
+            for f in fields(VertexFlags)
+        }
+    )
+    values = extinction.reshape(*leading, shape[1])
+    errors = error.reshape(*leading, shape[1])
+    return MultiPositionResult(
+        values, errors,
+        sight.from_extinction(values, errors, contrast=contrast),
+        shaped, near, chi_square.reshape(leading), freedom.reshape(leading),
+        deviation.reshape(leading), estimate.multiplier.reshape(leading), method,
+    )  # fmt: skip
+
+
+def _improbable(chi_square: Array, freedom: Array) -> Booleans:
+    """Return where chance gives so large a chi-square once in ten thousand, or less."""
+    known = np.isfinite(chi_square) & (freedom > 0)
+    chance = special.gammaincc(
+        np.where(known, freedom, 1.0) / 2.0, np.where(known, np.maximum(chi_square, 0.0), 0.0) / 2.0
+    )
+    return np.asarray(known & (chance < _LEAST_PROBABILITY))
+
+
+def _lost(rays: _rays.Rays, reason: int) -> Booleans:
+    """Return where a ray of a vertex has lost it for a reason."""
+    status = rays.data.status[:, rays.layout.crossings.ray]
+    beyond = (rays.data.usable == 0) & ~rays.weak[rays.block]
+    return _by_vertex(rays, (status == reason) & beyond)
+
+
+def _by_vertex(rays: _rays.Rays, crossings: Booleans) -> Booleans:
+    out = np.zeros((crossings.shape[0], rays.layout.vertices), dtype=np.bool_)
+    for c, vertex in enumerate(rays.layout.crossings.vertex):
+        out[:, vertex] |= crossings[:, c]
+    return out
+
+
+# Checks -------------------------------------------------------------------------------------
+
+
+def _check_settings(
+    method: Method, multiplier: float | None, cycle: Cycle | None, start: int | None
+) -> None:
+    cyclic = method in {Method.CYCLE, Method.MULTIPLIER, Method.UNBIASED}
+    if multiplier is not None:
+        if method not in {Method.MULTIPLIER, Method.UNBIASED}:
+            raise RetrievalInputError(
+                f"is not used by the method '{method}'",
+                field="multiplier",
+                remedy="choose 'multiplier' or 'unbiased'",
+            )
+        if not 0.0 <= multiplier <= 1.0:
+            raise RetrievalInputError(f"is {multiplier}, not from 0 to 1", field="multiplier")
+    for value, name in ((cycle, "cycle"), (start, "start")):
+        if value is not None and not cyclic:
+            raise RetrievalInputError(f"is not used by the method '{method}'", field=name)
+    if cycle is not None and start is not None and start != int(cycle.vertex[0]):
+        raise RetrievalInputError(
+            f"is {start}, but the cycle starts at {int(cycle.vertex[0])}",
+            field="start",
+            remedy="give it to geometry.cycle",
+        )

@@ -1,0 +1,302 @@
+"""The solution of a network: its parts against numpy, scipy and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracle_multiposition import (
+    at_vertices,
+    gradient,
+    grid,
+    homogeneous,
+    noisy,
+    signals,
+    three_by_two,
+    triangle,
+)
+from scipy import integrate, optimize
+
+from lidarops.retrieve import _network, _point_weights, _prior
+
+# Linear algebra -----------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 30), st.integers(0, 2**31))
+def test_cholesky_agrees_with_numpy(size, seed):
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((size, size + 3))
+    matrix, side = root @ root.T, rng.standard_normal(size)
+    factor, solution = matrix.copy(), side.copy()
+    assert _network.factorise(factor, size)
+    np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix), rtol=1e-8, atol=1e-10)
+    _network.substitute(factor, size, solution)
+    np.testing.assert_allclose(matrix @ solution, side, atol=1e-6)
+
+
+def test_singular_matrix_is_told():
+    assert not _network.factorise(np.ones((3, 3)), 3)
+    assert not _network.factorise(np.full((2, 2), np.nan), 2)
+    assert not _network.factorise(-np.eye(2), 2)
+
+
+# Values at vertices and integrals between them ------------------------------------------------
+
+
+def condensed(net, power, variance, exponent=1.0, gates=7, step=5.0):
+    r = grid(net, step)
+    layout = _point_weights.lay_out(
+        net, np.tile(r, (net.rays, 1)), None, np.full(net.rays, 100.0), gates
+    )
+    data = _point_weights.condense(
+        np.atleast_3d(power).reshape(-1, net.rays, r.size), variance[np.newaxis],
+        np.zeros(power.size // (net.rays * r.size), dtype=np.intp),
+        np.full(net.rays, exponent), layout, relative=False,
+    )  # fmt: skip
+    return layout, data
+
+
+def test_value_at_a_vertex_is_that_of_a_line_through_logarithms():
+    net = triangle()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 1)
+    layout, data = condensed(net, power, 1e-30 * variance)
+    for c, (ray, where) in enumerate(
+        zip(layout.crossings.ray, layout.crossings.range, strict=True)
+    ):
+        near = np.argsort(np.abs(r - where))[:7]
+        line = np.polyfit(r[near] - where, np.log(power[0, ray, near] * r[near] ** 2), 1)
+        first = layout.first_crossing[ray]
+        start = layout.crossings.range[first]
+        near = np.argsort(np.abs(r - start))[:7]
+        base = np.polyfit(r[near] - start, np.log(power[0, ray, near] * r[near] ** 2), 1)
+        assert data.log_value[0, c] == pytest.approx(line[1] - base[1], abs=1e-10)
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.8])
+def test_integral_agrees_with_quadrature_of_the_interpolated_signal(exponent):
+    net = triangle()
+    r = grid(net, 10.0)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 1)
+    layout, data = condensed(net, power, 1e-30 * variance, exponent, step=10.0)
+    for ray in range(3):
+        c = layout.first_crossing[ray]
+        low, high = layout.crossings.range[c : c + 2]
+        logs = exponent * np.log(power[0, ray] * r**2)
+        near = np.argsort(np.abs(r - low))[:7]
+        scale = np.polyfit(r[near] - low, logs[near], 1)[1]
+        inner = r[(r > low) & (r < high)]
+        expected = integrate.quad(
+            lambda x, logs=logs, scale=scale: np.exp(np.interp(x, r, logs) - scale),
+            low, high, points=inner, limit=200,
+        )[0]  # fmt: skip
+        assert data.integral[0, c] == pytest.approx(2 * exponent * expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.6])
+def test_covariance_agrees_with_finite_differences(exponent):
+    net = three_by_two()
+    r = grid(net, 8.0)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.03, 1)
+    layout, data = condensed(net, power, variance, exponent, step=8.0)
+    relative = variance / power[0] ** 2
+    step = 1e-6
+    for ray in (0, 5):
+        first, last = layout.first_crossing[ray], layout.first_crossing[ray + 1]
+        count = last - first
+        slopes = np.zeros((2 * count - 1, r.size))
+        quiet = np.zeros_like(variance)
+        shifted = np.repeat(power, 2 * r.size, axis=0)
+        for g in range(r.size):
+            shifted[2 * g, ray, g] *= 1 + step
+            shifted[2 * g + 1, ray, g] *= 1 - step
+        _, moved = condensed(net, shifted, quiet, exponent, step=8.0)
+        # Scaled to 1 at the first vertex, integrals lose what they share with it: put it back.
+        scale = np.exp(first_value(layout, ray, shifted, r, exponent))
+        values = moved.log_value[:, first:last] + np.log(scale)[:, None]
+        sums = moved.integral[:, first : last - 1] * scale[:, None]
+        window = slice(layout.window[first], layout.window[first] + 7)
+        mend = 0.5 * exponent * relative[ray, window] @ layout.weights[first]
+        centre = np.exp(first_value(layout, ray, power, r, exponent) + mend)
+        slopes[:count] = (values[::2] - values[1::2]).T / (2 * step)
+        slopes[count:] = (sums[::2] - sums[1::2]).T / (2 * step) / centre
+        expected = (slopes * relative[ray]) @ slopes.T
+        packed = data.covariance[0, layout.offset[ray] : layout.offset[ray + 1]]
+        measured = packed.reshape(expected.shape)
+        size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        np.testing.assert_allclose(measured / size, expected / size, atol=1e-5)
+
+
+def first_value(layout, ray, power, r, exponent):
+    c = layout.first_crossing[ray]
+    window = slice(layout.window[c], layout.window[c] + layout.weights.shape[1])
+    logs = exponent * np.log(power[:, ray, window] * r[window] ** 2)
+    return logs @ layout.weights[c]
+
+
+# Least squares ------------------------------------------------------------------------------
+
+
+class Oracle:
+    """The network's objective in dense numpy: no elimination, no packing."""
+
+    def __init__(self, layout, data, profile, net):
+        self.layout, self.net = layout, net
+        self.vertex = layout.crossings.vertex
+        self.ray = layout.crossings.ray
+        self.values = data.log_value[profile]
+        self.integrals = data.integral[profile]
+        self.packed = data.covariance[profile]
+        self.size = self.vertex.size
+
+    def beyond(self):
+        out = np.zeros(self.size)
+        for c in range(self.size - 2, -1, -1):
+            if self.ray[c] == self.ray[c + 1]:
+                out[c] = out[c + 1] + self.integrals[c]
+        return out
+
+    def residual(self, constants, logarithms):
+        weight = np.exp(constants[self.ray]) + self.beyond()
+        return self.values - np.log(weight) - logarithms[self.vertex]
+
+    def covariance(self, constants):
+        weight = np.exp(constants[self.ray]) + self.beyond()
+        out = np.zeros((self.size, self.size))
+        for ray in range(self.net.rays):
+            first, last = self.layout.first_crossing[ray : ray + 2]
+            n = last - first
+            turn = np.zeros((n, 2 * n - 1))
+            turn[:, :n] = np.eye(n)
+            for i in range(n):
+                turn[i, n + i :] = -1.0 / weight[first + i]
+            packed = self.packed[self.layout.offset[ray] : self.layout.offset[ray + 1]]
+            out[first:last, first:last] = turn @ packed.reshape(2 * n - 1, -1) @ turn.T
+        return out
+
+
+def case(profiles=3, relative=0.01, net=None):
+    net = net or three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), relative, profiles, additive=0.002)
+    layout, data = condensed(net, power, variance)
+    problem = _prior._Problem(data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    return net, layout, data, problem
+
+
+@pytest.mark.parametrize("deviation", [np.inf, 0.05])
+def test_solution_is_the_least_squares_one(deviation):
+    net, layout, data, problem = case()
+    result = problem.solve(deviation, 60)
+    assert np.all(result.status == _network.SOLVED)
+    for n in range(3):
+        oracle = Oracle(layout, data, n, net)
+        root = np.linalg.cholesky(oracle.covariance(problem.constants[n]))
+        prior = np.zeros((0, net.vertices))
+        if np.isfinite(deviation):
+            precision, _ = _prior._free_level(problem.gradient, deviation)
+            values, vectors = np.linalg.eigh(precision)
+            prior = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+        def objective(x, oracle=oracle, root=root, prior=prior):
+            gap = oracle.residual(x[: net.rays], x[net.rays :])
+            return np.concatenate([np.linalg.solve(root, gap), prior @ x[net.rays :]])
+
+        start = np.concatenate([problem.constants[n] + 0.05, result.logarithm[n] - 0.02])
+        best = optimize.least_squares(objective, start, xtol=1e-15, ftol=1e-15, gtol=1e-12)
+        # Without prior, the kernel holds the level by a hundredth of its information.
+        bound = 1e-6 if np.isfinite(deviation) else 2e-3
+        np.testing.assert_allclose(best.x[net.rays :], result.logarithm[n], atol=bound)
+        covariance = np.linalg.inv(best.jac.T @ best.jac)[net.rays :, net.rays :]
+        np.testing.assert_allclose(np.diag(covariance), result.variance[n], rtol=0.02)
+        if np.isfinite(deviation):
+            assert 2 * best.cost == pytest.approx(result.prior_chi_square[n], rel=1e-5)
+        else:
+            assert 2 * best.cost == pytest.approx(result.chi_square[n], rel=0.02)
+    assert result.degrees_of_freedom[0] == layout.crossings.ray.size - net.rays - net.vertices
+
+
+def test_likelihood_is_that_of_the_dense_linear_model():
+    net, layout, data, problem = case(1)
+    problem.solve(0.05, 60)
+    fixed = problem.constants.copy()
+    oracle = Oracle(layout, data, 0, net)
+    noise = oracle.covariance(fixed[0])
+    weight = np.exp(fixed[0][oracle.ray]) + oracle.beyond()
+    design = np.zeros((oracle.size, net.rays + 1))
+    design[np.arange(oracle.size), oracle.ray] = np.exp(fixed[0][oracle.ray]) / weight
+    design[:, -1] = 1.0
+    target = oracle.values - np.log(weight)
+    choose = np.eye(net.vertices)[oracle.vertex]
+
+    def dense(deviation):
+        field = _prior.GRADIENT**2 * problem.gradient + deviation**2 * np.eye(net.vertices)
+        total = noise + choose @ field @ choose.T
+        inverse = np.linalg.inv(total)
+        information = design.T @ inverse @ design
+        rest = target - design @ np.linalg.solve(information, design.T @ inverse @ target)
+        return (
+            np.linalg.slogdet(total)[1] + np.linalg.slogdet(information)[1] + rest @ inverse @ rest
+        )
+
+    def measured(deviation):
+        problem.constants[:] = fixed
+        problem.solve(deviation, 1)
+        return problem.likelihood
+
+    for deviation in (0.01, 0.1, 0.5):
+        difference = dense(deviation) - dense(0.05)
+        assert measured(deviation) - measured(0.05) == pytest.approx(difference, abs=1e-4)
+
+
+def test_standard_errors_are_the_scatter_of_solutions():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.005, 400, additive=5e-4)
+    layout, data = condensed(net, power, variance)
+    problem = _prior._Problem(data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    result = problem.solve(np.inf, 30)
+    truth = np.log(at_vertices(net, homogeneous()))
+    score = (result.logarithm - truth) / np.sqrt(result.variance)
+    np.testing.assert_allclose(score[:, net.near_vertex].std(axis=0), 1.0, atol=0.15)
+    assert np.mean(result.chi_square / result.degrees_of_freedom) == pytest.approx(1.0, abs=0.15)
+
+
+def test_solution_does_not_depend_on_the_other_profiles():
+    _, layout, data, problem = case(7)
+    exponent, position = np.ones(6), problem_position()
+    whole = problem.solve(0.05, 10)
+    for mine in ([0], [3, 4], [6, 1]):
+        part = _prior._Problem(
+            data.take(np.array(mine)), layout, layout.crossings.vertex, exponent, position
+        ).solve(0.05, 10)
+        assert np.array_equal(part.logarithm, whole.logarithm[mine])
+        assert np.array_equal(part.variance, whole.variance[mine])
+
+
+def problem_position():
+    return three_by_two().vertex
+
+
+def test_vertices_that_only_lost_rays_saw_are_missing():
+    net = three_by_two()
+    r = grid(net)
+    power = signals(net, r, homogeneous())[np.newaxis].copy()
+    power[0, 0, :] = np.nan
+    power[0, 4, :] = np.nan
+    layout, data = condensed(net, power, 1e-8 * np.nan_to_num(power[0]) ** 2 + 1e-60)
+    problem = _prior._Problem(data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    seen = np.zeros(net.vertices, dtype=bool)
+    for ray in (1, 2, 3, 5):
+        seen[net.on_ray(ray)[0]] = True
+    result = problem.solve(0.05, 10)
+    assert np.array_equal(np.isfinite(result.logarithm[0]), seen)
+    np.testing.assert_allclose(np.exp(result.logarithm[0, seen]), 2e-3, rtol=0.02)
+
+
+def test_prior_with_an_only_vertex_is_finite():
+    precision, norm = _prior._free_level(_prior._gradient(np.zeros((1, 3))), 0.1)
+    assert np.isfinite(precision).all()
+    assert np.isfinite(norm)
