@@ -31,6 +31,8 @@ _SCALE: Final[Mapping[str, Mapping[str, float]]] = {
     "temperature": {"K": 1.0, "degC": 1.0},
     "overlap": {"1": 1.0},
 }
+_FULL: Final = 0.95
+"""Overlap that counts as full."""
 _ZERO_CELSIUS: Final = 273.15
 _LARGEST: Final = 100_000_000
 """Bytes; a profile is small."""
@@ -144,8 +146,13 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
     content = _read(folder, name)
     columns, _ = _columns(content, folder, name, ("range", "overlap"))
     ranges, overlap = columns["range"], columns["overlap"]
-    if ranges.size < 2 or not np.all(np.diff(ranges) > 0):
-        raise AncillaryError("does not rise", file=name, field="range", remedy="sort the rows")
+    if ranges.size != overlap.size or ranges.size < 2 or not np.all(np.diff(ranges) > 0):
+        raise AncillaryError(
+            f"does not rise over {overlap.size} values of overlap",
+            file=name,
+            field="range",
+            remedy="sort the rows",
+        )
     if not np.all((overlap > 0) & (overlap <= 1.0)):
         raise AncillaryError(
             f"reaches from {overlap.min():g} to {overlap.max():g}",
@@ -153,30 +160,39 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
             field="overlap",
             remedy="give shares above 0 and at most 1; leave out ranges without overlap",
         )
+    if overlap[-1] < _FULL:
+        raise AncillaryError(
+            f"ends at {overlap[-1]:g}, beyond which it is taken as 1",
+            file=name,
+            field="overlap",
+            remedy="continue it to full overlap",
+        )
     return Overlap(ranges, overlap), hashlib.sha256(content).hexdigest()
 
 
 def _read(folder: Path, name: str) -> bytes:
     path = folder / name
     try:
-        if not path.resolve().is_relative_to(folder.resolve()):
-            raise AncillaryError("lies outside the folder of the campaign file", file=name)
-        if path.stat().st_size > _LARGEST:
-            raise AncillaryError("is larger than any profile", file=name)
-        return path.read_bytes()
-    except OSError as error:
+        inside = path.resolve().is_relative_to(folder.resolve())
+        small = inside and path.stat().st_size <= _LARGEST
+        if small:
+            return path.read_bytes()
+    # RuntimeError: a loop of links; ValueError: a name that no file can have.
+    except (OSError, RuntimeError, ValueError) as error:
         raise AncillaryError(
-            f"cannot be read: {error.strerror}",
+            f"cannot be read: {getattr(error, 'strerror', None) or error}",
             file=name,
             remedy="put it beside the campaign file, or correct its name there",
         ) from error
+    problem = "is larger than any profile" if inside else "lies outside the folder of the campaign file"
+    raise AncillaryError(problem, file=name)
 
 
 def _columns(
     content: bytes, folder: Path, file: str, names: tuple[str, ...]
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Return the columns in SI units, and the names of those whose unit was told."""
-    found = _netcdf(folder / file, file) if file.endswith(".nc") else _csv(content, file)
+    found = _netcdf(folder / file, file) if file.lower().endswith(".nc") else _csv(content, file)
     columns = {}
     for name in names:
         if name not in found:
@@ -201,10 +217,17 @@ def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
     except UnicodeDecodeError as error:
         raise AncillaryError("is not text", file=file) from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    rows = list(csv.reader(io.StringIO("\n".join(lines)), skipinitialspace=True))
+    try:
+        rows = list(csv.reader(io.StringIO("\n".join(lines)), skipinitialspace=True))
+    except csv.Error as error:
+        raise AncillaryError(f"is no table: {error}", file=file) from error
     if len(rows) < 2:
         raise AncillaryError("holds no rows", file=file)
     head, *body = rows
+    names = [title.partition("[")[0].strip().lower() for title in head]
+    for name in names:
+        if names.count(name) > 1:
+            raise AncillaryError(f"has more than one column {name!r}", file=file)
     columns: dict[str, list[float]] = {title: [] for title in head}
     for number, row in enumerate(body, start=2):
         if len(row) != len(head):
@@ -232,5 +255,5 @@ def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
                 for name, variable in opened.variables.items()
                 if variable.dtype.kind in "iuf"
             }
-    except (OSError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError, TypeError) as error:
         raise AncillaryError("is not NetCDF that can be read", file=file) from error

@@ -265,7 +265,11 @@ def bench(
     files: Annotated[
         list[Path] | None, typer.Argument(help="Raw files of one layout, for the case reader.")
     ] = None,
-    case: Annotated[str | None, typer.Option(help="homogeneous or reader.")] = None,
+    case: Annotated[str | None, typer.Option(help="elastic, homogeneous or reader.")] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the EARLINET elastic intercomparison, for the case elastic."),
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A minute at most.")] = False,
     repeats: Annotated[
         int | None, typer.Option(min=1, max=100, help="Counted repeats of each timing.")
@@ -277,14 +281,17 @@ def bench(
 
     Example: lidarops bench accuracy --case homogeneous --quick --out bench
 
+    Example: lidarops bench accuracy --case elastic --quick --data boeckmann
+
     Example: lidarops bench throughput demo/raw/coast/h*.*0
     """
     from lidarops.bench import cases, results
+    from lidarops.bench.terms import Effort
 
     today = datetime.now(UTC).date().isoformat()
     with _bar("bench", None) as advance:
-        effort = cases.Effort(quick=quick, repeats=repeats, date=today, progress=advance)
-        finding = cases.run(what, case, files or [], effort)
+        effort = Effort(quick=quick, repeats=repeats, date=today, progress=advance)
+        finding = cases.run(what, case, files or [], effort, data=data)
     page = None if out is None else cases.write(finding, out)
     if as_json:
         typer.echo(json.dumps(results.plain(finding.result), indent=1))

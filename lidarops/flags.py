@@ -40,6 +40,17 @@ class Quality(IntFlag):
     CLOUD = 1 << 17
     NO_REFERENCE = 1 << 18
     UNSTABLE_INVERSION = 1 << 19
+    NO_LEVERAGE = 1 << 20
+    POOR_STRATIFICATION = 1 << 21
+    PRIOR_DOMINATED = 1 << 22
+    EXTRAPOLATED = 1 << 23
+    INTERPOLATED = 1 << 24
+    ONE_SIDED = 1 << 25
+    LOW_LEVERAGE = 1 << 26
+    NO_RESIDUAL = 1 << 27
+    UNDERSMOOTHED = 1 << 28
+    HIGH_CORRELATION = 1 << 29
+    HORIZONTAL_GRADIENT = 1 << 30
 
     @property
     def description(self) -> str:
@@ -141,5 +152,52 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     Quality.UNSTABLE_INVERSION: (
         Severity.REJECT,
         "the inversion divides by nearly nothing, or lies beyond what its boundary value reaches",
+    ),
+    Quality.NO_LEVERAGE: (
+        Severity.REJECT,
+        "the angles are too few or too much alike for an optical depth",
+    ),
+    Quality.POOR_STRATIFICATION: (
+        Severity.REJECT,
+        "the air differs along the slant paths more than layers that are level allow for",
+    ),
+    Quality.PRIOR_DOMINATED: (
+        Severity.CARE,
+        "smoothness, or another prior, decides the extinction more than the data do",
+    ),
+    Quality.EXTRAPOLATED: (
+        Severity.REJECT,
+        "beyond the reach of the signals, where only the prior would speak",
+    ),
+    Quality.INTERPOLATED: (
+        Severity.CARE,
+        "in a gap of the data, bridged from the heights above and below",
+    ),
+    Quality.ONE_SIDED: (
+        Severity.CARE,
+        (
+            "the scan looks to one side only, so that a horizontal gradient is not seen; its"
+            " systematic error is given apart"
+        ),
+    ),
+    Quality.LOW_LEVERAGE: (
+        Severity.CARE,
+        "the slant paths differ little, so that small errors of the signal count much",
+    ),
+    Quality.NO_RESIDUAL: (
+        Severity.CARE,
+        "as many unknowns as angles: nothing tests the result",
+    ),
+    Quality.UNDERSMOOTHED: (
+        Severity.REJECT,
+        "more structure over height than the errors allow for",
+    ),
+    Quality.HIGH_CORRELATION: (
+        Severity.REJECT,
+        "errors of neighbouring heights are alike by more than 0.85: intervals are too narrow",
+    ),
+    Quality.HORIZONTAL_GRADIENT: (
+        Severity.REJECT,
+        "the residuals over angle show a horizontal gradient",
     ),
 }

@@ -168,10 +168,12 @@ def _absent(scene: Scene, instrument: Instrument) -> Iterator[LeftOut]:
 def _strange_facts(scene: Scene, facts: InstrumentFacts) -> Iterator[LeftOut]:
     """Name the channels of which the campaign tells facts, and which the files lack."""
     present = [channel.name for channel in scene.layout]
-    for name in facts.channels:
+    for name, known in facts.channels.items():
         if name not in present:
             reason = f"facts of a channel that the files do not hold, only {', '.join(present)}"
             yield LeftOut(StepName.READ.value, name, reason)
+        elif known.lag is not None and not name.startswith("analog_"):
+            yield LeftOut(StepName.LAG.value, name, "a lag is a fact of the analog channel")
 
 
 def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
@@ -221,6 +223,7 @@ def _channel(
 
 
 def _glue_rules(case: _Case) -> Iterator[Step | LeftOut]:
+    yield _overlap_rule(case)
     analog, photon = parts_of(case.channel.name)
     lag = channel_facts(case.facts, analog).lag
     if lag is None:
@@ -255,19 +258,7 @@ def _asked(case: _Case) -> Iterator[str]:
 
 def _conditioning(case: _Case) -> Iterator[Step | LeftOut]:
     photon = case.channel.mode is DetectionMode.PHOTON
-    if case.facts.overlap_profile:
-        reason = "given by the campaign; nearer bins are flagged and not retrieved from"
-        yield case.step(
-            StepName.OVERLAP,
-            reason,
-            full_overlap_range=case.facts.full_overlap_range,
-            overlap_profile=case.facts.overlap_profile,
-        )
-    elif case.facts.full_overlap_range > 0:
-        reason = "nearer bins are flagged and not retrieved from"
-        yield case.step(StepName.OVERLAP, reason, full_overlap_range=case.facts.full_overlap_range)
-    else:
-        yield case.without(StepName.OVERLAP, "the campaign gives no full_overlap_range")
+    yield _overlap_rule(case)
     if case.known.range_offset:
         reason = "given by the campaign"
         yield case.step(StepName.RANGE_OFFSET, reason, range_offset=case.known.range_offset)
@@ -292,6 +283,18 @@ def _conditioning(case: _Case) -> Iterator[Step | LeftOut]:
     else:
         reason = "the campaign gives no noise_variance; third differences along range"
         yield case.step(StepName.NOISE, reason, method="differences")
+
+
+def _overlap_rule(case: _Case) -> Step | LeftOut:
+    full = case.facts.full_overlap_range
+    reason = "nearer bins are flagged and not retrieved from"
+    if case.facts.overlap_profile:
+        told = f"given by the campaign; {reason}"
+        profile = case.facts.overlap_profile
+        return case.step(StepName.OVERLAP, told, full_overlap_range=full, overlap_profile=profile)
+    if full > 0:
+        return case.step(StepName.OVERLAP, reason, full_overlap_range=full)
+    return case.without(StepName.OVERLAP, "the campaign gives no full_overlap_range")
 
 
 def _dark_rule(case: _Case) -> Step | LeftOut:
@@ -361,10 +364,12 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
     zenith, reason = _steady_zenith(case)
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     window = settings.reference
-    bottom, top = window.lowest * stretch, min(window.highest * stretch, last)
-    if not reason and top - bottom < window.width * stretch:
+    # Windows are sought among the middles of bins.
+    reach = last - 0.5 * case.channel.bin_width + (case.known.range_offset or 0.0)
+    bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
+    if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
         reason = (
-            f"the bins end at {last:g} m, nearer than a reference window of {window.width:g} m"
+            f"the bins end at {reach:g} m, nearer than a reference window of {window.width:g} m"
             f" above {window.lowest:g} m"
         )
     if reason:

@@ -26,6 +26,9 @@ from lidarops.retrieve.molecular import MolecularProfile
 
 Array = npt.NDArray[np.float64]
 
+FULL_OVERLAP: Final = 0.99
+"""Overlap from which on a homogeneous section may begin."""
+
 _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 
 
@@ -71,7 +74,7 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
     if StepName.SIGNAL in steps:
         lazy[ProductKind.SIGNAL] = _signal(source.profiles(), steps, bench.ancillaries)
     if StepName.HOMOGENEOUS in steps:
-        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(source.profiles(), steps)
+        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(source.profiles(), steps, bench.ancillaries)
     for kind, data in lazy.items():
         lazy[kind] = data.assign(shots=source.shots).assign_coords(source.geometry.variables)
     if StepName.ELASTIC in steps:
@@ -174,8 +177,9 @@ class _Glued:
         parts = self._analog.profiles(), self._photon.profiles()
         if step is not None and step.settings["method"] == "estimate":
             return labeled_glue.estimate_lag(*parts)
-        given = 0.0 if step is None else float(step.settings["lag"])
-        return given + labeled_glue.told_lag(*parts)
+        if step is not None:
+            return float(step.settings["lag"])
+        return labeled_glue.told_lag(*parts)
 
 
 def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
@@ -200,7 +204,8 @@ def _signal(
     if overlap is not None:
         along = xr.DataArray(overlap.astype(np.float32), dims="range")
         result /= along
-        quality |= along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
+        lost = along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
+        quality = quality | lost
     return result.assign(_gluing(conditioned)).assign(
         background=tail["background"],
         background_standard_error=tail["background_standard_error"],
@@ -215,13 +220,21 @@ def _gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
     return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}
 
 
-def _homogeneous(conditioned: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
+def _homogeneous(
+    conditioned: xr.Dataset, steps: Mapping[str, Step], ancillaries: Ancillaries
+) -> xr.Dataset:
     settings = steps[StepName.HOMOGENEOUS].settings
+    quality = conditioned["quality"]
+    overlap = _overlap(steps, ancillaries, conditioned["range"].to_numpy())
+    if overlap is not None:
+        # A signal with its background cannot be divided: where overlap is not full is left out.
+        partial = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
+        quality = quality | xr.DataArray(partial.astype(np.int32), dims="range")
     result = labeled.homogeneous(
         conditioned["power"],
         sections=[(near, far) for near, far in settings["sections"]],
         variance=conditioned["variance"],
-        quality=conditioned["quality"],
+        quality=quality,
         method=settings["method"],
         # An estimate scatters, and its scatter must not pass for misfit.
         relative_variance=steps[StepName.NOISE].settings["method"] == "differences",

@@ -1,4 +1,7 @@
-"""How accurate the solvers of a homogeneous path are, against the least possible error."""
+"""How accurate the solvers of a homogeneous path are, against the least possible error.
+
+The scores of the elastic retrieval are here too; `lidarops.bench.elastic` measures it.
+"""
 
 from __future__ import annotations
 
@@ -202,8 +205,8 @@ def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
         start=path.start,
         length=path.length,
         averaged=averaged,
-        lag_1=_mean((published - louder.background) / scale),
-        compressed=_mean((ours - louder.background) / scale),
+        lag_1=mean((published - louder.background) / scale),
+        compressed=mean((ours - louder.background) / scale),
         scatter=float(np.nanstd(ours)) / scale,
         expected=background_bias(louder) / scale,
         flagged=float(found.flagged.mean()),
@@ -262,9 +265,9 @@ def _score(found: Estimates, quantity: str, truth: float, least: float) -> Score
     rmse = float(np.sqrt(squares.mean()))
     inside = np.abs(error[kept]) <= _TWO_SIDED * stated[kept]
     return Score(
-        rmse=Measured(rmse, _mean(squares).error / (2 * rmse)),
-        bias=_mean(error[kept]),
-        coverage=_share(inside),
+        rmse=Measured(rmse, mean(squares).error / (2 * rmse)),
+        bias=mean(error[kept]),
+        coverage=share(inside),
         rmse_of_all=float(np.sqrt(np.mean(error[finite] ** 2))),
     )
 
@@ -276,15 +279,17 @@ def _distance(found: Estimates, converged: Estimates, quantity: str) -> float:
     return float(np.nanmax(between, initial=0.0))
 
 
-def _mean(values: Array) -> Measured:
+def mean(values: Array) -> Measured:
+    """Return the mean of the finite values with its Monte Carlo error."""
     finite = values[np.isfinite(values)]
     return Measured(float(finite.mean()), float(finite.std() / np.sqrt(finite.size)))
 
 
-def _share(inside: npt.NDArray[np.bool_]) -> Measured:
+def share(inside: npt.NDArray[np.bool_]) -> Measured:
+    """Return how many of independent profiles are inside, with its Monte Carlo error."""
     # Where all or none are inside, half a profile keeps the error from being zero.
-    share = (inside.sum() + 0.5) / (inside.size + 1)
-    return Measured(float(inside.mean()), float(np.sqrt(share * (1 - share) / inside.size)))
+    likely = (inside.sum() + 0.5) / (inside.size + 1)
+    return Measured(float(inside.mean()), float(np.sqrt(likely * (1 - likely) / inside.size)))
 
 
 def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[Case, Outcome]]:
@@ -295,3 +300,114 @@ def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[Case, Outcome]]:
         for outcome in case.outcomes
         if outcome.way == way
     ]
+
+
+# Elastic retrieval ---------------------------------------------------------------------------
+
+
+SIGMAS: Final = (1.0, _TWO_SIDED)
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundScore:
+    """Errors of one way, in counts, over the profiles that it did not reject."""
+
+    profiles: int
+    bias: Measured
+    scatter: Measured
+    rmse: Measured
+    stated: float
+    """Median of the stated standard errors."""
+    deviation: Measured
+    """Mean error over its own stated standard error."""
+    spread: Measured
+    """Root mean square of the same; 1 where errors are as stated."""
+    coverage: tuple[Measured, Measured]
+    """Share of profiles whose truth is within 1 and 1.96 stated standard errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class InversionScore:
+    """Errors of backscatter from 0.5 to 6 km, relative to its mean there."""
+
+    profiles: int
+    """With any value in these bins."""
+    solved: float
+    """Share of these bins, of all profiles, that have a value; the others are withheld."""
+    bias: Measured
+    """Mean error of a profile."""
+    scatter: float
+    """Standard deviation of the same."""
+    rmse: Measured
+    """Root mean square error of a bin."""
+    stated: float
+    """Root mean square of the stated standard errors of a bin."""
+    coverage: tuple[Measured, Measured]
+    """Share of bins whose truth is within 1 and 1.96 stated standard errors."""
+
+
+def background_score(
+    error: Array, stated: Array, rejected: npt.NDArray[np.bool_]
+) -> BackgroundScore | None:
+    """Return the errors of backgrounds; None where less than two are usable.
+
+    Parameters
+    ----------
+    error, stated : (profile,) float
+        Counts.
+    rejected : (profile,) bool
+    """
+    kept = ~rejected & np.isfinite(error) & (stated > 0)
+    if kept.sum() < 2:
+        return None
+    error, stated = error[kept], stated[kept]
+    deviation = error / stated
+    inside = [share(np.abs(deviation) <= sigmas) for sigmas in SIGMAS]
+    return BackgroundScore(
+        profiles=int(kept.sum()),
+        bias=mean(error),
+        scatter=_root(mean((error - error.mean()) ** 2)),
+        rmse=_root(mean(error**2)),
+        stated=float(np.median(stated)),
+        deviation=mean(deviation),
+        spread=_root(mean(deviation**2)),
+        coverage=(inside[0], inside[1]),
+    )
+
+
+def inversion_score(error: Array, stated: Array, scale: float) -> InversionScore | None:
+    """Return the errors of backscatter; None where less than two of many profiles have a value.
+
+    Parameters
+    ----------
+    error, stated : (profile, compared bin) float
+        m-1 sr-1; NaN where withheld.
+    scale : float
+        Mean of the truth, m-1 sr-1.
+    """
+    valid = np.isfinite(error) & np.isfinite(stated)
+    kept = np.any(valid, axis=1)
+    if kept.sum() < min(2, kept.size) or not np.any(kept):
+        return None
+    error, stated, valid = error[kept], stated[kept], valid[kept]
+    bins = valid.sum(axis=1)
+
+    def over_bins(values: npt.NDArray[np.generic]) -> Array:
+        return np.asarray(np.where(valid, values, 0.0).sum(axis=1) / bins)
+
+    biases = over_bins(error) / scale
+    inside = [mean(over_bins(np.abs(error) <= sigmas * stated)) for sigmas in SIGMAS]
+    return InversionScore(
+        profiles=int(kept.sum()),
+        solved=float(bins.sum() / (kept.size * error.shape[1])),
+        bias=mean(biases),
+        scatter=float(biases.std()),
+        rmse=_root(mean(over_bins((error / scale) ** 2))),
+        stated=float(np.sqrt(over_bins((stated / scale) ** 2).mean())),
+        coverage=(inside[0], inside[1]),
+    )
+
+
+def _root(square: Measured) -> Measured:
+    value = float(np.sqrt(square.value))
+    return Measured(value, square.error / (2.0 * value) if value > 0 else 0.0)

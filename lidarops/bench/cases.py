@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Final, TypeVar
 
-from lidarops.bench import accuracy, results, speed, story, throughput
+from lidarops.bench import accuracy, elastic, results, speed, story, throughput
+from lidarops.bench.terms import RESULT, Effort, Finding, Kind
 from lidarops.bench.timing import machine
 from lidarops.errors import CampaignError
 from lidarops.reports import benchmark
 
-RESULT: Final = "result.json"
-"""Name of the figures beside the page."""
 _REPEATS: Final = 7
 
 _Names = TypeVar("_Names", bound=StrEnum)
@@ -23,50 +21,31 @@ _Names = TypeVar("_Names", bound=StrEnum)
 class Case(StrEnum):
     """What is measured."""
 
+    ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
     READER = "reader"
 
 
-class Kind(StrEnum):
-    """What is asked of it."""
-
-    ACCURACY = "accuracy"
-    THROUGHPUT = "throughput"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """What a benchmark found."""
-
-    result: object
-    """A frozen dataclass, or a list of them."""
-    report: benchmark.Report
-
-
-@dataclass(frozen=True, slots=True)
-class Effort:
-    """How much is measured, and what is told of it."""
-
-    quick: bool = False
-    repeats: int | None = None
-    """Of each timing; the benchmark's own where not given."""
-    date: str = ""
-    """When it is run, as it is to be stated."""
-    progress: Callable[[int], object] = lambda _: None
-    """Is given 1 after each scenario or setting."""
-
-
-def run(what: str, case: str | None, files: Sequence[Path], effort: Effort) -> Finding:
+def run(
+    what: str,
+    case: str | None,
+    files: Sequence[Path],
+    effort: Effort,
+    *,
+    data: Path | None = None,
+) -> Finding:
     """Run a benchmark.
 
     Parameters
     ----------
     what : {"accuracy", "throughput"}
-    case : {"homogeneous", "reader"} or None
+    case : {"elastic", "homogeneous", "reader"} or None
         None is "reader" where files are given, else "homogeneous".
     files : sequence of Path
         Raw files of one layout, for "reader" and no other.
     effort : Effort
+    data : Path, optional
+        Folder of published signals, for the accuracy of "elastic" and no other.
 
     Raises
     ------
@@ -79,8 +58,14 @@ def run(what: str, case: str | None, files: Sequence[Path], effort: Effort) -> F
     chosen = _member(Case, case or (Case.READER if files else Case.HOMOGENEOUS), "case")
     if chosen is Case.READER and kind is Kind.ACCURACY:
         raise CampaignError("the reader has no accuracy benchmark", remedy="choose throughput")
-    if chosen is Case.HOMOGENEOUS and files:
-        raise CampaignError("the case 'homogeneous' takes no files", remedy="leave them out")
+    if chosen is not Case.READER and files:
+        raise CampaignError(f"the case {chosen.value!r} takes no files", remedy="leave them out")
+    if data is not None and (chosen is not Case.ELASTIC or kind is not Kind.ACCURACY):
+        raise CampaignError(
+            "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
+        )
+    if chosen is Case.ELASTIC:
+        return elastic.run(kind, data=data, effort=effort)
     if chosen is Case.READER:
         read = throughput.reader(files, repeats=effort.repeats or _REPEATS)
         return Finding(read, story.reader_report(read, effort.date, machine(), RESULT))

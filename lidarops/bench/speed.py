@@ -1,9 +1,12 @@
-"""How fast the solvers of a homogeneous path are, against a vectorised read of the same array."""
+"""How fast the solvers of a homogeneous path, and the steps of an elastic inversion, are.
+
+Times stand beside that of a vectorised read of the same array in the same run.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -11,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from lidarops.bench import elastic_cases
 from lidarops.bench.homogeneous import Scenario, Way, arguments
 from lidarops.bench.peers import peers
 from lidarops.bench.timing import Machine, in_threads, least_times, machine
@@ -138,7 +142,7 @@ def _speeds(setting: Setting, count: int, repeats: int) -> Iterator[Speed]:
     calls: dict[str, Callable[[], object]] = {READ: partial(np.max, power)}
     sizes = {READ: count}
     for name, way in _ways(setting).items():
-        sizes[name] = _affordable(way, power)
+        sizes[name] = _affordable(_first(way, power), count)
         calls[name] = partial(way, power[: sizes[name]], PATH)
     times = least_times(calls, repeats)
     read = times[READ] / count
@@ -167,17 +171,22 @@ def _solve(method: Method, variance: float | None, power: Any, path: Scenario) -
     )
 
 
-def _affordable(way: Callable[[Any, Scenario], object], power: Any) -> int:
+def _first(way: Callable[[Any, Scenario], object], power: Any) -> Callable[[int], object]:
+    return lambda few: way(power[:few], PATH)
+
+
+def _affordable(call: Callable[[int], object], most: int) -> int:
+    """Return how many profiles a call may get; it takes a number of profiles."""
     # What a call costs before the first profile counts for less, the more profiles it gets.
-    few = _within(way, power[:_TRIED], len(power))
-    return few if few == len(power) else _within(way, power[:few], len(power))
+    few = _within(call, min(_TRIED, most), most)
+    return few if few == most else _within(call, few, most)
 
 
-def _within(way: Callable[[Any, Scenario], object], tried: Any, most: int) -> int:
-    way(tried, PATH)
+def _within(call: Callable[[int], object], tried: int, most: int) -> int:
+    call(tried)
     begin = time.perf_counter()
-    way(tried, PATH)
-    each = (time.perf_counter() - begin) / len(tried)
+    call(tried)
+    each = (time.perf_counter() - begin) / tried
     return int(min(most, max(round(_LONGEST / each), _TRIED)))
 
 
@@ -194,3 +203,147 @@ def _threads(way: str, dtype: str, count: int, repeats: int) -> Threads:
         clock="perf_counter",
     )
     return Threads(way, dtype, times["one"] / times["two"])
+
+
+# Elastic inversion ----------------------------------------------------------------------------
+
+ALL_STEPS: Final = "all steps"
+ELASTIC_LEVEL: Final = 1e4
+"""Background of the profiles that are timed, counts a shot."""
+_BATCHES: Final = (1, 100, 2000)
+_QUICK_BATCHES: Final = (1, 400)
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """CPU time of one step of the elastic retrieval, or of a peer."""
+
+    step: str
+    batch: int
+    """Profiles that a call would get."""
+    profiles: int
+    """Profiles that it got: fewer where it is slow."""
+    nanoseconds: float
+    """A profile, least of the repeats."""
+    reads: float
+    """The same as a multiple of the read of the same array in the same run."""
+    ours: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ElasticThroughput:
+    """The throughput benchmark of the elastic retrieval."""
+
+    date: str
+    machine: Machine
+    bins: int
+    level: float
+    """Background, counts a shot."""
+    costs: tuple[Cost, ...]
+
+
+def measure_elastic(
+    *,
+    quick: bool = False,
+    date: str = "",
+    batches: Sequence[int] | None = None,
+    repeats: int | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> ElasticThroughput:
+    """Time every step from counts to backscatter, and plain peers, on the simulated set.
+
+    Parameters
+    ----------
+    quick : bool
+        Fewer profiles and repeats.
+    date : str
+        When it is run, as it is to be stated.
+    batches : sequence of int, optional
+        Profiles of one call.
+    repeats : int, optional
+        Counted rounds, of which the least time counts.
+    progress : callable
+        Is given 1 after each batch.
+    """
+    sizes = batches or (_QUICK_BATCHES if quick else _BATCHES)
+    rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
+    costs: list[Cost] = []
+    for size in sizes:
+        costs += elastic_costs(size, rounds)
+        progress(1)
+    return ElasticThroughput(date, machine(), elastic_cases.RANGE.size, ELASTIC_LEVEL, tuple(costs))
+
+
+def elastic_costs(batch: int, repeats: int) -> list[Cost]:
+    """Return the CPU time of each step and peer, the read first.
+
+    Parameters
+    ----------
+    batch : int
+        Profiles of one call; slow peers get fewer.
+    repeats : int
+        Counted rounds.
+    """
+    steps, others = _steps(elastic_cases.simulated().counts(ELASTIC_LEVEL, batch))
+    sizes = {name: _affordable(step, batch) for name, step in (steps | others).items()}
+    sizes[READ] = batch
+    calls = {name: partial(step, sizes[name]) for name, step in (steps | others).items()}
+    times = least_times(calls, repeats)
+    read = times[READ] / batch
+    return [
+        Cost(
+            step=name,
+            batch=batch,
+            profiles=sizes[name],
+            nanoseconds=1e9 * seconds / sizes[name],
+            reads=seconds / sizes[name] / read,
+            ours=name in steps and name != READ,
+        )
+        for name, seconds in times.items()
+    ]
+
+
+_Step = Callable[[int], object]
+"""What is done with so many profiles."""
+
+
+def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
+    """Return our steps, with the read, and the peers."""
+    sky = elastic_cases.simulated()
+    find = elastic_cases.ways()
+    found = find[elastic_cases.KNOWN_SHAPE](counts, sky)
+    power, noise = elastic_cases.cleared(counts, sky, found), elastic_cases.variance(counts)
+    # The peers take no gaps: they get the bins of incomplete overlap too.
+    whole = counts - found.background[:, np.newaxis]
+
+    def solve_particles(few: int) -> object:
+        return elastic_cases.particles_of(
+            power[:few],
+            sky,
+            elastic_cases.GIVEN,
+            noise=noise[:few],
+            background_error=found.standard_error[:few],
+        )
+
+    whole_way = elastic_cases.Chain(elastic_cases.KNOWN_SHAPE, choose=True)
+
+    def everything(few: int) -> object:
+        part = counts[:few]
+        return elastic_cases.invert(part, sky, find[whole_way.way](part, sky), whole_way)
+
+    ours: dict[str, _Step] = {
+        READ: lambda few: np.max(counts[:few]),
+        elastic_cases.TAIL_MEAN: lambda few: find[elastic_cases.TAIL_MEAN](counts[:few], sky),
+        elastic_cases.KNOWN_SHAPE: lambda few: find[elastic_cases.KNOWN_SHAPE](counts[:few], sky),
+        elastic_cases.TOLD: lambda few: find[elastic_cases.TOLD](counts[:few], sky),
+        "layers.screen": lambda few: elastic_cases.screened(power[:few], noise[:few], sky),
+        "reference.choose": lambda few: elastic_cases.chosen_window(power[:few], noise[:few], sky),
+        "elastic.solve": solve_particles,
+        ALL_STEPS: everything,
+    }
+    others: dict[str, _Step] = {
+        "background, numpy lstsq": lambda few: elastic_cases.lstsq_backgrounds(counts[:few], sky),
+        "Klett, numpy": lambda few: elastic_cases.klett_numpy(whole[:few], sky),
+        "Klett, Python": lambda few: elastic_cases.klett_python(whole[:few], sky),
+    }
+    return ours, others

@@ -1,4 +1,4 @@
-"""What the benchmarks of the homogeneous path found, as tables and charts."""
+"""What the benchmarks found, as tables and charts; `lidarops.bench.elastic` tells the rest."""
 
 from __future__ import annotations
 
@@ -10,11 +10,19 @@ import numpy as np
 from lidarops.bench import throughput
 from lidarops.bench.accuracy import Accuracy, Case, Measured, Offset, Outcome, outcomes_of
 from lidarops.bench.homogeneous import QUANTITIES
-from lidarops.bench.speed import READ, Setting, Speed, Throughput, settings
+from lidarops.bench.speed import (
+    READ,
+    Cost,
+    ElasticThroughput,
+    Setting,
+    Speed,
+    Throughput,
+    settings,
+)
 from lidarops.bench.timing import Machine
 from lidarops.reports.benchmark import Part, Report, Table
 from lidarops.reports.charts import Chart, Ladder, Panel, Series, pareto
-from lidarops.reports.words import percent
+from lidarops.reports.words import counted, percent
 from lidarops.retrieve.homogeneous import Method
 
 _HELPED: Final = frozenset({Method.LINEARIZED, Method.KNOWN_BACKGROUND, Method.KNOWN_EXTINCTION})
@@ -30,7 +38,7 @@ def accuracy_report(found: Accuracy, data: str = "") -> Report:
     """Return the page of the accuracy benchmark."""
     return Report(
         title="Homogeneous path: error against the Cramér-Rao bound",
-        facts=_facts(found.date, found.machine),
+        facts=facts(found.date, found.machine),
         parts=(_overview(found), _by_difficulty(found), _offsets(found.offsets)),
         data=data,
     )
@@ -40,7 +48,7 @@ def throughput_report(found: Throughput, data: str = "") -> Report:
     """Return the page of the throughput benchmark."""
     return Report(
         title="Homogeneous path: time per profile",
-        facts=_facts(found.date, found.machine),
+        facts=facts(found.date, found.machine),
         parts=(_times(found), _threads(found)),
         data=data,
     )
@@ -66,16 +74,17 @@ def reader_report(
     text = "Raw files to arrays, from the page cache, against floors measured in the same run."
     return Report(
         title="Reader: files per second",
-        facts=_facts(date, machine),
+        facts=facts(date, machine),
         parts=(Part("Throughput", text, tables=(table,)),),
         data=data,
     )
 
 
-def _facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:
+def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:
+    """Return where, when and with what a benchmark ran."""
     packages = ", ".join(f"{name} {version}" for name, version in machine.packages.items())
-    facts = (("Date", date), ("Processor", machine.processor), ("Python", machine.python))
-    return tuple(fact for fact in (*facts, ("Packages", packages)) if fact[1])
+    known = (("Date", date), ("Processor", machine.processor), ("Python", machine.python))
+    return tuple(fact for fact in (*known, ("Packages", packages)) if fact[1])
 
 
 def _ways(found: Accuracy) -> list[str]:
@@ -461,4 +470,67 @@ def _threads(found: Throughput) -> Part:
                 rows=tuple((t.way, t.dtype, f"{t.gain:.2f}") for t in found.threads),
             ),
         ),
+    )
+
+
+# Elastic retrieval ---------------------------------------------------------------------------
+
+
+def elastic_throughput_report(found: ElasticThroughput, data: str = "") -> Report:
+    """Return the page of the throughput benchmark."""
+    return Report(
+        title="Elastic inversion: time per profile",
+        facts=facts(found.date, found.machine),
+        parts=(cost_part(found.costs, found.bins),),
+        data=data,
+    )
+
+
+def cost_part(costs: tuple[Cost, ...], bins: int) -> Part:
+    """Return the chapter of the CPU time of the steps of the elastic retrieval."""
+    batches = sorted({cost.batch for cost in costs})
+    return Part(
+        title="CPU time per profile",
+        text=f"Profiles of {bins} bins, float64, one thread, least CPU time of interleaved "
+        "repeats. Ours with all errors and flags; all steps: background, clouds, reference "
+        "window and inversion with its error budget. The peers give values without errors: a "
+        "weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy and in "
+        "plain Python. The read is a vectorised maximum of the same array in the same run.",
+        charts=(_cost_ladder(costs, batches, bins),),
+        tables=tuple(_cost_table(costs, batch) for batch in batches),
+    )
+
+
+def _cost_ladder(costs: tuple[Cost, ...], batches: list[int], bins: int) -> Ladder:
+    steps = list(dict.fromkeys(cost.step for cost in costs))
+    spent = {(cost.batch, cost.step): cost.nanoseconds / 1e3 for cost in costs}
+    return Ladder(
+        name="elastic-time",
+        title=f"CPU time per profile of {bins} bins",
+        caption="By the number of profiles that a call is given.",
+        x_label="CPU time per profile (µs)",
+        rows=tuple(steps),
+        series=tuple(
+            (counted(batch, "profile"), tuple(spent.get((batch, step)) for step in steps))
+            for batch in batches
+        ),
+    )
+
+
+def _cost_table(costs: tuple[Cost, ...], batch: int) -> Table:
+    return Table(
+        title=f"Calls of {counted(batch, 'profile')}",
+        columns=("step", "whose", "profiles", "µs each", "reads"),
+        rows=tuple(
+            (
+                cost.step,
+                "ours" if cost.ours else "peer" if cost.step != READ else "floor",
+                f"{cost.profiles:,}",
+                f"{cost.nanoseconds / 1e3:,.2f}",
+                f"{cost.reads:,.1f}",
+            )
+            for cost in costs
+            if cost.batch == batch
+        ),
+        note=f"Reads: multiples of {READ}. Profiles: of one call, fewer where it is slow.",
     )

@@ -35,6 +35,8 @@ class Series:
     high: tuple[float, ...] = ()
     hollow: bool = False
     joined: bool = False
+    band: bool = False
+    """`low` and `high` are the edges of an area, which need not hold the points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +134,9 @@ def _panel(panel: Axes, drawn: Panel) -> None:
 def _series(panel: Axes, series: Series, number: int) -> None:
     color = _COLORS[number % len(_COLORS)]
     bars = None
-    if series.low:
+    if series.band:
+        panel.fill_between(series.x, series.low, series.high, color=color, alpha=0.18, linewidth=0)
+    elif series.low:
         bars = (
             [y - low for y, low in zip(series.y, series.low, strict=True)],
             [high - y for y, high in zip(series.y, series.high, strict=True)],

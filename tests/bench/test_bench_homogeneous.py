@@ -22,6 +22,7 @@ from lidarops.bench.homogeneous import (
     scenarios,
 )
 from lidarops.bench.peers import JIT, peers
+from lidarops.bench.terms import Effort
 from lidarops.bench.timing import in_threads, least_times
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError, RawFormatError
@@ -277,7 +278,7 @@ def test_the_pareto_front_holds_what_nothing_beats():
 )
 def test_wrong_use_is_told(what, case, files, error, said):
     with pytest.raises(error, match=said):
-        cases.run(what, case, files, cases.Effort())
+        cases.run(what, case, files, Effort())
 
 
 def test_the_command_prints_writes_and_dates(monkeypatch, found, tmp_path):
