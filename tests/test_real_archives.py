@@ -64,7 +64,7 @@ def test_pilar_loses_no_file(pilar: RunRecord) -> None:
         if "wavelength" in left.reason
     ]
     assert told == ["photon_53200o"]
-    assert len(scene.products) == 11 + 2
+    assert len(scene.products) == 11 + 2 + 3
 
 
 def test_inputs_are_digested(pilar: RunRecord, data_root: Path) -> None:
@@ -125,3 +125,64 @@ def test_dark_files_are_subtracted(saopaulo: RunRecord) -> None:
 def test_saopaulo_is_not_homogeneous(saopaulo: RunRecord) -> None:
     product = _open(saopaulo, "homogeneous", "analog_532o")
     assert (product["quality_flag"].values != 0).all()
+
+
+def test_nothing_is_invented_where_photon_counting_is_paralysed(pilar: RunRecord) -> None:
+    for channel, bit in (
+        ("photon_532p", Quality.PILE_UP),
+        ("glued_532p", Quality.NO_GLUING),
+    ):
+        product = _open(pilar, "elastic", channel)
+        flags = product["quality_flag"].values
+        assert (flags & bit).all()
+        assert ((flags & int(Quality.rejecting())) != 0).all() or (flags != 0).all()
+    glued = _open(pilar, "elastic", "glued_532p")
+    assert np.isnan(glued["backscatter"].values).all()
+
+
+def test_pilar_has_aerosol_below_clean_air(pilar: RunRecord) -> None:
+    product = _open(pilar, "elastic", "analog_532p")
+    values = product[["backscatter", "scattering_ratio"]]
+    good = values.where(product["quality_flag"] == 0)
+    assert float(good["backscatter"].count()) > 0.5 * product["backscatter"].size
+    near = good["scattering_ratio"].sel(range=slice(800, 2000)).mean()
+    far = good["scattering_ratio"].sel(range=slice(8000, 10_000)).mean()
+    assert 1.2 < float(near) < 20.0
+    assert abs(float(far) - 1.0) < 0.5
+    assert product["profiles"].sum() == 120
+    # What the campaign assumes, and its error, decide on the error near the ground.
+    ratio = product["extinction"] / product["backscatter"]
+    np.testing.assert_allclose(ratio.values[np.isfinite(ratio.values)], 60.0, rtol=1e-3)
+
+
+def test_saopaulo_is_glued_with_the_lag_that_its_noise_tells(saopaulo: RunRecord) -> None:
+    product = _open(saopaulo, "signal", "glued_532o")
+    slope, error = product["glue_slope"].values, product["glue_slope_standard_error"].values
+    assert np.isfinite(slope).all()
+    # One detector and one recorder: the same slope in all profiles, but for their errors.
+    assert np.abs(slope / np.median(slope) - 1.0).max() < 0.1
+    assert (np.abs(slope - np.median(slope)) < 8.0 * error).all()
+    photon = _open(saopaulo, "signal", "photon_532o")
+    far = slice(float(product["glue_top"].max()) + 100.0, 12_000.0)
+    joined, alone = (item["signal"].sel(range=far).values for item in (product, photon))
+    np.testing.assert_allclose(joined, alone, rtol=1e-3, atol=1e-3 * np.nanmax(np.abs(alone)))
+    # Photon counting alone is paralysed near the lidar, and the joined signal is not.
+    near = {"range": slice(700.0, 900.0)}
+    assert ((photon["quality_flag"].sel(near).values & Quality.PILE_UP) != 0).mean() > 0.9
+    assert (product["quality_flag"].sel(near).values == 0).all()
+
+
+def test_saopaulo_has_aerosol_in_its_mixed_layer(saopaulo: RunRecord) -> None:
+    product = _open(saopaulo, "elastic", "glued_532o")
+    good = product["backscatter"].where(product["quality_flag"] == 0)
+    low = good.sel(range=slice(700, 1500)).mean("range")
+    assert (low > 1e-6).all()
+    assert (low < 2e-5).all()
+    budget = [
+        product[f"backscatter_error_{cause}"]
+        for cause in ("noise", "background", "reference", "lidar_ratio", "molecular")
+    ]
+    total = np.sqrt(sum(part**2 for part in budget))
+    stated = product["backscatter_standard_error"]
+    known = np.isfinite(stated.values)
+    np.testing.assert_allclose(total.values[known], stated.values[known], rtol=0.01)

@@ -112,11 +112,13 @@ def verdict(record: RunRecord) -> str:
     if not record.scenes:
         tail = f" {counted(refused, 'granule')} refused." if refused else ""
         return f"There was no scene to process.{tail}"
+    empty = sum(not p.unflagged for scene in record.scenes for p in scene.products)
+    tail = f" {counted(empty, 'product')} without an unflagged value." if empty else ""
     if not failed and not refused:
-        return "Every scene was processed and no granule was refused."
+        return f"Every scene was processed and no granule was refused.{tail}"
     parts = [f"{counted(failed, 'scene')} failed"] if failed else []
     parts += [f"{counted(refused, 'granule')} refused"] if refused else []
-    return f"{' and '.join(parts)}."
+    return f"{' and '.join(parts)}.{tail}"
 
 
 def instruments(record: RunRecord) -> list[InstrumentRow]:
