@@ -52,7 +52,10 @@ def _as_interval(value: Any) -> Any:
         number = value.rstrip("abcdefghijklmnopqrstuvwxyz ")
         unit = value[len(number) :].strip()
         if unit in units:
-            return timedelta(seconds=float(number) * units[unit])
+            try:
+                return timedelta(seconds=float(number) * units[unit])
+            except OverflowError as error:
+                raise ValueError(f"{value!r} is too long") from error
     return value
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import dask.config
+import numpy as np
 import xarray as xr
 
 from lidarops import __version__, steps
@@ -333,13 +334,15 @@ def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]
     # What the campaign says of the pointing wins over the headers.
     facts = job.facts
     told = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
-    return archive.assign_coords(
+    pointed = archive.assign_coords(
         {
             name: xr.full_like(archive["zenith_angle"], angle)
             for name, angle in told.items()
             if angle is not None
         }
     )
+    # Coordinates are compared at every step, and a lazy one would be computed each time.
+    return pointed.assign_coords({name: array.load() for name, array in pointed.coords.items()})
 
 
 def _bench(job: Job, scene: Scene, root: Path) -> steps.Bench:
@@ -429,6 +432,8 @@ def _record(
     kind: ProductKind, channel: str, path: str, written: write.Written, data: xr.Dataset
 ) -> ProductRecord:
     flags = data["quality_flag"].to_numpy()
+    # Few bits occur in a product: the others need no look at every value.
+    occurring = Quality(int(np.bitwise_or.reduce(flags, axis=None)))
     return ProductRecord(
         path=path,
         kind=kind,
@@ -436,12 +441,8 @@ def _record(
         sha256=written.sha256,
         size=written.size,
         values=int(flags.size),
-        flagged={
-            bit.name: count
-            for bit in Quality
-            if bit.name and (count := int(((flags & int(bit)) != 0).sum()))
-        },
-        unflagged=int((flags == 0).sum()),
+        flagged={str(bit.name): int(np.count_nonzero(flags & np.int32(bit))) for bit in occurring},
+        unflagged=flags.size - int(np.count_nonzero(flags)),
     )
 
 

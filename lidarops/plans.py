@@ -365,7 +365,8 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     window = settings.reference
     # Windows are sought among the middles of bins.
-    reach = last - 0.5 * case.channel.bin_width + (case.known.range_offset or 0.0)
+    offset = channel_facts(case.facts, _ranged_by(case.channel.name)).range_offset or 0.0
+    reach = last - 0.5 * case.channel.bin_width + offset
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
         reason = (
@@ -406,6 +407,11 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
         lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
         molecular_relative_error=settings.molecular_relative_error,
     )
+
+
+def _ranged_by(channel: str) -> str:
+    """Return the channel whose ranges a channel has: a joined one those of its photons."""
+    return parts_of(channel)[1] if channel.startswith(GLUED) else channel
 
 
 def _steady_zenith(case: _Case) -> tuple[float, str]:

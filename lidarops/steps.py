@@ -72,7 +72,7 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
     source = _Glued(bench, channel) if channel.startswith(GLUED) else _Plain(bench, channel)
     lazy: dict[ProductKind, xr.Dataset] = {}
     if StepName.SIGNAL in steps:
-        lazy[ProductKind.SIGNAL] = _signal(source.profiles(), steps, bench.ancillaries)
+        lazy[ProductKind.SIGNAL] = _signal(source, steps, bench.ancillaries)
     if StepName.HOMOGENEOUS in steps:
         lazy[ProductKind.HOMOGENEOUS] = _homogeneous(source.profiles(), steps, bench.ancillaries)
     for kind, data in lazy.items():
@@ -93,29 +93,34 @@ class _Plain:
     def __init__(self, bench: Bench, channel: str) -> None:
         self._channel = channel
         archive, steps = bench.archive, bench.steps(channel)
-        self._dark = None
+        self._dark: labeled_signal.Dark | None = None
         if bench.dark is not None and StepName.DARK in steps:
             method = steps[StepName.DARK].settings["method"]
             self._dark = labeled_signal.dark_of(bench.dark, channel, method=method)
-        self._conditioned = labeled_signal.condition(
-            archive,
-            channel,
-            dead_time=_setting(steps, StepName.DEAD_TIME, "dead_time"),
-            noise_variance=_setting(steps, StepName.NOISE, "noise_variance"),
-            dark=self._dark,
-            range_offset=_setting(steps, StepName.RANGE_OFFSET, "range_offset") or 0.0,
-            full_overlap_range=_setting(steps, StepName.OVERLAP, "full_overlap_range") or 0.0,
-        )
+        self._archive = archive
+        self._settings = {
+            "dead_time": _setting(steps, StepName.DEAD_TIME, "dead_time"),
+            "noise_variance": _setting(steps, StepName.NOISE, "noise_variance"),
+            "dark": self._dark,
+            "range_offset": _setting(steps, StepName.RANGE_OFFSET, "range_offset") or 0.0,
+            "full_overlap_range": _setting(steps, StepName.OVERLAP, "full_overlap_range") or 0.0,
+        }
         self.geometry = archive[[name for name in _GEOMETRY if name in archive]]
         self.shots = archive[f"{channel}_shots"]
 
     def profiles(self) -> xr.Dataset:
         """Return power, variance and quality of every profile."""
-        return self._conditioned
+        return labeled_signal.condition(self._archive, self._channel, **self._settings)
+
+    def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
+        """Return range-corrected signals without background of every profile."""
+        return labeled_signal.signals(
+            self._archive, self._channel, background_range=background_range, **self._settings
+        )
 
     def averages(self, seconds: float) -> xr.Dataset:
         """Return means over intervals of the clock, of every part of the channel."""
-        conditioned = self._conditioned.assign_coords(self.geometry.variables)
+        conditioned = self.profiles().assign_coords(self.geometry.variables)
         shared = None if self._dark is None else self._dark.variance
         averages = labeled_average.clock_average(
             conditioned, seconds=seconds, shots=self.shots, shared_variance=shared
@@ -146,6 +151,11 @@ class _Glued:
     def profiles(self) -> xr.Dataset:
         """Return power, variance and quality of every profile."""
         return labeled_glue.glue(self._analog.profiles(), self._photon.profiles(), lag=self._lag)
+
+    def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
+        """Return range-corrected signals without background of every profile."""
+        joined = self.profiles()
+        return labeled_signal.corrected(joined, background_range).assign(_gluing(joined))
 
     def averages(self, seconds: float) -> xr.Dataset:
         """Return means over intervals of the clock, of every part of the channel."""
@@ -188,30 +198,19 @@ def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
 
 
 def _signal(
-    conditioned: xr.Dataset, steps: Mapping[str, Step], ancillaries: Ancillaries
+    source: _Plain | _Glued, steps: Mapping[str, Step], ancillaries: Ancillaries
 ) -> xr.Dataset:
     start, stop = steps[StepName.BACKGROUND].settings["range"]
-    tail = labeled.tail_mean(
-        conditioned["power"].sel(range=slice(start, stop)),
-        start=start,
-        variance=conditioned["variance"].sel(range=slice(start, stop)),
-    )
-    result = labeled_signal.range_corrected(
-        conditioned, tail["background"], tail["background_standard_error"]
-    )
-    quality = conditioned["quality"]
-    overlap = _overlap(steps, ancillaries, conditioned["range"].to_numpy())
-    if overlap is not None:
-        along = xr.DataArray(overlap.astype(np.float32), dims="range")
-        result /= along
-        lost = along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
-        quality = quality | lost
-    return result.assign(_gluing(conditioned)).assign(
-        background=tail["background"],
-        background_standard_error=tail["background_standard_error"],
-        # Without a background there is no signal above it.
-        quality_flag=quality
-        | tail["background"].isnull().astype("int32") * np.int32(Quality.INPUT_MISSING),
+    result = source.signals((start, stop))
+    overlap = _overlap(steps, ancillaries, result["range"].to_numpy())
+    if overlap is None:
+        return result
+    along = xr.DataArray(overlap.astype(np.float32), dims="range")
+    lost = along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
+    return result.assign(
+        signal=result["signal"] / along,
+        signal_standard_error=result["signal_standard_error"] / along,
+        quality_flag=result["quality_flag"] | lost,
     )
 
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
 from typer.testing import CliRunner
 
 from lidarops.cli import app
+
+# Time is no property of a result, and a failure must come back when it is looked for.
+hypothesis.settings.register_profile("lidarops", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("lidarops")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

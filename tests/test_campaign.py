@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+import pickle
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import ValidationError
 
-from lidarops.campaign import Campaign, load
+from lidarops.campaign import Campaign, ElasticSettings, load
 from lidarops.errors import CampaignError
 
 MINIMAL = """\
@@ -103,3 +105,110 @@ def test_odd_windows_are_refused(window: str) -> None:
     raw = yaml.safe_load(MINIMAL) | {"scenes": {"window": window}}
     with pytest.raises(ValueError, match="window"):
         Campaign.model_validate(raw)
+
+
+# Settings of the elastic product, and files beside the campaign file ---------------------------
+
+
+def _instrument(**changes: object) -> Campaign:
+    raw = yaml.safe_load(MINIMAL)
+    raw["instruments"]["lidar"].update(changes)
+    return Campaign.model_validate(raw)
+
+
+def _elastic(**settings: object) -> ElasticSettings:
+    wanted = {"elastic": {"channels": ["photon_532o"], **settings}}
+    found = _instrument(products=wanted).instruments["lidar"].products.elastic
+    assert found is not None
+    return found
+
+
+def test_elastic_defaults_are_those_of_a_scientist() -> None:
+    found = _elastic()
+    assert found.average == timedelta(minutes=30)
+    assert (found.lidar_ratio, found.lidar_ratio_standard_error) == (50.0, 10.0)
+    assert found.background == "known_shape"
+    assert found.molecular_relative_error == 0.01
+    window = found.reference
+    assert (window.lowest, window.highest, window.width) == (3000.0, 12_000.0, 1000.0)
+    assert (window.scattering_ratio, window.relative_error) == (1.0, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10s", 10), ("5min", 300), ("2h", 7200), ("1d", 86400), (900, 900)]
+)
+def test_averages(text: object, seconds: float) -> None:
+    assert _elastic(average=text).average.total_seconds() == seconds
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"average": "7min"}, "divide a day"),
+        ({"average": "2d"}, "divide a day"),
+        ({"average": "0s"}, "divide a day"),
+        ({"average": "0.5s"}, "divide a day"),
+        ({"average": "-30min"}, "average"),
+        ({"average": "soon"}, "average"),
+        ({"average": "infh"}, "average"),
+        ({"average": "nanh"}, "average"),
+        ({"average": "min"}, "average"),
+        ({"average": "999999999999d"}, "average"),
+        ({"lidar_ratio": 0}, "lidar_ratio"),
+        ({"lidar_ratio": 250}, "lidar_ratio"),
+        ({"lidar_ratio": "nan"}, "lidar_ratio"),
+        ({"lidar_ratio_standard_error": -1}, "lidar_ratio_standard_error"),
+        ({"lidar_ratio_standard_error": float("nan")}, "lidar_ratio_standard_error"),
+        ({"molecular_relative_error": 1.5}, "molecular_relative_error"),
+        ({"background": "cubic"}, "known_shape"),
+        ({"channels": []}, "channels"),
+        ({"lidar_ration": 40}, "lidar_ration"),
+        ({"reference": {"lowest": 5000, "highest": 5999}}, "at least width above lowest"),
+        ({"reference": {"lowest": -1}}, "lowest"),
+        ({"reference": {"lowest": float("inf"), "highest": float("inf")}}, "lowest"),
+        ({"reference": {"width": 50}}, "width"),
+        ({"reference": {"width": float("nan")}}, "width"),
+        ({"reference": {"scattering_ratio": 0.9}}, "scattering_ratio"),
+        ({"reference": {"relative_error": -0.1}}, "relative_error"),
+    ],
+)
+def test_elastic_settings_that_cannot_be_right_are_refused(
+    settings: dict[str, object], words: str
+) -> None:
+    with pytest.raises(ValidationError, match=words):
+        _elastic(**settings)
+
+
+@pytest.mark.parametrize("lag", [-100, 3.5, 0, "estimate", None])
+def test_lags(lag: object) -> None:
+    facts = _with_facts({"channels": {"analog_532o": {"lag": lag}}}).instruments["lidar"].facts[0]
+    assert facts.channels["analog_532o"].lag == lag
+
+
+@pytest.mark.parametrize("lag", [101, -101, "guess", float("nan"), float("inf")])
+def test_odd_lags_are_refused(lag: object) -> None:
+    with pytest.raises(ValidationError, match="lag"):
+        _with_facts({"channels": {"analog_532o": {"lag": lag}}})
+
+
+@pytest.mark.parametrize("name", ["overlap_profile", "molecular_profile"])
+@pytest.mark.parametrize("path", ["../air.csv", "/etc/air.csv", "~/air.csv", "a/../../air.csv"])
+def test_profiles_stay_beside_the_campaign_file(name: str, path: str) -> None:
+    with pytest.raises(ValidationError, match="inside its folder"):
+        _with_facts({name: path})
+    assert getattr(_with_facts({name: "air/o.csv"}).instruments["lidar"].facts[0], name)
+
+
+def test_the_folder_is_that_of_the_campaign_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _write(tmp_path, MINIMAL)
+    monkeypatch.chdir(tmp_path)
+    assert load("campaign.yaml").folder == tmp_path.resolve()
+    assert load(tmp_path / "campaign.yaml", output="/elsewhere").folder == tmp_path.resolve()
+    assert load("campaign.yaml").model_copy().folder == tmp_path.resolve()
+
+
+def test_the_folder_goes_with_a_campaign_to_other_processes(tmp_path: Path) -> None:
+    campaign = load(_write(tmp_path, MINIMAL))
+    assert pickle.loads(pickle.dumps(campaign)).folder == campaign.folder

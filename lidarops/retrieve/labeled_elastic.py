@@ -25,6 +25,8 @@ from lidarops.retrieve.molecular import (
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
+CLOUD_MARGIN: Final = 300.0
+"""m beyond the last bin of a cloud: its thin edge reaches farther than it appears."""
 LEAST_SHARE: Final = 0.1
 """Of the bins, that must lie beyond a cloud for the background to be fitted there."""
 UNSEEN: Final = 1.5
@@ -231,7 +233,12 @@ def _cleared(prepared: _Prepared, *, known_shape: bool) -> tuple[_Clear, _layers
     if not known_shape or not clouds.cloudy.any():
         return clear, clouds
     # What lies beyond a cloud has the shape of air again, but not what holds the cloud.
-    beyond = ~np.logical_or.accumulate(clouds.mask[:, ::-1], axis=-1)[:, ::-1]
+    step = float(np.median(np.diff(prepared.distance)))
+    hidden = np.zeros_like(clouds.mask)
+    margin = min(round(CLOUD_MARGIN / step), hidden.shape[1])
+    hidden[:, margin:] = clouds.mask[:, : hidden.shape[1] - margin]
+    hidden |= clouds.mask
+    beyond = ~np.logical_or.accumulate(hidden[:, ::-1], axis=-1)[:, ::-1]
     enough = beyond.sum(axis=-1) >= LEAST_SHARE * prepared.distance.size
     again = clouds.cloudy & enough
     clear = _without_background(prepared, beyond | ~again[:, np.newaxis], known_shape=True)

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from lidarops.flags import Quality
 from lidarops.records import DetectionMode
-from lidarops.retrieve import signal
+from lidarops.retrieve import background, signal
 from lidarops.retrieve.dark import DarkProfile
 from lidarops.retrieve.dark import profile as dark_profile
 from lidarops.retrieve.signal import Signal
 
+_Block = npt.NDArray[Any]
+
 _PARTS = ("power", "variance", "quality")
-_DTYPES = [np.dtype(np.float64), np.dtype(np.float64), np.dtype(np.int32)]
+_DTYPES: Final[list[np.dtype[Any]]] = [
+    np.dtype(np.float64),
+    np.dtype(np.float64),
+    np.dtype(np.int32),
+]
+_OF_SIGNAL: Final[list[np.dtype[Any]]] = [
+    np.dtype(np.float32),
+    np.dtype(np.float32),
+    np.dtype(np.int32),
+    np.dtype(np.float64),
+    np.dtype(np.float64),
+]
+_AT_ONCE: Final = 64
+"""Profiles that are worked on together: their arrays stay in the cache."""
 
 
 def condition(
@@ -54,42 +71,160 @@ def condition(
         ``power`` (mV or MHz), ``variance`` and ``quality`` over (time, range), as lazy as the
         input.
     """
-    counts = archive[channel]
-    grid = str(counts.dims[-1])
-    if grid != "range":
-        counts = counts.rename({grid: "range"})
-    counts = counts.assign_coords(
-        range=counts["range"].copy(data=counts["range"].to_numpy() + range_offset)
+    source = _Source(
+        archive,
+        channel,
+        dead_time=dead_time,
+        noise_variance=noise_variance,
+        dark=dark,
+        range_offset=range_offset,
+        full_overlap_range=full_overlap_range,
     )
-    settings: dict[str, Any] = {
-        "range": counts["range"].to_numpy().astype(np.float64),
-        "full_overlap_range": full_overlap_range,
-    }
-    inputs = [counts, archive[f"{channel}_shots"]]
-    photon = counts.attrs["detection_mode"] == DetectionMode.PHOTON
-    if photon:
-        settings |= {"bin_width": counts.attrs["bin_width"], "dead_time": dead_time}
-    else:
-        inputs.append(archive[f"{channel}_input_range"])
-        settings |= {"adc_bits": counts.attrs["adc_bits"], "noise_variance": noise_variance}
-        if dark is not None:
-            inputs.append(archive["time"].astype(np.int64).drop_vars(archive["time"].coords))
-            settings["dark"] = dark
-    parts = xr.apply_ufunc(
-        _photon if photon else _analog,
-        *inputs,
-        input_core_dims=[["range"]] + [[]] * (len(inputs) - 1),
-        output_core_dims=[["range"]] * 3,
-        kwargs=settings,
-        dask="parallelized",
-        output_dtypes=_DTYPES,
-    )
+    parts = source.mapped(_conditioned, ranged=3, plain=0, dtypes=_DTYPES)
     result = xr.Dataset(dict(zip(_PARTS, parts, strict=True)))
-    unit = "MHz" if photon else "mV"
-    result["power"].attrs = {"units": unit}
-    result["variance"].attrs = {"units": f"{unit}2"}
-    result["range"].attrs = counts["range"].attrs
+    result["power"].attrs = {"units": source.unit}
+    result["variance"].attrs = {"units": f"{source.unit}2"}
+    result["range"].attrs = source.inputs[0]["range"].attrs
     return result
+
+
+def signals(
+    archive: xr.Dataset,
+    channel: str,
+    *,
+    background_range: tuple[float, float],
+    dead_time: float | None = None,
+    noise_variance: float | None = None,
+    dark: Dark | None = None,
+    range_offset: float = 0.0,
+    full_overlap_range: float = 0.0,
+) -> xr.Dataset:
+    """Turn the raw counts of one channel into range-corrected signals without background.
+
+    The same as `condition` and then `corrected`, to the last bit, in one pass over the counts.
+
+    Parameters
+    ----------
+    background_range : (float, float)
+        m; as of `corrected`.
+    archive, channel, dead_time, noise_variance, dark, range_offset, full_overlap_range
+        As of `condition`.
+
+    Returns
+    -------
+    xr.Dataset
+        As of `corrected`.
+    """
+    source = _Source(
+        archive,
+        channel,
+        dead_time=dead_time,
+        noise_variance=noise_variance,
+        dark=dark,
+        range_offset=range_offset,
+        full_overlap_range=full_overlap_range,
+    )
+    parts = source.mapped(
+        _signals, ranged=3, plain=2, dtypes=_OF_SIGNAL, background_range=background_range
+    )
+    return _named(parts)
+
+
+def corrected(conditioned: xr.Dataset, background_range: tuple[float, float]) -> xr.Dataset:
+    """Subtract the mean of far bins as background and correct for range.
+
+    Parameters
+    ----------
+    conditioned : xr.Dataset
+        From `condition`.
+    background_range : (float, float)
+        m; the bins whose mean is the background.
+
+    Returns
+    -------
+    xr.Dataset
+        ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
+        over (time, range), ``background`` and ``background_standard_error`` over time.
+        INPUT_MISSING where there is no background.
+    """
+    parts = xr.apply_ufunc(
+        _corrected,
+        *(conditioned[name] for name in _PARTS),
+        input_core_dims=[["range"]] * 3,
+        output_core_dims=[["range"]] * 3 + [[]] * 2,
+        kwargs={
+            "range": conditioned["range"].to_numpy().astype(np.float64),
+            "background_range": background_range,
+        },
+        dask="parallelized",
+        output_dtypes=_OF_SIGNAL,
+    )
+    return _named(parts)
+
+
+def _named(parts: Sequence[xr.DataArray]) -> xr.Dataset:
+    names = ("signal", "signal_standard_error", "quality_flag")
+    along_time = ("background", "background_standard_error")
+    return xr.Dataset(dict(zip((*names, *along_time), parts, strict=True)))
+
+
+class _Source:
+    """The counts of one channel, and what turns them into a signal."""
+
+    def __init__(
+        self,
+        archive: xr.Dataset,
+        channel: str,
+        *,
+        dead_time: float | None,
+        noise_variance: float | None,
+        dark: Dark | None,
+        range_offset: float,
+        full_overlap_range: float,
+    ) -> None:
+        counts = archive[channel]
+        grid = str(counts.dims[-1])
+        if grid != "range":
+            counts = counts.rename({grid: "range"})
+        counts = counts.assign_coords(
+            range=counts["range"].copy(data=counts["range"].to_numpy() + range_offset)
+        )
+        self.settings: dict[str, Any] = {
+            "range": counts["range"].to_numpy().astype(np.float64),
+            "full_overlap_range": full_overlap_range,
+        }
+        self.inputs = [counts, archive[f"{channel}_shots"]]
+        self.photon = counts.attrs["detection_mode"] == DetectionMode.PHOTON
+        self.unit = "MHz" if self.photon else "mV"
+        if self.photon:
+            self.settings |= {"bin_width": counts.attrs["bin_width"], "dead_time": dead_time}
+            return
+        self.inputs.append(archive[f"{channel}_input_range"])
+        self.settings |= {"adc_bits": counts.attrs["adc_bits"], "noise_variance": noise_variance}
+        if dark is not None:
+            self.inputs.append(archive["time"].astype(np.int64).drop_vars(archive["time"].coords))
+            self.settings["dark"] = dark
+
+    def mapped(
+        self,
+        function: Callable[..., tuple[_Block, ...]],
+        *,
+        ranged: int,
+        plain: int,
+        dtypes: Sequence[np.dtype[Any]],
+        **settings: Any,
+    ) -> tuple[xr.DataArray, ...]:
+        """Map a function that gives so many arrays over range, and so many over time alone."""
+        outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
+            function,
+            *self.inputs,
+            input_core_dims=[["range"]] + [[]] * (len(self.inputs) - 1),
+            output_core_dims=[["range"]] * ranged + [[]] * plain,
+            kwargs={"photon": self.photon, **self.settings, **settings},
+            dask="parallelized",
+            output_dtypes=list(dtypes),
+        )
+        return outputs
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,40 +267,8 @@ def dark_of(archive: xr.Dataset, channel: str, *, method: str) -> Dark:
     return Dark(power.to_numpy(), archive["time"].to_numpy(), method)
 
 
-def range_corrected(
-    conditioned: xr.Dataset, background: xr.DataArray, background_standard_error: xr.DataArray
-) -> xr.Dataset:
-    """Subtract the background and correct for range.
-
-    Parameters
-    ----------
-    conditioned : xr.Dataset
-        From `condition`.
-    background, background_standard_error : xr.DataArray
-        Over time, in the unit of the signal.
-
-    Returns
-    -------
-    xr.Dataset
-        ``signal``, ``signal_standard_error`` (mV m2 or MHz m2) over (time, range).
-    """
-    range_ = conditioned["range"].to_numpy().astype(np.float64)
-    parts = xr.apply_ufunc(
-        _range_corrected,
-        conditioned["power"],
-        conditioned["variance"],
-        background,
-        background_standard_error,
-        input_core_dims=[["range"], ["range"], [], []],
-        output_core_dims=[["range"], ["range"]],
-        kwargs={"range": range_},
-        dask="parallelized",
-        output_dtypes=[np.dtype(np.float32)] * 2,
-    )
-    return xr.Dataset({"signal": parts[0], "signal_standard_error": parts[1]})
-
-
-_Block = npt.NDArray[Any]
+def _conditioned(*inputs: _Block, photon: bool, **settings: Any) -> tuple[_Block, _Block, _Block]:
+    return (_photon if photon else _analog)(*inputs, **settings)
 
 
 def _analog(
@@ -200,20 +303,53 @@ def _tuple(result: Signal) -> tuple[_Block, _Block, _Block]:
     return result.power, result.variance, result.quality
 
 
-def _range_corrected(
+def _corrected(
     power: _Block,
     variance: _Block,
-    background: _Block,
-    error: _Block,
+    quality: _Block,
     *,
     range: _Block,  # noqa: A002
-) -> tuple[_Block, _Block]:
+    background_range: tuple[float, float],
+) -> tuple[_Block, ...]:
+    start, stop = background_range
+    far = slice(*np.searchsorted(range, (start, np.nextafter(stop, np.inf))))
+    tail = background.tail_mean(
+        power[..., far], range[far], start=start, variance=variance[..., far]
+    )
     result = signal.range_corrected(
         Signal(power, variance, np.empty(0, np.int32)),
         range,
-        background=background,
-        background_variance=error**2,
+        background=tail.background,
+        background_variance=tail.background_standard_error**2,
         dtype=np.float32,
     )
+    lost = np.where(np.isnan(tail.background), np.int32(Quality.INPUT_MISSING), np.int32(0))
     # The noise is far above the 24 bits of float32, and a day of profiles fits in memory.
-    return result.power, np.sqrt(result.variance, out=result.variance)
+    return (
+        result.power,
+        np.sqrt(result.variance, out=result.variance),
+        quality | lost[..., np.newaxis],
+        tail.background,
+        tail.background_standard_error,
+    )
+
+
+def _signals(
+    counts: _Block,
+    *others: _Block,
+    range: _Block,  # noqa: A002
+    background_range: tuple[float, float],
+    **settings: Any,
+) -> tuple[_Block, ...]:
+    parts = [
+        _corrected(
+            *_conditioned(
+                counts[some], *(array[some] for array in others), range=range, **settings
+            ),
+            range=range,
+            background_range=background_range,
+        )
+        for first in np.arange(0, max(len(counts), 1), _AT_ONCE)
+        for some in [slice(first, first + _AT_ONCE)]
+    ]
+    return tuple(np.concatenate(pieces) for pieces in zip(*parts, strict=True))

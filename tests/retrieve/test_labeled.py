@@ -240,3 +240,26 @@ def test_real_vertical_profiles_are_flagged(data_root):
     ).compute(scheduler="synchronous")
     assert found.sizes["time"] == len(files)
     assert np.all(found["quality_flag"] != 0)
+
+
+def test_one_pass_gives_the_bits_of_two(data_root):
+    """Condition and correct in one step, in chunks of any size, or one after the other."""
+    files = sorted((data_root / "pilar" / "20241002").iterdir())[:5]
+    for channel in ("analog_532p", "photon_387o"):
+        results = []
+        for chunk in (1, 2, 5):
+            archive = lidarops.open_archive(
+                files, mask_and_scale=False, profiles_per_chunk=chunk, header_position="ignore"
+            )
+            conditioned = labeled_signal.condition(archive, channel, full_overlap_range=500.0)
+            far = (27_000.0, 30_000.0)
+            results.append(labeled_signal.corrected(conditioned, far).load())
+            results.append(
+                labeled_signal.signals(
+                    archive, channel, background_range=far, full_overlap_range=500.0
+                ).load()
+            )
+        for other in results[1:]:
+            for name in results[0].data_vars:
+                np.testing.assert_array_equal(other[name].values, results[0][name].values)
+        assert np.isfinite(results[0]["background"].values).any()

@@ -70,7 +70,7 @@ def test_streams_of_different_files_differ():
         tuple(random_stream(seed, key, role, index).integers(0, 2**63, 2))
         for seed in (1, 2)
         for key in ("a", "b")
-        for role in Role
+        for role in (Role.SIGNAL, Role.DARK)
         for index in range(3)
     }
     assert len(draws) == 2 * 2 * 2 * 3
