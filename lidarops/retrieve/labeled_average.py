@@ -9,7 +9,6 @@ import dask.array as da
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from dask.delayed import delayed
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -67,27 +66,18 @@ def clock_average(
     moments = conditioned["time"].to_numpy()
     interval = (moments - np.datetime64("1970-01-01")) // np.timedelta64(round(seconds * 1e9), "ns")
     first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
-    weights = shots.to_numpy().astype(np.float64)
+    shots.to_numpy().astype(np.float64)
     past = np.append(first[1:], interval.size)
     starts, stops = bounds[first, 0], np.maximum.reduceat(bounds[:, 1], first)
     middles = starts + (stops - starts) // 2
     shared = None if shared_variance is None else shared_variance(middles)
-    parts = [
-        _part(
-            conditioned,
-            weights,
-            None if shared is None else shared[low:high],
-            first[low:high],
-            int(past[high - 1]),
-        )
-        for low, high in _batches(first, past)
-    ]
-    names = ("power", "variance", "quality", "profiles")
-    dims = (("time", "range"), ("time", "range"), ("time", "range"), ("time",))
-    arrays = [da.concatenate([part[i] for part in parts]) for i in range(len(names))]  # type: ignore[no-untyped-call]
+    packed = _packed(conditioned, shots.to_numpy().astype(np.float64), shared, first, past)
     result = xr.Dataset(
         {
-            **{n: (d, a) for n, d, a in zip(names, dims, arrays, strict=True)},
+            "power": (("time", "range"), packed[:, 0]),
+            "variance": (("time", "range"), packed[:, 1]),
+            "quality": (("time", "range"), packed[:, 2].astype(np.int32)),
+            "profiles": ("time", np.diff(first, append=interval.size).astype(np.int32)),
             "shots": ("time", np.add.reduceat(shots.to_numpy(), first).astype(np.int32)),
         },
         coords={
@@ -110,27 +100,43 @@ def _batches(first: npt.NDArray[np.intp], past: npt.NDArray[np.intp]) -> Iterato
             low = high
 
 
-def _part(
+def _packed(
     conditioned: xr.Dataset,
     weights: npt.NDArray[np.float64],
     shared: npt.NDArray[np.float64] | None,
     first: npt.NDArray[np.intp],
-    past: int,
-) -> tuple[da.Array, ...]:
-    start = int(first[0])
-    inside = slice(start, past)
-    blocks = [conditioned[name].isel(time=inside).data for name in ("power", "variance", "quality")]
-    group = np.repeat(np.arange(first.size), np.diff(np.append(first, past)))
-    whole = delayed(_averaged, nout=4, pure=True)(*blocks, weights[inside], shared, group)
-    shape = (first.size, conditioned.sizes["range"])
-    return tuple(
-        da.from_delayed(  # type: ignore[no-untyped-call]
-            piece, shape=shape[: 1 if index == 3 else 2], dtype=dtype
-        )
-        for index, (piece, dtype) in enumerate(
-            zip(whole, (np.float64, np.float64, np.int32, np.int32), strict=True)
-        )
+    past: npt.NDArray[np.intp],
+) -> da.Array:
+    """Return power, variance and bits of the means, (interval, 3, range).
+
+    In one array, and from arrays cut alike, so that what they are made of is computed once.
+    """
+    batches = list(_batches(first, past))
+    profiles = tuple(int(past[high - 1] - first[low]) for low, high in batches)
+    intervals = tuple(high - low for low, high in batches)
+    bins = conditioned.sizes["range"]
+    group = np.repeat(np.arange(first.size), past - first)
+    if shared is None:
+        shared = np.zeros((first.size, bins))
+    arrays = [
+        da.asarray(conditioned[name].data).rechunk((profiles, (bins,)))  # type: ignore[no-untyped-call]
+        for name in ("power", "variance", "quality")
+    ]
+    columns = [da.from_array(column, chunks=(profiles,)) for column in (weights, group)]  # type: ignore[no-untyped-call]
+    rows = da.from_array(shared, chunks=(intervals, (bins,)))  # type: ignore[no-untyped-call]
+    packed: da.Array = da.blockwise(  # type: ignore[no-untyped-call]
+        _averaged,
+        "tpr",
+        *(part for array in arrays for part in (array, "tr")),
+        *(part for column in columns for part in (column, "t")),
+        rows,
+        "tr",
+        new_axes={"p": 3},
+        adjust_chunks={"t": intervals},
+        align_arrays=False,
+        dtype=np.float64,
     )
+    return packed
 
 
 def _averaged(
@@ -138,18 +144,21 @@ def _averaged(
     variance: _Block,
     quality: _Block,
     weights: npt.NDArray[np.float64],
-    shared: npt.NDArray[np.float64] | None,
     group: npt.NDArray[np.intp],
-) -> tuple[_Block, _Block, _Block, _Block]:
-    if shared is not None:
-        shared = shared[group]
-        variance = np.maximum(variance - shared, 0.0)
+    shared: npt.NDArray[np.float64],
+) -> _Block:
+    own = group - group[0]
+    common = shared[own]
     means = averaging.mean(
-        power, variance, groups=group, weights=weights, shared_variance=shared, axis=0
+        power,
+        np.maximum(variance - common, 0.0),
+        groups=own,
+        weights=weights,
+        shared_variance=common,
+        axis=0,
     )
-    first = np.flatnonzero(np.diff(group, prepend=-1))
+    first = np.flatnonzero(np.diff(own, prepend=-1))
     missing = np.int32(Quality.INPUT_MISSING)
     bits = np.bitwise_or.reduceat(quality & ~missing, first, axis=0)
     bits[~np.isfinite(means.values)] |= missing
-    profiles = np.bincount(group).astype(np.int32)
-    return means.values, means.variance + means.shared_variance, bits, profiles
+    return np.stack([means.values, means.variance + means.shared_variance, bits], axis=1)
