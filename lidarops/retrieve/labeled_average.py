@@ -66,7 +66,6 @@ def clock_average(
     moments = conditioned["time"].to_numpy()
     interval = (moments - np.datetime64("1970-01-01")) // np.timedelta64(round(seconds * 1e9), "ns")
     first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
-    shots.to_numpy().astype(np.float64)
     past = np.append(first[1:], interval.size)
     starts, stops = bounds[first, 0], np.maximum.reduceat(bounds[:, 1], first)
     middles = starts + (stops - starts) // 2
