@@ -184,7 +184,8 @@ def _read(folder: Path, name: str) -> bytes:
             file=name,
             remedy="put it beside the campaign file, or correct its name there",
         ) from error
-    problem = "is larger than any profile" if inside else "lies outside the folder of the campaign file"
+    outside = "lies outside the folder of the campaign file"
+    problem = "is larger than any profile" if inside else outside
     raise AncillaryError(problem, file=name)
 
 

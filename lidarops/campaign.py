@@ -201,12 +201,34 @@ class ElasticSettings(_Model):
         return self
 
 
+class MultiAngleSettings(_Model):
+    """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
+
+    channels: list[str] = Field(min_length=1)
+    highest: Metres = Field(default=6000.0, description="m above the station")
+    step: float = Field(default=60.0, ge=5, le=1000, description="m, between altitudes")
+    method: Literal["auto", "joint", "kano_hamilton", "two_angle"] = "auto"
+    largest_gradient: float = Field(
+        default=5e-5,
+        ge=0,
+        le=1e-2,
+        description="m-1, of the logarithm of backscatter along the horizontal, to allow for",
+    )
+
+    @model_validator(mode="after")
+    def _holds_altitudes(self) -> Self:
+        if self.highest < 10 * self.step:
+            raise ValueError("highest must lie at least 10 steps up")
+        return self
+
+
 class Products(_Model):
     """Which products of an instrument are wanted, with which settings."""
 
     signal: SignalSettings | None = None
     homogeneous: HomogeneousSettings | None = None
     elastic: ElasticSettings | None = None
+    multiangle: MultiAngleSettings | None = None
 
 
 class Instrument(_Model):

@@ -189,11 +189,11 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
         "as many unknowns as angles: nothing tests the result",
     ),
     Quality.UNDERSMOOTHED: (
-        Severity.REJECT,
+        Severity.CARE,
         "more structure over height than the errors allow for",
     ),
     Quality.HIGH_CORRELATION: (
-        Severity.REJECT,
+        Severity.CARE,
         "errors of neighbouring heights are alike by more than 0.85: intervals are too narrow",
     ),
     Quality.HORIZONTAL_GRADIENT: (

@@ -18,6 +18,7 @@ from lidarops.campaign import (
     HomogeneousSettings,
     Instrument,
     InstrumentFacts,
+    MultiAngleSettings,
     SignalSettings,
     channel_facts,
 )
@@ -32,7 +33,12 @@ STEEPEST = 80.0
 STEADY = 0.05
 """degree; by which the zenith angle of a beam that stands still may differ between files."""
 
-_Settings = TypeVar("_Settings", SignalSettings, HomogeneousSettings, ElasticSettings)
+LEAST_SPREAD = 5.0
+"""degree; smallest spread of zenith angles that is a scan."""
+
+_Settings = TypeVar(
+    "_Settings", SignalSettings, HomogeneousSettings, ElasticSettings, MultiAngleSettings
+)
 
 
 class StepName(StrEnum):
@@ -54,6 +60,7 @@ class StepName(StrEnum):
     KNOWN_SHAPE = "known_shape"
     REFERENCE = "reference"
     ELASTIC = "elastic"
+    MULTIANGLE = "multiangle"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +77,8 @@ class _Case:
     """Set where the channel's ``homogeneous`` product is wanted."""
     elastic: ElasticSettings | None
     """Set where the channel's ``elastic`` product is wanted."""
+    multiangle: MultiAngleSettings | None
+    """Set where the channel's ``multiangle`` product is wanted."""
     glued: tuple[str, ...]
     """Channels that this one is joined into."""
 
@@ -136,7 +145,12 @@ def parts_of(glued: str) -> tuple[str, str]:
 
 def _asked_glued(instrument: Instrument) -> set[str]:
     products = instrument.products
-    asked = [*(products.elastic.channels if products.elastic else [])]
+    asked = [
+        name
+        for wanted in (products.elastic, products.multiangle)
+        if wanted is not None
+        for name in wanted.channels
+    ]
     if products.signal is not None and products.signal.channels != "all":
         asked += products.signal.channels
     return {name for name in asked if name.startswith(GLUED)}
@@ -156,6 +170,7 @@ def _absent(scene: Scene, instrument: Instrument) -> Iterator[LeftOut]:
         (StepName.SIGNAL, products.signal),
         (StepName.HOMOGENEOUS, products.homogeneous),
         (StepName.ELASTIC, products.elastic),
+        (StepName.MULTIANGLE, products.multiangle),
     ):
         names: Sequence[str] = [] if wanted is None or wanted.channels == "all" else wanted.channels
         for name in names:
@@ -201,6 +216,7 @@ def _channel(
         signal=_wanted(products.signal, channel),
         homogeneous=None if joined else _wanted(products.homogeneous, channel),
         elastic=_wanted(products.elastic, channel),
+        multiangle=_wanted(products.multiangle, channel),
         glued=tuple(name for name in made if channel.name in parts_of(name)),
     )
     asked = list(_asked(case))
@@ -220,6 +236,7 @@ def _channel(
     yield from _signal_rules(case, last)
     yield from _homogeneous_rules(case, last)
     yield from _elastic_rules(case, last)
+    yield from _multiangle_rules(case, last)
 
 
 def _glue_rules(case: _Case) -> Iterator[Step | LeftOut]:
@@ -253,6 +270,8 @@ def _asked(case: _Case) -> Iterator[str]:
         yield "homogeneous"
     if case.elastic is not None:
         yield "elastic"
+    if case.multiangle is not None:
+        yield "multiangle"
     yield from case.glued
 
 
@@ -378,12 +397,7 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
         return
     seconds = settings.average.total_seconds()
     yield case.step(StepName.AVERAGE, "noise of a single profile is too large", seconds=seconds)
-    source = case.facts.molecular_profile
-    if source:
-        yield case.step(StepName.MOLECULAR, "given by the campaign", molecular_profile=source)
-    else:
-        reason = "the campaign gives no molecular_profile: US Standard Atmosphere 1976"
-        yield case.step(StepName.MOLECULAR, reason)
+    yield _molecular_rule(case)
     if settings.background == "known_shape":
         reason = "the far range is taken as air without aerosol, and tested for it"
         yield case.step(StepName.KNOWN_SHAPE, reason)
@@ -407,6 +421,50 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
         lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
         molecular_relative_error=settings.molecular_relative_error,
     )
+
+
+def _molecular_rule(case: _Case) -> Step:
+    source = case.facts.molecular_profile
+    if source:
+        return case.step(StepName.MOLECULAR, "given by the campaign", molecular_profile=source)
+    reason = "the campaign gives no molecular_profile: US Standard Atmosphere 1976"
+    return case.step(StepName.MOLECULAR, reason)
+
+
+def _multiangle_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
+    settings = case.multiangle
+    if settings is None:
+        yield case.without(StepName.MULTIANGLE, "the campaign does not ask for it")
+        return
+    reason = _no_scan(case)
+    if reason:
+        yield case.without(StepName.MULTIANGLE, reason)
+        return
+    # The elastic product needs a beam that stands still: only one of both tells of molecules.
+    yield _molecular_rule(case)
+    yield case.step(
+        StepName.MULTIANGLE,
+        "the campaign asks for it, and the beam scans",
+        highest=settings.highest,
+        step=settings.step,
+        method=settings.method,
+        largest_gradient=settings.largest_gradient,
+        background_range=[0.9 * last, last],
+    )
+
+
+def _no_scan(case: _Case) -> str:
+    """Return why the files of a scene are no scan, nothing where they are."""
+    if case.facts.zenith_angle is not None:
+        return f"the campaign says that the beam stands still at {case.facts.zenith_angle:g} degree"
+    told = [granule.zenith_angle for granule in case.scene.granules]
+    angles = [angle for angle in told if angle is not None]
+    if len(angles) < len(told):
+        return "headers do not tell all zenith angles"
+    spread = max(angles) - min(angles)
+    if spread < LEAST_SPREAD:
+        return f"zenith angles spread over {spread:g} degree only: the beam does not scan"
+    return ""
 
 
 def _ranged_by(channel: str) -> str:

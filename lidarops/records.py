@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
@@ -45,6 +45,7 @@ class ProductKind(StrEnum):
     SIGNAL = "signal"
     HOMOGENEOUS = "homogeneous"
     ELASTIC = "elastic"
+    MULTIANGLE = "multiangle"
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +145,22 @@ class Plan:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the plan as plain JSON types."""
-        plain = asdict(self)
-        plain["steps"] = [{**step, "settings": dict(step["settings"])} for step in plain["steps"]]
-        plain["left_out"] = list(plain["left_out"])
-        return plain
+        return {
+            "scene": self.scene,
+            "steps": [
+                {
+                    "name": step.name,
+                    "channel": step.channel,
+                    "settings": dict(step.settings),
+                    "reason": step.reason,
+                }
+                for step in self.steps
+            ],
+            "left_out": [
+                {"name": left.name, "channel": left.channel, "reason": left.reason}
+                for left in self.left_out
+            ],
+        }
 
     @property
     def hash(self) -> str:

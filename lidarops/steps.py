@@ -20,6 +20,8 @@ from lidarops.retrieve import (
     labeled_average,
     labeled_elastic,
     labeled_glue,
+    labeled_multiangle,
+    labeled_scan,
     labeled_signal,
 )
 from lidarops.retrieve.molecular import MolecularProfile
@@ -79,11 +81,21 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
         lazy[kind] = data.assign(shots=source.shots).assign_coords(source.geometry.variables)
     if StepName.ELASTIC in steps:
         lazy[ProductKind.ELASTIC] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
+    if StepName.MULTIANGLE in steps:
+        lazy[ProductKind.MULTIANGLE] = _rays(source, steps, bench)
     # Together, so that products of one channel share one reading of the files.
     found = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
     if ProductKind.ELASTIC in found:
         averages = source.joined(found[ProductKind.ELASTIC])
         found[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
+    if ProductKind.MULTIANGLE in found:
+        settings = steps[StepName.MULTIANGLE].settings
+        found[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve(
+            found[ProductKind.MULTIANGLE],
+            station_altitude=bench.station_altitude,
+            method=settings["method"],
+            largest_gradient=settings["largest_gradient"],
+        )
     return found
 
 
@@ -264,6 +276,30 @@ def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> x
         overlap=_overlap(steps, bench.ancillaries, averages["range"].to_numpy()),
     )
     return found.assign(_gluing(averages))
+
+
+def _rays(source: _Plain | _Glued, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+    """Return the rays of every scan cycle on common altitudes, lazy."""
+    settings = steps[StepName.MULTIANGLE].settings
+    profiles, geometry = source.profiles(), source.geometry
+    near, far = settings["background_range"]
+    heights = np.arange(settings["step"], settings["highest"] + 1e-6, settings["step"])
+    return labeled_scan.on_altitudes(
+        profiles,
+        zenith_angle=geometry["zenith_angle"].to_numpy(),
+        azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
+        time=geometry["time"].to_numpy(),
+        time_bnds=geometry["time_bnds"].to_numpy(),
+        shots=source.shots.to_numpy(),
+        altitude_grid=bench.station_altitude + heights,
+        station_altitude=bench.station_altitude,
+        background=labeled_scan.Background(
+            (near, far),
+            _molecules(steps, bench.ancillaries),
+            steps[StepName.READ].settings["wavelength"],
+        ),
+        overlap=_overlap(steps, bench.ancillaries, profiles["range"].to_numpy()),
+    )
 
 
 def _overlap(steps: Mapping[str, Step], ancillaries: Ancillaries, distance: Array) -> Array | None:

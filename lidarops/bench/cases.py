@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final, TypeVar
 
-from lidarops.bench import accuracy, elastic, results, speed, story, throughput
+from lidarops.bench import accuracy, elastic, multiposition, results, speed, story, throughput
 from lidarops.bench.terms import RESULT, Effort, Finding, Kind
 from lidarops.bench.timing import machine
 from lidarops.errors import CampaignError
@@ -23,6 +23,7 @@ class Case(StrEnum):
 
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
+    MULTIPOSITION = "multiposition"
     READER = "reader"
 
 
@@ -39,7 +40,7 @@ def run(
     Parameters
     ----------
     what : {"accuracy", "throughput"}
-    case : {"elastic", "homogeneous", "reader"} or None
+    case : {"elastic", "homogeneous", "multiposition", "reader"} or None
         None is "reader" where files are given, else "homogeneous".
     files : sequence of Path
         Raw files of one layout, for "reader" and no other.
@@ -64,6 +65,8 @@ def run(
         raise CampaignError(
             "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
         )
+    if chosen is Case.MULTIPOSITION:
+        return multiposition.run(kind, effort=effort)
     if chosen is Case.ELASTIC:
         return elastic.run(kind, data=data, effort=effort)
     if chosen is Case.READER:

@@ -43,7 +43,9 @@ def build(data: xr.Dataset, context: Context) -> xr.Dataset:
         ``time_bnds`` (datetime64, UTC), ``zenith_angle`` and optionally ``azimuth`` (degree;
         scalar or over time); for ``signal`` also ``range`` (m, bin centres) and optionally
         ``range_bnds``, for ``homogeneous`` ``section``, ``section_range`` and
-        ``section_bounds`` (m). NaN is missing.
+        ``section_bounds`` (m); for ``multiangle``, in place of the angles, ``altitude`` (m above
+        the geoid), ``ray``, ``ray_zenith_angle`` and optionally ``ray_azimuth`` (degree). An
+        attribute ``steps`` goes into the product. NaN is missing.
     context : Context
         What the product is of.
 
@@ -69,7 +71,7 @@ def build(data: xr.Dataset, context: Context) -> xr.Dataset:
             **_measured(source, layout, coordinates, context.mode),
             **_about(layout, context, profiles=extents.vertical),
         },
-        attrs=global_attributes(context, layout, extents),
+        attrs=global_attributes(context, layout, extents) | _steps(data),
     )
     product.encoding["unlimited_dims"] = {"time"}
     return product
@@ -83,6 +85,11 @@ def _refuse_mismatch(context: Context) -> None:
             f"is that of {' '.join(told)}, not of {context.kind} {context.channel} {context.scene}",
             field="provenance",
         )
+
+
+def _steps(data: xr.Dataset) -> dict[str, str]:
+    """Return what the retrieval itself says that it did, where it does."""
+    return {"lidarops_steps": str(data.attrs["steps"])} if data.attrs.get("steps") else {}
 
 
 def _place(coordinates: list[Coordinate], mode: DetectionMode) -> dict[str, xr.Variable]:
@@ -114,14 +121,20 @@ def _measured(
             if row.dims == judged.dims:
                 check_flagged(row, stored, flags)
             stored[~np.isfinite(stored)] = rows.FILL_VALUE
-        listed = tuple(
-            found.row.name
-            for found in coordinates
-            if found.auxiliary and set(found.dims) <= set(row.dims)
-        )
-        found_attributes = attributes(row, mode=mode, coordinates=listed)
+        found_attributes = attributes(row, mode=mode, coordinates=_listed(row, coordinates))
         variables[row.name] = xr.Variable(row.dims, stored, found_attributes)
     return variables
+
+
+def _listed(row: Row, coordinates: list[Coordinate]) -> tuple[str, ...]:
+    """Return the auxiliary coordinates of a variable."""
+    # CDO 2.1 cannot read a variable of three dimensions that names a place without one.
+    unread = ("latitude", "longitude") if len(row.dims) > 2 else ()
+    return tuple(
+        found.row.name
+        for found in coordinates
+        if found.auxiliary and set(found.dims) <= set(row.dims) and found.row.name not in unread
+    )
 
 
 def _rounded(row: Row, values: Values) -> Values:

@@ -54,32 +54,73 @@ def locate(source: Intake, layout: Layout, context: Context) -> tuple[list[Coord
     ProductError
         If a coordinate is missing, not finite, not rising, or out of its cell.
     """
-    station = context.station
     time = _time(source, layout.row("time"))
-    found = {"time": time}
-    for name in _ALONG[layout.sampled]:
-        found[name] = _along(source, layout.row(name))
-    zenith = _beam(source, layout.row("zenith_angle"), time.values.size)
-    altitude, exact = _altitude(
-        layout.row("altitude"), found[_ALONG[layout.sampled][-1]], zenith, station.altitude
-    )
+    place = _scan_place if layout.sampled == "altitude" else _beam_place
+    found, vertical = place(source, layout, context.station.altitude, time.values.size)
+    found["time"] = time
+    for name, value in _fixed(context).items():
+        if np.isfinite(value):
+            found[name] = Coordinate(layout.row(name), (), np.asarray(value, np.float64))
+    ordered = [found[row.name] for row in layout.coordinates if row.name in found]
+    for coordinate in ordered:
+        check_range(coordinate.row, coordinate.values)
+    return ordered, _extents(source, vertical)
+
+
+@dataclass(frozen=True, slots=True)
+class _Vertical:
+    """What a product covers along the vertical."""
+
+    altitude: Values
+    """m, as stored."""
+    exact: Values
+    """m, before it was rounded."""
+    profiles: bool
+    """Whether the beam stands still and points up or down, as CF profiles do."""
+
+
+_Place = tuple[dict[str, Coordinate], _Vertical]
+
+
+def _beam_place(source: Intake, layout: Layout, station: float, profiles: int) -> _Place:
+    """Return the coordinates of a kind whose values lie along the beam."""
+    names = _ALONG[layout.sampled]
+    found = {name: _along(source, layout.row(name)) for name in names}
+    zenith = _beam(source, layout.row("zenith_angle"), profiles)
+    altitude, exact = _altitude(layout.row("altitude"), found[names[-1]], zenith, station)
     found |= {"altitude": altitude, "zenith_angle": zenith}
     if "azimuth" in source:
-        found["azimuth"] = _beam(source, layout.row("azimuth"), time.values.size)
-    fixed = {
+        found["azimuth"] = _beam(source, layout.row("azimuth"), profiles)
+    tilt = min(zenith.values.flat[0], 180.0 - zenith.values.flat[0])
+    vertical = zenith.dims == () and bool(tilt <= NEAR_VERTICAL)
+    return found, _Vertical(altitude.values, exact, vertical)
+
+
+def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) -> _Place:
+    """Return the coordinates of a kind whose values lie at altitudes seen by several rays."""
+    names = ["ray", "ray_zenith_angle"]
+    names += ["ray_azimuth"] if "ray_azimuth" in source else []
+    found = {name: _along(source, layout.row(name)) for name in names}
+    row = layout.row("altitude")
+    values = _along(source, replace(row, bounds=None)).values
+    if values[0] <= station:
+        raise ProductError(
+            f"begins at {values[0]:g} m, the station lies at {station:g} m", field=row.name
+        )
+    tops = np.append(station, values)
+    found["altitude"] = _celled(row, values, np.stack([tops[:-1], tops[1:]], axis=-1))
+    return found, _Vertical(values, values, profiles=False)
+
+
+def _fixed(context: Context) -> dict[str, float]:
+    station = context.station
+    return {
         "latitude": station.latitude,
         "longitude": station.longitude,
         "station_altitude": station.altitude,
         # Removes the last bits of metres times 1e9, so that 532 nm reads 532.
         "wavelength": round(context.wavelength * 1e9, 6),
     }
-    for name, value in fixed.items():
-        if np.isfinite(value):
-            found[name] = Coordinate(layout.row(name), (), np.asarray(value, np.float64))
-    ordered = [found[row.name] for row in layout.coordinates if row.name in found]
-    for coordinate in ordered:
-        check_range(coordinate.row, coordinate.values)
-    return ordered, _extents(source, altitude, exact, zenith)
 
 
 _ALONG: Final = {"range": ("range",), "section": ("section", "section_range")}
@@ -185,20 +226,19 @@ def _altitude(
     return Coordinate(row, (*zenith.dims, *row.dims), exact.astype(row.dtype), bounds), exact
 
 
-def _extents(source: Intake, altitude: Coordinate, exact: Values, zenith: Coordinate) -> Extents:
+def _extents(source: Intake, vertical: _Vertical) -> Extents:
     moments, bounds = _moments(source)
     intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
-    steps = np.abs(np.diff(exact, axis=-1))
+    steps = np.abs(np.diff(vertical.exact, axis=-1))
     constant = steps.size > 0 and bool(np.ptp(steps) <= 1e-6 * steps.max())
-    tilt = min(zenith.values.flat[0], 180.0 - zenith.values.flat[0])
     return Extents(
         start=_datetime(bounds[:, 0].min()),
         stop=_datetime(bounds[:, 1].max()),
         interval=float(np.median(intervals / np.timedelta64(1, "s"))),
-        lowest=float(altitude.values.min()),
-        highest=float(altitude.values.max()),
+        lowest=float(vertical.altitude.min()),
+        highest=float(vertical.altitude.max()),
         step=float(steps.flat[0]) if constant else None,
-        vertical=zenith.dims == () and bool(tilt <= NEAR_VERTICAL),
+        vertical=vertical.profiles,
     )
 
 

@@ -7,6 +7,7 @@ the row.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 from lidarops.flags import Quality
@@ -25,9 +26,10 @@ from lidarops.products.rows import (
     shots,
 )
 from lidarops.products.table_elastic import ELASTIC
+from lidarops.products.table_multiangle import MULTIANGLE
 from lidarops.records import ProductKind
 
-_OF_ELASTIC = {"average", "molecular", "known_shape", "reference", "elastic"}
+_OF_ELASTIC = {"average", "molecular", "known_shape", "reference"}
 
 _SIGNAL = Layout(
     title="Range-corrected lidar signals",
@@ -39,7 +41,7 @@ _SIGNAL = Layout(
     comment="The standard errors of the range bins of one profile share the error of its"
     " background.",
     sampled="range",
-    unused_steps=frozenset(_OF_ELASTIC | {"homogeneous"}),
+    unused_steps=frozenset(_OF_ELASTIC),
     coordinates=coordinates((RANGE,), altitude("range")),
     data=(
         Row(
@@ -106,7 +108,7 @@ _HOMOGENEOUS = Layout(
     " range r. altitude, and with it geospatial_vertical_min and _max, is that of the middle of"
     " a section; altitude_bnds holds its ends where the beam stands still.",
     sampled="section",
-    unused_steps=frozenset(_OF_ELASTIC | {"signal", "background"}),
+    unused_steps=frozenset(_OF_ELASTIC | {"background"}),
     coordinates=coordinates((SECTION, SECTION_RANGE), altitude("section", "altitude_bnds")),
     data=(
         Row(
@@ -183,9 +185,16 @@ _HOMOGENEOUS = Layout(
     ),
 )
 
-LAYOUTS: Final[Mapping[ProductKind, Layout]] = {
+_OWN = {
     ProductKind.SIGNAL: _SIGNAL,
     ProductKind.HOMOGENEOUS: _HOMOGENEOUS,
     ProductKind.ELASTIC: ELASTIC,
+    ProductKind.MULTIANGLE: MULTIANGLE,
+}
+
+LAYOUTS: Final[Mapping[ProductKind, Layout]] = {
+    # The step that makes a product is named after its kind, and makes nothing of another.
+    kind: replace(layout, unused_steps=layout.unused_steps | (set(ProductKind) - {kind}))
+    for kind, layout in _OWN.items()
 }
 """What each kind of product holds."""

@@ -19,12 +19,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lidarops.flags import Quality, Severity
-from lidarops.reports import panels, profile_panels
+from lidarops.reports import panels, profile_panels, scan_panels
 from lidarops.reports.profiles import Profile
 from lidarops.reports.raster import COLUMNS, Raster, read_raster
+from lidarops.reports.scans import ScanProfile, ScanResiduals, read_extinction
 from lidarops.reports.series import QUANTITIES, Section, compare, join, read_sections
 from lidarops.reports.timeaxis import Times, time_axis
-from lidarops.reports.words import bit_name, percent, visible
+from lidarops.reports.words import bit_name, counted, percent, visible
 
 DPI: Final = 150
 
@@ -253,6 +254,101 @@ def error_budget(profile: Profile, *, title: str = "") -> Figure:
     )
 
 
+def scan_profile(profile: ScanProfile, *, title: str = "") -> Figure:
+    """Draw optical depth and extinction of one cycle of a scan against altitude.
+
+    Parameters
+    ----------
+    profile : ScanProfile
+        From `lidarops.reports.scans.clearest_cycle`.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+        With 1-sigma bands, and lighter ones to which the largest error by a horizontal gradient
+        is added; flagged values marked, the reach as a line, the truth in black dashes.
+    """
+    figure = Figure(figsize=(10.0, 5.8), dpi=DPI, layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    moment = str(profile.time.astype("datetime64[s]")).replace("T", " ") + " UTC"
+    panels.title(figure, f"{title}, {moment}")
+    scan_panels.against_altitude(left, profile, "optical_depth")
+    scan_panels.against_altitude(right, profile, "extinction")
+    left.set_ylabel("altitude (km)")
+    panels.legend(left, columns=2)
+    panels.legend(right, columns=2, besides=left)
+    return _described(
+        figure,
+        f"{title}: optical depth and extinction against altitude at {moment}, with standard"
+        f" errors and the largest errors by a horizontal gradient. {_scanned(profile)}.",
+    )
+
+
+def scan_residuals(residuals: ScanResiduals, *, title: str = "") -> Figure:
+    """Draw what the fit over angles leaves, against ray and altitude.
+
+    Parameters
+    ----------
+    residuals : ScanResiduals
+        From `lidarops.reports.scans.read_residuals`.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+        Means over cycles on a diverging colour scale around 0, and beneath, the root mean
+        square by ray. Air in level layers leaves neither pattern nor sides that differ.
+    """
+    figure, (upper, lower) = _stack((3.9, 1.5), title)
+    limit = scan_panels.residual_map(figure, upper, residuals)
+    scan_panels.residual_rms(lower, residuals)
+    panels.legend(lower)
+    rms = np.where(np.isfinite(residuals.rms), residuals.rms, -np.inf)
+    worst, top = int(np.argmax(rms)), float(residuals.edges[-1]) / 1e3
+    return _described(
+        figure,
+        f"{title}: residuals of the signal against zenith angle of the ray and altitude to"
+        f" {top:.3g} km, mean of {counted(residuals.cycles, 'cycle')}; colours to {limit:.2g}"
+        f" percent. The root mean square is largest, {rms[worst]:.2g} percent, at a zenith angle"
+        f" of {residuals.zenith_angle[worst]:.3g} degrees.",
+    )
+
+
+def extinction_quicklook(products: Sequence[xr.Dataset], *, title: str = "") -> Figure:
+    """Draw the extinction of multi-angle products against time and altitude.
+
+    Parameters
+    ----------
+    products : sequence of Dataset
+        Kind ``multiangle``, of one instrument and channel; may be lazy.
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+        As `quicklook`, without a background.
+
+    Raises
+    ------
+    ProductError
+        Where a product is not of this kind.
+    """
+    profiles = -(-sum(product.sizes.get("time", 0) for product in products) // COLUMNS)
+    return draw_extinction([read_extinction(p, profiles=profiles) for p in products], title=title)
+
+
+def draw_extinction(rasters: Sequence[Raster], *, title: str = "") -> Figure:
+    """Draw rasters of extinction, at least one; see `extinction_quicklook`."""
+    figure, (panel,) = _stack((3.9,), title)
+    axis = time_axis(_middles(rasters))
+    words = panels.image(figure, panel, axis, rasters, "extinction")
+    panel.set_ylabel("altitude (km)")
+    panel.set_ylim(bottom=min(float(raster.edges[0]) for raster in rasters) / 1e3)
+    panels.time_ticks([panel], axis)
+    return _described(figure, f"{title}: extinction against time and altitude. {words}.")
+
+
 def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str = "") -> Figure:
     """Draw the share of values that carry each quality bit, by product.
 
@@ -394,4 +490,18 @@ def _retrieved(sections: Sequence[Section]) -> str:
         reach = f"{values.min():.3g} to {values.max():.3g} per km" if values.size else "no value"
         flagged = int((~good).sum())
         words.append(f"{section.label}: {reach} unflagged, {flagged} of {good.size} flagged")
+    return "; ".join(words)
+
+
+def _scanned(profile: ScanProfile) -> str:
+    values = profile.estimates["extinction"].value
+    known = 1e3 * values[np.isfinite(values)]
+    span = f"{known.min():.3g} to {known.max():.3g} per km" if known.size else "none to use"
+    flagged, bits = int((profile.flag != 0).sum()), scan_panels.bits_in_words(profile)
+    words = [f"extinction {span}", f"{flagged} of {profile.flag.size} altitudes flagged"]
+    words[-1] += f" ({bits})" if bits else ""
+    if np.isfinite(profile.reach):
+        words.append(f"reach {profile.reach / 1e3:.3g} km")
+    if profile.truth is not None:
+        words.append("with the truth of the simulation")
     return "; ".join(words)

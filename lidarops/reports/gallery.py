@@ -5,12 +5,13 @@ A product that is missing or cannot be read never stops a report: it is named as
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import xarray as xr
 
@@ -21,6 +22,7 @@ from lidarops.reports import figures, panels
 from lidarops.reports.profiles import clearest_profile
 from lidarops.reports.raster import COLUMNS, Raster, read_raster
 from lidarops.reports.record import write_atomically
+from lidarops.reports.scans import clearest_cycle, read_extinction, read_residuals
 from lidarops.reports.series import QUANTITIES, Comparison, Section, compare, join, read_sections
 from lidarops.reports.words import counted
 
@@ -29,9 +31,16 @@ FIGURES: Final = 40
 _FLAG_ROWS: Final = 40
 _DARK_STEP: Final = "dark"
 """Name of the step of a plan that subtracts dark files."""
-_KINDS: Final = (ProductKind.HOMOGENEOUS, ProductKind.ELASTIC, ProductKind.SIGNAL)
+_KINDS: Final = (
+    ProductKind.HOMOGENEOUS,
+    ProductKind.MULTIANGLE,
+    ProductKind.ELASTIC,
+    ProductKind.SIGNAL,
+)
 # What opening and reading a damaged or foreign file has been seen to raise.
 _UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, ProductError)
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +192,8 @@ def _draw(
             yield from _homogeneous(group, record, truth, gallery, full=full)
     elif full:
         return
+    elif group.kind is ProductKind.MULTIANGLE:
+        yield from _multiangle(group, record, truth, gallery)
     elif group.kind is ProductKind.ELASTIC:
         yield from _elastic(group, record, gallery)
     else:
@@ -241,7 +252,7 @@ def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:
 
 
 def _signal(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Drawn]:
-    rasters = _rasters(group, record, gallery, "signal")
+    rasters = _rasters(group, record, gallery, read_raster)
     if rasters:
         yield _Drawn(
             f"signal_{group.instrument}_{group.channel}",
@@ -252,7 +263,8 @@ def _signal(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Dra
 
 
 def _elastic(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Drawn]:
-    rasters = _rasters(group, record, gallery, "attenuated_backscatter")
+    read = functools.partial(read_raster, quantity="attenuated_backscatter")
+    rasters = _rasters(group, record, gallery, read)
     if rasters:
         yield _Drawn(
             f"elastic_{group.instrument}_{group.channel}",
@@ -260,25 +272,69 @@ def _elastic(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Dr
             f" {counted(len(rasters), 'scene')}.",
             figures.render(figures.draw_backscatter(rasters, title=group.label)),
         )
+    profile = _first(group, record, gallery, clearest_profile)
+    if profile is not None:
+        yield _Drawn(
+            f"profile_{group.instrument}_{group.channel}",
+            f"The profile of a scene with most unflagged gates, and its error budget:"
+            f" {group.label}.",
+            figures.render(figures.error_budget(profile, title=group.label)),
+        )
+
+
+def _multiangle(
+    group: _Group, record: RunRecord, truth: xr.Dataset | None, gallery: Gallery
+) -> Iterator[_Drawn]:
+    rasters = _rasters(group, record, gallery, read_extinction)
+    if rasters:
+        yield _Drawn(
+            f"multiangle_{group.instrument}_{group.channel}",
+            f"Extinction over time and altitude: {group.label}; {counted(len(rasters), 'scene')}.",
+            figures.render(figures.draw_extinction(rasters, title=group.label)),
+        )
+    clearest = functools.partial(clearest_cycle, truth=truth, instrument=group.instrument)
+    profile = _first(group, record, gallery, clearest)
+    if profile is not None:
+        yield _Drawn(
+            f"scan-profile_{group.instrument}_{group.channel}",
+            f"The cycle of a scene with most unflagged values: {group.label}.",
+            figures.render(figures.scan_profile(profile, title=group.label)),
+        )
+    residuals = _first(group, record, gallery, read_residuals)
+    if residuals is not None:
+        yield _Drawn(
+            f"scan-residuals_{group.instrument}_{group.channel}",
+            f"What the fit over angles leaves of the signal, mean of the cycles of a scene:"
+            f" {group.label}.",
+            figures.render(figures.scan_residuals(residuals, title=group.label)),
+        )
+
+
+def _first(
+    group: _Group,
+    record: RunRecord,
+    gallery: Gallery,
+    read: Callable[[xr.Dataset], Found | None],
+) -> Found | None:
+    """Return what is read of the first product of a group that has it."""
+    told = {problem.path for problem in gallery.problems}
     for _, product in group.members:
         path = Path(record.products) / product.path
         try:
             with _opened(path) as opened:
-                profile = clearest_profile(opened)
-        except _UNREADABLE:
-            # Already told when its raster was read.
+                found = read(opened)
+        except _UNREADABLE as error:
+            if product.path not in told:
+                gallery.problems.append(Problem(product.path, _reason(path, error)))
             continue
-        if profile is not None:
-            yield _Drawn(
-                f"profile_{group.instrument}_{group.channel}",
-                f"The profile of a scene with most unflagged gates, and its error budget:"
-                f" {group.label}.",
-                figures.render(figures.error_budget(profile, title=group.label)),
-            )
-            return
+        if found is not None:
+            return found
+    return None
 
 
-def _rasters(group: _Group, record: RunRecord, gallery: Gallery, quantity: str) -> list[Raster]:
+def _rasters(
+    group: _Group, record: RunRecord, gallery: Gallery, read: Callable[..., Raster]
+) -> list[Raster]:
     root = Path(record.products)
     sizes: dict[str, int] = {}
     for _, product in group.members:
@@ -293,7 +349,7 @@ def _rasters(group: _Group, record: RunRecord, gallery: Gallery, quantity: str) 
     for path in sizes:
         try:
             with _opened(root / path) as opened:
-                rasters.append(read_raster(opened, quantity=quantity, profiles=profiles))
+                rasters.append(read(opened, profiles=profiles))
         except _UNREADABLE as error:
             gallery.problems.append(Problem(path, _reason(root / path, error)))
     return rasters

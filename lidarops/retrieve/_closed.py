@@ -92,7 +92,9 @@ def rows_of(data: Condensed, rays: Rays, cycle: Cycle) -> Rows:
         usable = (data.usable[:, here[j]] & data.usable[:, there[j]]) == 1
         total = np.where(usable, np.cumsum(data.integral[:, between], axis=1)[:, -1], np.nan)
         logs = np.where(usable, data.log_value[:, [here[j], there[j]]].T, np.nan)
-        out.starts[:, j], out.ends[:, j] = np.exp(logs)
+        # A value that overflows is infinite, and flagged as not finite.
+        with np.errstate(over="ignore"):
+            out.starts[:, j], out.ends[:, j] = np.exp(logs)
         out.integrals[:, j] = sign * total
         out.depths[j] = sign * rays.exponent[cycle.ray[j]] * float(lengths[between].sum())
         out.covariances[:, j] = _row_covariance(

@@ -42,6 +42,7 @@ def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> P
             Step("background", "photon_532o", {"range": [1e4, 1.2e4]}, "the last tenth"),
             Step("homogeneous", "photon_532o", {"method": "auto"}, "asked for"),
             Step("elastic", "photon_532o", {"lidar_ratio": 50.0}, "asked for"),
+            Step("multiangle", "photon_532o", {"method": "auto"}, "asked for"),
             Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
         ),
         left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
@@ -204,8 +205,64 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     )
 
 
+def multiangle(
+    profiles: int = 5, levels: int = 20, zenith: Any = (0.0, 30.0, 60.0), azimuth: Any = None
+) -> xr.Dataset:
+    """A multi-angle retrieval, as `lidarops.retrieve.labeled_multiangle.retrieve` gives it."""
+    rng = np.random.default_rng(4)
+    angles = np.atleast_1d(np.float64(zenith))
+    dims = ("time", "altitude")
+    shape = (profiles, levels)
+    flags = np.full(shape, np.int32(Quality.ONE_SIDED))
+    flags[0, 2 * levels // 3 :] = Quality.EXTRAPOLATED
+    flags[-1, 0] |= np.int32(Quality.INTERPOLATED | Quality.HORIZONTAL_GRADIENT)
+    scales = {
+        "optical_depth": 0.3,
+        "optical_depth_standard_error": 0.01,
+        "optical_depth_gradient_error": 0.005,
+        "extinction": 1e-4,
+        "extinction_standard_error": 1e-5,
+        "extinction_gradient_error": 5e-6,
+        "log_intercept": 14.0,
+        "log_intercept_standard_error": 0.02,
+        "data_share": 0.99,
+        "inhomogeneity": 0.03,
+    }
+    missing = (flags & int(Quality.EXTRAPOLATED)) != 0
+    residual = rng.normal(0.0, 0.03, (profiles, angles.size, levels))
+    residual[0, -1] = np.nan
+    along = {} if azimuth is None else {"azimuth": azimuth}
+    pointing = {
+        f"ray_{name}": ("ray", np.broadcast_to(np.float64(values), angles.shape).copy())
+        for name, values in {"zenith_angle": zenith, **along}.items()
+    }
+    times = {name: clock(profiles)[name] for name in ("time", "time_bnds")}
+    return xr.Dataset(
+        {
+            **{
+                name: (dims, np.where(missing, np.nan, scale * rng.uniform(0.5, 1.5, shape)))
+                for name, scale in scales.items()
+            },
+            "residual": (("time", "ray", "altitude"), residual),
+            "effective_degrees_of_freedom": ("time", np.full(profiles, 12.5)),
+            "reach": ("time", np.full(profiles, 800.0)),
+            "quality_flag": (dims, flags),
+            "rays": ("time", np.full(profiles, angles.size, np.int32)),
+            "shots": ("time", np.full(profiles, 6000, np.int32)),
+        },
+        coords={
+            **times,
+            **pointing,
+            "ray": ("ray", np.arange(angles.size, dtype=np.int32)),
+            "altitude": ("altitude", STATION.altitude + 60.0 * np.arange(1, levels + 1)),
+        },
+        attrs={"steps": "joint: extinction is wanted"},
+    )
+
+
 MAKERS = {
     ProductKind.SIGNAL: signal,
     ProductKind.HOMOGENEOUS: homogeneous,
     ProductKind.ELASTIC: elastic,
+    ProductKind.MULTIANGLE: multiangle,
 }

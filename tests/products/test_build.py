@@ -14,7 +14,15 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from made_products import MAKERS, STATION, context, homogeneous, provenance, signal
+from made_products import (
+    MAKERS,
+    STATION,
+    context,
+    homogeneous,
+    multiangle,
+    provenance,
+    signal,
+)
 
 from lidarops.campaign import Metadata, Station
 from lidarops.errors import ProductError
@@ -23,6 +31,7 @@ from lidarops.products.build import bitround, build, product_path
 from lidarops.products.discovery import _duration
 from lidarops.products.table import LAYOUTS
 from lidarops.records import DetectionMode, ProductKind
+from lidarops.retrieve import labeled_multiangle
 
 KINDS = list(ProductKind)
 
@@ -87,11 +96,24 @@ def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
         for listed in variable.attrs.get("coordinates", "").split():
             assert set(product[listed].dims) <= set(variable.dims), (name, listed)
         assert "station" not in variable.attrs.get("coordinates", "").split()
-    main = "signal" if kind is ProductKind.SIGNAL else "extinction"
-    assert {"altitude", "zenith_angle", "azimuth", "wavelength"} <= set(
-        product[main].attrs["coordinates"].split()
-    )
-    assert "altitude" not in product["shots"].attrs["coordinates"].split()
+    main, beam = {
+        ProductKind.SIGNAL: ("signal", {"altitude", "zenith_angle", "azimuth"}),
+        ProductKind.MULTIANGLE: ("residual", {"ray_zenith_angle", "ray_azimuth"}),
+    }.get(kind, ("extinction", {"altitude", "zenith_angle", "azimuth"}))
+    assert beam | {"wavelength"} <= set(product[main].attrs["coordinates"].split())
+    assert not beam & set(product["shots"].attrs["coordinates"].split()) - {
+        "zenith_angle",
+        "azimuth",
+    }
+
+
+def test_no_variable_of_three_dimensions_names_a_place_which_cdo_could_not_read():
+    product = build(multiangle(), context(ProductKind.MULTIANGLE))
+    for row in LAYOUTS[ProductKind.MULTIANGLE].variables:
+        listed = set(product[row.name].attrs["coordinates"].split())
+        assert listed & {"latitude", "longitude"} == (
+            {"latitude", "longitude"} if len(row.dims) < 3 else set()
+        )
 
 
 def test_range_limits_are_half_way_between_centres():
@@ -122,7 +144,7 @@ def test_altitude_is_that_of_a_straight_beam(zenith, altitude, start, width):
     assert (product["station"].attrs.get("cf_role") == "timeseries_id") == vertical
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not ProductKind.MULTIANGLE])
 def test_a_moving_beam_gives_altitudes_over_time(kind: ProductKind):
     zenith = [0.0, 30.0, 60.0, 30.0, 90.0]
     product = decoded(MAKERS[kind](zenith=zenith), kind)
@@ -184,6 +206,7 @@ def test_dates_are_those_of_data_or_release_or_environment(monkeypatch: pytest.M
         (ProductKind.HOMOGENEOUS, ["read", "homogeneous"]),
         (ProductKind.SIGNAL, ["read", "background"]),
         (ProductKind.ELASTIC, ["read", "elastic"]),
+        (ProductKind.MULTIANGLE, ["read", "background", "multiangle"]),
     ],
 )
 def test_history_tells_what_made_this_product_one_line_a_step(kind: ProductKind, steps: list[str]):
@@ -281,7 +304,7 @@ def test_every_missing_variable_is_named(kind: ProductKind):
         (put("extinction_standard_error", math.inf, (1, 1)), "extinction_standard_error", "bit"),
         (put("extinction_standard_error", -1.0, (1, 1)), "extinction_standard_error", "range"),
         (put("reduced_chi2", -0.1, (1, 1)), "reduced_chi2", "valid range"),
-        (put("quality_flag", 1 << 20, (0, 0)), "quality_flag", "unknown bits 0x100000"),
+        (put("quality_flag", 1 << 20, (0, 0)), "quality_flag", "no_leverage"),
         (put("quality_flag", -1, (0, 0)), "quality_flag", "unknown bits"),
         (put("quality_flag", 0.5, (0, 0)), "quality_flag", "whole numbers"),
         (put("valid_bins", math.nan, (0, 0)), "valid_bins", "whole numbers"),
@@ -322,6 +345,55 @@ def test_bad_signals_are_refused(change, field, problem):
     with pytest.raises(ProductError, match=problem) as caught:
         build(change(signal()), context(ProductKind.SIGNAL))
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "problem"),
+    [
+        (put("altitude", 53.5, (0,)), "altitude", "station"),
+        (put("altitude", math.nan, (3,)), "altitude", "finite"),
+        (lambda data: data.isel(altitude=slice(None, None, -1)), "altitude", "rise"),
+        (put("ray_zenith_angle", -30.0, (1,)), "ray_zenith_angle", "valid range"),
+        (put("ray_zenith_angle", math.nan, (1,)), "ray_zenith_angle", "finite"),
+        (put("ray", 0.5, (0,)), "ray", "whole numbers"),
+        (put("optical_depth", math.nan, (2, 2)), None, ""),
+        (put("quality_flag", int(Quality.CLOUD), (0, 0)), "quality_flag", "cloud"),
+        (put("extinction_gradient_error", -1.0, (1, 1)), "extinction_gradient_error", "range"),
+        (lambda data: data.assign_coords(zenith_angle=0.0), None, ""),
+    ],
+)
+def test_bad_scans_are_refused(change, field, problem):
+    data = change(multiangle())
+    if field is None:
+        # A missing value with a bit, and coordinates that the kind does not have, do no harm.
+        assert "zenith_angle" not in build(data, context(ProductKind.MULTIANGLE))
+        return
+    with pytest.raises(ProductError, match=problem) as caught:
+        build(data, context(ProductKind.MULTIANGLE))
+    assert caught.value.field == field
+
+
+def test_a_missing_optical_depth_without_a_bit_is_refused():
+    data = multiangle()
+    data["quality_flag"][2] = 0
+    with pytest.raises(ProductError, match="carry no quality bit"):
+        build(put("optical_depth", math.nan, (2, 2))(data), context(ProductKind.MULTIANGLE))
+
+
+def test_layers_of_a_scan_reach_from_the_station_upwards():
+    product = build(multiangle(levels=4), context(ProductKind.MULTIANGLE))
+    assert product["altitude"].attrs["axis"] == "Z"
+    assert product["altitude"].attrs["bounds"] == "altitude_bnds"
+    tops = STATION.altitude + 60.0 * np.arange(5)
+    np.testing.assert_array_equal(product["altitude_bnds"], np.stack([tops[:-1], tops[1:]], -1))
+    assert product.attrs["geospatial_vertical_resolution"] == "60 m"
+    assert "featureType" not in product.attrs
+
+
+def test_a_product_tells_the_steps_of_its_retrieval():
+    product = build(multiangle(), context(ProductKind.MULTIANGLE))
+    assert product.attrs["lidarops_steps"] == "joint: extinction is wanted"
+    assert "lidarops_steps" not in build(homogeneous(), context()).attrs
 
 
 def test_a_bin_alone_may_bring_its_limits():
@@ -424,3 +496,36 @@ def test_the_window_is_told_in_utc():
     start = datetime(2026, 3, 1, tzinfo=UTC)
     attrs = build(homogeneous(), context(start=start, stop=start + timedelta(hours=6))).attrs
     assert attrs["lidarops_window_end"] == "2026-03-01T06:00:00Z"
+
+
+def test_a_scan_goes_from_profiles_to_a_product():
+    zenith = np.tile([0.0, 30.0, 50.0, 60.0], 3)
+    distance = 15.0 * (np.arange(400) + 0.5)
+    power = 1e7 * np.exp(-distance / 2e4) / distance**2 + 3.0
+    noise = np.random.default_rng(1).normal(0.0, 0.05, (12, 400))
+    starts = np.datetime64("2026-03-01T10:00:00", "ns") + np.arange(12) * np.timedelta64(60, "s")
+    ends = starts + np.timedelta64(60, "s")
+    dims = ("time", "range")
+    found = labeled_multiangle.scan(
+        xr.Dataset(
+            {
+                "power": (dims, power + noise),
+                "variance": (dims, np.full(noise.shape, 0.05**2)),
+                "quality": (dims, np.zeros(noise.shape, np.int32)),
+            },
+            coords={"range": distance},
+        ),
+        zenith_angle=zenith,
+        azimuth=np.full(12, 90.0),
+        time=starts + (ends - starts) // 2,
+        time_bnds=np.stack([starts, ends], axis=-1),
+        shots=np.full(12, 600),
+        altitude_grid=STATION.altitude + 60.0 * np.arange(1, 60),
+        station_altitude=STATION.altitude,
+        background=labeled_multiangle.Background((5400.0, 6000.0)),
+    )
+    product = decoded(found, ProductKind.MULTIANGLE)
+    assert {"time": 3, "altitude": 59, "ray": 4}.items() <= product.sizes.items()
+    np.testing.assert_array_equal(product["quality_flag"], found["quality_flag"])
+    np.testing.assert_allclose(product["ray_azimuth"], 90.0)
+    assert "joint" in product.attrs["lidarops_steps"]

@@ -117,3 +117,25 @@ def test_ncdump_reads_the_header(tmp_path: Path):
     assert "time = UNLIMITED ; // (5 currently)" in header
     assert "float signal(time, range) ;" in header
     assert STATION.name in header
+
+
+@pytest.mark.skipif(shutil.which("cdo") is None, reason="cdo is not installed")
+@pytest.mark.parametrize("kind", list(ProductKind))
+def test_cdo_takes_means_over_time(kind: ProductKind, tmp_path: Path):
+    path, mean = tmp_path / "product.nc", tmp_path / "mean.nc"
+    data = MAKERS[kind]()
+    write(build(data, context(kind)), path)
+    names = [
+        row.name
+        for row in LAYOUTS[kind].variables
+        if row.dtype == "f4" and row.dims[:1] == ("time",) and row.name in data
+    ]
+    subprocess.run(
+        ["cdo", "-s", "timmean", f"-selname,{','.join(names)}", str(path), str(mean)], check=True
+    )
+    with xr.open_dataset(path) as product, xr.open_dataset(mean) as found:
+        for name in names:
+            expected = product[name].astype(float).mean("time")
+            np.testing.assert_allclose(
+                np.squeeze(found[name].to_numpy()), np.squeeze(expected), rtol=1e-5, err_msg=name
+            )

@@ -95,6 +95,20 @@ def test_what_has_no_standard_name_is_what_the_table_does_not_know():
             "profiles",
             *gluing,
         },
+        ProductKind.MULTIANGLE: {
+            *(
+                f"{quantity}{error}"
+                for quantity in ("optical_depth", "extinction")
+                for error in ("", "_standard_error", "_gradient_error")
+            ),
+            "log_intercept",
+            "log_intercept_standard_error",
+            "data_share",
+            "inhomogeneity",
+            "residual",
+            "effective_degrees_of_freedom",
+            "reach",
+        },
         ProductKind.HOMOGENEOUS: {
             "extinction",
             "extinction_standard_error",
