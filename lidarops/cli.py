@@ -265,7 +265,9 @@ def bench(
     files: Annotated[
         list[Path] | None, typer.Argument(help="Raw files of one layout, for the case reader.")
     ] = None,
-    case: Annotated[str | None, typer.Option(help="elastic, homogeneous or reader.")] = None,
+    case: Annotated[
+        str | None, typer.Option(help="elastic, homogeneous, multiangle, multiposition or reader.")
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(help="Folder of the EARLINET elastic intercomparison, for the case elastic."),

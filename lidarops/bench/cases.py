@@ -7,7 +7,16 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final, TypeVar
 
-from lidarops.bench import accuracy, elastic, multiposition, results, speed, story, throughput
+from lidarops.bench import (
+    accuracy,
+    elastic,
+    multiangle,
+    multiposition,
+    results,
+    speed,
+    story,
+    throughput,
+)
 from lidarops.bench.terms import RESULT, Effort, Finding, Kind
 from lidarops.bench.timing import machine
 from lidarops.errors import CampaignError
@@ -23,6 +32,7 @@ class Case(StrEnum):
 
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
+    MULTIANGLE = "multiangle"
     MULTIPOSITION = "multiposition"
     READER = "reader"
 
@@ -40,7 +50,7 @@ def run(
     Parameters
     ----------
     what : {"accuracy", "throughput"}
-    case : {"elastic", "homogeneous", "multiposition", "reader"} or None
+    case : Case or str, optional
         None is "reader" where files are given, else "homogeneous".
     files : sequence of Path
         Raw files of one layout, for "reader" and no other.
@@ -65,6 +75,8 @@ def run(
         raise CampaignError(
             "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
         )
+    if chosen is Case.MULTIANGLE:
+        return multiangle.run(kind, effort=effort)
     if chosen is Case.MULTIPOSITION:
         return multiposition.run(kind, effort=effort)
     if chosen is Case.ELASTIC:
