@@ -33,6 +33,10 @@ _SCALE: Final[Mapping[str, Mapping[str, float]]] = {
 }
 _FULL: Final = 0.95
 """Overlap that counts as full."""
+_SHORTEST: Final = 30.0
+"""m, at which no overlap is complete yet."""
+_WIDEST: Final = 5000.0
+"""m between levels of a sounding, below 20 km: temperature is no straight line over more."""
 _ZERO_CELSIUS: Final = 273.15
 _LARGEST: Final = 100_000_000
 """Bytes; a profile is small."""
@@ -124,6 +128,15 @@ def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
     except RetrievalInputError as error:
         problem, field, remedy = error.problem, error.field, error.remedy
         raise AncillaryError(problem, file=name, field=field, remedy=remedy) from error
+    low = profile.altitude[:-1] < 20_000.0
+    widest = float(np.max(np.diff(profile.altitude)[low], initial=0.0))
+    if widest > _WIDEST:
+        raise AncillaryError(
+            f"has levels {widest:g} m apart",
+            file=name,
+            field="altitude",
+            remedy=f"give levels at most {_WIDEST:g} m apart",
+        )
     return profile, hashlib.sha256(content).hexdigest()
 
 
@@ -159,6 +172,13 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
             file=name,
             field="overlap",
             remedy="give shares above 0 and at most 1; leave out ranges without overlap",
+        )
+    if ranges[-1] < _SHORTEST:
+        raise AncillaryError(
+            f"ends at {ranges[-1]:g} m",
+            file=name,
+            field="range",
+            remedy="this looks like km: give m",
         )
     if overlap[-1] < _FULL:
         raise AncillaryError(

@@ -101,7 +101,7 @@ class ChannelFacts(_Model):
     lag: Annotated[float, Field(ge=-100, le=100)] | Literal["estimate"] | None = Field(
         default=None,
         description="bins by which an analog record lies farther than the photon counting one"
-        " of the same light, or 'estimate'",
+        " of the same light, besides range_offset; or 'estimate', for joined channels",
     )
 
 

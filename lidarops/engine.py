@@ -443,6 +443,7 @@ def _record(
         values=int(flags.size),
         flagged={str(bit.name): int(np.count_nonzero(flags & np.int32(bit))) for bit in occurring},
         unflagged=flags.size - int(np.count_nonzero(flags)),
+        usable=flags.size - int(np.count_nonzero(flags & np.int32(Quality.rejecting()))),
     )
 
 

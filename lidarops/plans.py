@@ -278,11 +278,7 @@ def _asked(case: _Case) -> Iterator[str]:
 def _conditioning(case: _Case) -> Iterator[Step | LeftOut]:
     photon = case.channel.mode is DetectionMode.PHOTON
     yield _overlap_rule(case)
-    if case.known.range_offset:
-        reason = "given by the campaign"
-        yield case.step(StepName.RANGE_OFFSET, reason, range_offset=case.known.range_offset)
-    else:
-        yield case.without(StepName.RANGE_OFFSET, "the campaign gives no range_offset")
+    yield _range_rule(case)
     yield _dark_rule(case)
     if not photon:
         yield case.without(StepName.DEAD_TIME, "analog detection has no dead time")
@@ -314,6 +310,26 @@ def _overlap_rule(case: _Case) -> Step | LeftOut:
     if full > 0:
         return case.step(StepName.OVERLAP, reason, full_overlap_range=full)
     return case.without(StepName.OVERLAP, "the campaign gives no full_overlap_range")
+
+
+def _range_rule(case: _Case) -> Step | LeftOut:
+    offset = range_offset(case.channel, case.facts)
+    if offset:
+        reason = "given by the campaign"
+        if isinstance(case.known.lag, float):
+            reason += f", with the lag of {case.known.lag:g} bins"
+        return case.step(StepName.RANGE_OFFSET, reason, range_offset=offset)
+    if case.known.lag == "estimate":
+        reason = "a lag that is estimated moves joined channels only"
+        return case.without(StepName.RANGE_OFFSET, reason)
+    return case.without(StepName.RANGE_OFFSET, "the campaign gives no range_offset")
+
+
+def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
+    """Return what is added to the ranges of a channel, m: what is told, less a lag that is told."""
+    known = channel_facts(facts, channel.name)
+    late = known.lag * channel.bin_width if isinstance(known.lag, float) else 0.0
+    return (known.range_offset or 0.0) - late
 
 
 def _dark_rule(case: _Case) -> Step | LeftOut:
@@ -384,7 +400,8 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     window = settings.reference
     # Windows are sought among the middles of bins.
-    offset = channel_facts(case.facts, _ranged_by(case.channel.name)).range_offset or 0.0
+    ranged_by = replace(case.channel, name=_ranged_by(case.channel.name))
+    offset = range_offset(ranged_by, case.facts)
     reach = last - 0.5 * case.channel.bin_width + offset
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):

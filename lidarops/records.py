@@ -211,6 +211,8 @@ class ProductRecord:
     """Quality bit name -> number of values that carry it."""
     unflagged: int
     """Number of values that carry no bit."""
+    usable: int | None = None
+    """Number of values that no bit rejects; None where it was not counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +233,13 @@ class SceneOutcome:
     """Why the scene gave no product; empty when it did."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time by stage."""
+
+    @property
+    def empty(self) -> bool:
+        """Whether every value of every ``elastic`` and ``multiangle`` product is rejected."""
+        kinds = (ProductKind.ELASTIC, ProductKind.MULTIANGLE)
+        retrieved = [product for product in self.products if product.kind in kinds]
+        return bool(retrieved) and all(product.usable == 0 for product in retrieved)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,5 +263,7 @@ class RunRecord:
 
     @property
     def failed(self) -> bool:
-        """Whether anything was refused or failed."""
-        return bool(self.refused) or any(scene.error or scene.refused for scene in self.scenes)
+        """Whether anything was refused or failed, or a scene's retrievals left nothing to use."""
+        return bool(self.refused) or any(
+            scene.error or scene.refused or scene.empty for scene in self.scenes
+        )

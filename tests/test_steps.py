@@ -411,7 +411,7 @@ def _glued(raw: xr.Dataset, **analog: object) -> xr.Dataset:
         (6, {"lag": 6}),
         (6, {"range_offset": -45.0}),
         (-4, {"range_offset": 30.0}),
-        (6, {"lag": 6, "range_offset": -45.0}),
+        (6, {"lag": 4, "range_offset": -15.0}),
         (0, {}),
         (0, {"lag": "estimate"}),
     ],

@@ -76,6 +76,7 @@ _SIGNAL = Layout(
             | Quality.SATURATED
             | Quality.PILE_UP
             | Quality.INCOMPLETE_OVERLAP
+            | Quality.BACKGROUND_UNCERTAIN
             | Quality.NO_GLUING,
         ),
         shots(of="the profile"),

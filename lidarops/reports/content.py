@@ -112,8 +112,8 @@ def verdict(record: RunRecord) -> str:
     if not record.scenes:
         tail = f" {counted(refused, 'granule')} refused." if refused else ""
         return f"There was no scene to process.{tail}"
-    empty = sum(not p.unflagged for scene in record.scenes for p in scene.products)
-    tail = f" {counted(empty, 'product')} without an unflagged value." if empty else ""
+    empty = sum(p.usable == 0 for scene in record.scenes for p in scene.products)
+    tail = f" {counted(empty, 'product')} without a value to use." if empty else ""
     if not failed and not refused:
         return f"Every scene was processed and no granule was refused.{tail}"
     parts = [f"{counted(failed, 'scene')} failed"] if failed else []

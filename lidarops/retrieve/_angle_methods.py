@@ -75,6 +75,9 @@ def solve_block(
     steps.append((method, True, why))
     part = _METHODS[method](rays, fit, prior, settings)
     _raise_common_flags(part, rays, fit)
+    if method in _BLIND:
+        # These fit no gradient, whatever sides the rays lead to.
+        part.flags["one_sided"] |= np.isfinite(part.optical_depth)
     return part, steps
 
 
@@ -355,6 +358,8 @@ def _regularised(
     return part
 
 
+_BLIND: Final = ("two_angle", "mld", "mld_prior")
+"""Methods that see no horizontal gradient."""
 _METHODS: Final[dict[str, Callable[[Rays, Regression, Array | None, Settings], Profiles]]] = {
     "two_angle": _two_angle,
     "kano_hamilton": _kano_hamilton,

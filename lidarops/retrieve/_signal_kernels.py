@@ -245,9 +245,9 @@ def _means(x: Array, y: Array, weight: Array) -> tuple[float, float]:
 
 @_summing
 def _moments(
-    x: Array, y: Array, weight: Array, x_mean: float, y_mean: float
-) -> tuple[float, float, float, float]:
-    square = product = from_zero = through = 0.0
+    x: Array, y: Array, weight: Array, x_mean: float, y_mean: float, floor: float
+) -> tuple[float, float, float, float, float]:
+    square = product = from_zero = from_floor = through = 0.0
     for i in range(weight.size):
         w = weight[i]
         value = x[i] if w > 0.0 else 0.0
@@ -255,23 +255,36 @@ def _moments(
         square += w * distance * distance
         product += w * distance * (y[i] - y_mean)
         from_zero += w * value * value
-        through += w * value * y[i]
-    return square, product, from_zero, through
+        above = value - floor if w > 0.0 else 0.0
+        from_floor += w * above * above
+        through += w * above * y[i]
+    return square, product, from_zero, from_floor, through
 
 
 @_compiled
-def _line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
-    """Return intercept and slope of y over x, neither below zero; NaN without weights."""
+def _floor(x: Array, weight: Array) -> float:
+    """Return the least x that has a weight."""
+    lowest = math.inf
+    for i in range(x.size):
+        if weight[i] > 0.0 and x[i] < lowest:
+            lowest = x[i]
+    return lowest
+
+
+@_compiled
+def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float]:
+    """Return y at the floor of x and its slope, neither below zero; NaN without weights."""
     x_mean, y_mean = _means(x, y, weight)
-    square, product, from_zero, through = _moments(x, y, weight, x_mean, y_mean)
+    moments = _moments(x, y, weight, x_mean, y_mean, floor)
+    square, product, from_zero, from_floor, through = moments
     slope = product / square
     if not (slope > 0.0) & (square > _FLAT * _FLAT * from_zero):
         slope = 0.0
-    intercept = y_mean - slope * x_mean
-    if intercept < 0.0:
-        # Through the origin, where the fit would have the noise vanish above zero light.
-        return 0.0, through / from_zero
-    return intercept, slope
+    lowest = y_mean - slope * (x_mean - floor)
+    if lowest < 0.0:
+        # From the floor up, where the fit would have the noise vanish above it.
+        return 0.0, through / from_floor
+    return lowest, slope
 
 
 @_compiled
@@ -281,10 +294,12 @@ def _estimate(power: Array, noise: Noise, least: float, s: Scratch, out: Array) 
     complete = _load_squares(power, s.sums)
     _averages(s.sums, noise.wide, complete, s.local)
     _weigh(s, noise.leak)
-    a, b = _line(s.mean, s.sums.values[: power.size], s.weight)
+    # Light is what exceeds the lowest level: an offset of the electronics makes no noise.
+    floor = _floor(s.mean, s.weight)
+    a, b = _line(s.mean, s.sums.values[: power.size], s.weight, floor)
     for i in range(power.size):
-        mean = s.mean[i]
-        variance = a + b * (0.0 if mean < 0.0 else mean)
+        light = s.mean[i] - floor
+        variance = a + b * (0.0 if light < 0.0 else light)
         # Too few differences for a line, or a signal without noise: what there is, locally.
         variance = variance if (variance > 0.0) & (variance < math.inf) else s.local[i]
         out[i] = least if variance < least else variance

@@ -32,6 +32,10 @@ _OF_SIGNAL: Final[list[np.dtype[Any]]] = [
     np.dtype(np.float64),
     np.dtype(np.float64),
 ]
+_FEWEST: Final = 8
+"""Bins before the tail that tell whether the signal still falls."""
+_FALLS: Final = 4.0
+"""Standard errors by which it then exceeds the tail."""
 _AT_ONCE: Final = 64
 """Profiles that are worked on together: their arrays stay in the cache."""
 
@@ -145,7 +149,8 @@ def corrected(conditioned: xr.Dataset, background_range: tuple[float, float]) ->
     xr.Dataset
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
         over (time, range), ``background`` and ``background_standard_error`` over time.
-        INPUT_MISSING where there is no background.
+        INPUT_MISSING where there is no background, BACKGROUND_UNCERTAIN where the bins before
+        those are brighter by 4 standard errors: signal is left in them.
     """
     parts = xr.apply_ufunc(
         _corrected,
@@ -324,6 +329,8 @@ def _corrected(
         dtype=np.float32,
     )
     lost = np.where(np.isnan(tail.background), np.int32(Quality.INPUT_MISSING), np.int32(0))
+    falling = _still_falls(power, variance, range, background_range, tail)
+    lost |= np.where(falling, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     # The noise is far above the 24 bits of float32, and a day of profiles fits in memory.
     return (
         result.power,
@@ -332,6 +339,28 @@ def _corrected(
         tail.background,
         tail.background_standard_error,
     )
+
+
+def _still_falls(
+    power: _Block,
+    variance: _Block,
+    range: _Block,  # noqa: A002
+    background_range: tuple[float, float],
+    tail: background.BackgroundResult,
+) -> _Block:
+    """Return which profiles are brighter in the bins before the tail, as far as it is long."""
+    start, stop = background_range
+    first, past = np.searchsorted(range, (2.0 * start - stop, start))
+    if past - first < _FEWEST:
+        return np.zeros(power.shape[:-1], dtype=bool)
+    near = slice(first, past)
+    before = background.tail_mean(
+        power[..., near], range[near], start=float(range[first]), variance=variance[..., near]
+    )
+    error = np.hypot(before.background_standard_error, tail.background_standard_error)
+    with np.errstate(invalid="ignore"):
+        falls: _Block = before.background - tail.background > _FALLS * error
+    return falls
 
 
 def _signals(

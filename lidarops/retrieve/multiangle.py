@@ -273,6 +273,12 @@ def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], gates: int) -
     if values is None:
         return None
     prior = _inputs.real_array(values, "prior_optical_depth").astype(np.float64, copy=False)
+    if not np.all(np.isfinite(prior)):
+        raise RetrievalInputError(
+            "holds values that are not finite",
+            field="prior_optical_depth",
+            remedy="give a value for every altitude",
+        )
     try:
         return np.broadcast_to(prior, (*leading, gates)).reshape(-1, gates)
     except ValueError:

@@ -138,7 +138,11 @@ def analog(
     top = fired * (2.0**adc_bits - 1.0)
     if noise_variance is None:
         variance = _estimated_variance(power, grid, rounding)
-        _flag_clipped(power, quality, _Scale(summed, step, top, fired), variance)
+        again = _flag_clipped(power, quality, _Scale(summed, step, top, fired), variance)
+        if again.size:
+            # Clipped bins are less noisy than others, and have drawn the estimate down.
+            rows = _rows(power)[again]
+            _rows(variance)[again] = _estimated_variance(rows, grid, rounding[again])
         return Signal(power, variance, quality)
     _refuse_unless(
         0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2"
@@ -162,8 +166,16 @@ class _Scale(NamedTuple):
     """(profile,)"""
 
 
-def _flag_clipped(power: Array, quality: Flags, scale: _Scale, variance: Array) -> None:
-    """Mark the bins of which some shots reached full scale though their mean did not."""
+def _flag_clipped(
+    power: Array, quality: Flags, scale: _Scale, variance: Array
+) -> npt.NDArray[np.intp]:
+    """Mark the bins of which some shots reached full scale though their mean did not.
+
+    Returns
+    -------
+    (profile,) int
+        Those with such bins.
+    """
     rows, noise = _rows(scale.counts), _rows(variance)
     fired = (scale.shots > 0)[:, np.newaxis]
     profile, bins = np.nonzero(fired & (rows > NEAR_FULL_SCALE * scale.top[:, np.newaxis]))
@@ -173,6 +185,7 @@ def _flag_clipped(power: Array, quality: Flags, scale: _Scale, variance: Array) 
     where = profile[clipped], bins[clipped]
     _rows(power)[where] = np.nan
     _rows(quality)[where] |= np.int32(Quality.SATURATED)
+    return np.unique(where[0])
 
 
 def photon(
@@ -433,14 +446,15 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
 
     Electronic noise is constant and shot noise follows the light, so that
 
-    .. math:: v(R) = a + b \, \overline{P}(R), \qquad
+    .. math:: v(R) = a + b \, (\overline{P}(R) - \overline{P}_{min}), \qquad
               \left\langle \frac{(P_{i-1} - 3 P_i + 3 P_{i+1} - P_{i+2})^2}{20} \right\rangle
-              = a + b \, \overline{P}_i
+              = v(R_i)
 
-    is fitted by weighted least squares with :math:`a, b \ge 0`, one pair a profile: weights made
-    of two well-determined numbers do not follow the noise of the single bin. Exact for noise
-    that is white along range; noise that is correlated from bin to bin is underestimated. Bins
-    so near that the fall of the signal itself would be taken for noise are left out of the fit.
+    over the lowest level (an offset of the electronics makes no noise) is fitted by weighted
+    least squares with :math:`a, b \ge 0`, one pair a profile: weights made of two
+    well-determined numbers do not follow the noise of the single bin. Exact for noise that is
+    white along range; noise that is correlated from bin to bin is underestimated. Bins so near
+    that the fall of the signal itself would be taken for noise are left out of the fit.
 
     Parameters
     ----------

@@ -47,6 +47,10 @@ def analog(
         clipped &= counts > signal.NEAR_FULL_SCALE * top
     power[clipped] = np.nan
     quality[clipped] |= np.int32(Quality.SATURATED)
+    if noise_variance is None:
+        again = clipped.any(axis=-1)
+        second = np.maximum(difference_variance(power, range), step**2 / 12.0)
+        variance[again] = second[again]
     return Signal(power, variance, quality)
 
 
@@ -115,12 +119,15 @@ def difference_variance(power, range):  # noqa: A002
         usable &= leak < signal.LEAK * local
         weight = np.where(usable, 1.0 / local**2, 0.0)
         weight /= np.max(weight, axis=-1, keepdims=True)
-        a, b = line(np.where(usable, mean, 0.0), np.where(usable, squares, 0.0), weight)
-        variance = a + b * np.maximum(mean, 0.0)
+        weighty = usable & (weight > 0.0)
+        floor = np.min(np.where(weighty, mean, np.inf), axis=-1, keepdims=True)
+        x, y = np.where(weighty, mean, 0.0), np.where(weighty, squares, 0.0)
+        a, b = line(x, y, weight, floor)
+        variance = a + b * np.maximum(mean - floor, 0.0)
     return np.where(np.isfinite(variance) & (variance > 0), variance, local)
 
 
-def line(x, y, weight):
+def line(x, y, weight, floor):
     total = weight.sum(axis=-1, keepdims=True)
     x_mean = (weight * x).sum(axis=-1, keepdims=True) / total
     y_mean = (weight * y).sum(axis=-1, keepdims=True) / total
@@ -130,7 +137,9 @@ def line(x, y, weight):
     x_square = (weight * x**2).sum(axis=-1, keepdims=True)
     # Values of x that differ by rounding alone tell no slope.
     slope = np.where((slope > 0) & (square > 1e-24 * x_square), slope, 0.0)
-    intercept = y_mean - slope * x_mean
-    through = (weight * x * y).sum(axis=-1, keepdims=True) / x_square
-    negative = intercept < 0
-    return np.where(negative, 0.0, intercept), np.where(negative, through, slope)
+    lowest = y_mean - slope * (x_mean - floor)
+    above = np.where(weight > 0.0, x - floor, 0.0)
+    through = (weight * above * y).sum(axis=-1, keepdims=True)
+    through /= (weight * above**2).sum(axis=-1, keepdims=True)
+    negative = lowest < 0
+    return np.where(negative, 0.0, lowest), np.where(negative, through, slope)

@@ -446,3 +446,18 @@ def test_what_cannot_be_right_is_refused(field, call) -> None:
 def test_shapes_that_do_not_fit_are_named() -> None:
     with pytest.raises(RetrievalInputError, match="counts"):
         signal.photon(np.zeros((1, 399), np.int32), SHOTS, RANGE, bin_width=7.5)
+
+
+@pytest.mark.parametrize("offset", [-40.0, 0.0, 3.0, 40.0])
+def test_an_offset_of_the_electronics_makes_no_noise(offset):
+    """Shot noise follows the light and not the voltage, whatever the zero is."""
+    rng = np.random.default_rng(5)
+    distance = 7.5 * np.arange(20, 4020)
+    light = 60.0 * (1500.0 / distance) ** 2 + 0.02
+    variance = 1e-4 + 2e-3 * light
+    power = light + offset + rng.normal(0.0, np.sqrt(variance), (20, distance.size))
+    found = signal.difference_variance(power, distance)
+    for low, high in ((1000, 2000), (3000, 5000), (8000, 12_000), (20_000, 28_000)):
+        part = (distance > low) & (distance < high)
+        ratio = np.mean(found[:, part] / variance[part])
+        assert 0.93 < ratio < 1.07
