@@ -25,8 +25,9 @@ from prefect.artifacts import (
 from prefect.utilities.annotations import quote
 
 from lidarops.campaign import Campaign, load
-from lidarops.engine import Job, conclude, make_jobs, process_all
+from lidarops.engine import conclude, make_jobs, process_all
 from lidarops.pipeline import prepare, report_run
+from lidarops.processing import Job
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import page
 from lidarops.scenes import Cut

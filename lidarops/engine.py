@@ -1,50 +1,25 @@
-"""Run scenes: open -> plan -> retrieve -> build -> write, serially or on a dask cluster.
+"""Run many scenes, serially or on a dask cluster.
 
-A scene is the unit of work: it becomes its product files or a stated failure, and nothing that
-happens to one scene stops the others.
+Nothing that happens to one scene stops the others.
 """
 
 from __future__ import annotations
 
-import hashlib
 import secrets
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import dask.config
-import numpy as np
-import xarray as xr
-
-from lidarops import __version__, steps
-from lidarops.ancillary import Ancillaries
-from lidarops.campaign import Campaign, InstrumentFacts, as_settings
+from lidarops import __version__
+from lidarops.campaign import Campaign
 from lidarops.catalog.store import Store
-from lidarops.errors import LidarOpsError, SceneError
-from lidarops.flags import Quality
-from lidarops.plans import StepName, glued_channels, plan
-from lidarops.products import build, provenance, write
-from lidarops.raw import licel
-from lidarops.raw.archive import open_archive
+from lidarops.plans import plan
+from lidarops.processing import Job, failed, process
 from lidarops.records import (
-    ChannelLayout,
-    DetectionMode,
-    Granule,
-    InputRecord,
-    Plan,
-    ProductKind,
-    ProductRecord,
-    Provenance,
     RunRecord,
-    Scene,
     SceneOutcome,
     Status,
-    Step,
 )
 from lidarops.scenes import Cut
 
@@ -52,34 +27,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
 Progress = Callable[[SceneOutcome], None]
-
-# What broken data, a broken disk or a broken library can raise; a bug in lidarops itself that
-# raises anything else must be seen, not entered in a report.
-_FAILURES = (
-    LidarOpsError,
-    OSError,
-    ValueError,
-    ArithmeticError,
-    LookupError,
-    RuntimeError,
-    MemoryError,
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """Everything that a worker needs to process one scene."""
-
-    campaign: Campaign
-    scene: Scene
-    plan: Plan
-    profiles_per_chunk: int | None = None
-
-    @property
-    def facts(self) -> InstrumentFacts:
-        """What is known of the instrument at the time of the scene."""
-        instrument = self.campaign.instruments[self.scene.instrument]
-        return instrument.facts_at(self.scene.granules[0].start or self.scene.start)
 
 
 def run(
@@ -221,259 +168,5 @@ def _distributed(jobs: Sequence[Job], client: Client) -> Iterator[SceneOutcome]:
         if error is None:
             yield future.result()
         else:
-            yield _failed(job, f"the worker failed: {error!r}")
+            yield failed(job, f"the worker failed: {error!r}")
         future.release()
-
-
-def process(job: Job) -> SceneOutcome:
-    """Process one scene: its products, or why there are none.
-
-    Parameters
-    ----------
-    job : Job
-
-    Returns
-    -------
-    SceneOutcome
-        Never raises for bad data or a bad disk; the outcome tells.
-    """
-    try:
-        with _Archive.of(job.campaign.archive).local(job.scene) as root:
-            return _process(job, root)
-    except _FAILURES as error:
-        text = str(error) if isinstance(error, LidarOpsError | OSError) else repr(error)
-        return _failed(job, text)
-
-
-def _failed(job: Job, error: str) -> SceneOutcome:
-    scene = job.scene
-    return SceneOutcome(
-        scene=scene.id,
-        station=scene.station,
-        instrument=scene.instrument,
-        start=scene.start,
-        granules=len(scene.granules),
-        plan=job.plan,
-        error=error,
-    )
-
-
-def _process(job: Job, root: Path) -> SceneOutcome:
-    clock = _Clock()
-    usable, inputs, refused = _digest(job.scene, root)
-    clock.lap("digest")
-    failed = replace(_failed(job, ""), refused=refused, inputs=inputs)
-    wanted = [step for step in job.plan.steps if step.name in tuple(ProductKind)]
-    if not wanted:
-        reasons = {left.reason for left in job.plan.left_out}
-        return replace(failed, error="nothing to do: " + "; ".join(sorted(reasons)))
-    if not usable.granules:
-        return replace(failed, error="no granule of the scene can be read")
-    channels = list(dict.fromkeys(step.channel for step in wanted))
-    with dask.config.set(scheduler="synchronous"):
-        bench = _bench(job, usable, root)
-        inputs += bench.ancillaries.inputs
-        products = tuple(
-            product
-            for channel in channels
-            for product in _channel_products(job, usable, inputs, bench, channel, clock)
-        )
-    return replace(failed, products=products, inputs=inputs, seconds=clock.laps)
-
-
-class _Clock:
-    """Wall time by stage."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
-        self._last = now
-
-
-def _digest(scene: Scene, root: Path) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...]]:
-    """Read every file once: its digest, and whether it is still what the catalog says."""
-    usable: dict[str, Granule] = {}
-    inputs: list[InputRecord] = []
-    refused: list[Granule] = []
-    for granule in (*scene.granules, *scene.dark):
-        try:
-            data = (root / granule.path).read_bytes()
-            if len(data) != granule.size:
-                raise SceneError(
-                    f"holds {len(data)} bytes, the catalog says {granule.size}",
-                    remedy="run lidarops catalog again",
-                )
-            licel.parse_header(data, file=granule.path, size=len(data))
-        except (LidarOpsError, OSError) as error:
-            reason = str(error).removeprefix(f"{granule.path}: ")
-            refused.append(replace(granule, status=Status.REFUSED, reason=reason))
-        else:
-            usable[granule.path] = granule
-            inputs.append(InputRecord(granule.path, granule.role, hashlib.sha256(data).hexdigest()))
-    remaining = replace(
-        scene,
-        granules=tuple(g for g in scene.granules if g.path in usable),
-        dark=tuple(g for g in scene.dark if g.path in usable),
-    )
-    return remaining, tuple(inputs), tuple(refused)
-
-
-def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]) -> xr.Dataset:
-    archive = open_archive(
-        list(granules),
-        root=root,
-        channels=channels,
-        mask_and_scale=False,
-        profiles_per_chunk=job.profiles_per_chunk,
-        header_position="ignore",
-    )
-    # What the campaign says of the pointing wins over the headers.
-    facts = job.facts
-    told = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
-    pointed = archive.assign_coords(
-        {
-            name: xr.full_like(archive["zenith_angle"], angle)
-            for name, angle in told.items()
-            if angle is not None
-        }
-    )
-    # Coordinates are compared at every step, and a lazy one would be computed each time.
-    return pointed.assign_coords({name: array.load() for name, array in pointed.coords.items()})
-
-
-def _bench(job: Job, scene: Scene, root: Path) -> steps.Bench:
-    """Open what the steps of a scene work on: of the raw files only the channels they read."""
-    read = dict.fromkeys(step.channel for step in job.plan.steps if step.name == StepName.READ)
-    present = {channel.name for channel in scene.layout}
-    subtracted = [step.channel for step in job.plan.steps if step.name == StepName.DARK]
-    return steps.Bench(
-        plan=job.plan,
-        archive=_open(job, scene.granules, root, [name for name in read if name in present]),
-        dark=_open(job, scene.dark, root, subtracted) if subtracted and scene.dark else None,
-        ancillaries=Ancillaries.read(job.campaign.folder, job.plan),
-        station_altitude=job.campaign.stations[scene.station].altitude,
-    )
-
-
-def _channel_products(
-    job: Job,
-    scene: Scene,
-    inputs: tuple[InputRecord, ...],
-    bench: steps.Bench,
-    name: str,
-    clock: _Clock,
-) -> Iterator[ProductRecord]:
-    layout = _layout(job, scene, name)
-    computed = steps.carry_out(bench, name)
-    clock.lap("retrieve")
-    for kind, data in computed.items():
-        context = _context(job, scene, kind, layout, bench.steps(name), inputs)
-        path = build.product_path(context)
-        written = write.write(build.build(data, context), job.campaign.products_root / path)
-        clock.lap("write")
-        yield _record(kind, name, path, written, data)
-
-
-def _layout(job: Job, scene: Scene, name: str) -> ChannelLayout:
-    instrument = job.campaign.instruments[scene.instrument]
-    known = (*scene.layout, *glued_channels(scene, instrument))
-    return next(channel for channel in known if channel.name == name)
-
-
-def _context(
-    job: Job,
-    scene: Scene,
-    kind: ProductKind,
-    channel: ChannelLayout,
-    planned: Mapping[str, Step],
-    inputs: tuple[InputRecord, ...],
-) -> build.Context:
-    campaign = job.campaign
-    instrument = campaign.instruments[scene.instrument]
-    return build.Context(
-        kind=kind,
-        channel=channel.name,
-        mode=DetectionMode(channel.mode),
-        wavelength=planned[StepName.READ].settings["wavelength"],
-        station_key=scene.station,
-        station=campaign.stations[scene.station],
-        instrument_key=scene.instrument,
-        instrument_name=instrument.name or scene.instrument,
-        metadata=campaign.metadata,
-        campaign=campaign.name,
-        title=campaign.title,
-        summary=campaign.summary,
-        scene=scene.id,
-        start=scene.start,
-        stop=scene.stop,
-        provenance=Provenance(
-            campaign=campaign.name,
-            scene=scene.id,
-            kind=kind,
-            channel=channel.name,
-            inputs=inputs,
-            plan=job.plan,
-            settings={
-                "station": as_settings(campaign.stations[scene.station]),
-                "facts": as_settings(job.facts),
-                "metadata": as_settings(campaign.metadata),
-            },
-            versions=provenance.package_versions(),
-            code_version=provenance.code_version(),
-        ),
-    )
-
-
-def _record(
-    kind: ProductKind, channel: str, path: str, written: write.Written, data: xr.Dataset
-) -> ProductRecord:
-    flags = data["quality_flag"].to_numpy()
-    # Few bits occur in a product: the others need no look at every value.
-    occurring = Quality(int(np.bitwise_or.reduce(flags, axis=None)))
-    return ProductRecord(
-        path=path,
-        kind=kind,
-        channel=channel,
-        sha256=written.sha256,
-        size=written.size,
-        values=int(flags.size),
-        flagged={str(bit.name): int(np.count_nonzero(flags & np.int32(bit))) for bit in occurring},
-        unflagged=flags.size - int(np.count_nonzero(flags)),
-        usable=flags.size - int(np.count_nonzero(flags & np.int32(Quality.rejecting()))),
-    )
-
-
-class _Archive:
-    """The raw files of a scene, on a local disk."""
-
-    def __init__(self, root: str) -> None:
-        self._root = root
-
-    @staticmethod
-    def of(archive: str) -> _Archive:
-        return _RemoteArchive(archive) if "://" in archive else _Archive(archive)
-
-    @contextmanager
-    def local(self, scene: Scene) -> Iterator[Path]:  # noqa: ARG002 - the remote one needs it
-        """Give the folder under which the scene's granules can be opened."""
-        yield Path(self._root)
-
-
-class _RemoteArchive(_Archive):
-    """Raw files behind an fsspec URL: fetched for the time of the scene."""
-
-    @contextmanager
-    def local(self, scene: Scene) -> Iterator[Path]:
-        import fsspec  # noqa: PLC0415 - most archives are local
-
-        store, prefix = fsspec.core.url_to_fs(self._root)
-        with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-            for granule in (*scene.granules, *scene.dark):
-                target = Path(folder) / granule.path
-                target.parent.mkdir(parents=True, exist_ok=True)
-                store.get_file(f"{prefix.rstrip('/')}/{granule.path}", str(target))
-            yield Path(folder)

@@ -27,7 +27,17 @@ EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
 
 _PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
-_NOT_COMPUTING: Final = ("bench/", "catalog/store.py", "cli.py", "reports/", "simulate/")
+_NOT_COMPUTING: Final = (
+    "aggregate/",
+    "bench/",
+    "catalog/",
+    "cli/",
+    "engine.py",
+    "pipeline.py",
+    "reports/",
+    "simulate/",
+    "site/",
+)
 """Sources of lidarops that change no byte of a product. Whatever else there is may."""
 
 

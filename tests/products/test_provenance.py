@@ -150,7 +150,13 @@ def test_files_without_provenance_are_refused(tmp_path: Path):
 
 @pytest.fixture
 def sources(tmp_path: Path) -> Path:
-    for name in ("flags.py", "retrieve/solver.py", "reports/page.py", "cli.py", "bench/speed.py"):
+    for name in (
+        "flags.py",
+        "retrieve/solver.py",
+        "reports/page.py",
+        "cli/app.py",
+        "bench/speed.py",
+    ):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(f"# {name}\n".encode())
@@ -165,7 +171,10 @@ def sources(tmp_path: Path) -> Path:
         ("retrieve/unheard_of.py", True),
         ("unheard_of.py", True),
         ("reports/page.py", False),
-        ("cli.py", False),
+        ("cli/app.py", False),
+        ("engine.py", False),
+        ("catalog/scan.py", False),
+        ("site/pages.py", False),
         ("bench/speed.py", False),
         ("simulate/signal.py", False),
         ("reports/templates/page.html", False),

@@ -1,0 +1,9 @@
+"""The command line: one function call a command.
+
+Exit codes: 0 all well, 1 something was refused or failed, 2 wrong use.
+"""
+
+from lidarops.cli import archive, bench, files, simulation
+from lidarops.cli.app import app
+
+__all__ = ["app", "archive", "bench", "files", "simulation"]

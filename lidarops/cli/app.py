@@ -1,0 +1,134 @@
+"""The typer application, the options that commands share, and how they speak."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+
+import typer
+
+from lidarops.errors import CampaignError, LidarOpsError, RetrievalInputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+app = typer.Typer(
+    help="Reprocess archives of atmospheric lidar data into CF-compliant products.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+CampaignFile = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN")]
+ArchiveOption = Annotated[
+    str | None,
+    typer.Option("--archive", help="Folder or URL of the raw files; wins over the campaign file."),
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", help="Folder of catalog, products and reports; wins over the file."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+InstrumentOption = Annotated[
+    list[str] | None, typer.Option("--instrument", help="Only this instrument; may be repeated.")
+]
+SinceOption = Annotated[
+    datetime | None, typer.Option("--since", help="Only scenes that end after this UTC time.")
+]
+UntilOption = Annotated[
+    datetime | None, typer.Option("--until", help="Only scenes that start before this UTC time.")
+]
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+WRONG_USE = 2
+REFUSED = 1
+
+
+def plainly(command: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Show an error of ours as a sentence, not as a traceback."""
+
+    @wraps(command)
+    def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        try:
+            return command(*args, **kwargs)
+        except LidarOpsError as error:
+            typer.secho(f"error: {error}", fg="red", err=True)
+            wrong_use = isinstance(error, CampaignError | RetrievalInputError)
+            raise typer.Exit(WRONG_USE if wrong_use else REFUSED) from error
+
+    return wrapped
+
+
+@app.callback()
+def _main(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        from lidarops import __version__
+
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def utc(moment: datetime | None) -> datetime | None:
+    """Read a time without a zone as UTC."""
+    return None if moment is None else moment.replace(tzinfo=moment.tzinfo or UTC)
+
+
+def leave(*, failed: bool) -> None:
+    """Exit with 1 where something failed."""
+    if failed:
+        raise typer.Exit(REFUSED)
+
+
+@contextmanager
+def progress_bar(name: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Show progress on standard error where that is a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(name, total=total)
+        yield lambda done: bar.advance(task, done)
+
+
+def show(table: Table) -> None:
+    """Print a table that has rows."""
+    from rich.console import Console
+
+    if table.row_count:
+        Console().print(table)
+
+
+def make_table(title: str, *columns: str) -> Table:
+    """Make an empty table whose cells fold."""
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def add_row(table: Table, *cells: Any) -> None:
+    """Add a row of plain text."""
+    from rich.text import Text
+
+    # Text, because a path or a reason may hold what rich would take for markup.
+    table.add_row(*(Text(str(cell)) for cell in cells))

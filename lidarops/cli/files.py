@@ -1,0 +1,46 @@
+"""Commands that look at one file or one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidarops.cli.app import app, plainly, show
+
+
+@app.command()
+@plainly
+def report(
+    run: Annotated[Path, typer.Argument(help="Folder of a run, or its run.json.", metavar="RUN")],
+) -> None:
+    """Build the HTML report and figures of a run again.
+
+    Example: lidarops report demo/report/20260301T000000-ab12cd
+    """
+    from lidarops.reports import page, record
+
+    folder = run if run.is_dir() else run.parent
+    typer.echo(str(page.build(record.load(run), folder)))
+
+
+@app.command()
+@plainly
+def inspect(
+    file: Annotated[Path, typer.Argument(help="A raw file or a product.", metavar="FILE")],
+    provenance: Annotated[
+        bool, typer.Option("--provenance", help="Print a product's PROV-JSON.")
+    ] = False,
+) -> None:
+    """Show what a raw file or a product holds.
+
+    Example: lidarops inspect demo/raw/coast/h2630100.000000
+    """
+    from lidarops import inspection
+
+    if provenance:
+        typer.echo(inspection.provenance(file))
+        return
+    for table in inspection.tables(file):
+        show(table)

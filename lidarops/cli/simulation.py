@@ -1,0 +1,37 @@
+"""Command that writes simulated campaigns."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from lidarops.cli.app import ArchiveOption, CampaignFile, OutOption, app, plainly, progress_bar
+
+
+@app.command()
+@plainly
+def simulate(
+    campaign: CampaignFile,
+    archive: ArchiveOption = None,
+    out: OutOption = None,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+) -> None:
+    """Write a simulated campaign of raw Licel files, with its truth.
+
+    Example: lidarops simulate catalogs/demo.yaml --workers 2
+    """
+    from contextlib import nullcontext
+
+    from lidarops.campaign import load
+    from lidarops.engine import local_client
+    from lidarops.products.write import write_plain
+    from lidarops.simulate.campaign import carry_out, plan
+
+    settings = load(campaign, archive=archive, output=out)
+    planned = plan(settings)
+    cluster = nullcontext() if workers == 1 else local_client(workers)
+    with progress_bar("simulate", len(planned.paths)) as advance, cluster as client:
+        simulated = carry_out(planned, client=client, progress=advance)
+    write_plain(simulated.truth, settings.truth_path)
+    typer.echo(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")
