@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps
 
-.PHONY: demo test lint lock clean
+.PHONY: demo test lint bench lock clean
 
 # The demo's archive holds damaged files on purpose, for which the flow exits with 1.
 demo: .venv/.runtime
@@ -18,6 +18,10 @@ lint: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Error against run time of every retrieval, one page: bench/index.html.
+bench: .venv/.runtime
+	$(BIN)/lidarops bench accuracy --out bench
 
 .venv/.runtime: requirements.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -37,4 +41,4 @@ lock:
 	$(COMPILE) --extra dev -c requirements.lock -o requirements-dev.lock
 
 clean:
-	rm -rf .venv demo build *.egg-info
+	rm -rf .venv bench demo build *.egg-info

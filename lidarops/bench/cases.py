@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Final, TypeVar
@@ -10,6 +10,7 @@ from typing import Final, TypeVar
 from lidarops.bench import (
     accuracy,
     elastic,
+    everything,
     multiangle,
     multiposition,
     results,
@@ -30,6 +31,7 @@ _Names = TypeVar("_Names", bound=StrEnum)
 class Case(StrEnum):
     """What is measured."""
 
+    ALL = "all"
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
     MULTIANGLE = "multiangle"
@@ -51,12 +53,13 @@ def run(
     ----------
     what : {"accuracy", "throughput"}
     case : Case or str, optional
-        None is "reader" where files are given, else "homogeneous".
+        None is "reader" where files are given; else all retrievals on one page for the accuracy,
+        and "homogeneous" for the throughput.
     files : sequence of Path
         Raw files of one layout, for "reader" and no other.
     effort : Effort
     data : Path, optional
-        Folder of published signals, for the accuracy of "elastic" and no other.
+        Folder of published signals, for the accuracy of "elastic" or of all.
 
     Raises
     ------
@@ -66,24 +69,26 @@ def run(
         Where "reader" gets no file, or one that cannot be read.
     """
     kind = _member(Kind, what, "benchmark")
-    chosen = _member(Case, case or (Case.READER if files else Case.HOMOGENEOUS), "case")
-    if chosen is Case.READER and kind is Kind.ACCURACY:
-        raise CampaignError("the reader has no accuracy benchmark", remedy="choose throughput")
-    if chosen is not Case.READER and files:
-        raise CampaignError(f"the case {chosen.value!r} takes no files", remedy="leave them out")
-    if data is not None and (chosen is not Case.ELASTIC or kind is not Kind.ACCURACY):
-        raise CampaignError(
-            "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
-        )
-    if chosen is Case.MULTIANGLE:
-        return multiangle.run(kind, effort=effort)
-    if chosen is Case.MULTIPOSITION:
-        return multiposition.run(kind, effort=effort)
-    if chosen is Case.ELASTIC:
-        return elastic.run(kind, data=data, effort=effort)
-    if chosen is Case.READER:
-        read = throughput.reader(files, repeats=effort.repeats or _REPEATS)
-        return Finding(read, story.reader_report(read, effort.date, machine(), RESULT))
+    usual = Case.ALL if kind is Kind.ACCURACY else Case.HOMOGENEOUS
+    chosen = _member(Case, case or (Case.READER if files else usual), "case")
+    _check(kind, chosen, files, data)
+    ways: dict[Case, Callable[[], Finding]] = {
+        Case.ALL: lambda: everything.run(effort, data=data),
+        Case.ELASTIC: lambda: elastic.run(kind, data=data, effort=effort),
+        Case.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
+        Case.MULTIANGLE: lambda: multiangle.run(kind, effort=effort),
+        Case.MULTIPOSITION: lambda: multiposition.run(kind, effort=effort),
+        Case.READER: lambda: _reader(files, effort),
+    }
+    return ways[chosen]()
+
+
+def _reader(files: Sequence[Path], effort: Effort) -> Finding:
+    read = throughput.reader(files, repeats=effort.repeats or _REPEATS)
+    return Finding(read, story.reader_report(read, effort.date, machine(), RESULT))
+
+
+def _homogeneous(kind: Kind, effort: Effort) -> Finding:
     if kind is Kind.ACCURACY:
         found = accuracy.measure(quick=effort.quick, date=effort.date, progress=effort.progress)
         return Finding(found, story.accuracy_report(found, RESULT))
@@ -91,6 +96,19 @@ def run(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
     return Finding(timed, story.throughput_report(timed, RESULT))
+
+
+def _check(kind: Kind, case: Case, files: Sequence[Path], data: Path | None) -> None:
+    if case is Case.READER and kind is Kind.ACCURACY:
+        raise CampaignError("the reader has no accuracy benchmark", remedy="choose throughput")
+    if case is Case.ALL and kind is Kind.THROUGHPUT:
+        raise CampaignError("all retrievals at once have no throughput", remedy="choose a case")
+    if case is not Case.READER and files:
+        raise CampaignError(f"the case {case.value!r} takes no files", remedy="leave them out")
+    if data is not None and (case not in {Case.ELASTIC, Case.ALL} or kind is not Kind.ACCURACY):
+        raise CampaignError(
+            "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
+        )
 
 
 def write(finding: Finding, folder: Path) -> Path:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -17,7 +18,7 @@ _HEIGHT: Final = 4.6
 _WIDTH: Final = 10.0
 _ROW: Final = 0.3
 _FEW_DECADES: Final = 2e3
-"""A vertical axis of less than this ratio is labelled at 1, 2 and 5 of each decade."""
+"""An axis of less than this ratio is labelled at 1, 2 and 5 of each decade."""
 _COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
 _LINES: Final = ("-", "--", "-.", ":")
@@ -107,7 +108,7 @@ def _chart(chart: Chart) -> Figure:
     for panel, drawn in zip(axes, chart.panels, strict=True):
         _panel(panel, drawn)
     if chart.panels[0].y_log:
-        _plain_ticks(axes[0])
+        _plain_ticks(axes[0].yaxis)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
     return figure
@@ -128,6 +129,8 @@ def _panel(panel: Axes, drawn: Panel) -> None:
         panel.step(x, y, where="post", color=panels.INK, linewidth=1.0, label="Pareto front")
     for number, series in enumerate(drawn.series):
         _series(panel, series, number)
+    if drawn.x_log:
+        _plain_ticks(panel.xaxis)
     _calm(panel)
 
 
@@ -183,12 +186,12 @@ def _ladder(ladder: Ladder) -> Figure:
     return figure
 
 
-def _plain_ticks(panel: Axes) -> None:
-    low, high = panel.get_ylim()
+def _plain_ticks(axis: Axis) -> None:
+    low, high = axis.get_view_interval()
     if high / low < _FEW_DECADES:
-        panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        panel.yaxis.set_minor_formatter(NullFormatter())
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def _calm(panel: Axes) -> None:
