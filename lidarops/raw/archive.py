@@ -9,7 +9,7 @@ from __future__ import annotations
 import glob
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ def open_archive(
     profiles_per_chunk: int | None = None,
     header_position: Position = "longitude_first",
     root: str | os.PathLike[str] | None = None,
+    nearest: Mapping[str, int] | None = None,
 ) -> xr.Dataset:
     """Open raw files of one layout as one Dataset.
 
@@ -57,6 +58,8 @@ def open_archive(
         Which coordinate the instrument writes first.
     root : path or str, optional
         Folder that relative paths start from; the working directory where not given.
+    nearest : mapping of str to int, optional
+        Of these channels only so many of the nearest bins, at least 1; the others stay on disk.
 
     Returns
     -------
@@ -76,18 +79,21 @@ def open_archive(
             columns.append(file.read_header())
             stamps.append((path, file.size, file.mtime_ns))
     columns.sort()
+    stored = {dataset.name: dataset.bins for dataset in columns.datasets}
+    columns.shorten(nearest or {})
     chunks = _chunks(columns, profiles_per_chunk)
-    token = tokenize(stamps)
+    token = tokenize(stamps, nearest)
 
     def signal(channel: int, dataset: Dataset) -> da.Array:
         offsets = columns.fact(channel, "offset").astype(np.int64)
         scales = columns.fact(channel, "scale") if mask_and_scale else None
         lengths = tuple(len(files.paths) for _, files in chunks)
+        whole = dataset.bins == stored[dataset.name]
         name = f"licel-{dataset.name}-{tokenize(token, offsets, scales, lengths)}"
         graph = {}
         for index, (part, files) in enumerate(chunks):
             scale = None if scales is None else scales[part]
-            graph[name, index, 0] = (_Chunk(files, offsets[part], dataset.bins, scale),)
+            graph[name, index, 0] = (_Chunk(files, offsets[part], dataset.bins, whole, scale),)
         shape = (lengths, (dataset.bins,))
         dtype = np.int32 if scales is None else np.float32
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
@@ -110,6 +116,8 @@ class _Chunk:
     files: _Files
     offsets: NDArray[np.int64]
     bins: int
+    whole: bool
+    """Whether these are all bins of the channel."""
     scales: NDArray[np.float64] | None
     """None for counts."""
 
@@ -121,7 +129,11 @@ class _Chunk:
         for index, (path, size) in enumerate(zip(self.files.paths, self.files.sizes, strict=True)):
             with RawFile(path) as file:
                 file.expect(size)
-                file.read_counts(int(self.offsets[index]), [row])
+                offset = int(self.offsets[index])
+                if self.whole:
+                    file.read_counts(offset, [row])
+                else:
+                    row = file.read_part(offset, self.bins)
             if self.scales is None:
                 values[index] = row
             else:

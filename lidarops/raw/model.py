@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from typing import Any, Final, Literal, NamedTuple
 
@@ -134,6 +134,30 @@ class Columns:
         for name in ("paths", "sizes", "times", "places", "variant"):
             values = getattr(self, name)
             setattr(self, name, [values[index] for index in order])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the chosen datasets."""
+        return tuple(dataset.name for dataset in self.datasets)
+
+    def shorten(self, nearest: Mapping[str, int]) -> None:
+        """Keep only so many of the nearest bins of these channels.
+
+        Raises
+        ------
+        RawFormatError
+            Where a channel is not opened, or is to keep no bin.
+        """
+        for name, bins in nearest.items():
+            if name not in self.names or bins < 1:
+                raise RawFormatError(
+                    f"{bins} bins of {name} cannot be kept",
+                    field="nearest",
+                    remedy=f"give at least 1 bin of {', '.join(self.names)}",
+                )
+        for stored, (number, chosen) in self.variants.items():
+            kept = (replace(d, bins=min(d.bins, nearest.get(d.name, d.bins))) for d in chosen)
+            self.variants[stored] = (number, tuple(kept))
 
     def _rank(self, name: str) -> int:
         if not self.variants:

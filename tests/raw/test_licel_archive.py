@@ -16,6 +16,7 @@ from licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
 import lidarops
 from lidarops.errors import RawFormatError
 from lidarops.raw.archive import open_archive
+from lidarops.raw.licel import RawFile
 from lidarops.records import Granule, Role, Status
 
 SYNCHRONOUS = {"scheduler": "synchronous"}
@@ -119,6 +120,32 @@ def test_threads_and_pickled_graphs_agree(pilar, stacked):
     np.testing.assert_array_equal(threads, stacked.photon_532s)
     again = pickle.loads(pickle.dumps(archive))
     np.testing.assert_array_equal(again.photon_532s.compute(**SYNCHRONOUS), stacked.photon_532s)
+
+
+def test_only_the_nearest_bins_are_read(pilar, stacked, monkeypatch):
+    near = open_archive(pilar, nearest={"photon_532s": 100}, profiles_per_chunk=4)
+    whole = near.analog_532p
+    assert near.photon_532s.shape == (len(pilar), 100)
+    read = []
+    monkeypatch.setattr(RawFile, "read_counts", lambda *_: pytest.fail("the whole channel"))
+    part = RawFile.read_part
+    monkeypatch.setattr(
+        RawFile, "read_part", lambda file, at, n: read.append(n) or part(file, at, n)
+    )
+    values = near.photon_532s.values
+    assert read == [100] * len(pilar)
+    monkeypatch.undo()
+    assert np.array_equal(values, stacked.photon_532s.values[:, :100])
+    assert np.array_equal(near[near.photon_532s.dims[1]], stacked.range[:100])
+    assert np.array_equal(whole, stacked.analog_532p)
+    every = stacked.photon_532s.shape[1]
+    assert open_archive(pilar, nearest={"photon_532s": every + 5}).photon_532s.shape[1] == every
+
+
+@pytest.mark.parametrize("nearest", [{"photon_1o": 4}, {"photon_532s": 0}])
+def test_nearest_bins_that_cannot_be_kept(pilar, nearest):
+    with pytest.raises(RawFormatError, match="cannot be kept"):
+        open_archive(pilar, nearest=nearest)
 
 
 def test_sources(tmp_path):
