@@ -1,0 +1,118 @@
+"""What a few profiles show of a scene: whether a stretch of range holds any light at all.
+
+A look at evenly spaced profiles tells what need not be computed. It never gives a result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+
+_TAIL: Final = 0.1
+"""Share of the bins, the farthest, that tell the background."""
+_FEWEST: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What some profiles show of one stretch of range."""
+
+    profiles: int
+    """That were looked at and have values there."""
+    significance: float
+    """Largest backscatter of a profile over its standard error; 0 where there is none."""
+    unsaturated: int
+    """Profiles without a saturated bin there."""
+
+
+def spaced(count: int, most: int) -> npt.NDArray[np.int64]:
+    """Return the places of at most `most` of `count` profiles, evenly spaced, ends included.
+
+    Parameters
+    ----------
+    count : int
+        At least 1.
+    most : int
+        At least 1.
+    """
+    if count < 1 or most < 1:
+        raise RetrievalInputError(f"{most} of {count} profiles cannot be chosen", field="most")
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
+def look(
+    power: npt.ArrayLike,
+    variance: npt.ArrayLike,
+    quality: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the term of the field
+    near: float,
+    far: float,
+) -> Look:
+    """Look for backscatter between two ranges.
+
+    The weighted least squares fit of ``P = b + A r**-2`` to the bins of the stretch and to the
+    last tenth of the bins; the significance of a profile is `A` over its standard error, with
+    unit variance where there is only noise.
+
+    Parameters
+    ----------
+    power, variance : (profile, range) array_like
+        mV or MHz, and its square; NaN = missing.
+    quality : (profile, range) array_like of int
+        `Quality` bits.
+    range : (range,) array_like
+        m, increasing.
+    near, far : float
+        m.
+
+    Returns
+    -------
+    Look
+
+    Raises
+    ------
+    RetrievalInputError
+        Where the shapes do not fit.
+    """
+    power, variance = (np.asarray(part, dtype=np.float64) for part in (power, variance))
+    flags, r = np.asarray(quality), np.asarray(range, dtype=np.float64)
+    if power.ndim != 2 or not power.shape == variance.shape == flags.shape == (len(power), r.size):
+        raise RetrievalInputError(
+            f"shapes {power.shape}, {variance.shape}, {flags.shape} and {r.shape} do not fit",
+            field="power",
+            remedy="give profiles over range, and one range a bin",
+        )
+    inside = (r >= near) & (r <= far) & (r > 0.0)
+    measured = np.isfinite(power) & np.isfinite(variance) & (variance > 0.0)
+    measured &= (flags & int(Quality.INPUT_MISSING)) == 0
+    seen = (measured & inside).sum(axis=1) >= _FEWEST
+    fitted = measured & (inside | (np.arange(r.size) >= (1.0 - _TAIL) * r.size)) & (r > 0.0)
+    significance = _significance(power, variance, fitted, r)
+    clipped = np.any(((flags & int(Quality.SATURATED)) != 0) & inside, axis=1)
+    found = significance[seen & np.isfinite(significance)]
+    return Look(
+        profiles=int(seen.sum()),
+        significance=max(float(found.max()), 0.0) if found.size else 0.0,
+        unsaturated=int(np.sum(seen & ~clipped)),
+    )
+
+
+def _significance(
+    power: npt.NDArray[np.float64],
+    variance: npt.NDArray[np.float64],
+    fitted: npt.NDArray[np.bool_],
+    r: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weight = np.where(fitted, 1.0 / variance, 0.0)
+        shape = np.where(r > 0.0, r, np.inf) ** -2.0
+        total = weight.sum(axis=1)
+        centred = shape - ((weight * shape).sum(axis=1) / total)[:, np.newaxis]
+        bright = (weight * centred * np.where(fitted, power, 0.0)).sum(axis=1)
+        return np.asarray(bright / np.sqrt((weight * centred**2).sum(axis=1)))
