@@ -10,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from lidarops.cli import app
-from lidarops.products.rows import Layout
 
 # Time is no property of a result, and a failure must come back when it is looked for.
 hypothesis.settings.register_profile("lidarops", deadline=None, derandomize=True)
@@ -43,8 +42,3 @@ def demo_archive(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     )
     assert result.exit_code == 0, result.output
     return archive
-
-
-def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str) -> str | None:
-    """Name a layout by its title: its sets have no order that two processes share."""
-    return val.title if isinstance(val, Layout) else None

@@ -144,7 +144,7 @@ def test_units_of_the_signal_follow_the_mode(mode: DetectionMode, name: str, uni
     assert attributes(LAYOUTS[ProductKind.SIGNAL].row(name), mode=mode)["units"] == unit
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=str)
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=list(LAYOUTS))
 def test_ancillaries_and_flags_hang_together(layout):
     names = [row.name for row in (*layout.coordinates, *layout.variables)]
     assert len(set(names)) == len(names)
@@ -158,7 +158,7 @@ def test_ancillaries_and_flags_hang_together(layout):
     assert all(row.valid_min is None for row in layout.variables if row.uncertain)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=str)
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=list(LAYOUTS))
 def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
     row = layout.row("quality_flag")
     found = attributes(row, mode=DetectionMode.ANALOG)
