@@ -11,6 +11,7 @@ from lidarops.products.rows import (
     PLACE,
     TIME,
     Coverage,
+    ErrorKind,
     Layout,
     Row,
     quality,
@@ -66,6 +67,20 @@ _RAY: Final = Row(
     comment="In order of vertical planes of rising azimuth, from one horizon over the zenith to"
     " the other.",
 )
+_LAYER: Final = Row(
+    name="layer_altitude",
+    dims=("layer",),
+    dtype="f8",
+    units="m",
+    standard_name="altitude",
+    long_name="altitude of the middle of the layer above the geoid",
+    coverage=Coverage.COORDINATE,
+    positive="up",
+    bounds="layer_bnds",
+    optional=True,
+    comment="Bottom and top in layer_bnds, moved to the nearest altitude of the profile or the"
+    " station.",
+)
 
 
 def _direction(name: str) -> Row:
@@ -87,6 +102,7 @@ def _gradient_error(quantity: str, called: str, units: str) -> Row:
         coverage=Coverage.QUALITY,
         valid_min=0.0,
         significant_bits=8,
+        error_kind=ErrorKind.SYSTEMATIC,
         comment=f"Apart from the random error in {quantity}_standard_error: what the largest"
         " horizontal gradient of ln backscatter that the settings declare would do. Near 0 where"
         f" rays lead to all sides. {NO_NAME}",
@@ -121,6 +137,7 @@ MULTIANGLE: Final = Layout(
         _RAY,
         _direction("zenith_angle"),
         _direction("azimuth"),
+        _LAYER,
         *_STATION,
     ),
     data=(
@@ -146,6 +163,20 @@ MULTIANGLE: Final = Layout(
             f" {NO_NAME}",
         ),
         _gradient_error("optical_depth", "optical depth", "1"),
+        Row(
+            name="monotone_optical_depth",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="nearest to optical_depth that nowhere decreases with altitude",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean altitude: point",
+            ancillaries=("quality_flag",),
+            significant_bits=_BITS,
+            optional=True,
+            comment="For pictures of single profiles. Where the signal is weak, means over many"
+            f" profiles are biased high: take those of optical_depth. {NO_NAME}",
+        ),
         Row(
             name="extinction",
             dims=_LEVELS,
@@ -201,6 +232,40 @@ MULTIANGLE: Final = Layout(
             valid_min=0.0,
             significant_bits=8,
             comment=f"Of the air between the rays, common to all cycles of the file. {NO_NAME}",
+        ),
+        Row(
+            name="reduced_chi2",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="squared residuals over the rays by their variances, per degree of freedom",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            significant_bits=8,
+            optional=True,
+            comment="About 1, as the inhomogeneity is found from the residuals; less where noise is"
+            f" overstated. Missing where no ray is redundant. {NO_NAME}",
+        ),
+        Row(
+            name="layer_optical_depth",
+            dims=("time", "layer"),
+            dtype="f4",
+            units="1",
+            long_name="optical depth of air and aerosol between the bounds of the layer",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean",
+            ancillaries=("layer_optical_depth_gradient_error",),
+            significant_bits=_BITS,
+            uncertain=True,
+            optional=True,
+            comment="Vertical, molecules and particles together, at the wavelength of the channel."
+            " Missing where quality_flag at a bound of the layer forbids the use of a value."
+            f" {NO_NAME}",
+        ),
+        replace(
+            _gradient_error("layer_optical_depth", "the optical depth of the layer", "1"),
+            dims=("time", "layer"),
+            optional=True,
         ),
         Row(
             name="residual",

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from lidarops.retrieve import _angle_mask, _angle_robust
 from lidarops.retrieve import _kano_hamilton as kh
@@ -20,7 +21,9 @@ _FIRST_GUESS: Final = 0.03**2
 _LEAST_GUESS: Final = 0.01
 _FEWEST_FREEDOM: Final = 4.1
 OUTLYING: Final = 4.5
-"""Standard errors beyond which a residual calls for the robust passes."""
+"""Least of the standard errors beyond which a residual calls for the robust passes."""
+FALSE_ALARM: Final = 0.01
+"""Probability that normal residuals, as many as there are, call for them by chance."""
 GRADIENT_WINDOW: Final = 1000.0
 """m, over which the residuals are searched for a gradient."""
 GRADIENT_LIMIT: Final = 4.0
@@ -261,10 +264,15 @@ def student_factor(freedom: Array) -> Array:
 def _has_outliers(rays: Rays, fit: Regression) -> bool:
     if np.max(np.count_nonzero(rays.noise < np.inf, axis=1), initial=0) < _angle_robust.FEWEST_RAYS:
         return False
-    largest = _angle_robust.largest_residual(
+    largest, count = _angle_robust.largest_residual(
         fit.residual, fit.leverage, rays.noise, fit.inhomogeneity
     )
-    return bool(largest > OUTLYING)
+    return largest > outlying(count)
+
+
+def outlying(count: int) -> float:
+    """Return the standard errors beyond which one of so many residuals is no chance."""
+    return max(OUTLYING, -float(ndtri(0.5 * FALSE_ALARM / max(count, 1))))
 
 
 def _fit_robustly(rays: Rays, inhomogeneity: float | None) -> Regression:

@@ -28,7 +28,6 @@ AHEAD: Final = 5
 """Gates of that window."""
 LEAST_NOISE: Final = 1e-6
 """Noise over signal that no lidar undercuts; keeps variances of zero from infinite weights."""
-_BESIDE: Final = 2
 _FARTHEST: Final = 3.0
 _HUGE: Final = 1e300
 _LARGEST_RATIO: Final = 1.0 / LOWEST_SNR**2
@@ -78,27 +77,32 @@ def _first_loss(row: Array, before: int, size: int, lowest: float, sums: Array) 
 
 
 @_compiled
-def _mean(row: Array, first: int, last: int) -> float:
-    """Return the mean of the gates that are given, 0 where none is or it is not positive."""
-    total = count = 0.0
-    for j in range(max(first, 0), min(last, row.shape[1])):
-        total += row[0, j]
-        count += row[2, j]
-    return float(total / count) if total > 0.0 else 0.0
+def _levels(row: Array, levels: Array, roots: Array) -> None:
+    """Fill the means of neighbours and their square roots, 0 where not positive.
+
+    Entry k is that of the two gates below k, entry k + 3 that of the two above, as far as there
+    are gates and they are given.
+    """
+    gates = row.shape[1]
+    for j in range(gates + 3):
+        total = count = 0.0
+        if 2 <= j <= gates + 1:
+            total, count = total + row[0, j - 2], count + row[2, j - 2]
+        if 1 <= j <= gates:
+            total, count = total + row[0, j - 1], count + row[2, j - 1]
+        levels[j] = total / count if total > 0.0 else 0.0
+        roots[j] = math.sqrt(levels[j])
 
 
 @_compiled
-def _expected(row: Array, k: int) -> float:
+def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
     """Return the signal at a gate as its neighbours tell it, unless its own noise forbids that.
 
     The geometric mean of both sides is right for an exponential decay.
     """
-    below = _mean(row, k - _BESIDE, k)
-    above = _mean(row, k + 1, k + 1 + _BESIDE)
-    if below > 0.0 and above > 0.0:
-        guess = math.sqrt(below) * math.sqrt(above)
-    else:
-        guess = max(below, above)
+    guess = roots[k] * roots[k + 3]
+    if guess == 0.0:
+        guess = max(levels[k], levels[k + 3])
     own = float(row[0, k])
     slack = _FARTHEST * math.sqrt(row[1, k])
     return own if guess == 0.0 else min(max(guess, own - slack), own + slack)
@@ -125,6 +129,7 @@ def take_logarithms(
     """
     count, angles, gates = signal.shape
     row, sums = np.empty((3, gates)), np.empty((3, gates))
+    levels, roots = np.empty(gates + 3), np.empty(gates + 3)
     for t in range(count):
         for a in range(angles):
             _clean(signal[t, a], variance[t, a], row)
@@ -133,11 +138,15 @@ def take_logarithms(
                 end = _first_loss(row, 0, AHEAD, SWALLOWED_SNR, sums)
                 end = min(end, _first_loss(row, AROUND // 2, AROUND, LOWEST_SNR, sums))
             ends[t, a] = end
+            _levels(row, levels, roots)
             for k in range(gates):
                 logarithm[t, a, k] = 0.0
                 noise[t, a, k] = np.inf
                 if k < end and row[0, k] > 0.0:
-                    ratio = max(math.sqrt(row[1, k]) / _expected(row, k), LEAST_NOISE) ** 2
+                    ratio = (
+                        max(math.sqrt(row[1, k]) / _expected(row, levels, roots, k), LEAST_NOISE)
+                        ** 2
+                    )
                     # The series of the logarithm's moments ends where it would diverge.
                     known = min(ratio, _LARGEST_RATIO)
                     noise[t, a, k] = ratio * (1.0 + 2.5 * known)

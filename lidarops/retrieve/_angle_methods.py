@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve import _angle_block, _mld_profiles, vertical
+from lidarops.retrieve import _angle_block, _angle_path, _mld_profiles, vertical
 from lidarops.retrieve import _kano_hamilton as kh
 from lidarops.retrieve._angle_block import Rays, Regression
 from lidarops.retrieve._angle_result import Profiles
@@ -24,9 +24,6 @@ LEAST_SPAN: Final = 0.1
 """Of slant paths, below which the flag of low leverage rises (0 to 25 degrees)."""
 _HARMLESS: Final = 0.02
 """Of the declared gradient: too little to raise a flag, however certain it is."""
-_GROWTH: Final = 1.5
-_CORRELATED: Final = 0.3
-_PATH_EVIDENCE: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +71,9 @@ def solve_block(
     method, why = _chosen(rays, fit, settings)
     steps.append((method, True, why))
     part = _METHODS[method](rays, fit, prior, settings)
+    if _angle_path.path_varies(rays, fit):
+        part.flags["poor_stratification"][:] = True
+        _withhold_extinction(part, part.flags["poor_stratification"])
     _raise_common_flags(part, rays, fit)
     if method in _BLIND:
         # These fit no gradient, whatever sides the rays lead to.
@@ -92,8 +92,8 @@ def _robust_step(fit: Regression, settings: Settings) -> Step:
     if not settings.robust:
         return ("robust_passes", False, "not wanted")
     if fit.robust:
-        return ("robust_passes", True, "a residual exceeds 4.5 standard errors")
-    return ("robust_passes", False, "no residual exceeds 4.5 standard errors, or fewer than 4 rays")
+        return ("robust_passes", True, "a residual is too large for chance")
+    return ("robust_passes", False, "no residual is too large for chance, or fewer than 4 rays")
 
 
 def _gradient_step(rays: Rays) -> Step:
@@ -132,10 +132,7 @@ def _kano_hamilton(
     step = np.diff(settings.height, prepend=0.0)
     part.extinction_standard_error[:] = np.sqrt(both + _below(both)) / step
     slopes = np.where(within, _gradient_slopes(fit, settings), np.nan)
-    part.optical_depth_gradient_error[:] = np.hypot(*slopes)
-    part.extinction_gradient_error[:] = np.hypot(
-        *(_layer_means(slope, settings.height) for slope in slopes)
-    )
+    _state_gradient_errors(part, slopes, settings)
     count = within.sum(axis=1)
     part.effective_degrees_of_freedom[:] = np.where(count > 0, count, np.nan)
     part.data_share[:] = np.where(within, 1.0, np.nan)
@@ -181,10 +178,7 @@ def _joint(rays: Rays, fit: Regression, _prior: Array | None, settings: Settings
     part.data_share[:] = smooth.data_share
     slopes = _gradient_slopes(fit, settings)
     reply = [vertical.respond(smooth.system, np.where(within, one, 0.0)) for one in slopes]
-    part.optical_depth_gradient_error[:] = np.hypot(*reply)
-    part.extinction_gradient_error[:] = np.hypot(
-        *(_layer_means(one, settings.height) for one in reply)
-    )
+    _state_gradient_errors(part, np.stack(reply), settings)
     levels = np.append(settings.height, 0.0)
     for number, (bottom, top) in enumerate(settings.layers):
         layer = vertical.layer_optical_depth(smooth, float(levels[bottom]), float(levels[top]))
@@ -193,7 +187,7 @@ def _joint(rays: Rays, fit: Regression, _prior: Array | None, settings: Settings
     _take_vertical_flags(part, smooth)
     correlation = float(np.nanmax(np.append(smooth.correlation, 0.0)))
     _raise_gradient(part, rays, fit, settings, correlation)
-    _withhold_extinction(part, fit, correlation)
+    _withhold_extinction(part, _led(part))
     return part
 
 
@@ -209,30 +203,16 @@ def _take_vertical_flags(part: Profiles, smooth: vertical.VerticalResult) -> Non
         part.flags[name] |= mask[:, np.newaxis]
 
 
-def _withhold_extinction(part: Profiles, fit: Regression, correlation: float) -> None:
-    """Withhold what stratification or smoothness, not the data, decides."""
-    if _path_varies(fit, correlation):
-        part.flags["poor_stratification"][:] = True
+def _led(part: Profiles) -> Mask:
+    """Tell where smoothness or a prior, not the data, decides."""
     with np.errstate(invalid="ignore"):
-        outside: Mask = (part.data_share < vertical.LEAST_SHARE) | (
-            part.data_share > vertical.LARGEST_SHARE
-        )
-    hidden = part.flags["poor_stratification"] | outside
-    part.extinction[hidden] = np.nan
-    part.extinction_standard_error[hidden] = np.nan
-    part.extinction_gradient_error[hidden] = np.nan
+        below = part.data_share < vertical.LEAST_SHARE
+        return np.asarray(below | (part.data_share > vertical.LARGEST_SHARE))
 
 
-def _path_varies(fit: Regression, correlation: float) -> bool:
-    """Tell whether the scatter of the rays grows with altitude as varying extinction makes it."""
-    seen = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
-    evidence = fit.column(kh.FREEDOM).sum(axis=0).max(initial=0.0)
-    if seen.size < 6 or evidence < _PATH_EVIDENCE or correlation <= _CORRELATED:
-        return False
-    third = seen.size // 3
-    low = np.mean(fit.inhomogeneity[seen[:third]])
-    high = np.mean(fit.inhomogeneity[seen[-third:]])
-    return bool(high > _GROWTH**2 * low)
+def _withhold_extinction(part: Profiles, where: Mask) -> None:
+    for values in (part.extinction, part.extinction_standard_error, part.extinction_gradient_error):
+        values[where] = np.nan
 
 
 def _start(rays: Rays, fit: Regression, settings: Settings) -> Profiles:
@@ -297,6 +277,18 @@ def _gradient_slopes(fit: Regression, settings: Settings) -> Array:
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 
 
+def _state_gradient_errors(part: Profiles, slopes: Array, settings: Settings) -> None:
+    """Fill what the largest gradient does, from what it does along east and north, signed."""
+    part.optical_depth_gradient_error[:] = np.hypot(*slopes)
+    part.extinction_gradient_error[:] = np.hypot(
+        *(_layer_means(slope, settings.height) for slope in slopes)
+    )
+    levels = np.concatenate([slopes, np.zeros((*slopes.shape[:2], 1))], axis=2)
+    for number, (bottom, top) in enumerate(settings.layers):
+        across = levels[:, :, top] - levels[:, :, bottom]
+        part.layer_optical_depth_gradient_error[:, number] = np.hypot(*across)
+
+
 def _layer_means(optical_depth: Array, height: Array) -> Array:
     """Return the change from the altitude below over the distance; zero at the lidar."""
     return (optical_depth - _below(optical_depth)) / np.diff(height, prepend=0.0)
@@ -342,19 +334,14 @@ def _regularised(
     step = np.diff(settings.height, prepend=0.0)
     part.extinction_standard_error[:] = np.sqrt(both + _below(both)) / step
     slopes = np.where(within, settings.largest_gradient * settings.height * answer.slopes, np.nan)
-    part.optical_depth_gradient_error[:] = np.hypot(*slopes)
-    part.extinction_gradient_error[:] = np.hypot(
-        *(_layer_means(slope, settings.height) for slope in slopes)
-    )
+    _state_gradient_errors(part, slopes, settings)
     part.effective_degrees_of_freedom[:] = np.where(
         within.any(axis=1), np.where(within, answer.freedom, 0.0).sum(axis=1), np.nan
     )
-    with np.errstate(invalid="ignore"):
-        led = (part.data_share < vertical.LEAST_SHARE) | (part.data_share > vertical.LARGEST_SHARE)
+    led = _led(part)
     part.flags["prior_dominated"] |= within & led
     _subtract_bounds(part, settings)
-    for values in (part.extinction, part.extinction_standard_error, part.extinction_gradient_error):
-        values[led] = np.nan
+    _withhold_extinction(part, led)
     return part
 
 

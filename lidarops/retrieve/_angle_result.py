@@ -32,8 +32,8 @@ class MultiAngleFlags:
     gradient: Mask
     """The residuals show a horizontal gradient that the fit does not account for."""
     poor_stratification: Mask
-    """The scatter of the rays grows with altitude and is correlated along it, as it is where
-    extinction itself varies along the horizontal. Extinction is withheld."""
+    """The scatter of the rays grows with altitude, more than noise, chance and a gradient make
+    it, as it does where extinction itself varies along the horizontal. Extinction is withheld."""
     prior_dominated: Mask
     """Smoothness or a prior, not the data, decides on the value. Extinction is withheld where
     the data share lies outside 0.9-1.1."""
@@ -103,6 +103,8 @@ class MultiAngleResult:
     layer_optical_depth_standard_error: Array
     """(..., layer): random error; without smoothing over altitude, as if the errors of both
     bounds were independent, which is too large where they go together."""
+    layer_optical_depth_gradient_error: Array
+    """(..., layer): systematic, as `optical_depth_gradient_error`."""
     residual: Array
     """(..., angle, altitude): logarithms less their fit over angles; NaN where no sample."""
     flags: MultiAngleFlags
@@ -140,6 +142,8 @@ class Profiles:
     """(profile, layer)"""
     layer_optical_depth_standard_error: Array
     """(profile, layer)"""
+    layer_optical_depth_gradient_error: Array
+    """(profile, layer)"""
     residual: Array
     """(profile, angle, altitude)"""
     flags: dict[str, Mask]
@@ -152,6 +156,7 @@ class Profiles:
             "reach": (profiles,),
             "layer_optical_depth": (profiles, layers),
             "layer_optical_depth_standard_error": (profiles, layers),
+            "layer_optical_depth_gradient_error": (profiles, layers),
             "residual": (profiles, angles, gates),
         }
         values: dict[str, Any] = {

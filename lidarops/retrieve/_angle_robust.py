@@ -25,6 +25,8 @@ _CLOSEST: Final = 1e-3
 _KEPT: Final = 0.3
 _FEWEST_KEPT: Final = 3
 _GAUSS: Final = 1.4826
+_CLEAR: Final = 0.01
+"""Variance of a logarithm."""
 _MEDIAN_OF: Final = 100_000
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -256,8 +258,12 @@ def fill_weights(
 @_compiled
 def largest_residual(
     residuals: Array, leverages: Array, noise: Array, inhomogeneity: Array
-) -> float:
+) -> tuple[float, int]:
     """Return the largest studentised residual, in units that outliers do not stretch.
+
+    Where detector noise dominates, of the relative residual, as `fill_weights` takes it; of
+    samples less than 10 times their noise only where inhomogeneity exceeds that, as the noise of
+    others is not known well enough for what is rare.
 
     Parameters
     ----------
@@ -266,8 +272,10 @@ def largest_residual(
 
     Returns
     -------
-    float
+    largest : float
         0 where there is no residual.
+    count : int
+        Residuals.
     """
     profiles, angles, gates = residuals.shape
     stride = max(residuals.size // _MEDIAN_OF, 1)
@@ -278,13 +286,17 @@ def largest_residual(
         for a in range(angles):
             for k in range(gates):
                 free = 1.0 - leverages[t, a, k]
-                if free > 1e-9:
-                    variance = (noise[t, a, k] + inhomogeneity[k]) * free
-                    size = abs(residuals[t, a, k]) / math.sqrt(variance)
+                clear = noise[t, a, k] < max(_CLEAR, inhomogeneity[k])
+                if free > 1e-9 and clear:
+                    spread = noise[t, a, k] + inhomogeneity[k]
+                    size = residuals[t, a, k]
+                    if noise[t, a, k] > inhomogeneity[k]:
+                        size = math.expm1(min(size, 700.0))
+                    size = abs(size) / math.sqrt(spread * free)
                     largest = max(largest, size)
                     if seen % stride == 0:
                         sizes[count] = size
                         count += 1
                     seen += 1
     unit = _GAUSS * np.median(sizes[:count]) if count > 0 else 1.0
-    return largest / min(unit, 1.0) if unit > 0.0 else largest
+    return (largest / min(unit, 1.0) if unit > 0.0 else largest), seen

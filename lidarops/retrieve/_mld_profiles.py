@@ -58,7 +58,7 @@ def solve(
     operators: dict[bytes, mld.Operator] = {}
     for k in range(gates):
         on = np.ascontiguousarray(rays.noise[:, :, k] < np.inf)
-        patterns, which = np.unique(on, axis=0, return_inverse=True)
+        patterns, which = _patterns(on)
         for number, pattern in enumerate(patterns):
             path = rays.path[pattern, k]
             if path.size < 2 or np.ptp(path) < 1e-9:
@@ -66,7 +66,7 @@ def solve(
             key = path.tobytes()
             if key not in operators:
                 operators[key] = mld.make_operator(path, regularisation)
-            members = np.flatnonzero(which.reshape(-1) == number)
+            members = np.flatnonzero(which == number)
             _solve_gate(
                 rays.logarithm[:, :, k],
                 rays.noise[:, :, k],
@@ -93,6 +93,15 @@ def solve(
         out[..., 3],
         np.stack([out[..., 4], out[..., 5]]),
     )
+
+
+def _patterns(on: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
+    """Return the different sets of rays, and which of them each profile has."""
+    if np.array_equal(on, np.broadcast_to(on[:1], on.shape)):
+        # As nearly everywhere; sorting costs more than solving a single profile.
+        return on[:1], np.zeros(len(on), dtype=np.intp)
+    patterns, which = np.unique(on, axis=0, return_inverse=True)
+    return patterns, which.reshape(-1)
 
 
 _ESTIMATES = 6

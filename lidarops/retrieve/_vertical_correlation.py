@@ -31,7 +31,7 @@ class ResidualMoments:
 
     lag_products: Array
     """(profile, 3): sums over rays and heights of products of weighted residuals 1, 2 and 3
-    heights apart."""
+    heights apart, weighted by the share of the inhomogeneity in them."""
     lag_norms: Array
     """(profile, 3): the same sums, where the inhomogeneity is wholly correlated."""
     inhomogeneity_share: Array
@@ -45,6 +45,9 @@ def lag_sums(
     residual: Array, weight: Array, leverage: Array, variance: Array
 ) -> tuple[Array, Array, Array]:
     """Sum products of weighted residuals along height, and what they are for full correlation.
+
+    Each product counts by the share of the inhomogeneity in it: where noise dominates, it tells
+    of errors that rays have in common with themselves, as of a background, not of the air.
 
     Parameters
     ----------
@@ -77,8 +80,8 @@ def lag_sums(
                 for k in range(heights - lag):
                     joint = spread[k] * spread[k + lag]
                     if joint > 0.0:
-                        product += weighted[k] * weighted[k + lag]
-                        norm += joint
+                        product += joint * weighted[k] * weighted[k + lag]
+                        norm += joint * joint
                 products[t, lag - 1] += product
                 norms[t, lag - 1] += norm
         for k in range(heights):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, Final
 
@@ -11,6 +12,7 @@ import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve import _slant, multiangle
+from lidarops.retrieve._monotone import project as monotone
 from lidarops.retrieve.labeled_scan import CARE, WITHHELD, Background, on_altitudes
 from lidarops.retrieve.multiangle import Method, MultiAngleResult, StepRecord
 
@@ -49,6 +51,12 @@ _LEVELS: Final = (
     "log_intercept_standard_error",
     "data_share",
     "inhomogeneity",
+    "reduced_chi_square",
+)
+_OF_LAYERS: Final = (
+    "layer_optical_depth",
+    "layer_optical_depth_standard_error",
+    "layer_optical_depth_gradient_error",
 )
 
 
@@ -66,6 +74,7 @@ def scan(
     overlap: Array | None = None,
     method: str = "auto",
     largest_gradient: float = multiangle.LARGEST_GRADIENT,
+    layers: Sequence[tuple[float, float]] = (),
 ) -> xr.Dataset:
     """Retrieve optical depth and extinction from the profiles of a scanning lidar.
 
@@ -98,6 +107,7 @@ def scan(
         station_altitude=station_altitude,
         method=method,
         largest_gradient=largest_gradient,
+        layers=layers,
     )
 
 
@@ -107,6 +117,7 @@ def retrieve(
     station_altitude: float,
     method: str = "auto",
     largest_gradient: float = multiangle.LARGEST_GRADIENT,
+    layers: Sequence[tuple[float, float]] = (),
 ) -> xr.Dataset:
     """Retrieve optical depth and extinction from the cycles of a scan.
 
@@ -121,12 +132,17 @@ def retrieve(
         Where "auto" takes "joint" and that doubts all its intervals, "kano_hamilton" follows.
     largest_gradient : float
         m-1, of ln backscatter along the horizontal, for which the gradient errors allow.
+    layers : sequence of (float, float)
+        m above mean sea level: bottom and top of layers whose optical depth is wanted; moved to
+        the nearest of the altitudes and the station.
 
     Returns
     -------
     xr.Dataset
         In memory: the variables of the ``multiangle`` product. Where a value is NaN, a bit of
-        ``quality_flag`` says why. The attribute ``steps`` tells what ran and what did not.
+        ``quality_flag`` says why; the optical depth of a layer is NaN where a bit at one of its
+        bounds forbids the use of a value there. The attribute ``steps`` tells what ran and what
+        did not.
 
     Raises
     ------
@@ -143,25 +159,48 @@ def retrieve(
         method=method,
         station_altitude=station_altitude,
         largest_gradient=largest_gradient,
+        layers=layers,
     )
     sampled = np.isfinite(signal).any(axis=-1)
     values = {name: (("time", "altitude"), getattr(found, name)) for name in _LEVELS}
-    return xr.Dataset(
+    values["reduced_chi2"] = values.pop("reduced_chi_square")
+    values["monotone_optical_depth"] = (("time", "altitude"), monotone(found.optical_depth))
+    quality = _judged(found, rays["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
+    quality |= _moved(found, rays, station_altitude) * np.int32(Quality.BACKGROUND_UNCERTAIN)
+    result = xr.Dataset(
         {
             **values,
             **{name: ("time", getattr(found, name)) for name in _PROFILES},
             "residual": (("time", "ray", "altitude"), found.residual),
-            "quality_flag": (
-                ("time", "altitude"),
-                _judged(found, rays["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
-                | _moved(found, rays, station_altitude) * np.int32(Quality.BACKGROUND_UNCERTAIN),
-            ),
+            "quality_flag": (("time", "altitude"), quality),
             "rays": ("time", sampled.sum(axis=1).astype(np.int32)),
             "shots": rays["shots"],
         },
         coords={name: rays[name] for name in rays.coords},
         attrs={"steps": _told(found)},
     )
+    if not layers:
+        return result
+    bounds = multiangle.layer_bounds(layers, rays["altitude"], station_altitude=station_altitude)
+    return result.assign(_in_layers(found, quality, rays["altitude"].to_numpy(), bounds))
+
+
+def _in_layers(
+    found: MultiAngleResult, quality: Flags, altitude: Array, bounds: Array
+) -> dict[str, xr.Variable]:
+    """Return what is wanted of layers, withheld where a bound is not to be used."""
+    unusable = (quality & np.int32(Quality.rejecting())) != 0
+    # The station, below all altitudes, is beyond doubt.
+    unusable = np.hstack([np.zeros((len(quality), 1), dtype=np.bool_), unusable])
+    levels = np.searchsorted(altitude, bounds, side="right")
+    hidden = unusable[:, levels].any(axis=2)
+    variables = {
+        name: xr.Variable(("time", "layer"), np.where(hidden, np.nan, getattr(found, name)))
+        for name in _OF_LAYERS
+    }
+    middle = xr.Variable("layer", bounds.mean(axis=1))
+    limits = xr.Variable(("layer", "nv"), bounds)
+    return {**variables, "layer_altitude": middle, "layer_bnds": limits}
 
 
 def _solved(*data: Array, method: str, **settings: Any) -> MultiAngleResult:
@@ -180,9 +219,7 @@ def _solved(*data: Array, method: str, **settings: Any) -> MultiAngleResult:
     causes = [name for name in ("undersmoothed", "high_correlation") if getattr(flags, name).any()]
     why = f"its intervals would be too narrow ({' and '.join(causes)})"
     return replace(
-        single,
-        flags=replace(single.flags, poor_stratification=flags.poor_stratification),
-        steps=(*single.steps, StepRecord(0, Method.JOINT.value, ran=False, reason=why)),
+        single, steps=(*single.steps, StepRecord(0, Method.JOINT.value, ran=False, reason=why))
     )
 
 
@@ -201,6 +238,9 @@ def _judged(found: MultiAngleResult, carried: Flags, samples: npt.NDArray[np.int
     for name, bit in _QUALITY_OF_FLAG.items():
         bits |= np.where(raised[name], np.int32(bit), np.int32(0))
     bits |= found.quality & np.int32(Quality.INPUT_MISSING)
+    untested = np.isfinite(found.optical_depth) & ~np.isfinite(found.reduced_chi_square)
+    untested &= ~raised["interpolated"]
+    bits |= np.where(untested, np.int32(Quality.NO_RESIDUAL), np.int32(0))
     silent = (bits & ~np.int32(CARE)) == 0
     lost = ~np.isfinite(found.optical_depth) & silent
     reasons = np.where(samples > 1, np.int32(Quality.NO_LEVERAGE), carried & np.int32(WITHHELD))

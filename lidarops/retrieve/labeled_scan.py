@@ -61,7 +61,7 @@ def on_altitudes(
     *,
     zenith_angle: npt.ArrayLike,
     azimuth: npt.ArrayLike | None,
-    time: npt.ArrayLike,
+    time: npt.ArrayLike,  # noqa: ARG001 - the bounds tell more
     time_bnds: npt.ArrayLike,
     shots: npt.ArrayLike,
     altitude_grid: npt.ArrayLike,
@@ -110,7 +110,7 @@ def on_altitudes(
         Where arguments cannot be right, or no ray leads above the horizon.
     """
     found = scan_cycles.directions(zenith_angle, azimuth)
-    numbers = scan_cycles.cycles(zenith_angle, azimuth, time)
+    numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
     levels = np.asarray(altitude_grid, dtype=np.float64)
     order = _order(found, numbers, _slant.altitude_grid(levels, station_altitude))
     distance = conditioned["range"].to_numpy().astype(np.float64)

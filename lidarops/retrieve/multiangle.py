@@ -34,6 +34,7 @@ __all__ = [
     "MultiAngleResult",
     "Regularisation",
     "StepRecord",
+    "layer_bounds",
     "solve",
 ]
 
@@ -88,8 +89,9 @@ def solve(
     noise, or that of the next 5 less than twice.
 
     :math:`s^2` is the moment estimate of random-effects meta-analysis, pooled over the profiles of
-    a block and 15 altitudes. In a block with a residual beyond 4.5 standard errors, outliers are
-    weighted down, starting from repeated medians and the pair of rays that most others agree
+    a block and 15 altitudes. In a block with a residual that is too large for chance (beyond 4.5
+    standard errors, and with a probability of 1 percent in so many), outliers are weighted
+    down, starting from repeated medians and the pair of rays that most others agree
     with. Nothing is iterated to convergence.
 
     Parameters
@@ -174,6 +176,35 @@ def solve(
         steps += [StepRecord(int(label), *step) for step in done]
     given = np.asarray(np.isfinite(rows).any(axis=(1, 2)))
     return profiles.result(leading, _quality(profiles, given), tuple(steps))
+
+
+def layer_bounds(
+    layers: Sequence[tuple[float, float]], altitude: npt.ArrayLike, *, station_altitude: float
+) -> Array:
+    """Return the bounds of layers as `solve` moves them.
+
+    Parameters
+    ----------
+    layers : sequence of (float, float)
+        m, bottom and top.
+    altitude : (altitude,) float
+        m, ascending, above `station_altitude`.
+    station_altitude : float
+        m.
+
+    Returns
+    -------
+    (layer, 2) float
+        m, of the nearest of the altitudes and the station.
+
+    Raises
+    ------
+    RetrievalInputError
+        For layers that hold no altitude, or reach beyond them.
+    """
+    height = _slant.altitude_grid(altitude, station_altitude)
+    levels = np.append(height, 0.0) + station_altitude
+    return levels[np.array(_layers(layers, levels), dtype=np.int64).reshape(-1, 2)]
 
 
 def _require_known(

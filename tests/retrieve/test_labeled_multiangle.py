@@ -176,6 +176,76 @@ def test_extinction_is_that_of_the_layers():
     assert float(found["extinction_standard_error"].median()) < 3e-5
 
 
+@pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
+def test_optical_depths_of_layers_lie_within_their_errors(method):
+    wanted = [(STATION, STATION + 600.0), (STATION + 610.0, STATION + 1500.0)]
+    off = []
+    for seed in range(4):
+        found = solve(*scan(32, seed=seed), method=method, background=FAR, layers=wanted)
+        bounds = found["layer_bnds"].to_numpy()
+        np.testing.assert_allclose(bounds, STATION + np.array([[0, 600], [600, 1500]]))
+        np.testing.assert_allclose(found["layer_altitude"], STATION + np.array([300, 1050]))
+        truth = np.diff(optical_depth(bounds - STATION), axis=1)[:, 0]
+        error = np.hypot(
+            found["layer_optical_depth_standard_error"],
+            found["layer_optical_depth_gradient_error"],
+        )
+        off.append(((found["layer_optical_depth"] - truth) / error).to_numpy())
+        reject = has(found, Quality.rejecting())
+        hidden = np.stack([reject[:, 5], reject[:, 5] | reject[:, 20]], axis=1)
+        np.testing.assert_array_equal(np.isnan(found["layer_optical_depth"]), hidden)
+        # As a difference of the optical depths, to the last bits.
+        depth = found["optical_depth"].to_numpy()
+        layer = np.where(hidden[:, 1], np.nan, depth[:, 20] - depth[:, 5])
+        np.testing.assert_allclose(found["layer_optical_depth"][:, 1], layer, atol=1e-12)
+    size = np.abs(np.concatenate(off))
+    size = size[np.isfinite(size)]
+    assert size.size > 100
+    assert np.mean(size < 3) >= 0.97
+    assert "layer_optical_depth" not in solve(*scan(3), method=method)
+
+
+def test_monotone_profiles_and_chi_square_come_along():
+    found = solve(*scan(16), background=FAR)
+    depth, risen = found["optical_depth"].to_numpy(), found["monotone_optical_depth"].to_numpy()
+    np.testing.assert_array_equal(np.isnan(depth), np.isnan(risen))
+    for one, plain in zip(risen, depth, strict=True):
+        steps = np.diff(one[np.isfinite(one)])
+        assert np.all(steps >= 0)
+        rising = np.all(np.diff(plain[np.isfinite(plain)], prepend=0.0) >= 0)
+        assert np.array_equal(one, plain, equal_nan=True) == rising
+    assert float(found["reduced_chi2"].mean()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_extinction_stays_withheld_where_single_altitudes_stand_in():
+    """Energy that jitters, in a cloud whose extinction varies along the paths."""
+    rng = np.random.default_rng(3)
+    height, cycles, rays = 10.0 * np.arange(1, 61), 24, 8
+    zenith = np.linspace(0.0, 60.0, rays)
+    path = 1.0 / np.cos(np.radians(zenith))[:, np.newaxis]
+    air = 0.1 * rng.normal(size=(cycles, rays, 1)) + 0.1 * rng.normal(size=(cycles, rays, 60))
+    lost = np.cumsum(5e-3 * 10.0 * np.exp(2.0 * air), axis=-1)
+    lost *= np.clip((height - 200.0) / 100.0, 0.0, 1.0)
+    signal = np.exp(air - 2.0 * path * lost)
+    dims = ("time", "ray", "altitude")
+    rays = xr.Dataset(
+        {
+            "signal": (dims, signal),
+            "variance": (dims, (1e-5 * signal) ** 2),
+            "quality": (dims[::2], np.zeros((cycles, 60), np.int32)),
+            "left": (dims[:2], np.zeros((cycles, rays))),
+            "shots": ("time", np.ones(cycles, np.int32)),
+        },
+        coords={"altitude": height, "ray_zenith_angle": ("ray", zenith)},
+    )
+    found = labeled_multiangle.retrieve(rays, station_altitude=0.0)
+    assert "left out joint" in found.attrs["steps"]
+    assert has(found, Quality.POOR_STRATIFICATION).all()
+    assert np.isfinite(found["optical_depth"]).any()
+    for name in ("extinction", "extinction_standard_error", "extinction_gradient_error"):
+        assert np.isnan(found[name]).all()
+
+
 def test_signal_left_in_the_tail_is_flagged_where_it_matters():
     conditioned, pointing = scan(32, sigma=0.02, scatter=0.003)
     found = solve(conditioned, pointing, method="kano_hamilton")
@@ -350,6 +420,8 @@ def test_rays_stay_lazy_until_they_are_wanted():
         ({"zenith_angle": np.full(30, np.nan)}, "zenith_angle"),
         ({"zenith_angle": np.full(30, -30.0), "azimuth": None}, "zenith_angle"),
         ({"largest_gradient": -1.0}, "largest_gradient"),
+        ({"layers": [(STATION, 1e5)]}, "layers"),
+        ({"layers": [(1000.0, 500.0)]}, "layers"),
     ],
 )
 def test_what_cannot_be_right_is_refused(change, field):

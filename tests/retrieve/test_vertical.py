@@ -552,6 +552,20 @@ def test_unit_of_the_noise_scales_the_errors_only():
 # Residuals and flags ------------------------------------------------------------------------
 
 
+def test_coherent_residuals_in_noise_are_no_correlation_of_the_air():
+    """The far half is noise, and all of it off along each ray, as by a background."""
+    rng = np.random.default_rng(41)
+    shape = (30, 8, 60)
+    noise = np.where(np.arange(60) < 30, 1e-4, 0.04)
+    variance = np.full((30, 60), 0.03**2)
+    residual = np.sqrt(noise + variance[0]) * rng.normal(size=shape)
+    residual += 0.5 * np.sqrt(noise) * (noise > 1e-3) * rng.normal(size=(30, 8, 1))
+    weight = np.broadcast_to(1.0 / (noise + variance[0]), shape)
+    moments = residual_moments(residual, weight, np.zeros(shape), variance, np.ones((30, 60)))
+    rho, _ = _vertical_correlation.fit(moments.lag_products, moments.lag_norms)
+    assert rho < 0.1
+
+
 def test_lag_sums_are_those_of_the_definition():
     rng = np.random.default_rng(40)
     shape = (3, 5, 12)
@@ -564,8 +578,9 @@ def test_lag_sums_are_those_of_the_definition():
     u = np.where(used, residual * np.sqrt(weight), 0.0)
     c = np.where(used, np.sqrt(weight * variance[:, None] * (1.0 - leverage)), 0.0)
     for lag in (1, 2, 3):
-        product = (u[..., lag:] * u[..., :-lag]).sum(axis=(1, 2))
-        norm = (c[..., lag:] * c[..., :-lag]).sum(axis=(1, 2))
+        joint = c[..., lag:] * c[..., :-lag]
+        product = (joint * u[..., lag:] * u[..., :-lag]).sum(axis=(1, 2))
+        norm = (joint**2).sum(axis=(1, 2))
         np.testing.assert_allclose(found.lag_products[:, lag - 1], product, rtol=1e-12)
         np.testing.assert_allclose(found.lag_norms[:, lag - 1], norm, rtol=1e-12)
     np.testing.assert_array_equal(found.degrees_of_freedom, np.maximum(used.sum(axis=1) - 2, 0))

@@ -1,0 +1,205 @@
+"""Whether extinction varies along the paths of a scan: a test of how its rays scatter.
+
+Where the extinction of level air varies along the horizontal, what a ray has lost adds up on its
+way, and rays differ the more the higher they are. Scatter that grows by chance, by a gradient, by
+noise or by a few outliers must not pass for that.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy.special import digamma, polygamma
+
+from lidarops.retrieve import _kano_hamilton as kh
+from lidarops.retrieve._angle_block import Rays, Regression
+
+Array = npt.NDArray[np.float64]
+Gates = npt.NDArray[np.intp]
+
+GROWTH: Final = 1.5**2
+"""Ratio of the variances in the upper and the lower third below which they count as alike."""
+CERTAINTY: Final = 3.0
+"""Standard errors by which the logarithm of that ratio must exceed zero. In simulated scenes
+without variation, 0.9 percent exceed both; most of them hold outliers as well."""
+_FEWEST_GATES: Final = 6
+_CLIP: Final = 3.0
+"""Standard errors to which residuals are cut, so that no outlier decides."""
+_DEPENDENT: Final = 1e-8
+_LEAST_WEIGHT: Final = 1e-3
+_COLUMNS: Final = 4
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+def path_varies(rays: Rays, fit: Regression) -> bool:
+    r"""Tell whether the scatter of the rays of a block grows with altitude.
+
+    With the inhomogeneity of the lower third of the altitudes, residuals are formed anew about a
+    constant, the slant path and the horizontal distances, which take a gradient away. Their mean
+    squares Q over the upper and the lower third are compared profile by profile,
+
+    .. math:: \ln Q_u - \ln Q_l, \qquad
+              \sigma^2 = \psi'(\nu_u / 2) + \psi'(\nu_l / 2) ,
+
+    weighted by :math:`1/\sigma^2`. Errors go along a ray; the effective degrees of freedom of a
+    third are those of one altitude times :math:`(tr A)^2 / tr A^2`, with A the products of
+    residuals at all its altitudes, summed over profiles and rays.
+
+    Parameters
+    ----------
+    rays : Rays
+    fit : Regression
+
+    Returns
+    -------
+    bool
+
+    References
+    ----------
+    satterthwaite1946.
+    """
+    seen = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
+    if seen.size < _FEWEST_GATES:
+        return False
+    third = seen.size // 3
+    thirds = seen[:third], seen[-third:]
+    low, high = (float(np.mean(fit.inhomogeneity[part])) for part in thirds)
+    # Noise can only lessen the ratio; this spares nearly all scans the rest.
+    if not high > GROWTH * low:
+        return False
+    squares, freedom = zip(*(_mean_squares(rays, fit, part, low) for part in thirds), strict=True)
+    told = (freedom[0] > 0) & (freedom[1] > 0) & (squares[0] > 0) & (squares[1] > 0)
+    if not told.any():
+        return False
+    (lower, upper), (few, many) = ([one[told] for one in pair] for pair in (squares, freedom))
+    difference = np.log(upper / lower) - _log_bias(many) + _log_bias(few)
+    weight = 1.0 / (polygamma(1, 0.5 * many) + polygamma(1, 0.5 * few))
+    certainty = (weight * difference).sum() / math.sqrt(weight.sum())
+    growth = np.average(upper, weights=many) / np.average(lower, weights=few)
+    return bool(growth > GROWTH and certainty > CERTAINTY)
+
+
+def _log_bias(freedom: Array) -> Array:
+    """Return the mean of the logarithm of a chi-square over its degrees of freedom."""
+    return np.asarray(digamma(0.5 * freedom) - np.log(0.5 * freedom))
+
+
+def _mean_squares(
+    rays: Rays, fit: Regression, gates: Gates, inhomogeneity: float
+) -> tuple[Array, Array]:
+    """Return mean squares of residuals over a third, and their effective freedom, (profile,)."""
+    count, angles, _ = rays.noise.shape
+    residual = np.zeros((count * angles, gates.size))
+    freedom = np.zeros((count, gates.size))
+    _standardise(
+        rays.logarithm,
+        rays.noise,
+        fit.keep,
+        inhomogeneity,
+        rays.path,
+        rays.distance,
+        gates,
+        residual,
+        freedom,
+    )
+    square = (residual**2).reshape(count, angles, gates.size).sum(axis=1)
+    total = freedom.sum(axis=1)
+    filled = np.count_nonzero(freedom > 0, axis=1)
+    # Fewer altitudes would be another third of another air.
+    on = 2 * filled >= gates.size
+    products = residual.T @ residual
+    whole = np.trace(products) ** 2 / max(float(np.sum(products**2)), np.finfo(np.float64).tiny)
+    mean = np.where(on, square.sum(axis=1) / np.maximum(total, 1.0), 0.0)
+    return mean, np.where(on, whole * total / np.maximum(filled, 1), 0.0)
+
+
+@_compiled
+def _standardise(
+    y: Array,
+    noise: Array,
+    keep: Array,
+    inhomogeneity: float,
+    path: Array,
+    distance: Array,
+    gates: Any,
+    residual: Array,
+    freedom: Array,
+) -> None:
+    """Fill residuals over their standard errors, and the degrees of freedom of each altitude.
+
+    Parameters
+    ----------
+    y, noise : (profile, angle, altitude) float
+    keep : (profile, angle or 0, altitude) float
+    inhomogeneity : float
+        Variance.
+    path : (angle, altitude) float
+    distance : (2, angle, altitude) float
+    gates : (gate,) int
+        Altitudes wanted.
+    residual : (profile * angle, gate) float
+        Zeros, where there is no sample they stay.
+    freedom : (profile, gate) float
+    """
+    profiles, angles, _ = noise.shape
+    root, left = np.empty(angles), np.empty(angles)
+    columns, basis = np.empty((_COLUMNS, angles)), np.empty((_COLUMNS, angles))
+    rays = np.empty(angles, np.int64)
+    for t in range(profiles):
+        for j in range(gates.size):
+            k = gates[j]
+            count = 0
+            for a in range(angles):
+                kept = keep[t, a, k] if keep.shape[1] > 0 else 1.0
+                if noise[t, a, k] < np.inf and kept > _LEAST_WEIGHT:
+                    rays[count] = a
+                    root[count] = math.sqrt(kept / (noise[t, a, k] + inhomogeneity))
+                    left[count] = y[t, a, k] * root[count]
+                    count += 1
+            for i in range(count):
+                columns[0, i] = root[i]
+                columns[1, i] = path[rays[i], k] * root[i]
+                columns[2, i] = distance[0, rays[i], k] * root[i]
+                columns[3, i] = distance[1, rays[i], k] * root[i]
+            known = 0
+            for one in columns:
+                basis[known] = one
+                known += 1 if _orthogonal(basis, known, count, left) else 0
+            freedom[t, j] = max(count - known, 0)
+            if count > known:
+                for i in range(count):
+                    residual[t * angles + rays[i], j] = min(max(left[i], -_CLIP), _CLIP)
+
+
+@_compiled
+def _orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
+    """Make a column orthogonal to those before, and take it out of what is left of the data."""
+    one = basis[known]
+    raw = _dot(one, one, count)
+    for c in range(known):
+        share = _dot(basis[c], one, count)
+        for i in range(count):
+            one[i] -= share * basis[c, i]
+    square = _dot(one, one, count)
+    if not square > _DEPENDENT * raw:
+        return False
+    norm = 1.0 / math.sqrt(square)
+    for i in range(count):
+        one[i] *= norm
+    share = _dot(one, left, count)
+    for i in range(count):
+        left[i] -= share * one[i]
+    return True
+
+
+@_compiled
+def _dot(first: Array, second: Array, count: int) -> float:
+    total = 0.0
+    for i in range(count):
+        total += first[i] * second[i]
+    return total

@@ -1,0 +1,81 @@
+"""Whether extinction varies along the paths: false alarms, and what must be seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import erfc
+
+from lidarops.bench import multiangle_cases as cases
+from lidarops.retrieve import _angle_block, _slant
+from lidarops.retrieve._angle_path import path_varies
+from lidarops.retrieve.multiangle import solve
+
+
+def varies(scan: cases.Scan) -> bool:
+    grid = _slant.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
+    rays = _angle_block.make_rays(scan.signal, scan.variance, grid)
+    return path_varies(rays, _angle_block.regress(rays, inhomogeneity=None, robust=True))
+
+
+def test_false_alarms_are_fewer_than_one_in_a_hundred():
+    """In scenes with gradients, outliers, weak light and all correlations along height."""
+    told = [
+        varies(replace(cases.random_scene(seed, 8), variation=0.0).draw(8, seed, 6))
+        for seed in range(300)
+    ]
+    assert np.mean(told) <= 0.01
+
+
+@pytest.mark.parametrize("largest", [15.0, 30.0, 45.0])
+@pytest.mark.parametrize("correlation", [0.5, 0.8])
+def test_variation_in_a_cloud_is_seen(largest, correlation):
+    scene = cases.cloud(correlation, largest=largest)
+    scattered = replace(scene, variation=1.0)
+    assert all(varies(scattered.draw(8, seed, 1)) for seed in range(8))
+    assert all(varies(replace(scene, variation=0.5).draw(24, seed, 2)) for seed in range(4))
+    assert not any(varies(scene.draw(8, seed, 1)) for seed in range(8))
+    # One profile of six rays holds too little to tell.
+    assert not varies(scattered.draw(1, 3))
+
+
+def test_noise_that_is_larger_than_stated_aloft_is_no_variation():
+    """As of a background that is a little off: 20 percent more in the logarithm's spread."""
+    for seed in range(10):
+        scene = replace(cases.clear(30.0, gates=100), inhomogeneity=0.002)
+        scan = scene.draw(20, seed, 3)
+        assert not varies(replace(scan, variance=scan.variance / 1.2**2))
+
+
+def test_extinction_is_withheld_whatever_the_method():
+    scan = replace(cases.cloud(0.8), variation=1.0).draw(16, 4)
+    for method in ("two_angle", "kano_hamilton", "joint", "mld"):
+        found = solve(
+            scan.signal,
+            scan.scene.zenith_angle,
+            scan.scene.altitude,
+            variance=scan.variance,
+            method=method,
+        )
+        assert found.flags.poor_stratification.all()
+        assert np.isfinite(found.optical_depth).any()
+        assert np.isnan(found.extinction).all()
+        assert np.isnan(found.extinction_standard_error).all()
+
+
+def test_robust_passes_run_by_chance_in_few_clean_blocks_and_wherever_outliers_are():
+    """By a probability of 1 percent, however many residuals a block holds."""
+    assert _angle_block.outlying(100) == _angle_block.OUTLYING
+    counts = 10 ** np.arange(4, 9)
+    limits = np.array([_angle_block.outlying(int(count)) for count in counts])
+    np.testing.assert_allclose(counts * erfc(limits / np.sqrt(2.0)), 0.01, rtol=1e-6)
+
+    def ran(scene: cases.Scene, profiles: int, seed: int) -> bool:
+        found = cases.retrieve(scene.draw(profiles, seed), cases.KANO_HAMILTON)
+        return any(step.ran for step in found.steps if step.step == "robust_passes")
+
+    clean = [ran(cases.clear(ratio), 60, seed) for ratio in (3000.0, 300.0) for seed in range(8)]
+    assert np.mean(clean) <= 0.1
+    assert all(ran(cases.clear(3000.0, outliers=0.01), 8, seed) for seed in range(4))
