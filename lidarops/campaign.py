@@ -15,10 +15,8 @@ from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     PrivateAttr,
     ValidationError,
@@ -26,54 +24,48 @@ from pydantic import (
 )
 
 from lidarops.errors import CampaignError
+from lidarops.product_settings import (
+    ElasticSettings,
+    HomogeneousSettings,
+    Identifier,
+    Inside,
+    Instant,
+    Metres,
+    Model,
+    MultiAngleSettings,
+    NetworkVisibilitySettings,
+    Patterns,
+    Products,
+    SignalSettings,
+    as_interval,
+)
 from lidarops.simulate.settings import SimulationSettings
 
-ARCHIVE_VARIABLE = "LIDAROPS_ARCHIVE"
-
-
-def _utc(value: datetime) -> datetime:
-    return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
-
-
-def _as_list(value: Any) -> Any:
-    return [value] if isinstance(value, str) else value
-
-
-def _clean_pattern(value: str) -> str:
-    if value.startswith(("/", "~")) or ".." in value.split("/"):
-        raise ValueError(f"{value!r} must stay inside its folder: relative, without '..'")
-    return value
-
-
-def _as_interval(value: Any) -> Any:
-    # YAML reads 1:30 as 90 and 3600 as seconds; people write 6h or 30min.
-    if isinstance(value, str) and value != "day":
-        units = {"s": 1, "min": 60, "h": 3600, "d": 86400}
-        number = value.rstrip("abcdefghijklmnopqrstuvwxyz ")
-        unit = value[len(number) :].strip()
-        if unit in units:
-            try:
-                return timedelta(seconds=float(number) * units[unit])
-            except OverflowError as error:
-                raise ValueError(f"{value!r} is too long") from error
-    return value
-
-
-Instant = Annotated[datetime, AfterValidator(_utc)]
-Patterns = Annotated[
-    list[Annotated[str, AfterValidator(_clean_pattern)]], BeforeValidator(_as_list), Field()
+__all__ = [
+    "Campaign",
+    "ChannelFacts",
+    "ElasticSettings",
+    "HomogeneousSettings",
+    "Instrument",
+    "InstrumentFacts",
+    "Metadata",
+    "MultiAngleSettings",
+    "Network",
+    "NetworkVisibilitySettings",
+    "Products",
+    "Scenes",
+    "SignalSettings",
+    "Station",
+    "as_settings",
+    "channel_facts",
+    "load",
 ]
-Inside = Annotated[str, AfterValidator(_clean_pattern)]
-"""Path relative to the campaign file, and below it."""
-Identifier = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$", max_length=40)]
-Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+ARCHIVE_VARIABLE = "LIDAROPS_ARCHIVE"
+CATALOG_VARIABLE = "LIDAROPS_CATALOG"
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Station(_Model):
+class Station(Model):
     """A place where instruments stand."""
 
     name: str
@@ -82,7 +74,7 @@ class Station(_Model):
     altitude: float = Field(default=0.0, ge=-500, le=9000, description="m above the geoid")
 
 
-class ChannelFacts(_Model):
+class ChannelFacts(Model):
     """What is known of one channel over a validity period."""
 
     wavelength: float | None = Field(
@@ -105,7 +97,7 @@ class ChannelFacts(_Model):
     )
 
 
-class InstrumentFacts(_Model):
+class InstrumentFacts(Model):
     """What is known of an instrument over a validity period."""
 
     valid_from: Instant = datetime.min.replace(tzinfo=UTC)
@@ -120,7 +112,7 @@ class InstrumentFacts(_Model):
         default=None,
         description="CSV or NetCDF file of altitude (m), pressure (Pa or hPa), temperature (K)",
     )
-    channels: dict[str, ChannelFacts] = {}
+    channels: dict[str, ChannelFacts] = Field(default={})
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -129,117 +121,15 @@ class InstrumentFacts(_Model):
         return self
 
 
-class SignalSettings(_Model):
-    """The ``signal`` product: background-subtracted, range-corrected signals."""
-
-    channels: list[str] | Literal["all"] = "all"
-    background_range: tuple[Metres, Metres] | None = Field(
-        default=None, description="m; the last tenth of the bins where not given"
-    )
-
-    @model_validator(mode="after")
-    def _rising(self) -> Self:
-        if self.background_range and self.background_range[0] >= self.background_range[1]:
-            raise ValueError("background_range must end farther than it starts")
-        return self
-
-
-class HomogeneousSettings(_Model):
-    """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
-
-    channels: list[str] = Field(min_length=1)
-    sections: list[tuple[Metres, Metres]] = Field(min_length=1, description="m")
-    method: Literal["auto", "direct", "cubic"] = "auto"
-
-    @model_validator(mode="after")
-    def _rising(self) -> Self:
-        for near, far in self.sections:
-            if far <= near:
-                raise ValueError(f"section [{near}, {far}] must end farther than it starts")
-        return self
-
-
-class ReferenceSettings(_Model):
-    """Where the air is taken as free of aerosol."""
-
-    lowest: Metres = Field(default=3000.0, description="m above the station")
-    highest: Metres = Field(default=12_000.0, description="m above the station")
-    width: float = Field(default=1000.0, ge=100, le=20_000, description="m")
-    scattering_ratio: float = Field(default=1.0, ge=1, le=10)
-    relative_error: float = Field(
-        default=0.02, ge=0, le=1, description="standard error of the scattering ratio, relative"
-    )
-
-    @model_validator(mode="after")
-    def _holds_a_window(self) -> Self:
-        if self.highest - self.lowest < self.width:
-            raise ValueError("highest must lie at least width above lowest")
-        return self
-
-
-class ElasticSettings(_Model):
-    """The ``elastic`` product: backscatter and extinction of aerosol, from a lidar ratio."""
-
-    channels: list[str] = Field(
-        min_length=1,
-        description="glued_532o joins analog_532o and photon_532o, which the files must hold",
-    )
-    lidar_ratio: Annotated[float, Field(ge=1, le=200)] = Field(default=50.0, description="sr")
-    lidar_ratio_standard_error: float = Field(default=10.0, ge=0, le=100, description="sr")
-    average: Annotated[timedelta, BeforeValidator(_as_interval)] = timedelta(minutes=30)
-    background: Literal["known_shape", "tail_mean"] = "known_shape"
-    reference: ReferenceSettings = ReferenceSettings()
-    molecular_relative_error: float = Field(
-        default=0.01, ge=0, le=1, description="standard error of the density of the air, relative"
-    )
-
-    @model_validator(mode="after")
-    def _divides_day(self) -> Self:
-        seconds = self.average.total_seconds()
-        if seconds < 1 or 86400 % seconds:
-            raise ValueError("average must be at least 1 s and divide a day: 5min, 30min, 2h")
-        return self
-
-
-class MultiAngleSettings(_Model):
-    """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
-
-    channels: list[str] = Field(min_length=1)
-    highest: Metres = Field(default=6000.0, description="m above the station")
-    step: float = Field(default=60.0, ge=5, le=1000, description="m, between altitudes")
-    method: Literal["auto", "joint", "kano_hamilton", "two_angle"] = "auto"
-    largest_gradient: float = Field(
-        default=5e-5,
-        ge=0,
-        le=1e-2,
-        description="m-1, of the logarithm of backscatter along the horizontal, to allow for",
-    )
-
-    @model_validator(mode="after")
-    def _holds_altitudes(self) -> Self:
-        if self.highest < 10 * self.step:
-            raise ValueError("highest must lie at least 10 steps up")
-        return self
-
-
-class Products(_Model):
-    """Which products of an instrument are wanted, with which settings."""
-
-    signal: SignalSettings | None = None
-    homogeneous: HomogeneousSettings | None = None
-    elastic: ElasticSettings | None = None
-    multiangle: MultiAngleSettings | None = None
-
-
-class Instrument(_Model):
+class Instrument(Model):
     """A lidar, the files it wrote, what is known of it and what is wanted from it."""
 
     station: Identifier
     name: str = ""
     files: Patterns
-    dark_files: Patterns = []
+    dark_files: Patterns = Field(default=[])
     header_position: Literal["longitude_first", "latitude_first", "ignore"] = "longitude_first"
-    facts: list[InstrumentFacts] = [InstrumentFacts()]
+    facts: list[InstrumentFacts] = Field(default=[InstrumentFacts()])
     products: Products = Products()
 
     @model_validator(mode="after")
@@ -258,7 +148,24 @@ class Instrument(_Model):
         return InstrumentFacts()
 
 
-class Metadata(_Model):
+class Network(Model):
+    """Instruments that look at the same air, and what is wanted from them together."""
+
+    name: str = ""
+    instruments: list[Identifier] = Field(min_length=2)
+    visibility: NetworkVisibilitySettings
+
+    @model_validator(mode="after")
+    def _told_apart(self) -> Self:
+        if len(set(self.instruments)) < len(self.instruments):
+            raise ValueError("an instrument stands twice in instruments")
+        strange = sorted(set(self.visibility.exponents) - set(self.instruments))
+        if strange:
+            raise ValueError(f"exponents of {', '.join(strange)}, not in instruments")
+        return self
+
+
+class Metadata(Model):
     """Who made the data: global attributes of every product (ACDD-1.3)."""
 
     institution: str = "unknown institution"
@@ -277,10 +184,10 @@ class Metadata(_Model):
     program: str = ""
 
 
-class Scenes(_Model):
+class Scenes(Model):
     """How granules are cut into scenes."""
 
-    window: Annotated[Literal["day"] | timedelta, BeforeValidator(_as_interval)] = "day"
+    window: Annotated[Literal["day"] | timedelta, BeforeValidator(as_interval)] = "day"
 
     @model_validator(mode="after")
     def _divides_day(self) -> Self:
@@ -291,7 +198,7 @@ class Scenes(_Model):
         return self
 
 
-class Campaign(_Model):
+class Campaign(Model):
     """One campaign: stations, instruments, where the raw files are, which products."""
 
     name: Identifier
@@ -302,8 +209,16 @@ class Campaign(_Model):
     metadata: Metadata = Metadata()
     stations: dict[Identifier, Station] = Field(min_length=1)
     instruments: dict[Identifier, Instrument] = Field(min_length=1)
+    networks: dict[Identifier, Network] = Field(default={})
     scenes: Scenes = Scenes()
     simulation: SimulationSettings | None = None
+    catalog: str | None = Field(
+        default=None,
+        description="SQLAlchemy URL of catalog and ledger; a file in the output folder else",
+    )
+    superseded: Literal["keep", "remove"] = Field(
+        default="remove", description="what becomes of products that a rerun replaces"
+    )
     _folder: str = PrivateAttr(default=".")
 
     @model_validator(mode="after")
@@ -317,6 +232,19 @@ class Campaign(_Model):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _known_members(self) -> Self:
+        for key, network in self.networks.items():
+            if key in self.instruments or key in self.stations:
+                raise ValueError(f"network {key!r} has the key of an instrument or station")
+            for member in network.instruments:
+                if member not in self.instruments:
+                    known = ", ".join(sorted(self.instruments))
+                    raise ValueError(
+                        f"network {key!r} names unknown instrument {member!r}; known: {known}"
+                    )
+        return self
+
     @property
     def folder(self) -> Path:
         """Folder of the campaign file, which the paths of profiles start from."""
@@ -325,6 +253,8 @@ class Campaign(_Model):
     @property
     def catalog_url(self) -> str:
         """SQLAlchemy URL of the campaign's catalog."""
+        if self.catalog:
+            return self.catalog
         return f"sqlite:///{Path(self.output) / 'catalog.sqlite'}"
 
     @property
@@ -344,7 +274,11 @@ class Campaign(_Model):
 
 
 def load(
-    path: str | Path, *, archive: str | Path | None = None, output: str | Path | None = None
+    path: str | Path,
+    *,
+    archive: str | Path | None = None,
+    output: str | Path | None = None,
+    catalog: str | None = None,
 ) -> Campaign:
     """Read and validate a campaign file.
 
@@ -357,6 +291,9 @@ def load(
         wins over the file.
     output : path or str, optional
         Folder of catalog, products and reports; wins over the file.
+    catalog : str, optional
+        SQLAlchemy URL of catalog and ledger; wins over the environment variable
+        ``LIDAROPS_CATALOG``, which wins over the file.
 
     Returns
     -------
@@ -412,6 +349,7 @@ def load(
             "output": _located(str(output), Path.cwd())
             if output
             else _located(campaign.output, base),
+            "catalog": catalog or os.environ.get(CATALOG_VARIABLE) or campaign.catalog,
         }
     )
     loaded._folder = str(base)  # noqa: SLF001 - set once, here

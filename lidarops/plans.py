@@ -8,26 +8,32 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
-from typing import Any, TypeVar
+from typing import TypeVar
 
-from lidarops.campaign import (
-    Campaign,
-    ChannelFacts,
+from lidarops import network_plans
+from lidarops.campaign import Campaign, Instrument, InstrumentFacts, channel_facts
+from lidarops.plan_rules import (
+    GLUED,
+    Case,
+    StepName,
+    conditioning,
+    glue_rules,
+    joined_channels,
+    parts_of,
+    range_offset,
+    ranged_by,
+    wavelength,
+)
+from lidarops.product_settings import (
     ElasticSettings,
     HomogeneousSettings,
-    Instrument,
-    InstrumentFacts,
     MultiAngleSettings,
     SignalSettings,
-    channel_facts,
 )
-from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, Scene, Step
+from lidarops.records import ChannelLayout, LeftOut, Plan, Scene, Step
 
 MIN_SECTION_BINS = 8
 
-GLUED = "glued_"
-"""Prefix of the channels that join ``analog_`` and ``photon_`` ones of the same light."""
 STEEPEST = 80.0
 """degree; largest zenith angle at which a beam reaches air without aerosol."""
 STEADY = 0.05
@@ -41,36 +47,10 @@ _Settings = TypeVar(
 )
 
 
-class StepName(StrEnum):
-    """Names of the steps, in the order in which they run."""
-
-    READ = "read"
-    OVERLAP = "overlap"
-    RANGE_OFFSET = "range_offset"
-    DARK = "dark"
-    DEAD_TIME = "dead_time"
-    NOISE = "noise"
-    LAG = "lag"
-    GLUE = "glue"
-    BACKGROUND = "background"
-    SIGNAL = "signal"
-    HOMOGENEOUS = "homogeneous"
-    AVERAGE = "average"
-    MOLECULAR = "molecular"
-    KNOWN_SHAPE = "known_shape"
-    REFERENCE = "reference"
-    ELASTIC = "elastic"
-    MULTIANGLE = "multiangle"
-
-
 @dataclass(frozen=True, slots=True)
-class _Case:
-    """What the rules of one channel look at."""
+class _Case(Case):
+    """What the rules of one channel look at, and the products that are wanted of it."""
 
-    scene: Scene
-    channel: ChannelLayout
-    facts: InstrumentFacts
-    known: ChannelFacts
     signal: SignalSettings | None
     """Set where the channel's ``signal`` product is wanted."""
     homogeneous: HomogeneousSettings | None
@@ -81,12 +61,6 @@ class _Case:
     """Set where the channel's ``multiangle`` product is wanted."""
     glued: tuple[str, ...]
     """Channels that this one is joined into."""
-
-    def step(self, name: StepName, reason: str, **settings: Any) -> Step:
-        return Step(name.value, self.channel.name, settings, reason)
-
-    def without(self, name: StepName, reason: str) -> LeftOut:
-        return LeftOut(name.value, self.channel.name, reason)
 
 
 def plan(scene: Scene, campaign: Campaign) -> Plan:
@@ -103,6 +77,8 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
         Steps by channel in the order in which they run. A plan without steps is possible; its
         `left_out` says why.
     """
+    if scene.members:
+        return network_plans.plan(scene, campaign)
     instrument = campaign.instruments[scene.instrument]
     # A scene never straddles an edge of a validity period, so its first granule speaks for all.
     facts = instrument.facts_at(scene.granules[0].start or scene.start)
@@ -128,19 +104,7 @@ def glued_channels(scene: Scene, instrument: Instrument) -> tuple[ChannelLayout,
     tuple of ChannelLayout
         Those of which the files hold both parts on one range grid; in photon counting units.
     """
-    present = {channel.name: channel for channel in scene.layout}
-    found = []
-    for name in sorted(_asked_glued(instrument)):
-        analog, photon = (present.get(part) for part in parts_of(name))
-        if analog and photon and analog.bin_width == photon.bin_width:
-            found.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
-    return tuple(found)
-
-
-def parts_of(glued: str) -> tuple[str, str]:
-    """Return the names of the analog and the photon counting part of a glued channel."""
-    label = glued.removeprefix(GLUED)
-    return f"analog_{label}", f"photon_{label}"
+    return joined_channels(scene, sorted(_asked_glued(instrument)))
 
 
 def _asked_glued(instrument: Instrument) -> set[str]:
@@ -154,11 +118,6 @@ def _asked_glued(instrument: Instrument) -> set[str]:
     if products.signal is not None and products.signal.channels != "all":
         asked += products.signal.channels
     return {name for name in asked if name.startswith(GLUED)}
-
-
-def wavelength(channel: ChannelLayout, known: ChannelFacts) -> float:
-    """Return the wavelength in m that the campaign or else the header gives; may be NaN."""
-    return channel.wavelength if known.wavelength is None else known.wavelength
 
 
 def _absent(scene: Scene, instrument: Instrument) -> Iterator[LeftOut]:
@@ -213,6 +172,7 @@ def _channel(
         channel=channel,
         facts=facts,
         known=channel_facts(facts, channel.name),
+        member="",
         signal=_wanted(products.signal, channel),
         homogeneous=None if joined else _wanted(products.homogeneous, channel),
         elastic=_wanted(products.elastic, channel),
@@ -232,27 +192,11 @@ def _channel(
     yield case.step(
         StepName.READ, "asked for by " + " and ".join(asked), wavelength=wavelength(channel, known)
     )
-    yield from _glue_rules(case) if joined else _conditioning(case)
+    yield from glue_rules(case) if joined else conditioning(case)
     yield from _signal_rules(case, last)
     yield from _homogeneous_rules(case, last)
     yield from _elastic_rules(case, last)
     yield from _multiangle_rules(case, last)
-
-
-def _glue_rules(case: _Case) -> Iterator[Step | LeftOut]:
-    yield _overlap_rule(case)
-    analog, photon = parts_of(case.channel.name)
-    lag = channel_facts(case.facts, analog).lag
-    if lag is None:
-        reason = "the campaign gives no lag and asks for no estimate; headers say 0"
-        yield case.without(StepName.LAG, reason)
-    elif lag == "estimate":
-        reason = "the campaign asks for an estimate, from noise that both records share"
-        yield case.step(StepName.LAG, reason, method="estimate")
-    else:
-        yield case.step(StepName.LAG, "given by the campaign", method="given", lag=lag)
-    reason = "the campaign asks for the joined channel"
-    yield case.step(StepName.GLUE, reason, analog=analog, photon=photon)
 
 
 def _wanted(settings: _Settings | None, channel: ChannelLayout) -> _Settings | None:
@@ -273,78 +217,6 @@ def _asked(case: _Case) -> Iterator[str]:
     if case.multiangle is not None:
         yield "multiangle"
     yield from case.glued
-
-
-def _conditioning(case: _Case) -> Iterator[Step | LeftOut]:
-    photon = case.channel.mode is DetectionMode.PHOTON
-    yield _overlap_rule(case)
-    yield _range_rule(case)
-    yield _dark_rule(case)
-    if not photon:
-        yield case.without(StepName.DEAD_TIME, "analog detection has no dead time")
-    elif case.known.dead_time is None:
-        reason = "the campaign gives no dead_time; pile-up is judged with 4 ns"
-        yield case.without(StepName.DEAD_TIME, reason)
-    else:
-        reason = "given by the campaign"
-        yield case.step(StepName.DEAD_TIME, reason, dead_time=case.known.dead_time)
-    if photon:
-        yield case.step(StepName.NOISE, "photon counts are Poisson distributed", method="poisson")
-    elif case.known.noise_variance is not None:
-        reason = "given by the campaign"
-        yield case.step(
-            StepName.NOISE, reason, method="given", noise_variance=case.known.noise_variance
-        )
-    else:
-        reason = "the campaign gives no noise_variance; third differences along range"
-        yield case.step(StepName.NOISE, reason, method="differences")
-
-
-def _overlap_rule(case: _Case) -> Step | LeftOut:
-    full = case.facts.full_overlap_range
-    reason = "nearer bins are flagged and not retrieved from"
-    if case.facts.overlap_profile:
-        told = f"given by the campaign; {reason}"
-        profile = case.facts.overlap_profile
-        return case.step(StepName.OVERLAP, told, full_overlap_range=full, overlap_profile=profile)
-    if full > 0:
-        return case.step(StepName.OVERLAP, reason, full_overlap_range=full)
-    return case.without(StepName.OVERLAP, "the campaign gives no full_overlap_range")
-
-
-def _range_rule(case: _Case) -> Step | LeftOut:
-    offset = range_offset(case.channel, case.facts)
-    if offset:
-        reason = "given by the campaign"
-        if isinstance(case.known.lag, float):
-            reason += f", with the lag of {case.known.lag:g} bins"
-        return case.step(StepName.RANGE_OFFSET, reason, range_offset=offset)
-    if case.known.lag == "estimate":
-        reason = "a lag that is estimated moves joined channels only"
-        return case.without(StepName.RANGE_OFFSET, reason)
-    return case.without(StepName.RANGE_OFFSET, "the campaign gives no range_offset")
-
-
-def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
-    """Return what is added to the ranges of a channel, m: what is told, less a lag that is told."""
-    known = channel_facts(facts, channel.name)
-    late = known.lag * channel.bin_width if isinstance(known.lag, float) else 0.0
-    return (known.range_offset or 0.0) - late
-
-
-def _dark_rule(case: _Case) -> Step | LeftOut:
-    if case.channel.mode is DetectionMode.PHOTON:
-        return case.without(StepName.DARK, "dark counts are part of the photon background")
-    if not case.scene.dark:
-        return case.without(StepName.DARK, "no dark files within 24 h of the scene")
-    told = f"{len(case.scene.dark)} dark files within 24 h of the scene"
-    times = [granule.start for granule in case.scene.dark if granule.start]
-    profiles = [granule.start for granule in case.scene.granules if granule.start]
-    if min(times) < max(profiles) and min(profiles) < max(times):
-        reason, method = f"{told}, before and after it: interpolated in time", "interpolated"
-    else:
-        reason, method = f"{told}, on one side of it: the nearest", "nearest"
-    return case.step(StepName.DARK, reason, files=len(case.scene.dark), method=method)
 
 
 def _signal_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
@@ -385,8 +257,13 @@ def _homogeneous_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
             sections.append([near, far])
     if sections:
         reason = "the campaign asks for it; background is retrieved with extinction"
+        wanted = case.homogeneous.visibility
         yield case.step(
-            StepName.HOMOGENEOUS, reason, method=case.homogeneous.method, sections=sections
+            StepName.HOMOGENEOUS,
+            reason,
+            method=case.homogeneous.method,
+            sections=sections,
+            **({} if wanted is None else {"visibility": network_plans.sight(wanted)}),
         )
 
 
@@ -400,8 +277,8 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     window = settings.reference
     # Windows are sought among the middles of bins.
-    ranged_by = replace(case.channel, name=_ranged_by(case.channel.name))
-    offset = range_offset(ranged_by, case.facts)
+    ranged = replace(case.channel, name=ranged_by(case.channel.name))
+    offset = range_offset(ranged, case.facts)
     reach = last - 0.5 * case.channel.bin_width + offset
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
@@ -466,6 +343,7 @@ def _multiangle_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
         step=settings.step,
         method=settings.method,
         largest_gradient=settings.largest_gradient,
+        layers=[list(layer) for layer in settings.layers],
         background_range=[0.9 * last, last],
     )
 
@@ -482,11 +360,6 @@ def _no_scan(case: _Case) -> str:
     if spread < LEAST_SPREAD:
         return f"zenith angles spread over {spread:g} degree only: the beam does not scan"
     return ""
-
-
-def _ranged_by(channel: str) -> str:
-    """Return the channel whose ranges a channel has: a joined one those of its photons."""
-    return parts_of(channel)[1] if channel.startswith(GLUED) else channel
 
 
 def _steady_zenith(case: _Case) -> tuple[float, str]:

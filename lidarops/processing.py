@@ -12,17 +12,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import dask.config
 import numpy as np
 import xarray as xr
 
-from lidarops import steps
+from lidarops import dependence, network_plans, network_steps, steps
 from lidarops.ancillary import Ancillaries
-from lidarops.campaign import Campaign, InstrumentFacts, as_settings
-from lidarops.errors import LidarOpsError, SceneError
+from lidarops.campaign import Campaign, InstrumentFacts, Station, as_settings
+from lidarops.errors import LidarOpsError, ProductError, SceneError
 from lidarops.flags import Quality
-from lidarops.plans import StepName, glued_channels
+from lidarops.plan_rules import StepName
+from lidarops.plans import glued_channels
 from lidarops.products import build, provenance, write
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
@@ -40,6 +42,7 @@ from lidarops.records import (
     Status,
     Step,
 )
+from lidarops.stores import RemoteStore
 
 # What broken data, a broken disk or a broken library can raise; a bug in lidarops itself that
 # raises anything else must be seen, not entered in a report.
@@ -62,6 +65,12 @@ class Job:
     scene: Scene
     plan: Plan
     profiles_per_chunk: int | None = None
+    only: str | None = None
+    """The channel whose products are wanted; all where None."""
+
+    def concerns(self, step: Step) -> bool:
+        """Whether the products of the step's channel are wanted."""
+        return self.only in (None, step.channel)
 
     @property
     def facts(self) -> InstrumentFacts:
@@ -82,12 +91,24 @@ def process(job: Job) -> SceneOutcome:
     SceneOutcome
         Never raises for bad data or a bad disk; the outcome tells.
     """
+    return attempt(job)[0]
+
+
+def attempt(job: Job) -> tuple[SceneOutcome, bool]:
+    """Process one scene, and tell whether the same inputs cannot but give the same outcome.
+
+    Returns
+    -------
+    outcome : SceneOutcome
+    final : bool
+        False where a disk, a network or memory failed: another try may do better.
+    """
     try:
         with _Archive.of(job.campaign.archive).local(job.scene) as root:
-            return _process(job, root)
+            return _process(job, root), True
     except _FAILURES as error:
         text = str(error) if isinstance(error, LidarOpsError | OSError) else repr(error)
-        return failed(job, text)
+        return failed(job, text), not isinstance(error, ProductError | OSError | MemoryError)
 
 
 def failed(job: Job, error: str) -> SceneOutcome:
@@ -115,9 +136,13 @@ def _process(job: Job, root: Path) -> SceneOutcome:
         return replace(failure, error="nothing to do: " + "; ".join(sorted(reasons)))
     if not usable.granules:
         return replace(failure, error="no granule of the scene can be read")
-    channels = list(dict.fromkeys(step.channel for step in wanted))
+    if usable.members:
+        with dask.config.set(scheduler="synchronous"):
+            inputs, product = _network_product(job, usable, inputs, root, clock)
+        return replace(failure, products=(product,), inputs=inputs, seconds=clock.laps)
+    channels = list(dict.fromkeys(step.channel for step in wanted if job.concerns(step)))
     with dask.config.set(scheduler="synchronous"):
-        bench = _bench(job, usable, root)
+        bench = _bench(job, usable, job.plan, root)
         inputs += bench.ancillaries.inputs
         products = tuple(
             product
@@ -160,15 +185,22 @@ def _digest(scene: Scene, root: Path) -> tuple[Scene, tuple[InputRecord, ...], t
         else:
             usable[granule.path] = granule
             inputs.append(InputRecord(granule.path, granule.role, hashlib.sha256(data).hexdigest()))
-    remaining = replace(
+    return _without(scene, usable), tuple(inputs), tuple(refused)
+
+
+def _without(scene: Scene, usable: Mapping[str, Granule]) -> Scene:
+    """Return a scene of its usable granules alone."""
+    return replace(
         scene,
         granules=tuple(g for g in scene.granules if g.path in usable),
         dark=tuple(g for g in scene.dark if g.path in usable),
+        members=tuple(_without(member, usable) for member in scene.members),
     )
-    return remaining, tuple(inputs), tuple(refused)
 
 
-def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]) -> xr.Dataset:
+def _open(
+    job: Job, scene: Scene, granules: Sequence[Granule], root: Path, channels: list[str]
+) -> xr.Dataset:
     archive = open_archive(
         list(granules),
         root=root,
@@ -178,7 +210,7 @@ def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]
         header_position="ignore",
     )
     # What the campaign says of the pointing wins over the headers.
-    facts = job.facts
+    facts = dependence.facts_of(job.campaign, scene)
     told = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
     pointed = archive.assign_coords(
         {
@@ -191,16 +223,16 @@ def _open(job: Job, granules: Sequence[Granule], root: Path, channels: list[str]
     return pointed.assign_coords({name: array.load() for name, array in pointed.coords.items()})
 
 
-def _bench(job: Job, scene: Scene, root: Path) -> steps.Bench:
+def _bench(job: Job, scene: Scene, plan: Plan, root: Path) -> steps.Bench:
     """Open what the steps of a scene work on: of the raw files only the channels they read."""
-    read = dict.fromkeys(step.channel for step in job.plan.steps if step.name == StepName.READ)
+    read = dict.fromkeys(step.channel for step in plan.steps if step.name == StepName.READ)
     present = {channel.name for channel in scene.layout}
-    subtracted = [step.channel for step in job.plan.steps if step.name == StepName.DARK]
+    subtracted = [step.channel for step in plan.steps if step.name == StepName.DARK]
     return steps.Bench(
-        plan=job.plan,
-        archive=_open(job, scene.granules, root, [name for name in read if name in present]),
-        dark=_open(job, scene.dark, root, subtracted) if subtracted and scene.dark else None,
-        ancillaries=Ancillaries.read(job.campaign.folder, job.plan),
+        plan=plan,
+        archive=_open(job, scene, scene.granules, root, [name for name in read if name in present]),
+        dark=_open(job, scene, scene.dark, root, subtracted) if subtracted and scene.dark else None,
+        ancillaries=Ancillaries.read(job.campaign.folder, plan),
         station_altitude=job.campaign.stations[scene.station].altitude,
     )
 
@@ -217,11 +249,46 @@ def _channel_products(
     computed = steps.carry_out(bench, name)
     clock.lap("retrieve")
     for kind, data in computed.items():
-        context = _context(job, scene, kind, layout, bench.steps(name), inputs)
-        path = build.product_path(context)
-        written = write.write(build.build(data, context), job.campaign.products_root / path)
-        clock.lap("write")
-        yield _record(kind, name, path, written, data)
+        colour = bench.steps(name)[StepName.READ].settings["wavelength"]
+        context = _context(job, scene, kind, layout, colour, inputs)
+        yield _written(job, context, data, clock)
+
+
+def _written(job: Job, context: build.Context, data: xr.Dataset, clock: _Clock) -> ProductRecord:
+    path = build.product_path(context)
+    written = write.write(build.build(data, context), job.campaign.products_root / path)
+    clock.lap("write")
+    return _record(context.kind, context.channel, path, written, data)
+
+
+def _network_product(
+    job: Job, scene: Scene, inputs: tuple[InputRecord, ...], root: Path, clock: _Clock
+) -> tuple[tuple[InputRecord, ...], ProductRecord]:
+    """Make the product of a network; return its inputs with the ancillary ones, and its record."""
+    joint = {step.name: step for step in job.plan.steps if not step.instrument}
+    asked = joint[StepName.VISIBILITY]
+    members = []
+    for planned, usable in zip(job.scene.members, scene.members, strict=True):
+        part = tuple(step for step in job.plan.steps if step.instrument == planned.instrument)
+        if not part:
+            continue
+        bench = None
+        if usable.granules:
+            bench = _bench(job, usable, Plan(job.plan.scene, part, ()), root)
+            inputs += tuple(used for used in bench.ancillaries.inputs if used not in inputs)
+        grid = network_plans.ranges_of(
+            network_plans.channel_of(planned, asked.channel),
+            dependence.facts_of(job.campaign, planned),
+        )
+        station = job.campaign.stations[planned.station]
+        members.append(network_steps.Member(planned.instrument, station, bench, grid))
+    data = network_steps.carry_out(members, joint)
+    clock.lap("retrieve")
+    first = next(m for m in job.scene.members if m.instrument == members[0].instrument)
+    layout = network_plans.channel_of(first, asked.channel)
+    colour = asked.settings["wavelength"]
+    context = _context(job, scene, ProductKind.VISIBILITY, layout, colour, inputs)
+    return inputs, _written(job, context, data, clock)
 
 
 def _layout(job: Job, scene: Scene, name: str) -> ChannelLayout:
@@ -235,20 +302,21 @@ def _context(
     scene: Scene,
     kind: ProductKind,
     channel: ChannelLayout,
-    planned: Mapping[str, Step],
+    wavelength: float,
     inputs: tuple[InputRecord, ...],
 ) -> build.Context:
     campaign = job.campaign
-    instrument = campaign.instruments[scene.instrument]
+    # What the product does not depend on must not stand in it.
+    mine = dependence.part(job.plan, [(kind, channel.name)])
     return build.Context(
         kind=kind,
         channel=channel.name,
         mode=DetectionMode(channel.mode),
-        wavelength=planned[StepName.READ].settings["wavelength"],
+        wavelength=wavelength,
         station_key=scene.station,
-        station=campaign.stations[scene.station],
+        station=_station(campaign, scene),
         instrument_key=scene.instrument,
-        instrument_name=instrument.name or scene.instrument,
+        instrument_name=_instrument_name(campaign, scene),
         metadata=campaign.metadata,
         campaign=campaign.name,
         title=campaign.title,
@@ -261,17 +329,68 @@ def _context(
             scene=scene.id,
             kind=kind,
             channel=channel.name,
-            inputs=inputs,
-            plan=job.plan,
+            inputs=dependence.inputs(mine, inputs),
+            plan=mine,
             settings={
-                "station": as_settings(campaign.stations[scene.station]),
-                "facts": as_settings(job.facts),
+                **_of_campaign(job, mine, kind, channel.name),
                 "metadata": as_settings(campaign.metadata),
+                "keys": {"station": scene.station, "instrument": scene.instrument},
+                "campaign": {"title": campaign.title, "summary": campaign.summary},
+                "window": [scene.start.isoformat(), scene.stop.isoformat()],
             },
             versions=provenance.package_versions(),
             code_version=provenance.code_version(),
         ),
     )
+
+
+def _of_campaign(job: Job, plan: Plan, kind: ProductKind, channel: str) -> dict[str, Any]:
+    """Return what a product depends on of the stations and instruments of the campaign."""
+    campaign, scene = job.campaign, job.scene
+    if not scene.members:
+        instrument = campaign.instruments[scene.instrument]
+        return {
+            "station": as_settings(campaign.stations[scene.station]),
+            "facts": dependence.facts(job.facts, plan, channel),
+            # What else `lidarops reproduce` needs to make the same bytes again.
+            "instrument": instrument.name,
+            "products": dependence.asked(as_settings(instrument.products).get(kind.value), channel),
+        }
+    return {
+        "network": as_settings(campaign.networks[scene.instrument]),
+        "members": {
+            member.instrument: {
+                "station": as_settings(campaign.stations[member.station]),
+                "facts": dependence.facts(dependence.facts_of(campaign, member), plan, channel),
+                "instrument": campaign.instruments[member.instrument].name,
+                "keys": {"station": member.station, "instrument": member.instrument},
+            }
+            for member in scene.members
+        },
+    }
+
+
+def _station(campaign: Campaign, scene: Scene) -> Station:
+    """Return where a scene was taken: of a network, the middle of its stations."""
+    if not scene.members:
+        return campaign.stations[scene.station]
+    places = [campaign.stations[member.station] for member in scene.members]
+    latitude, longitude, altitude = (
+        sum(getattr(place, name) for place in places) / len(places)
+        for name in ("latitude", "longitude", "altitude")
+    )
+    return Station(
+        name=campaign.networks[scene.instrument].name or scene.instrument,
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
+    )
+
+
+def _instrument_name(campaign: Campaign, scene: Scene) -> str:
+    if scene.members:
+        return "network of " + ", ".join(_instrument_name(campaign, m) for m in scene.members)
+    return campaign.instruments[scene.instrument].name or scene.instrument
 
 
 def _record(
@@ -314,12 +433,7 @@ class _RemoteArchive(_Archive):
 
     @contextmanager
     def local(self, scene: Scene) -> Iterator[Path]:
-        import fsspec  # noqa: PLC0415 - most archives are local
-
-        store, prefix = fsspec.core.url_to_fs(self._root)
+        paths = [granule.path for granule in (*scene.granules, *scene.dark)]
         with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-            for granule in (*scene.granules, *scene.dark):
-                target = Path(folder) / granule.path
-                target.parent.mkdir(parents=True, exist_ok=True)
-                store.get_file(f"{prefix.rstrip('/')}/{granule.path}", str(target))
+            RemoteStore(self._root).fetch(paths, Path(folder))
             yield Path(folder)

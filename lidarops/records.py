@@ -46,6 +46,7 @@ class ProductKind(StrEnum):
     HOMOGENEOUS = "homogeneous"
     ELASTIC = "elastic"
     MULTIANGLE = "multiangle"
+    VISIBILITY = "visibility"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +110,9 @@ class Scene:
     """Good signal granules, by start time then path."""
     dark: tuple[Granule, ...] = ()
     """Good dark granules that serve this scene, by start time then path."""
+    members: tuple[Scene, ...] = ()
+    """Of a network: the part of each instrument, whose granules are together those of the scene;
+    `station` and `instrument` are the network's key. Empty for a single instrument."""
 
     @property
     def layout(self) -> tuple[ChannelLayout, ...]:
@@ -124,6 +128,18 @@ class Step:
     channel: str
     settings: Mapping[str, Any]
     reason: str
+    instrument: str = ""
+    """Member of a network that the step is for; empty where the scene has no members."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the step as plain JSON types."""
+        return {
+            "name": self.name,
+            "channel": self.channel,
+            "settings": dict(self.settings),
+            "reason": self.reason,
+            **_of_member(self.instrument),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +149,22 @@ class LeftOut:
     name: str
     channel: str
     reason: str
+    instrument: str = ""
+    """Member of a network; empty where the scene has no members."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain JSON types."""
+        return {
+            "name": self.name,
+            "channel": self.channel,
+            "reason": self.reason,
+            **_of_member(self.instrument),
+        }
+
+
+def _of_member(instrument: str) -> dict[str, Any]:
+    """Return what only plans of networks hold, so that other plans keep their hash."""
+    return {"instrument": instrument} if instrument else {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,19 +179,8 @@ class Plan:
         """Return the plan as plain JSON types."""
         return {
             "scene": self.scene,
-            "steps": [
-                {
-                    "name": step.name,
-                    "channel": step.channel,
-                    "settings": dict(step.settings),
-                    "reason": step.reason,
-                }
-                for step in self.steps
-            ],
-            "left_out": [
-                {"name": left.name, "channel": left.channel, "reason": left.reason}
-                for left in self.left_out
-            ],
+            "steps": [step.as_dict() for step in self.steps],
+            "left_out": [left.as_dict() for left in self.left_out],
         }
 
     @property
@@ -236,8 +257,11 @@ class SceneOutcome:
 
     @property
     def empty(self) -> bool:
-        """Whether every value of every ``elastic`` and ``multiangle`` product is rejected."""
-        kinds = (ProductKind.ELASTIC, ProductKind.MULTIANGLE)
+        """Whether every value of the retrievals that judge themselves is rejected.
+
+        Those of the ``elastic``, ``multiangle`` and ``visibility`` products.
+        """
+        kinds = (ProductKind.ELASTIC, ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
         retrieved = [product for product in self.products if product.kind in kinds]
         return bool(retrieved) and all(product.usable == 0 for product in retrieved)
 

@@ -3,11 +3,15 @@
 A scene holds the granules of one instrument over one window of the campaign (a UTC day or a
 part of it). It is cut where the facts about the instrument change, because one scene has one
 plan, and where the files' channels or range grid change, because one product has one grid.
+
+A scene of a network holds one part a member instrument, over the same window; it is cut where
+the facts about any member change.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -43,7 +47,8 @@ def cut(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     Returns
     -------
     Cut
-        Scenes by instrument and time, the same for any order of `granules`.
+        Scenes by instrument and time, then those of networks, the same for any order of
+        `granules`.
     """
     good = sorted(
         (granule for granule in granules if granule.status is Status.GOOD),
@@ -54,13 +59,66 @@ def cut(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     groups: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
     for granule in signal:
         if granule.instrument in campaign.instruments:
-            groups[_window(campaign, granule)].append(granule)
+            window = _window(campaign, (granule.instrument,), granule)
+            groups[granule.instrument, *window].append(granule)
     scenes = [
         scene
         for (instrument, start, stop), members in sorted(groups.items())
         for scene in _by_layout(campaign, instrument, start, stop, members, dark)
     ]
+    for key in sorted(campaign.networks):
+        scenes += _of_network(campaign, key, signal, dark)
     return Cut(tuple(scenes), tuple(twins))
+
+
+def _of_network(
+    campaign: Campaign, key: str, signal: list[Granule], dark: list[Granule]
+) -> list[Scene]:
+    """Return the scenes of a network: windows in which two members at least have granules.
+
+    Where a member changed its range grid within a window, each grid makes a scene with the
+    others.
+    """
+    names = tuple(campaign.networks[key].instruments)
+    groups: dict[tuple[datetime, datetime], dict[str, list[Granule]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for granule in signal:
+        if granule.instrument in names:
+            groups[_window(campaign, names, granule)][granule.instrument].append(granule)
+    scenes = []
+    for (start, stop), found in sorted(groups.items()):
+        parts = [
+            _by_layout(campaign, name, start, stop, found[name], dark)
+            for name in names
+            if name in found
+        ]
+        chosen = list(itertools.product(*parts)) if len(parts) > 1 else []
+        for members in chosen:
+            suffix = f"-{_grids_key(members)}" if len(chosen) > 1 else ""
+            scenes.append(
+                Scene(
+                    id=f"{key}_{start:%Y%m%dT%H%M%S}{suffix}",
+                    campaign=campaign.name,
+                    station=key,
+                    instrument=key,
+                    start=start,
+                    stop=stop,
+                    granules=_in_time(g for member in members for g in member.granules),
+                    dark=_in_time(g for member in members for g in member.dark),
+                    members=members,
+                )
+            )
+    return scenes
+
+
+def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
+    return tuple(sorted(granules, key=lambda granule: (_start(granule), granule.path)))
+
+
+def _grids_key(members: Sequence[Scene]) -> str:
+    text = " ".join(_layout_key(member.granules[0]) for member in members)
+    return hashlib.sha256(text.encode()).hexdigest()[:6]
 
 
 def select(
@@ -114,15 +172,19 @@ def _without_twins(granules: list[Granule]) -> tuple[list[Granule], list[Granule
     return kept, twins
 
 
-def _window(campaign: Campaign, granule: Granule) -> tuple[str, datetime, datetime]:
+def _window(
+    campaign: Campaign, instruments: Sequence[str], granule: Granule
+) -> tuple[datetime, datetime]:
+    """Return the window of a granule, in which no fact about the instruments changes."""
     start = _start(granule)
     length = timedelta(days=1) if campaign.scenes.window == "day" else campaign.scenes.window
     midnight = start.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
     opens = midnight + (start - midnight) // length * length
     closes = opens + length
-    for fact in campaign.instruments[granule.instrument].facts:
-        opens, closes = _narrow(fact, start, opens, closes)
-    return granule.instrument, opens, closes
+    for instrument in instruments:
+        for fact in campaign.instruments[instrument].facts:
+            opens, closes = _narrow(fact, start, opens, closes)
+    return opens, closes
 
 
 def _narrow(

@@ -13,7 +13,7 @@ from dask.base import compute
 
 from lidarops.ancillary import Ancillaries
 from lidarops.flags import Quality
-from lidarops.plans import GLUED, StepName
+from lidarops.plan_rules import GLUED, StepName
 from lidarops.records import Plan, ProductKind, Step
 from lidarops.retrieve import (
     labeled,
@@ -23,7 +23,9 @@ from lidarops.retrieve import (
     labeled_multiangle,
     labeled_scan,
     labeled_signal,
+    labeled_visibility,
 )
+from lidarops.retrieve.labeled_visibility import Definition
 from lidarops.retrieve.molecular import MolecularProfile
 
 Array = npt.NDArray[np.float64]
@@ -71,7 +73,7 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
         Where the data cannot be what the plan says.
     """
     steps = bench.steps(channel)
-    source = _Glued(bench, channel) if channel.startswith(GLUED) else _Plain(bench, channel)
+    source = source_of(bench, channel)
     lazy: dict[ProductKind, xr.Dataset] = {}
     if StepName.SIGNAL in steps:
         lazy[ProductKind.SIGNAL] = _signal(source, steps, bench.ancillaries)
@@ -85,6 +87,8 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
         lazy[ProductKind.MULTIANGLE] = _rays(source, steps, bench)
     # Together, so that products of one channel share one reading of the files.
     found = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
+    if ProductKind.HOMOGENEOUS in found and "visibility" in steps[StepName.HOMOGENEOUS].settings:
+        found[ProductKind.HOMOGENEOUS] = _with_visibility(found[ProductKind.HOMOGENEOUS], steps)
     if ProductKind.ELASTIC in found:
         averages = source.joined(found[ProductKind.ELASTIC])
         found[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
@@ -95,11 +99,20 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
             station_altitude=bench.station_altitude,
             method=settings["method"],
             largest_gradient=settings["largest_gradient"],
+            layers=[
+                (low + bench.station_altitude, high + bench.station_altitude)
+                for low, high in settings["layers"]
+            ],
         )
     return found
 
 
-class _Plain:
+def source_of(bench: Bench, channel: str) -> Plain | Glued:
+    """Return what gives the profiles of a channel."""
+    return Glued(bench, channel) if channel.startswith(GLUED) else Plain(bench, channel)
+
+
+class Plain:
     """A channel of the files."""
 
     def __init__(self, bench: Bench, channel: str) -> None:
@@ -149,14 +162,14 @@ class _Plain:
         return averages
 
 
-class _Glued:
+class Glued:
     """A channel made of an analog and a photon counting one."""
 
     def __init__(self, bench: Bench, channel: str) -> None:
         steps = bench.steps(channel)
         parts = steps[StepName.GLUE].settings
-        self._analog = _Plain(bench, parts["analog"])
-        self._photon = _Plain(bench, parts["photon"])
+        self._analog = Plain(bench, parts["analog"])
+        self._photon = Plain(bench, parts["photon"])
         self.geometry, self.shots = self._photon.geometry, self._photon.shots
         self._lag = self._find_lag(steps.get(StepName.LAG))
 
@@ -209,11 +222,11 @@ def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
 
 
 def _signal(
-    source: _Plain | _Glued, steps: Mapping[str, Step], ancillaries: Ancillaries
+    source: Plain | Glued, steps: Mapping[str, Step], ancillaries: Ancillaries
 ) -> xr.Dataset:
     start, stop = steps[StepName.BACKGROUND].settings["range"]
     result = source.signals((start, stop))
-    overlap = _overlap(steps, ancillaries, result["range"].to_numpy())
+    overlap = overlap_at(steps, ancillaries, result["range"].to_numpy())
     if overlap is None:
         return result
     along = xr.DataArray(overlap.astype(np.float32), dims="range")
@@ -235,7 +248,7 @@ def _homogeneous(
 ) -> xr.Dataset:
     settings = steps[StepName.HOMOGENEOUS].settings
     quality = conditioned["quality"]
-    overlap = _overlap(steps, ancillaries, conditioned["range"].to_numpy())
+    overlap = overlap_at(steps, ancillaries, conditioned["range"].to_numpy())
     if overlap is not None:
         # A signal with its background cannot be divided: where overlap is not full is left out.
         partial = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
@@ -251,6 +264,21 @@ def _homogeneous(
     )
     slanted = labeled.not_level(result, conditioned["zenith_angle"])
     return result.assign(quality_flag=result["quality_flag"] | slanted)
+
+
+def _with_visibility(result: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
+    """Return sections, computed, with visibility along them."""
+    settings = steps[StepName.HOMOGENEOUS].settings
+    definition = Definition(
+        wavelength=steps[StepName.READ].settings["wavelength"], **settings["visibility"]
+    )
+    seen = labeled_visibility.of_extinction(
+        result["extinction"],
+        result["extinction_standard_error"],
+        result["extinction_model_error"],
+        definition,
+    )
+    return result.assign(seen.data_vars).assign_attrs(steps=definition.words)
 
 
 def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
@@ -272,12 +300,12 @@ def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> x
             relative_error=window["relative_error"],
         ),
         known_shape=StepName.KNOWN_SHAPE in steps,
-        overlap=_overlap(steps, bench.ancillaries, averages["range"].to_numpy()),
+        overlap=overlap_at(steps, bench.ancillaries, averages["range"].to_numpy()),
     )
     return found.assign(_gluing(averages))
 
 
-def _rays(source: _Plain | _Glued, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+def _rays(source: Plain | Glued, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
     """Return the rays of every scan cycle on common altitudes, lazy."""
     settings = steps[StepName.MULTIANGLE].settings
     profiles, geometry = source.profiles(), source.geometry
@@ -297,11 +325,13 @@ def _rays(source: _Plain | _Glued, steps: Mapping[str, Step], bench: Bench) -> x
             _molecules(steps, bench.ancillaries),
             steps[StepName.READ].settings["wavelength"],
         ),
-        overlap=_overlap(steps, bench.ancillaries, profiles["range"].to_numpy()),
+        overlap=overlap_at(steps, bench.ancillaries, profiles["range"].to_numpy()),
     )
 
 
-def _overlap(steps: Mapping[str, Step], ancillaries: Ancillaries, distance: Array) -> Array | None:
+def overlap_at(
+    steps: Mapping[str, Step], ancillaries: Ancillaries, distance: Array
+) -> Array | None:
     """Return the overlap at ranges where the campaign gives it."""
     source = _setting(steps, StepName.OVERLAP, "overlap_profile")
     return None if source is None else ancillaries.overlaps[source].at(distance)

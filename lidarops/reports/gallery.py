@@ -18,7 +18,14 @@ import xarray as xr
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
-from lidarops.reports import figures, panels
+from lidarops.reports import figures, network_figures, panels
+from lidarops.reports.networks import (
+    VertexSeries,
+    instruments_of,
+    join_vertices,
+    read_map,
+    read_vertices,
+)
 from lidarops.reports.profiles import clearest_profile
 from lidarops.reports.raster import COLUMNS, Raster, read_raster
 from lidarops.reports.record import write_atomically
@@ -33,6 +40,7 @@ _DARK_STEP: Final = "dark"
 """Name of the step of a plan that subtracts dark files."""
 _KINDS: Final = (
     ProductKind.HOMOGENEOUS,
+    ProductKind.VISIBILITY,
     ProductKind.MULTIANGLE,
     ProductKind.ELASTIC,
     ProductKind.SIGNAL,
@@ -190,6 +198,8 @@ def _draw(
     if group.kind is ProductKind.HOMOGENEOUS:
         if not full or truth is not None:
             yield from _homogeneous(group, record, truth, gallery, full=full)
+    elif group.kind is ProductKind.VISIBILITY:
+        yield from _visibility(group, record, truth, gallery, full=full)
     elif full:
         return
     elif group.kind is ProductKind.MULTIANGLE:
@@ -244,6 +254,45 @@ def _homogeneous(
                 f"Unflagged values against the truth of the simulation: {where}.",
                 figures.render(figures.draw_comparison(few, title=group.label)),
             )
+
+
+def _visibility(
+    group: _Group, record: RunRecord, truth: xr.Dataset | None, gallery: Gallery, *, full: bool
+) -> Iterator[_Drawn]:
+    found: list[VertexSeries] = []
+    for scene, product in group.members:
+        path = Path(record.products) / product.path
+        try:
+            with _opened(path) as opened:
+                found += read_vertices(opened, truth, instruments=instruments_of(scene))
+        except _UNREADABLE as error:
+            gallery.problems.append(Problem(product.path, _reason(path, error)))
+    series = join_vertices(found)
+    gallery.compared += [
+        Compared(group.instrument, group.channel, comparison)
+        for one in series
+        if (comparison := compare(one, "extinction")) is not None
+    ]
+    if full or not series:
+        return
+    scene = group.members[0][0]
+    network = _first(
+        group, record, gallery, functools.partial(read_map, instruments=instruments_of(scene))
+    )
+    if network is not None:
+        yield _Drawn(
+            f"network_{group.instrument}_{group.channel}",
+            f"Beams, and visibility where they meet: {group.label}.",
+            figures.render(network_figures.draw_map(network, title=group.label)),
+        )
+    for first in range(0, len(series), network_figures.VERTICES):
+        few = series[first : first + network_figures.VERTICES]
+        yield _Drawn(
+            f"visibility_{group.instrument}_{group.channel}",
+            f"Visibility and extinction with their errors:"
+            f" {group.label}, {', '.join(one.label for one in few)}.",
+            figures.render(network_figures.draw_series(few, title=group.label)),
+        )
 
 
 def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:

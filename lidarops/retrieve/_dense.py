@@ -15,6 +15,8 @@ from lidarops.retrieve._verdict import common_limits
 
 FEWEST_BINS: Final = 32
 """Below, the direct fit is as fast, and a basis of 11 shapes is most of the profile."""
+MOST_BINS: Final = 4096
+"""Above, making the tables would hold more than 100 MB, for longer than a fit takes."""
 DEFAULT_SIZE: Final = 11
 FAST_SIZE: Final = 7
 THINNEST: Final = 0.15
@@ -80,7 +82,7 @@ def _is_regular(problem: Problem) -> bool:
 
 def _tables(problem: Problem, size: int) -> Tables | None:
     """Return the tables, or None where profiles of this kind have none."""
-    if not problem.common_noise:
+    if not problem.common_noise or problem.range.size > MOST_BINS:
         return None
     weights = _weights(problem)
     if not np.all((weights > 0.0) & (weights < _compressed.HUGE)):

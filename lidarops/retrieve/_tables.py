@@ -16,6 +16,7 @@ Variables are scaled as in `lidarops.retrieve._direct`: x = (R - R_0) / L and ta
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -32,6 +33,8 @@ START_BINS: Final = 2048
 _WIDEST_SCALE: Final = 0.3
 
 _TRAINING: Final = 400
+_ROOM: Final = 2**17
+"""Numbers of one array of shapes at a time: 2 MB."""
 
 # Columns of `Tables.scalars`.
 INVERSE_NORM: Final = 0
@@ -120,6 +123,11 @@ class _Family:
         self.root = np.sqrt(self.weights)
         self.total = self.weights.sum()
 
+    def blocks(self, count: int) -> Iterator[slice]:
+        """Cut a number of shapes into what there is room for at a time."""
+        step = max(_ROOM // self.x.size, 1)
+        return (slice(first, first + step) for first in range(0, count, step))
+
     def shapes(self, tau: _Long) -> tuple[_Long, _Long]:
         """Return the shapes and their derivatives by tau, (tau, bin)."""
         shape = np.exp(-2 * tau[:, np.newaxis] * self.x) * self.envelope
@@ -132,11 +140,13 @@ class _Family:
 
     def basis(self, tau: _Long, size: int) -> Array:
         """Return the basis, (bin, size), orthonormal and free of the mean."""
-        shape, slope = (self.centred(part) for part in self.shapes(tau))
-        shape = shape / _norm(shape)[:, np.newaxis]
-        slope = slope - (slope * shape).sum(axis=1)[:, np.newaxis] * shape
-        slope = slope / _norm(slope)[:, np.newaxis]
-        both = np.concatenate([shape, slope]).astype(np.float64)
+        both = np.empty((2, tau.size, self.x.size))
+        for rows in self.blocks(tau.size):
+            shape, slope = (self.centred(part) for part in self.shapes(tau[rows]))
+            shape = shape / _norm(shape)[:, np.newaxis]
+            slope = slope - (slope * shape).sum(axis=1)[:, np.newaxis] * shape
+            both[0, rows], both[1, rows] = shape, slope / _norm(slope)[:, np.newaxis]
+        both = both.reshape(2 * tau.size, self.x.size)
         basis = np.linalg.svd(both.T, full_matrices=False)[0][:, :size]
         level = (self.root / np.sqrt(self.total)).astype(np.float64)
         # The vectors of small singular values keep traces of the mean: twice is enough.
@@ -160,6 +170,11 @@ def _norm(rows: _Long) -> _Long:
 
 
 def _project(family: _Family, columns: Array, tau: _Long, size: int) -> _Projected:
+    parts = [_project_block(family, columns, tau[rows], size) for rows in family.blocks(tau.size)]
+    return _Projected(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _Projected:
     shapes, slopes = family.shapes(tau)
     exact = columns.astype(np.longdouble)
     # Profiles are taken relative to their last bin, and so are shapes.

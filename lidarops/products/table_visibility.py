@@ -1,0 +1,237 @@
+"""The variables of the ``visibility`` product."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from lidarops.flags import Quality
+from lidarops.products.rows import (
+    NO_NAME,
+    PLACE,
+    TIME,
+    Coverage,
+    ErrorKind,
+    Layout,
+    Row,
+    quality,
+    shots,
+)
+from lidarops.products.rows_visibility import visibility
+
+_SERIES: Final = ("time", "vertex")
+_BITS: Final = 12
+"""Significant bits of a retrieved value: 1.2e-4 of it."""
+
+FLAGS: Final = (
+    Quality.INPUT_MISSING
+    | Quality.PILE_UP
+    | Quality.LOW_SIGNAL
+    | Quality.POORLY_DETERMINED
+    | Quality.POOR_FIT
+    | Quality.NOT_HOMOGENEOUS
+    | Quality.NO_REAL_SOLUTION
+    | Quality.BACKGROUND_UNCERTAIN
+    | Quality.UNSTABLE_INVERSION
+    | Quality.PRIOR_DOMINATED
+    | Quality.EXTRAPOLATED
+    | Quality.LOW_LEVERAGE
+)
+
+_OF_VALUE: Final = ("condition", "quality_flag", "optical_depth", "reduced_chi2", "shots")
+
+
+def _place(name: str) -> Row:
+    return next(row for row in PLACE if row.name == name)
+
+
+def _of_vertex(name: str) -> Row:
+    """Return the row of where the vertices lie, in place of where a station stands."""
+    row = _place(name)
+    return replace(row, dims=("vertex",), long_name=f"{name} of the point where beams meet")
+
+
+def _of_ray(name: str, source: str, called: str) -> Row:
+    row = _place(source)
+    return replace(
+        row,
+        name=f"ray_{name}",
+        dims=("ray",),
+        long_name=called,
+        follows_beam=False,
+        coverage=Coverage.REFERENCE,
+    )
+
+
+_ALTITUDE: Final = Row(
+    name="altitude",
+    dims=("vertex",),
+    dtype="f8",
+    units="m",
+    standard_name="altitude",
+    long_name="altitude of the point where beams meet, above the geoid",
+    coverage=Coverage.COORDINATE,
+    axis="Z",
+    positive="up",
+    comment="Beams are straight, on the WGS 84 ellipsoid, of which the geoid is taken for a"
+    " parallel.",
+)
+_VERTEX: Final = Row(
+    name="vertex_id",
+    dims=("vertex",),
+    dtype="i4",
+    units="1",
+    long_name="number of the point in the network of beams",
+    coverage=Coverage.COORDINATE,
+    cf_role="timeseries_id",
+    comment="In order of the nearest range. Points that are the farthest on all of their beams"
+    " have a number too, but no value: nothing tells the attenuation beyond them.",
+)
+_RAY: Final = Row(
+    name="ray",
+    dims=("ray",),
+    dtype="i4",
+    units="1",
+    long_name="number of the beam",
+    coverage=Coverage.COORDINATE,
+    comment="lidarops_steps names the instrument of each beam, and the points that lie on it.",
+)
+
+
+def _per_time(name: str, called: str, comment: str) -> Row:
+    return Row(
+        name=name,
+        dims=("time",),
+        dtype="f4",
+        units="1",
+        long_name=called,
+        coverage=Coverage.QUALITY,
+        valid_min=0.0,
+        significant_bits=8,
+        comment=f"{comment} {NO_NAME}",
+    )
+
+
+VISIBILITY: Final = Layout(
+    title="Visibility and extinction where beams of several lidars meet",
+    summary="Extinction of air and aerosol together, and visibility, at the points where the beams"
+    " of several lidars meet, without calibration, lidar ratio or reference, with standard errors.",
+    keywords=(
+        "EARTH SCIENCE > ATMOSPHERE > AIR QUALITY > VISIBILITY",
+        "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
+        "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
+    ),
+    processing_level="L2: retrieved quantities",
+    references=(
+        "Drabenko, V. A. et al. (2021): Multi-position sensing of visibility.",
+        "Yegorov, A. D. et al. (2008): Multi-position lidar sounding of the atmosphere.",
+        "Koschmieder, H. (1924), Beitr. Phys. freien Atmos. 12, 33-53.",
+    ),
+    comment="Model: along a beam, a = (P r^2 / overlap)^m is proportional to extinction times"
+    " exp(-2 m optical depth), with m the exponent of backscatter ~ extinction^(1/m); where two"
+    " beams meet, both see the same extinction. Signals were averaged before they were solved."
+    " Stations stand where ray_latitude, ray_longitude and ray_altitude say. Here poorly_determined"
+    " means a standard error above a third of extinction, of the value or as the median of its"
+    " block, low_leverage a beam that is too weak to be used beside the others, poor_fit beams that"
+    " disagree by more than their noise allows.",
+    sampled="vertex",
+    feature_type="timeSeries",
+    unused_steps=frozenset({"molecular", "known_shape", "reference"}),
+    coordinates=(
+        TIME,
+        _VERTEX,
+        _of_vertex("latitude"),
+        _of_vertex("longitude"),
+        _ALTITUDE,
+        _RAY,
+        _of_ray("latitude", "latitude", "latitude of the lidar of the beam"),
+        _of_ray("longitude", "longitude", "longitude of the lidar of the beam"),
+        _of_ray(
+            "altitude", "station_altitude", "altitude of the lidar of the beam above the geoid"
+        ),
+        _of_ray("zenith_angle", "zenith_angle", "zenith angle of the beam, 0 = up"),
+        _of_ray("azimuth", "azimuth", "azimuth of the beam, clockwise from north"),
+        _place("wavelength"),
+    ),
+    data=(
+        *visibility(
+            _SERIES,
+            called="at the point where beams meet",
+            ancillaries=("extinction_systematic_error", *_OF_VALUE),
+            optional=False,
+        ),
+        Row(
+            name="extinction",
+            dims=_SERIES,
+            dtype="f4",
+            units="m-1",
+            long_name="extinction coefficient of air and aerosol together",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean",
+            ancillaries=("extinction_systematic_error", *_OF_VALUE),
+            significant_bits=_BITS,
+            uncertain=True,
+            comment="Molecules and particles together, at the wavelength of the channel."
+            f" {NO_NAME}",
+        ),
+        Row(
+            name="extinction_systematic_error",
+            dims=_SERIES,
+            dtype="f4",
+            units="m-1",
+            long_name="systematic error of the extinction coefficient to allow for",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            significant_bits=8,
+            error_kind=ErrorKind.SYSTEMATIC,
+            comment="Apart from the random error in extinction_standard_error: what the errors of"
+            " exponent, lidar ratio and overlap that the settings declare would do, and the signal"
+            f" that may be left in the background. {NO_NAME}",
+        ),
+        Row(
+            name="condition",
+            dims=_SERIES,
+            dtype="f4",
+            units="1",
+            long_name="relative change of extinction over that of signals at near ends of beams",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            significant_bits=8,
+            comment="Root of the sum of squares over beams. The more, the more an error of the"
+            f" overlap counts. {NO_NAME}",
+        ),
+        quality(_SERIES, FLAGS),
+        _per_time(
+            "optical_depth",
+            "optical depth of the longest stretch between points of a beam",
+            "Of the mean extinction at the points.",
+        ),
+        _per_time(
+            "reduced_chi2",
+            "reduced chi-square of the network",
+            "Of the beams alone, free of the prior. Missing for methods that see one cycle, and"
+            " where nothing is left over.",
+        ),
+        _per_time(
+            "degrees_of_freedom",
+            "equations of the network beyond its unknowns",
+            "Missing for methods that see one cycle, and where unknowns are more than equations.",
+        ),
+        _per_time(
+            "prior_deviation",
+            "standard deviation of ln extinction about the mean field, told beforehand",
+            "Found as the likeliest of the block of profiles. Missing where nothing is told.",
+        ),
+        Row(
+            name="ray_range",
+            dims=("ray", "vertex"),
+            dtype="f4",
+            units="m",
+            long_name="distance of the point from the lidar along the beam",
+            coverage=Coverage.REFERENCE,
+            valid_min=0.0,
+            comment=f"Missing where the point does not lie on the beam. {NO_NAME}",
+        ),
+        shots(of="all beams of the interval"),
+    ),
+)
