@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import app, plainly, show
+from lidarops.cli.app import JsonOption, app, plainly, show
 
 
 @app.command()
@@ -32,6 +33,7 @@ def inspect(
     provenance: Annotated[
         bool, typer.Option("--provenance", help="Print a product's PROV-JSON.")
     ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Show what a raw file or a product holds.
 
@@ -41,6 +43,9 @@ def inspect(
 
     if provenance:
         typer.echo(inspection.provenance(file))
+        return
+    if as_json:
+        typer.echo(json.dumps(inspection.describe(file), indent=2, ensure_ascii=False))
         return
     for table in inspection.tables(file):
         show(table)

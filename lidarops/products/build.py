@@ -105,31 +105,38 @@ def _place(coordinates: list[Coordinate], mode: DetectionMode) -> dict[str, xr.V
 def _measured(
     source: Intake, layout: Layout, coordinates: list[Coordinate], mode: DetectionMode
 ) -> dict[str, xr.Variable]:
-    judged = layout.row("quality_flag")
+    judged = layout.row(rows.QUALITY_FLAG)
     flags = whole_numbers(judged, source.take(judged.name, judged.dims))
     check_flags(judged, flags)
     variables = {}
     for row in layout.variables:
         if row.optional and row.name not in source:
             continue
-        values = source.take(row.name, row.dims)
-        check_range(row, values)
-        if row.dtype.startswith("i"):
-            stored = whole_numbers(row, values)
-        else:
-            stored = _rounded(row, values)
-            if row.dims == judged.dims:
-                check_flagged(row, stored, flags)
-            stored[~np.isfinite(stored)] = rows.FILL_VALUE
+        stored = rows.sum_up(flags) if row.summary else _stored(source, row, judged, flags)
         found_attributes = attributes(row, mode=mode, coordinates=_listed(row, coordinates))
         variables[row.name] = xr.Variable(row.dims, stored, found_attributes)
     return variables
 
 
+def _stored(source: Intake, row: Row, judged: Row, flags: Values) -> Values:
+    values = source.take(row.name, row.dims)
+    check_range(row, values)
+    if row.dtype.startswith("i"):
+        return whole_numbers(row, values)
+    stored = _rounded(row, values)
+    # Bits judge what is retrieved; what an option derives may be missing where that stands.
+    if row.dims == judged.dims and not row.optional:
+        check_flagged(row, stored, flags)
+    stored[~np.isfinite(stored)] = rows.FILL_VALUE
+    return stored
+
+
 def _listed(row: Row, coordinates: list[Coordinate]) -> tuple[str, ...]:
     """Return the auxiliary coordinates of a variable."""
-    # CDO 2.1 cannot read a variable of three dimensions that names a place without one.
-    unread = ("latitude", "longitude") if len(row.dims) > 2 else ()
+    # CDO 2.1 cannot read a place that changes along a beam, nor a variable of three dimensions
+    # that names a place without one.
+    unread = tuple(place.name for place in rows.SOUNDED)
+    unread += ("latitude", "longitude") if len(row.dims) > 2 else ()
     return tuple(
         found.row.name
         for found in coordinates

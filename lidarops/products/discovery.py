@@ -24,6 +24,9 @@ class Extents:
     stop: datetime
     interval: float
     """s, between profiles."""
+    latitudes: tuple[float, float]
+    """degree, least and greatest of the sounded air."""
+    longitudes: tuple[float, float]
     lowest: float
     """m above the geoid."""
     highest: float
@@ -47,7 +50,9 @@ def global_attributes(context: Context, layout: Layout, extents: Extents) -> dic
     dict of str to str, float or numpy scalar
     """
     made, why = product_date(extents.stop)
-    feature = {"featureType": "timeSeriesProfile"} if extents.vertical else {}
+    profiles = "timeSeriesProfile" if extents.vertical else None
+    feature_type = layout.feature_type or profiles
+    feature = {"featureType": feature_type} if feature_type else {}
     return {
         "Conventions": CONVENTIONS,
         **feature,
@@ -146,24 +151,25 @@ def _kind_of(name: str, institution: str) -> str:
 
 def _place(context: Context, extents: Extents) -> dict[str, Any]:
     station = context.station
-    single = "not applicable: one place"
+    (south, north), (west, east) = extents.latitudes, extents.longitudes
+    spread = "along the beam" if (south, west) != (north, east) else "not applicable: one place"
     return {
         "platform": station.name,
         "platform_vocabulary": "station names of the campaign",
         "instrument": context.instrument_name,
         "instrument_vocabulary": "instrument names of the campaign",
         # Latitude first: the order of axes that EPSG:4326 defines.
-        "geospatial_bounds": f"POINT ({station.latitude!r} {station.longitude!r})",
+        "geospatial_bounds": _bounds(extents),
         "geospatial_bounds_crs": "EPSG:4326",
         "geospatial_bounds_vertical_crs": "EPSG:5714",
-        "geospatial_lat_min": station.latitude,
-        "geospatial_lat_max": station.latitude,
+        "geospatial_lat_min": south,
+        "geospatial_lat_max": north,
         "geospatial_lat_units": "degrees_north",
-        "geospatial_lat_resolution": single,
-        "geospatial_lon_min": station.longitude,
-        "geospatial_lon_max": station.longitude,
+        "geospatial_lat_resolution": spread,
+        "geospatial_lon_min": west,
+        "geospatial_lon_max": east,
         "geospatial_lon_units": "degrees_east",
-        "geospatial_lon_resolution": single,
+        "geospatial_lon_resolution": spread,
         "geospatial_vertical_min": extents.lowest,
         "geospatial_vertical_max": extents.highest,
         "geospatial_vertical_units": "m",
@@ -172,6 +178,15 @@ def _place(context: Context, extents: Extents) -> dict[str, Any]:
             "not constant" if extents.step is None else f"{extents.step:.6g} m"
         ),
     }
+
+
+def _bounds(extents: Extents) -> str:
+    """Return the area of the sounded air as text: a point, or the rectangle around it."""
+    (south, north), (west, east) = extents.latitudes, extents.longitudes
+    if (south, west) == (north, east):
+        return f"POINT ({south!r} {west!r})"
+    corners = ((south, west), (south, east), (north, east), (north, west), (south, west))
+    return f"POLYGON (({', '.join(f'{lat!r} {lon!r}' for lat, lon in corners)}))"
 
 
 def _times(extents: Extents, made: datetime) -> dict[str, str]:

@@ -32,7 +32,8 @@ class Intake:
 
     def __init__(self, data: xr.Dataset, layout: Layout) -> None:
         rows = (*layout.coordinates, *layout.variables)
-        known = {row.name for row in rows} | {row.bounds for row in rows}
+        # What is computed from the flags cannot be handed over, and so cannot contradict them.
+        known = {row.name for row in rows if not row.summary} | {row.bounds for row in rows}
         for name in data.data_vars:
             if name not in known:
                 raise ProductError(

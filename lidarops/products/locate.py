@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Final
@@ -12,7 +13,8 @@ from lidarops.errors import ProductError
 from lidarops.products.context import Context
 from lidarops.products.discovery import Extents
 from lidarops.products.intake import Intake, Values, check_range, whole_numbers
-from lidarops.products.rows import BOUNDS_DIM, Layout, Row
+from lidarops.products.rows import BOUNDS_DIM, Layout, Row, deployment
+from lidarops.products.sounded import sounded
 
 NEAR_VERTICAL: Final = 10.0
 """degree. A beam within this angle of the vertical makes profiles in the sense of CF chapter 9."""
@@ -55,16 +57,27 @@ def locate(source: Intake, layout: Layout, context: Context) -> tuple[list[Coord
         If a coordinate is missing, not finite, not rising, or out of its cell.
     """
     time = _time(source, layout.row("time"))
-    place = _scan_place if layout.sampled == "altitude" else _beam_place
+    place = _PLACES.get(layout.sampled, _beam_place)
     found, vertical = place(source, layout, context.station.altitude, time.values.size)
     found["time"] = time
+    gates = {} if vertical.profiles else _sounded(found, layout, context)
     for name, value in _fixed(context).items():
+        if name in found or not any(row.name == name for row in layout.coordinates):
+            continue
+        row = layout.row(name)
+        if f"gate_{name}" in gates:
+            row = deployment(row)
         if np.isfinite(value):
-            found[name] = Coordinate(layout.row(name), (), np.asarray(value, np.float64))
+            found[name] = Coordinate(row, (), np.asarray(value, np.float64))
+    found |= gates
     ordered = [found[row.name] for row in layout.coordinates if row.name in found]
     for coordinate in ordered:
         check_range(coordinate.row, coordinate.values)
-    return ordered, _extents(source, vertical)
+    horizontal = [
+        gates[f"gate_{name}"].values if gates else found[name].values
+        for name in ("latitude", "longitude")
+    ]
+    return ordered, _extents(source, vertical, horizontal)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +109,34 @@ def _beam_place(source: Intake, layout: Layout, station: float, profiles: int) -
     return found, _Vertical(altitude.values, exact, vertical)
 
 
+def _sounded(
+    found: Mapping[str, Coordinate], layout: Layout, context: Context
+) -> dict[str, Coordinate]:
+    """Return latitude and longitude of what lies along a slanting beam of known azimuth."""
+    has_gates = any(row.name == "gate_latitude" for row in layout.coordinates)
+    if not has_gates or "azimuth" not in found:
+        return {}
+    # Places that change over time too are what no tool reads: CDO takes garbage for them.
+    if found["zenith_angle"].dims or found["azimuth"].dims:
+        return {}
+    station = context.station
+    along = found[_ALONG[layout.sampled][-1]]
+    zenith, azimuth = (found[name].values for name in ("zenith_angle", "azimuth"))
+    angle = np.deg2rad(zenith)
+    ahead, up = along.values * np.sin(angle), along.values * np.cos(angle)
+    places = sounded(station.latitude, station.longitude, station.altitude, ahead, azimuth, up)
+    gates = {}
+    for name, values in zip(("gate_latitude", "gate_longitude"), places, strict=True):
+        row = layout.row(name)
+        stored = values.astype(row.dtype)
+        gates[name] = Coordinate(row, row.dims, stored)
+    return gates
+
+
 def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie at altitudes seen by several rays."""
     names = ["ray", "ray_zenith_angle"]
-    names += ["ray_azimuth"] if "ray_azimuth" in source else []
+    names += [name for name in ("ray_azimuth", "layer_altitude") if name in source]
     found = {name: _along(source, layout.row(name)) for name in names}
     row = layout.row("altitude")
     values = _along(source, replace(row, bounds=None)).values
@@ -110,6 +147,21 @@ def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) 
     tops = np.append(station, values)
     found["altitude"] = _celled(row, values, np.stack([tops[:-1], tops[1:]], axis=-1))
     return found, _Vertical(values, values, profiles=False)
+
+
+def _network_place(source: Intake, layout: Layout, _station: float, _profiles: int) -> _Place:
+    """Return the coordinates of a kind whose values lie where beams of several lidars meet."""
+    angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
+    rays = (f"ray_{name}" for name in angles)
+    names = ("vertex_id", "latitude", "longitude", "altitude", "ray", *rays)
+    found = {name: _along(source, layout.row(name)) for name in names}
+    altitude = found["altitude"].values
+    # Points stand in no order of altitude: there is no step from one to the next.
+    return found, _Vertical(altitude, altitude[:, np.newaxis], profiles=False)
+
+
+_PLACES: Final = {"altitude": _scan_place, "vertex": _network_place}
+"""By what a product is sampled over besides time; along a beam where it is none of these."""
 
 
 def _fixed(context: Context) -> dict[str, float]:
@@ -226,7 +278,7 @@ def _altitude(
     return Coordinate(row, (*zenith.dims, *row.dims), exact.astype(row.dtype), bounds), exact
 
 
-def _extents(source: Intake, vertical: _Vertical) -> Extents:
+def _extents(source: Intake, vertical: _Vertical, horizontal: list[Values]) -> Extents:
     moments, bounds = _moments(source)
     intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
     steps = np.abs(np.diff(vertical.exact, axis=-1))
@@ -235,6 +287,8 @@ def _extents(source: Intake, vertical: _Vertical) -> Extents:
         start=_datetime(bounds[:, 0].min()),
         stop=_datetime(bounds[:, 1].max()),
         interval=float(np.median(intervals / np.timedelta64(1, "s"))),
+        latitudes=(float(horizontal[0].min()), float(horizontal[0].max())),
+        longitudes=(float(horizontal[1].min()), float(horizontal[1].max())),
         lowest=float(vertical.altitude.min()),
         highest=float(vertical.altitude.max()),
         step=float(steps.flat[0]) if constant else None,

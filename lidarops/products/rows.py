@@ -14,10 +14,11 @@ from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarops import __version__
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
+from lidarops.flags import Quality, Severity
 from lidarops.records import DetectionMode
 
 CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
@@ -32,6 +33,20 @@ _SIGNAL_UNITS: Final = {DetectionMode.ANALOG: "mV", DetectionMode.PHOTON: "MHz"}
 _ERROR_BITS: Final = 8
 """Significant bits of the standard error of a rounded quantity: 0.2 percent at worst."""
 NO_NAME: Final = f"No standard name of the {STANDARD_NAME_TABLE} means this quantity."
+
+
+QUALITY_FLAG: Final = "quality_flag"
+USABLE: Final = "usable"
+
+
+class ErrorKind(StrEnum):
+    """How the errors of different values hang together: attribute ``error_kind``."""
+
+    RANDOM = "random"
+    """New in every profile: a mean over time makes it smaller."""
+    SYSTEMATIC = "systematic"
+    """Alike in all profiles: no mean makes it smaller."""
+    BOTH = "random and systematic"
 
 
 class Coverage(StrEnum):
@@ -75,6 +90,10 @@ class Row:
     """Whether ``time`` becomes the first dimension where the beam moves."""
     flags: Quality | None = None
     """The bits that a flag variable can carry."""
+    summary: bool = False
+    """Whether it is `usable`: computed from the flags, never handed over."""
+    error_kind: ErrorKind | None = None
+    """Of a variable that tells an error; of another, of its standard error."""
     cf_role: str | None = None
     algorithm: str | None = None
     comment: str | None = None
@@ -93,6 +112,7 @@ class Row:
             ancillaries=(),
             significant_bits=self.significant_bits and _ERROR_BITS,
             uncertain=False,
+            error_kind=self.error_kind or ErrorKind.RANDOM,
             comment=None if self.standard_name else NO_NAME,
         )
 
@@ -113,11 +133,13 @@ class Layout:
     """Steps of a scene's plan that other kinds need and this one does not."""
     coordinates: tuple[Row, ...]
     data: tuple[Row, ...]
+    feature_type: str | None = None
+    """Of the discrete sampling geometry (CF, chapter 9), where it does not depend on the beam."""
 
     @property
     def variables(self) -> tuple[Row, ...]:
-        """Data rows, each followed by the row of its standard error where it has one."""
-        return tuple(_with_errors(self.data))
+        """Data rows, each followed by what derives from it: standard error, summary of flags."""
+        return tuple(_with_derived(self.data))
 
     @property
     def rounded(self) -> bool:
@@ -142,14 +164,59 @@ class Layout:
         return rows[name]
 
 
-def _with_errors(rows: tuple[Row, ...]) -> Iterator[Row]:
+def _with_derived(rows: tuple[Row, ...]) -> Iterator[Row]:
     for row in rows:
+        ancillaries = tuple(_with_summary(row.ancillaries))
         if row.uncertain:
             error = row.standard_error()
-            yield replace(row, ancillaries=(error.name, *row.ancillaries))
+            yield replace(row, ancillaries=(error.name, *ancillaries))
             yield error
         else:
-            yield row
+            yield replace(row, ancillaries=ancillaries)
+        if row.flags is not None:
+            yield usable(row)
+
+
+def _with_summary(names: tuple[str, ...]) -> Iterator[str]:
+    for name in names:
+        yield name
+        if name == QUALITY_FLAG:
+            yield USABLE
+
+
+def usable(flags: Row) -> Row:
+    """Return the row that sums up quality bits for those who do not want to read them."""
+    return Row(
+        name=USABLE,
+        dims=flags.dims,
+        dtype="i1",
+        units="1",
+        standard_name="aggregate_quality_flag",
+        long_name="whether the value may be used, from the bits of quality_flag",
+        coverage=Coverage.QUALITY,
+        summary=True,
+        comment="do_not_use: a bit of severity reject is set in quality_flag. use_with_care: only"
+        " bits of severity care are. good: no test failed. The comment of quality_flag tells the"
+        " severity of each bit.",
+    )
+
+
+def sum_up(flags: NDArray[np.int32]) -> NDArray[np.int8]:
+    """Return `usable` of quality bits: the severity of the worst bit, 0 where there is none.
+
+    Parameters
+    ----------
+    flags : ndarray of int32
+        Of `lidarops.flags.Quality`.
+
+    Returns
+    -------
+    ndarray of int8
+        0 good, 1 use with care, 2 do not use.
+    """
+    found = np.where(flags == 0, 0, int(Severity.CARE)).astype(np.int8)
+    found[(flags & np.int32(Quality.rejecting())) != 0] = int(Severity.REJECT)
+    return found
 
 
 def attributes(
@@ -193,6 +260,11 @@ def attributes(
     if row.significant_bits is not None:
         found["quantization"] = QUANTIZATION.name
         found["quantization_nsb"] = np.int32(row.significant_bits)
+    if row.error_kind is not None and not row.uncertain:
+        found["error_kind"] = row.error_kind.value
+    if row.summary:
+        found["flag_values"] = np.array([0, *Severity], dtype=stored)
+        found["flag_meanings"] = "good use_with_care do_not_use"
     if row.flags is not None:
         found |= _flag_attributes(row.flags, stored)
     found["comment"] = (
@@ -348,6 +420,43 @@ PLACE = (
         valid_min=0.0,
     ),
 )
+SOUNDED = tuple(
+    Row(
+        name=f"gate_{name}",
+        dims=(),
+        dtype="f4",
+        units=units,
+        standard_name=name,
+        long_name=f"{name} of the sounded air",
+        coverage=Coverage.COORDINATE,
+        valid_min=-limit,
+        valid_max=limit,
+        follows_beam=True,
+        comment="Of a straight beam, on the WGS 84 ellipsoid.",
+    )
+    for name, units, limit in (
+        ("latitude", "degrees_north", 90.0),
+        ("longitude", "degrees_east", 180.0),
+    )
+)
+"""Of a slanting beam whose azimuth is known; `dims` is what lies along the beam."""
+
+
+def deployment(row: Row) -> Row:
+    """Return the row of the station's latitude or longitude where that of the air is another.
+
+    One latitude is that of the values: generic readers, which tell it by standard name or unit,
+    must not find two.
+    """
+    direction = "north" if row.name == "latitude" else "east"
+    return replace(
+        row,
+        standard_name=f"deployment_{row.name}",
+        units="degree",
+        comment=f"Positive {direction}. gate_{row.name} is that of the sounded air.",
+    )
+
+
 _STATION = Row(
     name="station",
     dims=("station_strlen",),
@@ -421,7 +530,7 @@ def shots(*, of: str) -> Row:
 def quality(dims: tuple[str, ...], flags: Quality) -> Row:
     """Return the row of the quality bits of a kind of product."""
     return Row(
-        name="quality_flag",
+        name=QUALITY_FLAG,
         dims=dims,
         dtype="i4",
         units="1",
@@ -434,7 +543,8 @@ def quality(dims: tuple[str, ...], flags: Quality) -> Row:
 
 def coordinates(along: tuple[Row, ...], altitude: Row) -> tuple[Row, ...]:
     """Return the coordinates of a kind of product: time, along the beam, place."""
-    return (TIME, *along, altitude, *PLACE)
+    sounded = (replace(row, dims=altitude.dims) for row in SOUNDED)
+    return (TIME, *along, altitude, *sounded, *PLACE)
 
 
 def station(*, profiles: bool) -> Row:

@@ -18,6 +18,7 @@ from lidarops.products.rows import (
     SECTION,
     SECTION_RANGE,
     Coverage,
+    ErrorKind,
     Layout,
     Row,
     altitude,
@@ -25,8 +26,10 @@ from lidarops.products.rows import (
     quality,
     shots,
 )
+from lidarops.products.rows_visibility import visibility
 from lidarops.products.table_elastic import ELASTIC
 from lidarops.products.table_multiangle import MULTIANGLE
+from lidarops.products.table_visibility import VISIBILITY
 from lidarops.records import ProductKind
 
 _OF_ELASTIC = {"average", "molecular", "known_shape", "reference"}
@@ -133,9 +136,13 @@ _HOMOGENEOUS = Layout(
             long_name="systematic error of the extinction coefficient to allow for",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
+            error_kind=ErrorKind.SYSTEMATIC,
             comment="Apart from the random error in extinction_standard_error: 5 percent of"
             " extinction + 1 / range. In random violations of the model that no test on the"
             f" residuals can see, it covered most of the excess error. {NO_NAME}",
+        ),
+        *visibility(
+            _SECTIONS, called="along the section", ancillaries=_OF_EXTINCTION, optional=True
         ),
         Row(
             name="amplitude",
@@ -191,6 +198,7 @@ _OWN = {
     ProductKind.HOMOGENEOUS: _HOMOGENEOUS,
     ProductKind.ELASTIC: ELASTIC,
     ProductKind.MULTIANGLE: MULTIANGLE,
+    ProductKind.VISIBILITY: VISIBILITY,
 }
 
 LAYOUTS: Final[Mapping[ProductKind, Layout]] = {

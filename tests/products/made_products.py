@@ -227,6 +227,8 @@ def multiangle(
         "log_intercept_standard_error": 0.02,
         "data_share": 0.99,
         "inhomogeneity": 0.03,
+        "monotone_optical_depth": 0.3,
+        "reduced_chi2": 1.0,
     }
     missing = (flags & int(Quality.EXTRAPOLATED)) != 0
     residual = rng.normal(0.0, 0.03, (profiles, angles.size, levels))

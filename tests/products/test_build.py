@@ -33,7 +33,7 @@ from lidarops.products.table import LAYOUTS
 from lidarops.records import DetectionMode, ProductKind
 from lidarops.retrieve import labeled_multiangle
 
-KINDS = list(ProductKind)
+KINDS = list(MAKERS)
 
 
 def decoded(data: xr.Dataset, kind: ProductKind, **changes) -> xr.Dataset:
@@ -48,6 +48,8 @@ def test_numbers_come_through(kind: ProductKind):
         if row.optional and row.name not in data:
             assert row.name not in product
             continue
+        if row.summary:
+            continue
         bits = 23 if row.significant_bits is None else row.significant_bits
         np.testing.assert_allclose(
             product[row.name].to_numpy().astype(float),
@@ -59,6 +61,36 @@ def test_numbers_come_through(kind: ProductKind):
     np.testing.assert_array_equal(product["time"], data["time"])
     np.testing.assert_array_equal(product["time_bnds"], data["time_bnds"])
     assert product["station"].item() == STATION.name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_usable_is_the_worst_severity_of_the_bits(kind: ProductKind):
+    data = MAKERS[kind]()
+    flags = data["quality_flag"]
+    allowed = [0, *(LAYOUTS[kind].row("quality_flag").flags or Quality(0))]
+    flags[...] = np.resize(np.array(allowed, np.int32), flags.shape)
+    flags[0, 0] = int(allowed[1] | allowed[-1])
+    # A value that is missing without a bit would be refused.
+    data = data.fillna(1.0)
+    product = build(data, context(kind))
+    expected = [
+        max((bit.severity for bit in Quality(int(value))), default=0) for value in flags.values.flat
+    ]
+    np.testing.assert_array_equal(product["usable"].values.ravel(), expected)
+    assert product["usable"].dims == product["quality_flag"].dims
+    assert product["usable"].dtype == np.int8
+    main = next(row for row in LAYOUTS[kind].variables if row.uncertain)
+    assert "quality_flag usable" in product[main.name].attrs["ancillary_variables"]
+    decoded_flags = xr.decode_cf(product)["usable"]
+    assert decoded_flags.attrs["flag_meanings"] == "good use_with_care do_not_use"
+    np.testing.assert_array_equal(decoded_flags.attrs["flag_values"], [0, 1, 2])
+
+
+def test_usable_cannot_be_handed_over():
+    data = homogeneous()
+    data["usable"] = (data["quality_flag"].dims, np.zeros(data["quality_flag"].shape, np.int8))
+    with pytest.raises(ProductError, match="usable"):
+        build(data, context())
 
 
 def test_storage_types_and_fill_values():
@@ -110,6 +142,8 @@ def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
 def test_no_variable_of_three_dimensions_names_a_place_which_cdo_could_not_read():
     product = build(multiangle(), context(ProductKind.MULTIANGLE))
     for row in LAYOUTS[ProductKind.MULTIANGLE].variables:
+        if row.name not in product:
+            continue
         listed = set(product[row.name].attrs["coordinates"].split())
         assert listed & {"latitude", "longitude"} == (
             {"latitude", "longitude"} if len(row.dims) < 3 else set()

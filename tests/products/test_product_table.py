@@ -92,15 +92,18 @@ def test_what_has_no_standard_name_is_what_the_table_does_not_know():
             "cloud_base_range",
             "background",
             "background_standard_error",
-            "profiles",
+            "scattering_ratio",
+            "scattering_ratio_standard_error",
             *gluing,
         },
         ProductKind.MULTIANGLE: {
             *(
                 f"{quantity}{error}"
-                for quantity in ("optical_depth", "extinction")
+                for quantity in ("optical_depth", "extinction", "layer_optical_depth")
                 for error in ("", "_standard_error", "_gradient_error")
             ),
+            "monotone_optical_depth",
+            "reduced_chi2",
             "log_intercept",
             "log_intercept_standard_error",
             "data_share",
@@ -109,7 +112,22 @@ def test_what_has_no_standard_name_is_what_the_table_does_not_know():
             "effective_degrees_of_freedom",
             "reach",
         },
+        ProductKind.VISIBILITY: {
+            "visibility_in_air_lower",
+            "visibility_in_air_upper",
+            "extinction",
+            "extinction_standard_error",
+            "extinction_systematic_error",
+            "condition",
+            "optical_depth",
+            "reduced_chi2",
+            "degrees_of_freedom",
+            "prior_deviation",
+            "ray_range",
+        },
         ProductKind.HOMOGENEOUS: {
+            "visibility_in_air_lower",
+            "visibility_in_air_upper",
             "extinction",
             "extinction_standard_error",
             "extinction_model_error",

@@ -1,0 +1,39 @@
+"""Command that makes a product again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidarops.cli.app import JsonOption, app, leave, plainly
+
+
+@app.command()
+@plainly
+def reproduce(
+    product: Annotated[Path, typer.Argument(help="A product.", metavar="PRODUCT")],
+    archive: Annotated[
+        str | None,
+        typer.Option("--archive", help="Folder or URL of the raw files; looked for if not told."),
+    ] = None,
+    ancillary: Annotated[
+        Path | None,
+        typer.Option("--ancillary", help="Folder of soundings and overlap functions."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a product again from its own provenance; exit code 0 where every byte is the same.
+
+    Example: lidarops reproduce demo/products/coast/coast-lidar/signal/2026/PRODUCT.nc
+    """
+    from dataclasses import asdict
+
+    from lidarops.reproduce import explain
+    from lidarops.reproduce import reproduce as make_again
+
+    result = make_again(product, archive=archive, ancillary=ancillary)
+    typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain(result))
+    leave(failed=not result.identical)

@@ -1,0 +1,434 @@
+"""Make a product again from nothing but its own provenance, and compare the bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from pydantic import ValidationError
+
+from lidarops.campaign import Campaign
+from lidarops.errors import LidarOpsError, ProductError
+from lidarops.processing import Job, process
+from lidarops.products.provenance import (
+    EPOCH_VARIABLE,
+    code_version,
+    package_versions,
+    read_provenance,
+)
+from lidarops.raw import licel
+from lidarops.records import Granule, InputRecord, LeftOut, Plan, Role, Scene, Status, Step
+
+_RAW: Final = (Role.SIGNAL, Role.DARK)
+"""Roles of files of the archive; those of the others lie beside the campaign file."""
+_SHOWN: Final = 20
+"""Files of one kind of trouble that are told by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One thing that is not what it was when the product was made."""
+
+    what: str
+    """``input``, ``code``, ``package``, ``processing``, ``attribute``, ``variable``, ``bytes``."""
+    name: str
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """What came of making a product again."""
+
+    product: str
+    identical: bool
+    """Whether every byte is the same."""
+    differences: tuple[Difference, ...]
+    """Empty where it is identical with the same software."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What a product tells of how it was made."""
+
+    file: Path
+    about: Mapping[str, Any]
+    """Of the entity ``lidarops:product``."""
+    settings: Mapping[str, Any]
+    plan: Plan
+    inputs: tuple[InputRecord, ...]
+    code_version: str
+    versions: Mapping[str, str]
+    epoch: str
+    """Of the environment in which the product was dated; empty where there was none."""
+
+    @classmethod
+    def of(cls, file: Path) -> _Told:
+        document = read_provenance(file)
+        try:
+            entities = document["entity"]
+            about = entities["lidarops:product"]
+            software = document["agent"]["lidarops:software"]
+            return cls(
+                file=file,
+                about=about,
+                settings=json.loads(about["lidarops:settings"]),
+                plan=_plan(json.loads(entities["lidarops:plan"]["lidarops:json"])),
+                inputs=_inputs(entities, document["used"]),
+                code_version=software["lidarops:code_version"],
+                versions=dict(each.split(" ", 1) for each in software["lidarops:versions"]),
+                epoch=_epoch(file),
+            )
+        except (KeyError, ValueError, TypeError) as error:
+            raise _untold(file, repr(error)) from error
+
+
+def _untold(file: Path, problem: str) -> ProductError:
+    return ProductError(
+        f"does not tell enough to make the product again: {problem}",
+        file=file,
+        field="provenance",
+        remedy="reprocess the campaign: products of older versions tell less",
+    )
+
+
+def _plan(told: Mapping[str, Any]) -> Plan:
+    return Plan(
+        told["scene"],
+        tuple(Step(**step) for step in told["steps"]),
+        tuple(LeftOut(**left) for left in told["left_out"]),
+    )
+
+
+def _inputs(
+    entities: Mapping[str, Any], uses: Mapping[str, Mapping[str, Any]]
+) -> tuple[InputRecord, ...]:
+    """Return the inputs of a document, in which files of equal content are one entity."""
+    paths = {
+        name: iter([paths] if isinstance(paths, str) else list(paths))
+        for name, entity in entities.items()
+        for paths in [entity.get("lidarops:path")]
+        if paths is not None
+    }
+    # Numbered in the order in which the writer sorted them, as are the paths of an entity.
+    numbered = [uses[name] for name in sorted(uses, key=lambda name: int(name[len("_:use") :]))]
+    return tuple(
+        InputRecord(
+            next(paths[use["prov:entity"]]),
+            Role(use["prov:role"]),
+            str(entities[use["prov:entity"]]["lidarops:sha256"]),
+        )
+        for use in numbered
+    )
+
+
+def _epoch(file: Path) -> str:
+    with xr.open_dataset(file, decode_cf=False) as product:
+        attributes = product.attrs
+    if f"that of {EPOCH_VARIABLE}" not in str(attributes["comment"]):
+        return ""
+    made = datetime.fromisoformat(str(attributes["date_created"]))
+    return str(round(made.timestamp()))
+
+
+def reproduce(
+    product: str | Path,
+    *,
+    archive: str | Path | None = None,
+    ancillary: str | Path | None = None,
+) -> Reproduction:
+    """Make a product again in a temporary folder and compare it with what it is.
+
+    Station, facts of the instrument, settings, plan and digests of all inputs are those that the
+    product itself holds; no campaign file or catalog is read.
+
+    Parameters
+    ----------
+    product : path or str
+        A product of one instrument.
+    archive : path or str, optional
+        Folder or URL of the raw files; without it, the nearest folder above the product that
+        holds them, itself or in a folder of its own.
+    ancillary : path or str, optional
+        Folder of the campaign file, from which soundings and overlap functions are named;
+        looked for like the archive where it is not given.
+
+    Returns
+    -------
+    Reproduction
+
+    Raises
+    ------
+    ProductError
+        If the file is no product, does not tell enough, or its inputs are nowhere to be found.
+    """
+    told = _Told.of(Path(product))
+    raw = [record for record in told.inputs if record.role in _RAW]
+    beside = [record for record in told.inputs if record.role not in _RAW]
+    with _staged(told, raw, archive, "--archive") as root:
+        folder = _folder_of(told, beside, ancillary, "--ancillary") if beside else root
+        changed = [*_changed(root, raw), *_changed(folder, beside)]
+        if changed:
+            return Reproduction(str(product), identical=False, differences=tuple(changed))
+        software = tuple(_software(told))
+        with tempfile.TemporaryDirectory(prefix="lidarops-") as out:
+            found = tuple(_made_again(told, root, folder, Path(out)))
+    # The same bytes from other software are the same product.
+    return Reproduction(
+        str(product), identical=not found, differences=(*found, *software) if found else ()
+    )
+
+
+@contextmanager
+def _staged(
+    told: _Told, records: Sequence[InputRecord], archive: str | Path | None, option: str
+) -> Iterator[Path]:
+    """Give a local folder of the raw files."""
+    if "://" not in str(archive):
+        yield _folder_of(told, records, archive, option)
+        return
+    import fsspec  # noqa: PLC0415 - most archives are local
+
+    store, prefix = fsspec.core.url_to_fs(str(archive))
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        for record in records:
+            target = Path(folder) / record.path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            source = f"{prefix.rstrip('/')}/{record.path}"
+            if store.exists(source):
+                store.get_file(source, str(target))
+        yield Path(folder)
+
+
+def _folder_of(
+    told: _Told, records: Sequence[InputRecord], given: str | Path | None, option: str
+) -> Path:
+    if given is not None:
+        return Path(given)
+    for parent in told.file.resolve().parents:
+        for folder in (parent, *_folders_in(parent)):
+            if any((folder / record.path).is_file() for record in records):
+                return folder
+    raise ProductError(
+        f"was made from {records[0].path}, which lies in no folder above the product",
+        file=told.file,
+        remedy=f"tell where with {option}",
+    )
+
+
+def _folders_in(parent: Path) -> list[Path]:
+    try:
+        return sorted(path for path in parent.iterdir() if path.is_dir())
+    except OSError:
+        return []
+
+
+def _changed(folder: Path, records: Iterable[InputRecord]) -> Iterator[Difference]:
+    for record in records:
+        try:
+            with (folder / record.path).open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            problem = f"missing from {folder}: {error.strerror}"
+            yield Difference("input", record.path, problem)
+        else:
+            if digest != record.sha256:
+                problem = f"changed: sha256 {digest[:12]}, was {record.sha256[:12]}"
+                yield Difference("input", record.path, problem)
+
+
+def _software(told: _Told) -> Iterator[Difference]:
+    if told.code_version != code_version():
+        yield Difference("code", "lidarops", f"{code_version()}, was {told.code_version}")
+    now = package_versions()
+    for name in sorted({*told.versions, *now}):
+        if told.versions.get(name) != now.get(name):
+            problem = f"{now.get(name, 'absent')}, was {told.versions.get(name, 'absent')}"
+            yield Difference("package", name, problem)
+
+
+def _made_again(told: _Told, root: Path, folder: Path, out: Path) -> Iterator[Difference]:
+    """Give what differs between a product and what is made of its inputs now."""
+    channel, kind = (str(told.about[f"lidarops:{key}"]) for key in ("channel", "kind"))
+    with _dated(told.epoch):
+        outcome = process(
+            Job(_campaign(told, root, folder, out), _scene(told, root), told.plan, only=channel)
+        )
+    if outcome.error:
+        yield Difference("processing", told.plan.scene, outcome.error)
+        return
+    record = next((each for each in outcome.products if each.kind.value == kind), None)
+    if record is None:
+        yield Difference("processing", told.plan.scene, f"makes no {kind} product any more")
+        return
+    with told.file.open("rb") as stream:
+        before = hashlib.file_digest(stream, "sha256").hexdigest()
+    if record.sha256 != before:
+        yield from _compared(told.file, out / "products" / record.path)
+
+
+@contextmanager
+def _dated(epoch: str) -> Iterator[None]:
+    """Set the date of products to that of the environment in which one was made."""
+    before = os.environ.pop(EPOCH_VARIABLE, None)
+    if epoch:
+        os.environ[EPOCH_VARIABLE] = epoch
+    try:
+        yield
+    finally:
+        os.environ.pop(EPOCH_VARIABLE, None)
+        if before is not None:
+            os.environ[EPOCH_VARIABLE] = before
+
+
+def _campaign(told: _Told, root: Path, folder: Path, out: Path) -> Campaign:
+    settings = told.settings
+    try:
+        keys, kind = settings["keys"], str(told.about["lidarops:kind"])
+        campaign = Campaign.model_validate(
+            {
+                **settings["campaign"],
+                "name": told.about["lidarops:campaign"],
+                "archive": str(root),
+                "output": str(out),
+                "metadata": settings["metadata"],
+                "stations": {keys["station"]: settings["station"]},
+                "instruments": {
+                    keys["instrument"]: {
+                        "station": keys["station"],
+                        "name": settings["instrument"],
+                        "files": "*",
+                        "facts": [settings["facts"]],
+                        "products": {kind: settings["products"]},
+                    }
+                },
+            }
+        )
+    except (KeyError, TypeError, ValidationError) as error:
+        raise _untold(told.file, str(error)) from error
+    campaign._folder = str(folder)  # noqa: SLF001 - as `lidarops.campaign.load` sets it
+    return campaign
+
+
+def _scene(told: _Told, root: Path) -> Scene:
+    try:
+        keys = told.settings["keys"]
+        start, stop = (datetime.fromisoformat(moment) for moment in told.settings["window"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _untold(told.file, repr(error)) from error
+    granules = [
+        _granule(root, record, keys["instrument"]) for record in told.inputs if record.role in _RAW
+    ]
+    granules.sort(key=lambda granule: (granule.start or start, granule.path))
+    return Scene(
+        id=told.plan.scene,
+        campaign=str(told.about["lidarops:campaign"]),
+        station=keys["station"],
+        instrument=keys["instrument"],
+        start=start,
+        stop=stop,
+        granules=tuple(each for each in granules if each.role is Role.SIGNAL),
+        dark=tuple(each for each in granules if each.role is Role.DARK),
+    )
+
+
+def _granule(root: Path, record: InputRecord, instrument: str) -> Granule:
+    path = root / record.path
+    header = licel.read_header(path)
+    return Granule(
+        path=record.path,
+        size=path.stat().st_size,
+        mtime_ns=0,
+        instrument=instrument,
+        role=record.role,
+        status=Status.GOOD,
+        start=header.start,
+        stop=header.stop,
+        layout=licel.layout(header),
+    )
+
+
+def _compared(before: Path, after: Path) -> Iterator[Difference]:
+    """Give what differs between two NetCDF files of which some byte does."""
+    count = 0
+    try:
+        with (
+            xr.open_dataset(before, decode_cf=False) as old,
+            xr.open_dataset(after, decode_cf=False) as new,
+        ):
+            for difference in (*_attributes("", old.attrs, new.attrs), *_variables(old, new)):
+                count += 1
+                yield difference
+    except (OSError, ValueError) as error:
+        raise LidarOpsError(f"cannot be read: {error}", file=before) from error
+    if not count:
+        yield Difference("bytes", before.name, "stored otherwise, with the same content")
+
+
+def _attributes(owner: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[Difference]:
+    for name in sorted({*old, *new}):
+        if not _same(old.get(name), new.get(name)):
+            problem = f"{_short(new.get(name))}, was {_short(old.get(name))}"
+            yield Difference("attribute", f"{owner}:{name}", problem)
+
+
+def _same(old: Any, new: Any) -> bool:
+    if old is None or new is None:
+        return old is new
+    return bool(np.array_equal(old, new))
+
+
+def _short(value: Any) -> str:
+    text = "absent" if value is None else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _variables(old: xr.Dataset, new: xr.Dataset) -> Iterator[Difference]:
+    for name in sorted({str(each) for each in (*old.variables, *new.variables)}):
+        if name not in old.variables or name not in new.variables:
+            state = "is new" if name in new.variables else "is no more"
+            yield Difference("variable", name, state)
+            continue
+        before, after = old.variables[name], new.variables[name]
+        yield from _attributes(name, before.attrs, after.attrs)
+        problem = _values(before.values, after.values)
+        if problem:
+            yield Difference("variable", name, problem)
+
+
+def _values(before: np.ndarray[Any, Any], after: np.ndarray[Any, Any]) -> str:
+    if before.shape != after.shape or before.dtype != after.dtype:
+        return f"has {after.dtype}{after.shape}, had {before.dtype}{before.shape}"
+    # As bytes: NaN equals itself, and the sign of zero counts.
+    other = before.view(np.uint8) != after.view(np.uint8) if before.ndim else before != after
+    if before.ndim:
+        other = other.reshape(*before.shape, -1).any(axis=-1)
+    count = int(np.count_nonzero(other))
+    if not count:
+        return ""
+    if before.dtype.kind != "f":
+        return f"{count} of {before.size} values differ"
+    most = float(np.max(np.abs(np.float64(after) - np.float64(before))[other]))
+    return f"{count} of {before.size} values differ, by {most:.3g} at most"
+
+
+def explain(result: Reproduction) -> str:
+    """Return what came of it in words, one line a difference."""
+    if result.identical:
+        return f"{result.product}: identical, every byte"
+    lines = [f"{result.product}: not the same"]
+    for what in dict.fromkeys(each.what for each in result.differences):
+        named = [each for each in result.differences if each.what == what]
+        lines += [f"  {what} {each.name}: {each.problem}" for each in named[:_SHOWN]]
+        if len(named) > _SHOWN:
+            lines.append(f"  ... and {len(named) - _SHOWN} more of {what}")
+    return "\n".join(lines)

@@ -1,0 +1,40 @@
+"""Products of every kind and shape of beam, as other people's tools get them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from products.made_products import MAKERS, context
+
+from lidarops.products.build import build
+from lidarops.products.write import write
+from lidarops.records import ProductKind
+
+BEAMS = {
+    "vertical": {"zenith": 0.0},
+    "horizontal": {"zenith": 90.0, "azimuth": 200.0},
+    "scan": {"zenith": [0.0, 30.0, 60.0, 80.0, 90.0], "azimuth": [0.0, 1.0, 2.0, 3.0, 4.0]},
+}
+CASES = [pytest.param((kind, beam), id=f"{kind}-{beam}") for kind in MAKERS for beam in BEAMS]
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ProductKind, str], Path]:
+    """Give the file of a kind and beam, written once."""
+    folder = tmp_path_factory.mktemp("products")
+
+    def path(kind: ProductKind, beam: str) -> Path:
+        file = folder / f"{kind}_{beam}.nc"
+        if not file.exists():
+            write(build(MAKERS[kind](**BEAMS[beam]), context(kind)), file)
+        return file
+
+    return path
+
+
+@pytest.fixture(scope="session", params=CASES)
+def product(request: pytest.FixtureRequest, made: Callable[[ProductKind, str], Path]) -> Path:
+    """Each of them."""
+    return made(*request.param)

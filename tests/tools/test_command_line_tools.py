@@ -1,0 +1,158 @@
+"""CDO, NCO and ncdump on products of every kind: means, cuts and joins are what they should be."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidarops.products.write import chunk_sizes
+from lidarops.records import ProductKind
+
+
+def needs(name: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(shutil.which(name) is None, reason=f"{name} is not installed")
+
+
+def call(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(part) for part in command],
+        check=True,
+        capture_output=True,
+        encoding="utf-8",
+        # CDO cuts names of units and stations between the bytes of a letter.
+        errors="replace",
+    )
+
+
+def measured(product: xr.Dataset) -> Iterator[str]:
+    """Names of numbers over time, which a mean is taken of."""
+    for name, variable in product.data_vars.items():
+        if variable.dims[:1] == ("time",) and variable.dtype.kind == "f":
+            yield str(name)
+
+
+def assert_means(product: Path, means: Path, names: list[str]) -> None:
+    with xr.open_dataset(product) as before, xr.open_dataset(means) as after:
+        assert names
+        for name in names:
+            expected = before[name].astype(float).mean("time")
+            np.testing.assert_allclose(
+                np.squeeze(after[name].to_numpy()), np.squeeze(expected), rtol=1e-6, err_msg=name
+            )
+
+
+def values_of(product: Path) -> list[str]:
+    with xr.open_dataset(product, decode_coords="all") as opened:
+        return list(measured(opened))
+
+
+@needs("cdo")
+def test_cdo_takes_means_over_time(product: Path, tmp_path: Path):
+    names = values_of(product)
+    # CDO means floats as floats; double precision is asked for, as anyone who compares does.
+    call(
+        "cdo",
+        "-s",
+        "-b",
+        "F64",
+        "timmean",
+        f"-selname,{','.join(names)}",
+        product,
+        tmp_path / "m.nc",
+    )
+    assert_means(product, tmp_path / "m.nc", names)
+
+
+@needs("cdo")
+def test_cdo_sees_every_number_and_says_which_text_it_skips(product: Path):
+    shown = call("cdo", "showname", product)
+    with xr.open_dataset(product, decode_coords="all") as opened:
+        numbers = {str(name) for name, each in opened.data_vars.items() if each.dtype.kind in "fi"}
+    # What has no dimension but the number of a container is no field for CDO.
+    assert numbers - set(shown.stdout.split()) <= {"quantization_info"}
+    # CDO 2.1 has no text: the two variables are named on standard error, nothing else is lost.
+    for name in ("station", "provenance"):
+        assert name not in shown.stdout.split()
+        assert f"skipped variable {name}" in shown.stderr
+
+
+@needs("cdo")
+def test_cdo_joins_days_and_keeps_bits(product: Path, tmp_path: Path):
+    later = tmp_path / "later.nc"
+    call("cdo", "-s", "shifttime,1day", product, later)
+    call("cdo", "-s", "mergetime", product, later, tmp_path / "both.nc")
+    with xr.open_dataset(product) as one, xr.open_dataset(tmp_path / "both.nc") as both:
+        assert both.sizes["time"] == 2 * one.sizes["time"]
+        flags = np.squeeze(both["quality_flag"].to_numpy())[: one.sizes["time"]]
+        np.testing.assert_array_equal(flags, np.squeeze(one["quality_flag"].to_numpy()))
+
+
+@needs("ncra")
+def test_nco_takes_means_over_time(product: Path, tmp_path: Path):
+    call("ncra", "--dbl", product, tmp_path / "mean.nc")
+    assert_means(product, tmp_path / "mean.nc", values_of(product))
+
+
+@needs("ncrcat")
+def test_nco_joins_files_over_time_for_time_is_the_record_dimension(product: Path, tmp_path: Path):
+    later = tmp_path / "later.nc"
+    shutil.copy(product, later)
+    with netCDF4.Dataset(later, "a") as file:
+        for name in ("time", "time_bnds"):
+            file[name][:] = file[name][:] + 86400.0
+    call("ncrcat", product, later, tmp_path / "both.nc")
+    with xr.open_dataset(tmp_path / "both.nc") as both, xr.open_dataset(product) as one:
+        profiles = one.sizes["time"]
+        np.testing.assert_array_equal(both["time"][:profiles], one["time"])
+        np.testing.assert_array_equal(both["time"][profiles:], one["time"] + np.timedelta64(1, "D"))
+        for name, variable in one.variables.items():
+            if "time" in variable.dims and variable.dtype.kind in "fi":
+                for half in (both[name][:profiles], both[name][profiles:]):
+                    np.testing.assert_array_equal(half, variable)
+        assert both["station"].item() == one["station"].item()
+    with netCDF4.Dataset(tmp_path / "both.nc") as file:
+        assert file.dimensions["time"].isunlimited()
+        variable = file["quality_flag"]
+        assert variable.chunking() != [1, *variable.shape[1:]]
+
+
+@needs("ncks")
+def test_nco_cuts_variables_with_all_that_belongs_to_them(product: Path, tmp_path: Path):
+    names = [name for name in values_of(product) if not name.startswith("gate_")]
+    call("ncks", "-v", names[0], "-d", "time,1,3", product, tmp_path / "cut.nc")
+    with xr.open_dataset(product) as whole, xr.open_dataset(tmp_path / "cut.nc") as cut:
+        np.testing.assert_array_equal(cut[names[0]], whole[names[0]][1:4])
+        # By the attributes `ancillary_variables`, `coordinates` and `bounds`.
+        assert {f"{names[0]}_standard_error", "quality_flag", "usable", "time_bnds"} <= set(
+            cut.variables
+        )
+        assert {"latitude", "longitude"} <= set(cut.variables) or len(whole[names[0]].dims) > 2
+
+
+@needs("ncdump")
+def test_ncdump_shows_one_epoch_and_the_meanings_of_flags(product: Path):
+    header = call("ncdump", "-hs", product).stdout
+    assert "time = UNLIMITED" in header
+    assert 'time:units = "seconds since 1970-01-01 00:00:00"' in header
+    assert 'usable:flag_meanings = "good use_with_care do_not_use"' in header
+    assert "usable:flag_values = 0b, 1b, 2b" in header
+    assert ':_Format = "netCDF-4 classic model"' in header
+    assert "NaN" not in header
+
+
+def test_chunks_are_those_that_the_writer_declares(
+    made: Callable[[ProductKind, str], Path],
+):
+    # An unlimited dimension would give chunks of one profile, and aggregates 30 times slower.
+    with netCDF4.Dataset(made(ProductKind.SIGNAL, "scan")) as file:
+        for variable in file.variables.values():
+            if variable.dimensions:
+                expected = chunk_sizes(variable.shape, variable.dtype.itemsize)
+                assert tuple(variable.chunking()) == expected
