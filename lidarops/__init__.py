@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import version as _version
 from typing import Any
 
-__all__ = ["__version__", "open_archive"]
+__all__ = ["__version__", "find_products", "open_archive", "open_products"]
 
 __version__ = _version("lidarops")
 
@@ -16,4 +16,12 @@ def __getattr__(name: str) -> Any:
         from lidarops.raw.archive import open_archive
 
         return open_archive
+    if name == "open_products":
+        from lidarops.aggregate.opening import open_products
+
+        return open_products
+    if name == "find_products":
+        from lidarops.aggregate.index import find_products
+
+        return find_products
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,71 @@
+"""Datasets of one group, joined along time; what belongs to a whole product stands apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from lidarops.products.table_means import PRODUCT, PRODUCT_INDEX
+
+_OF_ONE: Final = (
+    "date_", "history", "id", "lidarops_input_count", "lidarops_plan", "lidarops_scene",
+    "lidarops_steps", "lidarops_window_", "time_coverage_",
+)  # fmt: skip
+"""How the names of attributes begin that are true of one product only."""
+
+
+def shared_attributes(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the attributes that are equal in all and true of the whole, in their order."""
+    first = found[0]
+    return {
+        key: value
+        for key, value in first.items()
+        if not key.startswith(_OF_ONE)
+        and all(key in other and np.array_equal(other[key], value) for other in found[1:])
+    }
+
+
+def join(pieces: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Join datasets along time and along products.
+
+    Parameters
+    ----------
+    pieces : sequence of xr.Dataset
+        Of one group, each with ``product`` (product,) and ``product_index`` (time,) of its own.
+        What has neither dimension is equal in all.
+
+    Returns
+    -------
+    xr.Dataset
+        In order of time.
+    """
+    joined = pieces[0] if len(pieces) == 1 else _joined(pieces)
+    times = joined["time"].values
+    if (times[1:] < times[:-1]).any():
+        joined = joined.isel(time=np.argsort(times, kind="stable"))
+    return joined
+
+
+def _joined(pieces: Sequence[xr.Dataset]) -> xr.Dataset:
+    starts = np.cumsum([0, *(piece.sizes["product"] for piece in pieces[:-1])])
+    first = pieces[0]
+    variables = {}
+    for name, variable in first.variables.items():
+        parts = [piece.variables[name].to_base_variable() for piece in pieces]
+        if name == PRODUCT_INDEX.name:
+            # Each piece counts its own products from 0.
+            parts = [part + np.int32(start) for part, start in zip(parts, starts, strict=True)]
+            parts[0].attrs = variable.attrs
+        dim = next((dim for dim in ("time", PRODUCT.name) if dim in variable.dims), None)
+        variables[name] = variable if dim is None else _concat(parts, dim)
+    coordinates = {name: variables.pop(name) for name in first.coords}
+    shared = shared_attributes([piece.attrs for piece in pieces])
+    return xr.Dataset(variables, coords=coordinates, attrs=shared)
+
+
+def _concat(parts: Sequence[xr.Variable], dim: str) -> xr.Variable:
+    found: xr.Variable = xr.Variable.concat(parts, dim)  # type: ignore[no-untyped-call]
+    return found

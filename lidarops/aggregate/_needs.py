@@ -1,0 +1,36 @@
+"""Packages that only some users have."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from lidarops.errors import LidarOpsError
+
+
+def need(module: str, *, extra: str = "aggregate") -> Any:
+    """Import a package of an optional extra.
+
+    Parameters
+    ----------
+    module : str
+        Such as ``pyarrow.parquet``.
+    extra : str
+        Of lidarops, that installs it.
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    LidarOpsError
+        If it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise LidarOpsError(
+            f"the package {module.partition('.')[0]} cannot be imported: {error}",
+            remedy=f"pip install 'lidarops[{extra}]'",
+        ) from error

@@ -1,0 +1,161 @@
+"""Sums over profiles that means and their errors follow from, one product after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A quantity in the profiles of one product, all of shape (time, ...)."""
+
+    values: Array
+    """NaN where missing."""
+    errors: Array
+    """Standard errors."""
+    random: Array
+    """The part of `errors` that is new in every profile."""
+    shared: tuple[Array, ...]
+    """Errors that all profiles share, one array a cause, with signs."""
+    systematic: Array | None
+    """An error apart from `errors`, that all profiles share."""
+    wanted: NDArray[np.bool_]
+    """Where no quality bit rejects."""
+
+    def take(self, chosen: NDArray[np.intp]) -> Sample:
+        """Return some of the profiles."""
+        return Sample(
+            self.values[chosen],
+            self.errors[chosen],
+            self.random[chosen],
+            tuple(part[chosen] for part in self.shared),
+            None if self.systematic is None else self.systematic[chosen],
+            self.wanted[chosen],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Mean:
+    """What follows for a period, all of shape (...); NaN where nothing could be used."""
+
+    mean: Array
+    standard_error: Array
+    standard_deviation: Array
+    systematic: Array | None
+    observations: Counts
+
+
+@dataclass(slots=True)
+class Sums:
+    r"""Weighted sums of one quantity over the profiles of one period.
+
+    With weights :math:`w_i`, random errors :math:`r_i` and shared errors :math:`s_{ki}` of cause
+    :math:`k`, the mean and its variance are
+
+    .. math::
+        \bar x = \sum_i w_i x_i / W, \quad W = \sum_i w_i, \quad
+        \sigma^2 = \sum_i w_i^2 r_i^2 / W^2 + \sum_k \left(\sum_i w_i s_{ki} / W\right)^2 .
+
+    A shared error is fully correlated between profiles, and so is averaged before it is squared
+    (`gum2008`, section 5.2).
+    """
+
+    inverse_variance: bool
+    weight: Array
+    value: Array
+    random: Array
+    shared: tuple[Array, ...]
+    systematic: Array | None
+    count: Counts
+    centre: Array
+    """Unweighted mean so far, for the spread."""
+    spread: Array
+    """Sum of squared distances from it."""
+
+    @classmethod
+    def like(cls, sample: Sample, *, inverse_variance: bool) -> Sums:
+        """Return sums of nothing for samples of a shape.
+
+        Parameters
+        ----------
+        sample : Sample
+        inverse_variance : bool
+            Whether a profile counts by 1 / standard_error^2, else all count alike.
+        """
+        nothing = np.zeros(sample.values.shape[1:])
+        return cls(
+            inverse_variance=inverse_variance,
+            weight=nothing.copy(),
+            value=nothing.copy(),
+            random=nothing.copy(),
+            shared=tuple(nothing.copy() for _ in sample.shared),
+            systematic=None if sample.systematic is None else nothing.copy(),
+            count=nothing.astype(np.int64),
+            centre=nothing.copy(),
+            spread=nothing.copy(),
+        )
+
+    def add(self, sample: Sample) -> None:
+        """Add the profiles of one product.
+
+        Parameters
+        ----------
+        sample : Sample
+        """
+        used = self._used(sample)
+        # What is not used must be a number too, as nothing times NaN is NaN.
+        weights = np.zeros(used.shape)
+        weights[used] = sample.errors[used] ** -2.0 if self.inverse_variance else 1.0
+        self.weight += weights.sum(axis=0)
+        self.value += _sum(weights, sample.values, used)
+        self.random += _sum(weights**2, sample.random**2, used)
+        for total, part in zip(self.shared, sample.shared, strict=True):
+            np.add(total, _sum(weights, part, used), out=total)
+        if self.systematic is not None and sample.systematic is not None:
+            self.systematic += _sum(weights, sample.systematic, used)
+        self._spread(np.where(used, sample.values, 0.0), used)
+
+    def _used(self, sample: Sample) -> NDArray[np.bool_]:
+        parts = [sample.values, sample.errors, sample.random, *sample.shared]
+        parts += [] if sample.systematic is None else [sample.systematic]
+        used = sample.wanted.copy()
+        for part in parts:
+            used &= np.isfinite(part)
+        return used & (sample.errors > 0.0) if self.inverse_variance else used
+
+    def _spread(self, values: Array, used: NDArray[np.bool_]) -> None:
+        """Merge the spread of a product with that so far (`chan1983`)."""
+        count = used.sum(axis=0)
+        total = self.count + count
+        centre = values.sum(axis=0) / np.maximum(count, 1)
+        inner = np.where(used, (values - centre) ** 2, 0.0).sum(axis=0)
+        shift = np.where(count > 0, centre - self.centre, 0.0)
+        self.spread += inner + shift**2 * (self.count * count / np.maximum(total, 1))
+        self.centre += shift * (count / np.maximum(total, 1))
+        self.count = total
+
+    def mean(self) -> Mean:
+        """Return what follows from the sums."""
+        weight = np.where(self.count > 0, self.weight, np.nan)
+        variance = self.random / weight**2
+        for part in self.shared:
+            variance += (part / weight) ** 2
+        degrees = np.where(self.count > 1, self.count - 1.0, np.nan)
+        return Mean(
+            self.value / weight,
+            np.sqrt(variance),
+            np.sqrt(self.spread / degrees),
+            None if self.systematic is None else self.systematic / weight,
+            self.count,
+        )
+
+
+def _sum(weights: Array, values: Array, used: NDArray[np.bool_]) -> Array:
+    total: Array = (weights * np.where(used, values, 0.0)).sum(axis=0)
+    return total

@@ -1,0 +1,454 @@
+"""What an aggregate knows of a product: its facts, read from the file and from nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.products.rows import PROVENANCE
+from lidarops.products.table import LAYOUTS
+from lidarops.products.table_means import PERIOD
+from lidarops.records import ProductKind
+
+FOLDER: Final = "aggregates"
+"""Folder beside the products that aggregates are written to."""
+UNSHARED: Final = frozenset({PROVENANCE.name, "station", "quantization_info"})
+"""Variables about one product, which an aggregate does not hold."""
+
+_SCHEMA_ATTRIBUTES: Final = ("units", "standard_name", "flag_masks", "flag_meanings")
+_GRID_DIGITS: Final = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """One product as an aggregate sees it."""
+
+    path: str
+    """Relative to the folder of the aggregate's products, with forward slashes."""
+    id: str
+    kind: ProductKind
+    campaign: str
+    station: str
+    instrument: str
+    channel: str
+    mode: str
+    wavelength: float
+    """m; NaN where it is not known."""
+    start: datetime
+    """Start of the first profile."""
+    stop: datetime
+    latitude: float
+    """degree, of the station; of the middle of a network of several."""
+    longitude: float
+    altitude: float
+    """m above the geoid, of the same."""
+    sha256: str
+    size: int
+    profiles: int
+    values: int
+    """Values that ``quality_flag`` judges."""
+    usable: int
+    """Those that no bit rejects."""
+    unflagged: int
+    """Those that carry no bit."""
+    grid: str
+    """Digest of all that must be equal in products that are joined along time."""
+    code_version: str
+    flagged: Mapping[str, int] = field(default_factory=dict)
+    """Quality bit name -> number of values that carry it, without the bits of none."""
+
+    @property
+    def group(self) -> Group:
+        """What the product can be joined with."""
+        return Group(self.station, self.instrument, self.kind, self.channel, self.grid)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Group:
+    """Products that can be joined along time: one instrument, kind, channel and grid."""
+
+    station: str
+    instrument: str
+    kind: ProductKind
+    channel: str
+    grid: str
+
+    @property
+    def name(self) -> str:
+        """A name for files."""
+        return f"{self.station}_{self.instrument}_{self.kind.value}_{self.channel}_{self.grid[:8]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """A file that is no product, or no whole one."""
+
+    path: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which products are wanted; None and empty mean all."""
+
+    kind: ProductKind | None = None
+    channel: str | None = None
+    station: str | None = None
+    instrument: str | None = None
+    since: datetime | None = None
+    """Products that end after it."""
+    until: datetime | None = None
+    """Products that start before it."""
+
+    def admits(
+        self,
+        kind: ProductKind,
+        station: str,
+        instrument: str,
+        channel: str,
+        start: datetime,
+        stop: datetime,
+    ) -> bool:
+        """Say whether a product is wanted."""
+        asked = (self.kind, self.station, self.instrument, self.channel)
+        found = (kind, station, instrument, channel)
+        return (
+            all(want is None or want == is_ for want, is_ in zip(asked, found, strict=True))
+            and (self.since is None or stop > self.since)
+            and (self.until is None or start < self.until)
+        )
+
+
+EVERYTHING: Final = Selection()
+
+
+def product_paths(root: Path) -> list[str]:
+    """List the NetCDF files under a folder of output, or of products.
+
+    Parameters
+    ----------
+    root : path
+        The output of a campaign, of which only ``products`` counts, or a folder of products.
+        Hidden files, and what lies in ``aggregates``, are left out.
+
+    Returns
+    -------
+    list of str
+        Relative to `root`, sorted.
+
+    Raises
+    ------
+    ProductError
+        If there is no such folder.
+    """
+    if not root.is_dir():
+        raise ProductError("is no folder", file=root, remedy="give the folder of products")
+    below = root / "products" if (root / "products").is_dir() else root
+    found = (file.relative_to(root) for file in below.rglob("*.nc"))
+    return sorted(path.as_posix() for path in found if _is_listed(path))
+
+
+def _is_listed(path: Path) -> bool:
+    return path.parts[0] != FOLDER and not any(part.startswith(".") for part in path.parts)
+
+
+def within(root: Path, path: str) -> Path:
+    """Return a file of a folder, and refuse what leads out of it.
+
+    Parameters
+    ----------
+    root : path
+    path : str
+        Relative, with forward slashes.
+
+    Returns
+    -------
+    path
+
+    Raises
+    ------
+    ProductError
+        If the path is absolute, goes up, or is a link to the outside.
+    """
+    pure = PurePosixPath(path)
+    found = root / path
+    if pure.is_absolute() or ".." in pure.parts or "\\" in path or not path:
+        raise ProductError("is no path inside its folder", file=path)
+    if not found.resolve().is_relative_to(root.resolve()):
+        raise ProductError(f"leads out of {root}", file=path, remedy="replace the link by the file")
+    return found
+
+
+def scan(
+    root: Path, paths: Iterable[str], selection: Selection = EVERYTHING
+) -> Iterator[Facts | Refused]:
+    """Read the facts of the products that are wanted, and go on where one cannot be read.
+
+    Parameters
+    ----------
+    root : path
+    paths : iterable of str
+        From `product_paths`.
+    selection : Selection
+
+    Yields
+    ------
+    Facts or Refused
+        A file that cannot be read is refused whatever is wanted, as nothing tells what it is.
+    """
+    for path in paths:
+        try:
+            if _is_wanted(within(root, path), selection):
+                yield read_facts(root, path)
+        except ProductError as error:
+            yield Refused(path, error.problem)
+
+
+def _is_wanted(file: Path, selection: Selection) -> bool:
+    """Look at the attributes of a product, which is faster than to read its facts."""
+    if selection == EVERYTHING:
+        return True
+    with opened(file) as product:
+        found = product.attrs
+        names = ("station", "instrument", "channel")
+        start, stop = (_moment(found[f"time_coverage_{end}"]) for end in ("start", "end"))
+        station, instrument, channel = (found[f"lidarops_{name}"] for name in names)
+        return selection.admits(kind_of(product, file), station, instrument, channel, start, stop)
+
+
+def read_facts(root: Path, path: str) -> Facts:
+    """Read the facts of one product.
+
+    Parameters
+    ----------
+    root : path
+    path : str
+        Relative to `root`.
+
+    Returns
+    -------
+    Facts
+
+    Raises
+    ------
+    ProductError
+        If the file leads out of `root`, cannot be read, or is no product of lidarops.
+    """
+    file = within(root, path)
+    with opened(file) as product:
+        attributes = product.attrs
+        kind = kind_of(product, file)
+        flags = product["quality_flag"].values
+        rejecting = np.int32(Quality.rejecting())
+        height = "station_altitude" if "station_altitude" in product else "altitude"
+        return Facts(
+            path=path,
+            id=attributes["id"],
+            kind=kind,
+            campaign=attributes["lidarops_campaign"],
+            station=attributes["lidarops_station"],
+            instrument=attributes["lidarops_instrument"],
+            channel=attributes["lidarops_channel"],
+            mode=attributes["lidarops_detection_mode"],
+            wavelength=_middle(product, "wavelength") * 1e-9,
+            start=_moment(attributes["time_coverage_start"]),
+            stop=_moment(attributes["time_coverage_end"]),
+            latitude=_middle(product, "latitude"),
+            longitude=_middle(product, "longitude"),
+            altitude=_middle(product, height),
+            sha256=_sha256(file),
+            size=file.stat().st_size,
+            profiles=product.sizes["time"],
+            values=flags.size,
+            usable=flags.size - int(np.count_nonzero(flags & rejecting)),
+            unflagged=flags.size - int(np.count_nonzero(flags)),
+            grid=grid_digest(product, kind),
+            code_version=attributes["lidarops_code_version"],
+            flagged=_flagged(flags),
+        )
+
+
+@contextmanager
+def opened(file: Path) -> Iterator[xr.Dataset]:
+    """Open a product as stored, and tell what is wrong with it in a sentence.
+
+    Parameters
+    ----------
+    file : path
+
+    Yields
+    ------
+    xr.Dataset
+        Lazy, not decoded.
+
+    Raises
+    ------
+    ProductError
+        If the file cannot be read, or lacks what every product has.
+    """
+    try:
+        with xr.open_dataset(file, engine="netcdf4", decode_cf=False, cache=False) as product:
+            yield product
+    except KeyError as error:
+        raise ProductError(f"is no product of lidarops: it has no {error}", file=file) from error
+    # A damaged file gives OSError or RuntimeError, wherever it is read.
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ProductError(f"cannot be read: {error}", file=file) from error
+
+
+def kind_of(product: xr.Dataset, file: Path) -> ProductKind:
+    """Return the kind of a product.
+
+    Raises
+    ------
+    ProductError
+        If the file is no product, or of a kind that this version does not know.
+    """
+    kind = product.attrs.get("lidarops_kind")
+    if kind not in set(ProductKind):
+        told = "is no product of lidarops" if kind is None else f"is of an unknown kind: {kind}"
+        raise ProductError(told, file=file)
+    if PERIOD in product.attrs:
+        raise ProductError("holds means of products, and is no product itself", file=file)
+    return ProductKind(kind)
+
+
+def coordinate_names(kind: ProductKind) -> frozenset[str]:
+    """Return the names of the coordinates of a kind of product, cell limits included."""
+    rows = LAYOUTS[kind].coordinates
+    bounds = (row.bounds for row in rows if row.bounds)
+    return frozenset({*(row.name for row in rows), *bounds})
+
+
+def grid_digest(product: xr.Dataset, kind: ProductKind) -> str:
+    """Digest all that must be equal in products which are joined along time.
+
+    That is: the names, types, dimensions, units and flags of their variables, and the values of
+    every coordinate that does not change with time, the place of the station included.
+
+    Parameters
+    ----------
+    product : xr.Dataset
+        Not decoded.
+    kind : ProductKind
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits.
+    """
+    digest = hashlib.sha256(kind.value.encode())
+    coordinates = coordinate_names(kind)
+    for name in sorted(str(name) for name in product.variables):
+        if name in UNSHARED:
+            continue
+        variable = product.variables[name]
+        sizes = [(str(dim), size) for dim, size in variable.sizes.items() if dim != "time"]
+        schema = [plain(variable.attrs.get(key)) for key in _SCHEMA_ATTRIBUTES]
+        digest.update(repr((name, variable.dtype.str, variable.dims, sizes, schema)).encode())
+        if name in coordinates and "time" not in variable.dims:
+            digest.update(np.ascontiguousarray(variable.values).tobytes())
+    return digest.hexdigest()[:_GRID_DIGITS]
+
+
+def plain(value: Any) -> Any:
+    """Return an attribute as JSON types."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def groups(products: Iterable[Facts]) -> dict[Group, list[Facts]]:
+    """Sort products into groups that can be joined, each by time.
+
+    Parameters
+    ----------
+    products : iterable of Facts
+
+    Returns
+    -------
+    dict of Group to list of Facts
+        Groups by name, products by start, then path.
+    """
+    found: dict[Group, list[Facts]] = {}
+    for product in sorted(products, key=lambda each: (each.start, each.path)):
+        found.setdefault(product.group, []).append(product)
+    return dict(sorted(found.items()))
+
+
+def told_grids(found: Iterable[Group]) -> list[str]:
+    """Say which instruments, kinds and channels have products of several grids.
+
+    Parameters
+    ----------
+    found : iterable of Group
+
+    Returns
+    -------
+    list of str
+        One sentence each.
+    """
+    grids: dict[tuple[str, str, str, str], list[str]] = {}
+    for group in found:
+        of = (group.station, group.instrument, group.kind.value, group.channel)
+        grids.setdefault(of, []).append(group.grid[:8])
+    return [
+        f"{' '.join(of)}: products of {len(names)} grids, which are not joined: {', '.join(names)}"
+        for of, names in grids.items()
+        if len(names) > 1
+    ]
+
+
+def refuse_duplicates(times: NDArray[np.float64], owners: list[str]) -> None:
+    """Refuse profiles at the same time, naming the products that hold them.
+
+    Parameters
+    ----------
+    times : ndarray, shape (time,)
+        In any order.
+    owners : list of str
+        Path of the product of each.
+
+    Raises
+    ------
+    ProductError
+        If a time comes twice.
+    """
+    order = np.argsort(times, kind="stable")
+    same = np.flatnonzero(np.diff(times[order]) == 0)
+    if same.size:
+        first, second = (owners[order[at]] for at in (same[0], same[0] + 1))
+        moment = datetime.fromtimestamp(float(times[order[same[0]]]), UTC)
+        raise ProductError(
+            f"holds a profile at {moment:%Y-%m-%dT%H:%M:%SZ} that is also in {second}",
+            file=first,
+            remedy="leave one of the products out",
+        )
+
+
+def _moment(text: str) -> datetime:
+    return datetime.fromisoformat(text).astimezone(UTC)
+
+
+def _middle(product: xr.Dataset, name: str) -> float:
+    """Return a coordinate of the station, or the mean of those of a network; NaN without any."""
+    return float(product[name].values.mean()) if name in product else float("nan")
+
+
+def _flagged(flags: NDArray[np.int32]) -> dict[str, int]:
+    counts = {str(bit.name): int(np.count_nonzero(flags & int(bit))) for bit in Quality}
+    return {name: count for name, count in counts.items() if count}
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,256 @@
+"""Daily and monthly means of products, with errors, as NetCDF files of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.aggregate._join import shared_attributes
+from lidarops.aggregate._samples import Profiles, read_profiles
+from lidarops.aggregate._sums import Array, Sums
+from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates
+from lidarops.aggregate.means_file import (
+    Frame,
+    Lineage,
+    Periods,
+    encode,
+    means_version,
+    prov_json,
+    read_frame,
+)
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.products.table_means import About, Period, Weights, systematic
+from lidarops.products.write import write
+from lidarops.records import ProductKind
+
+_UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
+
+Record = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class MeansFile:
+    """A file of means that was written."""
+
+    path: str
+    """Relative to the folder of the products' root, with forward slashes."""
+    sha256: str
+    size: int
+    periods: int
+    products: int
+
+
+@dataclass(frozen=True, slots=True)
+class Averaged:
+    """The files of means of one group, and the products that could not be read."""
+
+    files: tuple[MeansFile, ...]
+    refused: tuple[Refused, ...]
+
+
+def write_means(
+    root: Path,
+    products: Sequence[Facts],
+    period: Period,
+    *,
+    weights: Weights = Weights.PLAIN,
+) -> Averaged:
+    """Write the means of one group of products, one file a calendar year.
+
+    Products are read one after the other, so that memory holds one product and the periods that
+    it reaches into. A product that cannot be read is named and left out.
+
+    Parameters
+    ----------
+    root : path
+        Folder that the products' paths start from; the files go to its ``aggregates/means``.
+    products : sequence of Facts
+        Of one group, in order of time (`lidarops.aggregate.facts.groups`).
+    period : Period
+    weights : Weights
+
+    Returns
+    -------
+    Averaged
+
+    Raises
+    ------
+    ProductError
+        If the beam moves, two products hold the same time, or a file cannot be written.
+    """
+    averaging = _Averaging(period, weights)
+    frame: Frame | None = None
+    refused = []
+    for facts in products:
+        try:
+            found = frame or read_frame(root, facts)
+            profiles = read_profiles(root, facts)
+        except ProductError as error:
+            refused.append(Refused(facts.path, error.problem))
+            continue
+        if frame is None:
+            found.refuse_moving_beam(facts.path)
+            frame = found
+        averaging.add(profiles)
+    averaging.finish()
+    files = () if frame is None else tuple(_written(root, products[0].group, frame, averaging))
+    return Averaged(files, tuple(refused))
+
+
+@dataclass(slots=True)
+class _PeriodSums:
+    """Sums of all quantities over one period."""
+
+    kind: ProductKind
+    weights: Weights
+    quantities: dict[str, Sums] = field(default_factory=dict)
+    profiles: int = 0
+    usable: Any = 0
+    """Profiles whose value no bit rejects, of the shape of the flags without time."""
+    flags: Any = 0
+    """Bits of all values."""
+    usable_flags: Any = 0
+    """Bits of the usable values."""
+    shots: float = 0.0
+
+    def add(self, profiles: Profiles, chosen: NDArray[np.intp]) -> None:
+        for name, sample in profiles.samples.items():
+            part = sample.take(chosen)
+            if name not in self.quantities:
+                inverse = self.weights is Weights.INVERSE_VARIANCE
+                self.quantities[name] = Sums.like(part, inverse_variance=inverse)
+            self.quantities[name].add(part)
+        flags = profiles.flags[chosen]
+        wanted = (flags & np.int32(Quality.rejecting())) == 0
+        self.profiles += chosen.size
+        self.usable = self.usable + wanted.sum(axis=0)
+        self.flags = self.flags | np.bitwise_or.reduce(flags, axis=0)
+        kept = np.where(wanted, flags, np.int32(0))
+        self.usable_flags = self.usable_flags | np.bitwise_or.reduce(kept, axis=0)
+        self.shots += float(profiles.shots[chosen].sum())
+
+    def record(self) -> dict[str, NDArray[Any]]:
+        """Return the variables of the period, without dimension time."""
+        flags = np.where(self.usable > 0, self.usable_flags, self.flags)
+        found: dict[str, NDArray[Any]] = {
+            "usable_share": self.usable / np.float64(self.profiles),
+            "shots": np.asarray(self.shots),
+        }
+        for name, sums in self.quantities.items():
+            mean = sums.mean()
+            found[name] = mean.mean
+            found[f"{name}_standard_error"] = mean.standard_error
+            found[f"{name}_standard_deviation"] = mean.standard_deviation
+            found[f"{name}_observations"] = mean.observations
+            if mean.systematic is not None:
+                found[f"{systematic(self.kind, name)}"] = mean.systematic
+            if mean.mean.shape == flags.shape:
+                # Usable, but without an error that it could be weighted by: say that it is missing.
+                silent = ~np.isfinite(mean.mean) & (flags == 0)
+                flags = np.where(silent, np.int32(Quality.INPUT_MISSING), flags)
+        return {**found, "quality_flag": flags}
+
+
+@dataclass(slots=True)
+class _Year:
+    """The means of one calendar year, and what they were made of."""
+
+    keys: list[np.datetime64] = field(default_factory=list)
+    records: list[Record] = field(default_factory=list)
+    inputs: dict[str, Facts] = field(default_factory=dict)
+    shared: dict[str, Any] | None = None
+    """Attributes that all products so far have alike."""
+
+    def note(self, profiles: Profiles) -> None:
+        path = profiles.facts.path
+        if path not in self.inputs:
+            self.inputs[path] = profiles.facts
+            so_far = profiles.attributes if self.shared is None else self.shared
+            self.shared = shared_attributes([so_far, profiles.attributes])
+
+    def close(self, key: np.datetime64, sums: _PeriodSums) -> None:
+        self.keys.append(key)
+        self.records.append(sums.record())
+
+
+@dataclass(slots=True)
+class _Averaging:
+    """Products in, years of means out."""
+
+    period: Period
+    weights: Weights
+    years: dict[int, _Year] = field(default_factory=dict)
+    _open: dict[np.datetime64, _PeriodSums] = field(default_factory=dict)
+    _times: list[Array] = field(default_factory=list)
+    _owners: list[str] = field(default_factory=list)
+
+    def add(self, profiles: Profiles) -> None:
+        """Add a product that starts no earlier than those before."""
+        facts = profiles.facts
+        self._close(before=np.datetime64(facts.start.replace(tzinfo=None), "ms"))
+        self._times.append(profiles.times)
+        self._owners += [facts.path] * profiles.times.size
+        for key, chosen in self._periods(profiles.times):
+            self.years.setdefault(_year(key), _Year()).note(profiles)
+            sums = self._open.setdefault(key, _PeriodSums(facts.kind, self.weights))
+            sums.add(profiles, chosen)
+
+    def finish(self) -> None:
+        """Close all periods.
+
+        Raises
+        ------
+        ProductError
+            If two products hold a profile at the same time.
+        """
+        if self._times:
+            refuse_duplicates(np.concatenate(self._times), self._owners)
+        self._close(before=None)
+
+    def _close(self, *, before: np.datetime64 | None) -> None:
+        done = [key for key in self._open if before is None or key + 1 <= before]
+        for key in sorted(done):
+            self.years[_year(key)].close(key, self._open.pop(key))
+
+    def _periods(self, times: Array) -> Iterator[tuple[np.datetime64, NDArray[np.intp]]]:
+        # Whole milliseconds: the middle of a profile is not known better.
+        moments = np.datetime64(0, "ms") + np.rint(times * 1e3).astype("timedelta64[ms]")
+        keys = moments.astype(f"datetime64[{_UNITS[self.period]}]")
+        for key in np.unique(keys):
+            yield key, np.flatnonzero(keys == key)
+
+
+def _year(key: np.datetime64) -> int:
+    return int(key.astype("datetime64[Y]").astype(int)) + 1970
+
+
+def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> Iterator[MeansFile]:
+    period, weights = averaging.period, averaging.weights
+    for number, year in sorted(averaging.years.items()):
+        keys = np.array(year.keys)
+        bounds = np.stack([keys, keys + 1], axis=-1).astype("datetime64[s]")
+        start, stop = (_datetime(moment) for moment in (bounds[0, 0], bounds[-1, 1]))
+        lineage = Lineage(tuple(year.inputs.values()), period, weights, start, stop)
+        about = About(lineage.id, period, weights, start, stop, len(year.inputs), means_version())
+        periods = Periods(bounds.astype(np.float64), year.records)
+        dataset = encode(frame, periods, year.shared or {}, about, prov_json(lineage))
+        path = _path(group, period, weights, number)
+        done = write(dataset, root / path)
+        yield MeansFile(path, done.sha256, done.size, len(keys), len(year.inputs))
+
+
+def _path(group: Group, period: Period, weights: Weights, year: int) -> str:
+    of = f"{group.station}/{group.instrument}/{group.kind.value}/{period.value}"
+    weighted = "" if weights is Weights.PLAIN else f"_{weights.value}"
+    return f"{FOLDER}/means/{of}/{group.name}_{period.value}{weighted}_{year}.nc"
+
+
+def _datetime(moment: np.datetime64) -> datetime:
+    return datetime.fromtimestamp(int(moment.astype(np.int64)), UTC)

@@ -1,0 +1,154 @@
+"""Products as a static STAC catalog for tools outside: one Item a product, a Collection a kind."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from lidarops.aggregate._needs import need
+from lidarops.aggregate.facts import FOLDER, Facts
+from lidarops.errors import ProductError
+from lidarops.products.table import LAYOUTS
+from lidarops.records import ProductKind
+
+_NETCDF: Final = "application/x-netcdf"
+_PREFIX: Final = "lidarops"
+
+
+def write_stac(root: Path, products: Sequence[Facts]) -> str:
+    """Write a self-contained STAC catalog of products, in place of the one before.
+
+    All links are relative, those to the products too, so that the whole output can be moved or
+    served from anywhere. Nothing depends on when or where it is written.
+
+    Parameters
+    ----------
+    root : path
+        Folder that the products' paths start from; the catalog goes to its ``aggregates/stac``.
+    products : sequence of Facts
+
+    Returns
+    -------
+    str
+        Path of ``catalog.json`` relative to `root`.
+
+    Raises
+    ------
+    ProductError
+        If two products have one file name, or there is none.
+    LidarOpsError
+        If pystac is not installed.
+    OSError
+        If the files cannot be written.
+    """
+    pystac = need("pystac")
+    if not products:
+        raise ProductError("there is no product to list", file=root)
+    _refuse_equal_names(products)
+    catalog = pystac.Catalog(
+        id=" ".join(sorted({product.campaign for product in products})),
+        description="Products of lidarops, one Collection for each kind.",
+    )
+    target = root / FOLDER / "stac"
+    for kind in ProductKind:
+        found = sorted((each for each in products if each.kind is kind), key=lambda each: each.path)
+        if found:
+            catalog.add_child(_collection(pystac, kind, found))
+    catalog.normalize_hrefs(target.resolve().as_posix(), skip_unresolved=False)
+    for item in catalog.get_items(recursive=True):
+        _link_product(item, root.resolve())
+    # Beside the old one, so that a reader finds the one or the other.
+    building = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        catalog.save(pystac.CatalogType.SELF_CONTAINED, dest_href=building.as_posix())
+        shutil.rmtree(target, ignore_errors=True)
+        building.rename(target)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return (target / "catalog.json").relative_to(root).as_posix()
+
+
+def _refuse_equal_names(products: Sequence[Facts]) -> None:
+    names: dict[str, str] = {}
+    for product in products:
+        other = names.setdefault(_name(product), product.path)
+        if other != product.path:
+            raise ProductError(
+                f"has the file name of {other}", file=product.path, remedy="leave one out"
+            )
+
+
+def _name(product: Facts) -> str:
+    return PurePosixPath(product.path).stem
+
+
+def _collection(pystac: Any, kind: ProductKind, products: Sequence[Facts]) -> Any:
+    layout = LAYOUTS[kind]
+    places = [(each.longitude, each.latitude) for each in products]
+    west, south = (min(axis) for axis in zip(*places, strict=True))
+    east, north = (max(axis) for axis in zip(*places, strict=True))
+    times = [[min(each.start for each in products), max(each.stop for each in products)]]
+    collection = pystac.Collection(
+        id=kind.value,
+        title=layout.title,
+        description=layout.summary,
+        keywords=list(layout.keywords),
+        extent=pystac.Extent(
+            pystac.SpatialExtent([[west, south, east, north]]), pystac.TemporalExtent(times)
+        ),
+    )
+    for product in products:
+        collection.add_item(_item(pystac, product))
+    return collection
+
+
+def _item(pystac: Any, product: Facts) -> Any:
+    place = [product.longitude, product.latitude]
+    wavelength = product.wavelength if math.isfinite(product.wavelength) else None
+    of_ours = {
+        "id": product.id,
+        "kind": product.kind.value,
+        "channel": product.channel,
+        "wavelength": wavelength,
+        "station_altitude": product.altitude,
+        "profiles": product.profiles,
+        "values": product.values,
+        "usable": product.usable,
+        "unflagged": product.unflagged,
+        "grid": product.grid,
+        "code_version": product.code_version,
+        "flags": {name.lower(): count for name, count in product.flagged.items()},
+    }
+    item = pystac.Item(
+        id=_name(product),
+        geometry={"type": "Point", "coordinates": place},
+        bbox=[*place, *place],
+        datetime=None,
+        start_datetime=product.start,
+        end_datetime=product.stop,
+        properties={
+            "platform": product.station,
+            "instruments": [product.instrument],
+            "mission": product.campaign,
+            **{f"{_PREFIX}:{name}": value for name, value in of_ours.items() if value is not None},
+        },
+    )
+    asset = pystac.Asset(
+        href=product.path,
+        media_type=_NETCDF,
+        roles=["data"],
+        extra_fields={f"{_PREFIX}:size": product.size, f"{_PREFIX}:sha256": product.sha256},
+    )
+    item.add_asset("product", asset)
+    return item
+
+
+def _link_product(item: Any, root: Path) -> None:
+    """Make the path of an item's product relative to the item."""
+    asset = item.assets["product"]
+    folder = Path(item.get_self_href()).parent
+    asset.href = Path(os.path.relpath(root / asset.href, folder)).as_posix()

@@ -1,0 +1,111 @@
+"""The command that makes many products one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lidarops.cli.app import (
+    JsonOption,
+    add_row,
+    app,
+    leave,
+    make_table,
+    plainly,
+    progress_bar,
+    show,
+    utc,
+)
+
+if TYPE_CHECKING:
+    from lidarops.aggregate.making import Made
+
+
+@app.command()
+@plainly
+def aggregate(
+    out: Annotated[
+        Path,
+        typer.Argument(
+            help="Output of a campaign, a folder of products, or a campaign file.",
+            metavar="OUT_OR_CAMPAIGN",
+        ),
+    ],
+    kind: Annotated[str | None, typer.Option(help="Only this kind of product.")] = None,
+    channel: Annotated[str | None, typer.Option(help="Only this channel.")] = None,
+    station: Annotated[str | None, typer.Option(help="Only this station.")] = None,
+    instrument: Annotated[str | None, typer.Option(help="Only this instrument.")] = None,
+    since: Annotated[
+        datetime | None, typer.Option(help="Only products that end after this UTC time.")
+    ] = None,
+    until: Annotated[
+        datetime | None, typer.Option(help="Only products that start before this UTC time.")
+    ] = None,
+    means: Annotated[
+        str | None, typer.Option(help="Write means too: day or month.", metavar="PERIOD")
+    ] = None,
+    weights: Annotated[
+        str, typer.Option(help="Of the profiles of a mean: plain or inverse-variance.")
+    ] = "plain",
+    stac: Annotated[bool, typer.Option("--stac", help="Write a STAC catalog too.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write an index of products, and one virtual dataset for each instrument, kind and channel.
+
+    All goes to the folder aggregates, and can be thrown away and made again.
+
+    Example: lidarops aggregate demo
+
+    Example: lidarops aggregate demo --kind elastic --means month --weights inverse-variance
+    """
+    from lidarops.aggregate.making import Wanted, make
+    from lidarops.aggregate.selecting import choice, select
+    from lidarops.products.table_means import Period, Weights
+
+    wanted = Wanted(
+        select(kind, channel, station, instrument, utc(since), utc(until)),
+        None if means is None else choice(Period, means, "means"),
+        choice(Weights, weights, "weights"),
+        stac,
+    )
+    with progress_bar("aggregate", None) as advance:
+        made = make(_root(out), wanted, progress=advance)
+    if as_json:
+        typer.echo(json.dumps(asdict(made), indent=2, default=str))
+    else:
+        _tell(made)
+    leave(failed=bool(made.refused or made.failed))
+
+
+def _root(out: Path) -> Path:
+    if not out.is_file():
+        return out
+    from lidarops.campaign import load
+
+    return Path(load(out).output)
+
+
+def _tell(made: Made) -> None:
+    views = make_table("Views", "file", "products", "profiles", "parts")
+    for view in made.views:
+        add_row(views, view.path, view.products, view.profiles, view.parts)
+    means = make_table("Means", "file", "products", "periods")
+    for file in made.means:
+        add_row(means, file.path, file.products, file.periods)
+    refused = make_table("Refused", "file", "reason")
+    for product in made.refused:
+        add_row(refused, product.path, product.reason)
+    for table in (views, means, refused):
+        show(table)
+    for sentence in made.told:
+        typer.echo(f"note: {sentence}")
+    for sentence in made.failed:
+        typer.secho(f"failed: {sentence}", fg="red", err=True)
+    for name, path in (("index", made.index), ("stac", made.stac)):
+        if path is not None:
+            typer.echo(f"{name}: {made.root / path}")

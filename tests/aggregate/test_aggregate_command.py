@@ -1,0 +1,104 @@
+"""The command line, and packages that are not there."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from made_archive import add_day
+from typer.testing import CliRunner
+
+from lidarops.aggregate._needs import need
+from lidarops.cli import aggregate as _command  # noqa: F401  # registers the command
+from lidarops.cli import app
+from lidarops.errors import LidarOpsError
+from lidarops.records import ProductKind
+
+pytest.importorskip("pyarrow")
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["aggregate", *map(str, arguments)])
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    return result.exit_code, result.output
+
+
+def test_everything_is_made(tmp_path: Path):
+    for day in range(2):
+        add_day(tmp_path, day)
+        add_day(tmp_path, day, ProductKind.ELASTIC)
+    code, output = run(tmp_path, "--means", "month", "--stac", "--json")
+    made = json.loads(output)
+    assert code == 0
+    assert made["products"] == 4
+    assert len(made["views"]) == len(made["means"]) == 2
+    files = [made["index"], made["stac"], *(each["path"] for each in made["views"])]
+    files += [each["path"] for each in made["means"]]
+    assert all((tmp_path / file).is_file() for file in files)
+
+
+def test_a_damaged_product_is_named_and_the_exit_code_is_1(tmp_path: Path):
+    add_day(tmp_path, 0)
+    damaged = add_day(tmp_path, 1)
+    (tmp_path / damaged).write_bytes(b"nothing")
+    code, output = run(tmp_path, "--json")
+    made = json.loads(output)
+    assert code == 1
+    assert [each["path"] for each in made["refused"]] == [damaged]
+    assert [each["products"] for each in made["views"]] == [1]
+
+
+def test_a_selection_leaves_the_index_alone(tmp_path: Path):
+    add_day(tmp_path, 0)
+    add_day(tmp_path, 0, ProductKind.SIGNAL)
+    code, output = run(tmp_path, "--kind", "signal", "--since", "2026-01-01", "--json")
+    made = json.loads(output)
+    assert code == 0
+    assert made["index"] is None
+    assert len(made["views"]) == 1
+    assert "signal" in made["views"][0]["path"]
+    code, output = run(tmp_path, "--kind", "signal", "--stac")
+    assert code == 1
+    assert "of all products" in output
+
+
+def test_what_cannot_be_averaged_is_told_and_the_rest_goes_on(tmp_path: Path):
+    add_day(tmp_path, 0, zenith=[0.0, 10.0, 20.0, 30.0, 40.0])
+    add_day(tmp_path, 1, ProductKind.SIGNAL)
+    code, output = run(tmp_path, "--means", "day", "--json")
+    made = json.loads(output)
+    assert code == 1
+    assert len(made["views"]) == 2
+    assert len(made["means"]) == 1
+    assert "the beam moves" in made["failed"][0]
+
+
+def test_a_person_is_told_of_grids(tmp_path: Path):
+    add_day(tmp_path, 0)
+    add_day(tmp_path, 1, sections=3)
+    code, output = run(tmp_path)
+    assert code == 0
+    assert "products of 2 grids, which are not joined" in " ".join(output.split())
+    assert "products.parquet" in output
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [["--kind", "x"], ["--means", "week"], ["--weights", "x"], ["--since", "x"]],
+)
+def test_wrong_use_exits_with_2(wrong: list[str], tmp_path: Path):
+    add_day(tmp_path, 0)
+    assert run(tmp_path, *wrong)[0] == 2
+
+
+def test_a_folder_without_products_is_refused(tmp_path: Path):
+    assert run(tmp_path)[0] == 1
+    assert run(tmp_path / "nothing")[0] == 1
+
+
+def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(LidarOpsError, match=r"pip install 'lidarops\[aggregate\]'"):
+        need("pyarrow")

@@ -1,0 +1,170 @@
+"""The index of products: what it finds, how large it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from uuid import UUID
+
+import numpy as np
+import pandas as pd
+import pytest
+from made_archive import add_day, facts_of
+
+from lidarops.aggregate.facts import Facts, Selection
+from lidarops.aggregate.index import INDEX, find, find_products, write_index
+from lidarops.errors import ProductError, RetrievalInputError
+from lidarops.records import ProductKind
+
+pytest.importorskip("pyarrow")
+
+VALUES = {
+    ProductKind.SIGNAL: 144 * 4096,
+    ProductKind.HOMOGENEOUS: 144 * 3,
+    ProductKind.ELASTIC: 48 * 2000,
+    ProductKind.MULTIANGLE: 24 * 100,
+}
+
+
+def fabricated(count: int) -> list[Facts]:
+    """Products of ten years as an archive has them, digests and counts at random."""
+    rng = np.random.default_rng(3)
+    found = []
+    for number in range(count):
+        kind = list(VALUES)[number % len(VALUES)]
+        channel = ("analog_532o", "photon_532o")[number // 4 % 2]
+        start = datetime(2015, 1, 1, tzinfo=UTC) + timedelta(days=number // 8)
+        values = VALUES[kind]
+        usable = int(rng.integers(values // 3, values))
+        cloudy = kind is ProductKind.ELASTIC and rng.random() < 0.4
+        found.append(
+            Facts(
+                path=f"products/odesa/lidar-1/{kind.value}/{start:%Y}/odesa_lidar-1_{kind.value}"
+                f"_{channel}_{start:%Y%m%dT%H%M%S}.nc",
+                id=str(UUID(bytes=rng.bytes(16))),
+                kind=kind,
+                campaign="demo",
+                station="odesa",
+                instrument="lidar-1",
+                channel=channel,
+                mode=channel.partition("_")[0],
+                wavelength=532e-9,
+                start=start,
+                stop=start + timedelta(minutes=int(rng.integers(600, 1440))),
+                latitude=46.44,
+                longitude=30.76,
+                altitude=53.5,
+                sha256=rng.bytes(32).hex(),
+                size=int(rng.normal(4e5, 5e3)),
+                profiles=144,
+                values=values,
+                usable=usable,
+                unflagged=int(usable * rng.uniform(0.5, 1.0)),
+                grid="0123456789abcdef",
+                code_version="0123456789abcdef",
+                flagged={
+                    "INCOMPLETE_OVERLAP": values // 40,
+                    "CLOUD": int(rng.integers(0, values // 3)) if cloudy else 0,
+                },
+            )
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Facts]]:
+    root = tmp_path_factory.mktemp("index")
+    products = fabricated(20_000)
+    return root / write_index(root, products), products
+
+
+def test_twenty_thousand_products_take_less_than_a_megabyte(archive: tuple[Path, list[Facts]]):
+    assert archive[0].stat().st_size <= 1_000_000
+
+
+def test_a_query_finds_what_overlaps_and_nothing_else(archive: tuple[Path, list[Facts]]):
+    index, products = archive
+    since, until = "2018-02-03T12:00", datetime(2018, 5, 1, tzinfo=UTC)
+    found = find_products(index, kind="elastic", channel="photon_532o", since=since, until=until)
+    wanted = Selection(
+        ProductKind.ELASTIC,
+        "photon_532o",
+        since=datetime(2018, 2, 3, 12, tzinfo=UTC),
+        until=datetime(2018, 5, 1, tzinfo=UTC),
+    )
+    expected = [
+        each
+        for each in products
+        if wanted.admits(
+            each.kind, each.station, each.instrument, each.channel, each.start, each.stop
+        )
+    ]
+    assert 80 < len(expected) < 90
+    assert found.path.tolist() == [each.path for each in expected]
+    assert found.attrs["root"] == str(index.parents[1])
+
+
+def test_every_fact_comes_back(archive: tuple[Path, list[Facts]]):
+    index, products = archive
+    found = find_products(index)
+    by_path = {each.path: each for each in products}
+    assert len(found) == len(products)
+    for row in found.sample(50, random_state=1).itertuples():
+        facts = by_path[row.path]
+        assert UUID(row.id) == UUID(facts.id)
+        assert row.sha256_prefix == facts.sha256[:32]
+        assert (row.start, row.stop) == (facts.start, facts.stop)
+        for name in ("kind", "mode", "size", "usable", "unflagged", "wavelength", "grid"):
+            assert getattr(row, name) == getattr(facts, name)
+        assert row.flag_cloud == facts.flagged.get("CLOUD", 0)
+        assert row.flag_saturated == 0
+
+
+def test_a_query_that_finds_nothing_is_empty(archive: tuple[Path, list[Facts]]):
+    found = find_products(archive[0], station="nowhere")
+    assert isinstance(found, pd.DataFrame)
+    assert found.empty
+    assert "path" in found
+
+
+def test_wrong_use_names_the_choices(archive: tuple[Path, list[Facts]]):
+    with pytest.raises(RetrievalInputError, match=r"kind: is 'nothing'.*homogeneous"):
+        find_products(archive[0], kind="nothing")
+    with pytest.raises(RetrievalInputError, match="since: is 'yesterday'"):
+        find_products(archive[0], since="yesterday")
+
+
+def test_equal_products_give_equal_bytes_in_any_order(tmp_path: Path):
+    products = fabricated(50)
+    first = (tmp_path / write_index(tmp_path, products)).read_bytes()
+    assert (tmp_path / write_index(tmp_path, reversed(products))).read_bytes() == first
+
+
+def test_the_index_of_real_files_is_found_again(tmp_path: Path):
+    for day in range(3):
+        add_day(tmp_path, day)
+    index = tmp_path / write_index(tmp_path, facts_of(tmp_path))
+    assert index.name == INDEX
+    found = find(index, Selection(since=datetime(2026, 3, 2, tzinfo=UTC)))
+    assert found.root == tmp_path.resolve()
+    assert [path[-11:-3] for path in found.paths] == ["2T000000", "3T000000"]
+
+
+def test_an_unknown_wavelength_is_missing(tmp_path: Path):
+    facts = replace(fabricated(1)[0], wavelength=float("nan"))
+    found = find_products(tmp_path / write_index(tmp_path, [facts]))
+    assert np.isnan(found.wavelength[0])
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1 and something else PAR1"])
+def test_what_is_no_index_is_refused(content: bytes, tmp_path: Path):
+    (tmp_path / INDEX).write_bytes(content)
+    with pytest.raises(ProductError, match="index"):
+        find_products(tmp_path / INDEX)
+
+
+def test_a_table_of_others_is_refused(tmp_path: Path):
+    pd.DataFrame({"path": ["a"]}).to_parquet(tmp_path / INDEX)
+    with pytest.raises(ProductError, match="is no index of this version"):
+        find_products(tmp_path / INDEX)

@@ -1,0 +1,273 @@
+"""Files of means against the products that they are of."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from compliance_checker.runner import CheckSuite, ComplianceChecker
+from made_archive import add_day, facts_of
+from products.made_products import MAKERS
+
+from lidarops.aggregate.facts import Refused, groups, read_facts
+from lidarops.aggregate.means import Averaged, write_means
+from lidarops.aggregate.opening import open_products
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.products.rows import ErrorKind
+from lidarops.products.table import LAYOUTS
+from lidarops.products.table_means import BUDGETS, Period, Weights, averaged, layout, systematic
+from lidarops.records import DetectionMode, ProductKind
+
+
+def findings(path: Path) -> list[set[str]]:
+    """What the checker has to say in strict mode: of CF, and of ACDD."""
+    checks = ["cf:1.11", "acdd:1.3"]
+    CheckSuite.load_all_available_checkers()
+    report = path.with_suffix(".json")
+    ComplianceChecker.run_checker(
+        str(path), checks, 0, "strict", output_filename=str(report), output_format="json"
+    )
+    results = json.loads(report.read_text(encoding="utf-8"))
+    assert all(results[check]["possible_points"] > 90 for check in checks)
+    return [set(_said(results[check]["all_priorities"])) for check in checks]
+
+
+def _said(results: list[dict[str, Any]]) -> Iterator[str]:
+    for result in results:
+        scored, possible = result["value"]
+        if scored != possible:
+            yield from (f"{result['name']} {message}" for message in result["msgs"])
+        yield from _said(result["children"])
+
+
+def means_of(root: Path, period: Period = Period.DAY, **options) -> Averaged:
+    (products,) = groups(facts_of(root)).values()
+    return write_means(root, products, period, **options)
+
+
+def only(root: Path, done: Averaged) -> xr.Dataset:
+    (file,) = done.files
+    with xr.open_dataset(root / file.path) as means:
+        return means.load()
+
+
+def test_daily_means_of_the_usable_values(tmp_path: Path):
+    for day in range(3):
+        add_day(tmp_path, day, profiles=6, sections=2)
+    means = only(tmp_path, means_of(tmp_path))
+    data = open_products(tmp_path, usable=1).load()
+    assert means.sizes["time"] == 3
+    for day in range(3):
+        values = data.isel(time=slice(6 * day, 6 * day + 6))
+        found = means.isel(time=day)
+        wanted = values.usable < 2
+        count = wanted.sum("time")
+        assert count.to_numpy().tolist() == [5, 6]
+        np.testing.assert_array_equal(found.extinction_observations, count)
+        np.testing.assert_allclose(found.usable_share, count / 6)
+        x = values.extinction.astype(float)
+        np.testing.assert_allclose(found.extinction, x.mean("time"), rtol=1e-6)
+        np.testing.assert_allclose(
+            found.extinction_standard_error,
+            np.sqrt((values.extinction_standard_error.astype(float) ** 2).sum("time")) / count,
+            rtol=1e-6,
+        )
+        np.testing.assert_allclose(
+            found.extinction_standard_deviation, x.std("time", ddof=1), rtol=1e-6
+        )
+        np.testing.assert_allclose(
+            found.extinction_model_error, values.extinction_model_error.mean("time"), rtol=1e-6
+        )
+        assert found.shots == 3600
+    assert (means.quality_flag == 0).all()
+
+
+def test_weights_are_the_inverse_variance_where_asked(tmp_path: Path):
+    def uneven(data: xr.Dataset) -> xr.Dataset:
+        data["extinction_standard_error"] *= xr.DataArray(np.arange(1.0, 6.0), dims="time")
+        return data
+
+    add_day(tmp_path, 0, change=uneven)
+    means = only(tmp_path, means_of(tmp_path, weights=Weights.INVERSE_VARIANCE))
+    data = open_products(tmp_path).astype(np.float64).load()
+    weights = 1.0 / data.extinction_standard_error**2
+    expected = (weights * data.extinction).sum("time") / weights.sum("time")
+    np.testing.assert_allclose(means.extinction[0], expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        means.extinction_standard_error[0], weights.sum("time") ** -0.5, rtol=1e-6
+    )
+    assert means.attrs["lidarops_weights"] == "inverse-variance"
+    assert "1 / standard_error^2" in means.extinction.attrs["comment"]
+
+
+def test_errors_that_the_profiles_share_do_not_shrink(tmp_path: Path):
+    add_day(tmp_path, 0, ProductKind.ELASTIC, profiles=9)
+    means = only(tmp_path, means_of(tmp_path)).isel(time=0)
+    data = open_products(tmp_path).astype(np.float64).load()
+    used = np.isfinite(data.backscatter)
+    count = used.sum("time")
+
+    def random(factor):
+        causes = ("noise", "background")
+        square = sum(data[f"backscatter_error_{cause}"] ** 2 for cause in causes)
+        return (factor**2 * square).where(used)
+
+    shared = sum(
+        (data[f"backscatter_error_{cause}"].where(used).sum("time") / count) ** 2
+        for cause in ("reference", "lidar_ratio", "molecular")
+    )
+    expected = np.sqrt(random(1.0).sum("time") / count**2 + shared)
+    some = count.to_numpy() > 0
+    assert some.any()
+    assert not some.all()
+    found = means.backscatter_standard_error.to_numpy()
+    np.testing.assert_allclose(found[some], expected.to_numpy()[some], rtol=3e-3)
+    for name, factor in (
+        ("extinction", data.lidar_ratio.item()),
+        ("scattering_ratio", 1.0 / data.molecular_backscatter.isel(product=0)),
+    ):
+        total = data[f"{name}_standard_error"] ** 2
+        rest = np.sqrt(np.maximum(total - random(factor), 0.0)).where(used).sum("time") / count
+        expected = np.sqrt(random(factor).sum("time") / count**2 + rest**2)
+        found = means[f"{name}_standard_error"].to_numpy()
+        np.testing.assert_allclose(found[some], expected.to_numpy()[some], rtol=3e-3)
+    assert np.isnan(means.backscatter.to_numpy()[~some]).all()
+    assert (means.quality_flag.to_numpy()[~some] & int(Quality.rejecting()) != 0).all()
+    assert (means.usable.to_numpy()[~some] == 2).all()
+
+
+def test_a_month_holds_all_of_its_days_and_a_year_its_own_file(tmp_path: Path):
+    # 1 March 2026 is day 0: these are in February and March 2026, and in December 2025.
+    for day in (-62, -3, 2, 4):
+        add_day(tmp_path, day)
+    done = means_of(tmp_path, Period.MONTH)
+    assert [(file.periods, file.products) for file in done.files] == [(1, 1), (2, 3)]
+    with xr.open_dataset(tmp_path / done.files[1].path) as means:
+        assert means.attrs["time_coverage_start"] == "2026-02-01T00:00:00Z"
+        assert means.attrs["time_coverage_end"] == "2026-04-01T00:00:00Z"
+        np.testing.assert_array_equal(
+            means.time_bnds,
+            np.array([["2026-02-01", "2026-03-01"], ["2026-03-01", "2026-04-01"]], "datetime64"),
+        )
+        np.testing.assert_array_equal(means.extinction_observations[:, 1], [5, 10])
+
+
+def test_a_profile_belongs_to_the_day_of_its_middle(tmp_path: Path):
+    def late(data: xr.Dataset) -> xr.Dataset:
+        shift = np.timedelta64(13 * 60 + 30, "m")
+        return data.assign_coords(time=data.time + shift, time_bnds=data.time_bnds + shift)
+
+    # From 23:30 on: three profiles on the one day, two on the next, which has five more.
+    add_day(tmp_path, 0, change=late)
+    add_day(tmp_path, 1)
+    means = only(tmp_path, means_of(tmp_path))
+    np.testing.assert_array_equal(means.amplitude_observations[:, 1], [3, 7])
+
+
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_every_kind_has_means_with_attributes_of_the_table(kind: ProductKind, tmp_path: Path):
+    add_day(tmp_path, 0, kind)
+    means = only(tmp_path, means_of(tmp_path))
+    for row in averaged(kind):
+        if row.name in means:
+            mode = DetectionMode.PHOTON
+            assert means[row.name].attrs["units"] == row.units.format(signal="MHz")
+            assert means[row.name].attrs["cell_methods"].startswith("time: mean (of usable")
+            deviation = means[f"{row.name}_standard_deviation"]
+            assert deviation.attrs["cell_methods"].startswith("time: standard_deviation")
+            assert mode.value == means.attrs["lidarops_detection_mode"]
+    for name in ("usable_share", "quality_flag", "usable", "shots"):
+        assert name in means
+
+
+@pytest.mark.parametrize(
+    ("kind", "period"), [(ProductKind.SIGNAL, Period.DAY), (ProductKind.HOMOGENEOUS, Period.MONTH)]
+)
+def test_means_comply(kind: ProductKind, period: Period, tmp_path: Path):
+    for day in range(2):
+        add_day(tmp_path, day, kind)
+    (file,) = means_of(tmp_path, period).files
+    conventions, discovery = findings(tmp_path / file.path)
+    assert conventions == set()
+    rows = layout(kind, period, Weights.PLAIN).variables
+    nameless = {
+        f'variable "{row.name}" missing the following attributes: standard_name'
+        for row in rows
+        if row.standard_name is None
+    }
+    # The checker wants the first middle where a mean covers its whole period.
+    other = {said for said in discovery if said not in nameless}
+    assert len(other) == 2
+    assert all("mismatch between time_coverage_" in said for said in other)
+
+
+def test_the_provenance_names_every_product(tmp_path: Path):
+    for day in range(3):
+        add_day(tmp_path, day)
+    means = only(tmp_path, means_of(tmp_path))
+    document = json.loads(means.provenance.item())
+    facts = facts_of(tmp_path)
+    inputs = {
+        (each["lidarops:sha256"], each["lidarops:id"], each["lidarops:path"])
+        for each in document["entity"].values()
+        if each["prov:type"]["$"] == "lidarops:Product"
+    }
+    assert inputs == {(each.sha256, each.id, each.path) for each in facts}
+    assert document["entity"]["lidarops:means"]["lidarops:id"] == means.attrs["id"]
+    assert document["activity"]["lidarops:averaging"]["lidarops:weights"] == "plain"
+    assert means.attrs["lidarops_input_count"] == 3
+
+
+def test_equal_products_give_equal_bytes_and_others_another_id(tmp_path: Path):
+    for root in "ab":
+        for day in range(2):
+            add_day(tmp_path / root, day)
+    (first,), (second,) = (means_of(tmp_path / root).files for root in "ab")
+    assert first.sha256 == second.sha256
+    ids = {only(tmp_path / "a", means_of(tmp_path / "a", period)).attrs["id"] for period in Period}
+    (weighted,) = means_of(tmp_path / "a", weights=Weights.INVERSE_VARIANCE).files
+    with xr.open_dataset(tmp_path / "a" / weighted.path) as means:
+        ids.add(means.attrs["id"])
+    assert len(ids) == 3
+
+
+def test_a_damaged_product_is_named_and_the_rest_goes_on(tmp_path: Path):
+    paths = [add_day(tmp_path, day) for day in range(2)]
+    products = facts_of(tmp_path)
+    (tmp_path / paths[0]).write_bytes(b"nothing")
+    done = write_means(tmp_path, products, Period.DAY)
+    assert [each.path for each in done.refused] == [paths[0]]
+    assert [file.products for file in done.files] == [1]
+
+
+def test_a_beam_that_moves_has_no_mean(tmp_path: Path):
+    add_day(tmp_path, 0, zenith=[0.0, 10.0, 20.0, 30.0, 40.0])
+    with pytest.raises(ProductError, match="the beam moves"):
+        means_of(tmp_path)
+
+
+def test_means_are_no_products(tmp_path: Path):
+    add_day(tmp_path, 0)
+    (file,) = means_of(tmp_path).files
+    with pytest.raises(ProductError, match="holds means of products"):
+        read_facts(tmp_path, file.path)
+    assert not any(isinstance(each, Refused) for each in facts_of(tmp_path))
+
+
+@pytest.mark.parametrize("kind", list(ProductKind))
+def test_every_error_that_is_not_random_has_its_rule(kind: ProductKind):
+    source = LAYOUTS[kind]
+    for row in averaged(kind):
+        if row.error_kind not in (None, ErrorKind.RANDOM):
+            assert (kind, row.name) in BUDGETS
+    told = {systematic(kind, row.name) for row in averaged(kind)}
+    told |= {name for (of, _), each in BUDGETS.items() if of is kind for name in each.shared}
+    for row in source.data:
+        if row.error_kind is ErrorKind.SYSTEMATIC and not row.uncertain and "time" in row.dims:
+            assert row.name in told, row.name

@@ -1,0 +1,126 @@
+"""Means and their errors against formulas written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from lidarops.aggregate._sums import Sample, Sums
+
+
+def sample(values, errors, *, random=None, shared=(), systematic=None, wanted=None) -> Sample:
+    values, errors = (np.asarray(each, np.float64) for each in (values, errors))
+    return Sample(
+        values,
+        errors,
+        errors if random is None else np.asarray(random, np.float64),
+        tuple(np.asarray(part, np.float64) for part in shared),
+        None if systematic is None else np.asarray(systematic, np.float64),
+        np.ones(values.shape, np.bool_) if wanted is None else np.asarray(wanted),
+    )
+
+
+def mean(*samples: Sample, inverse_variance: bool = False):
+    sums = Sums.like(samples[0], inverse_variance=inverse_variance)
+    for each in samples:
+        sums.add(each)
+    return sums.mean()
+
+
+def test_a_plain_mean_of_independent_errors():
+    found = mean(sample([1.0, 2.0, 6.0], [0.3, 0.4, 1.2]))
+    assert found.mean == pytest.approx(3.0)
+    assert found.standard_error == pytest.approx(1.3 / 3.0)
+    assert found.standard_deviation == pytest.approx(np.sqrt(7.0))
+    assert found.observations == 3
+
+
+def test_a_weighted_mean_has_the_least_error():
+    values, errors = np.array([1.0, 2.0]), np.array([0.1, 0.2])
+    found = mean(sample(values, errors), inverse_variance=True)
+    assert found.mean == pytest.approx((1.0 / 0.01 + 2.0 / 0.04) / 125.0)
+    assert found.standard_error == pytest.approx(1.0 / np.sqrt(125.0))
+
+
+def test_shared_errors_do_not_shrink():
+    found = mean(sample([1.0] * 100, [0.5] * 100, random=[0.3] * 100, shared=([0.4] * 100,)))
+    assert found.standard_error == pytest.approx(np.hypot(0.03, 0.4))
+
+
+def test_shared_errors_keep_their_signs():
+    found = mean(sample([1.0, 1.0], [0.4, 0.4], random=[0.0, 0.0], shared=([0.4, -0.4],)))
+    assert found.standard_error == 0.0
+
+
+def test_systematic_errors_are_averaged_with_the_weights():
+    given_ = sample([1.0, 1.0], [0.1, 0.2], systematic=[0.3, 0.8])
+    assert mean(given_).systematic == pytest.approx(0.55)
+    assert mean(given_, inverse_variance=True).systematic == pytest.approx((30 + 20) / 125)
+
+
+@pytest.mark.parametrize("inverse_variance", [False, True])
+def test_what_is_not_wanted_or_missing_counts_for_nothing(inverse_variance: bool):
+    values = [[1.0, np.nan], [3.0, 5.0], [1e30, 7.0], [2.0, 8.0]]
+    errors = [[0.1, 0.1], [0.1, np.nan], [0.1, 0.1], [np.nan, 0.1]]
+    wanted = [[True, True], [True, True], [False, False], [True, False]]
+    found = mean(sample(values, errors, wanted=wanted), inverse_variance=inverse_variance)
+    np.testing.assert_allclose(found.mean, [2.0, np.nan])
+    np.testing.assert_array_equal(found.observations, [2, 0])
+    assert np.isnan(found.standard_error[1])
+    assert np.isnan(found.standard_deviation[1])
+
+
+def test_an_error_of_nothing_cannot_be_a_weight():
+    given_ = sample([1.0, 5.0], [0.0, 0.1])
+    assert mean(given_, inverse_variance=True).mean == pytest.approx(5.0)
+    assert mean(given_).mean == pytest.approx(3.0)
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30),
+    st.integers(0, 30),
+    st.booleans(),
+)
+def test_products_give_what_their_profiles_give_together(values, cut, inverse_variance):
+    errors = np.linspace(1.0, 2.0, len(values))
+    whole = sample(values, errors)
+    parts = [whole.take(np.arange(len(values))[part]) for part in (slice(cut), slice(cut, None))]
+    found, expected = (mean(*each, inverse_variance=inverse_variance) for each in (parts, [whole]))
+    scale = 1e-12 * max(1.0, np.max(np.abs(values)))
+    np.testing.assert_allclose(found.mean, expected.mean, atol=scale, rtol=1e-12)
+    np.testing.assert_allclose(found.standard_error, expected.standard_error, rtol=1e-12)
+    np.testing.assert_allclose(
+        found.standard_deviation, expected.standard_deviation, atol=1e3 * scale, rtol=1e-9
+    )
+    if len(values) > 1:
+        np.testing.assert_allclose(
+            found.standard_deviation, np.std(values, ddof=1), atol=1e3 * scale, rtol=1e-9
+        )
+
+
+@pytest.mark.parametrize("inverse_variance", [False, True])
+def test_the_standard_error_covers_the_truth(inverse_variance: bool):
+    rng = np.random.default_rng(5)
+    trials, profiles, truth = 4000, 12, 3.0
+    noise = rng.uniform(0.1, 1.0, profiles)
+    slope = rng.uniform(-0.3, 0.3, profiles)
+    cause = rng.standard_normal(trials)
+    values = truth + rng.standard_normal((profiles, trials)) * noise[:, None]
+    values += slope[:, None] * cause
+    total = np.broadcast_to(np.hypot(noise, slope)[:, None], values.shape)
+    found = mean(
+        sample(
+            values,
+            total,
+            random=np.broadcast_to(noise[:, None], values.shape),
+            shared=(np.broadcast_to(slope[:, None], values.shape),),
+        ),
+        inverse_variance=inverse_variance,
+    )
+    normalised = (found.mean - truth) / found.standard_error
+    # chi-square of the sample variance: one in a thousand would lie beyond.
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], trials) / trials
+    assert low < np.mean(normalised**2) < high
