@@ -1,0 +1,62 @@
+"""Command that makes the archive browser."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidarops.cli.app import (
+    JsonOption,
+    add_row,
+    app,
+    leave,
+    make_table,
+    plainly,
+    progress_bar,
+    show,
+)
+
+
+@app.command()
+@plainly
+def site(
+    out: Annotated[
+        Path, typer.Argument(help="Output folder of a campaign, with its products.", metavar="OUT")
+    ],
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a static site of all products: calendar, figures, flags, provenance, downloads.
+
+    It lies in OUT/site, needs no server and no network, and is brought up to date when it is made
+    again. Exit code 1 where a product cannot be shown whole.
+
+    Example: lidarops site demo --workers 2
+    """
+    from lidarops.site.build import build
+
+    with progress_bar("site", None) as advance:
+        made = build(out, workers=workers, progress=advance)
+    if as_json:
+        typer.echo(
+            json.dumps(
+                {
+                    "index": str(made.index),
+                    "products": made.products,
+                    "made": made.made,
+                    "problems": [asdict(problem) for problem in made.problems],
+                },
+                indent=2,
+            )
+        )
+    else:
+        table = make_table("Cannot be shown whole", "file", "reason")
+        for problem in made.problems:
+            add_row(table, problem.path, problem.reason)
+        show(table)
+        typer.echo(f"{made.products} products, {made.made} pages made\nsite: {made.index}")
+    leave(failed=bool(made.problems))

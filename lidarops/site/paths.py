@@ -1,0 +1,110 @@
+"""Where products lie and where their pages go: no path leads out of its folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from pathlib import Path, PurePosixPath
+from typing import Final
+from urllib.parse import quote
+
+from lidarops.errors import ProductError
+
+SITE: Final = "site"
+"""Folder of the site beside the products."""
+_SAFE: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def product_folder(output: Path) -> Path:
+    """Return the folder of the products of a campaign's output.
+
+    Parameters
+    ----------
+    output : Path
+        Output of a campaign, which holds a folder ``products``.
+
+    Raises
+    ------
+    ProductError
+        If there is no such folder.
+    """
+    folder = output / "products"
+    if not folder.is_dir():
+        raise ProductError(
+            "holds no folder `products`",
+            file=output,
+            remedy="give the output folder of a campaign that was reprocessed",
+        )
+    return folder
+
+
+def product_paths(folder: Path) -> list[str]:
+    """List the products below a folder, sorted; hidden files are not looked at.
+
+    Links to folders are not followed, so that the walk ends and stays inside.
+    """
+    found = []
+    for here, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        found += [
+            (Path(here) / name).relative_to(folder).as_posix()
+            for name in files
+            if name.endswith(".nc") and not name.startswith(".")
+        ]
+    return sorted(found)
+
+
+def inside(folder: Path, path: str) -> Path:
+    """Return a file of a folder.
+
+    Raises
+    ------
+    ProductError
+        If the path is absolute, goes up, or is a link to the outside.
+    """
+    pure = PurePosixPath(path)
+    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+        raise ProductError("is no path inside its folder", file=path)
+    found = folder / pure
+    if not found.resolve().is_relative_to(folder.resolve()):
+        raise ProductError(
+            "is a link that leads out of its folder", file=path, remedy="put the file in its place"
+        )
+    return found
+
+
+def slug(name: str) -> str:
+    """Return a name as part of a path: itself where it is plain, else a digest of it."""
+    if _SAFE.fullmatch(name) and not name.endswith("."):
+        return name
+    return f"x-{hashlib.sha256(name.encode('utf-8', 'surrogateescape')).hexdigest()[:16]}"
+
+
+def product_page(path: str) -> str:
+    """Return the page of a product, relative to the site."""
+    parts = [slug(part) for part in PurePosixPath(path.removesuffix(".nc")).parts]
+    return "/".join(("product", *parts)) + ".html"
+
+
+def year_page(station: str, year: int) -> str:
+    """Return the page of a station's year, relative to the site."""
+    return f"station/{slug(station)}/{year:04d}.html"
+
+
+def day_page(station: str, day: str) -> str:
+    """Return the page of a station's day, relative to the site."""
+    return f"station/{slug(station)}/{day[:4]}/{day}.html"
+
+
+def href(target: str, page: str) -> str:
+    """Return the link from one page of the site to a file, both relative to the site.
+
+    Parameters
+    ----------
+    target : str
+        May begin with ``../`` to reach what lies beside the site.
+    page : str
+    """
+    relative = os.path.relpath(target, os.path.dirname(page) or ".")  # noqa: PTH120
+    return quote(os.fsencode(relative.replace(os.sep, "/")))

@@ -1,0 +1,372 @@
+"""The site as files: what is made, kept, refused, and that its bytes are those of the archive."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import netCDF4
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from site_archive import add, add_unknown, contents, small_archive
+from typer.testing import CliRunner
+
+from lidarops.cli import app
+from lidarops.errors import CatalogError, ProductError
+from lidarops.records import ProductKind
+from lidarops.site import paths
+from lidarops.site.build import build
+from lidarops.site.entries import Grade
+
+FIRST_PAGE = 300_000
+"""Bytes that the first page may load."""
+
+
+class _Page(HTMLParser):
+    """Collects tags with their attributes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+def _page(file: Path) -> _Page:
+    return _Page(file.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = small_archive(tmp_path_factory.mktemp("site") / "out")
+    add_unknown(output)
+    return output
+
+
+@pytest.fixture(scope="module")
+def site(archive: Path) -> Path:
+    made = build(archive)
+    assert made.products == made.made == 14
+    assert [problem.path for problem in made.problems] == ["odesa/wind.nc"]
+    return archive / "site"
+
+
+def _copy(archive: Path, target: Path) -> Path:
+    shutil.copytree(archive, target, ignore=shutil.ignore_patterns("site"))
+    return target
+
+
+def test_every_link_leads_to_a_file_of_the_output(archive: Path, site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) == 1 + 2 + 4 + 14
+    for page in pages:
+        tags = _page(page)
+        targets = [
+            attrs.get("href") or attrs.get("src") or ""
+            for tag, attrs in tags.tags
+            if tag in {"a", "img", "link"}
+        ]
+        identifiers = {attrs["id"] for _, attrs in tags.tags if "id" in attrs}
+        assert targets
+        for target in targets:
+            parts = urlsplit(target)
+            assert not parts.scheme, target
+            assert not parts.netloc, target
+            if parts.path:
+                found = (page.parent / unquote(parts.path)).resolve()
+                assert found.is_file(), (page, target)
+                assert found.is_relative_to(archive.resolve())
+            elif parts.fragment != "main":
+                assert parts.fragment in identifiers, (page, target)
+
+
+def test_no_page_names_another_host_or_holds_a_script(site: Path) -> None:
+    for name, content in contents(site).items():
+        text = content.decode()
+        assert "<script" not in text
+        assert not re.search(r"(?:src|href)=\"(?:https?:)?//", text), name
+        if name.endswith(".html"):
+            policy = [
+                attrs
+                for attrs in _Page(text).all("meta")
+                if attrs.get("http-equiv") == "Content-Security-Policy"
+            ]
+            assert len(policy) == 1
+            assert "default-src 'none'" in (policy[0]["content"] or "")
+            assert "http" not in (policy[0]["content"] or "")
+
+
+@pytest.mark.parametrize(
+    "pattern", ["index.html", "station/*/*.html", "station/*/*/*.html", "product/**/*.html"]
+)
+def test_pages_have_what_a_screen_reader_needs(site: Path, pattern: str) -> None:
+    for file in site.glob(pattern):
+        page = _page(file)
+        assert page.all("html")[0]["lang"] == "en"
+        for once in ("header", "main", "footer", "h1"):
+            assert len(page.all(once)) == 1, once
+        assert page.all("a")[0] == {"class": "skip", "href": "#main"}
+        levels = [int(tag[1]) for tag, _ in page.tags if re.fullmatch(r"h[1-6]", tag)]
+        assert all(after <= before + 1 for before, after in pairwise(levels))
+        assert all(attrs.get("alt") for attrs in page.all("img"))
+        assert all(attrs.get("scope") for attrs in page.all("th"))
+
+
+def test_product_page_tells_flags_provenance_and_download(archive: Path, site: Path) -> None:
+    page = next(site.glob("product/odesa/lidar-1/elastic/2026/*20260301T000000.html"))
+    text = page.read_text(encoding="utf-8")
+    for words in (
+        "incomplete_overlap",
+        "nearer than the range of full overlap",
+        "do not use",
+        "use with care",
+        "2026/03/a00.dat",
+        f"{2:064x}",
+        "photon counting has no dark",
+        "numpy 2.4.6",
+        "0123456789abcdef",
+        "full_overlap_range",
+    ):
+        assert words in text, words
+    download = next(a["href"] for a in _page(page).all("a") if "download" in a)
+    file = (page.parent / unquote(download or "")).resolve()
+    assert file == archive.resolve() / "products" / page.relative_to(site / "product").with_suffix(
+        ".nc"
+    )
+    assert text.count('<svg class="fig"') == 2
+    document = json.loads(page.with_suffix(".prov.json").read_text())
+    assert document["agent"]["lidarops:software"]["lidarops:code_version"] == "0123456789abcdef"
+
+
+def test_counts_of_quality_are_those_of_the_file(archive: Path, site: Path) -> None:
+    known = {
+        row["path"]: row for row in json.loads((site / "manifest.json").read_text())["products"]
+    }
+    for path, row in known.items():
+        if "wind" in path:
+            continue
+        with netCDF4.Dataset(archive / "products" / path) as file:
+            flags = file["quality_flag"][:].filled()
+            usable = file["usable"][:].filled() if "usable" in file.variables else None
+        assert row["values"] == flags.size
+        assert row["unflagged"] == int((flags == 0).sum())
+        if usable is not None:
+            assert row["usable"] == int((usable < 2).sum())
+
+
+def test_unknown_kind_gets_a_figure_and_is_named_for_what_it_lacks(site: Path) -> None:
+    text = (site / "product/odesa/wind.html").read_text(encoding="utf-8")
+    assert "Product of kind wind" in text
+    assert "the product holds no provenance" in text
+    assert text.count('<svg class="fig"') == 1
+    assert "4 of 6 series" in text
+
+
+def test_first_page_is_small_with_all_it_loads(site: Path) -> None:
+    index = site / "index.html"
+    page = _page(index)
+    loaded = [attrs["src"] for attrs in page.all("img")] + [page.all("link")[0]["href"]]
+    sizes = [(site / unquote(name or "")).stat().st_size for name in loaded]
+    assert index.stat().st_size + sum(sizes) <= FIRST_PAGE
+
+
+def test_equal_archives_give_equal_bytes_for_any_number_of_workers(
+    archive: Path, site: Path, tmp_path: Path
+) -> None:
+    other = _copy(archive, tmp_path / "elsewhere")
+    # In another order of making, too.
+    build(other, workers=2)
+    assert contents(other / "site") == contents(site)
+
+
+def test_what_is_unchanged_is_kept_and_what_vanished_is_removed(
+    archive: Path, tmp_path: Path
+) -> None:
+    output = _copy(archive, tmp_path / "out")
+    build(output)
+    whole = contents(output / "site")
+    pages = {path: path.stat().st_mtime_ns for path in (output / "site/product").rglob("*.html")}
+    again = build(output)
+    assert again.made == 0
+    assert contents(output / "site") == whole
+    assert pages == {path: path.stat().st_mtime_ns for path in pages}
+
+    tampered = next(path for path in pages if "elastic" in path.name)
+    tampered.write_text("edited")
+    changed = add(output, ProductKind.SIGNAL, 1, title="Another title")
+    gone = next((output / "products").rglob("*homogeneous*2027*.nc"))
+    gone.unlink()
+    third = build(output)
+    assert third.made == 2
+    assert third.products == 13
+    assert "Another title" in (
+        output / "site" / paths.product_page(changed.relative_to(output / "products").as_posix())
+    ).read_text(encoding="utf-8")
+    assert not list((output / "site").rglob("*2027*"))
+
+    fresh = _copy(output, tmp_path / "fresh")
+    build(fresh)
+    assert contents(fresh / "site") == contents(output / "site")
+
+
+def test_damaged_products_are_named_and_the_rest_goes_on(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    whole = add(output, ProductKind.SIGNAL)
+    cut = add(output, ProductKind.ELASTIC)
+    cut.write_bytes(cut.read_bytes()[:20_000])
+    (output / "products" / "empty.nc").write_bytes(b"")
+    foreign = add_unknown(output, "multiangle")
+    result = CliRunner().invoke(app, ["site", str(output), "--json"])
+    assert result.exit_code == 1
+    told = json.loads(result.stdout)
+    assert told["products"] == 2
+    products = output / "products"
+    expected = sorted(path.relative_to(products).as_posix() for path in (cut, foreign))
+    assert [problem["path"] for problem in told["problems"]] == sorted([*expected, "empty.nc"])
+    index = (output / "site/index.html").read_text(encoding="utf-8")
+    assert all(path in index for path in [*expected, "empty.nc"])
+    assert str(tmp_path) not in index
+    page = products.relative_to(output) and paths.product_page(
+        whole.relative_to(products).as_posix()
+    )
+    assert (output / "site" / page).is_file()
+    damaged = (output / "site/product/odesa/multiangle.html").read_text(encoding="utf-8")
+    assert "it cannot be drawn as multiangle" in damaged
+
+
+def test_damaged_provenance_is_named(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    path = add(output, ProductKind.HOMOGENEOUS)
+    with netCDF4.Dataset(path, "a") as file:
+        file["provenance"][...] = (
+            b"{" * file["provenance"].shape[0] if file["provenance"].ndim else "{"
+        )
+    made = build(output)
+    assert made.products == 1
+    assert "provenance" in made.problems[0].reason
+
+
+def test_text_of_files_is_text_on_pages(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    evil = '<script>alert(1)</script>"><img src=x onerror=alert(2)>\u202e'
+    add_unknown(
+        output, "k", platform=evil, lidarops_channel=evil, lidarops_kind=evil, title=evil,
+        lidarops_station="../../../up", lidarops_instrument=evil, lidarops_campaign=evil,
+    )  # fmt: skip
+    build(output)
+    site = output / "site"
+    for name, content in contents(site).items():
+        if name.endswith((".html", ".svg")):
+            text = content.decode()
+            assert "<script" not in text
+            assert "<img src=x" not in text
+            assert "\u202e" not in text
+    assert {path.name for path in tmp_path.iterdir()} == {"out"}
+    assert {path.name for path in output.iterdir()} == {"products", "site"}
+
+
+def test_links_out_of_the_products_are_not_followed(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    kept = add(output, ProductKind.SIGNAL)
+    outside = tmp_path / "outside.nc"
+    shutil.copy(kept, outside)
+    (output / "products" / "link.nc").symlink_to(outside)
+    made = build(output)
+    assert made.products == 1
+    assert made.problems[0].path == "link.nc"
+    assert "leads out" in made.problems[0].reason
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    add(output, ProductKind.SIGNAL)
+    (output / "site").mkdir()
+    (output / "site" / "thesis.txt").write_text("mine")
+    with pytest.raises(CatalogError, match="no site of lidarops"):
+        build(output)
+    assert contents(output / "site") == {"thesis.txt": b"mine"}
+    with pytest.raises(ProductError, match="products"):
+        build(tmp_path / "nothing")
+
+
+def test_pages_do_not_leave_the_site_through_a_link(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    add(output, ProductKind.SIGNAL)
+    build(output)
+    shutil.rmtree(output / "site/product")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (output / "site/product").symlink_to(elsewhere)
+    made = build(output)
+    assert made.problems
+    assert not list(elsewhere.iterdir())
+
+
+def test_manifest_that_was_edited_only_costs_time(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    add(output, ProductKind.SIGNAL)
+    build(output)
+    manifest = output / "site/manifest.json"
+    whole = contents(output / "site")
+    document: dict[str, Any] = json.loads(manifest.read_text())
+    document["products"][0]["page"] = "../../../etc/passwd"
+    for text in (json.dumps(document), "{", json.dumps({"format": "other"}), "[]"):
+        manifest.write_text(text)
+        assert build(output).made == 1
+        assert contents(output / "site") == whole
+
+
+def test_an_archive_without_products_has_a_site(tmp_path: Path) -> None:
+    (tmp_path / "products").mkdir()
+    made = build(tmp_path)
+    assert made.products == 0
+    assert "There is no product" in made.index.read_text(encoding="utf-8")
+
+
+@given(st.text(min_size=1))
+def test_slugs_are_safe_parts_of_paths(name: str) -> None:
+    found = paths.slug(name)
+    assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", found)
+    assert found not in {".", ".."}
+    assert paths.slug(found) == found
+
+
+@given(st.text(min_size=1).filter(lambda s: "\0" not in s), st.sampled_from(["", "a/", "a/b/"]))
+def test_hrefs_lead_back_to_their_target(name: str, folder: str) -> None:
+    target = f"product/{paths.slug(name)}.html"
+    found = unquote(paths.href(target, f"{folder}page.html"))
+    assert os.path.normpath(folder + found) == target
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../x.nc", "a/../../x.nc", ""])
+def test_paths_that_lead_out_are_refused(tmp_path: Path, path: str) -> None:
+    with pytest.raises(ProductError, match="no path inside"):
+        paths.inside(tmp_path, path)
+
+
+@pytest.mark.parametrize(
+    ("share", "grade"),
+    [
+        (None, Grade.UNJUDGED),
+        (0.0, Grade.NONE),
+        (1e-9, Grade.FEW),
+        (0.25, Grade.SOME),
+        (0.75, Grade.MOST),
+        (1.0, Grade.MOST),
+    ],
+)
+def test_grades_cover_every_share(share: float | None, grade: Grade) -> None:
+    assert Grade.of(share) is grade
