@@ -1,32 +1,103 @@
 """Run many scenes, serially or on a dask cluster.
 
-Nothing that happens to one scene stops the others.
+Nothing that happens to one scene stops the others: not an error, not the death of its worker.
 """
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Callable, Iterator, Sequence
+import logging
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final, Self
 
-from lidarops import __version__
 from lidarops.campaign import Campaign
+from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
+from lidarops.errors import SceneError
 from lidarops.plans import plan
-from lidarops.processing import Job, failed, process
-from lidarops.records import (
-    RunRecord,
-    SceneOutcome,
-    Status,
-)
+from lidarops.processing import Job, attempt, failed
+from lidarops.products.provenance import code_version
+from lidarops.records import RunRecord, SceneOutcome
 from lidarops.scenes import Cut
+from lidarops.session import Session
+from lidarops.staleness import Judge
 
 if TYPE_CHECKING:
     from distributed import Client
+    from distributed import Future as AnyFuture
+
+    Future = AnyFuture[Any]
 
 Progress = Callable[[SceneOutcome], None]
+
+AHEAD: Final = 2
+"""Scenes a worker thread has at hand, the one that it works on included."""
+LEAST_AHEAD: Final = 4
+GRACE: Final = 20.0
+"""s that scenes in hand get to end, on a cluster that is asked to stop."""
+TRIES: Final = 3
+"""Times that a scene may take its worker down before it is refused."""
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A scene that ended."""
+
+    job: Job
+    outcome: SceneOutcome
+    final: bool
+    """Whether another try on the same inputs cannot but end like this."""
+
+
+class Stop:
+    """A wish to stop: by signal, or by whoever calls `now`.
+
+    The first SIGINT or SIGTERM lets scenes in hand end; the second abandons them.
+    """
+
+    def __init__(self) -> None:
+        self.reason = ""
+        self.signal = 0
+        self._before: dict[int, Any] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self.reason)
+
+    def now(self, reason: str) -> None:
+        """Ask to stop."""
+        self.reason = self.reason or reason
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._caught)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _caught(self, number: int, _frame: FrameType | None) -> None:
+        if self.signal:
+            raise KeyboardInterrupt
+        self.signal = number
+        self.now(f"stopped by {signal.Signals(number).name}")
+        _LOG.warning("%s: scenes in hand are ended; once more to abandon them", self.reason)
+
+
+def make_jobs(campaign: Campaign, cut: Cut, *, profiles_per_chunk: int | None = None) -> list[Job]:
+    """Plan every scene."""
+    return [Job(campaign, scene, plan(scene, campaign), profiles_per_chunk) for scene in cut.scenes]
 
 
 def run(
@@ -38,7 +109,7 @@ def run(
     profiles_per_chunk: int | None = None,
     progress: Progress | None = None,
 ) -> RunRecord:
-    """Process scenes into products and enter the run in the ledger.
+    """Process scenes, fresh or stale, and enter the run in the ledger.
 
     Parameters
     ----------
@@ -61,7 +132,7 @@ def run(
     Raises
     ------
     CatalogError
-        If the ledger cannot be written.
+        If the ledger cannot be written, or another run holds it.
     """
     started = datetime.now(UTC)
     jobs = make_jobs(campaign, cut, profiles_per_chunk=profiles_per_chunk)
@@ -69,9 +140,21 @@ def run(
     return conclude(campaign, cut, outcomes, started=started)
 
 
-def make_jobs(campaign: Campaign, cut: Cut, *, profiles_per_chunk: int | None = None) -> list[Job]:
-    """Plan every scene."""
-    return [Job(campaign, scene, plan(scene, campaign), profiles_per_chunk) for scene in cut.scenes]
+def conclude(
+    campaign: Campaign, cut: Cut, outcomes: Sequence[SceneOutcome], *, started: datetime
+) -> RunRecord:
+    """Make the record of a run whose scenes have ended, and enter it in the ledger; see `run`."""
+    scenes = {scene.id: scene for scene in cut.scenes}
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        judge = Judge(campaign, store)
+        session = Session(campaign, store, lock, judge, started=started)
+        session.begin()
+        for outcome in outcomes:
+            scene = scenes[outcome.scene]
+            judged = judge.judgement(scene, outcome.plan or plan(scene, campaign))
+            session.end(judged, outcome, final=False)
+        return session.finish(RunStatus.FINISHED, cut.set_aside)
 
 
 def process_all(
@@ -81,92 +164,240 @@ def process_all(
     client: Client | None = None,
     progress: Progress | None = None,
 ) -> list[SceneOutcome]:
-    """Process scenes serially, on new local workers or on a cluster; see `run`."""
+    """Process scenes serially, on new local workers or on a cluster, without a ledger.
+
+    Parameters
+    ----------
+    jobs : sequence of Job
+    workers : int
+        Processes; 1 runs in this one, more start a dask cluster on this machine.
+    client : distributed.Client, optional
+        A cluster to use instead.
+    progress : callable, optional
+        Called with the outcome of each scene as it ends.
+
+    Returns
+    -------
+    list of SceneOutcome
+    """
     outcomes: list[SceneOutcome] = []
-    with _outcomes(jobs, workers, client) as stream:
-        for outcome in stream:
-            outcomes.append(outcome)
+    with cluster_of(min(workers, len(jobs)), client) as used, Stop() as stop:
+        for ended in carry_out(sorted(jobs, key=size, reverse=True), client=used, stop=stop):
+            outcomes.append(ended.outcome)
             if progress:
-                progress(outcome)
+                progress(ended.outcome)
     return outcomes
 
 
-def conclude(
-    campaign: Campaign, cut: Cut, outcomes: Sequence[SceneOutcome], *, started: datetime
-) -> RunRecord:
-    """Make the record of a run and enter it in the ledger; see `run`."""
-    store = Store(campaign.catalog_url, campaign.name)
-    try:
-        record = RunRecord(
-            id=f"{started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}",
-            campaign=campaign.name,
-            title=campaign.title,
-            started=started,
-            finished=datetime.now(UTC),
-            version=__version__,
-            archive=campaign.archive,
-            products=str(campaign.products_root),
-            scenes=tuple(sorted(outcomes, key=lambda outcome: outcome.scene)),
-            refused=(*store.granules(status=Status.REFUSED), *cut.set_aside),
-            truth=_truth(campaign),
-        )
-        store.record_run(record)
-    finally:
-        store.close()
-    return record
-
-
-def _truth(campaign: Campaign) -> str:
-    if campaign.simulation is None or not campaign.truth_path.exists():
-        return ""
-    return str(campaign.truth_path)
+def size(job: Job) -> int:
+    """Return the bytes that a job reads."""
+    return sum(granule.size for granule in job.scene.granules)
 
 
 @contextmanager
-def _outcomes(
-    jobs: Sequence[Job], workers: int, client: Client | None
-) -> Iterator[Iterator[SceneOutcome]]:
-    if client is not None:
-        yield _distributed(jobs, client)
-    elif workers <= 1 or len(jobs) <= 1:
-        yield map(process, jobs)
+def cluster_of(workers: int, client: Client | None = None) -> Iterator[Client | None]:
+    """Give the client, or one of so many new local workers, or None for one worker."""
+    if client is not None or workers <= 1:
+        yield client
     else:
-        with local_client(min(workers, len(jobs))) as own:
-            yield _distributed(jobs, own)
+        with local_client(workers) as own:
+            yield own
 
 
 @contextmanager
-def local_client(workers: int) -> Iterator[Client]:
+def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]:
     """Start a dask cluster of single-threaded processes on this machine.
 
     netCDF4 writes from one thread of a process only, and BLAS and numba gain nothing from more.
+
+    Parameters
+    ----------
+    workers : int
+    memory : str, optional
+        Most memory of a worker, such as ``2GiB``; an equal share of the machine's where not
+        given. A worker that needs more is restarted, and its scene tried again.
     """
+    import dask  # noqa: PLC0415 - takes a second to import
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
 
     with (
+        # Every death of a worker is to be seen here, where it is counted for its scene alone.
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
             dashboard_address=None,
+            memory_limit=memory or "auto",
         ) as cluster,
         Client(cluster) as client,
     ):
+        # Ctrl-C goes to all processes of a terminal, and the workers are to end their scenes.
+        client.run(_ignore_interrupts)
         yield client
 
 
-def _distributed(jobs: Sequence[Job], client: Client) -> Iterator[SceneOutcome]:
-    from distributed import as_completed  # noqa: PLC0415 - takes a second to import
+def _ignore_interrupts() -> None:
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    # The largest scene last would keep one worker busy while the others idle.
-    largest_first = sorted(jobs, key=lambda job: -sum(g.size for g in job.scene.granules))
-    futures = {client.submit(process, job, pure=False): job for job in largest_first}
-    for future in as_completed(futures):
-        job = futures[future]
-        error = future.exception()
-        if error is None:
-            yield future.result()
+
+def carry_out(
+    jobs: Iterable[Job],
+    *,
+    client: Client | None = None,
+    stop: Stop | None = None,
+    taken: Callable[[Job], None] | None = None,
+) -> Iterator[Ended]:
+    """Process scenes as they come, in the order in which they end.
+
+    Parameters
+    ----------
+    jobs : iterable of Job
+        Taken one by one, never many more than there are workers.
+    client : distributed.Client, optional
+        A cluster; in this process where None.
+    stop : Stop, optional
+        Asked before every scene.
+    taken : callable, optional
+        Called with a job before it starts.
+
+    Yields
+    ------
+    Ended
+    """
+    stop = stop or Stop()
+    if client is None:
+        yield from _serial(jobs, stop, taken)
+    else:
+        yield from _Window(client, stop, taken).run(jobs)
+
+
+def _serial(
+    jobs: Iterable[Job], stop: Stop, taken: Callable[[Job], None] | None
+) -> Iterator[Ended]:
+    for job in jobs:
+        if stop:
+            return
+        if taken:
+            taken(job)
+        yield Ended(job, *attempt(job))
+
+
+def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]:
+    """Process scenes that may take their worker down: one at a time, so that it is known which.
+
+    Parameters
+    ----------
+    jobs : sequence of Job
+    client : distributed.Client
+    stop : Stop
+
+    Yields
+    ------
+    Ended
+        A scene that takes its worker down every time ends as failed, by name.
+    """
+    for job in jobs:
+        for _ in range(TRIES):
+            if stop:
+                return
+            future = client.submit(_on_worker, job, code_version(), pure=False)
+            ended = _ended(future, job)
+            future.release()
+            if ended is not None:
+                yield ended
+                break
         else:
-            yield failed(job, f"the worker failed: {error!r}")
-        future.release()
+            reason = f"its worker died {TRIES} times: too little memory, or a damaged file"
+            yield Ended(job, failed(job, reason), final=True)
+
+
+def _on_worker(job: Job, code: str) -> tuple[SceneOutcome, bool]:
+    if code_version() != code:
+        reason = f"the worker has other code of lidarops: {code_version()}, not {code}"
+        return failed(job, reason), False
+    return attempt(job)
+
+
+class _Window:
+    """Keeps a cluster busy with a few scenes a worker, whatever the number of scenes."""
+
+    def __init__(self, client: Client, stop: Stop, taken: Callable[[Job], None] | None) -> None:
+        self._client = client
+        self._stop = stop
+        self._taken = taken
+        self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self._at_work: dict[Future, Job] = {}
+        self._suspects: list[Job] = []
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[Ended]:
+        source = iter(jobs)
+        self._fill(source)
+        asked = None
+        while self._at_work:
+            if self._stop:
+                asked = asked or time.monotonic()
+                if time.monotonic() - asked > GRACE:
+                    self._client.cancel(list(self._at_work), force=True)
+                    return
+            try:
+                future = self._done.get(timeout=0.2)
+            except queue.Empty:
+                continue
+            job = self._at_work.pop(future)
+            # First, so that no worker waits while the outcome is entered.
+            self._fill(source)
+            ended = _ended(future, job)
+            future.release()
+            if ended is None:
+                _LOG.warning("scene %s: its worker died", job.scene.id)
+                self._suspects.append(job)
+            else:
+                yield ended
+        yield from alone(self._suspects, client=self._client, stop=self._stop)
+
+    def _fill(self, source: Iterator[Job]) -> None:
+        room = max(LEAST_AHEAD, AHEAD * sum(self._client.nthreads().values()))
+        while len(self._at_work) < room and not self._stop:
+            job = next(source, None)
+            if job is None:
+                return
+            if self._taken:
+                self._taken(job)
+            future = self._client.submit(_on_worker, job, code_version(), pure=False)
+            self._at_work[future] = job
+            future.add_done_callback(self._done.put)
+
+
+def _ended(future: Future, job: Job) -> Ended | None:
+    """Return how a scene ended, or None where its worker died."""
+    from distributed import KilledWorker  # noqa: PLC0415 - takes a second to import
+
+    error = None if future.status == "finished" else _error_of(future)
+    if error is None:
+        outcome, final = future.result()
+        return Ended(job, outcome, final)
+    if isinstance(error, KilledWorker):
+        return None
+    return Ended(job, failed(job, f"the worker failed: {error!r}"), final=False)
+
+
+def _error_of(future: Future) -> BaseException | None:
+    from concurrent.futures import CancelledError  # noqa: PLC0415 - used where it is caught
+
+    try:
+        error: BaseException | None = future.exception()
+    except CancelledError as gone:
+        raise _lost() from gone
+    if isinstance(error, CancelledError):
+        raise _lost() from error
+    return error
+
+
+def _lost() -> SceneError:
+    return SceneError(
+        "the dask scheduler is gone, and with it the scenes in hand",
+        remedy="run again: what is done stays done",
+    )

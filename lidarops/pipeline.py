@@ -5,17 +5,469 @@ The command line and the Prefect flows call these; neither holds logic of its ow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lidarops.campaign import Campaign
-from lidarops.catalog.scan import scan
+from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.scan import ScanSummary, scan
 from lidarops.catalog.store import Store
+from lidarops.engine import Ended, Stop, alone, carry_out, local_client, size
 from lidarops.errors import SceneError
-from lidarops.records import RunRecord
+from lidarops.processing import Job, failed
+from lidarops.records import Granule, RunRecord, SceneOutcome
 from lidarops.reports import page, record
 from lidarops.scenes import Cut, cut, select
+from lidarops.session import Session
+from lidarops.staleness import DaysJudged, Judge, Judgement, Orphan, Selection
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+__all__ = [
+    "Options",
+    "Result",
+    "Selection",
+    "assess",
+    "bring_up_to_date",
+    "prepare",
+    "remove_orphans",
+    "report_run",
+    "reprocess",
+    "update_catalog",
+]
+
+GIVE_UP = 5
+"""Scenes in a row that fail for the sake of a disk, after which the others are not tried."""
+
+Progress = Callable[[SceneOutcome], None]
+_LOG = logging.getLogger(__name__)
+
+
+class _OvertakenError(Exception):
+    """Another run has worked on the catalog since it was read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to run; changes no result."""
+
+    force: bool = False
+    """Process what is asked for though it is fresh."""
+    workers: int = 1
+    memory: str | None = None
+    """Most memory of a worker that is started here, such as ``2GiB``."""
+    wait: float = 0.0
+    """s to wait for another run on the same catalog."""
+    profiles_per_chunk: int | None = None
+    progress: Progress | None = None
+    """Called with the outcome of each scene as it ends."""
+    expect: Callable[[int], None] | None = None
+    """Called with numbers of granules that are found to be processed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a run did, and how the archive stands after it."""
+
+    record: RunRecord | None
+    """None where there was nothing to do."""
+    status: RunStatus
+    summary: ScanSummary
+    fresh: int
+    """Products that were looked at and found fresh; those of days in which nothing at all changed
+    are not counted."""
+    orphans: tuple[Orphan, ...]
+    failures: Mapping[str, str]
+    """Scene -> error, of every scene whose last try failed."""
+    barren: int
+    """Scenes that can give no product."""
+    set_aside: int
+    """Granules that are good and stand in no scene."""
+    signal: int = 0
+    """The signal that stopped the run."""
+
+    @property
+    def troubled(self) -> bool:
+        """Whether anything was refused or failed, in this run or before and still so."""
+        return bool(
+            self.summary.refused
+            or self.failures
+            or self.barren
+            or self.set_aside
+            or self.status is not RunStatus.FINISHED
+            or (self.record is not None and self.record.failed)
+        )
+
+
+def reprocess(
+    campaign: Campaign,
+    *,
+    selection: Selection | None = None,
+    options: Options | None = None,
+    client: Client | None = None,
+) -> RunRecord | None:
+    """Bring catalog and products up to date: what is stale is made, nothing else.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    selection : Selection, optional
+        What is asked for; everything where not given.
+    options : Options, optional
+    client : distributed.Client, optional
+        A cluster to run on.
+
+    Returns
+    -------
+    RunRecord or None
+        None where there was nothing to do; nothing was written then.
+
+    Raises
+    ------
+    CatalogError
+        If archive or catalog cannot be used, or another run holds the catalog.
+    SceneError
+        If what is asked for is unknown, or the cluster is lost.
+    """
+    found = bring_up_to_date(campaign, selection=selection, options=options, client=client)
+    return found.record
+
+
+def bring_up_to_date(
+    campaign: Campaign,
+    *,
+    selection: Selection | None = None,
+    options: Options | None = None,
+    client: Client | None = None,
+) -> Result:
+    """Do what `reprocess` does, and tell all that is known at the end."""
+    selection = selection or Selection()
+    options = options or Options()
+    _refuse_unknown(campaign, selection)
+    with (
+        Store(campaign.catalog_url, campaign.name) as store,
+        Lock(store, wait=options.wait) as lock,
+    ):
+        while True:
+            try:
+                return _Work(campaign, store, lock, selection, options).carry_out(client)
+            except _OvertakenError:
+                _LOG.info("another run has ended: looking again")
+
+
+def assess(
+    campaign: Campaign,
+    *,
+    selection: Selection | None = None,
+    force: bool = False,
+    everything: bool = False,
+) -> Iterator[Judgement]:
+    """Tell for every scene that may have something to be done what that is, and why.
+
+    Brings the catalog up to date, and processes nothing.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    selection : Selection, optional
+        What is asked for; everything where not given.
+    force : bool
+        Whether all of it counts as stale.
+    everything : bool
+        Whether to tell of scenes too for which nothing is to be done.
+
+    Yields
+    ------
+    Judgement
+    """
+    selection = selection or Selection()
+    _refuse_unknown(campaign, selection)
+    update_catalog(campaign)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        judge = Judge(campaign, store, selection=selection, force=force)
+        days = _dirty(judge, store, selection, force=force or everything)
+        for batch in judge.batches(days):
+            for each in judge.days(batch).judgements:
+                if everything or each.stale or each.held:
+                    yield each
+
+
+def update_catalog(
+    campaign: Campaign, *, progress: Callable[[int], None] | None = None, wait: float = 0.0
+) -> ScanSummary:
+    """Bring the catalog up to date with the archive; see `lidarops.catalog.scan.scan`."""
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
+        return _scan(campaign, store, lock, progress)
+
+
+def _scan(
+    campaign: Campaign,
+    store: Store,
+    lock: Lock,
+    progress: Callable[[int], None] | None = None,
+) -> ScanSummary:
+    while True:
+        try:
+            return scan(campaign, store, progress=progress, before_write=_Writer(lock))
+        except _OvertakenError:
+            continue
+
+
+class _Writer:
+    """Takes the lock before the first write."""
+
+    def __init__(self, lock: Lock) -> None:
+        self._lock = lock
+
+    def __call__(self) -> None:
+        if self._lock.acquire():
+            raise _OvertakenError
+
+
+def _dirty(judge: Judge, store: Store, selection: Selection, *, force: bool) -> list[int]:
+    verdicts = store.verdicts()
+    signatures = judge.signatures()
+    days = selection.days(sorted(signatures))
+    if force:
+        return days
+    return [
+        day for day in days if not signatures[day] or verdicts.get(day, ("",))[0] != signatures[day]
+    ]
+
+
+def _refuse_unknown(campaign: Campaign, selection: Selection) -> None:
+    known = {
+        "instrument": (selection.instruments, (*campaign.instruments, *campaign.networks)),
+        "station": (selection.stations, (*campaign.stations, *campaign.networks)),
+    }
+    for word, (asked, there) in known.items():
+        for name in asked:
+            if name not in there:
+                raise SceneError(
+                    f"the campaign has no {word} {name!r}",
+                    remedy=f"known: {', '.join(sorted(set(there)))}",
+                )
+
+
+@dataclass(slots=True)
+class _Found:
+    """What is gathered on the way."""
+
+    fresh: int = 0
+    orphans: list[Orphan] = field(default_factory=list)
+    set_aside: list[Granule] = field(default_factory=list)
+    held: list[Judgement] = field(default_factory=list)
+    barren: int = 0
+    settled: dict[int, tuple[int, int]] = field(default_factory=dict)
+    worked: set[int] = field(default_factory=set)
+    """Days on which something was processed."""
+
+
+class _Work:
+    """One pass: catalog, judge, process what is stale, enter it."""
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        store: Store,
+        lock: Lock,
+        selection: Selection,
+        options: Options,
+    ) -> None:
+        self._campaign = campaign
+        self._store = store
+        self._lock = lock
+        self._selection = selection
+        self._options = options
+        self._write = _Writer(lock)
+        self._found = _Found()
+        self._judgements: dict[str, Judgement] = {}
+        self._suspects: list[Job] = []
+        self._session: Session | None = None
+        self._failing = 0
+
+    def carry_out(self, client: Client | None) -> Result:
+        self._summary = _scan_once(self._campaign, self._store, self._write)
+        self._judge = self._new_judge()
+        signatures = self._judge.signatures()
+        verdicts = self._store.verdicts()
+        days = _dirty(self._judge, self._store, self._selection, force=self._options.force)
+        clean = [verdicts[day] for day in signatures.keys() - set(days) if day in verdicts]
+        status, caught = RunStatus.FINISHED, 0
+        if days:
+            with Stop() as stop:
+                self._process(days, client, stop)
+                caught = stop.signal
+                status = _status(stop)
+            self._settle(signatures)
+        run = self._conclude(status)
+        found = self._found
+        return Result(
+            record=run,
+            status=status,
+            summary=self._summary,
+            fresh=found.fresh,
+            orphans=tuple(found.orphans),
+            failures=self._store.failures(),
+            barren=found.barren + sum(barren for _, barren, _ in clean),
+            set_aside=len(found.set_aside) + sum(aside for _, _, aside in clean),
+            signal=caught,
+        )
+
+    def _new_judge(self, *, again: bool = False) -> Judge:
+        force = self._options.force and not again
+        return Judge(self._campaign, self._store, selection=self._selection, force=force)
+
+    # Processing
+
+    def _process(self, days: Sequence[int], client: Client | None, stop: Stop) -> None:
+        jobs = self._jobs(days)
+        first = next(jobs, None)
+        if first is None:
+            return
+        options = self._options
+        with ExitStack() as stack:
+            used = client
+            if client is None and options.workers > 1:
+                used = stack.enter_context(local_client(options.workers, memory=options.memory))
+            serial = used is None
+            taken = self._take_noted if serial else self._take
+            self._enter(carry_out(_chained(first, jobs), client=used, stop=stop, taken=taken), stop)
+            if self._suspects and not stop:
+                if used is None:
+                    used = stack.enter_context(local_client(1, memory=options.memory))
+                for job in self._suspects:
+                    self._take(job)
+                self._enter(alone(self._suspects, client=used, stop=stop), stop)
+
+    def _enter(self, ended: Iterator[Ended], stop: Stop) -> None:
+        session = self._running()
+        for each in ended:
+            judged = self._judgements.pop(each.job.scene.id)
+            outcome = session.end(judged, each.outcome, final=each.final)
+            self._failing = self._failing + 1 if outcome.error and not each.final else 0
+            if self._failing >= GIVE_UP:
+                stop.now(f"the last {GIVE_UP} scenes failed alike: {outcome.error}")
+            if self._options.progress:
+                self._options.progress(outcome)
+
+    def _jobs(self, days: Sequence[int]) -> Iterator[Job]:
+        """Give what is stale, the largest scenes of some days first."""
+        for batch in self._judge.batches(days):
+            judged = self._judge.days(batch)
+            self._note(judged)
+            stale = [each for each in judged.judgements if each.stale]
+            jobs = [
+                Job(self._campaign, each.scene, each.needed(), self._options.profiles_per_chunk)
+                for each in stale
+            ]
+            self._judgements.update((each.scene.id, each) for each in stale)
+            self._found.worked.update(each.day for each in stale)
+            if self._options.expect:
+                self._options.expect(sum(len(each.scene.granules) for each in stale))
+            suspect = {each.scene.id for each in stale if each.suspect}
+            self._suspects += [job for job in jobs if job.scene.id in suspect]
+            # The largest scene last would keep one worker busy while the others idle.
+            for job in sorted(jobs, key=size, reverse=True):
+                if job.scene.id not in suspect:
+                    yield job
+
+    def _note(self, judged: DaysJudged) -> None:
+        found = self._found
+        found.fresh += sum(each.fresh for each in judged.judgements)
+        found.orphans += judged.orphans
+        found.set_aside += judged.set_aside
+        found.settled.update(judged.settled)
+        found.barren += sum(each.barren for each in judged.judgements)
+        found.held += [each for each in judged.judgements if each.held]
+        if self._judge.digests or judged.touched or judged.gone:
+            self._write()
+            self._store.store_digests(self._judge.digests)
+            self._store.touch_products(judged.touched)
+            self._store.forget_scenes(judged.gone)
+            self._judge.digests.clear()
+
+    def _take(self, job: Job) -> None:
+        self._running().take(self._judgements[job.scene.id], note=False)
+
+    def _take_noted(self, job: Job) -> None:
+        self._running().take(self._judgements[job.scene.id], note=True)
+
+    def _running(self) -> Session:
+        if self._session is None:
+            self._write()
+            self._session = Session(self._campaign, self._store, self._lock, self._judge)
+            self._session.begin()
+        return self._session
+
+    # The end
+
+    def _settle(self, signatures: Mapping[int, str]) -> None:
+        """Note the days on which everything is fresh, so that they need no second look."""
+        found = self._found
+        settled = {day: (signatures[day], *counts) for day, counts in found.settled.items()}
+        if found.worked and self._selection.everything:
+            judge = self._new_judge(again=True)
+            again = judge.signatures(found.worked)
+            for batch in judge.batches(found.worked & again.keys()):
+                counts = judge.days(batch).settled
+                settled.update((day, (again[day], *told)) for day, told in counts.items())
+        known = self._store.verdicts()
+        new = {day: told for day, told in settled.items() if told[0] and known.get(day) != told}
+        if new:
+            self._write()
+            self._store.store_verdicts(new)
+
+    def _conclude(self, status: RunStatus) -> RunRecord | None:
+        if self._session is None:
+            return None
+        for each in self._found.held:
+            job = Job(self._campaign, each.scene, each.plan)
+            self._session.add(failed(job, f"{each.held} (not tried again: nothing has changed)"))
+        return self._session.finish(status, self._found.set_aside)
+
+
+def _scan_once(campaign: Campaign, store: Store, write: _Writer) -> ScanSummary:
+    return scan(campaign, store, before_write=write)
+
+
+def _chained(first: Job, rest: Iterator[Job]) -> Iterator[Job]:
+    yield first
+    yield from rest
+
+
+def _status(stop: Stop) -> RunStatus:
+    if stop.signal:
+        return RunStatus.INTERRUPTED
+    return RunStatus.STOPPED if stop else RunStatus.FINISHED
+
+
+def remove_orphans(campaign: Campaign, orphans: Sequence[Orphan], *, wait: float = 0.0) -> int:
+    """Remove products that nothing asks for any more, files and ledger rows.
+
+    Returns
+    -------
+    int
+        How many files were removed.
+    """
+    if not orphans:
+        return 0
+    removed = 0
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
+        lock.acquire()
+        for orphan in orphans:
+            path = campaign.products_root / orphan.path
+            removed += path.exists()
+            path.unlink(missing_ok=True)
+        store.forget_products([orphan.path for orphan in orphans], lock.token)
+    return removed
 
 
 def prepare(
@@ -46,12 +498,9 @@ def prepare(
     SceneError
         If there is no scene, or none of an instrument that is asked for.
     """
-    store = Store(campaign.catalog_url, campaign.name)
-    try:
-        scan(campaign, store)
+    update_catalog(campaign)
+    with Store(campaign.catalog_url, campaign.name) as store:
         everything = cut(campaign, store.granules())
-    finally:
-        store.close()
     chosen = select(everything.scenes, instruments=instruments, since=since, until=until)
     if not chosen:
         raise SceneError(

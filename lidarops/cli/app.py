@@ -44,6 +44,25 @@ UntilOption = Annotated[
     datetime | None, typer.Option("--until", help="Only scenes that start before this UTC time.")
 ]
 
+CatalogOption = Annotated[
+    str | None,
+    typer.Option(
+        "--catalog",
+        help="SQLAlchemy URL of catalog and ledger; wins over LIDAROPS_CATALOG and the file.",
+        metavar="URL",
+    ),
+]
+StationOption = Annotated[
+    list[str] | None, typer.Option("--station", help="Only this station; may be repeated.")
+]
+ProductOption = Annotated[
+    list[str] | None, typer.Option("--product", help="Only this kind; may be repeated.")
+]
+WaitOption = Annotated[
+    float,
+    typer.Option("--wait", min=0, help="s to wait for another run on the same catalog."),
+]
+
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -86,6 +105,57 @@ def leave(*, failed: bool) -> None:
     """Exit with 1 where something failed."""
     if failed:
         raise typer.Exit(REFUSED)
+
+
+class Bar:
+    """Progress over something whose number becomes known on the way."""
+
+    def __init__(self, grow: Callable[[int], None], advance: Callable[[int], None]) -> None:
+        self.grow = grow
+        self.advance = advance
+
+
+@contextmanager
+def growing_bar(name: str, unit: str) -> Iterator[Bar]:
+    """Show progress, throughput and time to go on standard error where that is a terminal."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
+
+    class Speed(TextColumn):
+        def render(self, task: Task) -> Text:
+            return Text(f"{task.speed or 0.0:.0f} {unit}/s")
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        Speed(""),
+        TimeElapsedColumn(),
+        TextColumn("to go"),
+        TimeRemainingColumn(),
+    )
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(name, total=None)
+        total = 0
+
+        def grow(number: int) -> None:
+            nonlocal total
+            total += number
+            bar.update(task, total=total)
+
+        yield Bar(grow, lambda done: bar.advance(task, done))
 
 
 @contextmanager

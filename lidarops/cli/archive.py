@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,13 +13,18 @@ import typer
 from lidarops.cli.app import (
     ArchiveOption,
     CampaignFile,
+    CatalogOption,
     InstrumentOption,
     JsonOption,
     OutOption,
+    ProductOption,
     SinceOption,
+    StationOption,
     UntilOption,
+    WaitOption,
     add_row,
     app,
+    growing_bar,
     leave,
     make_table,
     plainly,
@@ -26,14 +32,16 @@ from lidarops.cli.app import (
     show,
     utc,
 )
+from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
 
 if TYPE_CHECKING:
+    from distributed import Client
     from rich.table import Table
 
     from lidarops.campaign import Campaign
-    from lidarops.catalog.store import Store
-    from lidarops.records import Granule, Plan, RunRecord
-    from lidarops.scenes import Cut
+    from lidarops.pipeline import Result
+    from lidarops.records import Granule, Plan
+    from lidarops.staleness import Judgement, Selection
 
 
 @app.command()
@@ -42,6 +50,8 @@ def catalog(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
     out: OutOption = None,
+    catalog: CatalogOption = None,
+    wait: WaitOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
     """Scan the archive, or bring its catalog up to date; list what is refused and why.
@@ -51,17 +61,14 @@ def catalog(
     from dataclasses import asdict
 
     from lidarops.campaign import load
-    from lidarops.catalog.scan import scan
-    from lidarops.records import Status
+    from lidarops.catalog.store import Store
+    from lidarops.pipeline import update_catalog
 
-    settings = load(campaign, archive=archive, output=out)
-    store = _open_store(settings)
-    try:
-        with progress_bar("catalog", None) as advance:
-            summary = scan(settings, store, progress=advance)
-        refused = store.granules(status=Status.REFUSED)
-    finally:
-        store.close()
+    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    with progress_bar("catalog", None) as advance:
+        summary = update_catalog(settings, progress=advance, wait=wait)
+    with Store(settings.catalog_url, settings.name) as store:
+        refused = store.refused()
     if as_json:
         reasons = [{"path": granule.path, "reason": granule.reason} for granule in refused]
         typer.echo(json.dumps({**asdict(summary), "refused_files": reasons}, indent=2))
@@ -69,7 +76,7 @@ def catalog(
         show(_refused_table(refused))
         typer.echo(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
-            f" {summary.unchanged} unchanged, {summary.vanished} vanished,"
+            f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
             f" {summary.refused} refused"
         )
     leave(failed=bool(refused))
@@ -81,27 +88,36 @@ def show_plan(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
     out: OutOption = None,
+    catalog: CatalogOption = None,
     instrument: InstrumentOption = None,
+    station: StationOption = None,
+    product: ProductOption = None,
     since: SinceOption = None,
     until: UntilOption = None,
+    stale: Annotated[
+        bool, typer.Option("--stale", help="Only what is to be made, and why.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the scenes, their steps, and what is left out and why. Runs nothing.
+    """Show the scenes, their steps, what is left out and why, and what is stale. Runs nothing.
 
     Example: lidarops plan catalogs/demo.yaml
     """
     from lidarops.campaign import load
-    from lidarops.plans import plan
+    from lidarops.pipeline import assess
 
-    settings = load(campaign, archive=archive, output=out)
-    cut = _cut_scenes(settings, instrument, since, until)
-    plans = [plan(scene, settings) for scene in cut.scenes]
+    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    wanted = _selection(instrument, station, product, since, until)
+    found = assess(settings, selection=wanted, everything=not stale)
     if as_json:
-        typer.echo(json.dumps([item.as_dict() for item in plans], indent=2))
+        typer.echo(json.dumps([_plain(each) for each in found], indent=2))
         return
-    for scene, item in zip(cut.scenes, plans, strict=True):
+    for each in found:
+        scene = each.scene
         title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
-        show(_plan_table(title, item))
+        if not stale:
+            show(_plan_table(title, each.plan))
+        show(_stale_table(title, each))
 
 
 @app.command()
@@ -110,56 +126,127 @@ def reprocess(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
     out: OutOption = None,
+    catalog: CatalogOption = None,
     instrument: InstrumentOption = None,
+    station: StationOption = None,
+    product: ProductOption = None,
     since: SinceOption = None,
     until: UntilOption = None,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+    force: Annotated[
+        bool, typer.Option("--force", help="Process what is asked for though it is fresh.")
+    ] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Processes; 1 where not given.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help="Address of a dask scheduler to run on.")
+    ] = None,
+    tls: Annotated[
+        tuple[Path, Path, Path] | None,
+        typer.Option("--tls", help="Certificate of the authority, own certificate, own key."),
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option("--cluster", help="slurm, kubernetes, or a YAML file of a cluster."),
+    ] = None,
+    memory_limit: Annotated[
+        str | None, typer.Option("--memory-limit", help="Most memory of a worker, such as 2GiB.")
+    ] = None,
+    wait: WaitOption = 0.0,
+    remove_orphans: Annotated[
+        bool,
+        typer.Option("--remove-orphans", help="Remove products that nothing asks for any more."),
+    ] = False,
     profiles_per_chunk: Annotated[
         int | None, typer.Option(min=1, help="Profiles a dask chunk; changes no result.")
     ] = None,
+    log_level: LogLevelOption = "warning",
+    log_json: LogJsonOption = False,
+    log_file: LogFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Catalog the archive, process its scenes into products, and write the report.
+    """Catalog the archive, make what is stale, and write the report.
+
+    A run with nothing to do writes nothing. Exit code 1 where something is refused or failed.
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
+    from lidarops import pipeline
     from lidarops.campaign import load
-    from lidarops.engine import run
-    from lidarops.pipeline import report_run
 
-    settings = load(campaign, archive=archive, output=out)
-    cut = _cut_scenes(settings, instrument, since, until)
-    with progress_bar("reprocess", len(cut.scenes)) as advance:
-        record = run(
-            settings,
-            cut,
-            workers=workers,
+    set_up(log_level, as_json=log_json, file=log_file)
+    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    wanted = _selection(instrument, station, product, since, until)
+    with growing_bar("reprocess", "granules") as bar, ExitStack() as stack:
+        client = _client(stack, workers, scheduler, tls, cluster)
+        options = pipeline.Options(
+            force=force,
+            workers=workers or 1,
+            memory=memory_limit,
+            wait=wait,
             profiles_per_chunk=profiles_per_chunk,
-            progress=lambda _outcome: advance(1),
+            progress=lambda outcome: bar.advance(outcome.granules),
+            expect=bar.grow,
         )
-    page = report_run(settings, record)
+        result = pipeline.bring_up_to_date(
+            settings, selection=wanted, options=options, client=client
+        )
+    removed = None
+    if remove_orphans:
+        removed = pipeline.remove_orphans(settings, result.orphans, wait=wait)
+    page = None if result.record is None else pipeline.report_run(settings, result.record)
     if as_json:
-        typer.echo(json.dumps(_run_summary(record, page), indent=2))
+        typer.echo(json.dumps(_run_summary(settings, result, page), indent=2))
     else:
-        _tell(record, page)
-    leave(failed=record.failed)
+        _tell(settings, result, page, removed)
+    if result.signal:
+        raise typer.Exit(128 + result.signal)
+    leave(failed=result.troubled)
 
 
-def _open_store(campaign: Campaign) -> Store:
-    from lidarops.catalog.store import Store
+def _client(
+    stack: ExitStack,
+    workers: int | None,
+    scheduler: str | None,
+    tls: tuple[Path, Path, Path] | None,
+    cluster: str | None,
+) -> Client | None:
+    """Reach the cluster that is asked for; None for this machine."""
+    if tls and scheduler is None:
+        raise typer.BadParameter("--tls is for --scheduler; a cluster's file has its own")
+    if scheduler is None and cluster is None:
+        return None
+    from lidarops import clusters
 
-    return Store(campaign.catalog_url, campaign.name)
+    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
+    if tls and isinstance(chosen, clusters.Scheduler):
+        ca, certificate, key = tls
+        files = clusters.Tls(ca=ca, certificate=certificate, key=key)
+        chosen = chosen.model_copy(update={"tls": files})
+    return stack.enter_context(clusters.client(chosen))
 
 
-def _cut_scenes(
-    campaign: Campaign,
+def _selection(
     instruments: list[str] | None,
+    stations: list[str] | None,
+    products: list[str] | None,
     since: datetime | None,
     until: datetime | None,
-) -> Cut:
-    from lidarops.pipeline import prepare
+) -> Selection:
+    from lidarops.records import ProductKind
+    from lidarops.staleness import Selection
 
-    return prepare(campaign, instruments=instruments or (), since=utc(since), until=utc(until))
+    kinds = [kind.value for kind in ProductKind]
+    for name in products or ():
+        if name not in kinds:
+            raise typer.BadParameter(f"{name!r} is no kind of product: {', '.join(kinds)}")
+    return Selection(
+        stations=tuple(stations or ()),
+        instruments=tuple(instruments or ()),
+        kinds=tuple(ProductKind(name) for name in products or ()),
+        since=utc(since),
+        until=utc(until),
+    )
 
 
 def _refused_table(refused: list[Granule]) -> Table:
@@ -179,24 +266,55 @@ def _plan_table(title: str, plan: Plan) -> Table:
     return table
 
 
-def _run_summary(record: RunRecord, page: Path) -> dict[str, Any]:
+def _stale_table(title: str, judged: Judgement) -> Table:
+    table = make_table(f"{title}: to be made", "product", "channel", "because")
+    for each in judged.stale:
+        add_row(table, each.kind.value, each.channel, each.reason)
+    if judged.held:
+        add_row(table, "none", "", f"not tried again, nothing has changed: {judged.held}")
+    return table
+
+
+def _plain(judged: Judgement) -> dict[str, Any]:
+    stale = [
+        {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
+        for each in judged.stale
+    ]
+    return {**judged.plan.as_dict(), "stale": stale, "fresh": judged.fresh, "held": judged.held}
+
+
+def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
+    record = result.record
+    scenes = () if record is None else record.scenes
     return {
-        "run": record.id,
-        "report": str(page),
-        "scenes": len(record.scenes),
-        "failed_scenes": {scene.scene: scene.error for scene in record.scenes if scene.error},
-        "refused_files": {granule.path: granule.reason for granule in _all_refused(record)},
-        "products": [product.path for scene in record.scenes for product in scene.products],
+        "run": None if record is None else record.id,
+        "status": result.status.value,
+        "report": None if page is None else str(page),
+        "scenes": len(scenes),
+        "failed_scenes": {
+            **result.failures,
+            **{scene.scene: scene.error for scene in scenes if scene.error},
+        },
+        "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
+        "products": [product.path for scene in scenes for product in scene.products],
+        "orphans": {orphan.path: orphan.reason for orphan in result.orphans},
     }
 
 
-def _all_refused(record: RunRecord) -> list[Granule]:
-    return [*record.refused, *(granule for scene in record.scenes for granule in scene.refused)]
+def _refused(campaign: Campaign, result: Result) -> list[Granule]:
+    if result.record is not None:
+        late = [granule for scene in result.record.scenes for granule in scene.refused]
+        early = {granule.path: granule for granule in (*result.record.refused, *late)}
+        return list(early.values())
+    from lidarops.catalog.store import Store
+
+    with Store(campaign.catalog_url, campaign.name) as store:
+        return store.refused()
 
 
-def _tell(record: RunRecord, page: Path) -> None:
+def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | None) -> None:
     table = make_table("Products", "scene", "kind", "channel", "values", "unflagged", "flags")
-    for scene in record.scenes:
+    for scene in () if result.record is None else result.record.scenes:
         for product in scene.products:
             flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
             of = (scene.scene, product.kind.value, product.channel)
@@ -204,5 +322,26 @@ def _tell(record: RunRecord, page: Path) -> None:
         if scene.error:
             add_row(table, scene.scene, "none", "", "", "", scene.error)
     show(table)
-    show(_refused_table(_all_refused(record)))
-    typer.echo(f"products: {record.products}\nreport:   {page}")
+    show(_refused_table(_refused(campaign, result)))
+    show(_orphans_table(result, removed))
+    if page is None:
+        show(_failures_table(result))
+        typer.echo("nothing to do: every product that is asked for is fresh or cannot be made")
+    else:
+        ended = f" ({result.status.value})" if result.status != "finished" else ""
+        typer.echo(f"products: {campaign.products_root}{ended}\nreport:   {page}")
+
+
+def _orphans_table(result: Result, removed: int | None) -> Table:
+    fate = "kept; --remove-orphans removes them" if removed is None else f"{removed} removed"
+    table = make_table(f"Products that nothing asks for ({fate})", "file", "because")
+    for orphan in result.orphans:
+        add_row(table, orphan.path, orphan.reason)
+    return table
+
+
+def _failures_table(result: Result) -> Table:
+    table = make_table("Failed before, and nothing has changed since", "scene", "error")
+    for scene, error in result.failures.items():
+        add_row(table, scene, error)
+    return table

@@ -5,17 +5,32 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from lidarops.cli.app import JsonOption, add_row, app, make_table, plainly, progress_bar, show
+from lidarops.cli.app import (
+    JsonOption,
+    add_row,
+    app,
+    leave,
+    make_table,
+    plainly,
+    progress_bar,
+    show,
+)
+from lidarops.errors import CampaignError
+
+if TYPE_CHECKING:
+    from lidarops.bench.terms import Effort, Finding
+
+_STABILITY: Final = "stability"
 
 
 @app.command()
 @plainly
 def bench(
-    what: Annotated[str, typer.Argument(help="accuracy or throughput", metavar="WHAT")],
+    what: Annotated[str, typer.Argument(help="accuracy, throughput or stability", metavar="WHAT")],
     files: Annotated[
         list[Path] | None, typer.Argument(help="Raw files of one layout, for the case reader.")
     ] = None,
@@ -35,11 +50,15 @@ def bench(
 ) -> None:
     """Measure errors against the least possible ones, or speed against a floor of the same run.
 
+    Or see what stiff and extreme cases come to, and how often a wrong value has no flag.
+
     Example: lidarops bench accuracy --case homogeneous --quick --out bench
 
     Example: lidarops bench accuracy --case elastic --quick --data boeckmann
 
     Example: lidarops bench throughput demo/raw/coast/h*.*0
+
+    Example: lidarops bench stability --quick --out bench
     """
     from lidarops.bench import cases, results
     from lidarops.bench.terms import Effort
@@ -47,10 +66,15 @@ def bench(
     today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as advance:
         effort = Effort(quick=quick, repeats=repeats, date=today, progress=advance)
-        finding = cases.run(what, case, files or [], effort, data=data)
+        if what == _STABILITY:
+            _refuse({"case": case, "files": files, "data": data, "repeats": repeats})
+            finding = _stability(effort)
+        else:
+            finding = cases.run(what, case, files or [], effort, data=data)
     page = None if out is None else cases.write(finding, out)
     if as_json:
         typer.echo(json.dumps(results.plain(finding.result), indent=1))
+        leave(failed=_failed(finding))
         return
     for part in finding.report.parts:
         for found in part.tables:
@@ -60,3 +84,24 @@ def bench(
             show(table)
     if page is not None:
         typer.echo(f"report: {page}")
+    leave(failed=_failed(finding))
+
+
+def _refuse(given: dict[str, object]) -> None:
+    """Refuse what stability does not take."""
+    for name, value in given.items():
+        if value:
+            raise CampaignError(
+                "is not taken by the benchmark 'stability'", field=name, remedy="leave it out"
+            )
+
+
+def _stability(effort: Effort) -> Finding:
+    from lidarops.bench import stability
+
+    return stability.run(effort)
+
+
+def _failed(finding: Finding) -> bool:
+    """Return whether a case went otherwise than it is known to."""
+    return bool(getattr(finding.result, "failed", False))

@@ -1,0 +1,182 @@
+"""A database that holds catalog and ledger: SQLite by default, PostgreSQL by URL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from lidarops.catalog.schema import GRANULE, METADATA, SCHEMA, SCHEMA_VERSION
+from lidarops.errors import CatalogError
+
+BATCH = 1000
+"""Rows a statement, where a list of them is asked for."""
+
+
+class Database:
+    """Transactions on the tables of `lidarops.catalog.schema`, for one campaign.
+
+    Parameters
+    ----------
+    url : str
+        SQLAlchemy URL, such as ``sqlite:///catalog.sqlite`` or ``postgresql+psycopg://...``.
+    campaign : str
+        Name of the campaign; several may share a database.
+
+    Raises
+    ------
+    CatalogError
+        If the database cannot be opened, or is of another version of lidarops.
+    """
+
+    def __init__(self, url: str, campaign: str) -> None:
+        self.campaign = campaign
+        self._url = _parsed(url)
+        self._sqlite = self._url.get_backend_name() == "sqlite"
+        if self._sqlite and self._url.database:
+            _make_folder(Path(self._url.database).parent)
+        self._engine = _engine(self._url)
+        if self._sqlite:
+            sa.event.listen(self._engine, "connect", _tune_sqlite)
+        with self.transaction() as connection:
+            self._settle_schema(connection)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def place(self) -> str:
+        """The URL without its password."""
+        return self._url.render_as_string(hide_password=True)
+
+    def close(self) -> None:
+        """Give the database connections back."""
+        self._engine.dispose()
+
+    @contextmanager
+    def transaction(self) -> Iterator[sa.Connection]:
+        """Give a connection whose changes are kept together, or not at all."""
+        try:
+            with self._engine.begin() as connection:
+                yield connection
+        except sa.exc.SQLAlchemyError as error:
+            raise self._told(error) from error
+
+    @contextmanager
+    def stream(self, query: sa.Select[Any]) -> Iterator[Iterator[sa.Row[Any]]]:
+        """Give the rows of a query one by one: never more than a few thousand in memory."""
+        try:
+            with self._engine.connect() as connection:
+                options = {"stream_results": True, "yield_per": 5000}
+                yield iter(connection.execution_options(**options).execute(query))
+        except sa.exc.SQLAlchemyError as error:
+            raise self._told(error) from error
+
+    def insert(self, table: sa.Table) -> Any:
+        """Return an insert that can say what to do with a row that is there."""
+        return sqlite.insert(table) if self._sqlite else postgresql.insert(table)
+
+    def clock(self) -> sa.ColumnElement[float]:
+        """Return the database's time in s: the one clock that all its users share."""
+        if self._sqlite:
+            return sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Float())
+        return sa.literal_column("extract(epoch from clock_timestamp())::float8", sa.Float())
+
+    def _settle_schema(self, connection: sa.Connection) -> None:
+        inspector = sa.inspect(connection)
+        if not inspector.has_table(SCHEMA.name):
+            if inspector.has_table(GRANULE.name):
+                raise self._other_version(1)
+            METADATA.create_all(connection)
+            statement = self.insert(SCHEMA).on_conflict_do_nothing()
+            connection.execute(statement, {"version": SCHEMA_VERSION})
+        found = connection.scalar(sa.select(sa.func.max(SCHEMA.c.version)))
+        if found != SCHEMA_VERSION:
+            raise self._other_version(found)
+
+    def _other_version(self, found: int | None) -> CatalogError:
+        older = found is None or found < SCHEMA_VERSION
+        return CatalogError(
+            f"is a catalog of version {found}, and this lidarops works with {SCHEMA_VERSION}",
+            file=self.place,
+            remedy="move it away: a new one is made from the archive, and products are made again"
+            if older
+            else "use the newer lidarops that made it, or another catalog",
+        )
+
+    def _told(self, error: sa.exc.SQLAlchemyError) -> CatalogError:
+        cause = str(getattr(error, "orig", None) or error).strip()
+        if "full" in cause:
+            remedy = "make space on the disk, then run again: what is done stays done"
+        elif "readonly" in cause or "read-only" in cause:
+            remedy = "make the folder writable, or choose another with --out or LIDAROPS_CATALOG"
+        else:
+            remedy = "check that the folder is writable and the file is a lidarops catalog"
+        return CatalogError(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
+
+
+def _parsed(url: str) -> sa.URL:
+    try:
+        return sa.make_url(url)
+    except sa.exc.ArgumentError as error:
+        raise CatalogError(
+            "is no URL of a database",
+            file=url,
+            remedy="give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME",
+        ) from error
+
+
+def _engine(url: sa.URL) -> sa.Engine:
+    try:
+        return sa.create_engine(url)
+    except (ImportError, sa.exc.SQLAlchemyError) as error:
+        raise CatalogError(
+            f"cannot be opened: {error}",
+            file=url.render_as_string(hide_password=True),
+            remedy="install its driver: pip install lidarops[postgresql]",
+        ) from error
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CatalogError(
+            f"the catalog's folder cannot be made: {error.strerror}",
+            file=folder,
+            remedy="choose another folder with --out",
+        ) from error
+
+
+def _tune_sqlite(connection: Any, _record: Any) -> None:
+    cursor = connection.cursor()
+    # Asked first, because setting it writes.
+    if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+        cursor.execute("PRAGMA journal_mode=WAL")
+    cursor.execute("PRAGMA synchronous=NORMAL")
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.execute("PRAGMA busy_timeout=30000")
+    cursor.close()
+
+
+def naive(moment: datetime | None) -> datetime | None:
+    """Return a time as the tables hold it: UTC, without a zone."""
+    return None if moment is None else moment.astimezone(UTC).replace(tzinfo=None)
+
+
+def aware(moment: datetime | None) -> datetime | None:
+    """Return a time of the tables with its zone."""
+    return None if moment is None else moment.replace(tzinfo=UTC)
+
+
+def day_of(moment: datetime) -> int:
+    """Return the days since 1970-01-01 of a time, in UTC."""
+    return (moment.astimezone(UTC).date() - datetime(1970, 1, 1, tzinfo=UTC).date()).days

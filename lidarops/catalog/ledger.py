@@ -1,0 +1,567 @@
+"""The ledger's half of the database: what was made, from what, by which run."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
+from itertools import groupby
+from operator import attrgetter
+from typing import Any, Final
+
+import sqlalchemy as sa
+
+from lidarops.catalog.database import BATCH, aware, naive
+from lidarops.catalog.granules import AGAIN, Granules
+from lidarops.catalog.schema import (
+    FILE_SET,
+    GRANULE,
+    LOCK,
+    PRODUCT,
+    PRODUCT_INPUT,
+    RUN,
+    SCENE,
+    STAGE,
+    SUPERSEDED,
+    VERDICT,
+)
+from lidarops.errors import CatalogError
+from lidarops.records import Granule, InputRecord, ProductRecord, Role, SceneOutcome, Status
+
+
+class RunStatus(StrEnum):
+    """How a run stands."""
+
+    RUNNING = "running"
+    FINISHED = "finished"
+    INTERRUPTED = "interrupted"
+    STOPPED = "stopped"
+    """The target could not be written."""
+    DIED = "died"
+    """Its process ended without a word."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dependence:
+    """What the content of one product depends on, as digests."""
+
+    plan_hash: str
+    settings_hash: str
+    inputs_hash: str
+    code_version: str
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A product as the ledger holds it."""
+
+    path: str
+    scene: str
+    day: int
+    kind: str
+    channel: str
+    sha256: str
+    size: int
+    mtime_ns: int
+    depends_on: Dependence
+    run: str
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Scene, kind and channel."""
+        return self.scene, self.kind, self.channel
+
+
+@dataclass(frozen=True, slots=True)
+class NewProduct:
+    """A product to be entered."""
+
+    record: ProductRecord
+    mtime_ns: int
+    depends_on: Dependence
+    inputs: tuple[InputRecord, ...]
+    kept: str = ""
+    """Where the version before it is kept, below the output folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What became of one scene, to be entered as it ends."""
+
+    outcome: SceneOutcome
+    day: int
+    key: str
+    final: bool
+    """Whether the same inputs cannot but fail again."""
+    products: tuple[NewProduct, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """How the last try of a scene ended."""
+
+    key: str
+    error: str
+    final: bool
+    crashes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run as the ledger tells it."""
+
+    id: str
+    started: datetime
+    finished: datetime | None
+    status: RunStatus
+    holder: str
+    version: str
+    code_version: str
+    scenes: int = 0
+    products: int = 0
+    granules: int = 0
+    failed: int = 0
+    refused: int = 0
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """By stage, summed over scenes."""
+
+
+@dataclass(frozen=True, slots=True)
+class OldVersion:
+    """A version of a product that was replaced."""
+
+    path: str
+    sha256: str
+    run: str
+    replaced_by: str
+    kept: str
+    """Below the output folder; empty where the file is gone."""
+
+
+_P: Final = PRODUCT.c
+_MADE: Final = (
+    _P.path, _P.scene, _P.day, _P.kind, _P.channel, _P.sha256, _P.size, _P.mtime_ns,
+    _P.plan_hash, _P.settings_hash, _P.inputs_hash, _P.code_version, _P.run,
+)  # fmt: skip
+
+
+class Ledger(Granules):
+    """Products, their inputs, and the runs that made them."""
+
+    # Runs
+
+    def begin_run(self, run: Run, token: str) -> None:
+        """Enter a run that starts, and close those whose process ended without a word."""
+        with self.transaction() as connection:
+            self._hold(connection, token)
+            connection.execute(
+                sa.update(RUN)
+                .where(RUN.c.campaign == self.campaign, RUN.c.status == RunStatus.RUNNING.value)
+                .values(status=RunStatus.DIED.value)
+            )
+            values = {
+                "id": run.id,
+                "campaign": self.campaign,
+                "started": naive(run.started),
+                "finished": naive(run.finished),
+                "status": run.status.value,
+                "holder": run.holder,
+                "version": run.version,
+                "code_version": run.code_version,
+                **dict.fromkeys(("scenes", "products", "granules", "failed", "refused"), 0),
+            }
+            connection.execute(sa.insert(RUN), values)
+
+    def end_run(self, run: str, status: RunStatus, *, refused: int, token: str) -> None:
+        """Enter how a run ended."""
+        with self.transaction() as connection:
+            self._hold(connection, token)
+            connection.execute(
+                sa.update(RUN)
+                .where(RUN.c.id == run)
+                .values(status=status.value, refused=refused, finished=naive(datetime.now(UTC)))
+            )
+
+    def runs(self, *, limit: int | None = None) -> list[Run]:
+        """Return the runs of the campaign, the newest first, with their stage timings."""
+        query = (
+            sa.select(RUN)
+            .where(RUN.c.campaign == self.campaign)
+            .order_by(RUN.c.started.desc(), RUN.c.id.desc())
+            .limit(limit)
+        )
+        with self.transaction() as connection:
+            rows = list(connection.execute(query))
+            return [_run_from(row, _stages(connection, row.id)) for row in rows]
+
+    # Outcomes
+
+    def begin_scene(self, scene: str, day: int, run: str, token: str) -> None:
+        """Note that a scene is taken in hand: where its process dies, the note stays."""
+        row = {
+            "campaign": self.campaign, "scene": scene, "day": day, "key": "", "run": run,
+            "error": "", "final": False, "crashes": 1,
+        }  # fmt: skip
+        with self.transaction() as connection:
+            self._hold(connection, token)
+            statement = self.insert(SCENE)
+            connection.execute(
+                statement.on_conflict_do_update(
+                    index_elements=["campaign", "scene"],
+                    set_={"crashes": SCENE.c.crashes + 1, "run": run, "day": day},
+                ),
+                row,
+            )
+
+    def record(self, entry: Entry, run: str, token: str) -> None:
+        """Enter what became of a scene: products, inputs, digests, timings, in one transaction."""
+        outcome = entry.outcome
+        with self.transaction() as connection:
+            self._hold(connection, token)
+            self._enter_products(connection, entry, run)
+            self._enter_scene(connection, entry, run)
+            self._enter_digests(connection, {used.path: used.sha256 for used in outcome.inputs})
+            self._refuse(connection, outcome.refused)
+            connection.execute(
+                sa.update(RUN)
+                .where(RUN.c.id == run)
+                .values(
+                    scenes=RUN.c.scenes + 1,
+                    products=RUN.c.products + len(outcome.products),
+                    granules=RUN.c.granules + outcome.granules,
+                    failed=RUN.c.failed + int(bool(outcome.error)),
+                )
+            )
+
+    def _hold(self, connection: sa.Connection, token: str) -> None:
+        """Refuse to write for a holder that has lost the lock."""
+        held = connection.execute(
+            sa.update(LOCK)
+            .where(LOCK.c.campaign == self.campaign, LOCK.c.token == token)
+            .values(heartbeat=self.clock())
+        )
+        if held.rowcount != 1:
+            raise CatalogError(
+                "another run has taken over, because this one gave no sign of life",
+                file=self.place,
+                remedy="see lidarops runs; what this run entered before stays",
+            )
+
+    def _enter_products(self, connection: sa.Connection, entry: Entry, run: str) -> None:
+        if not entry.products:
+            return
+        rows = [self._product_row(new, entry, run) for new in entry.products]
+        paths = [row["path"] for row in rows]
+        before = connection.execute(
+            sa.select(_P.path, _P.sha256, _P.run).where(
+                _P.campaign == self.campaign, _P.path.in_(paths)
+            )
+        )
+        shas = {new.record.path: (new.record.sha256, new.kept) for new in entry.products}
+        replaced = [
+            {
+                "campaign": self.campaign, "path": path, "sha256": sha256, "run": old,
+                "replaced_by": run, "kept": shas[path][1],
+            }
+            for path, sha256, old in before
+            if shas[path][0] != sha256
+        ]  # fmt: skip
+        if replaced:
+            connection.execute(self.insert(SUPERSEDED).on_conflict_do_nothing(), replaced)
+        self._drop_products(connection, paths)
+        connection.execute(sa.insert(PRODUCT), rows)
+        self._enter_inputs(connection, entry.products)
+
+    def _product_row(self, new: NewProduct, entry: Entry, run: str) -> dict[str, Any]:
+        record, depends_on = new.record, new.depends_on
+        return {
+            "campaign": self.campaign,
+            "path": record.path,
+            "scene": entry.outcome.scene,
+            "day": entry.day,
+            "kind": record.kind.value,
+            "channel": record.channel,
+            "sha256": record.sha256,
+            "size": record.size,
+            "mtime_ns": new.mtime_ns,
+            "plan_hash": depends_on.plan_hash,
+            "settings_hash": depends_on.settings_hash,
+            "inputs_hash": depends_on.inputs_hash,
+            "code_version": depends_on.code_version,
+            "run": run,
+        }
+
+    def _enter_inputs(self, connection: sa.Connection, products: Sequence[NewProduct]) -> None:
+        sets: dict[str, list[InputRecord]] = {}
+        rows = []
+        for new in products:
+            by_role = sorted(new.inputs, key=attrgetter("role", "path"))
+            for role, files in groupby(by_role, key=attrgetter("role")):
+                members = list(files)
+                name = _set_id(members)
+                sets[name] = members
+                rows.append(
+                    {
+                        "campaign": self.campaign, "product": new.record.path,
+                        "role": role.value, "file_set": name,
+                    }
+                )  # fmt: skip
+        known = set(
+            connection.scalars(sa.select(FILE_SET.c.id).where(FILE_SET.c.id.in_(sets)).distinct())
+        )
+        files_of_sets = [
+            {"id": name, "path": used.path, "sha256": used.sha256}
+            for name, members in sets.items()
+            if name not in known
+            for used in members
+        ]
+        if files_of_sets:
+            connection.execute(self.insert(FILE_SET).on_conflict_do_nothing(), files_of_sets)
+        if rows:
+            connection.execute(sa.insert(PRODUCT_INPUT), rows)
+
+    def _enter_scene(self, connection: sa.Connection, entry: Entry, run: str) -> None:
+        outcome = entry.outcome
+        row = {
+            "campaign": self.campaign, "scene": outcome.scene, "day": entry.day,
+            "key": entry.key, "run": run, "error": outcome.error, "final": entry.final,
+            "crashes": 0,
+        }  # fmt: skip
+        changes = {key: row[key] for key in ("day", "key", "run", "error", "final", "crashes")}
+        connection.execute(
+            self.insert(SCENE).on_conflict_do_update(
+                index_elements=["campaign", "scene"], set_=changes
+            ),
+            row,
+        )
+        stages = [
+            {"run": run, "scene": outcome.scene, "stage": stage, "seconds": seconds}
+            for stage, seconds in outcome.seconds.items()
+        ]
+        if stages:
+            connection.execute(self.insert(STAGE).on_conflict_do_nothing(), stages)
+
+    def _refuse(self, connection: sa.Connection, refused: Iterable[Granule]) -> None:
+        """Enter granules that turned out unreadable; the next scan looks at them again."""
+        for granule in refused:
+            connection.execute(
+                sa.update(GRANULE)
+                .where(GRANULE.c.campaign == self.campaign, GRANULE.c.path == granule.path)
+                .values(status=Status.REFUSED.value, reason=granule.reason, scan_key=AGAIN)
+            )
+
+    # Products
+
+    def made(self, first: int, last: int) -> list[Made]:
+        """Return the products of scenes that start on days `first` to `last`."""
+        query = sa.select(*_MADE).where(_P.campaign == self.campaign, _P.day.between(first, last))
+        with self.transaction() as connection:
+            return [_made_from(row) for row in connection.execute(query)]
+
+    @contextmanager
+    def all_made(self) -> Iterator[Iterator[Made]]:
+        """Give every product by path, without holding them all."""
+        query = sa.select(*_MADE).where(_P.campaign == self.campaign).order_by(_P.path)
+        with self.stream(query) as rows:
+            yield (_made_from(row) for row in rows)
+
+    def products(self) -> list[Mapping[str, Any]]:
+        """Return the ledger's rows of products, by path."""
+        query = sa.select(PRODUCT).where(_P.campaign == self.campaign).order_by(_P.path)
+        with self.transaction() as connection:
+            return [dict(row) for row in connection.execute(query).mappings()]
+
+    def product_inputs(self, product: str) -> dict[str, str]:
+        """Return input path -> sha256 of one product."""
+        return {used.path: used.sha256 for used in self.inputs_of(product)}
+
+    def inputs_of(self, product: str) -> list[InputRecord]:
+        """Return the files that a product was made from."""
+        link = PRODUCT_INPUT.c
+        query = (
+            sa.select(FILE_SET.c.path, link.role, FILE_SET.c.sha256)
+            .join(PRODUCT_INPUT, link.file_set == FILE_SET.c.id)
+            .where(link.campaign == self.campaign, link.product == product)
+            .order_by(link.role, FILE_SET.c.path)
+        )
+        with self.transaction() as connection:
+            return [
+                InputRecord(path, Role(role), sha256)
+                for path, role, sha256 in connection.execute(query)
+            ]
+
+    @contextmanager
+    def all_inputs(self) -> Iterator[Iterator[tuple[str, str, str]]]:
+        """Give role, path and sha256 of every file that a product was made from, by path."""
+        link = PRODUCT_INPUT.c
+        query = (
+            sa.select(link.role, FILE_SET.c.path, FILE_SET.c.sha256)
+            .join(PRODUCT_INPUT, link.file_set == FILE_SET.c.id)
+            .where(link.campaign == self.campaign)
+            .distinct()
+            .order_by(FILE_SET.c.path, link.role, FILE_SET.c.sha256)
+        )
+        with self.stream(query) as rows:
+            yield ((role, path, sha256) for role, path, sha256 in rows)
+
+    def touch_products(self, stamps: Mapping[str, int]) -> None:
+        """Enter new modification times of products whose content was found unchanged."""
+        if stamps:
+            with self.transaction() as connection:
+                connection.execute(
+                    sa.update(PRODUCT)
+                    .where(_P.campaign == self.campaign, _P.path == sa.bindparam("file"))
+                    .values(mtime_ns=sa.bindparam("stamp")),
+                    [{"file": path, "stamp": stamp} for path, stamp in stamps.items()],
+                )
+
+    def forget_products(self, paths: Collection[str], token: str) -> None:
+        """Remove products, and the files that nothing else was made from."""
+        with self.transaction() as connection:
+            self._hold(connection, token)
+            self._drop_products(connection, paths)
+            used = sa.select(PRODUCT_INPUT.c.file_set)
+            connection.execute(sa.delete(FILE_SET).where(FILE_SET.c.id.not_in(used)))
+
+    def _drop_products(self, connection: sa.Connection, paths: Collection[str]) -> None:
+        gone = [{"gone": path} for path in paths]
+        if not gone:
+            return
+        for table, column in ((PRODUCT_INPUT, "product"), (PRODUCT, "path")):
+            connection.execute(
+                sa.delete(table).where(
+                    table.c.campaign == self.campaign, table.c[column] == sa.bindparam("gone")
+                ),
+                gone,
+            )
+
+    def superseded(self) -> list[OldVersion]:
+        """Return the versions of products that were replaced, by path."""
+        old = SUPERSEDED.c
+        query = (
+            sa.select(old.path, old.sha256, old.run, old.replaced_by, old.kept)
+            .where(old.campaign == self.campaign)
+            .order_by(old.path, old.run)
+        )
+        with self.transaction() as connection:
+            return [OldVersion(*row) for row in connection.execute(query)]
+
+    # Scenes and verdicts
+
+    def tried(self, first: int, last: int) -> dict[str, Tried]:
+        """Return how the last try of every scene of these days ended."""
+        known = SCENE.c
+        query = sa.select(known.scene, known.key, known.error, known.final, known.crashes).where(
+            known.campaign == self.campaign, known.day.between(first, last)
+        )
+        with self.transaction() as connection:
+            return {row[0]: Tried(*row[1:]) for row in connection.execute(query)}
+
+    def failures(self) -> dict[str, str]:
+        """Return scene -> error of the scenes whose last try failed."""
+        known = SCENE.c
+        query = sa.select(known.scene, known.error).where(
+            known.campaign == self.campaign, known.error != ""
+        )
+        with self.transaction() as connection:
+            return {row.scene: row.error for row in connection.execute(query)}
+
+    def forget_scenes(self, scenes: Collection[str]) -> None:
+        """Remove what is noted of scenes that are no more."""
+        names = sorted(scenes)
+        with self.transaction() as connection:
+            for first in range(0, len(names), BATCH):
+                connection.execute(
+                    sa.delete(SCENE).where(
+                        SCENE.c.campaign == self.campaign,
+                        SCENE.c.scene.in_(names[first : first + BATCH]),
+                    )
+                )
+
+    def verdicts(self) -> dict[int, tuple[str, int, int]]:
+        """Return day -> signature, barren scenes and granules set aside, where all was fresh."""
+        found = VERDICT.c
+        query = sa.select(found.day, found.signature, found.barren, found.set_aside).where(
+            found.campaign == self.campaign
+        )
+        with self.transaction() as connection:
+            return {row[0]: (row[1], row[2], row[3]) for row in connection.execute(query)}
+
+    def store_verdicts(self, verdicts: Mapping[int, tuple[str, int, int]]) -> None:
+        """Note that everything which these days ask for is fresh."""
+        if not verdicts:
+            return
+        rows = [
+            {
+                "campaign": self.campaign, "day": day, "signature": signature,
+                "barren": barren, "set_aside": set_aside,
+            }
+            for day, (signature, barren, set_aside) in verdicts.items()
+        ]  # fmt: skip
+        statement = self.insert(VERDICT)
+        new = statement.excluded
+        with self.transaction() as connection:
+            connection.execute(
+                statement.on_conflict_do_update(
+                    index_elements=["campaign", "day"],
+                    set_={
+                        "signature": new.signature,
+                        "barren": new.barren,
+                        "set_aside": new.set_aside,
+                    },
+                ),
+                rows,
+            )
+
+
+def _set_id(files: Sequence[InputRecord]) -> str:
+    digest = hashlib.sha256()
+    for used in files:
+        digest.update(f"{used.path}\0{used.sha256}\0".encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()[:32]
+
+
+def _made_from(row: Any) -> Made:
+    return Made(
+        path=row.path,
+        scene=row.scene,
+        day=row.day,
+        kind=row.kind,
+        channel=row.channel,
+        sha256=row.sha256,
+        size=row.size,
+        mtime_ns=row.mtime_ns,
+        depends_on=Dependence(row.plan_hash, row.settings_hash, row.inputs_hash, row.code_version),
+        run=row.run,
+    )
+
+
+def _stages(connection: sa.Connection, run: str) -> dict[str, float]:
+    query = (
+        sa.select(STAGE.c.stage, sa.func.sum(STAGE.c.seconds))
+        .where(STAGE.c.run == run)
+        .group_by(STAGE.c.stage)
+        .order_by(STAGE.c.stage)
+    )
+    return {stage: float(seconds) for stage, seconds in connection.execute(query)}
+
+
+def _run_from(row: Any, seconds: Mapping[str, float]) -> Run:
+    return Run(
+        id=row.id,
+        started=row.started.replace(tzinfo=UTC),
+        finished=aware(row.finished),
+        status=RunStatus(row.status),
+        holder=row.holder,
+        version=row.version,
+        code_version=row.code_version,
+        scenes=row.scenes,
+        products=row.products,
+        granules=row.granules,
+        failed=row.failed,
+        refused=row.refused,
+        seconds=seconds,
+    )

@@ -1,0 +1,250 @@
+"""One writer an archive: a lock in the database, with a heartbeat."""
+
+from __future__ import annotations
+
+import getpass
+import logging
+import os
+import secrets
+import socket
+import threading
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, Self
+
+import sqlalchemy as sa
+
+from lidarops.catalog.database import Database
+from lidarops.catalog.schema import LOCK
+from lidarops.errors import CatalogError
+
+HEARTBEAT: Final = 5.0
+"""s between signs of life."""
+SILENCE: Final = 60.0
+"""s without one after which a holder counts as dead."""
+_POLL: Final = 0.5
+
+_L = LOCK.c
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """Who holds a lock."""
+
+    token: str
+    name: str
+    machine: str
+    process: int
+    process_started: str
+    acquired: float
+    silent: float
+    """s since the last sign of life, by the database's clock."""
+
+    @property
+    def dead(self) -> bool:
+        """Whether it cannot be at work any more."""
+        if self.silent > SILENCE:
+            return True
+        here = self.machine == _machine()
+        return here and _start_of(self.process) != self.process_started
+
+
+class Lock:
+    """The right to write to the catalog of one campaign.
+
+    Taken with the first write, so that a run with nothing to do writes nothing at all. The holder
+    gives a sign of life every few seconds; one that is dead loses the lock to the next who asks.
+
+    Parameters
+    ----------
+    database : Database
+    wait : float
+        s to wait for another holder, at most.
+    """
+
+    def __init__(self, database: Database, *, wait: float = 0.0) -> None:
+        self._database = database
+        self._wait = wait
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.token = secrets.token_hex(16)
+        self.held = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    @staticmethod
+    def holder_name() -> str:
+        """Return user, host and process of this one."""
+        try:
+            user = getpass.getuser()
+        except (KeyError, OSError):
+            user = str(os.getuid())
+        return f"{user}@{socket.gethostname()} process {os.getpid()}"
+
+    def acquire(self) -> bool:
+        """Take the lock.
+
+        Returns
+        -------
+        bool
+            Whether it had to be waited for: what was read before may then be outdated.
+
+        Raises
+        ------
+        CatalogError
+            Naming the holder, where it does not give the lock back in time.
+        """
+        if self.held:
+            return False
+        until = time.monotonic() + self._wait
+        waited = False
+        while not self._try():
+            if time.monotonic() >= until:
+                raise self._refused()
+            waited = True
+            time.sleep(_POLL)
+        self.held = True
+        self._thread = threading.Thread(target=self._beat, name="lidarops-lock", daemon=True)
+        self._thread.start()
+        return waited
+
+    def release(self) -> None:
+        """Give the lock back, where it is held."""
+        if not self.held:
+            return
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+        self.held = False
+        try:
+            with self._database.transaction() as connection:
+                connection.execute(sa.delete(LOCK).where(*self._mine()))
+        except CatalogError as error:
+            # On a full disk: whoever comes next finds this process gone and takes over.
+            _LOG.warning("the lock stays until the next run: %s", error)
+
+    def holder(self) -> Holder | None:
+        """Return who holds the lock now."""
+        clock = self._database.clock()
+        query = sa.select(LOCK, (clock - _L.heartbeat).label("silent")).where(
+            _L.campaign == self._database.campaign
+        )
+        with self._database.transaction() as connection:
+            row = connection.execute(query).one_or_none()
+        if row is None:
+            return None
+        return Holder(
+            row.token,
+            row.holder,
+            row.machine,
+            row.process,
+            row.process_started,
+            row.acquired,
+            row.silent,
+        )
+
+    def _mine(self) -> tuple[sa.ColumnElement[bool], ...]:
+        return _L.campaign == self._database.campaign, _L.token == self.token
+
+    def _try(self) -> bool:
+        current = self.holder()
+        if current is not None and not current.dead:
+            return False
+        database = self._database
+        clock = database.clock()
+        values = {
+            "campaign": database.campaign,
+            "token": self.token,
+            "holder": self.holder_name(),
+            "machine": _machine(),
+            "process": os.getpid(),
+            "process_started": _start_of(os.getpid()),
+        }
+        statement = database.insert(LOCK).values(**values, acquired=clock, heartbeat=clock)
+        if current is None:
+            statement = statement.on_conflict_do_nothing()
+        else:
+            # Only from the very holder that was found dead: another may have been quicker.
+            changes = {
+                column.name: statement.excluded[column.name]
+                for column in LOCK.columns
+                if column.name != "campaign"
+            }
+            statement = statement.on_conflict_do_update(
+                index_elements=["campaign"], set_=changes, where=_L.token == current.token
+            )
+        with database.transaction() as connection:
+            connection.execute(statement)
+            mine = sa.select(sa.func.count()).select_from(LOCK).where(*self._mine())
+            return bool(connection.scalar(mine))
+
+    def _beat(self) -> None:
+        while not self._stop.wait(HEARTBEAT):
+            try:
+                with self._database.transaction() as connection:
+                    connection.execute(
+                        sa.update(LOCK)
+                        .where(*self._mine())
+                        .values(heartbeat=self._database.clock())
+                    )
+            except CatalogError:
+                # A busy or full disk: whoever writes next is told, and the next beat may do.
+                continue
+
+    def _refused(self) -> CatalogError:
+        current = self.holder()
+        if current is None:
+            told = "another run holds the catalog"
+        else:
+            since = datetime.fromtimestamp(current.acquired, UTC)
+            told = f"held by {current.name} since {since:%Y-%m-%d %H:%M:%S} UTC"
+        return CatalogError(
+            told, file=self._database.place, remedy="wait for it, with --wait SECONDS, or stop it"
+        )
+
+
+def _machine() -> str:
+    """Return what a process number is unique on: host, boot and namespace of processes."""
+    return ":".join((socket.gethostname(), _read("/proc/sys/kernel/random/boot_id"), _namespace()))
+
+
+def _namespace() -> str:
+    try:
+        return os.readlink("/proc/self/ns/pid")  # noqa: PTH115 - the target is no path
+    except OSError:
+        return ""
+
+
+def _start_of(process: int) -> str:
+    """Return when a process started, as its system counts; empty where there is none."""
+    # The name of the program, in brackets, may hold blanks.
+    fields = _read(f"/proc/{process}/stat").rpartition(")")[2].split()
+    if len(fields) > 19:
+        return "" if fields[0] == "Z" else fields[19]
+    return _alive(process)
+
+
+def _alive(process: int) -> str:
+    if Path("/proc/self/stat").exists():
+        return ""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return ""
+    except PermissionError:
+        pass
+    return "alive"
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

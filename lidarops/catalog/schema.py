@@ -1,0 +1,187 @@
+"""The tables of catalog and ledger, and the version that they carry."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import sqlalchemy as sa
+
+SCHEMA_VERSION: Final = 2
+"""Raised with every change of a table: a database of another version is refused by name."""
+
+METADATA: Final = sa.MetaData()
+
+# PostgreSQL would sort by the language of the server, the file system is listed by code point.
+_PATH = sa.String(1024).with_variant(sa.String(1024, collation="C"), "postgresql")
+_NAME = sa.String(40)
+_SCENE = sa.String(160)
+_DIGEST = sa.String(64)
+
+SCHEMA = sa.Table("schema_version", METADATA, sa.Column("version", sa.Integer, primary_key=True))
+
+LAYOUT = sa.Table(
+    "layout",
+    METADATA,
+    sa.Column("hash", sa.String(16), primary_key=True),
+    sa.Column("channels", sa.Text, nullable=False),
+)
+
+GRANULE = sa.Table(
+    "granule",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("path", _PATH, primary_key=True),
+    sa.Column("size", sa.BigInteger, nullable=False),
+    sa.Column("mtime_ns", sa.BigInteger, nullable=False),
+    sa.Column("scan_key", sa.String(16), nullable=False),
+    sa.Column("instrument", _NAME, nullable=False),
+    sa.Column("role", sa.String(8), nullable=False),
+    sa.Column("status", sa.String(8), nullable=False),
+    sa.Column("reason", sa.Text, nullable=False),
+    sa.Column("notes", sa.Text, nullable=False),
+    sa.Column("start", sa.DateTime),
+    sa.Column("stop", sa.DateTime),
+    sa.Column("zenith_angle", sa.Float),
+    sa.Column("azimuth", sa.Float),
+    sa.Column("latitude", sa.Float),
+    sa.Column("longitude", sa.Float),
+    sa.Column("altitude", sa.Float),
+    sa.Column("layout", sa.ForeignKey("layout.hash")),
+    sa.Column("sha256", _DIGEST),
+    # Days since 1970-01-01 of the start; null where that is not known.
+    sa.Column("day", sa.Integer),
+    # Two halves of a digest of the row, whose sums over a day tell whether anything in it changed.
+    sa.Column("stamp_low", sa.BigInteger, nullable=False),
+    sa.Column("stamp_high", sa.BigInteger, nullable=False),
+    sa.Index("granule_by_day", "campaign", "day", "role", "status", "stamp_low", "stamp_high"),
+    sqlite_with_rowid=False,
+)
+
+RUN = sa.Table(
+    "run",
+    METADATA,
+    sa.Column("id", _NAME, primary_key=True),
+    sa.Column("campaign", _NAME, nullable=False),
+    sa.Column("started", sa.DateTime, nullable=False),
+    sa.Column("finished", sa.DateTime),
+    sa.Column("status", sa.String(12), nullable=False),
+    sa.Column("holder", sa.Text, nullable=False),
+    sa.Column("version", _NAME, nullable=False),
+    sa.Column("code_version", _NAME, nullable=False),
+    sa.Column("scenes", sa.Integer, nullable=False),
+    sa.Column("products", sa.Integer, nullable=False),
+    sa.Column("granules", sa.Integer, nullable=False),
+    sa.Column("failed", sa.Integer, nullable=False),
+    sa.Column("refused", sa.Integer, nullable=False),
+    sa.Index("run_by_time", "campaign", "started"),
+)
+
+PRODUCT = sa.Table(
+    "product",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("path", _PATH, primary_key=True),
+    sa.Column("scene", _SCENE, nullable=False),
+    sa.Column("day", sa.Integer, nullable=False),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("channel", _NAME, nullable=False),
+    sa.Column("sha256", _DIGEST, nullable=False),
+    sa.Column("size", sa.BigInteger, nullable=False),
+    sa.Column("mtime_ns", sa.BigInteger, nullable=False),
+    sa.Column("plan_hash", _DIGEST, nullable=False),
+    sa.Column("settings_hash", _DIGEST, nullable=False),
+    sa.Column("inputs_hash", _DIGEST, nullable=False),
+    sa.Column("code_version", _NAME, nullable=False),
+    sa.Column("run", sa.ForeignKey("run.id"), nullable=False),
+    sa.Index("product_by_day", "campaign", "day"),
+    sqlite_with_rowid=False,
+)
+
+PRODUCT_INPUT = sa.Table(
+    "product_input",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("product", _PATH, primary_key=True),
+    sa.Column("role", sa.String(10), primary_key=True),
+    # The products of a scene share their files, so these are kept once for all of them.
+    sa.Column("file_set", sa.String(32), nullable=False),
+    sa.Index("product_input_by_set", "file_set"),
+    sqlite_with_rowid=False,
+)
+
+FILE_SET = sa.Table(
+    "file_set",
+    METADATA,
+    sa.Column("id", sa.String(32), primary_key=True),
+    sa.Column("path", _PATH, primary_key=True),
+    sa.Column("sha256", _DIGEST, nullable=False),
+    sqlite_with_rowid=False,
+)
+
+SUPERSEDED = sa.Table(
+    "superseded",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("path", _PATH, primary_key=True),
+    sa.Column("sha256", _DIGEST, primary_key=True),
+    sa.Column("run", sa.ForeignKey("run.id"), primary_key=True),
+    # The run that wrote the version, and the one that replaced it.
+    sa.Column("replaced_by", sa.ForeignKey("run.id"), nullable=False),
+    # Where the old file is kept, below the output folder; empty where it is not.
+    sa.Column("kept", _PATH, nullable=False),
+)
+
+SCENE = sa.Table(
+    "scene",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("scene", _SCENE, primary_key=True),
+    sa.Column("day", sa.Integer, nullable=False),
+    # What the scene was judged by when it was last tried.
+    sa.Column("key", _DIGEST, nullable=False),
+    sa.Column("run", sa.ForeignKey("run.id"), nullable=False),
+    sa.Column("error", sa.Text, nullable=False),
+    # Whether the same inputs cannot but fail again.
+    sa.Column("final", sa.Boolean, nullable=False),
+    # Tries that began and did not end: what was processed when its process died.
+    sa.Column("crashes", sa.Integer, nullable=False),
+    sa.Index("scene_by_day", "campaign", "day"),
+    sqlite_with_rowid=False,
+)
+
+STAGE = sa.Table(
+    "stage",
+    METADATA,
+    sa.Column("run", sa.ForeignKey("run.id"), primary_key=True),
+    sa.Column("scene", _SCENE, primary_key=True),
+    sa.Column("stage", _NAME, primary_key=True),
+    sa.Column("seconds", sa.Float, nullable=False),
+    sqlite_with_rowid=False,
+)
+
+VERDICT = sa.Table(
+    "verdict",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("day", sa.Integer, primary_key=True),
+    # What the day looked like when everything that it asks for was found fresh.
+    sa.Column("signature", _DIGEST, nullable=False),
+    # Scenes of the day that can give no product.
+    sa.Column("barren", sa.Integer, nullable=False),
+    # Granules of the day that stand in no scene.
+    sa.Column("set_aside", sa.Integer, nullable=False),
+    sqlite_with_rowid=False,
+)
+
+LOCK = sa.Table(
+    "lock",
+    METADATA,
+    sa.Column("campaign", _NAME, primary_key=True),
+    sa.Column("token", sa.String(32), nullable=False),
+    sa.Column("holder", sa.Text, nullable=False),
+    sa.Column("machine", sa.Text, nullable=False),
+    sa.Column("process", sa.BigInteger, nullable=False),
+    sa.Column("process_started", sa.Text, nullable=False),
+    sa.Column("acquired", sa.Float, nullable=False),
+    sa.Column("heartbeat", sa.Float, nullable=False),
+)

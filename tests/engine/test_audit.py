@@ -1,0 +1,102 @@
+"""What the ledger can be asked: history of runs, checksums; and the command line over it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from small_archive import Archive
+from typer.testing import CliRunner
+
+from lidarops.catalog.store import Store
+from lidarops.catalog.verify import verify
+from lidarops.cli import app
+from lidarops.pipeline import reprocess
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """A small archive, processed once."""
+    made_here = Archive(tmp_path, days=2)
+    reprocess(made_here.write())
+    return made_here
+
+
+def _mismatches(archive: Archive) -> set[tuple[str, str]]:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        return {(found.what, found.path) for found in verify(campaign, store)}
+
+
+def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> None:
+    assert _mismatches(archive) == set()
+    product = next((archive.folder / "out/products").rglob("*.nc"))
+    product.write_bytes(product.read_bytes()[:-1] + b"?")
+    archive.flip("raw/rich/h00")
+    archive.flip("overlap.csv", -7)
+    (archive.folder / "raw/poor/h11").unlink()
+    (archive.folder / "raw/poor/h10").rename(archive.folder / "raw/poor/h-moved")
+    name = str(product.relative_to(archive.folder / "out/products"))
+    told = {("product", name), ("signal", "rich/h00"), ("overlap", "overlap.csv")}
+    lost = {("signal", "poor/h11"), ("signal", "poor/h10")}
+    assert _mismatches(archive) == told | lost
+    # Once the catalog has seen the move, the content is known to be there.
+    CliRunner().invoke(app, ["catalog", str(archive.file)])
+    assert _mismatches(archive) == told | {("signal", "poor/h11")}
+
+
+def test_the_command_line_tells_what_the_ledger_knows(archive: Archive) -> None:
+    runner, file = CliRunner(), str(archive.file)
+    told = runner.invoke(app, ["runs", file, "--json"])
+    assert told.exit_code == 0
+    (run,) = json.loads(told.stdout)
+    assert (run["status"], run["scenes"], run["products"]) == ("finished", 4, 12)
+    assert set(run["seconds"]) == {"digest", "retrieve", "write"}
+    assert run["id"] in runner.invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
+    assert runner.invoke(app, ["verify", file]).exit_code == 0
+    archive.flip("raw/rich/h00")
+    wrong = runner.invoke(app, ["verify", file, "--json"])
+    assert wrong.exit_code == 1
+    (mismatch,) = json.loads(wrong.stdout)["mismatches"]
+    assert mismatch["path"] == "rich/h00"
+    assert runner.invoke(app, ["verify", file, "--products-only"]).exit_code == 0
+
+
+def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> None:
+    runner, file = CliRunner(), str(archive.file)
+    nothing = runner.invoke(app, ["reprocess", file, "--json"])
+    assert nothing.exit_code == 0
+    assert json.loads(nothing.stdout)["run"] is None
+    assert not (archive.folder / "out/report").exists()
+    archive.flip("raw/poor/h10")
+    planned = runner.invoke(app, ["plan", file, "--stale", "--json"])
+    (scene,) = json.loads(planned.stdout)
+    assert {stale["reason"] for stale in scene["stale"]} == {"changed: signal poor/h10"}
+    log = archive.folder / "log.jsonl"
+    words = ["--log-json", "--log-level", "info", "--log-file", str(log), "--json"]
+    done = runner.invoke(app, ["reprocess", file, *words])
+    assert done.exit_code == 0, done.output
+    assert len(json.loads(done.stdout)["products"]) == 2
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert any("changed: signal poor/h10" in line["message"] for line in lines)
+    (ended,) = [line for line in lines if line.get("granules") == 3]
+    assert ended["scene"] == "poor_20260302T000000"
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--product", "luck"], 2, "homogeneous"),
+        (["--instrument", "luck"], 1, "poor"),
+        (["--station", "luck"], 1, "coast"),
+        (["--log-level", "luck"], 2, "warning"),
+        (["--catalog", "luck"], 1, "postgresql"),
+    ],
+)
+def test_wrong_use_names_the_choices(
+    archive: Archive, words: list[str], code: int, said: str
+) -> None:
+    result = CliRunner().invoke(app, ["reprocess", str(archive.file), *words])
+    assert result.exit_code == code
+    assert said in result.output

@@ -1,0 +1,151 @@
+"""Many scenes: on workers as in one process, none stopping the others, each entered as it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client
+from poison import Poison
+from small_archive import Archive, made
+
+from lidarops import engine
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+from lidarops.engine import Ended, Stop, carry_out, local_client
+from lidarops.pipeline import Options, Selection, bring_up_to_date, prepare, reprocess
+from lidarops.processing import Job, failed
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    """Two workers on this machine."""
+    with local_client(2) as started:
+        yield started
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """A small archive."""
+    return Archive(tmp_path, days=2)
+
+
+def test_workers_make_the_bytes_that_one_process_makes(archive: Archive, client: Client) -> None:
+    campaign = archive.write()
+    alone = reprocess(campaign.model_copy(update={"output": str(archive.folder / "alone")}))
+    together = reprocess(campaign, client=client)
+    assert made(alone) == made(together)
+    assert archive.contents("alone/products") == archive.contents("out/products")
+
+
+def test_a_scene_that_kills_its_worker_is_refused_by_name(archive: Archive, client: Client) -> None:
+    campaign = archive.write()
+    scene = "rich_20260302T000000"
+    client.register_plugin(Poison(scene))
+    try:
+        result = bring_up_to_date(campaign, client=client)
+    finally:
+        client.unregister_worker_plugin("poison")
+        client.restart()
+    assert set(result.failures) == {scene}
+    assert "died 3 times" in result.failures[scene]
+    others = {outcome.scene for outcome in result.record.scenes if not outcome.error}
+    assert others == {"rich_20260301T000000", "poor_20260301T000000", "poor_20260302T000000"}
+    assert bring_up_to_date(campaign).record is None
+    forced = Selection(instruments=("rich",))
+    healed = bring_up_to_date(campaign, selection=forced, options=Options(force=True))
+    assert not healed.troubled
+
+
+def test_a_scene_that_took_its_process_down_is_tried_in_another(archive: Archive) -> None:
+    campaign = archive.write()
+    scene = prepare(campaign).scenes[0]
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        from lidarops.session import Session
+        from lidarops.staleness import Judge
+
+        judge = Judge(campaign, store)
+        session = Session(campaign, store, lock, judge)
+        session.begin()
+        (judged,) = [
+            each
+            for each in judge.days(sorted(judge.signatures())).judgements
+            if each.scene.id == scene.id
+        ]
+        session.take(judged, note=True)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        again = Judge(campaign, store)
+        found = again.days(sorted(again.signatures())).judgements
+        assert [each.scene.id for each in found if each.suspect] == [scene.id]
+    result = bring_up_to_date(campaign)
+    assert not result.troubled
+    assert len(result.record.scenes) == 4
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert [run.status.value for run in store.runs()] == ["finished", "died"]
+
+
+def test_scenes_are_taken_one_by_one_and_never_many_ahead(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut = prepare(archive.write())
+    jobs = engine.make_jobs(archive.write(), cut) * 50
+    taken = 0
+
+    def counted() -> Iterator[Job]:
+        nonlocal taken
+        for job in jobs:
+            taken += 1
+            yield job
+
+    monkeypatch.setattr(engine, "attempt", lambda job: (failed(job, "no"), True))
+    ended: list[Ended] = []
+    for each in carry_out(counted()):
+        ended.append(each)
+        assert taken == len(ended)
+    assert len(ended) == len(jobs)
+
+
+def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
+    archive: Archive, client: Client
+) -> None:
+    cut = prepare(archive.write())
+    jobs = engine.make_jobs(archive.write(), cut) * 10
+    at_hand = most = done = 0
+
+    def took(_job: Job) -> None:
+        nonlocal at_hand, most
+        at_hand += 1
+        most = max(most, at_hand)
+
+    for _ in carry_out(jobs, client=client, taken=took):
+        at_hand -= 1
+        done += 1
+    assert done == len(jobs)
+    assert most <= engine.LEAST_AHEAD + 1
+
+
+def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> None:
+    campaign = archive.write()
+    stop = Stop()
+    ended = []
+    for each in carry_out(engine.make_jobs(campaign, prepare(campaign)), stop=stop):
+        ended.append(each)
+        stop.now("enough")
+    assert len(ended) == 1
+
+
+def test_every_scene_is_entered_as_it_ends(archive: Archive) -> None:
+    campaign = archive.write()
+    entered = []
+
+    def look(_outcome: object) -> None:
+        with Store(campaign.catalog_url, campaign.name) as store:
+            entered.append((len({row["scene"] for row in store.products()}), store.runs()[0]))
+
+    reprocess(campaign, options=Options(progress=look))
+    assert [number for number, _ in entered] == [1, 2, 3, 4]
+    assert [run.scenes for _, run in entered] == [1, 2, 3, 4]
+    assert {run.status.value for _, run in entered} == {"running"}
+    assert set(entered[-1][1].seconds) == {"digest", "retrieve", "write"}

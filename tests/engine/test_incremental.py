@@ -1,0 +1,303 @@
+"""Only what is stale is made again: every kind of change, and exactly what depends on it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import quick
+from small_archive import DAY, Archive, made
+
+from lidarops import engine
+from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.store import Store
+from lidarops.pipeline import (
+    Options,
+    Selection,
+    assess,
+    bring_up_to_date,
+    remove_orphans,
+    reprocess,
+)
+from lidarops.records import ProductKind
+
+RICH = ("signal analog", "signal photon", "homogeneous photon", "elastic analog")
+
+
+def _all(days: range, products: tuple[str, ...] = RICH) -> set[str]:
+    return {f"rich {day} {product}" for day in days for product in products}
+
+
+def _poor(days: range) -> set[str]:
+    return {f"poor {day} signal {channel}" for day in days for channel in ("analog", "photon")}
+
+
+EVERYTHING = _all(range(1, 5)) | _poor(range(1, 5))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quick() -> Iterator[None]:
+    """Leave the physics out: other tests show that products are what their plans say."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "attempt", quick.attempt)
+        yield
+
+
+@pytest.fixture(scope="module")
+def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small archive, processed."""
+    made_here = Archive(tmp_path_factory.mktemp("processed"))
+    assert made(reprocess(made_here.write())) == EVERYTHING
+    return made_here.folder
+
+
+@pytest.fixture
+def archive(processed: Path, tmp_path: Path) -> Archive:
+    """A copy of it, with the same modification times."""
+    shutil.copytree(processed, tmp_path / "archive")
+    return Archive(tmp_path / "archive")
+
+
+def test_a_run_with_nothing_to_do_writes_nothing(archive: Archive) -> None:
+    before = archive.contents()
+    stamps = {path: path.stat().st_mtime_ns for path in (archive.folder / "out").rglob("*")}
+    assert reprocess(archive.write()) is None
+    assert archive.contents() == before
+    after = {path: path.stat().st_mtime_ns for path in (archive.folder / "out").rglob("*")}
+    folders = {path for path in after if path.is_dir() or path.suffix == ".nc"}
+    assert {path: after[path] for path in folders} == {path: stamps[path] for path in folders}
+
+
+def _dead_time(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["facts"][1]["channels"]["photon_532o"]["dead_time"] = 5e-9
+
+
+def _lidar_ratio(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+
+
+def _sections(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[800, 4500]]
+
+
+def _closed_period(archive: Archive) -> None:
+    """A calibration that is valid from the last day on."""
+    facts = archive.told["instruments"]["rich"]["facts"]
+    facts[1]["valid_to"] = "2026-03-04T00:00:00Z"
+    facts.append({**facts[1], "valid_from": "2026-03-04T00:00:00Z", "azimuth": 12.0})
+    del facts[2]["valid_to"]
+
+
+def _new_overlap(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["facts"][0]["full_overlap_range"] = 500.0
+
+
+def _title(archive: Archive) -> None:
+    archive.told["title"] = "Another title"
+
+
+def _name(archive: Archive) -> None:
+    archive.told["instruments"]["poor"]["name"] = "Poor lidar"
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda a: a.flip("raw/rich/h11"), _all(range(2, 3))),
+        (lambda a: a.flip("raw/poor/h30"), _poor(range(4, 5))),
+        # Taken on the first day: it serves that day and the next, and analog channels only.
+        (
+            lambda a: a.flip("raw/rich/d0", -(4 * 1500 + 60)),
+            _all(range(1, 3), ("signal analog", "elastic analog")),
+        ),
+        (lambda a: a.flip("air.csv", -2), _all(range(1, 3), ("elastic analog",))),
+        (lambda a: a.flip("overlap.csv", -7), _all(range(1, 5))),
+        (_lidar_ratio, _all(range(1, 5), ("elastic analog",))),
+        (_sections, _all(range(1, 5), ("homogeneous photon",))),
+        (_dead_time, _all(range(3, 5), ("signal photon", "homogeneous photon"))),
+        (_closed_period, _all(range(4, 5))),
+        (_new_overlap, _all(range(1, 3))),
+        (_title, EVERYTHING),
+        (_name, _poor(range(1, 5))),
+    ],
+    ids=[
+        "raw", "raw of another", "dark", "molecular", "overlap", "lidar ratio", "sections",
+        "dead time of a period", "new period", "overlap range", "title", "name",
+    ],
+)  # fmt: skip
+def test_exactly_what_depends_on_a_change_is_made_again(
+    archive: Archive, change: Callable[[Archive], None], expected: set[str]
+) -> None:
+    change(archive)
+    campaign = archive.write()
+    judged = {
+        f"{each.scene.instrument} {each.scene.start.day} {stale.kind.value} {stale.channel[:6]}"
+        for each in assess(campaign)
+        for stale in each.stale
+    }
+    assert judged == expected
+    assert made(reprocess(campaign)) == expected
+    assert reprocess(campaign) is None
+
+
+def test_what_is_made_bit_by_bit_is_what_is_made_at_once(archive: Archive, tmp_path: Path) -> None:
+    for change in (_lidar_ratio, _sections, _dead_time):
+        change(archive)
+        reprocess(archive.write())
+    other = Archive(tmp_path / "other")
+    other.told = archive.told
+    reprocess(other.write())
+    assert archive.contents("out/products") == other.contents("out/products")
+
+
+def test_touched_and_moved_files_make_nothing_stale(archive: Archive) -> None:
+    raw = archive.folder / "raw"
+    os.utime(raw / "rich" / "h00", ns=(1, 1))
+    (raw / "rich" / "h01").rename(raw / "rich" / "h-renamed")
+    result = bring_up_to_date(archive.write())
+    assert result.record is None
+    assert (result.summary.moved, result.summary.added, result.summary.vanished) == (1, 0, 0)
+    assert result.summary.changed == 0
+    before = archive.contents()
+    assert reprocess(archive.write()) is None
+    assert archive.contents() == before
+
+
+def test_a_lost_catalog_row_is_judged_by_content(archive: Archive) -> None:
+    raw = archive.folder / "raw"
+    # As when a disk is not mounted for one run.
+    raw.rename(archive.folder / "away")
+    raw.mkdir()
+    result = bring_up_to_date(archive.write())
+    assert result.record is None
+    assert len(result.orphans) == len(EVERYTHING)
+    raw.rmdir()
+    (archive.folder / "away").rename(raw)
+    assert reprocess(archive.write()) is None
+
+
+def test_products_that_are_damaged_or_lost_are_made_again(archive: Archive) -> None:
+    before = archive.contents("out/products")
+    first, second, third = sorted((archive.folder / "out/products").rglob("*.nc"))[:3]
+    first.unlink()
+    second.write_bytes(second.read_bytes()[:-1])
+    os.utime(third)
+    record = reprocess(archive.write())
+    assert len(made(record)) == 2
+    assert archive.contents("out/products") == before
+    assert reprocess(archive.write()) is None
+
+
+def test_new_files_join_their_scene_and_lost_ones_leave_it(archive: Archive) -> None:
+    archive.raw("rich/h09", 610, seed=77)
+    (archive.folder / "raw/poor/h10").unlink()
+    reasons = {
+        (each.scene.instrument, stale.reason)
+        for each in assess(archive.write())
+        for stale in each.stale
+    }
+    assert ("rich", "new: signal rich/h09") in reasons
+    assert ("poor", "gone: signal poor/h10") in reasons
+    assert made(reprocess(archive.write())) == _all(range(1, 2)) | _poor(range(2, 3))
+
+
+def test_products_of_vanished_inputs_are_told_and_kept_until_asked(archive: Archive) -> None:
+    for path in (archive.folder / "raw/poor").glob("h1*"):
+        path.unlink()
+    campaign = archive.write()
+    before = archive.contents("out/products")
+    for _ in range(2):
+        result = bring_up_to_date(campaign)
+        assert result.record is None
+        assert len(result.orphans) == 2
+        assert archive.contents("out/products") == before
+    assert remove_orphans(campaign, result.orphans) == 2
+    assert set(before) - set(archive.contents("out/products")) == {
+        orphan.path for orphan in result.orphans
+    }
+    assert bring_up_to_date(campaign).orphans == ()
+
+
+def test_a_selection_makes_its_part_and_leaves_the_rest_stale(archive: Archive) -> None:
+    _title(archive)
+    campaign = archive.write()
+    parts = [
+        (Selection(instruments=("poor",)), _poor(range(1, 5))),
+        (Selection(kinds=(ProductKind.ELASTIC,)), _all(range(1, 5), ("elastic analog",))),
+    ]
+    for selection, expected in parts:
+        assert made(reprocess(campaign, selection=selection)) == expected
+        assert reprocess(campaign, selection=selection) is None
+    rest = made(reprocess(campaign))
+    assert rest == EVERYTHING - parts[0][1] - parts[1][1]
+    assert reprocess(campaign) is None
+
+
+def test_force_makes_what_is_fresh(archive: Archive) -> None:
+    before = archive.contents("out/products")
+    selection = Selection(stations=("coast",), instruments=("poor",))
+    record = reprocess(archive.write(), selection=selection, options=Options(force=True))
+    assert made(record) == _poor(range(1, 5))
+    assert archive.contents("out/products") == before
+
+
+def test_refused_files_are_told_by_a_run_with_nothing_to_do(archive: Archive) -> None:
+    (archive.folder / "raw/rich/h-broken").write_bytes(b"broken")
+    archive.raw("poor/h-twin", 600, seed=1)
+    first = bring_up_to_date(archive.write())
+    assert first.troubled
+    before = archive.contents()
+    again = bring_up_to_date(archive.write())
+    assert again.record is None
+    assert again.troubled
+    assert (again.summary.refused, again.set_aside) == (1, 1)
+    assert archive.contents() == before
+
+
+def test_a_scene_that_cannot_but_fail_is_not_tried_until_something_changes(
+    archive: Archive,
+) -> None:
+    (archive.folder / "air.csv").write_text("altitude,pressure\n0,1013\n")
+    first = bring_up_to_date(archive.write())
+    assert sum(bool(scene.error) for scene in first.record.scenes) == 2
+    before = archive.contents()
+    again = bring_up_to_date(archive.write())
+    assert again.record is None
+    assert len(again.failures) == 2
+    assert "air.csv" in next(iter(again.failures.values()))
+    assert again.troubled
+    assert archive.contents() == before
+    from small_archive import SOUNDING
+
+    (archive.folder / "air.csv").write_text(SOUNDING)
+    healed = bring_up_to_date(archive.write())
+    assert not healed.troubled
+    assert healed.status is RunStatus.FINISHED
+
+
+def test_replaced_versions_are_kept_where_the_campaign_says_so(archive: Archive) -> None:
+    archive.told["superseded"] = "keep"
+    assert reprocess(archive.write()) is None
+    before = archive.contents("out/products")
+    _lidar_ratio(archive)
+    campaign = archive.write()
+    reprocess(campaign)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        old = store.superseded()
+    assert {version.path: version.sha256 for version in old} == {
+        path: sha256 for path, sha256 in before.items() if "elastic" in path
+    }
+    kept = archive.contents("out/superseded")
+    assert sorted(kept.values()) == sorted(version.sha256 for version in old)
+    # Forced, to the same bytes: nothing is replaced, so nothing more is kept.
+    reprocess(campaign, options=Options(force=True))
+    assert archive.contents("out/superseded") == kept
+
+
+def test_a_day_of_more_is_a_day_of_work(archive: Archive) -> None:
+    for k in range(3):
+        archive.raw(f"rich/h9{k}", 9 * DAY + k, seed=k)
+    assert made(reprocess(archive.write())) == _all(range(10, 11))
