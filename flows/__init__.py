@@ -1,7 +1,7 @@
 """Prefect flows over lidarops: thin, no logic of their own.
 
 Importing this package sets what an ephemeral Prefect server needs on a machine without any
-set-up; a value in the environment wins.
+set-up, and what the reaper of dead runs relies on; a value in the environment wins.
 """
 
 from __future__ import annotations
@@ -13,3 +13,5 @@ os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "120")
 # A station may have no network, and reprocessing is nobody else's business.
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
+# s; what `flows.maintenance` judges a run by. Prefect's own 180 would block a schedule for longer.
+os.environ.setdefault("PREFECT_FLOWS_HEARTBEAT_FREQUENCY", "30")

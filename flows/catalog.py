@@ -12,13 +12,16 @@ from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
 from lidarops.campaign import load
-from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
+from lidarops.pipeline import update_catalog
 from lidarops.records import Status
 
 
 @flow(name="lidarops-catalog")
-def catalog(campaign: str, archive: str | None = None, out: str | None = None) -> ScanSummary:
+def catalog(
+    campaign: str, archive: str | None = None, out: str | None = None, wait: float = 0.0
+) -> ScanSummary:
     """Scan the archive of a campaign and publish what it refuses as an artifact.
 
     Parameters
@@ -27,18 +30,17 @@ def catalog(campaign: str, archive: str | None = None, out: str | None = None) -
         Path of the campaign file.
     archive, out : str, optional
         As on the command line.
+    wait : float
+        s to wait for another run on the same archive.
 
     Returns
     -------
     ScanSummary
     """
     settings = load(campaign, archive=archive, output=out)
-    store = Store(settings.catalog_url, settings.name)
-    try:
-        summary = scan(settings, store)
+    summary = update_catalog(settings, wait=wait)
+    with Store(settings.catalog_url, settings.name) as store:
         refused = store.granules(status=Status.REFUSED)
-    finally:
-        store.close()
     get_run_logger().info("catalog of %s: %s", settings.name, asdict(summary))
     create_table_artifact(
         key=f"{settings.name.lower()}-refused",

@@ -1,71 +1,133 @@
-"""Flow: reprocess a campaign.
+"""Flow: bring the products of a campaign up to date.
 
 ``python -m flows.reprocess catalogs/demo.yaml`` needs no set-up: without a Prefect server in the
 environment it starts one for the time of the run.
+
+One Prefect task processes all scenes that are due, with a dask cluster of its own: a task costs
+tens of milliseconds and a file fewer. What is done is entered scene by scene in the ledger, so
+that a task that is tried again goes on where it was.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+import time
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 from uuid import UUID
 
 import typer
-from prefect import flow, get_run_logger, task
+from prefect import flow, get_run_logger, runtime, task
 from prefect.artifacts import (
     create_image_artifact,
-    create_markdown_artifact,
+    create_link_artifact,
     create_progress_artifact,
     create_table_artifact,
     update_progress_artifact,
 )
+from prefect.client.schemas.objects import State, TaskRun
+from prefect.tasks import exponential_backoff
 from prefect.utilities.annotations import quote
+from pydantic import Field
 
+from lidarops import clusters
 from lidarops.campaign import Campaign, load
-from lidarops.engine import conclude, make_jobs, process_all
-from lidarops.pipeline import prepare, report_run
-from lidarops.processing import Job
+from lidarops.catalog.ledger import RunStatus
+from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
+from lidarops.pipeline import Options, Result, Selection, bring_up_to_date, report_run
+from lidarops.product_settings import Instant
+from lidarops.publication import publish as publish_products
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import page
-from lidarops.scenes import Cut
 
 _T = TypeVar("_T")
 
-BATCH = 50
-"""Scenes a Prefect task: a task costs tens of milliseconds, so never one a file."""
+Workers = Annotated[int, Field(ge=1, le=10_000)]
+Seconds = Annotated[float, Field(ge=0, le=86_400)]
+
+_TOLD_EVERY = 5.0
+"""s between reports of progress, each of which is a request to the server."""
+
+
+def _may_pass(_task: object, _run: TaskRun, state: State[Any]) -> bool:
+    """Tell whether trying again may help: a store, a database or a cluster that is away."""
+    # Who waits at a terminal is better told at once.
+    if runtime.deployment.id is None:
+        return False
+    return isinstance(state.data, OSError | CatalogError | clusters.ClusterError | ProductError)
+
+
+_RETRY: dict[str, Any] = {
+    "retries": 4,
+    "retry_delay_seconds": exponential_backoff(10),
+    "retry_jitter_factor": 0.5,
+    "retry_condition_fn": _may_pass,
+}
 
 
 def _opaque(value: _T) -> _T:
-    """Keep Prefect from walking an argument in search of futures: a scene holds thousands."""
+    """Keep Prefect from walking an argument in search of futures: a run holds thousands."""
     return cast("_T", quote(value))
 
 
-@task(name="catalog")
-def catalog_task(campaign: Campaign, instruments: Sequence[str]) -> Cut:
-    """Bring the catalog up to date and cut it into scenes."""
-    return prepare(campaign, instruments=instruments)
+class _Progress:
+    """Publishes how far a run is, now and then."""
+
+    def __init__(self, campaign: str) -> None:
+        described = f"Granules of campaign {campaign} that are due"
+        self._artifact = cast("UUID", create_progress_artifact(0.0, description=described))
+        self._expected = 0
+        self._done = 0
+        self._next = 0.0
+
+    def expect(self, granules: int) -> None:
+        self._expected += granules
+
+    def advance(self, outcome: SceneOutcome) -> None:
+        self._done += outcome.granules
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + _TOLD_EVERY
+            share = min(1.0, self._done / max(self._expected, 1))
+            update_progress_artifact(self._artifact, 100.0 * share)
+
+    def end(self) -> None:
+        update_progress_artifact(self._artifact, 100.0)
 
 
-@task(name="process", retries=2, retry_delay_seconds=[5, 30])
-def process_task(jobs: Sequence[Job], workers: int) -> list[SceneOutcome]:
-    """Process one batch of scenes."""
-    return process_all(jobs, workers=workers)
+@task(name="process", **_RETRY)
+def process_task(
+    campaign: Campaign,
+    selection: Selection,
+    cluster: clusters.Cluster,
+    *,
+    full: bool,
+    wait: float,
+) -> Result:
+    """Bring catalog and products up to date."""
+    progress = _Progress(campaign.name)
+    options = Options(force=full, wait=wait, progress=progress.advance, expect=progress.expect)
+    with ExitStack() as stack:
+        client = None
+        if cluster != clusters.Local():
+            client = stack.enter_context(clusters.client(cluster))
+        result = bring_up_to_date(campaign, selection=selection, options=options, client=client)
+    progress.end()
+    if result.status is not RunStatus.FINISHED:
+        raise SceneError(f"the run is {result.status}", remedy="run again: what is done stays done")
+    return result
 
 
-@task(name="report")
+@task(name="report", **_RETRY)
 def report_task(campaign: Campaign, record: RunRecord) -> Path:
-    """Write the report of a run and publish its table and quicklook."""
+    """Write the report of a run and publish its table, its link and its quicklook."""
     built = report_run(campaign, record)
     key = campaign.name.lower()
     create_table_artifact(
         key=f"{key}-products", table=page.summary_rows(record), description=f"Run {record.id}"
     )
-    create_markdown_artifact(
-        key=f"{key}-report", markdown=f"Run {record.id}: [{built}]({built.as_uri()})"
-    )
+    create_link_artifact(built.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
     picture = page.quicklook(record, built.parent)
     if picture is not None:
         # The server may stand on another machine, so the picture travels in the artifact.
@@ -74,15 +136,38 @@ def report_task(campaign: Campaign, record: RunRecord) -> Path:
     return built
 
 
-@flow(name="lidarops-reprocess")
+@task(name="publish", **_RETRY)
+def publish_task(campaign: Campaign, url: str) -> None:
+    """Bring an object store up to date with the products."""
+    done = publish_products(campaign, url)
+    get_run_logger().info("%s: %d sent, %d unchanged", url, len(done.uploaded), done.unchanged)
+
+
+def _run_name() -> str:
+    """Name a run after its campaign, what it does, and when it was due."""
+    given = runtime.flow_run.parameters
+    due = runtime.flow_run.scheduled_start_time or datetime.now(UTC)
+    kind = "full" if given.get("full") else "incremental"
+    return f"{Path(given['campaign']).stem}-{kind}-{due:%Y%m%dT%H%M}"
+
+
+@flow(name="lidarops-reprocess", flow_run_name=_run_name)
 def reprocess(
     campaign: str,
     archive: str | None = None,
     out: str | None = None,
-    workers: int = 1,
+    workers: Workers | None = None,
     instruments: list[str] | None = None,
-) -> tuple[RunRecord, Path]:
-    """Catalog the archive of a campaign, process its scenes, and write the report.
+    since: Instant | None = None,
+    until: Instant | None = None,
+    scheduler: str | None = None,
+    cluster: str | None = None,
+    wait: Seconds = 0.0,
+    publish: str | None = None,
+    *,
+    full: bool = False,
+) -> tuple[Result, Path | None]:
+    """Make the products of a campaign that are missing or stale, and the report of the run.
 
     Parameters
     ----------
@@ -90,43 +175,78 @@ def reprocess(
         Path of the campaign file.
     archive, out : str, optional
         As on the command line.
-    workers : int
-        Processes.
+    workers : int, optional
+        Processes; 1 where not given.
     instruments : list of str, optional
         Only these.
+    since, until : datetime, optional
+        Only scenes that touch this interval.
+    scheduler, cluster : str, optional
+        As on the command line: `lidarops.clusters.choose`.
+    wait : float
+        s to wait for another run on the same archive.
+    publish : str, optional
+        URL of an object store that the products are copied to.
+    full : bool
+        Also what is fresh.
 
     Returns
     -------
-    record : RunRecord
-    report : Path
-        The HTML page.
+    result : Result
+    report : Path or None
+        The HTML page; None where there was nothing to do.
     """
-    started = datetime.now(UTC)
+    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
     settings = load(campaign, archive=archive, output=out)
-    cut = catalog_task(_opaque(settings), _opaque(instruments or []))
-    jobs = make_jobs(settings, cut)
-    description = f"Scenes of campaign {settings.name}"
-    progress = cast("UUID", create_progress_artifact(0.0, description=description))
-    outcomes: list[SceneOutcome] = []
-    for first in range(0, len(jobs), BATCH):
-        outcomes += process_task(_opaque(jobs[first : first + BATCH]), workers)
-        update_progress_artifact(progress, 100.0 * len(outcomes) / len(jobs))
-    record = conclude(settings, cut, outcomes, started=started)
-    built = report_task(_opaque(settings), _opaque(record))
-    get_run_logger().info("run %s: %d scenes, report %s", record.id, len(outcomes), built)
-    return record, built
+    selection = Selection(instruments=tuple(instruments or ()), since=since, until=until)
+    result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
+    # Also where nothing was due: an earlier copy may have failed.
+    if publish is not None:
+        publish_task(_opaque(settings), publish)
+    if result.record is None:
+        get_run_logger().info("campaign %s is up to date", settings.name)
+        return result, None
+    built = report_task(_opaque(settings), _opaque(result.record))
+    scenes = len(result.record.scenes)
+    get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
+    return result, built
 
 
 def main(
     campaign: str,
     archive: str | None = None,
     out: str | None = None,
-    workers: Annotated[int, typer.Option(min=1, max=256)] = 1,
+    workers: Annotated[int | None, typer.Option(min=1, max=10_000)] = None,
+    scheduler: Annotated[str | None, typer.Option(help="address of a dask scheduler")] = None,
+    cluster: Annotated[
+        str | None, typer.Option(help="slurm, kubernetes, or a YAML file that describes one")
+    ] = None,
+    publish: Annotated[
+        str | None, typer.Option(help="URL of a store that the products are copied to")
+    ] = None,
+    *,
+    full: Annotated[bool, typer.Option("--full", help="also what is fresh")] = False,
 ) -> None:
-    """Reprocess a campaign as a Prefect flow."""
-    record, built = reprocess(campaign, archive, out, workers)
-    typer.echo(f"products: {record.products}\nreport:   {built}")
-    raise typer.Exit(1 if record.failed else 0)
+    """Bring the products of a campaign up to date as a Prefect flow."""
+    try:
+        result, built = reprocess(
+            campaign,
+            archive,
+            out,
+            workers,
+            scheduler=scheduler,
+            cluster=cluster,
+            publish=publish,
+            full=full,
+        )
+    except LidarOpsError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from error
+    if result.record is None:
+        typer.echo("nothing to do")
+    else:
+        typer.echo(f"products: {result.record.products}\nreport:   {built}")
+    raise typer.Exit(1 if result.troubled else 0)
 
 
 if __name__ == "__main__":

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from uuid import UUID, uuid4
 
 import factories
 import pytest
 import rawfiles
 import yaml
+from prefect import get_client
+from prefect.client.orchestration import SyncPrefectClient
+from prefect.client.schemas.objects import State, StateType
+from prefect.states import Completed, Pending, Running
 
+from flows import maintenance
 from flows.catalog import catalog
+from flows.maintenance import reap_runs
 from flows.reprocess import reprocess
 
 
@@ -39,9 +47,45 @@ def campaign_file(tmp_path: Path) -> Path:
 def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
     summary = catalog(str(campaign_file))
     assert (summary.files, summary.refused) == (4, 1)
-    record, page = reprocess(str(campaign_file), workers=1)
+    result, page = reprocess(str(campaign_file), workers=1)
+    record = result.record
+    assert record is not None
+    assert page is not None
     assert page.is_file()
     assert [scene.error for scene in record.scenes] == [""]
     assert [granule.path for granule in record.refused] == ["coast/h9"]
-    assert record.failed
+    assert result.troubled
     assert len(list(Path(record.products).rglob("*.nc"))) == 1
+    again, no_page = reprocess(str(campaign_file))
+    assert again.record is None
+    assert no_page is None
+    forced, _ = reprocess(str(campaign_file), full=True)
+    assert forced.record is not None
+
+
+def claimed(client: SyncPrefectClient, state: State, *tags: str) -> UUID:
+    """Make a run of a deployment that comes to a state now."""
+    flow_id = client.create_flow_from_name("stand-in")
+    deployment = client.create_deployment(flow_id, f"stand-in-{uuid4()}", tags=list(tags))
+    run = client.create_flow_run_from_deployment(deployment, tags=list(tags))
+    client.set_flow_run_state(run.id, state, force=True)
+    return run.id
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_reaper_ends_the_silent_and_spares_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    with get_client(sync_client=True) as client:
+        dead = claimed(client, Running(), "lidarops", "nightly")
+        starts = claimed(client, Pending(), "lidarops")
+        claimed(client, Running(), "elsewhere")
+        claimed(client, Completed(), "lidarops")
+        assert reap_runs(client, silence=90.0, start=600.0) == []
+        later = datetime.now(UTC) + timedelta(seconds=300)
+        monkeypatch.setattr(maintenance, "_now", lambda: later)
+        (reaped,) = reap_runs(client, silence=90.0, start=600.0)
+        assert reaped.id == dead
+        assert reaped.silent > 90
+        assert client.read_flow_run(dead).state_type is StateType.CRASHED
+        assert reap_runs(client, silence=90.0, start=600.0) == []
+        # What was claimed and never ran blocks as well, only later.
+        assert [run.id for run in reap_runs(client, silence=90.0, start=60.0)] == [starts]

@@ -1,0 +1,282 @@
+"""Object stores and other file systems behind an fsspec URL: raw files from, products to.
+
+``s3://``, ``gs://`` and whatever else fsspec knows; ``http(s)://`` can be read only. Keys and
+endpoints come from where the drivers look for them, such as ``AWS_ACCESS_KEY_ID`` and
+``FSSPEC_S3_ENDPOINT_URL``; none is kept here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from lidarops.errors import CatalogError, LidarOpsError, ProductError
+
+_READ_ONLY: Final = frozenset({"http", "https"})
+# Here an object appears when its upload is complete, or not at all.
+_ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
+_BATCH: Final = 100
+"""Files on their way at the same time."""
+
+# What the drivers raise besides OSError; only of a driver that is loaded can it come.
+_DRIVER_ERRORS: Final = (
+    ("aiohttp", "ClientError"),
+    ("botocore.exceptions", "BotoCoreError"),
+    ("botocore.exceptions", "ClientError"),
+    ("google.auth.exceptions", "GoogleAuthError"),
+    ("gcsfs.retry", "HttpError"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """An object as its store lists it."""
+
+    path: str
+    """Relative to the URL."""
+    size: int
+    """Byte."""
+    stamp: int
+    """Changes when the object does: its time in ns, or a number made of its tag."""
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """What `RemoteStore.publish` did."""
+
+    uploaded: tuple[str, ...]
+    unchanged: int
+    others: int
+    """Objects in the store that are none of the products; they are left alone."""
+
+
+def is_url(location: str) -> bool:
+    """Tell a URL from a folder."""
+    return "://" in location
+
+
+class RemoteStore:
+    """The objects below one URL.
+
+    Parameters
+    ----------
+    url : str
+
+    Raises
+    ------
+    CatalogError
+        If fsspec does not know the URL or lacks its driver.
+    """
+
+    def __init__(self, url: str) -> None:
+        import fsspec  # noqa: PLC0415 - most archives are local, and the import takes 0.1 s
+
+        self.url = url
+        self._scheme = url.partition("://")[0]
+        try:
+            self._fs, prefix = fsspec.core.url_to_fs(url)
+        except (ValueError, ImportError) as error:
+            raise CatalogError(
+                f"the URL cannot be opened: {error}",
+                file=url,
+                remedy="use a URL that fsspec knows and install its driver: lidarops[s3] for s3://",
+            ) from error
+        self._prefix = prefix.rstrip("/")
+
+    def files(self) -> Iterator[Stored]:
+        """List everything below the URL in the order of the paths.
+
+        Raises
+        ------
+        CatalogError
+            If the store cannot be reached or does not list.
+        """
+        with self._told(CatalogError, "cannot be listed"):
+            # Another process may have written since this one has looked.
+            self._fs.invalidate_cache()
+            listing = self._fs.find(self._prefix, detail=True)
+            # A web server's index names files without their sizes.
+            unsized = [name for name, about in listing.items() if about.get("size") is None]
+            listing |= {name: self._fs.info(name) for name in unsized}
+        for name in sorted(listing):
+            about = listing[name]
+            path = name.removeprefix(self._prefix).lstrip("/")
+            yield Stored(path, int(about["size"] or 0), _stamp(about))
+
+    def head(self, path: str, size: int) -> bytes:
+        """Return the first bytes of a file.
+
+        Raises
+        ------
+        CatalogError
+            If it cannot be read.
+        """
+        with self._told(CatalogError, f"{path} cannot be read"):
+            data: bytes = self._fs.cat_file(self._name(path), start=0, end=size)
+        return data
+
+    def fetch(self, paths: Sequence[str], folder: Path) -> None:
+        """Copy files to a local folder, under their paths; what the store lacks is left out.
+
+        Parameters
+        ----------
+        paths : sequence of str
+        folder : path
+
+        Raises
+        ------
+        CatalogError
+            If the store cannot be reached, so that what it lacks is not known.
+        """
+        pairs = [(self._name(path), str(folder / path)) for path in paths]
+        for path in paths:
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        with self._told(CatalogError, "cannot be read"):
+            try:
+                self._fs.get(*_columns(pairs), batch_size=_BATCH)
+            except FileNotFoundError:
+                # Rare, so the files that are there may be asked for twice.
+                for name, target in pairs:
+                    with suppress(FileNotFoundError):
+                        self._fs.get_file(name, target)
+
+    def publish(self, root: Path, products: Mapping[str, str], journal: Path) -> Published:
+        """Upload the products that the store lacks or holds in another version.
+
+        A reader of the store sees a product whole, the old one or the new one. Interrupted, a
+        second call completes the first. What was sent is told by a journal and not by the times
+        of files, as the store has another clock.
+
+        Parameters
+        ----------
+        root : path
+            The folder of the products.
+        products : mapping of str to str
+            Path relative to `root`, and SHA-256 as the ledger has it.
+        journal : path
+            Text file that this method keeps, one a store; lost, everything is sent again.
+
+        Returns
+        -------
+        Published
+
+        Raises
+        ------
+        ProductError
+            If the store is read-only, cannot be reached, or holds less than was sent, or if a
+            product is no longer what the ledger says.
+        """
+        if self._scheme in _READ_ONLY:
+            raise ProductError(
+                "is read-only", file=self.url, remedy="publish to s3://, gs:// or a mounted folder"
+            )
+        there = {stored.path: stored.size for stored in self._existing()}
+        sent = _read_journal(journal)
+        due = [
+            path
+            for path, sha256 in sorted(products.items())
+            if sent.get(path) != sha256 or there.get(path) != (root / path).stat().st_size
+        ]
+        for first in range(0, len(due), _BATCH):
+            batch = {path: products[path] for path in due[first : first + _BATCH]}
+            with self._told(ProductError, "cannot be written"):
+                self._upload(root, batch)
+            _append_journal(journal, batch)
+        return Published(tuple(due), len(products) - len(due), len(there.keys() - products.keys()))
+
+    def _existing(self) -> Sequence[Stored]:
+        try:
+            return tuple(self.files())
+        except CatalogError as error:
+            if isinstance(error.__cause__, FileNotFoundError):
+                return ()
+            raise ProductError(error.problem, file=self.url, remedy=error.remedy) from error
+
+    def _upload(self, root: Path, products: Mapping[str, str]) -> None:
+        for path, sha256 in products.items():
+            with (root / path).open("rb") as file:
+                if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
+                    raise ProductError(
+                        "is not what the ledger says", file=root / path, remedy="reprocess"
+                    )
+        targets = [self._name(path) for path in products]
+        sources = [str(root / path) for path in products]
+        if self._scheme in _ATOMIC:
+            self._fs.put(sources, targets, batch_size=_BATCH)
+        else:
+            for source, target in zip(sources, targets, strict=True):
+                self._put_and_rename(source, target)
+        for path, target in zip(products, targets, strict=True):
+            sent, held = (root / path).stat().st_size, int(self._fs.info(target)["size"])
+            if sent != held:
+                raise ProductError(f"holds {held} of {sent} bytes", file=target)
+
+    def _put_and_rename(self, source: str, target: str) -> None:
+        where = PurePosixPath(target)
+        self._fs.makedirs(str(where.parent), exist_ok=True)
+        temporary = str(where.with_name(f".{where.name}.{secrets.token_hex(8)}.part"))
+        try:
+            self._fs.put_file(source, temporary)
+            self._fs.mv(temporary, target)
+        except OSError:
+            with suppress(OSError):
+                self._fs.rm_file(temporary)
+            raise
+
+    def _name(self, path: str) -> str:
+        return f"{self._prefix}/{path}"
+
+    @contextmanager
+    def _told(self, kind: type[LidarOpsError], problem: str) -> Iterator[None]:
+        try:
+            yield
+        except LidarOpsError:
+            raise
+        except _failures() as error:
+            raise kind(
+                f"{problem}: {error!r}", file=self.url, remedy="check address, network and keys"
+            ) from error
+
+
+def _columns(pairs: Sequence[tuple[str, str]]) -> tuple[list[str], list[str]]:
+    return [first for first, _ in pairs], [second for _, second in pairs]
+
+
+def _read_journal(journal: Path) -> dict[str, str]:
+    """Read lines as sha256sum writes them; of a path the last one counts."""
+    try:
+        lines = journal.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return {}
+    # The last line may have been cut by a crash: its product is then sent again.
+    pairs = (line.split("  ", 1) for line in lines if "  " in line)
+    return {path: sha256 for sha256, path in pairs}
+
+
+def _append_journal(journal: Path, products: Mapping[str, str]) -> None:
+    journal.parent.mkdir(parents=True, exist_ok=True)
+    with journal.open("a", encoding="utf-8") as file:
+        # The first line break ends a line that a crash may have cut.
+        file.write("\n" + "".join(f"{sha256}  {path}\n" for path, sha256 in products.items()))
+
+
+def _failures() -> tuple[type[Exception], ...]:
+    loaded = ((sys.modules.get(module), name) for module, name in _DRIVER_ERRORS)
+    return (OSError, *(getattr(module, name) for module, name in loaded if module is not None))
+
+
+def _stamp(about: dict[str, Any]) -> int:
+    for key in ("mtime", "LastModified", "last_modified", "updated", "created", "ETag", "etag"):
+        value = about.get(key)
+        if isinstance(value, int | float):
+            return int(value * 1e9)
+        if value is not None:
+            text = value.isoformat() if hasattr(value, "isoformat") else str(value)
+            return int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
+    return 0

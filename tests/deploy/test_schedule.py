@@ -1,0 +1,162 @@
+"""What deploy/prefect.yaml schedules really runs, and a dead worker cannot block it."""
+
+from __future__ import annotations
+
+import http.server
+import subprocess
+import threading
+import time
+from pathlib import Path
+from typing import Any, ClassVar
+
+import factories
+import httpx
+import pytest
+import rawfiles
+import servers
+import yaml
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+class Api:
+    """The few questions that the tests ask a Prefect server."""
+
+    def __init__(self, site: servers.Site) -> None:
+        user, _, password = site.environment["PREFECT_API_AUTH_STRING"].partition(":")
+        self._client = httpx.Client(
+            base_url=site.environment["PREFECT_API_URL"], auth=(user, password), timeout=60
+        )
+
+    def runs(self, *states: str) -> list[dict[str, Any]]:
+        query: dict[str, Any] = {"sort": "START_TIME_DESC"}
+        query["flow_runs"] = {"state": {"type": {"any_": list(states)}}}
+        answer = self._client.post("/flow_runs/filter", json=query)
+        return list(answer.raise_for_status().json())
+
+    def artifacts(self) -> set[str]:
+        answer = self._client.post("/artifacts/filter", json={})
+        return {each["type"] for each in answer.raise_for_status().json()}
+
+
+def campaign_file(folder: Path) -> Path:
+    for minute in range(3):
+        content = rawfiles.content(minute, bins=1000)
+        rawfiles.write(folder / "raw" / "coast" / f"h{minute}", content)
+    path = folder / "campaign.yaml"
+    campaign = factories.campaign().model_dump(mode="json", exclude={"simulation"})
+    path.write_text(yaml.safe_dump(campaign))
+    return path
+
+
+def schedule(site: servers.Site) -> None:
+    """Deploy the shipped file, but for each minute and for the campaign of the test."""
+    shipped = yaml.safe_load((servers.REPOSITORY / "deploy" / "prefect.yaml").read_text())
+    for deployment in shipped["deployments"]:
+        if "campaign" in deployment.get("parameters", {}):
+            deployment["parameters"]["campaign"] = str(campaign_file(site.folder))
+            deployment["parameters"]["workers"] = 1
+        if deployment["name"] == "demo-nightly":
+            deployment["schedules"][0]["cron"] = "* * * * *"
+        else:
+            deployment.pop("schedules", None)
+    file = site.folder / "prefect.yaml"
+    file.write_text(yaml.safe_dump(shipped))
+    site.call("prefect", "--no-prompt", "work-pool", "create", "lidarops", "--type", "process")
+    site.call("prefect", "--no-prompt", "deploy", "--all", "--prefect-file", str(file))
+
+
+def work(site: servers.Site, name: str) -> subprocess.Popen[bytes]:
+    return site.start(
+        name, "prefect", "worker", "start", "--pool", "lidarops", "--limit", "4", "--name", name
+    )
+
+
+def scheduled_run_fires_and_zombie_is_cleared(
+    site: servers.Site, record_testsuite_property: Any
+) -> None:
+    refused = httpx.post(site.environment["PREFECT_API_URL"] + "/flow_runs/filter", json={})
+    assert refused.status_code == 401
+    schedule(site)
+    api = Api(site)
+    worker = work(site, "first")
+    servers.wait_until(lambda: bool(api.runs("COMPLETED")), 240, "no scheduled run completed")
+    done = api.runs("COMPLETED")[-1]
+    assert done["auto_scheduled"]
+    assert done["name"].startswith("campaign-incremental-")
+    assert {"table", "progress", "markdown", "image"} <= api.artifacts()
+    assert list((site.folder / "out" / "products").rglob("*.nc"))
+
+    servers.wait_until(lambda: bool(api.runs("RUNNING")), 120, "no second run started", every=0.1)
+    zombie = api.runs("RUNNING")[0]
+    servers.kill_tree(worker)
+    killed = time.monotonic()
+    time.sleep(5)
+    assert [run["id"] for run in api.runs("RUNNING")] == [zombie["id"]]
+    site.start("reaper", "flows.maintenance", "--every", "5", "--silence", "60")
+    work(site, "second")
+    servers.wait_until(
+        lambda: zombie["id"] in {run["id"] for run in api.runs("CRASHED")}, 150, "not reaped"
+    )
+    reaped = time.monotonic() - killed
+
+    def completed_later() -> bool:
+        return any(run["start_time"] > zombie["start_time"] for run in api.runs("COMPLETED"))
+
+    servers.wait_until(completed_later, 240, "no later run completed")
+    record_testsuite_property(f"{site.folder.name} reaped_after", round(reaped))
+    record_testsuite_property(
+        f"{site.folder.name} next_run_completed_after", round(time.monotonic() - killed)
+    )
+
+
+def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
+    with servers.prefect_site(tmp_path) as site:
+        scheduled_run_fires_and_zombie_is_cleared(site, record_testsuite_property)
+
+
+def test_on_postgresql(tmp_path: Path, postgresql: str, record_testsuite_property: Any) -> None:
+    pytest.importorskip("asyncpg")
+    pytest.importorskip("psycopg")
+    urls = {
+        "PREFECT_SERVER_DATABASE_CONNECTION_URL": f"postgresql+asyncpg://{postgresql}",
+        "LIDAROPS_CATALOG": f"postgresql+psycopg://{postgresql}",
+    }
+    with servers.prefect_site(tmp_path, **urls) as site:
+        scheduled_run_fires_and_zombie_is_cleared(site, record_testsuite_property)
+        assert not (tmp_path / "prefect" / "prefect.db").exists()
+
+
+class Sink(http.server.BaseHTTPRequestHandler):
+    """Keeps what is posted to it."""
+
+    posted: ClassVar[list[str]] = []
+
+    def do_POST(self) -> None:
+        self.posted.append(self.rfile.read(int(self.headers["Content-Length"])).decode())
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *args: object) -> None:
+        """Say nothing."""
+
+
+def test_a_failed_run_is_told(tmp_path: Path) -> None:
+    with (
+        http.server.ThreadingHTTPServer(("127.0.0.1", 0), Sink) as sink,
+        servers.prefect_site(tmp_path) as site,
+    ):
+        threading.Thread(target=sink.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{sink.server_port}/hook"
+        for told in ("new: lidarops: a run failed", ""):
+            said = site.call("flows.notifications", url)
+            assert told in said
+        schedule(site)
+        (site.folder / "campaign.yaml").unlink()
+        work(site, "worker")
+        deployment = "lidarops-reprocess/demo-full"
+        site.call("prefect", "--no-prompt", "deployment", "run", deployment)
+        servers.wait_until(lambda: bool(Sink.posted), 240, "nobody was told")
+        sink.shutdown()
+    assert "lidarops: a run failed" in Sink.posted[0]
+    assert "cannot be read" in Sink.posted[0]

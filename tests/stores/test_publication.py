@@ -1,0 +1,65 @@
+"""Raw files in a store, products to a store: the same bytes as on a disk."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import factories
+import pytest
+import rawfiles
+import yaml
+
+from lidarops.campaign import load
+from lidarops.pipeline import reprocess
+from lidarops.publication import publish
+from lidarops.stores import RemoteStore
+
+
+@pytest.fixture
+def campaign_file(tmp_path: Path) -> Path:
+    """A campaign of two scenes and a file that is broken."""
+    for hour in (0, 30):
+        content = rawfiles.content(60.0 * hour, bins=1000)
+        rawfiles.write(tmp_path / "raw" / "coast" / f"h{hour:02d}", content)
+    rawfiles.write(tmp_path / "raw" / "coast" / "h99", b"broken")
+    path = tmp_path / "campaign.yaml"
+    path.write_text(
+        yaml.safe_dump(factories.campaign().model_dump(mode="json", exclude={"simulation"}))
+    )
+    return path
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.rglob("*.nc")
+    }
+
+
+def test_raw_from_s3_and_products_to_s3(tmp_path: Path, campaign_file: Path, s3: str) -> None:
+    import fsspec
+
+    url = f"{s3}/{tmp_path.name}"
+    fs, prefix = fsspec.core.url_to_fs(url)
+    raw = tmp_path / "raw"
+    for path in raw.rglob("h*"):
+        fs.put_file(str(path), f"{prefix}/raw/{path.relative_to(raw)}")
+    on_disk = load(campaign_file, output=tmp_path / "disk")
+    in_store = load(campaign_file, archive=f"{url}/raw", output=tmp_path / "store")
+    assert reprocess(on_disk) is not None
+    record = reprocess(in_store)
+    assert record is not None
+    expected = digests(on_disk.products_root)
+    assert len(expected) == 2
+    # The name of the archive stands in no product.
+    assert digests(in_store.products_root) == expected
+
+    done = publish(in_store, f"{url}/products")
+    assert sorted(done.uploaded) == sorted(expected)
+    store = RemoteStore(f"{url}/products")
+    store.fetch(list(expected), tmp_path / "fetched")
+    assert digests(tmp_path / "fetched") == expected
+    assert reprocess(in_store) is None
+    again = publish(in_store, f"{url}/products")
+    assert (again.uploaded, again.unchanged, again.others) == ((), 2, 0)
