@@ -13,6 +13,7 @@ from lidarops.bench import (
     everything,
     multiangle,
     multiposition,
+    pipeline,
     results,
     speed,
     story,
@@ -36,6 +37,7 @@ class Case(StrEnum):
     HOMOGENEOUS = "homogeneous"
     MULTIANGLE = "multiangle"
     MULTIPOSITION = "multiposition"
+    PIPELINE = "pipeline"
     READER = "reader"
 
 
@@ -78,6 +80,7 @@ def run(
         Case.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
         Case.MULTIANGLE: lambda: multiangle.run(kind, effort=effort),
         Case.MULTIPOSITION: lambda: multiposition.run(kind, effort=effort),
+        Case.PIPELINE: lambda: pipeline.run(kind, effort=effort),
         Case.READER: lambda: _reader(files, effort),
     }
     return ways[chosen]()

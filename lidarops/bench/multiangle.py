@@ -499,8 +499,8 @@ def _times(found: MultiAngleThroughput) -> Part:
         text=f"Clear air, {found.angles} angles, {found.altitudes} altitudes, float64, one "
         "thread, least CPU time of interleaved repeats. make_rays, regress and vertical.smooth "
         "are steps; the others are whole calls of solve, with all errors, residuals and flags. "
-        "Plain: without the robust passes, for which a single residual beyond 4.5 standard "
-        "errors calls, and which cost more than all else. The peers give values without flags, "
+        "Plain: without the robust passes, for which a single residual calls that is too "
+        "large for chance, and which cost more than all else. The peers give values without flags, "
         f"lstsq with standard errors. {READ} is a vectorised maximum of the signals in the same "
         "run.",
         charts=(_time_ladder(found, batches),),

@@ -270,7 +270,7 @@ def test_the_pareto_front_holds_what_nothing_beats():
     ("what", "case", "files", "error", "said"),
     [
         ("luck", None, [], CampaignError, "throughput"),
-        ("accuracy", "weather", [], CampaignError, "multiposition or reader"),
+        ("accuracy", "weather", [], CampaignError, "pipeline or reader"),
         ("accuracy", "reader", ["file"], CampaignError, "no accuracy"),
         ("throughput", "homogeneous", ["file"], CampaignError, "takes no files"),
         ("throughput", "reader", [], RawFormatError, "at least one file"),

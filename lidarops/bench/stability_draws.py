@@ -1,0 +1,228 @@
+"""How often random scenes are answered wrongly without a flag: counts and shares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.bench.accuracy import Measured
+from lidarops.bench.stability_terms import REJECTING, Array
+
+Mask = npt.NDArray[np.bool_]
+
+FALSE: Final = 4.0
+"""Stated standard errors beyond which a value is false."""
+FINE: Final = 2.5
+"""Stated standard errors within which a value needed no flag."""
+ALL: Final = "all together"
+"""Class that holds every scene of a retrieval."""
+_COUNTS: Final = (
+    "values",
+    "kept",
+    "plain",
+    "bare",
+    "false random",
+    "false",
+    "false plain",
+    "false bare",
+    "rejected",
+    "fine rejected",
+    "solvable",
+    "solvable rejected",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One way in which scenes violate a model, or none."""
+
+    name: str
+    satisfied: bool = False
+    """Whether the model holds, so that random errors alone have to cover."""
+    unseen: str = ""
+    """Why the data cannot tell it; empty where they can."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Values of one chunk of scenes of one class, all of one shape."""
+
+    failure: Failure
+    quantity: str
+    error: Array
+    """NaN where there is no value."""
+    random: Array
+    """Stated standard error."""
+    systematic: Any
+    """Stated systematic error; 0 where none is declared."""
+    bits: npt.NDArray[np.int32]
+    doubted: Mask | None = None
+    """Where the retrieval's own flags doubt the stated error; where it is rejected, if None."""
+    solvable: Mask | None = None
+    """Where a flag is needless; not known where None."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """What came of the scenes of one class."""
+
+    retrieval: str
+    failure: str
+    quantity: str
+    scenes: int
+    values: int
+    kept: Measured
+    """Share of the values that no bit rejects."""
+    false_random: Measured
+    """Of these, off by more than 4 stated standard errors."""
+    false: Measured
+    """Of these, off by more than 4 of random and systematic error together."""
+    false_undoubted: Measured
+    """The same of the values that the retrieval's own flags do not doubt either."""
+    false_bare: Measured | None
+    """The same of the values without any bit; None where there are none."""
+    fine_of_rejected: Measured
+    """Share of the rejected values that are off by less than 2.5."""
+    needless: Measured | None
+    """Share flagged or withheld of the values that could be determined; None where the model does
+    not hold, so that a flag is right, or where nothing is known to be solvable."""
+    satisfied: bool
+    """Whether the model holds."""
+    target: float
+    """For what `judged` returns."""
+    needless_target: float | None
+    unseen: str
+
+    @property
+    def judged(self) -> Measured:
+        """What has to stay below the target: by random errors alone where the model holds."""
+        return self.false_random if self.satisfied else self.false_undoubted
+
+    @property
+    def met(self) -> bool:
+        """Whether the target is met, or missed by less than 2 Monte Carlo errors."""
+        return self.judged.value - 2.0 * self.judged.error <= self.target
+
+    @property
+    def needed(self) -> bool:
+        """Whether flags are as rarely needless as they have to be."""
+        if self.needless is None or self.needless_target is None:
+            return True
+        return self.needless.value - 2.0 * self.needless.error <= self.needless_target
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of classes, cluster by cluster: scenes of one cluster share their geometry."""
+
+    counts: dict[tuple[str, str], list[dict[str, float]]] = field(default_factory=dict)
+    scenes: dict[tuple[str, str], int] = field(default_factory=dict)
+    failures: dict[str, Failure] = field(default_factory=dict)
+
+    def add(self, judged: Judged, scenes: int) -> None:
+        """Count the values of a chunk."""
+        self.failures[judged.failure.name] = judged.failure
+        for name in (judged.failure.name, ALL):
+            key = (name, judged.quantity)
+            self.counts.setdefault(key, []).append(_counted(judged))
+            self.scenes[key] = self.scenes.get(key, 0) + scenes
+
+    def rates(self, retrieval: str, needless: float | None) -> Iterator[Rate]:
+        """Give one rate for each class and quantity.
+
+        Parameters
+        ----------
+        retrieval : str
+        needless : float, optional
+            Largest share of needless flags where the model holds.
+        """
+        for (name, quantity), chunks in self.counts.items():
+            column = {one: np.array([chunk[one] for chunk in chunks]) for one in _COUNTS}
+            failure = self.failures.get(name, Failure(name))
+            yield Rate(
+                retrieval=retrieval,
+                failure=name,
+                quantity=quantity,
+                scenes=self.scenes[name, quantity],
+                values=int(column["values"].sum()),
+                kept=share(column["kept"], column["values"]),
+                false_random=share(column["false random"], column["kept"]),
+                false=share(column["false"], column["kept"]),
+                false_undoubted=share(column["false plain"], column["plain"]),
+                false_bare=share(column["false bare"], column["bare"])
+                if column["bare"].any()
+                else None,
+                fine_of_rejected=share(column["fine rejected"], column["rejected"]),
+                needless=share(column["solvable rejected"], column["solvable"])
+                if failure.satisfied and column["solvable"].any()
+                else None,
+                satisfied=failure.satisfied,
+                target=SATISFIED if failure.satisfied else VIOLATED,
+                needless_target=needless if failure.satisfied else None,
+                unseen=failure.unseen,
+            )
+
+
+SATISFIED: Final = 1e-3
+"""Largest share of false values where the model holds."""
+VIOLATED: Final = 5e-3
+"""Largest share where it does not."""
+
+Generator = Callable[[int], Iterator[tuple[Judged, int]]]
+"""From the number of a cluster to what its scenes gave, and how many scenes these were."""
+
+
+def collect(generator: Generator, clusters: int, progress: Callable[[int], object]) -> Tally:
+    """Count the scenes of so many clusters; the same numbers give the same scenes."""
+    tally = Tally()
+    for cluster in range(clusters):
+        for judged, scenes in generator(cluster):
+            tally.add(judged, scenes)
+        progress(1)
+    return tally
+
+
+def share(part: Array, whole: Array) -> Measured:
+    """Return a share with the Monte Carlo error of independent clusters."""
+    total = float(whole.sum())
+    if total == 0.0:
+        return Measured(0.0, 0.0)
+    value = float(part.sum()) / total
+    error = float(np.sqrt(np.sum((part - value * whole) ** 2))) / total
+    # Where none is found, one more keeps the error from being zero.
+    return Measured(value, max(error, 1.0 / total))
+
+
+def _counted(judged: Judged) -> dict[str, float]:
+    shape = judged.error.shape
+    size = np.abs(judged.error)
+    valued = np.isfinite(size)
+    bits = np.broadcast_to(judged.bits, shape)
+    rejected = (bits & REJECTING) != 0
+    doubted = rejected if judged.doubted is None else judged.doubted | rejected
+    solvable = np.zeros_like(valued) if judged.solvable is None else judged.solvable
+    random = np.broadcast_to(judged.random, shape)
+    stated = np.hypot(random, judged.systematic)
+    # A value without a stated error is false whatever it is.
+    wild, false = ~(size <= FALSE * random), ~(size <= FALSE * stated)
+    kept = valued & ~rejected
+    plain, bare = kept & ~doubted, kept & (bits == 0)
+    masks = {
+        "values": valued,
+        "kept": kept,
+        "plain": plain,
+        "bare": bare,
+        "false random": kept & wild,
+        "false": kept & false,
+        "false plain": plain & false,
+        "false bare": bare & false,
+        "rejected": valued & rejected,
+        "fine rejected": valued & rejected & (size <= FINE * stated),
+        "solvable": solvable,
+        "solvable rejected": solvable & ~plain,
+    }
+    return {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}

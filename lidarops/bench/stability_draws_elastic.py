@@ -1,0 +1,200 @@
+"""Random skies above a vertical lidar, and skies that are not as assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from lidarops.bench import elastic_cases
+from lidarops.bench.stability_draws import Failure, Judged
+from lidarops.bench.stability_terms import Array
+from lidarops.flags import Quality
+from lidarops.retrieve import elastic, known_shape, layers, reference
+from lidarops.retrieve.molecular import MolecularProfile
+
+Random = np.random.Generator
+
+_RATIO_ERROR: Final = 0.2
+"""Declared relative standard error of the lidar ratio."""
+_AIR_ERROR: Final = 0.02
+"""Declared, of the density of the air."""
+_CARRIED: Final = 1.5
+"""Standard errors of the window's mean that particles in it may add unseen."""
+_CLEAN_FROM: Final = 6000.0
+_COMPARED: Final = (500.0, 6000.0)
+_SHOTS: Final = elastic_cases.SHOTS
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """What is there, (range,) each; the retrieval is told of none of it."""
+
+    particles: Array
+    """m-1 sr-1."""
+    lidar_ratio: float
+    """sr."""
+    density: float = 1.0
+    """Of the air, over that which is told."""
+    background: float = 0.0
+    """Counts that the far range shows more than the near one (a slow baseline)."""
+    cloud: float = 0.0
+    """Optical depth of a cloud at 9 km."""
+    overlap: float = 0.0
+    """m, scale of an overlap that is not told."""
+    gaps: float = 0.0
+    """Share of the bins that are missing."""
+
+
+def _sky(rng: Random) -> Sky:
+    """Return haze in a mixed layer and a layer aloft, none from 6 km on."""
+    z = elastic_cases.RANGE
+    top, amount = rng.uniform(500.0, 3000.0), np.exp(rng.uniform(np.log(1e-7), np.log(1e-5)))
+    mixed = amount / (1.0 + np.exp((z - top) / rng.uniform(50.0, 200.0)))
+    middle, half = rng.uniform(3500.0, 5000.0), rng.uniform(200.0, 900.0)
+    aloft = rng.uniform(0.0, 1.0) * amount * np.exp(-0.5 * ((z - middle) / (0.3 * half)) ** 2)
+    found = np.where(z < _CLEAN_FROM, mixed + aloft, 0.0)
+    return Sky(found, elastic_cases.LIDAR_RATIO)
+
+
+def _ratio(sky: Sky, rng: Random) -> Sky:
+    deviate = np.clip(rng.normal(), -3.0, 3.0)
+    return replace(sky, lidar_ratio=sky.lidar_ratio * (1.0 + _RATIO_ERROR * deviate))
+
+
+def _as_is(sky: Sky, _: Random) -> Sky:
+    return sky
+
+
+def _hazy(sky: Sky, rng: Random) -> Sky:
+    haze = np.exp(rng.uniform(np.log(1e-9), np.log(1e-7)))
+    return replace(sky, particles=sky.particles + haze * np.exp(-elastic_cases.RANGE / 5000.0))
+
+
+def _dense(sky: Sky, rng: Random) -> Sky:
+    return replace(sky, density=1.0 + _AIR_ERROR * float(np.clip(rng.normal(), -3.0, 3.0)))
+
+
+def _drifting(sky: Sky, rng: Random) -> Sky:
+    return replace(sky, background=rng.uniform(0.0, 3.0))
+
+
+def _clouded(sky: Sky, rng: Random) -> Sky:
+    return replace(sky, cloud=float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))))
+
+
+def _partly_seen(sky: Sky, rng: Random) -> Sky:
+    return replace(sky, overlap=rng.uniform(50.0, 300.0))
+
+
+def _holed(sky: Sky, rng: Random) -> Sky:
+    return replace(sky, gaps=rng.uniform(0.0, 0.2))
+
+
+def _bent_ratio(sky: Sky, rng: Random) -> Sky:
+    return replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0])))
+
+
+_DECLARED: Final = "no elastic signal tells the lidar ratio: the declared error has to cover it"
+_ALIKE: Final = (
+    "haze that falls off as the air does looks like air in the window: only what the noise hides"
+    " is declared"
+)
+_NEAR: Final = "a signal that is too low near the lidar is a signal of less haze"
+FAILURES: Final[tuple[tuple[Failure, Callable[[Sky, Random], Sky]], ...]] = (
+    (Failure("none", satisfied=True), _as_is),
+    (Failure("gaps", satisfied=True), _holed),
+    (Failure("lidar ratio off as declared", unseen=_DECLARED), _ratio),
+    (Failure("lidar ratio off by a factor of 2", unseen=_DECLARED), _bent_ratio),
+    (Failure("density of the air off as declared"), _dense),
+    (Failure("haze at all heights", unseen=_ALIKE), _hazy),
+    (Failure("slow baseline"), _drifting),
+    (Failure("cloud in the far range"), _clouded),
+    (Failure("overlap error", unseen=_NEAR), _partly_seen),
+)
+
+
+def _signal(sky: Sky) -> Array:
+    """Return counts of a shot without noise; optical depth by trapezoids of a fifth of a bin."""
+    air = MolecularProfile.us_standard()
+    r = elastic_cases.RANGE
+    fine = np.linspace(0.0, r[-1], 5 * (2 * r.size - 1) + 1)
+    wavelength = elastic_cases.WAVELENGTH
+    molecules = sky.density * air.extinction(fine, wavelength)
+    base = sky.cloud * np.exp(-0.5 * ((fine - 9000.0) / 150.0) ** 2) / (150.0 * 2.5066282746)
+    haze = np.interp(fine, r, sky.particles)
+    along = molecules + sky.lidar_ratio * haze + base
+    depth = np.concatenate([[0.0], np.cumsum(0.5 * (along[1:] + along[:-1]) * np.diff(fine))])
+    cloud = np.interp(r, fine, base) / 20.0
+    scattered = sky.particles + cloud + sky.density * air.backscatter(r, wavelength)
+    signal = scattered * np.exp(-2.0 * np.interp(r, fine, depth)) / r**2
+    if sky.overlap:
+        signal = signal * (1.0 - np.exp(-((r / sky.overlap) ** 2)))
+    bright = signal[r > elastic_cases.OVERLAP].max()
+    return np.asarray(signal / bright)
+
+
+def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+    """Invert profiles of one random sky, class by class."""
+    base = elastic_cases.simulated()
+    for number, (failure, change) in enumerate(FAILURES):
+        rng = np.random.default_rng((74, cluster, number))
+        sky = change(_sky(rng), rng)
+        brightest = np.exp(rng.uniform(np.log(1e4), np.log(1e8)))
+        level = np.exp(rng.uniform(np.log(1.0), np.log(1e5)))
+        signal = brightest * np.minimum(_signal(sky), 1.0)
+        fading = sky.background * np.exp(-base.range / 8000.0)
+        mean = _SHOTS * (signal + level + fading)
+        counts = rng.poisson(np.broadcast_to(mean, (profiles, mean.size))) / _SHOTS
+        if sky.gaps:
+            counts = np.where(rng.random(counts.shape) < sky.gaps, np.nan, counts)
+        yield _inverted(failure, sky, counts, base), profiles
+
+
+def _inverted(failure: Failure, sky: Sky, counts: Array, base: elastic_cases.Sky) -> Judged:
+    r = base.range
+    noise = np.broadcast_to(_smoothed(counts), counts.shape)
+    found = known_shape.solve(counts, r, base.shape, variance=noise)
+    power = np.where(base.inverted, counts - found.background[:, np.newaxis], np.nan)
+    clouds = layers.screen(power, r, noise, molecular_attenuated=base.shape)
+    window = reference.choose(
+        power, r, noise, molecular_attenuated=base.shape,
+        candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
+    )  # fmt: skip
+    hidden = np.nan_to_num(_CARRIED * window.scale_standard_error / window.scale)
+    solved = elastic.solve(
+        power, r, molecular_backscatter=base.molecular_backscatter,
+        molecular_extinction=base.molecular_extinction, lidar_ratio=elastic_cases.LIDAR_RATIO,
+        reference=window.edges, variance=noise,
+        background_standard_error=np.nan_to_num(found.background_standard_error),
+        lidar_ratio_standard_error=_RATIO_ERROR * elastic_cases.LIDAR_RATIO,
+        reference_relative_error=hidden, molecular_relative_error=_AIR_ERROR,
+    )  # fmt: skip
+    inside = (r >= _COMPARED[0]) & (r <= _COMPARED[1])
+    bits = np.where(solved.valid, np.int32(0), np.int32(Quality.UNSTABLE_INVERSION))
+    bits |= np.where(window.chosen, np.int32(0), np.int32(Quality.NO_REFERENCE))[:, np.newaxis]
+    bits |= np.where(clouds.mask, np.int32(Quality.CLOUD), np.int32(0))
+    # What rests on a background that its own fit doubts is not to be relied on.
+    bits |= (np.asarray(found.quality) & int(Quality.NOT_HOMOGENEOUS))[:, np.newaxis]
+    # As in the product: what lies before a cloud was inverted through it.
+    with np.errstate(invalid="ignore"):
+        through = (window.top > clouds.cloud_base_range)[:, np.newaxis]
+    bits |= np.where(through, np.int32(Quality.CLOUD), np.int32(0))
+    budget = solved.budget
+    systematic: Any = np.sqrt(
+        budget.reference**2 + budget.lidar_ratio**2 + budget.molecular**2 + budget.background**2
+    )
+    error = (solved.backscatter - sky.particles)[:, inside]
+    return Judged(
+        failure, "backscatter", error, budget.noise[:, inside], systematic[:, inside],
+        bits[:, inside], doubted=(bits[:, inside] & int(Quality.CLOUD)) != 0,
+    )  # fmt: skip
+
+
+def _smoothed(counts: Array) -> Array:
+    """Return the variance of mean counts from the mean of the profiles."""
+    with np.errstate(invalid="ignore"):
+        mean = np.nanmean(counts, axis=0)
+    return np.asarray(np.maximum(mean, 1.0 / _SHOTS) / _SHOTS)

@@ -1,0 +1,177 @@
+"""Random raw counts, and recorders that are not as assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from lidarops.bench import elastic_cases
+from lidarops.bench.stability_draws import Failure, Judged
+from lidarops.bench.stability_signal import RANGE
+from lidarops.bench.stability_terms import Array
+from lidarops.flags import Quality
+from lidarops.retrieve import background, known_shape, signal
+from lidarops.simulate import counting
+
+Random = np.random.Generator
+
+_BINS: Final = 400
+_BIN_WIDTH: Final = 7.5
+_BIN_TIME: Final = 50e-9
+_DEAD_TIME: Final = 4e-9
+_BITS: Final = 12
+_STEP: Final = 500.0 / 2**_BITS
+"""mV."""
+_MEAN_OF: Final = slice(100, 300)
+"""Bins whose mean is judged: single ones hold too few counts for Gaussian errors."""
+
+Found = tuple[str, Array, Array, Any, Any]
+"""Quantity, error, its random and its systematic standard error, bits."""
+
+
+def _logarithmic(rng: Random, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _mean(found: signal.Signal, truth: float, quantity: str) -> Found:
+    """Return the error of the mean of the bins that are to be used, with a bit for the rest."""
+    part = found.power[:, _MEAN_OF]
+    good = np.isfinite(part)
+    count = good.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = np.where(good, part, 0.0).sum(axis=1) / count - truth
+        variance = np.where(good, found.variance[:, _MEAN_OF], 0.0).sum(axis=1) / count**2
+    bits = np.bitwise_or.reduce(found.quality[:, _MEAN_OF], axis=1)
+    return quantity, error, np.sqrt(variance), 0.0, bits
+
+
+def _counts(rng: Random, rate: float, dead_time: float, shots: int, profiles: int, *,
+            paralyzable: bool = False) -> Any:  # fmt: skip
+    mean, variance = counting.counter_moments(
+        np.full(_BINS, rate), bin_time=_BIN_TIME, dead_time=dead_time, paralyzable=paralyzable
+    )
+    if rate * dead_time * 1e6 < 1e-3:
+        return rng.poisson(shots * mean, (profiles, _BINS)).astype(np.int32)
+    noise = rng.standard_normal((profiles, _BINS)) * np.sqrt(shots * variance)
+    return np.maximum(np.rint(shots * mean + noise), 0.0).astype(np.int32)
+
+
+def _photon(rng: Random, profiles: int, *, off: float = 0.0, paralyzable: bool = False) -> Found:
+    rate, shots = _logarithmic(rng, 1e-2, 300.0), int(_logarithmic(rng, 50.0, 1e4))
+    dead_time = _DEAD_TIME * (1.0 + off * rng.normal())
+    counts = _counts(rng, rate, dead_time, shots, profiles, paralyzable=paralyzable)
+    found = signal.photon(
+        counts, np.full(profiles, shots), RANGE[:_BINS], bin_width=_BIN_WIDTH,
+        dead_time=_DEAD_TIME,
+    )  # fmt: skip
+    return _mean(found, rate, "count rate")
+
+
+def _analog(
+    rng: Random, profiles: int, *, noises: tuple[float, float], levels: tuple[float, float]
+) -> Found:
+    shots = int(_logarithmic(rng, 20.0, 300.0))
+    level, noise = _logarithmic(rng, *levels), _logarithmic(rng, *noises)
+    total = np.zeros((profiles, _BINS))
+    for _ in range(shots):
+        sampled = np.rint(level + noise * rng.standard_normal(total.shape, dtype=np.float32))
+        total += np.clip(sampled, 0.0, 2**_BITS - 1)
+    found = signal.analog(
+        total.astype(np.int32), np.full(profiles, shots), RANGE[:_BINS], adc_bits=_BITS,
+        input_range=np.full(profiles, 0.5),
+    )  # fmt: skip
+    return _mean(found, level * _STEP, "voltage")
+
+
+def _far(rng: Random, profiles: int) -> tuple[elastic_cases.Sky, Array, Array, float]:
+    """Return the far range of a profile above a background."""
+    sky = elastic_cases.simulated()
+    level = _logarithmic(rng, 1.0, 1e8)
+    scale = _logarithmic(rng, 1e-3, 10.0)
+    mean = elastic_cases.SHOTS * (scale * sky.signal + level)
+    counts = rng.poisson(np.broadcast_to(mean, (profiles, mean.size))) / elastic_cases.SHOTS
+    variance = np.maximum(counts.mean(axis=0), 1e-3) / elastic_cases.SHOTS
+    return sky, np.asarray(counts), np.asarray(variance), level
+
+
+def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Found:
+    sky, counts, variance, level = _far(rng, profiles)
+    added = haze * rng.uniform(0.2, 1.0) * np.exp(-sky.range / 3000.0)
+    shape = sky.shape * (1.0 + added)
+    found = known_shape.solve(counts, sky.range, shape, variance=variance)
+    bits = found.quality | np.where(
+        found.singular, np.int32(Quality.POORLY_DETERMINED), np.int32(0)
+    )
+    error = found.background - level
+    return "background, known shape", error, found.background_standard_error, 0.0, bits
+
+
+def _tail(rng: Random, profiles: int) -> Found:
+    sky, counts, variance, level = _far(rng, profiles)
+    found = background.tail_mean(counts, sky.range, variance=variance)
+    error = found.background - level
+    return (
+        "background, mean of the tail",
+        error,
+        found.background_standard_error,
+        0.0,
+        (found.quality),
+    )
+
+
+def _cubic(rng: Random, profiles: int) -> Found:
+    from_range = RANGE[300:700]
+    extinction, amount = _logarithmic(rng, 1e-6, 3e-3), _logarithmic(rng, 1e-1, 1e5)
+    level = _logarithmic(rng, 1.0, 1e6)
+    fall = np.exp(-2.0 * extinction * (from_range - from_range[0]))
+    model = level + amount * (from_range[0] / from_range) ** 2 * fall
+    power = model + rng.standard_normal((profiles, from_range.size))
+    found = background.cubic(power, from_range, variance=1.0)
+    error = found.background - level
+    return "background, cubic", error, found.background_standard_error, 0.0, found.quality
+
+
+_LEFT: Final = (
+    "what is left of the signal in the tail is part of its mean, and the mean alone does not tell"
+)
+_NOT_DECLARED: Final = "a wrong dead time bends the scale and leaves no trace in one profile"
+_ONE_VALUE: Final = "two rates give the same counts"
+_WHOLE_STEPS: Final = "where the noise is less than a step, all shots round to the same side"
+FAILURES: Final[tuple[tuple[Failure, Callable[[Random, int], Found]], ...]] = (
+    (Failure("none, photon counting", satisfied=True), _photon),
+    (Failure("dead time off by 10 %", unseen=_NOT_DECLARED), partial(_photon, off=0.1)),
+    (Failure("paralyzable counter", unseen=_ONE_VALUE), partial(_photon, paralyzable=True)),
+    (
+        Failure("none, analog", satisfied=True),
+        partial(_analog, noises=(0.5, 30.0), levels=(100.0, 3500.0)),
+    ),
+    (
+        Failure("analog noise below half a step", unseen=_WHOLE_STEPS),
+        partial(_analog, noises=(0.02, 0.5), levels=(100.0, 3500.0)),
+    ),
+    (
+        Failure("analog near full scale"),
+        partial(_analog, noises=(0.5, 30.0), levels=(3900.0, 4200.0)),
+    ),
+    (Failure("none, known shape", satisfied=True), _known_shape),
+    (Failure("shape of hazy air"), partial(_known_shape, haze=3.0)),
+    (Failure("mean of a tail with signal in it", unseen=_LEFT), _tail),
+    (Failure("none, cubic", satisfied=True), _cubic),
+)
+
+
+def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+    """Process random counts, class by class."""
+    for number, (failure, process) in enumerate(FAILURES):
+        rng = np.random.default_rng((75, cluster, number))
+        quantity, error, random, systematic, bits = process(rng, profiles)
+        could = np.isfinite(error) if failure.satisfied and "cubic" not in failure.name else None
+        yield (
+            Judged(
+                failure, quantity, error, random, systematic, np.asarray(bits), solvable=could
+            ),
+            profiles,
+        )  # fmt: skip

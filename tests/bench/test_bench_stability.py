@@ -1,0 +1,202 @@
+"""False values of random scenes: what is drawn, what is counted, the page and the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lidarops.bench import results, stability, stability_draws_homogeneous, stability_report
+from lidarops.bench.homogeneous import Scenario, difficulty
+from lidarops.bench.stability_draws import ALL, Failure, Judged, Tally, collect, share
+from lidarops.bench.stability_terms import Outcome, Retrieval
+from lidarops.bench.terms import Effort
+from lidarops.cli import app
+from lidarops.flags import Quality
+from lidarops.reports.benchmark import build
+
+HOLDS = Failure("none", satisfied=True)
+HIDDEN = Failure("hidden", unseen="it has the shape of the answer")
+BAD = int(Quality.POOR_FIT)
+CARE = int(Quality.OUTLIER)
+
+
+def judged(failure, error, bits=0, **more):
+    error = np.asarray(error, dtype=np.float64)
+    given = {"random": np.ones(error.shape), "systematic": 0.0} | more
+    bits = np.broadcast_to(np.int32(bits), error.shape)
+    return Judged(failure, "x", error, given.pop("random"), given.pop("systematic"), bits, **given)
+
+
+def counted(*chunks, needless=0.05):
+    tally = Tally()
+    for chunk in chunks:
+        tally.add(chunk, chunk.error.size)
+    return {rate.failure: rate for rate in tally.rates("made", needless)}
+
+
+def test_a_value_is_false_beyond_four_errors_and_not_before():
+    rate = counted(judged(HOLDS, [3.9, -3.9, 4.1, np.nan]))["none"]
+    assert (rate.scenes, rate.values) == (4, 3)
+    assert rate.false_random.value == pytest.approx(1 / 3)
+
+
+@pytest.mark.parametrize(("false", "met"), [(1, True), (2, True), (20, False)])
+def test_a_target_is_missed_by_more_than_two_monte_carlo_errors(false, met):
+    errors = np.zeros((20, 500))
+    errors[:false, 0] = 9.0
+    rate = counted(*(judged(HOLDS, row) for row in errors))["none"]
+    assert rate.false_random.value == pytest.approx(false / 10_000)
+    assert rate.met is met
+
+
+def test_what_is_rejected_is_not_false_and_may_be_needless():
+    bits = [BAD, BAD, CARE, 0]
+    rate = counted(judged(HOLDS, [9.0, 1.0, 9.0, 0.0], bits, solvable=np.ones(4, bool)))["none"]
+    assert rate.kept.value == 0.5
+    assert rate.false.value == 0.5
+    assert rate.false_bare.value == 0.0
+    assert rate.fine_of_rejected.value == 0.5
+    assert rate.needless.value == 0.5
+
+
+def test_systematic_errors_and_doubts_count_apart():
+    chunk = judged(HIDDEN, [6.0, 9.0], systematic=2.0, doubted=np.array([False, True]))
+    rate = counted(chunk)["hidden"]
+    assert rate.false_random.value == 1.0
+    assert rate.false.value == 0.5
+    assert rate.false_undoubted.value == 0.0
+    assert rate.judged is rate.false_undoubted
+    assert rate.needless is None
+
+
+def test_a_value_without_a_stated_error_is_false():
+    rate = counted(judged(HOLDS, [0.0, 0.0], random=np.array([np.nan, 1.0])))["none"]
+    assert rate.false_random.value == 0.5
+
+
+def test_all_classes_together_hold_every_scene():
+    rates = counted(judged(HOLDS, [0.0] * 3), judged(HIDDEN, [9.0]))
+    assert rates[ALL].scenes == 4
+    assert rates[ALL].false.value == 0.25
+
+
+def test_monte_carlo_error_is_that_of_clusters():
+    whole = np.full(100, 50.0)
+    together = share(np.repeat([0.0, 50.0], 50), whole)
+    apart = share(np.full(100, 25.0) + np.tile([-1.0, 1.0], 50), whole)
+    assert together.value == apart.value == 0.5
+    assert together.error == pytest.approx(0.05)
+    assert apart.error < 0.01
+    assert share(np.zeros(100), whole).error == pytest.approx(1 / 5000)
+
+
+def test_difficulty_of_random_paths_is_that_of_the_information_matrix():
+    paths, _ = stability_draws_homogeneous.scenes(3, 8)
+    found = stability_draws_homogeneous.least_relative_error(paths)
+    r = paths.range
+    for k in range(8):
+        same = Scenario(
+            float(r[0]), float(r[-1] - r[0]), float(paths.extinction[k, 0]),
+            float(paths.signal[k, 0]), bins=r.size,
+        )  # fmt: skip
+        assert found[k] == pytest.approx(difficulty(same), rel=1e-5)
+
+
+@pytest.mark.parametrize("draws", stability.DRAWS, ids=lambda one: one.retrieval.value)
+def test_the_same_numbers_give_the_same_scenes(draws):
+    profiles = min(draws.profiles, 20)
+
+    def rates():
+        tally = collect(lambda cluster: draws.judged(cluster, profiles), 2, lambda _: None)
+        return list(tally.rates(draws.retrieval.value, draws.needless))
+
+    first = rates()
+    assert first == rates()
+    assert {one.failure for one in first} > {ALL}
+    assert any(one.satisfied for one in first)
+    assert sum(one.values for one in first if one.failure == ALL) > 0
+
+
+def test_where_the_model_holds_homogeneous_paths_are_not_false():
+    draws = next(one for one in stability.DRAWS if one.retrieval is Retrieval.HOMOGENEOUS)
+    tally = collect(lambda cluster: draws.judged(cluster, 300), 6, lambda _: None)
+    rates = {(r.failure, r.quantity): r for r in tally.rates("homogeneous", 1e-3)}
+    held = rates["none", "extinction"]
+    assert held.met
+    assert 0.2 < held.kept.value < 0.8
+    bent = rates["plume", "extinction"]
+    assert bent.kept.value < 0.5 * held.kept.value
+    assert bent.false.value > held.false.value
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Return the benchmark of some cases and few scenes."""
+    cases = tuple(case for case in stability.cases() if "visibility" in case.name)
+    draws = tuple(
+        replace(one, quick=1, profiles=8) for one in stability.DRAWS
+        if one.retrieval in {Retrieval.HOMOGENEOUS, Retrieval.SIGNAL}
+    )  # fmt: skip
+    steps = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stability, "cases", lambda: cases)
+        effort = Effort(quick=True, date="2024-01-01", progress=steps.append)
+        measured = stability.measure(effort, draws)
+    assert steps == [1] * (len(cases) + len(draws))
+    return measured
+
+
+def test_page_names_cases_and_what_cannot_be_seen(found, tmp_path):
+    page = build(stability_report.report(found, "result.json"), tmp_path).read_text()
+    assert "visibility of extinction" in page
+    assert "no: an exponential of range has the shape of extinction itself" in page
+    assert "False values: homogeneous" in page
+    assert not found.failed
+
+
+def test_figures_survive_the_file(found, tmp_path):
+    path = results.save(found, tmp_path / "result.json")
+    assert results.load(stability_report.Stability, path) == found
+
+
+@pytest.mark.parametrize(
+    ("passed", "finding", "failed"),
+    [(True, "", False), (False, "", True), (False, "known", False), (True, "known", True)],
+)
+def test_a_case_fails_where_it_goes_otherwise_than_known(found, passed, finding, failed):
+    outcome = Outcome("one", "made", "a value", "another", passed, finding)
+    one = replace(found, outcomes=(outcome,))
+    assert one.failed is failed
+    assert stability_report.verdict(outcome)
+    rows = stability_report.report(one).parts[0].tables[1].rows
+    assert bool(rows) is (not passed or bool(finding))
+
+
+def test_command_prints_json_and_writes_the_page(found, monkeypatch, tmp_path):
+    monkeypatch.setattr(stability, "measure", lambda effort: replace(found, date=effort.date))
+    folder = tmp_path / "out"
+    made = CliRunner().invoke(
+        app, ["bench", "stability", "--quick", "--json", "--out", str(folder)]
+    )
+    assert made.exit_code == 0, made.output
+    assert len(json.loads(made.stdout)["outcomes"]) == len(found.outcomes)
+    assert (folder / "index.html").is_file()
+
+
+def test_command_fails_where_a_case_does(found, monkeypatch):
+    outcome = Outcome("one", "made", "a value", "another", passed=False, finding="")
+    monkeypatch.setattr(stability, "measure", lambda _: replace(found, outcomes=(outcome,)))
+    made = CliRunner().invoke(app, ["bench", "stability"])
+    assert made.exit_code == 1
+    assert "FAILED" in made.stdout
+
+
+@pytest.mark.parametrize("option", [["--case", "homogeneous"], ["--repeats", "3"], ["file"]])
+def test_command_refuses_what_stability_does_not_take(option):
+    made = CliRunner().invoke(app, ["bench", "stability", *option])
+    assert made.exit_code == 2
+    assert "leave it out" in made.output
