@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps
 
-.PHONY: demo test lint bench lock clean
+.PHONY: demo test lint bench golden lock clean
 
 # The demo's archive holds damaged files on purpose, for which the flow exits with 1.
 demo: .venv/.runtime
@@ -18,6 +18,11 @@ lint: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The products and tables that tests compare with; look at the difference before you commit it.
+golden: .venv/.dev
+	PYTHONPATH=tests $(BIN)/python -m golden.regenerate
+	$(BIN)/python docs/products_table.py
 
 # Error against run time of every retrieval, one page: bench/index.html.
 bench: .venv/.runtime
@@ -39,6 +44,8 @@ COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-ha
 lock:
 	$(COMPILE) -o requirements.lock
 	$(COMPILE) --extra dev -c requirements.lock -o requirements-dev.lock
+	$(COMPILE) --extra postgresql --extra s3 --extra slurm -c requirements-dev.lock \
+		-o deploy/requirements.lock
 
 clean:
 	rm -rf .venv bench demo build *.egg-info
