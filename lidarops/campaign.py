@@ -219,6 +219,11 @@ class Campaign(Model):
     superseded: Literal["keep", "remove"] = Field(
         default="remove", description="what becomes of products that a rerun replaces"
     )
+    all_steps: bool = Field(
+        default=False,
+        description="whether steps run too that by all signs give nothing, and every file is"
+        " read whole again",
+    )
     _folder: str = PrivateAttr(default=".")
 
     @model_validator(mode="after")

@@ -22,6 +22,9 @@ Wanted = tuple[ProductKind, str]
 _KINDS: Final = frozenset(kind.value for kind in ProductKind)
 _ONLY_FOR: Final[Mapping[str, frozenset[str]]] = {
     StepName.BACKGROUND: frozenset({ProductKind.SIGNAL, ProductKind.VISIBILITY}),
+    StepName.RANGE_GATE: frozenset({ProductKind.HOMOGENEOUS}),
+    StepName.LOOK: frozenset({ProductKind.HOMOGENEOUS}),
+    StepName.GRADIENT: frozenset({ProductKind.MULTIANGLE}),
     StepName.AVERAGE: frozenset({ProductKind.ELASTIC, ProductKind.VISIBILITY}),
     StepName.MOLECULAR: frozenset({ProductKind.ELASTIC, ProductKind.MULTIANGLE}),
     StepName.KNOWN_SHAPE: frozenset({ProductKind.ELASTIC}),
@@ -30,7 +33,7 @@ _ONLY_FOR: Final[Mapping[str, frozenset[str]]] = {
 """Steps that serve some kinds only. Any other step counts for all."""
 
 _OF_CAMPAIGN: Final = frozenset(
-    {"archive", "output", "catalog", "superseded", "scenes", "simulation", "stations",
+    {"all_steps", "archive", "output", "catalog", "superseded", "scenes", "simulation", "stations",
      "instruments", "networks"}
 )  # fmt: skip
 _OF_INSTRUMENT: Final = frozenset({"files", "dark_files", "header_position", "facts", "products"})

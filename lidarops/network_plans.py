@@ -102,7 +102,9 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
     else:
         kept, reason = _meeting(rays, scene, campaign, settings, left_out)
     if reason:
-        left_out.append(LeftOut(StepName.VISIBILITY.value, settings.channel, reason))
+        left_out.append(
+            LeftOut(StepName.VISIBILITY.value, settings.channel, reason, rule="visibility")
+        )
         return Plan(scene.id, (), tuple(left_out))
     used = {ray.instrument for ray in kept}
     steps = [step for step in steps if step.instrument in used]
@@ -157,8 +159,17 @@ def pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | 
     return zenith, azimuth % 360.0
 
 
-def _left(settings: NetworkVisibilitySettings, member: str, reason: str) -> LeftOut:
-    return LeftOut(StepName.VISIBILITY.value, settings.channel, f"{member}: {reason}", member)
+def _left(
+    settings: NetworkVisibilitySettings,
+    member: str,
+    reason: str,
+    *,
+    rule: str = "member",
+    number: float | None = None,
+) -> LeftOut:
+    told = f"{member}: {reason}"
+    step = StepName.VISIBILITY.value
+    return LeftOut(step, settings.channel, told, member, rule=rule, number=number)
 
 
 class _Member:
@@ -316,7 +327,7 @@ def _meeting(
         for ray in lost:
             told = f"the beam at {ray.zenith_angle:g} degree, azimuth {ray.azimuth:g}, meets"
             reason = f"{told} fewer than two points that others see"
-            left_out.append(_left(settings, ray.instrument, reason))
+            left_out.append(_left(settings, ray.instrument, reason, rule="beams_meet"))
         if not lost:
             break
         kept = [ray for ray in kept if ray not in lost]
@@ -347,6 +358,8 @@ def _joint(
         settings.channel,
         {"seconds": settings.average.total_seconds()},
         "signals are averaged before they are solved: noise biases what is averaged afterwards",
+        rule="average",
+        number=settings.average.total_seconds(),
     )
     yield Step(
         StepName.VISIBILITY.value,
@@ -366,4 +379,6 @@ def _joint(
         },
         f"{len(rays)} beams of {len({ray.instrument for ray in rays})} instruments meet in"
         f" {net.vertices} points, {int(net.near_vertex.sum())} of which are near ones",
+        rule="visibility",
+        number=float(net.vertices),
     )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final
 
 from lidarops.campaign import ChannelFacts, InstrumentFacts, channel_facts
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Scene, Step
@@ -14,10 +15,20 @@ GLUED = "glued_"
 """Prefix of the channels that join ``analog_`` and ``photon_`` ones of the same light."""
 
 
+STEEPEST = 80.0
+"""degree; largest zenith angle at which a beam reaches air without aerosol."""
+STEADY = 0.05
+"""degree; by which the zenith angle of a beam that stands still may differ between files."""
+
+LEAST_SPREAD = 5.0
+"""degree; smallest spread of zenith angles that is a scan."""
+
+
 class StepName(StrEnum):
     """Names of the steps, in the order in which they run."""
 
     READ = "read"
+    RANGE_GATE = "range_gate"
     OVERLAP = "overlap"
     RANGE_OFFSET = "range_offset"
     DARK = "dark"
@@ -27,12 +38,14 @@ class StepName(StrEnum):
     GLUE = "glue"
     BACKGROUND = "background"
     SIGNAL = "signal"
+    LOOK = "look"
     HOMOGENEOUS = "homogeneous"
     AVERAGE = "average"
     MOLECULAR = "molecular"
     KNOWN_SHAPE = "known_shape"
     REFERENCE = "reference"
     ELASTIC = "elastic"
+    GRADIENT = "gradient"
     MULTIANGLE = "multiangle"
     VISIBILITY = "visibility"
 
@@ -48,16 +61,48 @@ class Case:
     member: str
     """Instrument, where it is part of a network; else empty."""
 
-    def step(self, name: StepName, reason: str, **settings: Any) -> Step:
-        """Return a step of the channel."""
-        return Step(name.value, self.channel.name, settings, self._told(reason), self.member)
+    def step(
+        self, name: StepName, reason: str, *, number: float | None = None, **settings: Any
+    ) -> Step:
+        """Return a step of the channel; `number` is the one that it was decided on."""
+        return Step(
+            name.value, self.channel.name, settings, self._told(reason), self.member, number=number
+        )
 
-    def without(self, name: StepName, reason: str) -> LeftOut:
+    def without(self, name: StepName, reason: str, *, number: float | None = None) -> LeftOut:
         """Return what is left out of the channel."""
-        return LeftOut(name.value, self.channel.name, self._told(reason), self.member)
+        return LeftOut(
+            name.value, self.channel.name, self._told(reason), self.member, number=number
+        )
 
     def _told(self, reason: str) -> str:
         return f"{self.member}: {reason}" if self.member else reason
+
+
+Decisions = Iterator[Step | LeftOut]
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One decision, by name: what it is about, what it asks, and the function that takes it."""
+
+    name: str
+    step: StepName
+    asks: str
+    decide: Callable[[Any], Decisions]
+    """Of a `Case`, or of what else the stage of the rule looks at; gives nothing where the
+    question does not arise."""
+
+    def decisions(self, case: Any) -> Decisions:
+        """Give what the rule decides, with its name."""
+        for decision in self.decide(case):
+            yield replace(decision, rule=self.name)
+
+
+def applied(rules: Iterable[Rule], case: Any) -> Decisions:
+    """Give what rules decide, in their order."""
+    for rule in rules:
+        yield from rule.decisions(case)
 
 
 def parts_of(glued: str) -> tuple[str, str]:
@@ -82,11 +127,79 @@ def wavelength(channel: ChannelLayout, known: ChannelFacts) -> float:
     return channel.wavelength if known.wavelength is None else known.wavelength
 
 
-def glue_rules(case: Case) -> Iterator[Step | LeftOut]:
-    """Decide on the steps that join two channels."""
-    yield _overlap_rule(case)
-    analog, photon = parts_of(case.channel.name)
-    lag = channel_facts(case.facts, analog).lag
+def _overlap(case: Case) -> Decisions:
+    full = case.facts.full_overlap_range
+    reason = "nearer bins are flagged and not retrieved from"
+    if case.facts.overlap_profile:
+        told = f"given by the campaign; {reason}"
+        profile = case.facts.overlap_profile
+        yield case.step(
+            StepName.OVERLAP, told, number=full, full_overlap_range=full, overlap_profile=profile
+        )
+    elif full > 0:
+        yield case.step(StepName.OVERLAP, reason, number=full, full_overlap_range=full)
+    else:
+        yield case.without(StepName.OVERLAP, "the campaign gives no full_overlap_range")
+
+
+def _range(case: Case) -> Decisions:
+    offset = range_offset(case.channel, case.facts)
+    if offset:
+        reason = "given by the campaign"
+        if isinstance(case.known.lag, float):
+            reason += f", with the lag of {case.known.lag:g} bins"
+        yield case.step(StepName.RANGE_OFFSET, reason, number=offset, range_offset=offset)
+    elif case.known.lag == "estimate":
+        reason = "a lag that is estimated moves joined channels only"
+        yield case.without(StepName.RANGE_OFFSET, reason)
+    else:
+        yield case.without(StepName.RANGE_OFFSET, "the campaign gives no range_offset")
+
+
+def _dark(case: Case) -> Decisions:
+    if case.channel.mode is DetectionMode.PHOTON:
+        yield case.without(StepName.DARK, "dark counts are part of the photon background")
+        return
+    count = len(case.scene.dark)
+    if not count:
+        yield case.without(StepName.DARK, "no dark files within 24 h of the scene", number=0.0)
+        return
+    told = f"{count} dark files within 24 h of the scene"
+    times = [granule.start for granule in case.scene.dark if granule.start]
+    profiles = [granule.start for granule in case.scene.granules if granule.start]
+    if min(times) < max(profiles) and min(profiles) < max(times):
+        reason, method = f"{told}, before and after it: interpolated in time", "interpolated"
+    else:
+        reason, method = f"{told}, on one side of it: the nearest", "nearest"
+    yield case.step(StepName.DARK, reason, number=float(count), files=count, method=method)
+
+
+def _dead_time(case: Case) -> Decisions:
+    dead_time = case.known.dead_time
+    if case.channel.mode is not DetectionMode.PHOTON:
+        yield case.without(StepName.DEAD_TIME, "analog detection has no dead time")
+    elif dead_time is None:
+        reason = "the campaign gives no dead_time; pile-up is judged with 4 ns"
+        yield case.without(StepName.DEAD_TIME, reason)
+    else:
+        reason = "given by the campaign"
+        yield case.step(StepName.DEAD_TIME, reason, number=dead_time, dead_time=dead_time)
+
+
+def _noise(case: Case) -> Decisions:
+    given = case.known.noise_variance
+    if case.channel.mode is DetectionMode.PHOTON:
+        yield case.step(StepName.NOISE, "photon counts are Poisson distributed", method="poisson")
+    elif given is not None:
+        reason = "given by the campaign"
+        yield case.step(StepName.NOISE, reason, number=given, method="given", noise_variance=given)
+    else:
+        reason = "the campaign gives no noise_variance; third differences along range"
+        yield case.step(StepName.NOISE, reason, method="differences")
+
+
+def _lag(case: Case) -> Decisions:
+    lag = channel_facts(case.facts, parts_of(case.channel.name)[0]).lag
     if lag is None:
         reason = "the campaign gives no lag and asks for no estimate; headers say 0"
         yield case.without(StepName.LAG, reason)
@@ -94,60 +207,43 @@ def glue_rules(case: Case) -> Iterator[Step | LeftOut]:
         reason = "the campaign asks for an estimate, from noise that both records share"
         yield case.step(StepName.LAG, reason, method="estimate")
     else:
-        yield case.step(StepName.LAG, "given by the campaign", method="given", lag=lag)
+        reason = "given by the campaign"
+        yield case.step(StepName.LAG, reason, number=lag, method="given", lag=lag)
+
+
+def _glue(case: Case) -> Decisions:
+    analog, photon = parts_of(case.channel.name)
     reason = "the campaign asks for the joined channel"
     yield case.step(StepName.GLUE, reason, analog=analog, photon=photon)
 
 
-def conditioning(case: Case) -> Iterator[Step | LeftOut]:
+_OVERLAP: Final = Rule(
+    "overlap", StepName.OVERLAP, "Does the campaign say where the beam is seen whole?", _overlap
+)
+CONDITIONING: Final = (
+    _OVERLAP,
+    Rule("range_offset", StepName.RANGE_OFFSET, "Are the ranges of the bins off?", _range),
+    Rule("dark", StepName.DARK, "Is it analog, with dark files within 24 h?", _dark),
+    Rule("dead_time", StepName.DEAD_TIME, "Does it count, with a known dead time?", _dead_time),
+    Rule("noise", StepName.NOISE, "Is the noise given, Poisson, or to be estimated?", _noise),
+)
+"""From the counts of a channel of the files to its signal."""
+GLUING: Final = (
+    _OVERLAP,
+    Rule("lag", StepName.LAG, "Is one of the records known to be late?", _lag),
+    Rule("glue", StepName.GLUE, "Does a product ask for the joined channel?", _glue),
+)
+"""From two channels of the files to one that joins them."""
+
+
+def glue_rules(case: Case) -> Decisions:
+    """Decide on the steps that join two channels."""
+    return applied(GLUING, case)
+
+
+def conditioning(case: Case) -> Decisions:
     """Decide on the steps from the counts of a channel of the files to its signal."""
-    photon = case.channel.mode is DetectionMode.PHOTON
-    yield _overlap_rule(case)
-    yield _range_rule(case)
-    yield _dark_rule(case)
-    if not photon:
-        yield case.without(StepName.DEAD_TIME, "analog detection has no dead time")
-    elif case.known.dead_time is None:
-        reason = "the campaign gives no dead_time; pile-up is judged with 4 ns"
-        yield case.without(StepName.DEAD_TIME, reason)
-    else:
-        reason = "given by the campaign"
-        yield case.step(StepName.DEAD_TIME, reason, dead_time=case.known.dead_time)
-    if photon:
-        yield case.step(StepName.NOISE, "photon counts are Poisson distributed", method="poisson")
-    elif case.known.noise_variance is not None:
-        reason = "given by the campaign"
-        yield case.step(
-            StepName.NOISE, reason, method="given", noise_variance=case.known.noise_variance
-        )
-    else:
-        reason = "the campaign gives no noise_variance; third differences along range"
-        yield case.step(StepName.NOISE, reason, method="differences")
-
-
-def _overlap_rule(case: Case) -> Step | LeftOut:
-    full = case.facts.full_overlap_range
-    reason = "nearer bins are flagged and not retrieved from"
-    if case.facts.overlap_profile:
-        told = f"given by the campaign; {reason}"
-        profile = case.facts.overlap_profile
-        return case.step(StepName.OVERLAP, told, full_overlap_range=full, overlap_profile=profile)
-    if full > 0:
-        return case.step(StepName.OVERLAP, reason, full_overlap_range=full)
-    return case.without(StepName.OVERLAP, "the campaign gives no full_overlap_range")
-
-
-def _range_rule(case: Case) -> Step | LeftOut:
-    offset = range_offset(case.channel, case.facts)
-    if offset:
-        reason = "given by the campaign"
-        if isinstance(case.known.lag, float):
-            reason += f", with the lag of {case.known.lag:g} bins"
-        return case.step(StepName.RANGE_OFFSET, reason, range_offset=offset)
-    if case.known.lag == "estimate":
-        reason = "a lag that is estimated moves joined channels only"
-        return case.without(StepName.RANGE_OFFSET, reason)
-    return case.without(StepName.RANGE_OFFSET, "the campaign gives no range_offset")
+    return applied(CONDITIONING, case)
 
 
 def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
@@ -157,21 +253,36 @@ def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
     return (known.range_offset or 0.0) - late
 
 
-def _dark_rule(case: Case) -> Step | LeftOut:
-    if case.channel.mode is DetectionMode.PHOTON:
-        return case.without(StepName.DARK, "dark counts are part of the photon background")
-    if not case.scene.dark:
-        return case.without(StepName.DARK, "no dark files within 24 h of the scene")
-    told = f"{len(case.scene.dark)} dark files within 24 h of the scene"
-    times = [granule.start for granule in case.scene.dark if granule.start]
-    profiles = [granule.start for granule in case.scene.granules if granule.start]
-    if min(times) < max(profiles) and min(profiles) < max(times):
-        reason, method = f"{told}, before and after it: interpolated in time", "interpolated"
-    else:
-        reason, method = f"{told}, on one side of it: the nearest", "nearest"
-    return case.step(StepName.DARK, reason, files=len(case.scene.dark), method=method)
-
-
 def ranged_by(channel: str) -> str:
     """Return the channel whose ranges a channel has: a joined one those of its photons."""
     return parts_of(channel)[1] if channel.startswith(GLUED) else channel
+
+
+def no_scan(case: Case) -> str:
+    """Return why the files of a scene are no scan, nothing where they are."""
+    if case.facts.zenith_angle is not None:
+        return f"the campaign says that the beam stands still at {case.facts.zenith_angle:g} degree"
+    told = [granule.zenith_angle for granule in case.scene.granules]
+    angles = [angle for angle in told if angle is not None]
+    if len(angles) < len(told):
+        return "headers do not tell all zenith angles"
+    spread = max(angles) - min(angles)
+    if spread < LEAST_SPREAD:
+        return f"zenith angles spread over {spread:g} degree only: the beam does not scan"
+    return ""
+
+
+def steady_zenith(case: Case) -> tuple[float, str]:
+    """Return the zenith angle of a beam that stands still, or why there is none."""
+    if case.facts.zenith_angle is not None:
+        angles = [case.facts.zenith_angle]
+    else:
+        told = [granule.zenith_angle for granule in case.scene.granules]
+        if any(angle is None for angle in told):
+            return math.nan, "neither headers nor campaign tell the zenith angle"
+        angles = [angle for angle in told if angle is not None]
+    if max(angles) - min(angles) > STEADY:
+        return math.nan, f"the beam moves, from {min(angles):g} to {max(angles):g} degree"
+    if max(angles) > STEEPEST:
+        return math.nan, f"at {max(angles):g} degree the beam reaches no air without aerosol"
+    return max(angles), ""

@@ -8,20 +8,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from lidarops import network_plans
 from lidarops.campaign import Campaign, Instrument, InstrumentFacts, channel_facts
 from lidarops.plan_rules import (
+    CONDITIONING,
     GLUED,
     Case,
+    Decisions,
+    Rule,
     StepName,
-    conditioning,
+    applied,
     glue_rules,
     joined_channels,
+    no_scan,
     parts_of,
     range_offset,
     ranged_by,
+    steady_zenith,
     wavelength,
 )
 from lidarops.product_settings import (
@@ -30,17 +35,18 @@ from lidarops.product_settings import (
     MultiAngleSettings,
     SignalSettings,
 )
-from lidarops.records import ChannelLayout, LeftOut, Plan, Scene, Step
+from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, Scene, Step
+from lidarops.retrieve.labeled import LEVEL
+from lidarops.retrieve.signal import MIN_NOISE_BINS, NOISE_WINDOW
 
 MIN_SECTION_BINS = 8
 
-STEEPEST = 80.0
-"""degree; largest zenith angle at which a beam reaches air without aerosol."""
-STEADY = 0.05
-"""degree; by which the zenith angle of a beam that stands still may differ between files."""
+LOOKED_AT: Final = 16
+"""Profiles of a scene that are looked at first."""
+ALL_STEPS: Final = "all steps are asked for: nothing is left out for giving nothing"
 
-LEAST_SPREAD = 5.0
-"""degree; smallest spread of zenith angles that is a scan."""
+_ROUNDING: Final = 1e-6
+"""Relative; angles of headers and of files are rounded in ways of their own."""
 
 _Settings = TypeVar(
     "_Settings", SignalSettings, HomogeneousSettings, ElasticSettings, MultiAngleSettings
@@ -61,6 +67,22 @@ class _Case(Case):
     """Set where the channel's ``multiangle`` product is wanted."""
     glued: tuple[str, ...]
     """Channels that this one is joined into."""
+    all_steps: bool
+    """Whether nothing is left out because it would give nothing."""
+
+    @property
+    def last(self) -> float:
+        """Where the bins end, m, without an offset."""
+        return self.channel.bins * self.channel.bin_width
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What the rules of a whole scene look at."""
+
+    scene: Scene
+    instrument: Instrument
+    facts: InstrumentFacts
 
 
 def plan(scene: Scene, campaign: Campaign) -> Plan:
@@ -83,9 +105,10 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
     # A scene never straddles an edge of a validity period, so its first granule speaks for all.
     facts = instrument.facts_at(scene.granules[0].start or scene.start)
     steps: list[Step] = []
-    left_out = [*_absent(scene, instrument), *_strange_facts(scene, facts)]
+    asked = _Asked(scene, instrument, facts)
+    left_out = [left for left in applied((ABSENT, STRANGE), asked) if isinstance(left, LeftOut)]
     for channel in (*scene.layout, *glued_channels(scene, instrument)):
-        for decision in _channel(scene, channel, instrument, facts):
+        for decision in _channel(channel, asked, all_steps=campaign.all_steps):
             (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
     return Plan(scene.id, tuple(steps), tuple(left_out))
 
@@ -120,8 +143,9 @@ def _asked_glued(instrument: Instrument) -> set[str]:
     return {name for name in asked if name.startswith(GLUED)}
 
 
-def _absent(scene: Scene, instrument: Instrument) -> Iterator[LeftOut]:
+def _absent(asked: _Asked) -> Decisions:
     """Name the channels that the campaign wants and the files lack."""
+    scene, instrument = asked.scene, asked.instrument
     channels = {channel.name: channel for channel in scene.layout}
     made = [channel.name for channel in glued_channels(scene, instrument)]
     products = instrument.products
@@ -139,8 +163,9 @@ def _absent(scene: Scene, instrument: Instrument) -> Iterator[LeftOut]:
                 yield LeftOut(kind.value, name, _why_absent(name, channels))
 
 
-def _strange_facts(scene: Scene, facts: InstrumentFacts) -> Iterator[LeftOut]:
+def _strange_facts(asked: _Asked) -> Decisions:
     """Name the channels of which the campaign tells facts, and which the files lack."""
+    scene, facts = asked.scene, asked.facts
     present = [channel.name for channel in scene.layout]
     for name, known in facts.channels.items():
         if name not in present:
@@ -161,9 +186,8 @@ def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
     return f"the files hold no such channel, only {', '.join(channels)}"
 
 
-def _channel(
-    scene: Scene, channel: ChannelLayout, instrument: Instrument, facts: InstrumentFacts
-) -> Iterator[Step | LeftOut]:
+def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decisions:
+    scene, instrument, facts = asked.scene, asked.instrument, asked.facts
     products = instrument.products
     made = [glued.name for glued in glued_channels(scene, instrument)]
     joined = channel.name in made
@@ -178,25 +202,32 @@ def _channel(
         elastic=_wanted(products.elastic, channel),
         multiangle=_wanted(products.multiangle, channel),
         glued=tuple(name for name in made if channel.name in parts_of(name)),
+        all_steps=all_steps,
     )
+    reading = list(CHANNEL.decisions(case))
+    yield from reading
+    if not any(isinstance(decision, Step) for decision in reading):
+        return
+    yield from glue_rules(case) if joined else applied((GATE, *CONDITIONING), case)
+    yield from applied(PRODUCTS, case)
+
+
+def _read(case: _Case) -> Decisions:
     asked = list(_asked(case))
     if not asked:
         yield case.without(StepName.READ, "no product of the campaign asks for this channel")
         return
-    known = channel_facts(facts, parts_of(channel.name)[1]) if joined else case.known
-    if math.isnan(wavelength(channel, known)):
+    name = case.channel.name
+    known = channel_facts(case.facts, parts_of(name)[1]) if name.startswith(GLUED) else case.known
+    if math.isnan(wavelength(case.channel, known)):
         reason = "the header's wavelength is implausible and the campaign's facts give none"
         yield case.without(StepName.READ, reason)
         return
-    last = channel.bins * channel.bin_width
     yield case.step(
-        StepName.READ, "asked for by " + " and ".join(asked), wavelength=wavelength(channel, known)
+        StepName.READ,
+        "asked for by " + " and ".join(asked),
+        wavelength=wavelength(case.channel, known),
     )
-    yield from glue_rules(case) if joined else conditioning(case)
-    yield from _signal_rules(case, last)
-    yield from _homogeneous_rules(case, last)
-    yield from _elastic_rules(case, last)
-    yield from _multiangle_rules(case, last)
 
 
 def _wanted(settings: _Settings | None, channel: ChannelLayout) -> _Settings | None:
@@ -219,95 +250,241 @@ def _asked(case: _Case) -> Iterator[str]:
     yield from case.glued
 
 
-def _signal_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
-    if case.signal is None:
-        yield case.without(StepName.SIGNAL, "the campaign does not ask for it")
+def _gate(case: _Case) -> Decisions:
+    if case.homogeneous is None:
         return
-    start, stop = case.signal.background_range or (0.9 * last, last)
-    if (min(stop, last) - start) / case.channel.bin_width < MIN_SECTION_BINS:
-        reason = (
-            f"background_range {start:g}-{stop:g} m holds fewer than {MIN_SECTION_BINS} bins,"
-            f" which end at {last:g} m"
-        )
-        yield case.without(StepName.SIGNAL, reason)
+    if case.channel.mode is not DetectionMode.PHOTON:
+        reason = "noise of analog records is estimated from the whole of them"
+        yield case.without(StepName.RANGE_GATE, reason)
+        return
+    if case.all_steps:
+        yield case.without(StepName.RANGE_GATE, ALL_STEPS)
+        return
+    farthest = max((far for _, far in _level_sections(case)), default=math.nan)
+    if math.isnan(farthest):
+        return
+    offset = range_offset(case.channel, case.facts)
+    # The variance of counts is that of their mean over a share of the range on either side.
+    width = case.channel.bin_width
+    beyond = max(math.ceil(NOISE_WINDOW * farthest / width), MIN_NOISE_BINS)
+    bins = math.ceil((farthest - offset) / width) + beyond + 2
+    if not 0 < bins < case.channel.bins:
+        reason = "a section reaches the end of the bins"
+        yield case.without(StepName.RANGE_GATE, reason, number=float(case.channel.bins))
+        return
+    reason = "homogeneous sections need no farther bins, and counts none to tell their noise"
+    yield case.step(StepName.RANGE_GATE, reason, number=float(bins), bins=bins)
+
+
+def _background(case: _Case) -> Decisions:
+    if case.signal is None:
+        return
+    start, stop, bins = _tail(case, case.signal)
+    if bins < MIN_SECTION_BINS:
         return
     reason = (
         "the last tenth of the bins: signal left there biases it"
         if case.signal.background_range is None
         else "background_range of the campaign: signal left there biases it"
     )
-    yield case.step(StepName.BACKGROUND, reason, method="tail_mean", range=[start, min(stop, last)])
+    yield case.step(
+        StepName.BACKGROUND, reason, number=bins, method="tail_mean", range=[start, stop]
+    )
+
+
+def _tail(case: _Case, settings: SignalSettings) -> tuple[float, float, float]:
+    """Return the range whose mean is the background, m, and how many bins that holds."""
+    start, stop = settings.background_range or (0.9 * case.last, case.last)
+    stop = min(stop, case.last)
+    return start, stop, (stop - start) / case.channel.bin_width
+
+
+def _signal(case: _Case) -> Decisions:
+    if case.signal is None:
+        yield case.without(StepName.SIGNAL, "the campaign does not ask for it")
+        return
+    start, _, bins = _tail(case, case.signal)
+    if bins < MIN_SECTION_BINS:
+        stop = case.signal.background_range[1] if case.signal.background_range else case.last
+        reason = (
+            f"background_range {start:g}-{stop:g} m holds fewer than {MIN_SECTION_BINS} bins,"
+            f" which end at {case.last:g} m"
+        )
+        yield case.without(StepName.SIGNAL, reason, number=bins)
+        return
     yield case.step(StepName.SIGNAL, "the campaign asks for it")
 
 
-def _homogeneous_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
+def _inside(case: _Case, near: float, far: float) -> float:
+    """Return how many bins hold a section; NaN where it reaches beyond them."""
+    return (far - near) / case.channel.bin_width if far <= case.last else math.nan
+
+
+def _sections(case: _Case) -> list[tuple[float, float]]:
+    """Return the sections that lie inside the bins."""
+    wanted = [] if case.homogeneous is None else case.homogeneous.sections
+    return [(near, far) for near, far in wanted if _inside(case, near, far) >= MIN_SECTION_BINS]
+
+
+def _outside(case: _Case) -> Decisions:
+    inside = _sections(case)
+    for near, far in [] if case.homogeneous is None else case.homogeneous.sections:
+        if (near, far) not in inside:
+            bins = (min(far, case.last) - near) / case.channel.bin_width
+            reason = (
+                f"section {near:g}-{far:g} m does not lie inside the bins, which end at"
+                f" {case.last:g} m, with at least {MIN_SECTION_BINS} of them"
+            )
+            yield case.without(StepName.HOMOGENEOUS, reason, number=bins)
+
+
+def _climb(case: _Case, near: float, far: float) -> float:
+    """Return by how much the most level beam of a scene climbs along a section, m, or infinity.
+
+    A beam of which nobody tells where it points is not taken for a level one.
+    """
+    told = case.facts.zenith_angle
+    angles = [granule.zenith_angle if told is None else told for granule in case.scene.granules]
+    return min(
+        math.inf if angle is None else (far - near) * abs(math.cos(math.radians(angle)))
+        for angle in angles
+    )
+
+
+def _level_sections(case: _Case) -> list[tuple[float, float]]:
+    """Return the sections that are retrieved: inside the bins, along a path that may be level."""
+    return [
+        (near, far)
+        for near, far in _sections(case)
+        if case.all_steps or _climb(case, near, far) <= LEVEL * (1.0 + _ROUNDING)
+    ]
+
+
+def _level(case: _Case) -> Decisions:
+    kept = _level_sections(case)
+    for near, far in _sections(case):
+        if (near, far) not in kept:
+            climb = _climb(case, near, far)
+            told = (
+                "neither headers nor campaign tell that it is level"
+                if math.isinf(climb)
+                else f"it climbs by {climb:.0f} m, and {LEVEL:g} m are level"
+            )
+            reason = f"section {near:g}-{far:g} m: {told}: aerosol that thins fakes extinction"
+            number = None if math.isinf(climb) else climb
+            yield case.without(StepName.HOMOGENEOUS, reason, number=number)
+
+
+def _look(case: _Case) -> Decisions:
+    if case.homogeneous is None or not _level_sections(case):
+        return
+    if case.all_steps:
+        yield case.without(StepName.LOOK, ALL_STEPS)
+    else:
+        reason = "sections in which no profile shows light are not retrieved"
+        yield case.step(StepName.LOOK, reason, number=float(LOOKED_AT), profiles=LOOKED_AT)
+
+
+def _homogeneous(case: _Case) -> Decisions:
     if case.homogeneous is None:
         yield case.without(StepName.HOMOGENEOUS, "the campaign does not ask for it")
         return
-    sections = []
-    for near, far in case.homogeneous.sections:
-        bins = (min(far, last) - near) / case.channel.bin_width
-        if far > last or bins < MIN_SECTION_BINS:
-            reason = (
-                f"section {near:g}-{far:g} m does not lie inside the bins, which end at {last:g} m,"
-                f" with at least {MIN_SECTION_BINS} of them"
-            )
-            yield case.without(StepName.HOMOGENEOUS, reason)
-        else:
-            sections.append([near, far])
+    sections = [[near, far] for near, far in _level_sections(case)]
     if sections:
         reason = "the campaign asks for it; background is retrieved with extinction"
         wanted = case.homogeneous.visibility
         yield case.step(
             StepName.HOMOGENEOUS,
             reason,
+            number=float(len(sections)),
             method=case.homogeneous.method,
             sections=sections,
             **({} if wanted is None else {"visibility": network_plans.sight(wanted)}),
         )
 
 
-def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
-    """Decide on the steps of the ``elastic`` product of a channel, whose bins end at `last` m."""
-    settings = case.elastic
-    if settings is None:
-        yield case.without(StepName.ELASTIC, "the campaign does not ask for it")
-        return
-    zenith, reason = _steady_zenith(case)
+@dataclass(frozen=True, slots=True)
+class _Clean:
+    """Where along a beam air without aerosol is looked for."""
+
+    bottom: float
+    """m along the beam, as the others."""
+    top: float
+    width: float
+    reason: str
+    """Why it is looked for nowhere; empty where it is."""
+
+
+def _clean(case: _Case, settings: ElasticSettings) -> _Clean:
+    zenith, reason = steady_zenith(case)
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     window = settings.reference
     # Windows are sought among the middles of bins.
     ranged = replace(case.channel, name=ranged_by(case.channel.name))
     offset = range_offset(ranged, case.facts)
-    reach = last - 0.5 * case.channel.bin_width + offset
+    reach = case.last - 0.5 * case.channel.bin_width + offset
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
         reason = (
             f"the bins end at {reach:g} m, nearer than a reference window of {window.width:g} m"
             f" above {window.lowest:g} m"
         )
-    if reason:
-        yield case.without(StepName.ELASTIC, reason)
+    return _Clean(bottom, top, window.width * stretch, reason)
+
+
+def _elastic_settings(case: _Case) -> ElasticSettings | None:
+    """Return the settings of the elastic product, where there is one."""
+    settings = case.elastic
+    return None if settings is None or _clean(case, settings).reason else settings
+
+
+def _average(case: _Case) -> Decisions:
+    settings = _elastic_settings(case)
+    if settings is not None:
+        seconds = settings.average.total_seconds()
+        reason = "noise of a single profile is too large"
+        yield case.step(StepName.AVERAGE, reason, number=seconds, seconds=seconds)
+
+
+def _known_shape(case: _Case) -> Decisions:
+    settings = _elastic_settings(case)
+    if settings is None:
         return
-    seconds = settings.average.total_seconds()
-    yield case.step(StepName.AVERAGE, "noise of a single profile is too large", seconds=seconds)
-    yield _molecular_rule(case)
     if settings.background == "known_shape":
         reason = "the far range is taken as air without aerosol, and tested for it"
         yield case.step(StepName.KNOWN_SHAPE, reason)
     else:
         reason = "the campaign asks for tail_mean: signal left in the far range biases it"
         yield case.without(StepName.KNOWN_SHAPE, reason)
+
+
+def _reference(case: _Case) -> Decisions:
+    settings = _elastic_settings(case)
+    if settings is None:
+        return
+    clean = _clean(case, settings)
     reason = "candidates within the campaign's limits are tested against the shape of air"
     yield case.step(
         StepName.REFERENCE,
         reason,
-        lowest=bottom,
-        highest=top,
-        width=window.width * stretch,
-        scattering_ratio=window.scattering_ratio,
-        relative_error=window.relative_error,
+        number=clean.top - clean.bottom,
+        lowest=clean.bottom,
+        highest=clean.top,
+        width=clean.width,
+        scattering_ratio=settings.reference.scattering_ratio,
+        relative_error=settings.reference.relative_error,
     )
+
+
+def _elastic(case: _Case) -> Decisions:
+    settings = case.elastic
+    if settings is None:
+        yield case.without(StepName.ELASTIC, "the campaign does not ask for it")
+        return
+    clean = _clean(case, settings)
+    if clean.reason:
+        yield case.without(StepName.ELASTIC, clean.reason)
+        return
     yield case.step(
         StepName.ELASTIC,
         "the campaign asks for it",
@@ -317,25 +494,40 @@ def _elastic_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
     )
 
 
-def _molecular_rule(case: _Case) -> Step:
+def _molecular(case: _Case) -> Decisions:
+    scans = case.multiangle is not None and not no_scan(case)
+    if _elastic_settings(case) is None and not scans:
+        return
     source = case.facts.molecular_profile
     if source:
-        return case.step(StepName.MOLECULAR, "given by the campaign", molecular_profile=source)
+        reason = "given by the campaign"
+        yield case.step(StepName.MOLECULAR, reason, molecular_profile=source)
+        return
     reason = "the campaign gives no molecular_profile: US Standard Atmosphere 1976"
-    return case.step(StepName.MOLECULAR, reason)
+    yield case.step(StepName.MOLECULAR, reason)
 
 
-def _multiangle_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
+def _gradient(case: _Case) -> Decisions:
+    if case.multiangle is None or no_scan(case):
+        return
+    largest = case.multiangle.largest_gradient
+    if largest > 0:
+        reason = "backscatter may change along the horizontal: retrieved or allowed for"
+        yield case.step(StepName.GRADIENT, reason, number=largest)
+    else:
+        reason = "the campaign says that no horizontal gradient is to be allowed for"
+        yield case.without(StepName.GRADIENT, reason, number=0.0)
+
+
+def _multiangle(case: _Case) -> Decisions:
     settings = case.multiangle
     if settings is None:
         yield case.without(StepName.MULTIANGLE, "the campaign does not ask for it")
         return
-    reason = _no_scan(case)
+    reason = no_scan(case)
     if reason:
         yield case.without(StepName.MULTIANGLE, reason)
         return
-    # The elastic product needs a beam that stands still: only one of both tells of molecules.
-    yield _molecular_rule(case)
     yield case.step(
         StepName.MULTIANGLE,
         "the campaign asks for it, and the beam scans",
@@ -344,35 +536,35 @@ def _multiangle_rules(case: _Case, last: float) -> Iterator[Step | LeftOut]:
         method=settings.method,
         largest_gradient=settings.largest_gradient,
         layers=[list(layer) for layer in settings.layers],
-        background_range=[0.9 * last, last],
+        background_range=[0.9 * case.last, case.last],
     )
 
 
-def _no_scan(case: _Case) -> str:
-    """Return why the files of a scene are no scan, nothing where they are."""
-    if case.facts.zenith_angle is not None:
-        return f"the campaign says that the beam stands still at {case.facts.zenith_angle:g} degree"
-    told = [granule.zenith_angle for granule in case.scene.granules]
-    angles = [angle for angle in told if angle is not None]
-    if len(angles) < len(told):
-        return "headers do not tell all zenith angles"
-    spread = max(angles) - min(angles)
-    if spread < LEAST_SPREAD:
-        return f"zenith angles spread over {spread:g} degree only: the beam does not scan"
-    return ""
-
-
-def _steady_zenith(case: _Case) -> tuple[float, str]:
-    """Return the zenith angle of a beam that stands still, or why there is none."""
-    if case.facts.zenith_angle is not None:
-        angles = [case.facts.zenith_angle]
-    else:
-        told = [granule.zenith_angle for granule in case.scene.granules]
-        if any(angle is None for angle in told):
-            return math.nan, "neither headers nor campaign tell the zenith angle"
-        angles = [angle for angle in told if angle is not None]
-    if max(angles) - min(angles) > STEADY:
-        return math.nan, f"the beam moves, from {min(angles):g} to {max(angles):g} degree"
-    if max(angles) > STEEPEST:
-        return math.nan, f"at {max(angles):g} degree the beam reaches no air without aerosol"
-    return max(angles), ""
+CHANNEL: Final = Rule(
+    "channel", StepName.READ, "Does a product need the channel, at a known wavelength?", _read
+)
+GATE: Final = Rule(
+    "range_gate", StepName.RANGE_GATE, "Which bins do the sections of counts need?", _gate
+)
+PRODUCTS: Final = (
+    Rule("background", StepName.BACKGROUND, "Does the far range hold enough bins?", _background),
+    Rule("signal", StepName.SIGNAL, "Is it asked for, and can background be told?", _signal),
+    Rule("section_inside", StepName.HOMOGENEOUS, "Do the bins hold the section?", _outside),
+    Rule("section_level", StepName.HOMOGENEOUS, "May the path be level?", _level),
+    Rule("look", StepName.LOOK, "May sections turn out to hold no light?", _look),
+    Rule("homogeneous", StepName.HOMOGENEOUS, "Is a section left to retrieve?", _homogeneous),
+    Rule("average", StepName.AVERAGE, "Does a retrieval need less noise?", _average),
+    Rule("molecular", StepName.MOLECULAR, "Does a retrieval need the air's density?", _molecular),
+    Rule("known_shape", StepName.KNOWN_SHAPE, "Which background is asked for?", _known_shape),
+    Rule("reference", StepName.REFERENCE, "Where may air be without aerosol?", _reference),
+    Rule("elastic", StepName.ELASTIC, "Does one beam reach air without aerosol?", _elastic),
+    Rule("gradient", StepName.GRADIENT, "May the air differ along the horizontal?", _gradient),
+    Rule("multiangle", StepName.MULTIANGLE, "Does the beam scan over zenith angle?", _multiangle),
+)
+"""Of the products of a channel, in the order in which they run."""
+ABSENT: Final = Rule(
+    "channel_present", StepName.READ, "Do the files hold what is asked for?", _absent
+)
+STRANGE: Final = Rule(
+    "facts_fit", StepName.READ, "Do the campaign's facts fit the files?", _strange_facts
+)

@@ -27,7 +27,7 @@ from lidarops.plan_rules import StepName
 from lidarops.plans import glued_channels
 from lidarops.products import build, provenance, write
 from lidarops.raw import licel
-from lidarops.raw.archive import open_archive
+from lidarops.raw.archive import counting, open_archive
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
@@ -42,6 +42,7 @@ from lidarops.records import (
     Status,
     Step,
 )
+from lidarops.refinement import refine
 from lidarops.stores import RemoteStore
 
 # What broken data, a broken disk or a broken library can raise; a bug in lidarops itself that
@@ -127,29 +128,58 @@ def failed(job: Job, error: str) -> SceneOutcome:
 
 def _process(job: Job, root: Path) -> SceneOutcome:
     clock = _Clock()
-    usable, inputs, refused = _digest(job.scene, root)
-    clock.lap("digest")
-    failure = replace(failed(job, ""), refused=refused, inputs=inputs)
     wanted = [step for step in job.plan.steps if step.name in tuple(ProductKind)]
     if not wanted:
-        reasons = {left.reason for left in job.plan.left_out}
-        return replace(failure, error="nothing to do: " + "; ".join(sorted(reasons)))
+        return failed(job, _nothing_to_do(job.plan))
+    usable, inputs, refused, read = _digest(job, root)
+    clock.lap("digest")
+    failure = replace(failed(job, ""), refused=refused, inputs=inputs, bytes_read=read)
     if not usable.granules:
         return replace(failure, error="no granule of the scene can be read")
-    if usable.members:
-        with dask.config.set(scheduler="synchronous"):
+    with dask.config.set(scheduler="synchronous"), counting() as tally:
+        if usable.members:
             inputs, product = _network_product(job, usable, inputs, root, clock)
-        return replace(failure, products=(product,), inputs=inputs, seconds=clock.laps)
-    channels = list(dict.fromkeys(step.channel for step in wanted if job.concerns(step)))
-    with dask.config.set(scheduler="synchronous"):
-        bench = _bench(job, usable, job.plan, root)
-        inputs += bench.ancillaries.inputs
-        products = tuple(
-            product
-            for channel in channels
-            for product in _channel_products(job, usable, inputs, bench, channel, clock)
-        )
-    return replace(failure, products=products, inputs=inputs, seconds=clock.laps)
+            products: tuple[ProductRecord, ...] = (product,)
+        else:
+            channels = list(dict.fromkeys(step.channel for step in wanted if job.concerns(step)))
+            bench = _bench(job, usable, job.plan, root)
+            job, bench = _refined(job, usable, bench, root)
+            clock.lap("look")
+            inputs += bench.ancillaries.inputs
+            products = tuple(
+                product
+                for channel in channels
+                for product in _channel_products(job, usable, inputs, bench, channel, clock)
+            )
+    return replace(
+        failure,
+        plan=job.plan,
+        products=products,
+        inputs=inputs,
+        seconds=clock.laps,
+        bytes_read=read + tally.bytes,
+    )
+
+
+def _nothing_to_do(plan: Plan) -> str:
+    """Say why a plan gives no product: what was asked for first, what nobody asked for not."""
+    kinds = tuple(ProductKind)
+    unasked = ("does not ask", "no product of the campaign asks")
+    asked = [left for left in plan.left_out if not any(word in left.reason for word in unasked)]
+    told = sorted(asked or plan.left_out, key=lambda left: left.name not in kinds)
+    reasons = dict.fromkeys(f"{left.name} of {left.channel}: {left.reason}" for left in told)
+    return "nothing to do: " + "; ".join(reasons)
+
+
+def _refined(job: Job, scene: Scene, bench: steps.Bench, root: Path) -> tuple[Job, steps.Bench]:
+    """Leave out what a look at some profiles says will give nothing."""
+
+    def profiles(channel: str, granules: Sequence[Granule]) -> xr.Dataset:
+        some = _open(job, scene, granules, root, [channel])
+        return steps.Plain(replace(bench, archive=some), channel).profiles().compute()
+
+    plan = refine(job.plan, scene.granules, profiles)
+    return replace(job, plan=plan), replace(bench, plan=plan)
 
 
 class _Clock:
@@ -165,27 +195,52 @@ class _Clock:
         self._last = now
 
 
-def _digest(scene: Scene, root: Path) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...]]:
-    """Read every file once: its digest, and whether it is still what the catalog says."""
+def _digest(
+    job: Job, root: Path
+) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...], int]:
+    """Take the digest of every file, and say whether it is still what the catalog says.
+
+    A file of the size and modification time of the catalog's has the digest that it noted, where
+    it did. Returns the bytes that were read at the end.
+    """
+    scene = job.scene
     usable: dict[str, Granule] = {}
     inputs: list[InputRecord] = []
     refused: list[Granule] = []
+    read = 0
     for granule in (*scene.granules, *scene.dark):
         try:
-            data = (root / granule.path).read_bytes()
-            if len(data) != granule.size:
-                raise SceneError(
-                    f"holds {len(data)} bytes, the catalog says {granule.size}",
-                    remedy="run lidarops catalog again",
-                )
-            licel.parse_header(data, file=granule.path, size=len(data))
+            known = None if job.campaign.all_steps else _known_digest(granule, root)
+            if known is None:
+                read += granule.size
+                known = _read_digest(granule, root)
         except (LidarOpsError, OSError) as error:
             reason = str(error).removeprefix(f"{granule.path}: ")
             refused.append(replace(granule, status=Status.REFUSED, reason=reason))
         else:
             usable[granule.path] = granule
-            inputs.append(InputRecord(granule.path, granule.role, hashlib.sha256(data).hexdigest()))
-    return _without(scene, usable), tuple(inputs), tuple(refused)
+            inputs.append(InputRecord(granule.path, granule.role, known))
+    return _without(scene, usable), tuple(inputs), tuple(refused), read
+
+
+def _known_digest(granule: Granule, root: Path) -> str | None:
+    """Return the digest of a file that has not changed since it was taken."""
+    if granule.sha256 is None:
+        return None
+    about = (root / granule.path).stat()
+    same = (about.st_size, about.st_mtime_ns) == (granule.size, granule.mtime_ns)
+    return granule.sha256 if same else None
+
+
+def _read_digest(granule: Granule, root: Path) -> str:
+    data = (root / granule.path).read_bytes()
+    if len(data) != granule.size:
+        raise SceneError(
+            f"holds {len(data)} bytes, the catalog says {granule.size}",
+            remedy="run lidarops catalog again",
+        )
+    licel.parse_header(data, file=granule.path, size=len(data))
+    return hashlib.sha256(data).hexdigest()
 
 
 def _without(scene: Scene, usable: Mapping[str, Granule]) -> Scene:
@@ -199,7 +254,12 @@ def _without(scene: Scene, usable: Mapping[str, Granule]) -> Scene:
 
 
 def _open(
-    job: Job, scene: Scene, granules: Sequence[Granule], root: Path, channels: list[str]
+    job: Job,
+    scene: Scene,
+    granules: Sequence[Granule],
+    root: Path,
+    channels: list[str],
+    nearest: Mapping[str, int] | None = None,
 ) -> xr.Dataset:
     archive = open_archive(
         list(granules),
@@ -208,6 +268,7 @@ def _open(
         mask_and_scale=False,
         profiles_per_chunk=job.profiles_per_chunk,
         header_position="ignore",
+        nearest=nearest,
     )
     # What the campaign says of the pointing wins over the headers.
     facts = dependence.facts_of(job.campaign, scene)
@@ -230,7 +291,14 @@ def _bench(job: Job, scene: Scene, plan: Plan, root: Path) -> steps.Bench:
     subtracted = [step.channel for step in plan.steps if step.name == StepName.DARK]
     return steps.Bench(
         plan=plan,
-        archive=_open(job, scene, scene.granules, root, [name for name in read if name in present]),
+        archive=_open(
+            job,
+            scene,
+            scene.granules,
+            root,
+            [name for name in read if name in present],
+            steps.gates(plan),
+        ),
         dark=_open(job, scene, scene.dark, root, subtracted) if subtracted and scene.dark else None,
         ancillaries=Ancillaries.read(job.campaign.folder, plan),
         station_altitude=job.campaign.stations[scene.station].altitude,
@@ -364,6 +432,7 @@ def _of_campaign(job: Job, plan: Plan, kind: ProductKind, channel: str) -> dict[
                 "facts": dependence.facts(dependence.facts_of(campaign, member), plan, channel),
                 "instrument": campaign.instruments[member.instrument].name,
                 "keys": {"station": member.station, "instrument": member.instrument},
+                "files": sorted(used.path for used in (*member.granules, *member.dark)),
             }
             for member in scene.members
         },

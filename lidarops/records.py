@@ -130,6 +130,10 @@ class Step:
     reason: str
     instrument: str = ""
     """Member of a network that the step is for; empty where the scene has no members."""
+    rule: str = ""
+    """Name of the rule that decided, in `lidarops.rules`."""
+    number: float | None = None
+    """That the rule decided on, where there is one."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step as plain JSON types."""
@@ -139,6 +143,7 @@ class Step:
             "settings": dict(self.settings),
             "reason": self.reason,
             **_of_member(self.instrument),
+            **_decided(self.rule, self.number),
         }
 
 
@@ -151,6 +156,10 @@ class LeftOut:
     reason: str
     instrument: str = ""
     """Member of a network; empty where the scene has no members."""
+    rule: str = ""
+    """Name of the rule that decided, in `lidarops.rules`."""
+    number: float | None = None
+    """That the rule decided on, where there is one."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain JSON types."""
@@ -159,12 +168,20 @@ class LeftOut:
             "channel": self.channel,
             "reason": self.reason,
             **_of_member(self.instrument),
+            **_decided(self.rule, self.number),
         }
 
 
 def _of_member(instrument: str) -> dict[str, Any]:
     """Return what only plans of networks hold, so that other plans keep their hash."""
     return {"instrument": instrument} if instrument else {}
+
+
+def _decided(rule: str, number: float | None) -> dict[str, Any]:
+    return {
+        **({"rule": rule} if rule else {}),
+        **({"number": number} if number is not None else {}),
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +271,8 @@ class SceneOutcome:
     """Why the scene gave no product; empty when it did."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time by stage."""
+    bytes_read: int = 0
+    """Of raw files, headers apart."""
 
     @property
     def empty(self) -> bool:

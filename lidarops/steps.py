@@ -15,6 +15,7 @@ from lidarops.ancillary import Ancillaries
 from lidarops.flags import Quality
 from lidarops.plan_rules import GLUED, StepName
 from lidarops.records import Plan, ProductKind, Step
+from lidarops.refinement import WITHOUT
 from lidarops.retrieve import (
     labeled,
     labeled_average,
@@ -33,6 +34,8 @@ Array = npt.NDArray[np.float64]
 FULL_OVERLAP: Final = 0.99
 """Overlap from which on a homogeneous section may begin."""
 
+_WHOLE: Final = (StepName.SIGNAL, StepName.ELASTIC, StepName.MULTIANGLE)
+"""Products that need all bins of a channel."""
 _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 
 
@@ -110,6 +113,19 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
 def source_of(bench: Bench, channel: str) -> Plain | Glued:
     """Return what gives the profiles of a channel."""
     return Glued(bench, channel) if channel.startswith(GLUED) else Plain(bench, channel)
+
+
+def gates(plan: Plan) -> dict[str, int]:
+    """Return the channels of which only the nearest bins are needed, and how many."""
+    whole = {step.channel for step in plan.steps if step.name in _WHOLE}
+    for step in plan.steps:
+        if step.name == StepName.GLUE:
+            whole |= set(step.settings.values())
+    return {
+        step.channel: int(step.settings["bins"])
+        for step in plan.steps
+        if step.name == StepName.RANGE_GATE and step.channel not in whole
+    }
 
 
 class Plain:
@@ -247,23 +263,53 @@ def _homogeneous(
     conditioned: xr.Dataset, steps: Mapping[str, Step], ancillaries: Ancillaries
 ) -> xr.Dataset:
     settings = steps[StepName.HOMOGENEOUS].settings
+    absent = {(near, far): Quality[bit] for near, far, bit in settings.get(WITHOUT, ())}
+    sections = [(near, far) for near, far in settings["sections"]]
+    kept = [section for section in sections if section not in absent]
+    parts = [_empty_section(conditioned["power"], *each) for each in absent.items()]
+    if kept:
+        parts.insert(0, _retrieved(conditioned, kept, steps, ancillaries))
+    result: xr.Dataset = xr.concat(parts, dim="section") if absent else parts[0]
+    if absent:
+        order = [[*kept, *absent].index(section) for section in sections]
+        number = np.arange(len(sections), dtype=np.int32)
+        result = result.isel(section=order).assign_coords(section=("section", number))
+    slanted = labeled.not_level(result, conditioned["zenith_angle"])
+    return result.assign(quality_flag=result["quality_flag"] | slanted)
+
+
+def _empty_section(power: xr.DataArray, section: tuple[float, float], bit: Quality) -> xr.Dataset:
+    """Return a section without values, for which no bin is read."""
+    distance = power["range"].to_numpy()
+    few = np.flatnonzero(distance >= section[0])[: labeled.FEWEST_BINS]
+    like = power.isel(range=few)
+    nothing = like.copy(data=np.full(like.shape, np.nan))
+    empty = labeled.homogeneous(nothing, sections=[section], variance=1.0)
+    flags = np.full(empty["quality_flag"].shape, int(bit), np.int32)
+    return empty.assign(quality_flag=empty["quality_flag"].copy(data=flags))
+
+
+def _retrieved(
+    conditioned: xr.Dataset,
+    sections: list[tuple[float, float]],
+    steps: Mapping[str, Step],
+    ancillaries: Ancillaries,
+) -> xr.Dataset:
     quality = conditioned["quality"]
     overlap = overlap_at(steps, ancillaries, conditioned["range"].to_numpy())
     if overlap is not None:
         # A signal with its background cannot be divided: where overlap is not full is left out.
         partial = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
         quality = quality | xr.DataArray(partial.astype(np.int32), dims="range")
-    result = labeled.homogeneous(
+    return labeled.homogeneous(
         conditioned["power"],
-        sections=[(near, far) for near, far in settings["sections"]],
+        sections=sections,
         variance=conditioned["variance"],
         quality=quality,
-        method=settings["method"],
+        method=steps[StepName.HOMOGENEOUS].settings["method"],
         # An estimate scatters, and its scatter must not pass for misfit.
         relative_variance=steps[StepName.NOISE].settings["method"] == "differences",
     )
-    slanted = labeled.not_level(result, conditioned["zenith_angle"])
-    return result.assign(quality_flag=result["quality_flag"] | slanted)
 
 
 def _with_visibility(result: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:

@@ -72,10 +72,26 @@ def test_extinction_agrees_with_the_truth(demo: tuple[Campaign, RunRecord]) -> N
     assert 0.8 < score[good].std() < 1.2
 
 
-def test_a_vertical_path_is_said_not_to_be_homogeneous(
+def test_a_vertical_path_is_left_out_of_homogeneous_retrievals(
     demo: tuple[Campaign, RunRecord],
 ) -> None:
     _, record = demo
+    scenes = [scene for scene in record.scenes if scene.instrument == "hill-vertical"]
+    assert scenes
+    for scene in scenes:
+        assert all(product.kind != "homogeneous" for product in scene.products)
+        assert scene.plan is not None
+        (left,) = (left for left in scene.plan.left_out if left.rule == "section_level")
+        assert left.channel == "analog_532o"
+        assert "climbs by 3750 m" in left.reason
+        assert left.number == pytest.approx(3750.0)
+
+
+def test_a_vertical_path_that_is_retrieved_all_the_same_is_said_not_to_be_homogeneous(
+    repository: Path, demo_archive: Path, tmp_path: Path
+) -> None:
+    campaign = _campaign(repository, demo_archive, tmp_path).model_copy(update={"all_steps": True})
+    record = run(campaign, prepare(campaign, instruments=["hill-vertical"]))
     retrieved = _products(record, "homogeneous", "hill-vertical")
     assert (retrieved["quality_flag"].values != 0).mean() > 0.99
 
@@ -200,7 +216,11 @@ def test_a_profile_without_shots_is_flagged_and_the_rest_stands(tmp_path: Path) 
         "homogeneous": {"channels": ["photon_532o", "analog_532o"], "sections": [[750, 4500]]},
     }
     campaign = factories.campaign(products=wanted).model_copy(
-        update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
+        update={
+            "archive": str(tmp_path / "raw"),
+            "output": str(tmp_path / "out"),
+            "all_steps": True,
+        }
     )
     record = run(campaign, prepare(campaign))
     assert not record.failed
@@ -273,6 +293,11 @@ def test_the_campaign_knows_the_pointing_better_than_the_header(tmp_path: Path) 
         campaign = factories.campaign(facts=[facts]).model_copy(
             update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / f"{zenith_angle}")}
         )
+        if not level:
+            (scene,) = run(campaign, prepare(campaign)).scenes
+            assert scene.error.startswith("nothing to do: homogeneous of photon_532o: section")
+            assert not scene.products
+        campaign = campaign.model_copy(update={"all_steps": True})
         record = run(campaign, prepare(campaign))
         (path,) = (product.path for product in record.scenes[0].products)
         product = xr.load_dataset(Path(record.products) / path)

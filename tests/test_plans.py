@@ -30,7 +30,15 @@ def _left_out(result: Plan, channel: str) -> dict[str, str]:
 def test_photon_channel() -> None:
     result = plan(_scene(), factories.campaign())
     steps = _steps(result, "photon_532o")
-    assert list(steps) == ["read", "overlap", "dead_time", "noise", "homogeneous"]
+    assert list(steps) == [
+        "read",
+        "range_gate",
+        "overlap",
+        "dead_time",
+        "noise",
+        "look",
+        "homogeneous",
+    ]
     assert steps["dead_time"] == {"dead_time": 4e-9}
     assert steps["homogeneous"]["sections"] == [[750.0, 4500.0]]
     assert "photon background" in _left_out(result, "photon_532o")["dark"]

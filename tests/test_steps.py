@@ -116,7 +116,9 @@ def campaign(products, **facts) -> Campaign:
         "analog_532o": {"noise_variance": 4e-4},
     }
     told = {"zenith_angle": 0.0, "channels": channels, **facts}
-    return factories.campaign(products=products, facts=[told])
+    made = factories.campaign(products=products, facts=[told])
+    # Sections along a vertical beam too: what a step does is asked here, not whether it is worth it.
+    return made.model_copy(update={"all_steps": True})
 
 
 def planned(settings: Campaign, *, dark: bool = False, bins: int = 1200) -> Plan:

@@ -10,6 +10,8 @@ import glob
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,27 @@ from lidarops.records import Granule
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
 
 _CHUNK_BYTES = 16_000_000
+
+
+@dataclass(slots=True)
+class Tally:
+    """Bytes of signals that were read."""
+
+    bytes: int = 0
+
+
+_TALLY: ContextVar[Tally | None] = ContextVar("tally", default=None)
+
+
+@contextmanager
+def counting() -> Iterator[Tally]:
+    """Count the bytes of signals that are read in this thread; headers do not count."""
+    tally = Tally()
+    token = _TALLY.set(tally)
+    try:
+        yield tally
+    finally:
+        _TALLY.reset(token)
 
 
 def open_archive(
@@ -138,6 +161,9 @@ class _Chunk:
                 values[index] = row
             else:
                 to_physical(row, self.scales[index], values[index])
+        tally = _TALLY.get()
+        if tally is not None:
+            tally.bytes += len(self.offsets) * self.bins * row.itemsize
         return values
 
 

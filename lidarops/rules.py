@@ -1,0 +1,14 @@
+"""All rules of plans in one table: name, step, what is asked, and the function that answers."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lidarops.plan_rules import CONDITIONING, GLUING, Rule
+from lidarops.plans import ABSENT, CHANNEL, GATE, PRODUCTS, STRANGE
+from lidarops.refinement import REFINEMENTS
+
+RULES: Final[tuple[Rule, ...]] = tuple(
+    dict.fromkeys((ABSENT, STRANGE, CHANNEL, GATE, *CONDITIONING, *GLUING, *PRODUCTS, *REFINEMENTS))
+)
+"""In the order in which they are asked; the last ones in the worker, of some profiles."""

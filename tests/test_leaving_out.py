@@ -1,0 +1,367 @@
+"""What plans leave out: every rule by name, and that nothing good is lost by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import factories
+import mixed_campaign
+import numpy as np
+import pytest
+import rawfiles
+import xarray as xr
+
+from lidarops.engine import run
+from lidarops.flags import Quality
+from lidarops.pipeline import Options, prepare, reprocess
+from lidarops.plans import CHANNEL, GATE, PRODUCTS, plan
+from lidarops.processing import Job, process
+from lidarops.records import Plan, Role, RunRecord
+from lidarops.refinement import GAP, WITHOUT, refine
+from lidarops.rules import RULES
+from lidarops.scenes import cut
+from lidarops.simulate.campaign import simulate
+
+SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}
+HOMOGENEOUS = {"homogeneous": SECTIONS}
+
+
+def planned(*granules: Any, all_steps: bool = False, **changes: Any) -> Plan:
+    campaign = factories.campaign(**changes).model_copy(update={"all_steps": all_steps})
+    return plan(cut(campaign, granules or (factories.granule(0),)).scenes[0], campaign)
+
+
+def decided(made: Plan, rule: str) -> tuple[list[str], list[str]]:
+    """Return the steps that a rule asks for, and what it leaves out."""
+    steps = [step.name for step in made.steps if step.rule == rule]
+    return steps, [left.reason for left in made.left_out if left.rule == rule]
+
+
+# The table ------------------------------------------------------------------------------------
+
+
+def test_rules_have_names_and_questions():
+    assert len({rule.name for rule in RULES}) == len(RULES)
+    assert all(rule.asks.endswith("?") for rule in RULES)
+    assert {CHANNEL, GATE, *PRODUCTS} <= set(RULES)
+
+
+def told(**facts: Any) -> dict[str, Any]:
+    return {"facts": [facts]}
+
+
+def wanted(**products: Any) -> dict[str, Any]:
+    return {"products": products}
+
+
+LEVEL = factories.granule(0)
+UP = factories.granule(0, zenith_angle=0.0)
+DARK = factories.granule(-30, path="dark/d", role=Role.DARK)
+SCAN = [factories.granule(k, zenith_angle=15.0 * k) for k in range(6)]
+ANALOG = wanted(signal={"channels": ["analog_532o"]})
+ELASTIC = wanted(elastic={"channels": ["photon_532o"]})
+TAIL = wanted(elastic={"channels": ["photon_532o"], "background": "tail_mean"})
+GLUED = wanted(elastic={"channels": ["glued_532o"]})
+LATE = {**GLUED, **told(channels={"analog_532o": {"lag": 3}})}
+MULTI = wanted(multiangle={"channels": ["photon_532o"]})
+CALM = wanted(multiangle={"channels": ["photon_532o"], "largest_gradient": 0.0})
+FEW = wanted(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_000]})
+OF_ANALOG = wanted(homogeneous={**SECTIONS, "channels": ["analog_532o"]})
+OFFSET = told(channels={"photon_532o": {"range_offset": 5}})
+BEYOND = wanted(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 16_000]]})
+
+
+@pytest.mark.parametrize(
+    ("rule", "needing", "needless"),
+    [
+        ("channel", ([LEVEL], {}), ([LEVEL], wanted(signal={"channels": []}))),
+        ("range_gate", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
+        ("overlap", ([LEVEL], {}), ([LEVEL], told())),
+        ("range_offset", ([LEVEL], OFFSET), ([LEVEL], {})),
+        ("dark", ([LEVEL, DARK], ANALOG), ([LEVEL], ANALOG)),
+        ("dead_time", ([LEVEL], {}), ([LEVEL], told())),
+        ("lag", ([UP], LATE), ([UP], GLUED)),
+        ("signal", ([LEVEL], ANALOG), ([LEVEL], FEW)),
+        ("homogeneous", ([LEVEL], {}), ([LEVEL], ANALOG)),
+        ("known_shape", ([UP], ELASTIC), ([UP], TAIL)),
+        ("elastic", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
+        ("gradient", (SCAN, MULTI), (SCAN, CALM)),
+        ("multiangle", (SCAN, MULTI), ([UP], MULTI)),
+    ],
+)  # fmt: skip
+def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, needing, needless):
+    granules, changes = needing
+    steps, _ = decided(planned(*granules, **changes), rule)
+    assert steps
+    granules, changes = needless
+    made = planned(*granules, **changes)
+    steps, reasons = decided(made, rule)
+    assert reasons
+    assert all(reasons)
+    channels = {left.channel for left in made.left_out if left.rule == rule}
+    assert not [step for step in made.steps if step.rule == rule and step.channel in channels]
+
+
+@pytest.mark.parametrize(
+    ("rule", "asked", "unasked"),
+    [
+        ("noise", ([LEVEL], {}), ([LEVEL], wanted())),
+        ("glue", ([UP], GLUED), ([UP], ELASTIC)),
+        ("background", ([LEVEL], ANALOG), ([LEVEL], {})),
+        ("average", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
+        ("molecular", ([UP], ELASTIC), ([LEVEL], {})),
+        ("reference", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
+        ("look", ([LEVEL], {}), ([UP], {})),
+    ],
+)
+def test_a_question_that_does_not_arise_is_not_answered(rule, asked, unasked):
+    assert decided(planned(*asked[0], **asked[1]), rule)[0]
+    assert decided(planned(*unasked[0], **unasked[1]), rule) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("rule", "changes"),
+    [
+        ("section_inside", BEYOND),
+        ("channel_present", wanted(signal={"channels": ["photon_999x"]})),
+        ("facts_fit", told(channels={"photon_999x": {}})),
+    ],
+)
+def test_what_cannot_be_is_left_out_by_name(rule, changes):
+    assert decided(planned(LEVEL, **changes), rule)[1]
+    assert decided(planned(LEVEL), rule) == ([], [])
+
+
+# Headers --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("angles", "kept"),
+    [
+        ([90.0], 2),
+        ([89.0], 1),
+        ([88.0], 0),
+        ([None], 0),
+        ([0.0, 90.0], 2),
+        ([0.0, None], 0),
+    ],
+)
+def test_sections_are_retrieved_where_a_beam_may_be_level(angles, kept):
+    # At 89 degree 3750 m climb by 65 m, 6000 m by 105 m, and 100 m are level.
+    granules = [factories.granule(k, zenith_angle=angle) for k, angle in enumerate(angles)]
+    made = planned(*granules, products=HOMOGENEOUS)
+    step = [step for step in made.steps if step.name == "homogeneous"]
+    assert sum(len(each.settings["sections"]) for each in step) == kept
+    assert len(decided(made, "section_level")[1]) == 2 - kept
+    whole = planned(*granules, products=HOMOGENEOUS, all_steps=True)
+    (step,) = (step for step in whole.steps if step.name == "homogeneous")
+    assert len(step.settings["sections"]) == 2
+    assert any("all steps" in left.reason for left in whole.left_out)
+
+
+def test_the_gate_holds_the_farthest_section_and_what_tells_its_noise():
+    # 7500 m, a tenth more for the variance, and two bins for rounding.
+    made = planned(products=HOMOGENEOUS)
+    (gate,) = (step for step in made.steps if step.name == "range_gate")
+    assert gate.settings == {"bins": 1102}
+    assert gate.number == 1102
+    assert gate.as_dict()["rule"] == "range_gate"
+    moved = told(channels={"photon_532o": {"range_offset": -75.0}})
+    (gate,) = (s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_gate")
+    assert gate.settings == {"bins": 1112}
+
+
+# Looks ----------------------------------------------------------------------------------------
+
+RANGE = 7.5 * (np.arange(2000) + 0.5)
+
+
+def sky(light, *, saturated=()):
+    """Give profiles of a constant sky, in some of which there is light, by minute."""
+    seen: list[float] = []
+
+    def profiles(_channel, granules):
+        minutes = [(g.start - factories.DAY).total_seconds() / 60 for g in granules]
+        seen.extend(minutes)
+        power = np.full((len(minutes), RANGE.size), 3.0)
+        power += np.array([[light(minute)] for minute in minutes]) * 1e6 / RANGE**2
+        quality = np.zeros(power.shape, np.int32)
+        quality[[minute in saturated for minute in minutes], 200] = int(Quality.SATURATED)
+        pair = ("time", "range")
+        return xr.Dataset(
+            {
+                "power": (pair, power),
+                "variance": (pair, np.full(power.shape, 0.01)),
+                "quality": (pair, quality),
+            },
+            coords={"range": RANGE},
+        )
+
+    return profiles, seen
+
+
+def looked(profiles, count=600):
+    granules = [factories.granule(float(k)) for k in range(count)]
+    return refine(planned(*granules, products=HOMOGENEOUS), granules, profiles)
+
+
+def absent(made):
+    (step,) = (step for step in made.steps if step.name == "homogeneous")
+    return step.settings.get(WITHOUT, [])
+
+
+def test_sixteen_profiles_with_light_are_enough():
+    profiles, seen = sky(lambda _: 1.0)
+    made = looked(profiles)
+    assert absent(made) == []
+    assert len(seen) == 16
+
+
+def test_a_dark_scene_is_left_out_and_told_with_its_number():
+    made = looked(sky(lambda _: 0.0)[0])
+    assert absent(made) == [[750.0, 4500.0, "LOW_SIGNAL"], [1500.0, 7500.0, "LOW_SIGNAL"]]
+    left = [each for each in made.left_out if each.rule == "section_dark"]
+    assert [each.channel for each in left] == ["photon_532o"] * 2
+    assert all(each.number is not None and each.number < 1e-6 for each in left)
+    assert "no light" in left[0].reason
+
+
+@pytest.mark.parametrize("begins", [3, 101, 333, 580])
+def test_light_of_ten_minutes_in_a_dark_day_is_not_lost(begins):
+    made = looked(sky(lambda minute: float(begins <= minute <= begins + 10))[0])
+    assert absent(made) == []
+
+
+def test_profiles_that_are_looked_at_lie_close():
+    profiles, seen = sky(lambda _: 0.0)
+    looked(profiles)
+    assert np.diff(sorted(seen)).max() <= GAP.total_seconds() / 60
+    assert len(seen) == len(set(seen))
+
+
+def test_sections_that_are_always_saturated_are_left_out():
+    profiles, _ = sky(lambda _: 1.0, saturated=set(range(600)))
+    # Bin 200 lies at 1504 m: in both.
+    assert [bit for *_, bit in absent(looked(profiles))] == ["SATURATED"] * 2
+    profiles, _ = sky(lambda _: 1.0, saturated=set(range(600)) - set(range(70, 81)))
+    assert absent(looked(profiles)) == []
+
+
+def test_a_refined_plan_stays_as_it_is():
+    made = looked(sky(lambda _: 0.0)[0])
+    granules = [factories.granule(float(k)) for k in range(600)]
+    assert refine(made, granules, sky(lambda _: 1.0)[0]) == made
+
+
+# Files ----------------------------------------------------------------------------------------
+
+
+def archive(folder: Path, **changes: Any):
+    for k in range(4):
+        rawfiles.write(folder / "raw" / "coast" / f"h{k}", rawfiles.content(k, bins=1000))
+    return factories.campaign(**changes).model_copy(
+        update={"archive": str(folder / "raw"), "output": str(folder / "out")}
+    )
+
+
+def test_a_file_that_is_known_is_not_read_again(tmp_path):
+    campaign = archive(tmp_path)
+    first = reprocess(campaign)
+    again = reprocess(campaign, options=Options(force=True))
+    whole = reprocess(campaign.model_copy(update={"all_steps": True}), options=Options(force=True))
+    size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
+    (one,), (two,), (three,) = first.scenes, again.scenes, whole.scenes
+    assert one.inputs == two.inputs == three.inputs
+    assert one.bytes_read - two.bytes_read == size
+    assert three.bytes_read == size + 4 * 1000 * 4
+
+
+@pytest.mark.parametrize("far", [1500, 3000, 4500, 6700])
+@pytest.mark.parametrize("offset", [-60.0, 0.0, 40.0])
+def test_the_gate_changes_no_bit_of_a_section(tmp_path, far, offset):
+    facts = {"zenith_angle": 90, "channels": {"photon_532o": {"range_offset": offset}}}
+    products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, far]]}}
+    campaign = archive(tmp_path, facts=[facts], products=products)
+    scene = prepare(campaign).scenes[0]
+    made = plan(scene, campaign)
+    values, read = [], []
+    for dropped in (["look"], ["look", "range_gate"]):
+        steps = tuple(step for step in made.steps if step.name not in dropped)
+        outcome = process(Job(campaign, scene, replace(made, steps=steps)))
+        values.append(xr.load_dataset(campaign.products_root / outcome.products[0].path))
+        read.append(outcome.bytes_read)
+    assert read[0] < read[1]
+    for name in ("extinction", "extinction_standard_error", "reduced_chi2", "quality_flag"):
+        one, two = (each[name].to_numpy() for each in values)
+        np.testing.assert_array_equal(one, two)
+    assert np.isfinite(values[0]["extinction"]).any()
+
+
+def test_a_changed_time_has_a_file_read_again(tmp_path):
+    campaign = archive(tmp_path)
+    one = reprocess(campaign).scenes[0]
+    size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
+    scene = prepare(campaign).scenes[0]
+    stale = replace(scene, granules=tuple(replace(g, mtime_ns=1) for g in scene.granules))
+    found = process(Job(campaign, stale, plan(stale, campaign)))
+    assert found.inputs == one.inputs
+    assert found.bytes_read > size
+
+
+def test_what_was_asked_for_is_told_first_where_there_is_nothing_to_do(tmp_path):
+    campaign = archive(tmp_path, facts=[{"zenith_angle": 0.0}])
+    (scene,) = run(campaign, prepare(campaign)).scenes
+    assert scene.error.startswith("nothing to do: homogeneous of photon_532o: section 750-4500 m")
+    assert "no product of the campaign asks" not in scene.error
+
+
+# All together ---------------------------------------------------------------------------------
+
+
+def _opened(record: RunRecord) -> dict[str, xr.Dataset]:
+    root = Path(record.products)
+    return {
+        product.path: xr.load_dataset(root / product.path)
+        for scene in record.scenes
+        for product in scene.products
+    }
+
+
+_MAIN = {
+    "homogeneous": ("extinction", "extinction_standard_error"),
+    "elastic": ("backscatter", "backscatter_standard_error"),
+    "multiangle": ("extinction", "extinction_standard_error"),
+    "visibility": ("extinction", "extinction_standard_error"),
+}
+
+
+@pytest.mark.slow
+def test_what_is_left_out_loses_and_changes_nothing_good(tmp_path):
+    campaign = mixed_campaign.write(tmp_path, profiles=40)
+    simulate(campaign)
+    reprocess(campaign)
+    planned_run = reprocess(campaign, options=Options(force=True))
+    everything = campaign.model_copy(
+        update={"all_steps": True, "output": str(tmp_path / "everything")}
+    )
+    whole = reprocess(everything, options=Options(force=True))
+    assert len(whole.scenes) >= 8
+    ours, theirs = _opened(planned_run), _opened(whole)
+    good = 0
+    for path, full in theirs.items():
+        kind = path.rsplit("/", 1)[-1]
+        value, error = next(names for key, names in _MAIN.items() if key in kind)
+        unflagged = full["quality_flag"].to_numpy() == 0
+        good += int(unflagged.sum())
+        if path not in ours:
+            assert not unflagged.any()
+            continue
+        mine = ours[path]
+        assert (mine["quality_flag"].to_numpy()[unflagged] == 0).all()
+        apart = np.abs(mine[value].to_numpy() - full[value].to_numpy())[unflagged]
+        assert np.all(apart <= 0.1 * full[error].to_numpy()[unflagged])
+    assert good > 1000
+    read = [sum(scene.bytes_read for scene in record.scenes) for record in (planned_run, whole)]
+    assert read[0] <= 0.5 * read[1]
