@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy import stats
 
 from lidarops.bench.multiangle_cases import correlated
 from lidarops.bench.stability_draws import Failure, Judged, Mask
@@ -26,9 +27,12 @@ _STARTS: Final = (200.0, 12e3)
 _LENGTHS: Final = (100.0, 12e3)
 _STEPS: Final = (3.75, 7.5, 15.0, 37.5)
 _BINS: Final = (8, 800)
-_SOLVABLE: Final = 0.09
+_SOLVABLE: Final = 0.075
 """Least standard error of extinction over extinction + 1 / mean range up to which a path counts as
-solvable."""
+solvable: 4 of them reach the lower bound of the search, -0.3 / last range."""
+_DEEPEST: Final = 600.0
+"""Optical depth, there and back, from the lidar to the first bin, above which the amplitude at
+range zero leaves the numbers that a computer has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,9 +218,10 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Solve random paths of one geometry, class by class."""
     paths, rng = scenes(cluster, profiles)
     with np.errstate(under="ignore", over="ignore", invalid="ignore", divide="ignore"):
-        could: Mask = least_relative_error(paths) <= _SOLVABLE
+        least = least_relative_error(paths)
     bounds = homogeneous.HIGHEST_OPTICAL_DEPTH / float(paths.depth[0, -1])
-    could &= paths.extinction[:, 0] < 0.9 * bounds
+    within = paths.extinction[:, 0] < 0.9 * bounds
+    within &= 2.0 * paths.extinction[:, 0] * paths.range[0] < _DEEPEST
     for failure, violate in FAILURES:
         with np.errstate(under="ignore"):
             seen = violate(paths, rng)
@@ -226,7 +231,15 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
         elif failure.name == "outliers":
             power = _with_outliers(power, rng)
         noise = None if "not stated" in failure.name else 1.0
+        wider = _widening(paths.range.size) if noise is None else 1.0
+        could: Mask = within & (wider * least <= _SOLVABLE)
         yield from _solved(failure, paths, seen, power, noise, could)
+
+
+def _widening(bins: int) -> float:
+    """Return how much wider 4 standard errors are where the noise is estimated from the bins."""
+    freedom = 18.0 / 35.0 * (bins - 2)
+    return float(stats.t.isf(stats.norm.sf(4.0), freedom) / 4.0)
 
 
 def _solved(

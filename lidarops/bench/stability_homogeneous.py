@@ -36,11 +36,6 @@ _NEWTON: Final = 400
 """Steps of the oracle's root, which starts far above it."""
 _WRONG: Final = Quality.POOR_FIT | Quality.NOT_HOMOGENEOUS
 _ANY: Final = Quality(REJECTING)
-_LEAK: Final = (
-    "without a variance, differences along range tell the noise; where the signal's own curvature"
-    " is all there is, the correction for noise that is not there moves the root of lag 1 by 10"
-    " standard errors"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +243,7 @@ def _study() -> tuple[Case, ...]:
               expected=(Near("background", partial(_rooted, _DEEP, 1), 3.2e-7 * 1000.0,
                              relative=False),)),
         _case("S2 cubic, the same, against the truth", build=lambda: _exact(_DEEP, lag=1),
-              solve=cubic, expected=(Honest("background", 1e11),), finding=_LEAK),
+              solve=cubic, expected=(Honest("background", 1e11), Raised(_ANY))),
         _case("S3 extinction 1e-8 per km", build=lambda: _exact(Path(extinction=1e-11)),
               solve=solve,
               expected=(Near("background", 370.0, 1e-13 * 1000.0, relative=False),
@@ -430,7 +425,7 @@ def _unsolvable() -> tuple[Case, ...]:
               solve=solve, expected=(Raised(_ANY), *no_value)),
         _case("a variance of 1e300", build=lambda: CLEAR.arguments(variance=1e300), solve=solve,
               expected=(Raised(_ANY),)),
-        _case("a million bins, direct", build=partial(_long, 1_000_000, "direct"), solve=solve,
+        _case("200 000 bins, direct", build=partial(_long, 200_000, "direct"), solve=solve,
               expected=(Honest("extinction", 3e-5, valued=1.0),)),
         _case("a million bins", build=partial(_long, 1_000_000, "auto"), solve=solve,
               expected=(Honest("extinction", 3e-5, valued=1.0),)),

@@ -49,7 +49,6 @@ LAYOUTS: Final[dict[str, Layout]] = {
     "masked, nothing of it": np.ma.masked_array,
     "as a list": lambda array: array.tolist(),
 }
-_CAST: Final = "numpy casts booleans to 32 bits safely, and so they pass for counts of 0 and 1"
 REFUSED: Final[dict[str, Layout]] = {
     "objects": lambda array: array.astype(object),
     "complex numbers": lambda array: array.astype(complex),
@@ -170,7 +169,6 @@ def _refused(retrieval: Retrieval, name: str, layout: Layout) -> Case:
         dict,
         partial(_alike, solver, array, signals_alone, _plain),
         (Refused(RetrievalInputError, field),),
-        _CAST if retrieval is Retrieval.SIGNAL and name == "booleans" else "",
     )
 
 

@@ -41,12 +41,6 @@ _ANY: Final = Quality(REJECTING)
 FLAGGED: Final = Quality.UNSTABLE_INVERSION
 """Stands for any of the retrieval's own flags that doubt a value."""
 _PROFILES: Final = 200
-_AMPLIFIED: Final = (
-    "at the second near vertex, which a cycle reaches against attenuation, the reciprocal of"
-    " extinction is off by a factor, and its linear error is taken where it came to lie: 30 % of"
-    " what is not flagged there is false by up to 20 standard errors"
-)
-_OVERFLOW: Final = "the square of the mean signal overflows, and numpy's warning leaves"
 
 
 def answered(found: MultiPositionResult) -> Answer:
@@ -186,7 +180,7 @@ def _networks() -> tuple[Case, ...]:
               expected=(Honest("extinction", 2e-5, most=5e-3),)),
         _case("A e extinction of 20 per km, exact cycle",
               build=lambda: arguments(air=homogeneous(0.02), method="cycle"), solve=solve,
-              expected=(Honest("extinction", 0.02, most=5e-3),), finding=_AMPLIFIED),
+              expected=(Honest("extinction", 0.02, most=5e-3),)),
         _case("A e the same, network", build=lambda: arguments(air=homogeneous(0.02)),
               solve=solve, expected=(Honest("extinction", 0.02, most=5e-3),)),
         _case("A f extinction of 60 per km without noise",
@@ -209,7 +203,7 @@ def _networks() -> tuple[Case, ...]:
         ),
         *(
             _case(f"A h one gate of {value:g}", build=partial(_one_gate, value), solve=solve,
-                  expected=(honest,), finding=_OVERFLOW if value == 1e300 else "")
+                  expected=(honest,))
             for value in (np.nan, 0.0, -1e9, np.inf, 1e300)
         ),
         _case("A i one crossing of two rays, without prior", build=_two_lidars,

@@ -34,11 +34,6 @@ DEAD_TIME: Final = 4e-9
 """s."""
 _BITS: Final = 12
 _TOP: Final = SHOTS * (2**_BITS - 1)
-_ROUNDED: Final = (
-    "the floor of the variance is that of rounding the sum to whole counts, 1 / 12 N^2 steps"
-    " squared; rounding each shot leaves 1 / 12 N at least, and the same error in all shots"
-    " where the noise does not reach over a step"
-)
 _FOLDED: Final = Quality.PILE_UP | Quality.SATURATED
 
 
@@ -119,9 +114,13 @@ def _analog_cases() -> tuple[Case, ...]:
     return (
         _case("analog, noise of 2 steps", build=noisy, solve=analog,
               expected=(Stands(), Honest("power", _level(100.3), errors=5.0))),
-        _case("B d analog, noise of 0.05 steps: rounding does not average out",
-              build=lambda: _steady(100.3, 0.05), solve=analog,
-              expected=(Honest("power", _level(100.3)),), finding=_ROUNDED),
+        *(
+            _case(f"B d analog, noise of {noise:g} steps at {steps:g}: rounding stays",
+                  build=partial(_steady, steps, noise), solve=analog,
+                  expected=(Honest("power", _level(steps), valued=1.0),))
+            for steps, noise in ((100.3, 0.0), (100.3, 0.05), (100.45, 0.05), (100.4, 0.1),
+                                 (100.25, 0.2), (100.25, 0.3), (100.25, 0.4))
+        ),
         _case("B e analog without shots", build=lambda: _empty(0), solve=analog,
               expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
         _case("analog of zeros alone", build=_empty, solve=analog,
@@ -153,6 +152,9 @@ def _analog_cases() -> tuple[Case, ...]:
               build=lambda: noisy() | {"dark": np.where(np.arange(200) == 3, np.nan, 1.0)},
               expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
         _case("counts as floats with fractions", build=lambda: {"counts": np.full((2, 200), 0.5)},
+              solve=analog, expected=(Refused(RetrievalInputError, "counts"),)),
+        _case("counts that are true or false",
+              build=lambda: {"counts": np.ones((2, 200), dtype=np.bool_)},
               solve=analog, expected=(Refused(RetrievalInputError, "counts"),)),
         _case("counts of 64 bits beyond 32",
               build=lambda: {"counts": np.full((2, 200), 2**40)}, solve=analog,
@@ -194,6 +196,9 @@ def _photon_cases() -> tuple[Case, ...]:
         _case("the largest integer in all bins", solve=photon,
               build=lambda: {"counts": np.full((1, 200), 2**31 - 1, np.int32)},
               expected=(Raised(Quality.INPUT_MISSING | Quality.SATURATED), Missing("power"))),
+        _case("photon counts that are true or false", solve=photon,
+              build=lambda: {"counts": np.ones((2, 200), dtype=np.bool_)},
+              expected=(Refused(RetrievalInputError, "counts"),)),
         _case("negative dead time", build=lambda: _rate_counts(1.0) | {"dead_time": -1e-9},
               solve=photon, expected=(Refused(RetrievalInputError, "dead_time"),)),
         _case("bin width of zero", build=lambda: _rate_counts(1.0) | {"bin_width": 0.0},

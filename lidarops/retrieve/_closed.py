@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,9 @@ from lidarops.retrieve.geometry import Cycle
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
+
+_LARGEST_RELATIVE_ERROR: Final = 1.0 / 3.0
+"""Beyond, no linear error tells how far off a value is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,15 +173,41 @@ def by_cycle(
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             out.extinction[:, vertex] = 1.0 / value
             out.variance[:, vertex] = variance / value**4
+            amplified = shaky(out.extinction[:, [vertex]], out.variance[:, [vertex]], rays.block)
             if not unbiased:
                 bias = _modelled_bias(turned, rays, chosen)
                 out.variance[:, vertex] += (bias * out.extinction[:, vertex]) ** 2
-            shaky = ~(np.abs(determinant) >= 3.0 * np.sqrt(spread))
-        out.weak_attenuation[:, vertex] = shaky if unbiased else weak
+            singular = ~(np.abs(determinant) >= 3.0 * np.sqrt(spread))
+        out.weak_attenuation[:, vertex] = amplified[:, 0] | (singular if unbiased else weak)
         out.pole[:, vertex] = pole
         out.far_start[vertex] = cycle.sign[j] < 0
         if j == 0:
             out.multiplier[:] = chosen
+    return out
+
+
+def shaky(extinction: Array, variance: Array, block: Indices) -> Booleans:
+    """Return which values have an error above a third of them, or typically in their block.
+
+    Where noise is amplified beyond that, a value comes to lie anywhere, and the error that is
+    taken where it lies says nothing: of such profiles of a block, none is to be believed.
+
+    Parameters
+    ----------
+    extinction, variance : (profile, vertex) float
+        m-1 and m-2; NaN where there is none.
+    block : (profile,) int
+    """
+    with np.errstate(invalid="ignore"):
+        out = np.asarray(variance > (_LARGEST_RELATIVE_ERROR * extinction) ** 2)
+    for number in np.unique(block):
+        mine = np.flatnonzero(block == number)
+        known = np.isfinite(variance[mine])
+        for vertex in np.flatnonzero(known.any(axis=0)):
+            rows = mine[known[:, vertex]]
+            error = np.sqrt(np.median(variance[rows, vertex]))
+            typical = np.median(extinction[rows, vertex])
+            out[mine, vertex] |= error > _LARGEST_RELATIVE_ERROR * typical
     return out
 
 

@@ -439,7 +439,7 @@ def _set_noise(tables: Tables, s: _Scratch, bins: int, mode: Mode) -> None:
 
 
 @_compiled
-def _convert(tables: Tables, s: _Scratch, bins: int) -> None:
+def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
     """Fill the results in SI units."""
     found, results = s.found, s.results
     for p in range(BLOCK):
@@ -451,11 +451,12 @@ def _convert(tables: Tables, s: _Scratch, bins: int) -> None:
         size = found[_B, p]
         amplitude = size * results[2, p]
         results[0, p] = found[_P, p]
-        results[1, p] = found[_P_ERROR, p] * root
+        wide = root * widening
+        results[1, p] = found[_P_ERROR, p] * wide
         results[2, p] = amplitude
-        results[3, p] = abs(amplitude) * (found[_B_ERROR, p] * root)
+        results[3, p] = abs(amplitude) * (found[_B_ERROR, p] * wide)
         results[4, p] = found[_TAU, p] / tables.length
-        results[5, p] = found[_TAU_ERROR, p] * root / tables.length
+        results[5, p] = found[_TAU_ERROR, p] * wide / tables.length
         results[6, p] = s.sign[p] * found[_F, p] / root
         results[7, p] = found[_ENERGY, p] / (noise * (bins - 3))
         curvature = found[_CURVATURE, p]
@@ -514,7 +515,7 @@ def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: Co
         _look_back(block, s, not mode.known_variance)
     bins = block.shape[1]
     _set_noise(tables, s, bins, mode)
-    _convert(tables, s, bins)
+    _convert(tables, s, bins, limits.widening)
     _judge(tables, s, mode, limits)
     _settle_exceptions(tables, s, mode)
 

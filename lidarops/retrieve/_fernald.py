@@ -250,20 +250,28 @@ def _measure_certainty(
     by_reference: float,
     offset: float,
     path: Array,
-    least_square: float,
+    limits: Array,
     work: Array,
+    of_noise: Array,
 ) -> None:
-    """Compare denominators with their errors, without what changes the gain of a bin as much."""
+    """Compare denominators with their errors, without what changes the gain of a bin as much.
+
+    `limits` are the least square of the denominator over its variance, and the one from which on
+    errors by noise are skewed, for which they are widened here.
+    """
     d, share, others, certainty = work[DENOMINATOR], work[OWN_SHARE], work[OTHERS], work[CERTAINTY]
     by_offset, by_ratio, by_air = work[BY_OFFSET], work[BY_RATIO], work[BY_AIR]
     reference = by_reference * by_reference
     for i in range(variance.size):
-        square = others[i] + share[i] * share[i] * variance[i] + reference
-        square += offset * offset * by_offset[i] * by_offset[i]
+        noise = others[i] + share[i] * share[i] * variance[i]
+        noise += offset * offset * by_offset[i] * by_offset[i]
+        square = noise + reference
         ratio = by_ratio[i] - d[i] * path[GAIN_RATIO, i]
         air = by_air[i] - d[i] * path[GAIN_AIR, i]
         square += ratio * ratio + air * air
-        certainty[i] = d[i] * d[i] - least_square * square
+        certainty[i] = d[i] * d[i] - limits[0] * square
+        skewed = limits[1] * noise / (d[i] * d[i])
+        of_noise[i] *= max(1.0, 0.98 + skewed * math.sqrt(skewed))
 
 
 @_compiled
@@ -417,9 +425,9 @@ def invert(
         Of the lidar ratio in sr, and of the air, relative.
     causes : (profile or 1, 2) float64
         Standard error of the background, relative one of the scattering ratio.
-    limits : (3,) float64
+    limits : (4,) float64
         m, the longest gap that is bridged; least share of the denominator at the reference;
-        least square of the denominator over its variance.
+        least square of the denominator over its variance, and of that by noise for `SKEWED`.
     out : (`FIELDS`, profile, bin) float64
         Gets what this module names, NaN where nothing is known.
     scalars : (profile, `SCALARS`) float64
@@ -462,7 +470,7 @@ def invert(
             )  # fmt: skip
             change = -calibration[0] * cause[1] * calibration[4]
             _solve_bins(power[k], noise, path, change, cause[0], work, k, out)
-            _measure_certainty(noise, change, cause[0], path, limits[2], work)
+            _measure_certainty(noise, change, cause[0], path, limits[2:], work, out[NOISE, k])
             nearest = _doubt(start, limits[1] * calibration[0], work, state[k])
         if nearest >= 0:
             scale = _scale(nearest, noise, range_, path, change, cause[0], work, out[:, k])

@@ -201,11 +201,11 @@ def _flat(
     verdict = judge(fit, known_variance=problem.known_variance, unknowns=unknowns)
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        level = verdict.noise
+        level = verdict.noise * verdict.widening**2
         background_error = np.sqrt(fit.background_variance * level + given.background)
         relative_error = np.sqrt(fit.amplitude_relative_variance * level + given.amplitude_relative)
         extinction_error = np.sqrt(fit.extinction_variance * level + given.extinction)
-        signal_to_noise = np.copysign(np.sqrt(fit.signal_energy / level), fit.amplitude)
+        signal_to_noise = np.copysign(np.sqrt(fit.signal_energy / verdict.noise), fit.amplitude)
         amplitude_error = np.abs(fit.amplitude) * relative_error
 
     def of(values: Array, where: npt.NDArray[np.bool_]) -> Array:

@@ -285,7 +285,8 @@ def _loudness(mean: Array, single: Array, layout: Layout, *, relative: bool) -> 
     out = np.zeros((mean.shape[0], total))
     for c in range(total):
         ray, gate = layout.crossings.ray[c], slice(layout.window[c], layout.window[c] + gates)
-        with np.errstate(invalid="ignore", divide="ignore"):
+        # A wild gate may be so large that its square is none.
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             level = mean[:, ray, gate].sum(axis=1) / gates
             spread = single[:, ray, gate].sum(axis=1) / gates
             out[:, c] = spread if relative else np.where(level > 0, spread / level**2, np.inf)

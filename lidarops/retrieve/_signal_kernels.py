@@ -288,7 +288,7 @@ def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float
 
 
 @_compiled
-def _estimate(power: Array, noise: Noise, least: float, s: Scratch, out: Array) -> None:
+def _estimate(power: Array, noise: Noise, s: Scratch, out: Array) -> None:
     complete = _load(power, s.sums)
     _averages(s.sums, noise.narrow, complete, s.mean)
     complete = _load_squares(power, s.sums)
@@ -301,8 +301,7 @@ def _estimate(power: Array, noise: Noise, least: float, s: Scratch, out: Array) 
         light = s.mean[i] - floor
         variance = a + b * (0.0 if light < 0.0 else light)
         # Too few differences for a line, or a signal without noise: what there is, locally.
-        variance = variance if (variance > 0.0) & (variance < math.inf) else s.local[i]
-        out[i] = least if variance < least else variance
+        out[i] = variance if (variance > 0.0) & (variance < math.inf) else s.local[i]
 
 
 @_compiled
@@ -370,21 +369,19 @@ def voltage_profiles(
 
 
 @_compiled
-def noise_profiles(power: Array, noise: Noise, least: Array, s: Scratch, out: Array) -> None:
+def noise_profiles(power: Array, noise: Noise, s: Scratch, out: Array) -> None:
     """Estimate the noise variance of every profile from third differences.
 
     Parameters
     ----------
     power : (profile, bin) float64
     noise : Noise
-    least : (profile,) float64
-        No variance is below.
     s : Scratch
     out : (profile, bin) float64
         Gets the variance.
     """
     for k in range(power.shape[0]):
-        _estimate(power[k], noise, least[k], s, out[k])
+        _estimate(power[k], noise, s, out[k])
 
 
 @_compiled

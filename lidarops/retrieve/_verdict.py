@@ -33,6 +33,8 @@ FEWEST_BINS: Final = 8
 FEWEST_BENDS: Final = 5
 """Second differences below which the noise is taken from the residuals themselves."""
 
+FAR: Final = 4.0
+"""Standard errors beyond which a value must not lie more often than with a known variance."""
 _BEND_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
 
@@ -42,6 +44,8 @@ class Verdict:
     """Noise variance (of unit weight), reduced chi-square and quality of a batch."""
 
     noise: Array
+    widening: Array
+    """Of standard errors that rest on `noise`: 1 where the variance is known."""
     reduced_chi2: Array
     quality: Flags
 
@@ -55,6 +59,7 @@ class _Limits:
     most_misfit: Array
     trend: Array
     outlier: Array
+    widening: Array
 
 
 class CommonLimits(NamedTuple):
@@ -66,6 +71,8 @@ class CommonLimits(NamedTuple):
     most_misfit: float
     curvature: float
     outlier: float
+    widening: float
+    """Of standard errors, which is no limit but depends on the same counts."""
 
 
 def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimits:
@@ -101,7 +108,7 @@ def judge(fit: Estimate, *, known_variance: bool, unknowns: int = 3) -> Verdict:
         limits = _limits(fit, unknowns, known_variance=known_variance)
         tests = (
             (Quality.LOW_SIGNAL, fit.signal_energy / noise > LOWEST_SIGNAL**2),
-            (Quality.POORLY_DETERMINED, _determined(fit, noise)),
+            (Quality.POORLY_DETERMINED, _determined(fit, noise, limits.widening)),
             (Quality.NEGATIVE_AMPLITUDE, fit.amplitude > 0),
             (Quality.AT_BOUND, fit.bounded == 0),
             (Quality.POOR_FIT, reduced >= limits.least_misfit),
@@ -117,7 +124,7 @@ def judge(fit: Estimate, *, known_variance: bool, unknowns: int = 3) -> Verdict:
     quality[fit.status == _estimate.CONSTANT] |= np.int32(Quality.NO_SIGNAL)
     quality[fit.status == _estimate.EMPTY] |= np.int32(Quality.INPUT_MISSING)
     quality[(fit.bins > 0) & (fit.bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
-    return Verdict(noise, reduced, quality)
+    return Verdict(noise, limits.widening, reduced, quality)
 
 
 def _residual_dof(bins: Array, unknowns: int) -> Array:
@@ -131,8 +138,8 @@ def _estimated_noise(fit: Estimate, unknowns: int) -> Array:
     return np.maximum(variance, fit.rounding)
 
 
-def _determined(fit: Estimate, noise: Array) -> npt.NDArray[np.bool_]:
-    error = np.sqrt(fit.extinction_variance * noise)
+def _determined(fit: Estimate, noise: Array, widening: Array) -> npt.NDArray[np.bool_]:
+    error = np.sqrt(fit.extinction_variance * noise) * widening
     scale = fit.extinction + 1.0 / fit.mean_range
     finite = np.isfinite(fit.amplitude * np.sqrt(fit.amplitude_relative_variance * noise))
     determined: npt.NDArray[np.bool_] = finite & (error < LARGEST_RELATIVE_ERROR * scale)
@@ -159,6 +166,7 @@ def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[
         special.chdtri(dof, 0.5 * FALSE_ALARM) / dof,
         np.where(shapes > 0, special.chdtri(shapes, FALSE_ALARM), np.inf),
         np.maximum(OUTLIER, -special.ndtri(0.5 * FALSE_ALARM / np.maximum(bins, 1.0))),
+        np.ones_like(bins),
     )
 
 
@@ -174,4 +182,6 @@ def _estimated_limits(bins: Array, bends: Array, shapes: Array, unknowns: int) -
         np.where(independent, ratio, np.inf),
         np.where(shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - FALSE_ALARM), np.inf),
         np.maximum(OUTLIER, -special.stdtrit(dof, 0.5 * FALSE_ALARM / np.maximum(bins, 1.0))),
+        # An error over its estimate follows Student's distribution.
+        -special.stdtrit(dof, special.ndtr(-FAR)) / FAR,
     )

@@ -21,6 +21,9 @@ _LAG_SHARE: Final = 0.4
 LOWEST_CONTRAST: Final = 10.0
 """Curvature of the quartic at its minimum over what the noise adds to it; below, the minimum may
 be another one, and the standard error understates by a factor of 2 (simulations)."""
+MOST_MISTAKEN: Final = 1.0
+"""Standard errors by which the background may be moved by curvature of the signal that is taken
+for noise."""
 _UNIFORM: Final = 2.0**-22
 """Largest deviation from a uniform grid over the last range: what float32 ranges need."""
 
@@ -101,7 +104,9 @@ def cubic(
         power of each bin. INPUT_MISSING where a bin is not finite, or its variance is 0 where
         that of others is not; TOO_FEW_BINS below 8 bins (NaN below 3), NO_SIGNAL where the
         profile is constant, LOW_SIGNAL where the noise may
-        have moved the minimum to another root, NO_REAL_SOLUTION where the root is no minimum.
+        have moved the minimum to another root (or, where no variance is given and the bins are few
+        or a lag short, curvature of the signal that is taken for noise), NO_REAL_SOLUTION where
+        the root is no minimum.
 
     Raises
     ------
@@ -185,7 +190,8 @@ def solve_cubic(
     quality = np.zeros(count, dtype=np.int32)
     for code, bit in _QUALITY_OF_STATUS.items():
         quality[status == code] |= np.int32(bit)
-    quality[out[:, _cubic.CONTRAST] < LOWEST_CONTRAST] |= np.int32(Quality.LOW_SIGNAL)
+    moved = (out[:, _cubic.CONTRAST] < LOWEST_CONTRAST) | (out[:, _cubic.MISTAKEN] > MOST_MISTAKEN)
+    quality[moved] |= np.int32(Quality.LOW_SIGNAL)
     if bins < FEWEST_BINS:
         quality[status != _cubic.MISSING] |= np.int32(Quality.TOO_FEW_BINS)
     lost = status == _cubic.LOST

@@ -36,7 +36,6 @@ DEFAULT_GATES: Final = 7
 DEFAULT_UNBIASED_MULTIPLIER: Final = 0.25
 """Of the unbiased estimate: its noise is nearly least there, in fields of any kind."""
 _LEAST_PROBABILITY: Final = 1e-4
-_ILL_CONDITIONED: Final = 1.0 / 3.0
 
 
 class Method(StrEnum):
@@ -72,8 +71,8 @@ class VertexFlags:
     """What is wrong with a value: (..., vertex) booleans each."""
 
     ill_conditioned: Booleans
-    """Attenuation around the cycle, or what takes its place, is less than 3 standard errors: of
-    the profile, or typically of its block."""
+    """Attenuation around the cycle, what takes its place, or the value itself is less than 3
+    standard errors: of the profile, or typically of its block."""
     far_start: Booleans
     """The start of the cycle is the far vertex of its ray."""
     not_positive: Booleans
@@ -276,31 +275,12 @@ def _solve_network(
         extinction[:, layout.measured] = np.exp(fit.logarithm)
         variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
     none = np.zeros(shape, dtype=np.bool_)
-    with np.errstate(invalid="ignore"):
-        shaky = variance > (_ILL_CONDITIONED * extinction) ** 2
-    shaky |= _typically_shaky(extinction, variance, rays.block)
+    shaky = _closed.shaky(extinction, variance, rays.block)
     estimate = _closed.Estimate(
         extinction, variance, shaky, none, np.zeros(shape[1], dtype=np.bool_),
         np.full(shape[0], np.nan),
     )  # fmt: skip
     return estimate, fit
-
-
-def _typically_shaky(extinction: Array, variance: Array, block: npt.NDArray[np.intp]) -> Booleans:
-    """Return where the profiles of a block have a median error too large for their median.
-
-    In thin air the error is an absolute one, so that what exceeds three errors of its own is
-    what noise has made too large: of such profiles, none is to be believed.
-    """
-    out = np.zeros(extinction.shape, dtype=np.bool_)
-    for number in np.unique(block):
-        mine = np.flatnonzero(block == number)
-        known = np.isfinite(variance[mine])
-        for vertex in np.flatnonzero(known.any(axis=0)):
-            rows = mine[known[:, vertex]]
-            error = np.sqrt(np.median(variance[rows, vertex]))
-            out[mine, vertex] = error > _ILL_CONDITIONED * np.median(extinction[rows, vertex])
-    return out
 
 
 def _solve_closed(

@@ -42,6 +42,9 @@ WEIGHT_WINDOW = 0.3
 """The same for the weights of the noise model."""
 MIN_NOISE_BINS = kernels.BLOCK
 """Smallest half-width of such a window in bins: 16."""
+_FINE = 0.5
+"""Variance of a shot in squares of a digitiser step above which rounding needs no thought: there
+the error that does not average out is below 1e-4 steps."""
 LEAK = 0.05
 """Largest share of the noise that the fall of the signal may fake in a third difference."""
 
@@ -82,6 +85,11 @@ def analog(
     one so near to it that single shots reached it: within 3.5 standard deviations of a shot. A
     bin at an extreme of the integer type, or of a profile without shots or of zeros alone, or
     without a finite input range or dark signal, is INPUT_MISSING.
+
+    Each shot is rounded to whole steps of the digitiser. Where the noise of a shot is above half
+    a step, that averages out and is part of the noise that is seen; below, all shots err to one
+    side, by up to half a step however many there are, and the variance is raised to cover it. That
+    part of the error is the same in neighbouring bins: a mean over bins does not reduce it.
 
     Parameters
     ----------
@@ -133,24 +141,22 @@ def analog(
         _rows(power),
         _rows(quality),
     )
-    # Rounding to whole counts is noise too, and all there is where a signal stands still.
-    rounding = step**2 / 12.0
-    top = fired * (2.0**adc_bits - 1.0)
+    scale = _Scale(summed, step, fired * (2.0**adc_bits - 1.0), fired)
     if noise_variance is None:
-        variance = _estimated_variance(power, grid, rounding)
-        again = _flag_clipped(power, quality, _Scale(summed, step, top, fired), variance)
+        variance = _estimated_variance(power, grid)
+        again = _flag_clipped(power, quality, scale, variance)
         if again.size:
             # Clipped bins are less noisy than others, and have drawn the estimate down.
-            rows = _rows(power)[again]
-            _rows(variance)[again] = _estimated_variance(rows, grid, rounding[again])
-        return Signal(power, variance, quality)
+            _rows(variance)[again] = _estimated_variance(_rows(power)[again], grid)
+        return Signal(power, _with_rounding(variance, scale), quality)
     _refuse_unless(
         0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2"
     )
-    known = noise_variance + _per_bin(dark_variance, "dark_variance", summed.shape)
-    variance = np.maximum(known, rounding[:, np.newaxis]).reshape(power.shape)
-    _flag_clipped(power, quality, _Scale(summed, step, top, fired), variance)
-    return Signal(power, variance, quality)
+    known = np.full(power.shape, noise_variance)
+    of_dark = _per_bin(dark_variance, "dark_variance", summed.shape)
+    _flag_clipped(power, quality, scale, (_rows(known) + of_dark).reshape(power.shape))
+    variance = _rows(_with_rounding(known, scale)) + of_dark
+    return Signal(power, variance.reshape(power.shape), quality)
 
 
 class _Scale(NamedTuple):
@@ -164,6 +170,35 @@ class _Scale(NamedTuple):
     """(profile,), counts at full scale."""
     shots: Array
     """(profile,)"""
+
+
+def _with_rounding(variance: Array, scale: _Scale) -> Array:
+    """Return variances of the noise as seen, raised by what rounding does unseen.
+
+    Each shot is rounded on its own. Noise of half a step or more makes that a noise of 1 / 12,
+    which is part of what is seen and averages out. Less noise leaves all shots on the same side:
+    an error that no number of shots takes away and that no scatter tells, uniform within half a
+    step where there is no noise at all. In between, shots fall on two steps with variance
+    m (1 - m), and their mean m may be off by sqrt(1/4 - m (1 - m)); above a variance of 1/4 the
+    first harmonic of the error is left. The variance of a bin scatters, that of the middle one of
+    a profile does not: the smaller of the two is asked.
+    """
+    found = variance.copy()
+    rows = _rows(found)
+    # Without a shot, nothing is known.
+    rows[scale.shots <= 0] += np.inf
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        unit = (scale.step**2 * scale.shots)[:, np.newaxis]
+        coarse = np.flatnonzero((rows < _FINE * unit).any(axis=-1))
+        unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
+        seen = rows[coarse] / unit
+        middle = np.sort(seen, axis=-1)[:, (seen.shape[-1] - 1) // 2, np.newaxis]
+        least = np.fmin(seen, middle)
+        harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(least - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
+        common = np.maximum((0.25 - least) / 3.0, harmonic)
+        raised = unit * (np.maximum(seen, 1.0 / 12.0) + shots * common)
+    rows[coarse] = np.where(seen >= _FINE, rows[coarse], raised)
+    return found
 
 
 def _flag_clipped(
@@ -299,8 +334,8 @@ def _counts(counts: npt.ArrayLike, grid: Array, shots: npt.ArrayLike) -> npt.NDA
             remedy="counts are (..., time, range), shots (..., time), range (range,)",
         )
     # Other integers pass where no count is too large.
-    if not np.can_cast(array.dtype, np.int32) and not (
-        array.dtype.kind in "iu" and np.array_equal(array, array.astype(np.int32))
+    if array.dtype.kind not in "iu" or not (
+        np.can_cast(array.dtype, np.int32) or np.array_equal(array, array.astype(np.int32))
     ):
         raise RetrievalInputError(
             f"holds {array.dtype} that is no 32-bit count",
@@ -394,12 +429,9 @@ def _noise(grid: Array) -> kernels.Noise:
     )
 
 
-def _estimated_variance(power: Array, grid: Array, least: Array) -> Array:
+def _estimated_variance(power: Array, grid: Array) -> Array:
     rows, variance = _rows(power), np.empty(power.shape)
-    each = np.broadcast_to(least, rows.shape[:1])
-    kernels.noise_profiles(
-        frozen(rows), _noise(grid), frozen(each), kernels.scratch(grid.size), _rows(variance)
-    )
+    kernels.noise_profiles(frozen(rows), _noise(grid), kernels.scratch(grid.size), _rows(variance))
     return variance
 
 
@@ -475,7 +507,7 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
     """
     grid = _grid(range)
     rows = _profiles(power, "power", grid.size)
-    return _estimated_variance(rows, grid, np.zeros(1))
+    return _estimated_variance(rows, grid)
 
 
 def range_corrected(

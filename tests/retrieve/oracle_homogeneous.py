@@ -93,7 +93,7 @@ def quartic_derivative(r, power, lag):
 def real_roots(coefficients):
     """Return the real roots of a polynomial, ascending."""
     a, b, c, d = coefficients
-    roots = mp.polyroots([d / a, c / a, b / a, mp.mpf(1)], maxsteps=400, extraprec=400, asc=True)
+    roots = mp.polyroots([mp.mpf(1), b / a, c / a, d / a], maxsteps=400, extraprec=400)
     size = max(abs(root) for root in roots) + 1
     tiny = mp.mpf(10) ** (-mp.mp.dps // 3)
     return sorted(mp.re(root) for root in roots if abs(mp.im(root)) < tiny * size)

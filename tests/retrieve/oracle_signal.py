@@ -31,6 +31,7 @@ def analog(
     fired = shots.astype(np.float64)[..., np.newaxis]
     quality = raw_quality(counts, fired, range, full_overlap_range)
     quality[counts >= fired * (2.0**adc_bits - 1.0)] |= np.int32(Quality.SATURATED)
+    whole = input_range[..., np.newaxis] * 1000.0 / 2.0**adc_bits
     with np.errstate(divide="ignore", invalid="ignore"):
         step = input_range[..., np.newaxis] * 1000.0 / (fired * 2.0**adc_bits)
         power = counts * step - dark
@@ -39,7 +40,6 @@ def analog(
         variance = difference_variance(power, range)
     else:
         variance = np.full(power.shape, noise_variance) + dark_variance
-    variance = np.maximum(variance, step**2 / 12.0)
     top = fired * (2.0**adc_bits - 1.0)
     with np.errstate(invalid="ignore"):
         clipped = (top - counts) * step < signal.CLIPPING * np.sqrt(variance * fired)
@@ -49,9 +49,27 @@ def analog(
     quality[clipped] |= np.int32(Quality.SATURATED)
     if noise_variance is None:
         again = clipped.any(axis=-1)
-        second = np.maximum(difference_variance(power, range), step**2 / 12.0)
-        variance[again] = second[again]
-    return Signal(power, variance, quality)
+        variance[again] = difference_variance(power, range)[again]
+        return Signal(power, rounded(variance, whole, fired), quality)
+    known = rounded(np.full(power.shape, noise_variance), whole, fired)
+    return Signal(power, known + dark_variance, quality)
+
+
+def rounded(variance, step, shots):
+    """Return the variance of a mean of shots that a digitiser rounds one by one, in steps."""
+    result = variance.copy()
+    for row, size, fired in zip(result, step[:, 0], shots[:, 0], strict=True):
+        if fired == 0:
+            row[:] = row + np.inf
+            continue
+        shot = row * fired / size**2
+        middle = np.sort(shot)[(shot.size - 1) // 2]
+        least = shot if np.isnan(middle) else np.where(shot < middle, shot, middle)
+        few = np.where(least < 1 / 12, 1.0, np.exp(-4 * np.pi**2 * (least - 1 / 12)))
+        bias = np.maximum((1 / 4 - least) / 3, few / (2 * np.pi**2))
+        coarse = (np.maximum(shot, 1 / 12) / fired + bias) * size**2
+        row[shot < 0.5] = coarse[shot < 0.5]
+    return result
 
 
 def photon(counts, shots, range, *, bin_width, dead_time=None, full_overlap_range=0.0):  # noqa: A002

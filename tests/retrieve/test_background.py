@@ -217,6 +217,23 @@ def test_cubic_is_unbiased_and_its_standard_error_honest(
     assert np.mean(found.quality == 0) > 0.995
 
 
+@pytest.mark.parametrize("lag", [1, 3, 10, None])
+def test_curvature_that_is_taken_for_noise_does_not_move_what_is_accepted(lag):
+    kept = []
+    for height in (1e6, 1e7, 1e8, 1e10):
+        power = 1e3 + signal(LONG, height, 0.03 * KM)
+        power = power + np.random.default_rng(9).standard_normal((300, LONG.size))
+        found = cubic(power, LONG, lag=lag)
+        off = np.abs(found.background - 1e3) / found.background_standard_error
+        good = found.quality == 0
+        assert np.max(off[good], initial=0.0) < 4.2
+        # With a variance, nothing is taken for noise.
+        known = cubic(power, LONG, lag=lag, variance=1.0)
+        assert np.mean(known.quality == 0) == (0.0 if (lag, height) == (1, 1e6) else 1.0)
+        kept.append(np.mean(good))
+    assert kept == ([0.0] * 4 if lag == 1 else [1.0] * 4)
+
+
 def test_counts_are_their_own_variance():
     rng = np.random.default_rng(4)
     power = rng.poisson(510.0 + signal(LONG, 5000.0, 0.03 * KM), (4000, LONG.size))

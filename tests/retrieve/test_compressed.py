@@ -10,7 +10,7 @@ from oracle_homogeneous import GEOMETRIES, lowest_errors, section, signal
 from scipy import stats
 
 from lidarops.flags import Quality
-from lidarops.retrieve import _compressed, _vector
+from lidarops.retrieve import _compressed, _dense, _tables, _vector
 from lidarops.retrieve._tables import make_tables
 from lidarops.retrieve.homogeneous import HomogeneousResult, solve
 
@@ -53,6 +53,28 @@ def test_basis_holds_what_a_profile_says_of_extinction(start, length, size, loss
             left = slope - others @ np.linalg.lstsq(others, slope, rcond=None)[0]
             kept.append(left @ left)
         assert kept[1] >= (1.0 - loss) * kept[0]
+
+
+@pytest.mark.parametrize("room", [1, 500, 10**9])
+def test_tables_do_not_depend_on_how_much_is_made_at_a_time(monkeypatch, room):
+    r, weights = LONG, np.linspace(1.0, 2.0, LONG.size)
+    whole = _tables._make(r, weights, bounds(r), 11)
+    monkeypatch.setattr(_tables, "_ROOM", room)
+    for one, other in zip(whole, _tables._make(r, weights, bounds(r), 11), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_long_profiles_are_solved_without_tables_alike(monkeypatch):
+    r = 2500.0 + 2.0 * np.arange(_dense.MOST_BINS + 1.0)
+    power = signal(r, 100.0, 3e-5) + np.random.default_rng(8).standard_normal((3, r.size))
+    made = []
+    monkeypatch.setattr(_dense, "make_tables", lambda *given: made.append(given))
+    found, direct = (solve(power, r, variance=1.0, method=way) for way in ("auto", "direct"))
+    assert not made
+    np.testing.assert_allclose(
+        found.extinction, direct.extinction, atol=1e-3 * direct.extinction_standard_error.min()
+    )
+    np.testing.assert_array_equal(found.quality, direct.quality)
 
 
 def test_tables_are_made_once():

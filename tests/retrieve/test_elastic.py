@@ -594,6 +594,8 @@ def test_the_unit_of_the_power_does_not_matter(scale):
         ({"background_standard_error": -1.0}, "background_standard_error"),
         ({"reference_relative_error": np.inf}, "reference_relative_error"),
         ({"lidar_ratio_standard_error": np.nan}, "lidar_ratio_standard_error"),
+        ({"lidar_ratio_standard_error": -1.0}, "lidar_ratio_standard_error"),
+        ({"molecular_relative_error": -0.01}, "molecular_relative_error"),
         ({"molecular_relative_error": "much"}, "molecular_relative_error"),
     ],
 )

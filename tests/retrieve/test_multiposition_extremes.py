@@ -155,3 +155,21 @@ def test_extreme_j_pole_is_refused():
     refused = result.flags.pole
     assert refused.any()
     assert np.isnan(result.extinction[refused]).all()
+
+
+@pytest.mark.parametrize("method", ["cycle", "multiplier"])
+@pytest.mark.parametrize("relative", [0.01, 0.03])
+def test_a_vertex_reached_against_strong_attenuation_is_flagged(method, relative):
+    net, field = triangle(60.0), homogeneous(0.02)
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field), relative, 200, 7, additive=0.0)
+    result = solve(power, r, net, method=method, variance=variance, full_overlap_range=100.0)
+    error = relative_errors(result, at_vertices(net, field))
+    stated = result.extinction_standard_error / result.extinction
+    start = int(geometry.cycle(net).vertex[0])
+    other = [v for v in np.flatnonzero(result.near_vertex) if v != start]
+    # Values are there, and many are off by more than their linear error tells.
+    assert (np.abs(error[:, other]) > 4.0 * stated[:, other]).mean() > 0.1
+    assert result.flags.ill_conditioned[:, other].mean() > 0.6
+    assert result.flags.flagged[:, other].all()
+    assert not result.flags.flagged[:, start].any()

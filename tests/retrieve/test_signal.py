@@ -65,6 +65,40 @@ def test_a_mean_of_shots_of_which_some_were_clipped_is_masked() -> None:
     assert abs(bias) < 4.0 * spread / np.sqrt(shots * 360)
 
 
+@pytest.mark.parametrize("shots", [20, 600])
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.1, 0.2, 0.3, 0.4, 0.5, 1.0])
+def test_rounding_of_each_shot_is_covered_at_every_level(noise: float, shots: int) -> None:
+    rng = np.random.default_rng(round(1e3 * noise) + shots)
+    level = 100.0 + np.linspace(0.0, 1.0, 41)[:, np.newaxis]
+    sums = np.zeros((41, 400))
+    for _ in range(shots):
+        sums += np.rint(level + noise * rng.standard_normal(sums.shape))
+    found = signal.analog(
+        sums.astype(np.int32), np.full(41, shots), RANGE, adc_bits=12, input_range=np.full(41, 0.5)
+    )
+    step = 500.0 / 4096.0
+    error = np.sqrt(found.variance)
+    assert np.abs((found.power - level * step) / error).max() < 5.0
+    if noise >= 0.5:
+        ideal = step * np.sqrt((noise**2 + 1.0 / 12.0) / shots)
+        assert np.median(error) == pytest.approx(ideal, rel=0.1)
+    if noise == 0.0:
+        assert error == pytest.approx(step * np.sqrt((1.0 + 1.0 / shots) / 12.0))
+
+
+def test_the_stated_noise_is_raised_by_rounding_and_that_of_the_dark_signal_is_not() -> None:
+    settings = {"adc_bits": 12, "input_range": np.array([0.5])}
+    step = 500.0 / 4096.0
+    counts = np.full((1, 400), 60_200, np.int32)
+    quiet = signal.analog(counts, SHOTS, RANGE, noise_variance=0.0, **settings)
+    assert quiet.variance == pytest.approx(step**2 * (1.0 + 1.0 / 600.0) / 12.0)
+    loud = signal.analog(counts, SHOTS, RANGE, noise_variance=step**2 / 600.0, **settings)
+    assert loud.variance == pytest.approx(step**2 / 600.0)
+    dark = {"dark": np.zeros(400), "dark_variance": np.full(400, 7.0)}
+    both = signal.analog(counts, SHOTS, RANGE, noise_variance=0.0, **dark, **settings)
+    assert both.variance == pytest.approx(quiet.variance + 7.0)
+
+
 def test_no_shots_is_missing_input_not_infinity() -> None:
     counts = np.full((2, 400), 1000, np.int32)
     result = signal.photon(counts, np.array([0, 600]), RANGE, bin_width=7.5)
@@ -421,6 +455,8 @@ _COUNTS = np.ones((1, 400), np.int32)
         ("values", lambda: signal.smooth(np.zeros(399), RANGE)),
         ("window", lambda: signal.smooth(np.zeros(400), RANGE, window=np.nan)),
         ("window", lambda: signal.smooth(np.zeros(400), RANGE, window=-1.0)),
+        ("counts", lambda: _analog(_COUNTS > 0, SHOTS)),
+        ("counts", lambda: _photon(_COUNTS > 0, SHOTS)),
         ("bin_width", lambda: signal.photon(_COUNTS, SHOTS, RANGE, bin_width=0.0)),
         ("dead_time", lambda: _photon(_COUNTS, SHOTS, dead_time=-4e-9)),
         ("noise_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=np.nan)),
