@@ -135,6 +135,9 @@ def draw_series(series: Sequence[VertexSeries], *, title: str = "") -> Figure:
     panels.title(figure, title)
     panels.estimates(upper, axis, series, "visibility")
     panels.estimates(lower, axis, series, "extinction")
+    for panel in (upper, lower):
+        # Neither is ever negative, and its axis is not either.
+        panel.set_ylim(bottom=max(0.0, panel.get_ylim()[0]))
     panels.time_ticks([upper, lower], axis)
     panels.legend(upper)
     panels.legend(lower, besides=upper)

@@ -40,7 +40,7 @@ from lidarops.simulate.settings import (
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.site import Order, Site, channel_name, dead_time, modes, random_stream
 from lidarops.simulate.sun import sky_brightness, solar_elevation
-from lidarops.simulate.truth import ChannelTruth, FileTruth, Grid, ProfileTruth
+from lidarops.simulate.truth import ChannelTruth, FileTruth, Grid, ProfileTruth, cell_stops
 
 Array = NDArray[np.float64]
 AnyCounts = NDArray[np.signedinteger[Any]]
@@ -420,12 +420,11 @@ def _grid(site: Site) -> Grid:
     grids = [grid_of(acquisition, detector) for detector in site.simulated.detectors]
     bin_width = min(width for _, width in grids)
     bins = int(max(bins * width for bins, width in grids) // bin_width)
-    cells = min(settings.truth.cells, bins)
     return Grid(
         instrument=site.key,
         wavelengths=tuple(sorted({d.wavelength * 1e-9 for d in site.simulated.detectors})),
         bin_width=bin_width,
-        stops=np.rint(np.linspace(0, bins, cells + 1)).astype(np.intp),
+        stops=cell_stops(bins, bin_width, settings.truth.cells),
         every=-(-settings.files(site.key) // settings.truth.profiles),
     )
 

