@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -154,7 +154,7 @@ def reproduce(
     Parameters
     ----------
     product : path or str
-        A product of one instrument.
+        Of one instrument or of a network.
     archive : path or str, optional
         Folder or URL of the raw files; without it, the nearest folder above the product that
         holds them, itself or in a folder of its own.
@@ -293,7 +293,6 @@ def _dated(epoch: str) -> Iterator[None]:
 def _campaign(told: _Told, root: Path, folder: Path, out: Path) -> Campaign:
     settings = told.settings
     try:
-        keys, kind = settings["keys"], str(told.about["lidarops:kind"])
         campaign = Campaign.model_validate(
             {
                 **settings["campaign"],
@@ -301,16 +300,7 @@ def _campaign(told: _Told, root: Path, folder: Path, out: Path) -> Campaign:
                 "archive": str(root),
                 "output": str(out),
                 "metadata": settings["metadata"],
-                "stations": {keys["station"]: settings["station"]},
-                "instruments": {
-                    keys["instrument"]: {
-                        "station": keys["station"],
-                        "name": settings["instrument"],
-                        "files": "*",
-                        "facts": [settings["facts"]],
-                        "products": {kind: settings["products"]},
-                    }
-                },
+                **_instruments(told),
             }
         )
     except (KeyError, TypeError, ValidationError) as error:
@@ -319,16 +309,70 @@ def _campaign(told: _Told, root: Path, folder: Path, out: Path) -> Campaign:
     return campaign
 
 
+def _instruments(told: _Told) -> dict[str, Any]:
+    """Return stations, instruments and network of a campaign, as far as a product tells them."""
+    settings = told.settings
+    if "network" in settings:
+        members = settings["members"]
+        return {
+            "stations": {each["keys"]["station"]: each["station"] for each in members.values()},
+            "instruments": {name: _instrument(each, {}) for name, each in members.items()},
+            "networks": {settings["keys"]["instrument"]: settings["network"]},
+        }
+    kind, keys = str(told.about["lidarops:kind"]), settings["keys"]
+    return {
+        "stations": {keys["station"]: settings["station"]},
+        "instruments": {keys["instrument"]: _instrument(settings, {kind: settings["products"]})},
+    }
+
+
+def _instrument(settings: Mapping[str, Any], products: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "station": settings["keys"]["station"],
+        "name": settings["instrument"],
+        "files": "*",
+        "facts": [settings["facts"]],
+        "products": products,
+    }
+
+
 def _scene(told: _Told, root: Path) -> Scene:
+    settings = told.settings
     try:
-        keys = told.settings["keys"]
-        start, stop = (datetime.fromisoformat(moment) for moment in told.settings["window"])
+        if "network" not in settings:
+            return _part(told, root, settings["keys"], told.inputs)
+        members = tuple(
+            _part(told, root, each["keys"], _files_of(told, each["files"]))
+            # Texts are sorted in a product; the network names its instruments in their order.
+            for name in settings["network"]["instruments"]
+            for each in [settings["members"].get(name)]
+            if each is not None
+        )
+        whole = _part(told, root, settings["keys"], ())
     except (KeyError, TypeError, ValueError) as error:
         raise _untold(told.file, repr(error)) from error
+    granules = (granule for member in members for granule in member.granules)
+    dark = (granule for member in members for granule in member.dark)
+    return replace(
+        whole,
+        granules=tuple(sorted(granules, key=_order)),
+        dark=tuple(sorted(dark, key=_order)),
+        members=members,
+    )
+
+
+def _files_of(told: _Told, names: Sequence[str]) -> tuple[InputRecord, ...]:
+    """Return the raw files of one member of a network."""
+    return tuple(record for record in told.inputs if record.path in set(names))
+
+
+def _part(told: _Told, root: Path, keys: Mapping[str, str], inputs: Iterable[InputRecord]) -> Scene:
+    """Return what one instrument gives to the scene of a product."""
+    start, stop = (datetime.fromisoformat(moment) for moment in told.settings["window"])
     granules = [
-        _granule(root, record, keys["instrument"]) for record in told.inputs if record.role in _RAW
+        _granule(root, record, keys["instrument"]) for record in inputs if record.role in _RAW
     ]
-    granules.sort(key=lambda granule: (granule.start or start, granule.path))
+    granules.sort(key=_order)
     return Scene(
         id=told.plan.scene,
         campaign=str(told.about["lidarops:campaign"]),
@@ -339,6 +383,10 @@ def _scene(told: _Told, root: Path) -> Scene:
         granules=tuple(each for each in granules if each.role is Role.SIGNAL),
         dark=tuple(each for each in granules if each.role is Role.DARK),
     )
+
+
+def _order(granule: Granule) -> tuple[bool, datetime | None, str]:
+    return granule.start is not None, granule.start, granule.path
 
 
 def _granule(root: Path, record: InputRecord, instrument: str) -> Granule:

@@ -10,6 +10,7 @@ from typing import Any
 
 import h5py
 import netCDF4
+import network_campaigns as networks
 import pytest
 import test_scans_end_to_end as scans
 import xarray as xr
@@ -92,6 +93,22 @@ def test_every_kind_is_made_again_to_the_last_byte(kind: ProductKind, campaign: 
     assert result.identical, explain(result)
     assert result.differences == ()
     assert "identical" in explain(result)
+
+
+@pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
+def test_the_product_of_a_network_is_made_again(six_beams: bool, tmp_path: Path):
+    told, _ = networks.written(tmp_path, networks.tree(networks.HOMOGENEOUS, six_beams=six_beams))
+    process_all([job for job in make_jobs(told, prepare(told)) if job.scene.members])
+    product = of_kind(told, ProductKind.VISIBILITY)
+    result = reproduce(product)
+    assert result.identical, explain(result)
+    with xr.open_dataset(product) as opened:
+        paths = json.loads(opened["provenance"].item())["entity"].values()
+    changed = Path(told.archive) / max(str(each.get("lidarops:path", "")) for each in paths)
+    content = bytearray(changed.read_bytes())
+    content[-3] ^= 1
+    changed.write_bytes(content)
+    assert len(names(reproduce(product), "input")) == 1
 
 
 def test_products_that_were_dated_by_the_environment_are_dated_so_again(

@@ -115,7 +115,16 @@ def _measured(
         stored = rows.sum_up(flags) if row.summary else _stored(source, row, judged, flags)
         found_attributes = attributes(row, mode=mode, coordinates=_listed(row, coordinates))
         variables[row.name] = xr.Variable(row.dims, stored, found_attributes)
+    _refuse_parts(layout, variables)
     return variables
+
+
+def _refuse_parts(layout: Layout, variables: dict[str, xr.Variable]) -> None:
+    """Refuse optional values without what they name: their errors, limits and judgements."""
+    for row in layout.variables:
+        missing = [name for name in row.ancillaries if name not in variables]
+        if row.name in variables and missing:
+            raise ProductError("is missing", field=missing[0], remedy=f"{row.name} needs it")
 
 
 def _stored(source: Intake, row: Row, judged: Row, flags: Values) -> Values:

@@ -58,7 +58,7 @@ def global_attributes(context: Context, layout: Layout, extents: Extents) -> dic
         **feature,
         **_description(context, layout, made, why),
         **_people(context),
-        **_place(context, extents),
+        **_place(context, layout, extents),
         **_times(extents, made),
         **_ours(context),
     }
@@ -149,10 +149,12 @@ def _kind_of(name: str, institution: str) -> str:
     return "institution" if name == institution else "person"
 
 
-def _place(context: Context, extents: Extents) -> dict[str, Any]:
+def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
     station = context.station
     (south, north), (west, east) = extents.latitudes, extents.longitudes
-    spread = "along the beam" if (south, west) != (north, east) else "not applicable: one place"
+    spread = "not applicable: one place"
+    if (south, west) != (north, east):
+        spread = _SPREADS.get(layout.sampled, "along the beam")
     return {
         "platform": station.name,
         "platform_vocabulary": "station names of the campaign",
@@ -178,6 +180,9 @@ def _place(context: Context, extents: Extents) -> dict[str, Any]:
             "not constant" if extents.step is None else f"{extents.step:.6g} m"
         ),
     }
+
+
+_SPREADS = {"vertex": "irregular: where beams meet"}
 
 
 def _bounds(extents: Extents) -> str:

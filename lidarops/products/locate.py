@@ -136,7 +136,9 @@ def _sounded(
 def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie at altitudes seen by several rays."""
     names = ["ray", "ray_zenith_angle"]
-    names += [name for name in ("ray_azimuth", "layer_altitude") if name in source]
+    names += [name for name in ("ray_azimuth",) if name in source]
+    # Layers are an option; where one is used, its coordinate is none.
+    names += ["layer_altitude"] if "layer_optical_depth" in source else []
     found = {name: _along(source, layout.row(name)) for name in names}
     row = layout.row("altitude")
     values = _along(source, replace(row, bounds=None)).values

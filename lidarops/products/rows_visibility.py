@@ -34,8 +34,9 @@ def visibility(
             ancillaries=(*limits, *ancillaries),
             uncertain=True,
             optional=optional,
-            comment="-ln(contrast) / extinction, with the contrast, and how extinction was brought"
-            " to 550 nm where it was, in lidarops_steps. Missing where extinction is not positive.",
+            comment="-ln(contrast) / extinction of the interval, which is no mean of visibilities."
+            " lidarops_steps tells the contrast, and how extinction was brought to 550 nm where it"
+            " was. Missing where extinction is not positive.",
         ),
         *(
             Row(

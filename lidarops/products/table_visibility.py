@@ -14,6 +14,7 @@ from lidarops.products.rows import (
     ErrorKind,
     Layout,
     Row,
+    deployment,
     quality,
     shots,
 )
@@ -53,6 +54,9 @@ def _of_vertex(name: str) -> Row:
 
 def _of_ray(name: str, source: str, called: str) -> Row:
     row = _place(source)
+    if name in ("latitude", "longitude"):
+        # As of a station whose values lie elsewhere: one latitude is that of the values.
+        row = replace(deployment(row), comment=None)
     return replace(
         row,
         name=f"ray_{name}",
@@ -130,10 +134,7 @@ VISIBILITY: Final = Layout(
     comment="Model: along a beam, a = (P r^2 / overlap)^m is proportional to extinction times"
     " exp(-2 m optical depth), with m the exponent of backscatter ~ extinction^(1/m); where two"
     " beams meet, both see the same extinction. Signals were averaged before they were solved."
-    " Stations stand where ray_latitude, ray_longitude and ray_altitude say. Here poorly_determined"
-    " means a standard error above a third of extinction, of the value or as the median of its"
-    " block, low_leverage a beam that is too weak to be used beside the others, poor_fit beams that"
-    " disagree by more than their noise allows.",
+    " Stations stand where ray_latitude, ray_longitude and ray_altitude say.",
     sampled="vertex",
     feature_type="timeSeries",
     unused_steps=frozenset({"molecular", "known_shape", "reference"}),
@@ -200,7 +201,13 @@ VISIBILITY: Final = Layout(
             comment="Root of the sum of squares over beams. The more, the more an error of the"
             f" overlap counts. {NO_NAME}",
         ),
-        quality(_SERIES, FLAGS),
+        replace(
+            quality(_SERIES, FLAGS),
+            comment="In this kind of product poorly_determined means a standard error above a third"
+            " of extinction, of the value or as the median of its block; low_leverage a beam that"
+            " is too weak to be used beside the others; poor_fit beams that disagree by more than"
+            " their noise allows.",
+        ),
         _per_time(
             "optical_depth",
             "optical depth of the longest stretch between points of a beam",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from lidarops.flags import Quality
 from lidarops.products.rows import QUALITY_FLAG
 from lidarops.records import ProductKind
+from lidarops.reports.networks import read_map, read_vertices
 from lidarops.reports.profiles import clearest_profile
 from lidarops.reports.raster import Raster, read_raster
 from lidarops.reports.scans import clearest_cycle, read_extinction
 from lidarops.reports.series import Section, join, read_sections
 from lidarops.reports.timeaxis import time_axis
-from lidarops.site import images, profiles, series, svg
+from lidarops.site import images, networks, profiles, series, svg
 from lidarops.site.series import Line
 from lidarops.site.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
 
@@ -28,8 +29,7 @@ Floats = NDArray[np.float64]
 THUMB: Final = (240, 84)
 """Width and height of a thumbnail."""
 _PREFERRED: Final = (
-    "visibility",
-    "meteorological_optical_range",
+    "visibility_in_air",
     "extinction",
     "optical_depth",
     "backscatter",
@@ -135,46 +135,79 @@ def _moment(time: np.datetime64) -> str:
     return str(time.astype("datetime64[s]")).replace("T", " ") + " UTC"
 
 
+@dataclass(frozen=True, slots=True)
+class _Quantity:
+    """What one panel of a stack shows of a section."""
+
+    name: str
+    factor: float
+    """From the unit of the section to the one shown."""
+    called: str
+    units: str
+
+    @property
+    def label(self) -> str:
+        return f"{self.called} ({self.units})"
+
+
 def _homogeneous(product: xr.Dataset) -> _Parts:
     sections = [section for section in join(read_sections(product)) if section.time.size]
     if not sections:
         return _nothing("no profile")
-    units = sections[0].estimates["background"].units
-    rows = (
-        ("extinction", 1e3, "extinction (km⁻¹)"),
-        ("background", 1.0, f"background ({svg.units(units)})"),
+    units = svg.units(sections[0].estimates["background"].units)
+    quantities = (
+        _Quantity("extinction", 1e3, "extinction", "km⁻¹"),
+        _Quantity("background", 1.0, "background", units),
     )
+    return _stacks(sections, quantities, "Extinction and background of range sections")
+
+
+def _visibility(product: xr.Dataset) -> _Parts:
+    quantities = (
+        _Quantity("visibility", 1.0, "visibility", "km"),
+        _Quantity("extinction", 1e3, "extinction", "km⁻¹"),
+    )
+    called = "Visibility and extinction where beams meet"
+    drawn, thumbnail, alt = _stacks(read_vertices(product), quantities, called)
+    sheet, words = networks.draw(read_map(product))
+    plan = _finish(sheet, "Beams and the vertices in which they meet", words, "map")
+    return [*drawn, plan], thumbnail, alt
+
+
+def _stacks(
+    sections: Sequence[Section], quantities: tuple[_Quantity, _Quantity], called: str
+) -> _Parts:
+    """Draw two quantities of series against time, a figure for every few of them."""
     drawn = []
     for first in range(0, len(sections), series.SERIES):
         few, key = sections[first : first + series.SERIES], f"f{first // series.SERIES + 1}"
-        sheet, words = _stack(few, rows, key)
-        caption = "Extinction and background of range sections against time"
-        drawn.append(_finish(sheet, caption, words, key))
-    lines = [series.line_of(s, "extinction", 1e3) for s in sections[: series.SERIES]]
-    reach = series.in_words(lines, "km⁻¹")
-    return drawn, series.sparkline(lines, *THUMB), f"Extinction against time. {reach}"
+        sheet, words = _stack(few, quantities, key)
+        drawn.append(_finish(sheet, f"{called} against time", words, key))
+    main = quantities[0]
+    lines = [series.line_of(s, main.name, main.factor) for s in sections[: series.SERIES]]
+    reach = series.in_words(lines, main.units)
+    alt = f"{main.called.capitalize()} against time. {reach}"
+    return drawn, series.sparkline(lines, *THUMB), alt
 
 
 def _stack(
-    sections: list[Section], rows: tuple[tuple[str, float, str], ...], key: str
+    sections: Sequence[Section], quantities: tuple[_Quantity, _Quantity], key: str
 ) -> tuple[Sheet, str]:
     axis = time_axis(np.unique(np.concatenate([section.time for section in sections])))
     sheet = Sheet(height=516)
     places = ((268, 28), (466, 292))
     panels: list[Panel] = []
     drawn: list[tuple[str, Panel, list[Line]]] = []
-    words = []
-    for (name, factor, label), (foot, top) in zip(rows, places, strict=True):
-        lines = [series.line_of(section, name, factor) for section in sections]
+    for shown, (foot, top) in zip(quantities, places, strict=True):
+        lines = [series.line_of(section, shown.name, shown.factor) for section in sections]
         panel = Panel(series.time_scale(axis), Scale(*series.limits(lines), foot, top))
-        sheet.frame(panel, label)
+        sheet.frame(panel, shown.label)
         panels.append(panel)
-        drawn.append((name, panel, lines))
+        drawn.append((shown.name, panel, lines))
     series.time_ticks(sheet, axis, panels)
+    words = [series.in_words(drawn[0][2], quantities[0].units)]
     for name, panel, lines in drawn:
         beyond = series.values(sheet, panel, axis, lines, f"{key}-{name}")
-        if name == "extinction":
-            words.append(series.in_words(lines, "km⁻¹"))
         if beyond:
             words.append(f"{beyond} values of {name} lie beyond the axis")
     series.legend(sheet, 14, drawn[0][2])
@@ -265,4 +298,5 @@ _DRAWERS: Final[Mapping[str, Callable[[xr.Dataset], _Parts]]] = {
     ProductKind.HOMOGENEOUS.value: _homogeneous,
     ProductKind.ELASTIC.value: _elastic,
     ProductKind.MULTIANGLE.value: _multiangle,
+    ProductKind.VISIBILITY.value: _visibility,
 }

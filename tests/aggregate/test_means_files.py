@@ -187,7 +187,7 @@ def test_every_kind_has_means_with_attributes_of_the_table(kind: ProductKind, tm
 
 
 @pytest.mark.parametrize(
-    ("kind", "period"), [(ProductKind.SIGNAL, Period.DAY), (ProductKind.HOMOGENEOUS, Period.MONTH)]
+    ("kind", "period"), [(ProductKind.SIGNAL, Period.DAY), (ProductKind.VISIBILITY, Period.MONTH)]
 )
 def test_means_comply(kind: ProductKind, period: Period, tmp_path: Path):
     for day in range(2):

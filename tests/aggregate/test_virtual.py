@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from made_archive import add_day, facts_of
+from products.made_products import MAKERS
 
 from lidarops.aggregate.facts import groups
 from lidarops.aggregate.opening import open_products
@@ -37,7 +38,7 @@ def eager(root: Path, name: str) -> np.ndarray:
     return np.concatenate(parts)
 
 
-@pytest.mark.parametrize("kind", [ProductKind.SIGNAL, ProductKind.ELASTIC, ProductKind.MULTIANGLE])
+@pytest.mark.parametrize("kind", [kind for kind in MAKERS if kind is not ProductKind.HOMOGENEOUS])
 def test_a_view_is_what_the_products_hold(kind: ProductKind, tmp_path: Path):
     for day in (2, 0, 1):
         add_day(tmp_path, day, kind)
@@ -51,6 +52,7 @@ def test_a_view_is_what_the_products_hold(kind: ProductKind, tmp_path: Path):
         np.testing.assert_array_equal(virtual[name], eager(tmp_path, name))
 
 
+@pytest.mark.slow
 def test_two_hundred_products_have_the_mean_of_the_eager_ones(tmp_path: Path):
     for day in range(200):
         add_day(tmp_path, day, profiles=6)

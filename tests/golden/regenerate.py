@@ -5,18 +5,21 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from golden.cdl import dump
-from products.made_products import MAKERS, context
+from products.made_products import MAKERS, PLACED, context
 
 from lidarops.products.build import build
 from lidarops.products.write import write
-from lidarops.records import ProductKind
 
 FOLDER = Path(__file__).parent
-BEAMS = {"vertical": {"zenith": 0.0}, "slanting": {"zenith": 80.0, "azimuth": 90.0}}
+BEAMS: dict[str, dict[str, Any]] = {
+    "vertical": {"zenith": 0.0},
+    "slanting": {"zenith": 80.0, "azimuth": 90.0},
+}
 
 
 def plain(data: xr.Dataset) -> xr.Dataset:
@@ -34,12 +37,9 @@ def plain(data: xr.Dataset) -> xr.Dataset:
 def texts(folder: Path) -> Iterator[tuple[str, str]]:
     """Give name and text of the golden product of each kind and beam."""
     for kind in MAKERS:
-        for beam, angles in BEAMS.items():
-            if kind is ProductKind.MULTIANGLE and beam != "vertical":
-                continue
+        for beam, angles in ({"several_beams": {}} if kind in PLACED else BEAMS).items():
             path = folder / f"{kind}_{beam}.nc"
-            beams = {} if kind is ProductKind.MULTIANGLE else angles
-            write(build(plain(MAKERS[kind](**beams)), context(kind)), path)
+            write(build(plain(MAKERS[kind](**angles)), context(kind)), path)
             yield f"{path.stem}.cdl", dump(path)
 
 

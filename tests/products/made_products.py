@@ -43,6 +43,7 @@ def provenance(kind: ProductKind = ProductKind.HOMOGENEOUS, **changes: Any) -> P
             Step("homogeneous", "photon_532o", {"method": "auto"}, "asked for"),
             Step("elastic", "photon_532o", {"lidar_ratio": 50.0}, "asked for"),
             Step("multiangle", "photon_532o", {"method": "auto"}, "asked for"),
+            Step("visibility", "photon_532o", {"contrast": 0.05}, "asked for"),
             Step("read", "analog_1064o", {"wavelength": 1.064e-6}, "another channel needs it"),
         ),
         left_out=(LeftOut("dark", "photon_532o", "photon counting has no dark\nsignal"),),
@@ -206,7 +207,12 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
 
 
 def multiangle(
-    profiles: int = 5, levels: int = 20, zenith: Any = (0.0, 30.0, 60.0), azimuth: Any = None
+    profiles: int = 5,
+    levels: int = 20,
+    zenith: Any = (0.0, 30.0, 60.0),
+    azimuth: Any = None,
+    *,
+    layers: bool = True,
 ) -> xr.Dataset:
     """A multi-angle retrieval, as `lidarops.retrieve.labeled_multiangle.retrieve` gives it."""
     rng = np.random.default_rng(4)
@@ -239,7 +245,7 @@ def multiangle(
         for name, values in {"zenith_angle": zenith, **along}.items()
     }
     times = {name: clock(profiles)[name] for name in ("time", "time_bnds")}
-    return xr.Dataset(
+    found = xr.Dataset(
         {
             **{
                 name: (dims, np.where(missing, np.nan, scale * rng.uniform(0.5, 1.5, shape)))
@@ -260,6 +266,87 @@ def multiangle(
         },
         attrs={"steps": "joint: extinction is wanted"},
     )
+    return with_layers(found) if layers else found
+
+
+def with_layers(data: xr.Dataset) -> xr.Dataset:
+    """Add the optical depths of two layers, that of the second in the first cycle missing."""
+    bounds = STATION.altitude + 60.0 * np.array([[0.0, 2.0], [1.0, 4.0]])
+    dims, shape = ("time", "layer"), (data.sizes["time"], 2)
+    missing = np.zeros(shape, np.bool_)
+    missing[0, 1] = True
+    scales = {"": 0.1, "_standard_error": 0.01, "_gradient_error": 0.005}
+    return data.assign(
+        {
+            f"layer_optical_depth{error}": (dims, np.where(missing, np.nan, scale))
+            for error, scale in scales.items()
+        }
+    ).assign_coords(
+        layer_altitude=("layer", bounds.mean(axis=1)), layer_bnds=(("layer", "nv"), bounds)
+    )
+
+
+def visibility(
+    profiles: int = 5, vertices: int = 3, zenith: Any = 90.0, azimuth: Any = None
+) -> xr.Dataset:
+    """A retrieval of a network, as `lidarops.retrieve.labeled_network.retrieve` gives it."""
+    rng = np.random.default_rng(5)
+    rays = max(3, np.size(zenith))
+    pair = ("time", "vertex")
+    shape = (profiles, vertices)
+    flags = np.zeros(shape, np.int32)
+    flags[-1] = int(Quality.LOW_LEVERAGE)
+    flags[0, 0] = int(Quality.INPUT_MISSING | Quality.LOW_SIGNAL)
+    lost = flags[:, :] == flags[0, 0]
+    extinction = rng.uniform(1e-4, 1e-3, shape)
+    error, systematic = 0.02 * extinction, 0.03 * extinction
+    both = np.hypot(error, systematic)
+    law = -np.log(0.05)
+    values = {
+        "visibility_in_air": law / extinction,
+        "visibility_in_air_standard_error": law * error / extinction**2,
+        "visibility_in_air_lower": law / (extinction + both),
+        "visibility_in_air_upper": law / (extinction - both),
+        "extinction": extinction,
+        "extinction_standard_error": error,
+        "extinction_systematic_error": systematic,
+        "condition": rng.uniform(1.0, 3.0, shape),
+    }
+    scalars = {"optical_depth": 0.8, "reduced_chi2": 1.1, "degrees_of_freedom": 1.0}
+    distance = np.full((rays, vertices), np.nan)
+    for vertex in range(vertices):
+        meeting = [vertex % rays, (vertex + 1) % rays]
+        distance[meeting, vertex] = 500.0 + 1000.0 * vertex + 100.0 * np.arange(2)
+    told = {
+        "latitude": STATION.latitude + 0.01 * np.arange(rays),
+        "longitude": STATION.longitude + 0.02 * np.arange(rays),
+        "altitude": STATION.altitude + np.arange(rays),
+        "zenith_angle": np.resize(np.float64(zenith), rays),
+        "azimuth": np.resize(
+            np.float64([70.0, 310.0, 190.0] if azimuth is None else azimuth), rays
+        ),
+    }
+    vertex = np.arange(vertices)
+    return xr.Dataset(
+        {
+            **{name: (pair, np.where(lost, np.nan, found)) for name, found in values.items()},
+            **{name: ("time", np.full(profiles, found)) for name, found in scalars.items()},
+            "prior_deviation": ("time", np.full(profiles, np.nan)),
+            "quality_flag": (pair, flags),
+            "shots": ("time", np.full(profiles, 9000, np.int32)),
+            "ray_range": (("ray", "vertex"), distance),
+        },
+        coords={
+            **{name: clock(profiles)[name] for name in ("time", "time_bnds")},
+            "vertex_id": ("vertex", vertex.astype(np.int32)),
+            "latitude": ("vertex", STATION.latitude + 0.003 * (vertex + 1)),
+            "longitude": ("vertex", STATION.longitude + 0.004 * (vertex + 1)),
+            "altitude": ("vertex", STATION.altitude + 5.0 * vertex[::-1]),
+            "ray": ("ray", np.arange(rays, dtype=np.int32)),
+            **{f"ray_{name}": ("ray", found) for name, found in told.items()},
+        },
+        attrs={"steps": "method iterative; ray 0: lidar-0, with the vertices 0 at 500 m"},
+    )
 
 
 MAKERS = {
@@ -267,4 +354,7 @@ MAKERS = {
     ProductKind.HOMOGENEOUS: homogeneous,
     ProductKind.ELASTIC: elastic,
     ProductKind.MULTIANGLE: multiangle,
+    ProductKind.VISIBILITY: visibility,
 }
+PLACED = (ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
+"""Kinds whose values lie where several beams look, and not along one."""

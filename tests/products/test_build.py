@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from made_products import (
     MAKERS,
+    PLACED,
     STATION,
     context,
     homogeneous,
@@ -61,6 +62,15 @@ def test_numbers_come_through(kind: ProductKind):
     np.testing.assert_array_equal(product["time"], data["time"])
     np.testing.assert_array_equal(product["time_bnds"], data["time_bnds"])
     assert product["station"].item() == STATION.name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_attribute_names_what_is_not_there(kind: ProductKind):
+    product = build(MAKERS[kind](), context(kind))
+    for name, variable in product.variables.items():
+        for attribute in ("ancillary_variables", "coordinates", "bounds"):
+            for named in variable.attrs.get(attribute, "").split():
+                assert named in product.variables, (name, attribute)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -131,6 +141,7 @@ def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
     main, beam = {
         ProductKind.SIGNAL: ("signal", {"altitude", "zenith_angle", "azimuth"}),
         ProductKind.MULTIANGLE: ("residual", {"ray_zenith_angle", "ray_azimuth"}),
+        ProductKind.VISIBILITY: ("extinction", {"latitude", "longitude", "altitude", "vertex_id"}),
     }.get(kind, ("extinction", {"altitude", "zenith_angle", "azimuth"}))
     assert beam | {"wavelength"} <= set(product[main].attrs["coordinates"].split())
     assert not beam & set(product["shots"].attrs["coordinates"].split()) - {
@@ -178,7 +189,7 @@ def test_altitude_is_that_of_a_straight_beam(zenith, altitude, start, width):
     assert (product["station"].attrs.get("cf_role") == "timeseries_id") == vertical
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not ProductKind.MULTIANGLE])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in PLACED])
 def test_a_moving_beam_gives_altitudes_over_time(kind: ProductKind):
     zenith = [0.0, 30.0, 60.0, 30.0, 90.0]
     product = decoded(MAKERS[kind](zenith=zenith), kind)
@@ -241,6 +252,7 @@ def test_dates_are_those_of_data_or_release_or_environment(monkeypatch: pytest.M
         (ProductKind.SIGNAL, ["read", "background"]),
         (ProductKind.ELASTIC, ["read", "elastic"]),
         (ProductKind.MULTIANGLE, ["read", "background", "multiangle"]),
+        (ProductKind.VISIBILITY, ["read", "background", "visibility"]),
     ],
 )
 def test_history_tells_what_made_this_product_one_line_a_step(kind: ProductKind, steps: list[str]):
@@ -310,7 +322,8 @@ def put(name: str, value: float, where: tuple[int, ...] = ()) -> Callable[[xr.Da
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_missing_variable_is_named(kind: ProductKind):
     data = MAKERS[kind]()
-    optional = {row.name for row in LAYOUTS[kind].variables if row.optional}
+    rows = (*LAYOUTS[kind].coordinates, *LAYOUTS[kind].variables)
+    optional = {row.name for row in rows if row.optional and "standard_error" not in row.name}
     needed = [str(name) for name in data.variables if name not in optional]
     assert len(needed) > 9
     for name in needed:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from compliance_checker.runner import CheckSuite, ComplianceChecker
-from made_products import MAKERS, STATION, context, homogeneous, signal
+from made_products import MAKERS, context, homogeneous
 
 from lidarops.flags import Quality
 from lidarops.products.build import build
@@ -105,37 +103,3 @@ def test_the_checker_would_find_a_fault(tmp_path: Path):
     path = tmp_path / "product.nc"
     write(product, path)
     assert any("extinction" in said for said in findings(path)[0])
-
-
-@pytest.mark.skipif(shutil.which("ncdump") is None, reason="ncdump is not installed")
-def test_ncdump_reads_the_header(tmp_path: Path):
-    path = tmp_path / "product.nc"
-    write(build(signal(), context(ProductKind.SIGNAL)), path)
-    header = subprocess.run(
-        ["ncdump", "-h", str(path)], capture_output=True, text=True, check=True
-    ).stdout
-    assert "time = UNLIMITED ; // (5 currently)" in header
-    assert "float signal(time, range) ;" in header
-    assert STATION.name in header
-
-
-@pytest.mark.skipif(shutil.which("cdo") is None, reason="cdo is not installed")
-@pytest.mark.parametrize("kind", list(MAKERS))
-def test_cdo_takes_means_over_time(kind: ProductKind, tmp_path: Path):
-    path, mean = tmp_path / "product.nc", tmp_path / "mean.nc"
-    data = MAKERS[kind]()
-    write(build(data, context(kind)), path)
-    names = [
-        row.name
-        for row in LAYOUTS[kind].variables
-        if row.dtype == "f4" and row.dims[:1] == ("time",) and row.name in data
-    ]
-    subprocess.run(
-        ["cdo", "-s", "timmean", f"-selname,{','.join(names)}", str(path), str(mean)], check=True
-    )
-    with xr.open_dataset(path) as product, xr.open_dataset(mean) as found:
-        for name in names:
-            expected = product[name].astype(float).mean("time")
-            np.testing.assert_allclose(
-                np.squeeze(found[name].to_numpy()), np.squeeze(expected), rtol=1e-5, err_msg=name
-            )

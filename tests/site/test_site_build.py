@@ -59,7 +59,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def site(archive: Path) -> Path:
     made = build(archive)
-    assert made.products == made.made == 14
+    assert made.products == made.made == 17
     assert [problem.path for problem in made.problems] == ["odesa/wind.nc"]
     return archive / "site"
 
@@ -71,7 +71,7 @@ def _copy(archive: Path, target: Path) -> Path:
 
 def test_every_link_leads_to_a_file_of_the_output(archive: Path, site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
-    assert len(pages) == 1 + 2 + 4 + 14
+    assert len(pages) == 1 + 2 + 4 + 17
     for page in pages:
         tags = _page(page)
         targets = [
@@ -211,7 +211,7 @@ def test_what_is_unchanged_is_kept_and_what_vanished_is_removed(
     gone.unlink()
     third = build(output)
     assert third.made == 2
-    assert third.products == 13
+    assert third.products == 16
     assert "Another title" in (
         output / "site" / paths.product_page(changed.relative_to(output / "products").as_posix())
     ).read_text(encoding="utf-8")
