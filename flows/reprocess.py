@@ -13,6 +13,7 @@ from __future__ import annotations
 import base64
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
@@ -110,7 +111,10 @@ def process_task(
     options = Options(force=full, wait=wait, progress=progress.advance, expect=progress.expect)
     with ExitStack() as stack:
         client = None
-        if cluster != clusters.Local():
+        if isinstance(cluster, clusters.Local):
+            # Started by the pipeline itself, and only where something is due.
+            options = replace(options, workers=cluster.workers, memory=cluster.memory)
+        else:
             client = stack.enter_context(clusters.client(cluster))
         result = bring_up_to_date(campaign, selection=selection, options=options, client=client)
     progress.end()

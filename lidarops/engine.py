@@ -152,7 +152,8 @@ def conclude(
         session.begin()
         for outcome in outcomes:
             scene = scenes[outcome.scene]
-            judged = judge.judgement(scene, outcome.plan or plan(scene, campaign))
+            # What staleness compares is the plan before any file was looked at.
+            judged = judge.judgement(scene, plan(scene, campaign))
             session.end(judged, outcome, final=False)
         return session.finish(RunStatus.FINISHED, cut.set_aside)
 
@@ -229,6 +230,8 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
             processes=True,
             host="127.0.0.1",
             dashboard_address=None,
+            # Without a dashboard dask still answers by HTTP, on a port of all interfaces.
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
             memory_limit=memory or "auto",
         ) as cluster,
         Client(cluster) as client,
@@ -267,7 +270,8 @@ def carry_out(
     ------
     Ended
     """
-    stop = stop or Stop()
+    # A wish that nobody has had yet is false.
+    stop = Stop() if stop is None else stop
     if client is None:
         yield from _serial(jobs, stop, taken)
     else:

@@ -330,7 +330,7 @@ class _Work:
     def _process(self, days: Sequence[int], client: Client | None, stop: Stop) -> None:
         jobs = self._jobs(days)
         first = next(jobs, None)
-        if first is None:
+        if first is None and not self._suspects:
             return
         options = self._options
         with ExitStack() as stack:
@@ -339,7 +339,9 @@ class _Work:
                 used = stack.enter_context(local_client(options.workers, memory=options.memory))
             serial = used is None
             taken = self._take_noted if serial else self._take
-            self._enter(carry_out(_chained(first, jobs), client=used, stop=stop, taken=taken), stop)
+            if first is not None:
+                others = _chained(first, jobs)
+                self._enter(carry_out(others, client=used, stop=stop, taken=taken), stop)
             if self._suspects and not stop:
                 if used is None:
                     used = stack.enter_context(local_client(1, memory=options.memory))

@@ -101,11 +101,10 @@ class Session:
             As it was entered: failed where its files are not there any more.
         """
         new, outcome = self._new_products(judged, outcome)
-        read = {used.path: used.sha256 for used in outcome.inputs}
         entry = Entry(
             outcome=outcome,
             day=judged.day,
-            key=self._judge.key(judged, read),
+            key=self._judge.key(judged),
             final=final,
             products=tuple(new),
         )

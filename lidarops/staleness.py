@@ -327,16 +327,12 @@ class Judge:
         stale = tuple(Stale(*each, "asked for") for each in dependence.wanted(whole))
         return Judgement(scene, whole, day_of(scene.start), "", stale, 0)
 
-    def key(self, judged: Judgement, read: Mapping[str, str] | None = None) -> str:
+    def key(self, judged: Judgement) -> str:
         """Return what changes with anything that may change the outcome of a scene.
 
-        Parameters
-        ----------
-        judged : Judgement
-        read : mapping, optional
-            Path -> sha256 of inputs that were read since they were catalogued.
+        Raw files are told by size and time: contents become known at different moments, and
+        what this costs is one try more of a scene whose files were touched.
         """
-        known = read or {}
         scene, whole = judged.scene, judged.plan
         return dependence.digest(
             [
@@ -344,7 +340,7 @@ class Judge:
                 code_version(),
                 [self._settings.of(scene, whole, channel) for channel in _channels(whole)],
                 [
-                    known.get(granule.path) or self._content(granule)
+                    [granule.path, granule.size, granule.mtime_ns]
                     for granule in (*scene.granules, *scene.dark)
                 ],
                 [[name, self._profile(name)] for name, _ in _profiles(whole)],
@@ -412,7 +408,7 @@ class Judge:
     def _files(self, scene: Scene, whole: Plan) -> tuple[InputRecord, ...]:
         """Return the inputs of a scene as they are now."""
         raw = [
-            InputRecord(granule.path, granule.role, self._content(granule, read=True))
+            InputRecord(granule.path, granule.role, self._content(granule))
             for granule in (*scene.granules, *scene.dark)
         ]
         return (
@@ -420,10 +416,10 @@ class Judge:
             *(InputRecord(name, role, self._profile(name)) for name, role in _profiles(whole)),
         )
 
-    def _content(self, granule: Granule, *, read: bool = False) -> str:
-        """Return the sha256 of a granule, or what no sha256 is where that is not known."""
+    def _content(self, granule: Granule) -> str:
+        """Return the sha256 of a granule, or what no sha256 is where it cannot be read."""
         known = granule.sha256 or self.digests.get(granule.path)
-        if known is None and read:
+        if known is None:
             try:
                 known = self.digests[granule.path] = self._source.digest(granule.path)
             except OSError:

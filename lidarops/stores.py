@@ -100,7 +100,7 @@ class RemoteStore:
         with self._told(CatalogError, "cannot be listed"):
             # Another process may have written since this one has looked.
             self._fs.invalidate_cache()
-            listing = self._fs.find(self._prefix, detail=True)
+            listing = self._found()
             # A web server's index names files without their sizes.
             unsized = [name for name, about in listing.items() if about.get("size") is None]
             listing |= {name: self._fs.info(name) for name in unsized}
@@ -108,6 +108,15 @@ class RemoteStore:
             about = listing[name]
             path = name.removeprefix(self._prefix).lstrip("/")
             yield Stored(path, int(about["size"] or 0), _stamp(about))
+
+    def _found(self) -> dict[str, Any]:
+        # Drivers that walk through folders leave out what they cannot list, unless told not to.
+        strict = {} if self._scheme in _ATOMIC else {"on_error": "raise"}
+        listing: dict[str, Any] = self._fs.find(self._prefix, detail=True, **strict)
+        if not listing:
+            # Raises where there is nothing at all, which is no empty place.
+            self._fs.ls(self._prefix, detail=False)
+        return listing
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file.
@@ -120,6 +129,20 @@ class RemoteStore:
         with self._told(CatalogError, f"{path} cannot be read"):
             data: bytes = self._fs.cat_file(self._name(path), start=0, end=size)
         return data
+
+    def digest(self, path: str) -> str:
+        """Return the SHA-256 of a file.
+
+        Raises
+        ------
+        CatalogError
+            If it cannot be read.
+        """
+        with (
+            self._told(CatalogError, f"{path} cannot be read"),
+            self._fs.open(self._name(path), "rb") as stream,
+        ):
+            return hashlib.file_digest(stream, "sha256").hexdigest()
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Copy files to a local folder, under their paths; what the store lacks is left out.

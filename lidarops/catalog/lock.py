@@ -28,6 +28,8 @@ _POLL: Final = 0.5
 
 _L = LOCK.c
 _LOG = logging.getLogger(__name__)
+_held: set[str] = set()
+"""Tokens of the locks that this process holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +50,12 @@ class Holder:
         """Whether it cannot be at work any more."""
         if self.silent > SILENCE:
             return True
-        here = self.machine == _machine()
-        return here and _start_of(self.process) != self.process_started
+        if self.machine != _machine():
+            return False
+        if self.process == os.getpid() and self.token not in _held:
+            # Of this very process, which could not give it back: the disk was full.
+            return True
+        return _start_of(self.process) != self.process_started
 
 
 class Lock:
@@ -111,6 +117,7 @@ class Lock:
             waited = True
             time.sleep(_POLL)
         self.held = True
+        _held.add(self.token)
         self._thread = threading.Thread(target=self._beat, name="lidarops-lock", daemon=True)
         self._thread.start()
         return waited
@@ -123,6 +130,7 @@ class Lock:
         if self._thread is not None:
             self._thread.join()
         self.held = False
+        _held.discard(self.token)
         try:
             with self._database.transaction() as connection:
                 connection.execute(sa.delete(LOCK).where(*self._mine()))

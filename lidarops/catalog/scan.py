@@ -9,10 +9,11 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lidarops.campaign import Campaign
 from lidarops.catalog.granules import AGAIN, Fingerprint, stamp_of
@@ -20,6 +21,7 @@ from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, RawFormatError
 from lidarops.raw import licel
 from lidarops.records import Granule, Role, Status
+from lidarops.stores import RemoteStore
 
 _BATCH = 2000
 _HEADER_BYTES = 16384
@@ -466,44 +468,30 @@ class RemoteSource(Source):
     """A store behind an fsspec URL."""
 
     def __init__(self, url: str) -> None:
-        import fsspec  # noqa: PLC0415 - most archives are local, and the import takes 0.1 s
-
-        try:
-            self._fs, self._prefix = fsspec.core.url_to_fs(url)
-        except (ValueError, ImportError) as error:
-            raise CatalogError(
-                f"the archive's URL cannot be opened: {error}",
-                file=url,
-                remedy="use a URL that fsspec knows and install its package",
-            ) from error
-        self._prefix = self._prefix.rstrip("/")
+        self._store = RemoteStore(url)
 
     def files(self) -> Iterator[RawFile]:
         """List files in the order of their paths."""
-        listing = self._fs.find(self._prefix, detail=True)
-        for name in sorted(listing):
-            about = listing[name]
-            path = name.removeprefix(self._prefix).lstrip("/")
-            yield RawFile(path, int(about["size"]), _modified(about))
+        for stored in self._store.files():
+            yield RawFile(stored.path, stored.size, stored.stamp)
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""
-        data: bytes = self._fs.cat_file(f"{self._prefix}/{path}", start=0, end=size)
-        return data
+        with _of_one_file():
+            return self._store.head(path, size)
 
     def digest(self, path: str) -> str:
         """Return the sha256 of a file."""
-        with self._fs.open(f"{self._prefix}/{path}", "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        with _of_one_file():
+            return self._store.digest(path)
 
 
-def _modified(about: dict[str, Any]) -> int:
-    """Return a number that changes when a remote file does."""
-    for key in ("mtime", "LastModified", "last_modified", "updated", "created", "ETag", "etag"):
-        value = about.get(key)
-        if isinstance(value, int | float):
-            return int(value * 1e9)
-        if value is not None:
-            text = value.isoformat() if hasattr(value, "isoformat") else str(value)
-            return int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
-    return 0
+@contextmanager
+def _of_one_file() -> Iterator[None]:
+    """Tell a file that cannot be read, which is refused, from a store that is away."""
+    try:
+        yield
+    except CatalogError as error:
+        if isinstance(error.__cause__, FileNotFoundError | PermissionError):
+            raise error.__cause__ from error
+        raise

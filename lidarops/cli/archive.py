@@ -43,6 +43,13 @@ if TYPE_CHECKING:
     from lidarops.records import Granule, Plan
     from lidarops.staleness import Judgement, Selection
 
+AllStepsOption = Annotated[
+    bool,
+    typer.Option(
+        "--all-steps", help="Leave nothing out for giving nothing, and read every file whole."
+    ),
+]
+
 
 @app.command()
 @plainly
@@ -97,16 +104,16 @@ def show_plan(
     stale: Annotated[
         bool, typer.Option("--stale", help="Only what is to be made, and why.")
     ] = False,
+    all_steps: AllStepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show the scenes, their steps, what is left out and why, and what is stale. Runs nothing.
 
     Example: lidarops plan catalogs/demo.yaml
     """
-    from lidarops.campaign import load
     from lidarops.pipeline import assess
 
-    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
     found = assess(settings, selection=wanted, everything=not stale)
     if as_json:
@@ -160,6 +167,7 @@ def reprocess(
     profiles_per_chunk: Annotated[
         int | None, typer.Option(min=1, help="Profiles a dask chunk; changes no result.")
     ] = None,
+    all_steps: AllStepsOption = False,
     log_level: LogLevelOption = "warning",
     log_json: LogJsonOption = False,
     log_file: LogFileOption = None,
@@ -172,10 +180,9 @@ def reprocess(
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
     from lidarops import pipeline
-    from lidarops.campaign import load
 
     set_up(log_level, as_json=log_json, file=log_file)
-    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
     with growing_bar("reprocess", "granules") as bar, ExitStack() as stack:
         client = _client(stack, workers, scheduler, tls, cluster)
@@ -202,6 +209,15 @@ def reprocess(
     if result.signal:
         raise typer.Exit(128 + result.signal)
     leave(failed=result.troubled)
+
+
+def _loaded(
+    campaign: Path, archive: str | None, out: Path | None, catalog: str | None, *, all_steps: bool
+) -> Campaign:
+    from lidarops.campaign import load
+
+    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    return settings.model_copy(update={"all_steps": all_steps or settings.all_steps})
 
 
 def _client(
@@ -257,12 +273,12 @@ def _refused_table(refused: list[Granule]) -> Table:
 
 
 def _plan_table(title: str, plan: Plan) -> Table:
-    table = make_table(title, "channel", "step", "does", "why")
+    table = make_table(title, "channel", "step", "does", "why", "rule")
     for step in plan.steps:
         settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
-        add_row(table, step.channel, step.name, settings or "yes", step.reason)
+        add_row(table, step.channel, step.name, settings or "yes", step.reason, step.rule)
     for left in plan.left_out:
-        add_row(table, left.channel, left.name, "left out", left.reason)
+        add_row(table, left.channel, left.name, "left out", left.reason, left.rule)
     return table
 
 

@@ -35,7 +35,10 @@ def bench(
         list[Path] | None, typer.Argument(help="Raw files of one layout, for the case reader.")
     ] = None,
     case: Annotated[
-        str | None, typer.Option(help="elastic, homogeneous, multiangle, multiposition or reader.")
+        str | None,
+        typer.Option(
+            help="all, elastic, homogeneous, multiangle, multiposition, pipeline or reader."
+        ),
     ] = None,
     data: Annotated[
         Path | None,

@@ -48,7 +48,9 @@ def start(folder: Path, mode: str, **environment: str) -> subprocess.Popen[bytes
         start_new_session=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        cwd=RUNNER.parents[2],
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PREFECT_HOME": str(folder / "prefect")}
+        | {"PYTHONPATH": str(RUNNER.parents[2]), **environment},
     )
 
 

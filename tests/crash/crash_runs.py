@@ -11,6 +11,11 @@ from lidarops.pipeline import Options, bring_up_to_date
 
 def run(folder: Path, mode: str) -> int:
     """Process the campaign of a folder in one of the ways that can be killed."""
+    if mode == "flow":
+        from flows.reprocess import reprocess
+
+        found, _ = reprocess(str(folder / "campaign.yaml"), wait=60.0)
+        return int(found.troubled)
     campaign = load(folder / "campaign.yaml")
     workers = 2 if mode == "cluster" else 1
     result = bring_up_to_date(campaign, options=Options(workers=workers, wait=60.0))

@@ -37,13 +37,14 @@ def test_kills_at_random_points_do_no_damage(tmp_path: Path) -> None:
     whole = crash_archive.products(calm)
     rng = random.Random(20261121)
     kills = rounds = 0
-    landed = {"serial": 0, "cluster": 0}
+    landed = {"serial": 0, "cluster": 0, "flow": 0}
     while kills < KILLS:
         folder = tmp_path / f"round{rounds}"
         campaign = crash_archive.make(folder)
-        mode = ("serial", "cluster")[rounds % 2]
+        mode = ("serial", "cluster", "flow")[rounds % 3]
         rounds += 1
-        for _ in range(6):
+        # A flow has its own server to start, which takes longer than the archive.
+        for _ in range(3 if mode == "flow" else 8):
             process = crash_archive.start(folder, mode)
             began = time.monotonic()
             # Wait for the start-up to pass, then strike anywhere within the work.
@@ -64,7 +65,7 @@ def test_kills_at_random_points_do_no_damage(tmp_path: Path) -> None:
         assert crash_archive.products(folder) == whole
         assert crash_archive.wrong_rows(folder) == []
         assert bring_up_to_date(campaign).record is None
-    assert min(landed.values()) > 0
+    assert min(landed.values()) >= min(3, KILLS // 10)
 
 
 @pytest.mark.slow

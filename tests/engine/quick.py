@@ -16,7 +16,7 @@ from lidarops.records import ProductRecord, SceneOutcome
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     """Stand in for `lidarops.processing.attempt`."""
-    scene, inputs, refused = _digest(job.scene, Path(job.campaign.archive))
+    scene, inputs, refused, _ = _digest(job, Path(job.campaign.archive))
     try:
         inputs += Ancillaries.read(job.campaign.folder, job.plan).inputs
     except LidarOpsError as error:

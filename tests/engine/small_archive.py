@@ -25,7 +25,7 @@ def tree() -> dict[str, Any]:
     """The campaign file: one lidar with everything, one with little."""
     products = {
         "signal": {},
-        "homogeneous": {"channels": ["photon_532o"], "sections": [[750, 4500]]},
+        "homogeneous": {"channels": ["photon_532o"], "sections": [[750, 840]]},
         "elastic": {
             "channels": ["analog_532o"],
             "average": "1h",

@@ -52,7 +52,7 @@ def test_the_command_line_tells_what_the_ledger_knows(archive: Archive) -> None:
     assert told.exit_code == 0
     (run,) = json.loads(told.stdout)
     assert (run["status"], run["scenes"], run["products"]) == ("finished", 4, 12)
-    assert set(run["seconds"]) == {"digest", "retrieve", "write"}
+    assert {"digest", "retrieve", "write"} <= set(run["seconds"])
     assert run["id"] in runner.invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
     assert runner.invoke(app, ["verify", file]).exit_code == 0
     archive.flip("raw/rich/h00")

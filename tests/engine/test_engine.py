@@ -11,11 +11,14 @@ from poison import Poison
 from small_archive import Archive, made
 
 from lidarops import engine
+from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.engine import Ended, Stop, carry_out, local_client
 from lidarops.pipeline import Options, Selection, bring_up_to_date, prepare, reprocess
 from lidarops.processing import Job, failed
+from lidarops.session import Session
+from lidarops.staleness import Judge
 
 
 @pytest.fixture(scope="module")
@@ -55,33 +58,31 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(archive: Archive, clie
     assert bring_up_to_date(campaign).record is None
     forced = Selection(instruments=("rich",))
     healed = bring_up_to_date(campaign, selection=forced, options=Options(force=True))
-    assert not healed.troubled
+    assert not healed.failures
 
 
-def test_a_scene_that_took_its_process_down_is_tried_in_another(archive: Archive) -> None:
+@pytest.mark.parametrize("crashed", [1, 4], ids=["one", "all"])
+def test_scenes_that_took_their_process_down_are_tried_in_another(
+    archive: Archive, crashed: int
+) -> None:
     campaign = archive.write()
-    scene = prepare(campaign).scenes[0]
+    scenes = {scene.id for scene in prepare(campaign).scenes[:crashed]}
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
-        from lidarops.session import Session
-        from lidarops.staleness import Judge
-
         judge = Judge(campaign, store)
         session = Session(campaign, store, lock, judge)
         session.begin()
-        (judged,) = [
-            each
-            for each in judge.days(sorted(judge.signatures())).judgements
-            if each.scene.id == scene.id
-        ]
-        session.take(judged, note=True)
+        for judged in judge.days(sorted(judge.signatures())).judgements:
+            if judged.scene.id in scenes:
+                session.take(judged, note=True)
     with Store(campaign.catalog_url, campaign.name) as store:
         again = Judge(campaign, store)
         found = again.days(sorted(again.signatures())).judgements
-        assert [each.scene.id for each in found if each.suspect] == [scene.id]
+        assert {each.scene.id for each in found if each.suspect} == scenes
     result = bring_up_to_date(campaign)
-    assert not result.troubled
-    assert len(result.record.scenes) == 4
+    assert [scene.error for scene in result.record.scenes] == [""] * 4
+    assert result.status is RunStatus.FINISHED
+    assert bring_up_to_date(campaign).record is None
     with Store(campaign.catalog_url, campaign.name) as store:
         assert [run.status.value for run in store.runs()] == ["finished", "died"]
 
@@ -111,7 +112,7 @@ def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
     archive: Archive, client: Client
 ) -> None:
     cut = prepare(archive.write())
-    jobs = engine.make_jobs(archive.write(), cut) * 10
+    jobs = engine.make_jobs(archive.write(), cut) * 4
     at_hand = most = done = 0
 
     def took(_job: Job) -> None:
@@ -148,4 +149,4 @@ def test_every_scene_is_entered_as_it_ends(archive: Archive) -> None:
     assert [number for number, _ in entered] == [1, 2, 3, 4]
     assert [run.scenes for _, run in entered] == [1, 2, 3, 4]
     assert {run.status.value for _, run in entered} == {"running"}
-    assert set(entered[-1][1].seconds) == {"digest", "retrieve", "write"}
+    assert {"digest", "retrieve", "write"} <= set(entered[-1][1].seconds)

@@ -80,7 +80,7 @@ def _lidar_ratio(archive: Archive) -> None:
 
 
 def _sections(archive: Archive) -> None:
-    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[800, 4500]]
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 825]]
 
 
 def _closed_period(archive: Archive) -> None:
