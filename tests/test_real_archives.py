@@ -14,6 +14,7 @@ from lidarops.campaign import load
 from lidarops.engine import run
 from lidarops.flags import Quality
 from lidarops.pipeline import prepare, report_run
+from lidarops.plans import plan
 from lidarops.records import Role, RunRecord
 
 CAMPAIGNS = Path(__file__).parent / "campaigns"
@@ -21,6 +22,8 @@ CAMPAIGNS = Path(__file__).parent / "campaigns"
 
 def _reprocess(name: str, data_root: Path, out: Path) -> RunRecord:
     campaign = load(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=out)
+    # What a plan would leave out has to be flagged by what is found.
+    campaign = campaign.model_copy(update={"all_steps": True})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cut = prepare(campaign)
@@ -125,6 +128,19 @@ def test_dark_files_are_subtracted(saopaulo: RunRecord) -> None:
 def test_saopaulo_is_not_homogeneous(saopaulo: RunRecord) -> None:
     product = _open(saopaulo, "homogeneous", "analog_532o")
     assert (product["quality_flag"].values != 0).all()
+
+
+@pytest.mark.parametrize("name", ["pilar", "saopaulo"])
+def test_sections_of_a_vertical_path_are_left_out(
+    data_root: Path, tmp_path: Path, name: str
+) -> None:
+    campaign = load(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=tmp_path)
+    (scene,) = prepare(campaign).scenes
+    planned = plan(scene, campaign)
+    assert not [step for step in planned.steps if step.name == "homogeneous"]
+    left = [item for item in planned.left_out if item.rule == "section_level"]
+    assert left
+    assert all(item.number is not None and item.number > 100.0 for item in left)
 
 
 def test_nothing_is_invented_where_photon_counting_is_paralysed(pilar: RunRecord) -> None:

@@ -117,7 +117,7 @@ def campaign(products, **facts) -> Campaign:
     }
     told = {"zenith_angle": 0.0, "channels": channels, **facts}
     made = factories.campaign(products=products, facts=[told])
-    # Sections along a vertical beam too: what a step does is asked here, not whether it is worth it.
+    # Sections along a vertical beam too: this asks what a step does, not whether it is worth it.
     return made.model_copy(update={"all_steps": True})
 
 
