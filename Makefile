@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps
 
-.PHONY: demo test lint bench golden lock clean
+.PHONY: demo test test-deployment lint bench golden lock clean
 
 # The demo's archive holds damaged files on purpose, for which the flow exits with 1.
 demo: .venv/.runtime
@@ -11,7 +11,11 @@ demo: .venv/.runtime
 	$(BIN)/python -m flows.reprocess catalogs/demo.yaml; test $$? -le 1
 
 test: .venv/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
+
+# Schedules on SQLite and PostgreSQL, and Slurm: needs their Debian packages, and root for Slurm.
+test-deployment: .venv/.dev
+	$(BIN)/python -m pytest -q -m deployment
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

@@ -16,7 +16,7 @@ import rawfiles
 import servers
 import yaml
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.deployment, pytest.mark.timeout(900)]
 
 
 class Api:

@@ -22,7 +22,7 @@ from lidarops.pipeline import prepare
 from lidarops.records import SceneOutcome
 
 PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "scancel", "squeue")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.deployment, pytest.mark.timeout(600)]
 
 CONFIGURATION = """\
 ClusterName=lidarops
