@@ -157,7 +157,6 @@ def test_no_page_needs_sideways_scrolling(site: Path, watched: Watched, width: i
         watched.open(file)
         wide = watched.page.evaluate("document.documentElement.scrollWidth")
         assert wide <= width, name
-    _quiet(watched)
 
 
 def test_images_are_drawn_and_thumbnails_load(site: Path, watched: Watched) -> None:
