@@ -244,10 +244,10 @@ def test_the_command_tells_by_its_exit_code(campaign: Campaign, moved: Campaign)
     product = of_kind(campaign, ProductKind.HOMOGENEOUS)
     good = CliRunner().invoke(app, ["reproduce", str(product)])
     assert (good.exit_code, "identical" in good.output) == (0, True)
-    gone = sorted(Path(moved.archive).glob("hill/v*"))[0]
+    gone = sorted(Path(moved.archive).glob("coast/h*"))[0]
     gone.unlink()
     bad = CliRunner().invoke(app, ["reproduce", str(product), "--archive", moved.archive, "--json"])
     assert bad.exit_code == 1
     told = json.loads(bad.output)
     assert not told["identical"]
-    assert told["differences"][0]["name"] == f"hill/{gone.name}"
+    assert told["differences"][0]["name"] == f"coast/{gone.name}"

@@ -108,7 +108,7 @@ def test_files_are_named_and_headed_as_licel_does(small):
 
 def test_the_truth_has_its_schema(small):
     truth = simulate(small()).truth
-    profiles = {"profile_hill_lidar": 4, "wavelength_hill_lidar": 2, "range_hill_lidar": 64}
+    profiles = {"profile_hill_lidar": 4, "wavelength_hill_lidar": 2, "range_hill_lidar": 200}
     assert dict(truth.sizes) == {"granule": 24} | profiles
     assert list(truth["path"].values[:1]) == ["coast/h24C3123.510000"]
     assert set(truth["instrument"].values) == {"coast-lidar", "hill-lidar"}
