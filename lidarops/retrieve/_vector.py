@@ -357,7 +357,7 @@ def residuals(
     amplitude, background : float
         The signal is ``background + amplitude * e1**i * envelope[i]``.
     """
-    raise NotImplementedError  # pragma: no cover - numba compiles the overload below
+    raise TypeError("is for compiled code only: numba puts the overload below in its place")
 
 
 def _single(  # type: ignore[no-untyped-def]
