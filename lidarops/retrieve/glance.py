@@ -24,7 +24,7 @@ class Look:
     """What some profiles show of one stretch of range."""
 
     profiles: int
-    """That were looked at and have values there."""
+    """That were looked at and have values there, saturated ones too."""
     significance: float
     """Largest backscatter of a profile over its standard error; 0 where there is none."""
     unsaturated: int
@@ -91,10 +91,11 @@ def look(
     inside = (r >= near) & (r <= far) & (r > 0.0)
     measured = np.isfinite(power) & np.isfinite(variance) & (variance > 0.0)
     measured &= (flags & int(Quality.INPUT_MISSING)) == 0
-    seen = (measured & inside).sum(axis=1) >= _FEWEST
+    saturated = (flags & int(Quality.SATURATED)) != 0
+    seen = ((measured | saturated) & inside).sum(axis=1) >= _FEWEST
     fitted = measured & (inside | (np.arange(r.size) >= (1.0 - _TAIL) * r.size)) & (r > 0.0)
     significance = _significance(power, variance, fitted, r)
-    clipped = np.any(((flags & int(Quality.SATURATED)) != 0) & inside, axis=1)
+    clipped = np.any(saturated & inside, axis=1)
     found = significance[seen & np.isfinite(significance)]
     return Look(
         profiles=int(seen.sum()),

@@ -47,6 +47,8 @@ _SEEN: Final = 3.0
 """Standard errors by which bins before the tail are then brighter than it."""
 _PROBE: Final = 1e-2
 """Relative change of signals, by which sensitivities are found."""
+_BEYOND: Final = 200
+"""Bins kept beyond the farthest vertex of a beam: more than twice the widest window of a gate."""
 _MOST_APART: Final = 16
 """Beams whose errors are looked at one by one; of more, those of an instrument together."""
 _SHARE_OF_ERROR: Final = 0.5
@@ -216,7 +218,23 @@ def _gathered(beams: Sequence[BeamSignals], intervals: Integers, network: Networ
         ranges = network.on_ray(ray)[1]
         used = (distance >= ranges[0]) & (distance <= ranges[-1])
         care[rows, ray] = np.bitwise_or.reduce(bits[:, used] & np.int32(_CARE), axis=1)
-    return _Signals(power, variance, grid, error, left, care, overlap)
+    # The solver looks at no farther bins, and is asked many times.
+    near = slice(_bins_used(grid, network))
+    return _Signals(
+        np.ascontiguousarray(power[..., near]),
+        np.ascontiguousarray(variance[..., near]),
+        grid[:, near],
+        error,
+        left,
+        care,
+        overlap[:, near],
+    )
+
+
+def _bins_used(grid: Array, network: Network) -> int:
+    """Return how many of the bins of the beams reach beyond their farthest vertices."""
+    reached = [int(np.sum(row <= network.on_ray(ray)[1][-1])) for ray, row in enumerate(grid)]
+    return max(reached) + _BEYOND
 
 
 def _left_in_tail(net: Array, noise: Array, distance: Array, tail: npt.NDArray[np.bool_]) -> Array:
