@@ -81,7 +81,7 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
     if StepName.SIGNAL in steps:
         lazy[ProductKind.SIGNAL] = _signal(source, steps, bench.ancillaries)
     if StepName.HOMOGENEOUS in steps:
-        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(source.profiles(), steps, bench.ancillaries)
+        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(bench, channel, source)
     for kind, data in lazy.items():
         lazy[kind] = data.assign(shots=source.shots).assign_coords(source.geometry.variables)
     if StepName.ELASTIC in steps:
@@ -259,33 +259,36 @@ def _gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
     return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}
 
 
-def _homogeneous(
-    conditioned: xr.Dataset, steps: Mapping[str, Step], ancillaries: Ancillaries
-) -> xr.Dataset:
+def _homogeneous(bench: Bench, channel: str, source: Plain | Glued) -> xr.Dataset:
+    steps = bench.steps(channel)
     settings = steps[StepName.HOMOGENEOUS].settings
     absent = {(near, far): Quality[bit] for near, far, bit in settings.get(WITHOUT, ())}
     sections = [(near, far) for near, far in settings["sections"]]
     kept = [section for section in sections if section not in absent]
-    parts = [_empty_section(conditioned["power"], *each) for each in absent.items()]
+    parts = []
     if kept:
-        parts.insert(0, _retrieved(conditioned, kept, steps, ancillaries))
-    result: xr.Dataset = xr.concat(parts, dim="section") if absent else parts[0]
+        parts.append(_retrieved(source.profiles(), kept, steps, bench.ancillaries))
     if absent:
+        unit = labeled_signal.unit_of(bench.archive, channel)
+        parts.append(_absent(source.shots, unit, absent))
+    result = parts[0]
+    if len(parts) > 1:
         order = [[*kept, *absent].index(section) for section in sections]
         number = np.arange(len(sections), dtype=np.int32)
-        result = result.isel(section=order).assign_coords(section=("section", number))
-    slanted = labeled.not_level(result, conditioned["zenith_angle"])
+        joined: xr.Dataset = xr.concat(parts, dim="section")
+        result = joined.isel(section=order).assign_coords(section=("section", number))
+    slanted = labeled.not_level(result, source.geometry["zenith_angle"])
     return result.assign(quality_flag=result["quality_flag"] | slanted)
 
 
-def _empty_section(power: xr.DataArray, section: tuple[float, float], bit: Quality) -> xr.Dataset:
-    """Return a section without values, for which no bin is read."""
-    distance = power["range"].to_numpy()
-    few = np.flatnonzero(distance >= section[0])[: labeled.FEWEST_BINS]
-    like = power.isel(range=few)
-    nothing = like.copy(data=np.full(like.shape, np.nan))
-    empty = labeled.homogeneous(nothing, sections=[section], variance=1.0)
-    flags = np.full(empty["quality_flag"].shape, int(bit), np.int32)
+def _absent(
+    shots: xr.DataArray, unit: str, absent: Mapping[tuple[float, float], Quality]
+) -> xr.Dataset:
+    """Return sections without values, for which no bin is read."""
+    empty = labeled.nothing(shots, unit=unit, sections=list(absent))
+    bits = np.array([int(bit) for bit in absent.values()], dtype=np.int32)
+    missing = np.where(shots.to_numpy() > 0, np.int32(0), np.int32(Quality.INPUT_MISSING))
+    flags = bits | missing[:, np.newaxis]
     return empty.assign(quality_flag=empty["quality_flag"].copy(data=flags))
 
 

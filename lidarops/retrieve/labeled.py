@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,7 @@ _SECTION: Final = {
     "reduced_chi2": "1",
 }
 """Variables and their units, in terms of the unit of the power."""
+_COUNTS: Final = ("valid_bins", "quality_flag")
 
 _Block = npt.NDArray[Any]
 _Function = Callable[..., tuple[_Block, ...]]
@@ -86,16 +87,67 @@ def homogeneous(
     distance = _distance(power)
     edges = _edges(sections)
     inputs = _Inputs.gather(power, variance, quality)
-    settings = {"method": method, "relative": relative_variance}
-    parts = [_section(inputs, distance, (near, far), settings) for near, far in edges]
-    others = [dim for dim in power.dims if dim != "range"]
-    result: xr.Dataset = xr.concat(parts, dim="section").transpose(*others, "section")
-    _set_units(result, _SECTION, power)
-    return result.assign_coords(
-        section=("section", np.arange(len(parts), dtype=np.int32)),
-        section_range=("section", edges.mean(axis=1), {"units": "m"}),
-        section_bounds=(("section", "nv"), edges, {"units": "m"}),
+    bins = [_bins(distance, near, far) for near, far in edges]
+    reached = slice(min(part.start for part in bins), max(part.stop for part in bins))
+    outputs = inputs.isel(reached).map(
+        _solve,
+        len(_SECTION),
+        2,
+        {
+            "range": distance[reached],
+            "sections": [slice(b.start - reached.start, b.stop - reached.start) for b in bins],
+            "method": method,
+            "relative": relative_variance,
+        },
+        along=("section", len(bins)),
     )
+    result = xr.Dataset(dict(zip((*_SECTION, *_COUNTS), outputs, strict=True)))
+    _set_units(result, _SECTION, power.attrs.get("units", "1"))
+    return result.assign_coords(_places(edges))
+
+
+def nothing(
+    profiles: xr.DataArray, *, unit: str, sections: Sequence[tuple[float, float]]
+) -> xr.Dataset:
+    """Return sections as of `homogeneous`, without values, and without any power.
+
+    Parameters
+    ----------
+    profiles : xr.DataArray, (...)
+        Whatever the profiles have one of each; its coordinates are kept.
+    unit : str
+        Of the power.
+    sections : sequence of (float, float)
+        m.
+
+    Returns
+    -------
+    xr.Dataset, (..., section)
+        In memory: NaN, 0 valid bins, and a ``quality_flag`` of 0, to be filled.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where the sections cannot be right.
+    """
+    edges = _edges(sections)
+    dims = (*profiles.dims, "section")
+    shape = (*profiles.shape, len(edges))
+    result = xr.Dataset(
+        {name: (dims, np.full(shape, np.nan)) for name in _SECTION}
+        | {name: (dims, np.zeros(shape, np.int32)) for name in _COUNTS},
+        coords=profiles.coords,
+    )
+    _set_units(result, _SECTION, unit)
+    return result.assign_coords(_places(edges))
+
+
+def _places(edges: npt.NDArray[np.float64]) -> dict[str, tuple[Any, ...]]:
+    return {
+        "section": ("section", np.arange(len(edges), dtype=np.int32)),
+        "section_range": ("section", edges.mean(axis=1), {"units": "m"}),
+        "section_bounds": (("section", "nv"), edges, {"units": "m"}),
+    }
 
 
 def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
@@ -154,7 +206,7 @@ def tail_mean(
     inputs = _Inputs.gather(power, variance, None)
     outputs = inputs.map(_tail_mean, len(_TAIL), 1, {"range": distance, "start": start})
     result = xr.Dataset(dict(zip((*_TAIL, "quality_flag"), outputs, strict=True)))
-    _set_units(result, _TAIL, power)
+    _set_units(result, _TAIL, power.attrs.get("units", "1"))
     return result
 
 
@@ -196,16 +248,26 @@ class _Inputs:
         return _Inputs(cut, self._variance)
 
     def map(
-        self, function: _Function, values: int, counts: int, settings: Mapping[str, Any]
+        self,
+        function: _Function,
+        values: int,
+        counts: int,
+        settings: Mapping[str, Any],
+        *,
+        along: tuple[str, int] | None = None,
     ) -> tuple[xr.DataArray, ...]:
-        """Map a function of blocks that gives `values` floats and `counts` integers a profile."""
+        """Map a function of blocks that gives `values` floats and `counts` integers a profile.
+
+        Each is an array along the dimension and of the length `along`, where that is given.
+        """
+        core = [] if along is None else [along[0]]
         outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
             _on_blocks,
             *self._arrays.values(),
             input_core_dims=[
                 ["range"] if "range" in array.dims else [] for array in self._arrays.values()
             ],
-            output_core_dims=[[]] * (values + counts),
+            output_core_dims=[core] * (values + counts),
             kwargs={
                 "function": function,
                 "ranged": {name: "range" in array.dims for name, array in self._arrays.items()},
@@ -213,6 +275,7 @@ class _Inputs:
             },
             dask="parallelized",
             output_dtypes=[np.float64] * values + [np.int32] * counts,
+            dask_gufunc_kwargs={} if along is None else {"output_sizes": dict([along])},
             keep_attrs=False,
         )
         return outputs
@@ -229,13 +292,7 @@ def _on_blocks(
     return function(**(dict(settings) | arguments))
 
 
-def _section(
-    inputs: _Inputs,
-    distance: npt.NDArray[np.float64],
-    edges: tuple[float, float],
-    settings: Mapping[str, Any],
-) -> xr.Dataset:
-    near, far = edges
+def _bins(distance: npt.NDArray[np.float64], near: float, far: float) -> slice:
     inside = np.flatnonzero((distance >= near) & (distance < far))
     if inside.size < FEWEST_BINS:
         raise RetrievalInputError(
@@ -244,17 +301,43 @@ def _section(
             field="sections",
             remedy=f"choose sections that hold at least {FEWEST_BINS}, better 50, bins",
         )
-    bins = slice(int(inside[0]), int(inside[-1]) + 1)
-    of_section = {"range": distance[bins], **settings}
-    outputs = inputs.isel(bins).map(_solve, len(_SECTION), 2, of_section)
-    names = (*_SECTION, "valid_bins", "quality_flag")
-    return xr.Dataset(dict(zip(names, outputs, strict=True)))
+    return slice(int(inside[0]), int(inside[-1]) + 1)
 
 
 def _solve(
     power: _Block,
     variance: _Block | float | None,
     quality: _Block | None = None,
+    *,
+    range: _Block,  # noqa: A002 - the field's word
+    sections: Sequence[slice],
+    method: str,
+    relative: bool,
+) -> tuple[_Block, ...]:
+    """Return the values of all sections, stacked along a last axis."""
+    found = [
+        _solve_section(
+            power[..., bins],
+            variance[..., bins] if _along_range(variance) else variance,
+            None if quality is None else quality[..., bins] if _along_range(quality) else quality,
+            range=range[bins],
+            method=method,
+            relative=relative,
+        )
+        for bins in sections
+    ]
+    return tuple(np.stack(parts, axis=-1) for parts in zip(*found, strict=True))
+
+
+def _along_range(block: Any) -> TypeGuard[_Block]:
+    # What holds for whole profiles has one bin.
+    return isinstance(block, np.ndarray) and block.shape[-1] > 1
+
+
+def _solve_section(
+    power: _Block,
+    variance: _Block | float | None,
+    quality: _Block | None,
     *,
     range: _Block,  # noqa: A002 - the field's word
     method: str,
@@ -336,7 +419,6 @@ def _one_chunk(array: xr.DataArray) -> xr.DataArray:
     return array
 
 
-def _set_units(result: xr.Dataset, units: Mapping[str, str], power: xr.DataArray) -> None:
-    own = power.attrs.get("units", "1")
+def _set_units(result: xr.Dataset, units: Mapping[str, str], own: str) -> None:
     for name, pattern in units.items():
         result[name].attrs["units"] = pattern.format(own).removeprefix("1 ")

@@ -167,6 +167,11 @@ def corrected(conditioned: xr.Dataset, background_range: tuple[float, float]) ->
     return _named(parts)
 
 
+def unit_of(archive: xr.Dataset, channel: str) -> str:
+    """Return the unit of the power of a channel: MHz of photon counting, mV of analog ones."""
+    return "MHz" if archive[channel].attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
+
+
 def _named(parts: Sequence[xr.DataArray]) -> xr.Dataset:
     names = ("signal", "signal_standard_error", "quality_flag")
     along_time = ("background", "background_standard_error")
@@ -199,8 +204,8 @@ class _Source:
             "full_overlap_range": full_overlap_range,
         }
         self.inputs = [counts, archive[f"{channel}_shots"]]
-        self.photon = counts.attrs["detection_mode"] == DetectionMode.PHOTON
-        self.unit = "MHz" if self.photon else "mV"
+        self.unit = unit_of(archive, channel)
+        self.photon = self.unit == "MHz"
         if self.photon:
             self.settings |= {"bin_width": counts.attrs["bin_width"], "dead_time": dead_time}
             return
