@@ -36,6 +36,8 @@ CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits of a bin that all results keep to which it adds."""
 _BATCH: Final = 256
 """Profiles that one task puts on altitudes, unless one cycle has more."""
+_BESIDE: Final = 4
+"""Bins beside an altitude that an interpolation may need."""
 _BEFORE_TAIL: Final = (0.6, 0.7)
 """Of the start of the tail: where the signal is taken that may be left in the tail."""
 _SHAPE_ERROR: Final = 0.2
@@ -178,6 +180,20 @@ class _Settings:
     altitude: Array
     station_altitude: float
 
+    @property
+    def ahead(self) -> slice:
+        """Bins before the lidar: those behind it, which an offset may give, hold no light."""
+        return slice(int(np.searchsorted(self.distance, 0.0, side="right")), None)
+
+    @property
+    def reached(self) -> slice:
+        """Bins that rays need up to the highest altitude, with those beside."""
+        height = self.altitude[-1:] - self.station_altitude
+        farthest = float(np.max(_slant.slant_path(self.zenith_angle, height) * height))
+        first = self.ahead.start
+        bins = int(np.searchsorted(self.distance, farthest)) + _BESIDE
+        return slice(first, max(bins, first + _BESIDE))
+
 
 @dataclass(frozen=True, slots=True)
 class _Clear:
@@ -279,16 +295,17 @@ def _crossed(
     bits |= np.where(clear.uncertain, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))[
         :, np.newaxis
     ]
+    # Farther bins told the background, and are not interpolated in.
+    reached = settings.reached
+    distance = settings.distance[reached]
+    values, noise, bits = values[:, reached], noise[:, reached], bits[:, reached]
     silent = ~np.isfinite(values) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(silent, np.int32(Quality.INPUT_MISSING), np.int32(0))
     cell = cycle * settings.zenith_angle.size + ray
     first = np.flatnonzero(np.diff(cell, prepend=-1))
     if first.size < cell.size:
         values, noise, bits, left = _visited(values, noise, bits, left, shots, first)
-    # Ranges behind the lidar, which an offset may give, hold no light.
-    ahead = settings.distance > 0
-    distance = settings.distance[ahead]
-    values, noise = values[:, ahead] * distance**2, noise[:, ahead] * distance**4
+    values, noise = values * distance**2, noise * distance**4
     shape = (int(cycle[-1]) + 1, settings.zenith_angle.size, settings.altitude.size)
     signal, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     told = np.zeros((shape[0], shape[2]), dtype=np.int32)
@@ -307,7 +324,7 @@ def _crossed(
             station_altitude=settings.station_altitude,
         )
         signal[cycle[at], number], spread[cycle[at], number] = one.signal[:, 0], one.variance[:, 0]
-        told[cycle[at]] |= _bits_on(bits[at][:, ahead], distance, angle, settings)
+        told[cycle[at]] |= _bits_on(bits[at], distance, angle, settings)
     return signal, spread, told, remains
 
 
@@ -331,7 +348,7 @@ def _without_background(
     left = _left_in_tail(values - background[:, np.newaxis], distance, start, tail)
     uncertain = np.isfinite(background) & ~np.isfinite(left)
     if settings.shapes is not None:
-        ahead = distance > 0
+        ahead = settings.ahead
         shapes = settings.shapes[ray]
         fit = known_shape.solve(
             values[:, ahead], distance[ahead], shapes[:, ahead], variance=variance[:, ahead]
