@@ -176,7 +176,8 @@ def _refined(job: Job, scene: Scene, bench: steps.Bench, root: Path) -> tuple[Jo
 
     def profiles(channel: str, granules: Sequence[Granule]) -> xr.Dataset:
         some = _open(job, scene, granules, root, [channel])
-        return steps.Plain(replace(bench, archive=some), channel).profiles().compute()
+        looked_at = steps.at_hand(replace(bench, archive=some), [channel])
+        return steps.Plain(looked_at, channel).profiles().compute()
 
     plan = refine(job.plan, scene.granules, profiles)
     return replace(job, plan=plan), replace(bench, plan=plan)

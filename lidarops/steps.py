@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +13,7 @@ from dask.base import compute
 
 from lidarops.ancillary import Ancillaries
 from lidarops.flags import Quality
-from lidarops.plan_rules import GLUED, StepName
+from lidarops.plan_rules import GLUED, StepName, parts_of
 from lidarops.records import Plan, ProductKind, Step
 from lidarops.refinement import WITHOUT
 from lidarops.retrieve import (
@@ -34,6 +34,9 @@ Array = npt.NDArray[np.float64]
 FULL_OVERLAP: Final = 0.99
 """Overlap from which on a homogeneous section may begin."""
 
+AT_ONCE: Final = 2_000_000
+"""Bytes of counts up to which a scene is read before it is worked on: to put off so little costs
+more than to do it, and of more the arrays would leave the cache."""
 _WHOLE: Final = (StepName.SIGNAL, StepName.ELASTIC, StepName.MULTIANGLE)
 """Products that need all bins of a channel."""
 _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
@@ -76,6 +79,8 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
         Where the data cannot be what the plan says.
     """
     steps = bench.steps(channel)
+    if _is_read(steps):
+        bench = at_hand(bench, parts_of(channel) if channel.startswith(GLUED) else (channel,))
     source = source_of(bench, channel)
     lazy: dict[ProductKind, xr.Dataset] = {}
     if StepName.SIGNAL in steps:
@@ -108,6 +113,21 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
             ],
         )
     return found
+
+
+def at_hand(bench: Bench, channels: Sequence[str]) -> Bench:
+    """Return a bench with the counts of channels in memory, where they are few."""
+    counts = bench.archive[[name for name in channels if name in bench.archive]]
+    small = counts.nbytes <= AT_ONCE
+    return replace(bench, archive=bench.archive.assign(counts.load())) if small else bench
+
+
+def _is_read(steps: Mapping[str, Step]) -> bool:
+    """Whether a step looks at the counts of the channel."""
+    if any(name in steps for name in _WHOLE):
+        return True
+    settings = steps[StepName.HOMOGENEOUS].settings if StepName.HOMOGENEOUS in steps else {}
+    return len(settings.get(WITHOUT, ())) < len(settings.get("sections", ()))
 
 
 def source_of(bench: Bench, channel: str) -> Plain | Glued:

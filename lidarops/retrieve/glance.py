@@ -88,12 +88,15 @@ def look(
             field="power",
             remedy="give profiles over range, and one range a bin",
         )
-    inside = (r >= near) & (r <= far) & (r > 0.0)
+    told = (np.arange(r.size) >= (1.0 - _TAIL) * r.size) & (r > 0.0)
+    used = np.flatnonzero(told | ((r >= near) & (r <= far) & (r > 0.0)))
+    power, variance, flags, r = power[:, used], variance[:, used], flags[:, used], r[used]
+    inside, told = (r >= near) & (r <= far), told[used]
     measured = np.isfinite(power) & np.isfinite(variance) & (variance > 0.0)
     measured &= (flags & int(Quality.INPUT_MISSING)) == 0
     saturated = (flags & int(Quality.SATURATED)) != 0
     seen = ((measured | saturated) & inside).sum(axis=1) >= _FEWEST
-    fitted = measured & (inside | (np.arange(r.size) >= (1.0 - _TAIL) * r.size)) & (r > 0.0)
+    fitted = measured & (inside | told)
     significance = _significance(power, variance, fitted, r)
     clipped = np.any(saturated & inside, axis=1)
     found = significance[seen & np.isfinite(significance)]
@@ -112,7 +115,7 @@ def _significance(
 ) -> npt.NDArray[np.float64]:
     with np.errstate(invalid="ignore", divide="ignore"):
         weight = np.where(fitted, 1.0 / variance, 0.0)
-        shape = np.where(r > 0.0, r, np.inf) ** -2.0
+        shape = r**-2.0
         total = weight.sum(axis=1)
         centred = shape - ((weight * shape).sum(axis=1) / total)[:, np.newaxis]
         bright = (weight * centred * np.where(fitted, power, 0.0)).sum(axis=1)
