@@ -16,6 +16,8 @@ from lidarops.retrieve import averaging
 
 _BATCH: Final = 256
 """Profiles that one task averages, unless one mean takes more."""
+_AT_ONCE: Final = 32
+"""Profiles that are averaged together, unless one mean takes more: they stay in the cache."""
 
 Shared = Callable[[npt.NDArray[np.datetime64]], npt.NDArray[np.float64]]
 
@@ -146,7 +148,35 @@ def _averaged(
     group: npt.NDArray[np.intp],
     shared: npt.NDArray[np.float64],
 ) -> _Block:
-    own = group - group[0]
+    ends = np.flatnonzero(np.diff(group, append=group[-1] + 1)) + 1
+    parts = []
+    first, low = 0, 0
+    for high, end in enumerate(map(int, ends), start=1):
+        # In pieces of whole intervals whose arrays stay in the cache.
+        if high == ends.size or ends[high] - first > _AT_ONCE:
+            part = slice(first, end)
+            parts.append(
+                _averaged_piece(
+                    power[part],
+                    variance[part],
+                    quality[part],
+                    weights[part],
+                    group[part] - group[first],
+                    shared[low:high],
+                )
+            )
+            first, low = end, high
+    return np.concatenate(parts)
+
+
+def _averaged_piece(
+    power: _Block,
+    variance: _Block,
+    quality: _Block,
+    weights: npt.NDArray[np.float64],
+    own: npt.NDArray[np.intp],
+    shared: npt.NDArray[np.float64],
+) -> _Block:
     common = shared[own]
     means = averaging.mean(
         power,

@@ -36,6 +36,8 @@ CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
 """Bits of a bin that all results keep to which it adds."""
 _BATCH: Final = 256
 """Profiles that one task puts on altitudes, unless one cycle has more."""
+_AT_ONCE: Final = 32
+"""Profiles whose background is found together: their arrays stay in the cache."""
 _BESIDE: Final = 4
 """Bins beside an altitude that an interpolation may need."""
 _BEFORE_TAIL: Final = (0.6, 0.7)
@@ -286,19 +288,13 @@ def _crossed(
 
     And as (cycle, ray) the most signal that may have been taken for background.
     """
-    bits = quality[members] & np.int32(WITHHELD | CARE)
-    if settings.overlap is not None:
-        unknown = ~(np.isfinite(settings.overlap) & (settings.overlap > 0))
-        bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
-    clear = _without_background(power[members], variance[members], bits, ray, settings)
-    values, noise, left = clear.power, clear.variance, clear.left
-    bits |= np.where(clear.uncertain, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))[
-        :, np.newaxis
+    pieces = [
+        _cleared(power[some], variance[some], quality[some], turn, settings)
+        for first in range(0, members.size, _AT_ONCE)
+        for some, turn in [(members[first : first + _AT_ONCE], ray[first : first + _AT_ONCE])]
     ]
-    # Farther bins told the background, and are not interpolated in.
-    reached = settings.reached
-    distance = settings.distance[reached]
-    values, noise, bits = values[:, reached], noise[:, reached], bits[:, reached]
+    values, noise, bits, left = (np.concatenate(part) for part in zip(*pieces, strict=True))
+    distance = settings.distance[settings.reached]
     silent = ~np.isfinite(values) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(silent, np.int32(Quality.INPUT_MISSING), np.int32(0))
     cell = cycle * settings.zenith_angle.size + ray
@@ -326,6 +322,23 @@ def _crossed(
         signal[cycle[at], number], spread[cycle[at], number] = one.signal[:, 0], one.variance[:, 0]
         told[cycle[at]] |= _bits_on(bits[at], distance, angle, settings)
     return signal, spread, told, remains
+
+
+def _cleared(
+    power: _Block, variance: _Block, quality: _Block, ray: Integers, settings: _Settings
+) -> tuple[Array, Array, Flags, Array]:
+    """Return signal, variance and bits of the bins that are reached, and what may be left."""
+    bits = quality & np.int32(WITHHELD | CARE)
+    if settings.overlap is not None:
+        unknown = ~(np.isfinite(settings.overlap) & (settings.overlap > 0))
+        bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
+    clear = _without_background(power, variance, bits, ray, settings)
+    bits |= np.where(clear.uncertain, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))[
+        :, np.newaxis
+    ]
+    # Farther bins told the background, and are not interpolated in.
+    reached = settings.reached
+    return clear.power[:, reached], clear.variance[:, reached], bits[:, reached], clear.left
 
 
 def _without_background(
