@@ -13,6 +13,7 @@ import pytest
 import rawfiles
 import xarray as xr
 
+from lidarops import processing, steps
 from lidarops.engine import run
 from lidarops.flags import Quality
 from lidarops.pipeline import Options, prepare, reprocess
@@ -297,6 +298,44 @@ def test_the_gate_changes_no_bit_of_a_section(tmp_path, far, offset):
         one, two = (each[name].to_numpy() for each in values)
         np.testing.assert_array_equal(one, two)
     assert np.isfinite(values[0]["extinction"]).any()
+
+
+def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeypatch):
+    products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, 1500]]}}
+    campaign = archive(tmp_path, products=products)
+    scene = prepare(campaign).scenes[0]
+    made = plan(scene, campaign)
+    absent = {WITHOUT: [[700.0, 1500.0, "LOW_SIGNAL"]]}
+    told = [
+        replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
+        for step in made.steps
+        if step.name != "look"
+    ]
+    opened = processing.open_archive
+
+    def without_shots(*files: Any, **settings: Any) -> xr.Dataset:
+        found = opened(*files, **settings)
+        found["photon_532o_shots"][1] = 0
+        return found
+
+    monkeypatch.setattr(processing, "open_archive", without_shots)
+    (product,) = process(Job(campaign, scene, replace(made, steps=tuple(told)))).products
+    flags = xr.load_dataset(campaign.products_root / product.path)["quality_flag"].to_numpy()
+    bits = flags[:, 0] & int(Quality.LOW_SIGNAL | Quality.INPUT_MISSING)
+    low = int(Quality.LOW_SIGNAL)
+    assert bits.tolist() == [low, low | int(Quality.INPUT_MISSING), low, low]
+
+
+@pytest.mark.parametrize("bytes_at_once", [0, 10**9])
+def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
+    tmp_path, monkeypatch, bytes_at_once
+):
+    campaign = archive(tmp_path)
+    scene = prepare(campaign).scenes[0]
+    job = Job(campaign, scene, plan(scene, campaign))
+    usual = [product.sha256 for product in process(job).products]
+    monkeypatch.setattr(steps, "AT_ONCE", bytes_at_once)
+    assert [product.sha256 for product in process(job).products] == usual
 
 
 def test_a_changed_time_has_a_file_read_again(tmp_path):

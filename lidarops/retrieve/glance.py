@@ -99,7 +99,8 @@ def look(
     fitted = measured & (inside | told)
     significance = _significance(power, variance, fitted, r)
     clipped = np.any(saturated & inside, axis=1)
-    found = significance[seen & np.isfinite(significance)]
+    lit = (measured & inside).sum(axis=1) >= _FEWEST
+    found = significance[lit & np.isfinite(significance)]
     return Look(
         profiles=int(seen.sum()),
         significance=max(float(found.max()), 0.0) if found.size else 0.0,

@@ -78,3 +78,18 @@ def test_wrong_shapes_are_told():
         look(noise(), noise()[:, :5], flags(), RANGE, 0.0, 1e3)
     with pytest.raises(RetrievalInputError, match="cannot be chosen"):
         spaced(0, 3)
+
+
+def test_saturated_bins_were_looked_at_though_they_have_no_values():
+    power, quality = noise(), flags()
+    power[:, 100:500] = np.nan
+    quality[:, 100:500] = int(Quality.SATURATED | Quality.INPUT_MISSING)
+    found = look(power, np.full(SHAPE, 0.01), quality, RANGE, 1000.0, 3000.0)
+    assert (found.profiles, found.unsaturated, found.significance) == (20, 0, 0.0)
+
+
+def test_bins_between_the_stretch_and_the_tail_tell_nothing():
+    power, variance = noise(), np.full(SHAPE, 0.01)
+    plain = look(power, variance, flags(), RANGE, 500.0, 4000.0)
+    power[:, 600:850] = 1e9
+    assert look(power, variance, flags(), RANGE, 500.0, 4000.0) == plain

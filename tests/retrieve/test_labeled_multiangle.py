@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve import labeled_multiangle
+from lidarops.retrieve import labeled_multiangle, labeled_scan
 from lidarops.retrieve.labeled_multiangle import Background
 from lidarops.retrieve.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import Method
@@ -397,6 +397,14 @@ def test_any_chunking_gives_the_same_bits(size):
         conditioned.chunk(time=size, range=-1 if size > 7 else 500), pointing, background=FAR
     )
     xr.testing.assert_identical(whole, chunked)
+
+
+def test_bins_that_no_ray_reaches_and_pieces_do_not_matter(monkeypatch):
+    conditioned, pointing = scan(12)
+    cut = solve(conditioned, pointing, background=FAR)
+    monkeypatch.setattr(labeled_scan, "_BESIDE", 10**6)
+    monkeypatch.setattr(labeled_scan, "_AT_ONCE", 5)
+    xr.testing.assert_identical(cut, solve(conditioned, pointing, background=FAR))
 
 
 def test_rays_stay_lazy_until_they_are_wanted():

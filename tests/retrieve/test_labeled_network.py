@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from made_network import EXTINCTION, beam, network, product, without
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.retrieve import labeled_network
 from lidarops.retrieve.labeled_network import Settings, retrieve
 from lidarops.retrieve.labeled_visibility import Definition
 
@@ -153,3 +155,11 @@ def test_visibility_goes_by_the_definition():
 def test_beams_are_as_many_as_rays():
     with pytest.raises(RetrievalInputError, match="beams"):
         retrieve([beam(0)], network(), PLAIN)
+
+
+def test_bins_that_are_not_used_do_not_matter(monkeypatch):
+    beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
+    cut = solved(beams)
+    monkeypatch.setattr(labeled_network, "_BEYOND", 10**6)
+    xr.testing.assert_identical(cut, solved(beams))
+    assert beams[0].averages.sizes["range"] > 700
