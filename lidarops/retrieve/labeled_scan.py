@@ -254,13 +254,10 @@ def _part(
     """Return signal, variance and quality of a run of cycles, lazily."""
     members = order.profile[batch]
     start, stop = int(members.min()), int(members.max()) + 1
-    blocks = [
-        conditioned[name].isel(time=slice(start, stop)).data
-        for name in ("power", "variance", "quality")
-    ]
+    found = [_blocks(conditioned[name], start, stop) for name in ("power", "variance", "quality")]
     cycle = order.cycle[batch] - order.cycle[batch.start]
     whole = delayed(_crossed, nout=4, pure=True)(
-        *blocks, members - start, shots[members], cycle, order.ray[batch], settings
+        *found, members, shots[members], cycle, order.ray[batch], settings
     )
     shape = (int(cycle[-1]) + 1, settings.zenith_angle.size, settings.altitude.size)
     return tuple(
@@ -274,10 +271,34 @@ def _part(
     )
 
 
+def _blocks(array: xr.DataArray, start: int, stop: int) -> tuple[int, list[Any]]:
+    """Return the blocks that hold some profiles, and the number of the first profile in them."""
+    data = array.data
+    if not isinstance(data, da.Array):
+        return start, [data[start:stop]]
+    ends = np.cumsum(data.chunks[0])
+    first, last = np.searchsorted(ends, (start, stop - 1), side="right")
+    # Optimised one by one, each array of each batch would read the files for itself.
+    blocks = data.rechunk({1: -1}).to_delayed(optimize_graph=False)  # type: ignore[no-untyped-call]
+    return int(ends[first] - data.chunks[0][first]), list(blocks[first : last + 1, 0])
+
+
+def _rows(found: tuple[int, list[_Block]], members: Integers) -> _Block:
+    """Return some profiles of blocks."""
+    first, blocks = found
+    stops = first + np.cumsum([len(block) for block in blocks])
+    place = np.searchsorted(stops, members, side="right")
+    out = np.empty((members.size, *blocks[0].shape[1:]), blocks[0].dtype)
+    for number in np.unique(place):
+        here, block = place == number, blocks[number]
+        out[here] = block[members[here] - (stops[number] - len(block))]
+    return out
+
+
 def _crossed(
-    power: _Block,
-    variance: _Block,
-    quality: _Block,
+    power: tuple[int, list[_Block]],
+    variance: tuple[int, list[_Block]],
+    quality: tuple[int, list[_Block]],
     members: Integers,
     shots: Array,
     cycle: Integers,
@@ -289,7 +310,7 @@ def _crossed(
     And as (cycle, ray) the most signal that may have been taken for background.
     """
     pieces = [
-        _cleared(power[some], variance[some], quality[some], turn, settings)
+        _cleared(_rows(power, some), _rows(variance, some), _rows(quality, some), turn, settings)
         for first in range(0, members.size, _AT_ONCE)
         for some, turn in [(members[first : first + _AT_ONCE], ray[first : first + _AT_ONCE])]
     ]
