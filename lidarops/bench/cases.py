@@ -9,6 +9,7 @@ from typing import Final, TypeVar
 
 from lidarops.bench import (
     accuracy,
+    costs,
     elastic,
     everything,
     multiangle,
@@ -33,6 +34,7 @@ class Case(StrEnum):
     """What is measured."""
 
     ALL = "all"
+    COSTS = "costs"
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
     MULTIANGLE = "multiangle"
@@ -76,6 +78,7 @@ def run(
     _check(kind, chosen, files, data)
     ways: dict[Case, Callable[[], Finding]] = {
         Case.ALL: lambda: everything.run(effort, data=data),
+        Case.COSTS: lambda: costs.run(kind, effort=effort),
         Case.ELASTIC: lambda: elastic.run(kind, data=data, effort=effort),
         Case.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
         Case.MULTIANGLE: lambda: multiangle.run(kind, effort=effort),

@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Final
+
+from lidarops.costs import processor
 
 _SHORTEST: Final = 1e-9
 """The clock of a fast machine with little work may not have moved."""
@@ -29,7 +30,7 @@ class Machine:
 def machine() -> Machine:
     """Return the machine and the packages of this process."""
     return Machine(
-        processor=_processor(),
+        processor=processor(),
         python=platform.python_version(),
         packages={name: found for name in _PACKAGES if (found := _version(name))},
     )
@@ -68,15 +69,6 @@ def in_threads(way: Callable[[int], object], parts: int) -> None:
     with ThreadPoolExecutor(parts) as pool:
         for future in [pool.submit(way, part) for part in range(parts)]:
             future.result()
-
-
-def _processor() -> str:
-    facts = Path("/proc/cpuinfo")
-    if facts.is_file():
-        for line in facts.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def _version(package: str) -> str:

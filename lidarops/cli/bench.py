@@ -37,7 +37,8 @@ def bench(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, elastic, homogeneous, multiangle, multiposition, pipeline or reader."
+            help="all, costs, elastic, homogeneous, multiangle, multiposition, pipeline or"
+            " reader."
         ),
     ] = None,
     data: Annotated[
@@ -60,6 +61,8 @@ def bench(
     Example: lidarops bench accuracy --case elastic --quick --data boeckmann
 
     Example: lidarops bench throughput demo/raw/coast/h*.*0
+
+    Example: lidarops bench throughput --case costs
 
     Example: lidarops bench stability --quick --out bench
     """
