@@ -11,7 +11,7 @@ import math
 import os
 import platform
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -25,7 +25,7 @@ from lidarops.records import Granule, Plan, ProductKind, Scene, Step
 
 _FORMAT: Final = "lidarops costs"
 _CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
-_MOST_PICTURES: Final = 40
+MOST_FIGURES: Final = 40
 """Groups of products that a report draws."""
 
 
@@ -33,7 +33,14 @@ class Term(StrEnum):
     """What CPU time goes into."""
 
     RUN = "run"
-    """A run: its process, what it imports, compiled code that is loaded, ledger."""
+    """A run: its process, what it imports, ledger."""
+    LOAD = "load"
+    """What the first scene of a process loads, whatever it is."""
+    HOMOGENEOUS_LOAD = "homogeneous_load"
+    """Compiled code that is loaded with the first scene that has such a product."""
+    ELASTIC_LOAD = "elastic_load"
+    MULTIANGLE_LOAD = "multiangle_load"
+    VISIBILITY_LOAD = "visibility_load"
     SCENE = "scene"
     FILE = "file"
     """A raw file of a scene, dark ones too."""
@@ -69,6 +76,8 @@ class Term(StrEnum):
     ELASTIC_FIGURE = "elastic_figure"
     MULTIANGLE_FIGURE = "multiangle_figure"
     VISIBILITY_FIGURE = "visibility_figure"
+    FIGURE_VALUE = "figure_value"
+    """A profile times a bin that figures are made of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,30 +106,36 @@ UNCALIBRATED: Final = (
     "not calibrated on this machine: run lidarops bench throughput --case costs, once"
 )
 DEFAULTS: Final[Mapping[Term, float]] = {
-    Term.RUN: 5.0,
-    Term.SCENE: 0.02,
-    Term.FILE: 2.5e-4,
-    Term.DIGEST: 1.5e-9,
-    Term.CHANNEL: 0.02,
-    Term.VALUE: 1e-7,
-    Term.DARK: 0.03,
-    Term.LOOK: 0.03,
+    Term.RUN: 7.0,
+    Term.LOAD: 1.5,
+    Term.HOMOGENEOUS_LOAD: 0.1,
+    Term.ELASTIC_LOAD: 0.1,
+    Term.MULTIANGLE_LOAD: 0.1,
+    Term.VISIBILITY_LOAD: 0.1,
+    Term.SCENE: 0.005,
+    Term.FILE: 2e-5,
+    Term.DIGEST: 2e-9,
+    Term.CHANNEL: 0.01,
+    Term.VALUE: 1.2e-7,
+    Term.DARK: 0.035,
+    Term.LOOK: 0.04,
     Term.SIGNAL: 0.05,
-    Term.SIGNAL_VALUE: 1e-7,
-    Term.HOMOGENEOUS: 0.05,
-    Term.HOMOGENEOUS_VALUE: 1e-7,
+    Term.SIGNAL_VALUE: 2e-8,
+    Term.HOMOGENEOUS: 0.08,
+    Term.HOMOGENEOUS_VALUE: 1.2e-7,
     Term.ELASTIC: 0.1,
     Term.ELASTIC_VALUE: 5e-7,
     Term.MULTIANGLE: 0.1,
-    Term.MULTIANGLE_VALUE: 3e-6,
-    Term.VISIBILITY: 0.15,
-    Term.VISIBILITY_VALUE: 5e-3,
-    Term.PAGE: 0.3,
+    Term.MULTIANGLE_VALUE: 6e-6,
+    Term.VISIBILITY: 0.2,
+    Term.VISIBILITY_VALUE: 2.5e-3,
+    Term.PAGE: 0.2,
     Term.SIGNAL_FIGURE: 0.8,
-    Term.HOMOGENEOUS_FIGURE: 1.0,
-    Term.ELASTIC_FIGURE: 1.2,
-    Term.MULTIANGLE_FIGURE: 2.5,
-    Term.VISIBILITY_FIGURE: 1.5,
+    Term.HOMOGENEOUS_FIGURE: 0.4,
+    Term.ELASTIC_FIGURE: 1.5,
+    Term.MULTIANGLE_FIGURE: 1.9,
+    Term.VISIBILITY_FIGURE: 1.2,
+    Term.FIGURE_VALUE: 3e-7,
 }
 """Costs of a common server core, where nothing was measured."""
 
@@ -135,38 +150,62 @@ class Tally:
     count: int = 0
     """Of scenes in which something is done."""
     _figures: set[tuple[str, str, str]] = field(default_factory=set)
+    _values: float = 0.0
 
     def add(self, scene: Scene, plan: Plan, *, whole: bool = False) -> float:
         """Add a scene and return its own CPU time, s; see `amounts`."""
-        found = self.costs.of(amounts(scene, plan, whole=whole))
-        self.scenes += found
-        kinds = tuple(ProductKind)
-        made = {
-            (step.name, scene.instrument, step.channel)
-            for step in plan.steps
-            if step.name in kinds
-        }
+        terms = amounts(scene, plan, whole=whole)
+        made = {(step.name, scene.instrument, step.channel) for step in _products(plan)}
         self.count += bool(made)
         self._figures |= made
+        self._values += terms.get(Term.SIGNAL_VALUE, 0.0) + terms.get(Term.ELASTIC_VALUE, 0.0)
+        found = self.costs.of(terms)
+        self.scenes += found
         return found
 
     @property
-    def run(self) -> float:
-        """What a run costs beside its scenes, s: start, ledger."""
-        return self.costs.of({Term.RUN: 1.0}) if self.count else 0.0
+    def loading(self) -> float:
+        """What scenes cost once, s: compiled code, by kinds of products."""
+        kinds = {kind for kind, _, _ in self._figures}
+        return self.costs.of(
+            {load_of(kind): 1.0 for kind in kinds}
+            | dict.fromkeys([Term.LOAD] if kinds else [], 1.0)
+        )
+
+    @property
+    def start(self) -> float:
+        """What a run costs once, s: its process, compiled code, ledger."""
+        return self.loading + self.costs.of({Term.RUN: 1.0}) if self.count else 0.0
 
     @property
     def report(self) -> float:
         """What the report costs, s."""
         if not self.count:
             return 0.0
-        drawn = Counter(kind for kind, _, _ in sorted(self._figures)[:_MOST_PICTURES])
-        return self.costs.of({Term.PAGE: 1.0, **{figure(kind): n for kind, n in drawn.items()}})
+        drawn = Counter(kind for kind, _, _ in sorted(self._figures)[:MOST_FIGURES])
+        terms = {figure(kind): float(number) for kind, number in drawn.items()}
+        return self.costs.of({Term.PAGE: 1.0, Term.FIGURE_VALUE: self._values, **terms})
 
     @property
     def total(self) -> float:
         """CPU time of the run, s."""
-        return self.run + self.scenes + self.report
+        return self.start + self.scenes + self.report
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """CPU time of scenes, start and report, and of all, s."""
+        return {
+            "scenes": self.scenes,
+            "start": self.start,
+            "report": self.report,
+            "all": self.total,
+        }
+
+
+def load_of(kind: str) -> Term:
+    """Return the term of what is loaded with the first product of a kind."""
+    # What signals load is what all products do.
+    return Term.LOAD if kind == ProductKind.SIGNAL else Term(f"{kind}_load")
 
 
 def figure(kind: str) -> Term:
@@ -190,14 +229,13 @@ def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[Term, floa
     dict of Term to float
         Without what there is nothing of; empty where the plan gives no product.
     """
-    kinds = tuple(ProductKind)
-    products = [step for step in plan.steps if step.name in kinds]
+    products = _products(plan)
     if not products:
         return {}
     parts = scene.members or (scene,)
     reading = [step.channel for step in plan.steps if step.name == StepName.READ]
     files = (*scene.granules, *scene.dark)
-    found: Counter[Term] = Counter()
+    found: dict[Term, float] = defaultdict(float)
     found[Term.SCENE] = 1
     found[Term.FILE] = sum(
         len(part.granules) + len(part.dark) * _darkened(plan, part.instrument) for part in parts
@@ -211,6 +249,11 @@ def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[Term, floa
         found[Term(step.name)] += 1
         found[Term(f"{step.name}_value")] += _values(step, scene, plan)
     return {term: float(amount) for term, amount in found.items() if amount}
+
+
+def _products(plan: Plan) -> list[Step]:
+    kinds = tuple(ProductKind)
+    return [step for step in plan.steps if step.name in kinds]
 
 
 def _darkened(plan: Plan, instrument: str) -> bool:
@@ -248,10 +291,7 @@ def _only_a_part(channel: str, plan: Plan) -> bool:
     """Return whether a channel is read for joined ones alone."""
     glued = {value for step in plan.steps if step.name == StepName.GLUE
              for value in step.settings.values()}  # fmt: skip
-    kinds = tuple(ProductKind)
-    return channel in glued and not any(
-        step.channel == channel and step.name in kinds for step in plan.steps
-    )
+    return channel in glued and channel not in {step.channel for step in _products(plan)}
 
 
 def _values(step: Step, scene: Scene, plan: Plan) -> float:
@@ -266,9 +306,9 @@ def _values(step: Step, scene: Scene, plan: Plan) -> float:
     profiles = len(scene.granules)
     if step.name == ProductKind.HOMOGENEOUS:
         width = min(channel.bin_width for channel in scene.layout)
-        return profiles * sum((far - near) / width for near, far in settings["sections"])
+        return float(profiles * sum((far - near) / width for near, far in settings["sections"]))
     if step.name == ProductKind.MULTIANGLE:
-        return profiles * settings["highest"] / settings["step"]
+        return float(profiles * settings["highest"] / settings["step"])
     held = _bins(scene)
     names = parts_of(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
     bins = min(held[name] for name in names)

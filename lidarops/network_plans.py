@@ -15,7 +15,10 @@ from lidarops.errors import RetrievalInputError
 from lidarops.plan_rules import (
     GLUED,
     Case,
+    Decisions,
+    Rule,
     StepName,
+    applied,
     conditioning,
     glue_rules,
     joined_channels,
@@ -80,35 +83,33 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
         Steps of every member's channels, then the one that joins them, whose settings name the
         beams. Without steps where the beams do not meet; its `left_out` says why.
     """
-    settings = campaign.networks[scene.instrument].visibility
+    asked = NetworkCase(scene, campaign)
     steps: list[Step] = []
-    rays: list[RayPlan] = []
-    present = {member.instrument for member in scene.members}
-    left_out = [
-        _left(settings, name, "no granule in the window")
-        for name in campaign.networks[scene.instrument].instruments
-        if name not in present
-    ]
+    left_out: list[LeftOut] = []
+    _sort(applied((PRESENT,), asked), steps, left_out)
     for member in scene.members:
-        decided = _Member(member, campaign, settings)
-        for decision in decided.decisions:
-            (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
-        rays += decided.rays
-    colours = {step.settings["wavelength"] for step in steps if step.name == StepName.READ}
-    if colours and max(colours) - min(colours) > _SAME_COLOUR:
-        told = ", ".join(f"{colour * 1e9:g}" for colour in sorted(colours))
-        reason = f"the instruments see different wavelengths: {told} nm"
-        kept: list[RayPlan] = []
-    else:
-        kept, reason = _meeting(rays, scene, campaign, settings, left_out)
-    if reason:
-        left_out.append(
-            LeftOut(StepName.VISIBILITY.value, settings.channel, reason, rule="visibility")
-        )
+        _sort(applied(MEMBER, MemberCase(member, campaign, asked.settings)), steps, left_out)
+    able = {step.instrument for step in steps}
+    rays = [
+        ray
+        for member in scene.members
+        if member.instrument in able
+        for ray in MemberCase(member, campaign, asked.settings).pointings()
+    ]
+    colours = [step.settings["wavelength"] for step in steps if step.name == StepName.READ]
+    found = Meeting(asked, tuple(rays), tuple(colours))
+    _sort(applied(MEETING, found), [], left_out)
+    if found.reason:
         return Plan(scene.id, (), tuple(left_out))
-    used = {ray.instrument for ray in kept}
+    used = {ray.instrument for ray in found.kept}
     steps = [step for step in steps if step.instrument in used]
-    return Plan(scene.id, (*steps, *_joint(kept, scene, campaign, min(colours))), tuple(left_out))
+    _sort(applied(JOINT, found), steps, left_out)
+    return Plan(scene.id, tuple(steps), tuple(left_out))
+
+
+def _sort(decisions: Decisions, steps: list[Step], left_out: list[LeftOut]) -> None:
+    for decision in decisions:
+        (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
 
 
 def sight(settings: VisibilitySettings) -> dict[str, Any]:
@@ -159,121 +160,164 @@ def pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | 
     return zenith, azimuth % 360.0
 
 
-def _left(
-    settings: NetworkVisibilitySettings,
-    member: str,
-    reason: str,
-    *,
-    rule: str = "member",
-    number: float | None = None,
-) -> LeftOut:
-    told = f"{member}: {reason}"
-    step = StepName.VISIBILITY.value
-    return LeftOut(step, settings.channel, told, member, rule=rule, number=number)
+@dataclass(frozen=True, slots=True)
+class NetworkCase:
+    """What the rules of a network look at."""
+
+    scene: Scene
+    campaign: Campaign
+
+    @property
+    def settings(self) -> NetworkVisibilitySettings:
+        """Of the product."""
+        return self.campaign.networks[self.scene.instrument].visibility
+
+    def step(
+        self, name: StepName, reason: str, *, number: float | None = None, **settings: Any
+    ) -> Step:
+        """Return a step that joins the members."""
+        return Step(name.value, self.settings.channel, settings, reason, number=number)
+
+    def without(self, name: StepName, reason: str, *, number: float | None = None) -> LeftOut:
+        """Return what is left out for all members."""
+        return LeftOut(name.value, self.settings.channel, reason, number=number)
 
 
-class _Member:
-    """The rules of one member of a network."""
+@dataclass(frozen=True, slots=True)
+class MemberCase:
+    """What the rules of one member of a network look at."""
 
-    def __init__(
-        self, member: Scene, campaign: Campaign, settings: NetworkVisibilitySettings
-    ) -> None:
-        self._scene = member
-        self._settings = settings
-        instrument = campaign.instruments[member.instrument]
-        self._facts = instrument.facts_at(member.granules[0].start or member.start)
-        self.rays: list[RayPlan] = []
-        self.decisions: list[Step | LeftOut] = list(self._decide())
+    scene: Scene
+    """Of the member."""
+    campaign: Campaign
+    settings: NetworkVisibilitySettings
 
-    def _case(self, channel: ChannelLayout) -> Case:
-        known = channel_facts(self._facts, channel.name)
-        return Case(self._scene, channel, self._facts, known, self._scene.instrument)
+    @property
+    def facts(self) -> InstrumentFacts:
+        """What is known of the instrument."""
+        instrument = self.campaign.instruments[self.scene.instrument]
+        return instrument.facts_at(self.scene.granules[0].start or self.scene.start)
 
-    def _decide(self) -> Iterator[Step | LeftOut]:
-        name = self._settings.channel
-        reason = self._why_not()
-        if reason:
-            yield _left(self._settings, self._scene.instrument, reason)
-            return
-        present = {channel.name: channel for channel in self._scene.layout}
-        for part in parts_of(name) if name.startswith(GLUED) else (name,):
-            case = self._case(present[part])
-            asked = f"asked for by {StepName.VISIBILITY}"
-            colour = wavelength(case.channel, case.known)
-            yield case.step(StepName.READ, asked, wavelength=colour)
-            yield from conditioning(case)
-        if name.startswith(GLUED):
-            case = self._case(self._channel())
-            photon = channel_facts(self._facts, parts_of(name)[1])
-            colour = wavelength(case.channel, photon)
-            yield case.step(StepName.READ, f"asked for by {StepName.VISIBILITY}", wavelength=colour)
-            yield from glue_rules(case)
-        yield self._background()
-        self.rays = list(self._pointings())
+    @property
+    def channel(self) -> ChannelLayout:
+        """The channel that the network wants."""
+        return channel_of(self.scene, self.settings.channel)
 
-    def _background(self) -> Step:
-        channel = self._channel()
-        last = channel.bins * channel.bin_width
-        told = self._settings.background_range
-        reason = (
-            "the last tenth of the bins: signal left there biases it"
-            if told is None
-            else "background_range of the campaign: signal left there biases it"
-        )
-        start, stop = told or (0.9 * last, last)
-        return self._case(channel).step(
-            StepName.BACKGROUND, reason, method="tail_mean", range=[start, min(stop, last)]
-        )
+    def of(self, channel: ChannelLayout) -> Case:
+        """Return what the rules of a channel look at."""
+        known = channel_facts(self.facts, channel.name)
+        return Case(self.scene, channel, self.facts, known, self.scene.instrument)
 
-    def _channel(self) -> ChannelLayout:
-        return channel_of(self._scene, self._settings.channel)
-
-    def _why_not(self) -> str:
-        """Return why a member cannot take part, nothing where it can."""
-        name = self._settings.channel
-        joined = joined_channels(self._scene, [name]) if name.startswith(GLUED) else ()
-        held = [channel.name for channel in (*self._scene.layout, *joined)]
+    def why_not(self) -> tuple[str, float | None]:
+        """Return why a member cannot take part, nothing where it can, and the number."""
+        name, facts = self.settings.channel, self.facts
+        joined = joined_channels(self.scene, [name]) if name.startswith(GLUED) else ()
+        held = [channel.name for channel in (*self.scene.layout, *joined)]
         if name not in held:
-            return f"the files hold no {name}, only {', '.join(held)}"
-        photon = channel_facts(self._facts, ranged_by(name))
-        if math.isnan(wavelength(self._channel(), photon)):
-            return "the header's wavelength is implausible and the campaign's facts give none"
-        if not (self._facts.overlap_profile or self._facts.full_overlap_range > 0):
+            return f"the files hold no {name}, only {', '.join(held)}", None
+        photon = channel_facts(facts, ranged_by(name))
+        if math.isnan(wavelength(self.channel, photon)):
+            return "the header's wavelength is implausible and the campaign's facts give none", None
+        if not (facts.overlap_profile or facts.full_overlap_range > 0):
             return (
                 "the campaign gives neither full_overlap_range nor overlap_profile: 1 percent of"
                 " overlap at the nearest point changes extinction there by 5 percent"
-            )
-        last = self._channel().bins * self._channel().bin_width
-        if self._settings.background_range and self._settings.background_range[0] >= last:
-            return f"background_range begins beyond the bins, which end at {last:g} m"
-        if any(pointing(granule, self._facts) is None for granule in self._scene.granules):
-            return "neither headers nor campaign tell where all beams point"
-        return ""
+            ), facts.full_overlap_range
+        last = self.channel.bins * self.channel.bin_width
+        if self.settings.background_range and self.settings.background_range[0] >= last:
+            return f"background_range begins beyond the bins, which end at {last:g} m", last
+        if any(pointing(granule, facts) is None for granule in self.scene.granules):
+            return "neither headers nor campaign tell where all beams point", None
+        return "", None
 
-    def _pointings(self) -> Iterator[RayPlan]:
+    def pointings(self) -> Iterator[RayPlan]:
+        """Give the beams of the member, each once."""
         told = sorted(
             {
                 found
-                for granule in self._scene.granules
-                if (found := pointing(granule, self._facts)) is not None
+                for granule in self.scene.granules
+                if (found := pointing(granule, self.facts)) is not None
             }
         )
-        channel = self._channel()
-        end = float(ranges_of(channel, self._facts)[-1])
-        farthest = min(end, self._settings.farthest or end)
+        end = float(ranges_of(self.channel, self.facts)[-1])
+        farthest = min(end, self.settings.farthest or end)
         kept: list[tuple[float, float]] = []
         for found in told:
             if not any(apart(found, other) <= SAME_POINTING for other in kept):
                 kept.append(found)
         for zenith, azimuth in kept:
             yield RayPlan(
-                self._scene.instrument,
+                self.scene.instrument,
                 zenith,
                 azimuth,
-                self._facts.full_overlap_range,
+                self.facts.full_overlap_range,
                 farthest,
-                self._settings.exponent_of(self._scene.instrument),
+                self.settings.exponent_of(self.scene.instrument),
             )
+
+
+def _left(
+    settings: NetworkVisibilitySettings, member: str, reason: str, number: float | None = None
+) -> LeftOut:
+    told = f"{member}: {reason}"
+    return LeftOut(StepName.VISIBILITY.value, settings.channel, told, member, number=number)
+
+
+def _present(case: NetworkCase) -> Decisions:
+    present = {member.instrument for member in case.scene.members}
+    for name in case.campaign.networks[case.scene.instrument].instruments:
+        if name not in present:
+            yield _left(case.settings, name, "no granule in the window", 0.0)
+
+
+def _fits(case: MemberCase) -> Decisions:
+    reason, number = case.why_not()
+    if reason:
+        yield _left(case.settings, case.scene.instrument, reason, number)
+
+
+def _signals(case: MemberCase) -> Decisions:
+    """Decide on what makes a signal of the counts of a member, by the rules of any channel."""
+    if case.why_not()[0]:
+        return
+    name = case.settings.channel
+    present = {channel.name: channel for channel in case.scene.layout}
+    for part in parts_of(name) if name.startswith(GLUED) else (name,):
+        of_part = case.of(present[part])
+        yield _reading(of_part, wavelength(of_part.channel, of_part.known))
+        yield from conditioning(of_part)
+    if name.startswith(GLUED):
+        joined = case.of(case.channel)
+        photon = channel_facts(case.facts, parts_of(name)[1])
+        yield _reading(joined, wavelength(joined.channel, photon))
+        yield from glue_rules(joined)
+
+
+def _reading(case: Case, colour: float) -> Step:
+    told = f"asked for by {StepName.VISIBILITY}"
+    read = case.step(StepName.READ, told, number=colour, wavelength=colour)
+    return replace(read, rule=_MEMBER_CHANNEL)
+
+
+def _background(case: MemberCase) -> Decisions:
+    if case.why_not()[0]:
+        return
+    channel, told = case.channel, case.settings.background_range
+    last = channel.bins * channel.bin_width
+    reason = (
+        "the last tenth of the bins: signal left there biases it"
+        if told is None
+        else "background_range of the campaign: signal left there biases it"
+    )
+    start, stop = told or (0.9 * last, last)
+    stop = min(stop, last)
+    yield case.of(channel).step(
+        StepName.BACKGROUND,
+        reason,
+        number=(stop - start) / channel.bin_width,
+        method="tail_mean",
+        range=[start, stop],
+    )
 
 
 def apart(one: tuple[float, float], other: tuple[float, float]) -> float:
@@ -307,78 +351,149 @@ def meeting_of(
     )
 
 
-def _meeting(
-    rays: Sequence[RayPlan],
-    scene: Scene,
-    campaign: Campaign,
-    settings: NetworkVisibilitySettings,
-    left_out: list[LeftOut],
-) -> tuple[list[RayPlan], str]:
-    """Return the beams that meet others twice at least, or why there are none."""
-    kept = list(rays)
-    if len(kept) > geometry.MOST_RAYS:
-        return [], f"{len(kept)} beams are more than {geometry.MOST_RAYS}"
-    while kept:
-        net = meeting_of(
-            kept, scene, campaign,
+class Meeting:
+    """What the rules of beams that may meet look at: those that do, found on the way."""
+
+    def __init__(
+        self, asked: NetworkCase, rays: Sequence[RayPlan], colours: Sequence[float]
+    ) -> None:
+        self.asked = asked
+        self.rays = tuple(rays)
+        self.colours = tuple(colours)
+        self.kept: tuple[RayPlan, ...] = ()
+        self.reason = ""
+        """Why there is no network; empty where there is one."""
+
+    def net(self, rays: Sequence[RayPlan]) -> geometry.Network:
+        """Return where beams meet."""
+        settings = self.asked.settings
+        return meeting_of(
+            rays, self.asked.scene, self.asked.campaign,
             tolerance=settings.tolerance, smallest_angle=settings.smallest_angle,
         )  # fmt: skip
-        lost = [ray for n, ray in enumerate(kept) if net.on_ray(n)[0].size < 2]
+
+    def none(self, reason: str, number: float | None = None) -> LeftOut:
+        """Return the product as left out."""
+        self.reason = reason
+        return self.asked.without(StepName.VISIBILITY, reason, number=number)
+
+
+def _one_colour(case: Meeting) -> Decisions:
+    if case.colours and max(case.colours) - min(case.colours) > _SAME_COLOUR:
+        told = ", ".join(f"{colour * 1e9:g}" for colour in sorted(set(case.colours)))
+        reason = f"the instruments see different wavelengths: {told} nm"
+        yield case.none(reason, max(case.colours) - min(case.colours))
+
+
+def _few_enough(case: Meeting) -> Decisions:
+    if not case.reason and len(case.rays) > geometry.MOST_RAYS:
+        reason = f"{len(case.rays)} beams are more than {geometry.MOST_RAYS}"
+        yield case.none(reason, float(len(case.rays)))
+
+
+def _beams_meet(case: Meeting) -> Decisions:
+    """Leave out beams that meet fewer than two others, until all that are left meet."""
+    if case.reason:
+        return
+    kept = list(case.rays)
+    while kept:
+        net = case.net(kept)
+        points = {ray: int(net.on_ray(n)[0].size) for n, ray in enumerate(kept)}
+        lost = [ray for ray in kept if points[ray] < 2]
         for ray in lost:
             told = f"the beam at {ray.zenith_angle:g} degree, azimuth {ray.azimuth:g}, meets"
             reason = f"{told} fewer than two points that others see"
-            left_out.append(_left(settings, ray.instrument, reason, rule="beams_meet"))
+            yield _left(case.asked.settings, ray.instrument, reason, float(points[ray]))
         if not lost:
             break
         kept = [ray for ray in kept if ray not in lost]
-    if not kept:
-        return [], "no beam meets others in two points, between which extinction attenuates it"
-    if settings.method in {"cycle", "multiplier", "unbiased"}:
-        try:
-            geometry.cycle(net)
-        except RetrievalInputError as error:
-            return [], f"method {settings.method}: {error}"
-    return kept, ""
+    case.kept = tuple(kept)
 
 
-def _joint(
-    rays: Sequence[RayPlan],
-    scene: Scene,
-    campaign: Campaign,
-    colour: float,
-) -> Iterator[Step]:
-    """Give the steps that join the members, which see light of one wavelength."""
-    settings = campaign.networks[scene.instrument].visibility
-    net = meeting_of(
-        rays, scene, campaign,
-        tolerance=settings.tolerance, smallest_angle=settings.smallest_angle,
-    )  # fmt: skip
-    yield Step(
-        StepName.AVERAGE.value,
-        settings.channel,
-        {"seconds": settings.average.total_seconds()},
-        "signals are averaged before they are solved: noise biases what is averaged afterwards",
-        rule="average",
-        number=settings.average.total_seconds(),
-    )
-    yield Step(
-        StepName.VISIBILITY.value,
-        settings.channel,
-        {
-            "rays": [ray.as_dict() for ray in rays],
-            "wavelength": colour,
-            "block_seconds": settings.block.total_seconds(),
-            "method": settings.method,
-            "prior": settings.prior,
-            "tolerance": settings.tolerance,
-            "smallest_angle": settings.smallest_angle,
-            "exponent_relative_error": settings.exponent_relative_error,
-            "lidar_ratio_relative_error": settings.lidar_ratio_relative_error,
-            "overlap_relative_error": settings.overlap_relative_error,
-            **sight(settings.visibility),
-        },
+def _some_meet(case: Meeting) -> Decisions:
+    if not case.reason and not case.kept:
+        reason = "no beam meets others in two points, between which extinction attenuates it"
+        yield case.none(reason, 0.0)
+
+
+def _cycle(case: Meeting) -> Decisions:
+    method = case.asked.settings.method
+    if case.reason or method not in {"cycle", "multiplier", "unbiased"}:
+        return
+    try:
+        geometry.cycle(case.net(case.kept))
+    except RetrievalInputError as error:
+        yield case.none(f"method {method}: {error}", float(len(case.kept)))
+
+
+def _average(case: Meeting) -> Decisions:
+    seconds = case.asked.settings.average.total_seconds()
+    reason = "signals are averaged before they are solved: noise biases what is averaged afterwards"
+    yield case.asked.step(StepName.AVERAGE, reason, number=seconds, seconds=seconds)
+
+
+def _prior(case: Meeting) -> Decisions:
+    settings = case.asked.settings
+    if settings.method != "network":
+        reason = f"method {settings.method} takes no prior"
+        yield case.asked.without(StepName.PRIOR, reason)
+    elif settings.prior == "none":
+        reason = "the campaign asks for none: gradients along beams pass for attenuation"
+        yield case.asked.without(StepName.PRIOR, reason)
+    else:
+        reason = (
+            "decided from the data: the strongest prior about the mean field of a block that its"
+            " beams do not contradict"
+        )
+        number = settings.block / settings.average
+        yield case.asked.step(StepName.PRIOR, reason, number=number)
+
+
+def _visibility(case: Meeting) -> Decisions:
+    """Give the step that joins the members, which see light of one wavelength."""
+    settings, net = case.asked.settings, case.net(case.kept)
+    rays = case.kept
+    yield case.asked.step(
+        StepName.VISIBILITY,
         f"{len(rays)} beams of {len({ray.instrument for ray in rays})} instruments meet in"
         f" {net.vertices} points, {int(net.near_vertex.sum())} of which are near ones",
-        rule="visibility",
         number=float(net.vertices),
+        rays=[ray.as_dict() for ray in rays],
+        wavelength=min(case.colours),
+        block_seconds=settings.block.total_seconds(),
+        method=settings.method,
+        prior=settings.prior,
+        tolerance=settings.tolerance,
+        smallest_angle=settings.smallest_angle,
+        exponent_relative_error=settings.exponent_relative_error,
+        lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
+        overlap_relative_error=settings.overlap_relative_error,
+        **sight(settings.visibility),
     )
+
+
+_MEMBER_CHANNEL: Final = "member_channel"
+PRESENT: Final = Rule(
+    "member_present", StepName.VISIBILITY, "Does the window hold files of the instrument?", _present
+)
+MEMBER: Final = (
+    Rule("member", StepName.VISIBILITY, "Can the instrument take part?", _fits),
+    Rule(_MEMBER_CHANNEL, StepName.READ, "Which channels does the network need?", _signals),
+    Rule("member_background", StepName.BACKGROUND, "Where is its background?", _background),
+)
+"""Of each instrument of a network."""
+MEETING: Final = (
+    Rule("one_colour", StepName.VISIBILITY, "Do all see one wavelength?", _one_colour),
+    Rule("few_beams", StepName.VISIBILITY, "Are there beams that can be solved?", _few_enough),
+    Rule("beams_meet", StepName.VISIBILITY, "Does the beam meet others twice?", _beams_meet),
+    Rule("some_meet", StepName.VISIBILITY, "Is a beam left that others meet?", _some_meet),
+    Rule("cycle", StepName.VISIBILITY, "Do the beams make what the method needs?", _cycle),
+)
+"""Of all beams of a network; the first that finds that there is none ends it."""
+JOINT: Final = (
+    Rule("network_average", StepName.AVERAGE, "How long are signals averaged?", _average),
+    Rule("prior", StepName.PRIOR, "Is a mean field held beforehand?", _prior),
+    Rule("visibility", StepName.VISIBILITY, "Do beams meet, and where?", _visibility),
+)
+"""Of the beams that meet."""
+NETWORK: Final = (PRESENT, *MEMBER, *MEETING, *JOINT)

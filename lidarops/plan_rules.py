@@ -9,6 +9,12 @@ from enum import StrEnum
 from typing import Any, Final
 
 from lidarops.campaign import ChannelFacts, InstrumentFacts, channel_facts
+from lidarops.product_settings import (
+    ElasticSettings,
+    HomogeneousSettings,
+    MultiAngleSettings,
+    SignalSettings,
+)
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Scene, Step
 
 GLUED = "glued_"
@@ -40,13 +46,20 @@ class StepName(StrEnum):
     SIGNAL = "signal"
     LOOK = "look"
     HOMOGENEOUS = "homogeneous"
+    ALONG_PATH = "along_path"
     AVERAGE = "average"
     MOLECULAR = "molecular"
     KNOWN_SHAPE = "known_shape"
     REFERENCE = "reference"
     ELASTIC = "elastic"
     GRADIENT = "gradient"
+    GRADIENT_REGRESSOR = "gradient_regressor"
+    ROBUST = "robust"
+    VERTICAL = "vertical"
+    CORRELATION = "correlation"
+    LAYERS = "layers"
     MULTIANGLE = "multiangle"
+    PRIOR = "prior"
     VISIBILITY = "visibility"
 
 
@@ -79,6 +92,29 @@ class Case:
         return f"{self.member}: {reason}" if self.member else reason
 
 
+@dataclass(frozen=True, slots=True)
+class ChannelCase(Case):
+    """What the rules of one channel look at, and the products that are wanted of it."""
+
+    signal: SignalSettings | None
+    """Set where the channel's ``signal`` product is wanted."""
+    homogeneous: HomogeneousSettings | None
+    """Set where the channel's ``homogeneous`` product is wanted."""
+    elastic: ElasticSettings | None
+    """Set where the channel's ``elastic`` product is wanted."""
+    multiangle: MultiAngleSettings | None
+    """Set where the channel's ``multiangle`` product is wanted."""
+    glued: tuple[str, ...]
+    """Channels that this one is joined into."""
+    all_steps: bool
+    """Whether nothing is left out because it would give nothing."""
+
+    @property
+    def last(self) -> float:
+        """Where the bins end, m, without an offset."""
+        return self.channel.bins * self.channel.bin_width
+
+
 Decisions = Iterator[Step | LeftOut]
 
 
@@ -94,9 +130,9 @@ class Rule:
     question does not arise."""
 
     def decisions(self, case: Any) -> Decisions:
-        """Give what the rule decides, with its name."""
+        """Give what the rule decides, with its name, unless that of a rule it asks is there."""
         for decision in self.decide(case):
-            yield replace(decision, rule=self.name)
+            yield replace(decision, rule=decision.rule or self.name)
 
 
 def applied(rules: Iterable[Rule], case: Any) -> Decisions:

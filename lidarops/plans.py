@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
-from lidarops import network_plans
+from lidarops import network_plans, scan_rules
 from lidarops.campaign import Campaign, Instrument, InstrumentFacts, channel_facts
 from lidarops.plan_rules import (
     CONDITIONING,
     GLUED,
-    Case,
+    ChannelCase,
     Decisions,
     Rule,
     StepName,
@@ -51,29 +51,6 @@ _ROUNDING: Final = 1e-6
 _Settings = TypeVar(
     "_Settings", SignalSettings, HomogeneousSettings, ElasticSettings, MultiAngleSettings
 )
-
-
-@dataclass(frozen=True, slots=True)
-class _Case(Case):
-    """What the rules of one channel look at, and the products that are wanted of it."""
-
-    signal: SignalSettings | None
-    """Set where the channel's ``signal`` product is wanted."""
-    homogeneous: HomogeneousSettings | None
-    """Set where the channel's ``homogeneous`` product is wanted."""
-    elastic: ElasticSettings | None
-    """Set where the channel's ``elastic`` product is wanted."""
-    multiangle: MultiAngleSettings | None
-    """Set where the channel's ``multiangle`` product is wanted."""
-    glued: tuple[str, ...]
-    """Channels that this one is joined into."""
-    all_steps: bool
-    """Whether nothing is left out because it would give nothing."""
-
-    @property
-    def last(self) -> float:
-        """Where the bins end, m, without an offset."""
-        return self.channel.bins * self.channel.bin_width
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +168,7 @@ def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decis
     products = instrument.products
     made = [glued.name for glued in glued_channels(scene, instrument)]
     joined = channel.name in made
-    case = _Case(
+    case = ChannelCase(
         scene=scene,
         channel=channel,
         facts=facts,
@@ -212,7 +189,7 @@ def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decis
     yield from applied(PRODUCTS, case)
 
 
-def _read(case: _Case) -> Decisions:
+def _read(case: ChannelCase) -> Decisions:
     asked = list(_asked(case))
     if not asked:
         yield case.without(StepName.READ, "no product of the campaign asks for this channel")
@@ -238,7 +215,7 @@ def _wanted(settings: _Settings | None, channel: ChannelLayout) -> _Settings | N
     return settings if everything or channel.name in settings.channels else None
 
 
-def _asked(case: _Case) -> Iterator[str]:
+def _asked(case: ChannelCase) -> Iterator[str]:
     if case.signal is not None:
         yield "signal"
     if case.homogeneous is not None:
@@ -250,7 +227,7 @@ def _asked(case: _Case) -> Iterator[str]:
     yield from case.glued
 
 
-def _gate(case: _Case) -> Decisions:
+def _gate(case: ChannelCase) -> Decisions:
     if case.homogeneous is None:
         return
     if case.channel.mode is not DetectionMode.PHOTON:
@@ -276,7 +253,7 @@ def _gate(case: _Case) -> Decisions:
     yield case.step(StepName.RANGE_GATE, reason, number=float(bins), bins=bins)
 
 
-def _background(case: _Case) -> Decisions:
+def _background(case: ChannelCase) -> Decisions:
     if case.signal is None:
         return
     start, stop, bins = _tail(case, case.signal)
@@ -292,14 +269,14 @@ def _background(case: _Case) -> Decisions:
     )
 
 
-def _tail(case: _Case, settings: SignalSettings) -> tuple[float, float, float]:
+def _tail(case: ChannelCase, settings: SignalSettings) -> tuple[float, float, float]:
     """Return the range whose mean is the background, m, and how many bins that holds."""
     start, stop = settings.background_range or (0.9 * case.last, case.last)
     stop = min(stop, case.last)
     return start, stop, (stop - start) / case.channel.bin_width
 
 
-def _signal(case: _Case) -> Decisions:
+def _signal(case: ChannelCase) -> Decisions:
     if case.signal is None:
         yield case.without(StepName.SIGNAL, "the campaign does not ask for it")
         return
@@ -315,18 +292,18 @@ def _signal(case: _Case) -> Decisions:
     yield case.step(StepName.SIGNAL, "the campaign asks for it")
 
 
-def _inside(case: _Case, near: float, far: float) -> float:
+def _inside(case: ChannelCase, near: float, far: float) -> float:
     """Return how many bins hold a section; NaN where it reaches beyond them."""
     return (far - near) / case.channel.bin_width if far <= case.last else math.nan
 
 
-def _sections(case: _Case) -> list[tuple[float, float]]:
+def _sections(case: ChannelCase) -> list[tuple[float, float]]:
     """Return the sections that lie inside the bins."""
     wanted = [] if case.homogeneous is None else case.homogeneous.sections
     return [(near, far) for near, far in wanted if _inside(case, near, far) >= MIN_SECTION_BINS]
 
 
-def _outside(case: _Case) -> Decisions:
+def _outside(case: ChannelCase) -> Decisions:
     inside = _sections(case)
     for near, far in [] if case.homogeneous is None else case.homogeneous.sections:
         if (near, far) not in inside:
@@ -338,7 +315,7 @@ def _outside(case: _Case) -> Decisions:
             yield case.without(StepName.HOMOGENEOUS, reason, number=bins)
 
 
-def _climb(case: _Case, near: float, far: float) -> float:
+def _climb(case: ChannelCase, near: float, far: float) -> float:
     """Return by how much the most level beam of a scene climbs along a section, m, or infinity.
 
     A beam of which nobody tells where it points is not taken for a level one.
@@ -351,7 +328,7 @@ def _climb(case: _Case, near: float, far: float) -> float:
     )
 
 
-def _level_sections(case: _Case) -> list[tuple[float, float]]:
+def _level_sections(case: ChannelCase) -> list[tuple[float, float]]:
     """Return the sections that are retrieved: inside the bins, along a path that may be level."""
     return [
         (near, far)
@@ -360,7 +337,7 @@ def _level_sections(case: _Case) -> list[tuple[float, float]]:
     ]
 
 
-def _level(case: _Case) -> Decisions:
+def _level(case: ChannelCase) -> Decisions:
     kept = _level_sections(case)
     for near, far in _sections(case):
         if (near, far) not in kept:
@@ -375,7 +352,7 @@ def _level(case: _Case) -> Decisions:
             yield case.without(StepName.HOMOGENEOUS, reason, number=number)
 
 
-def _look(case: _Case) -> Decisions:
+def _look(case: ChannelCase) -> Decisions:
     if case.homogeneous is None or not _level_sections(case):
         return
     if case.all_steps:
@@ -385,7 +362,7 @@ def _look(case: _Case) -> Decisions:
         yield case.step(StepName.LOOK, reason, number=float(LOOKED_AT), profiles=LOOKED_AT)
 
 
-def _homogeneous(case: _Case) -> Decisions:
+def _homogeneous(case: ChannelCase) -> Decisions:
     if case.homogeneous is None:
         yield case.without(StepName.HOMOGENEOUS, "the campaign does not ask for it")
         return
@@ -403,6 +380,18 @@ def _homogeneous(case: _Case) -> Decisions:
         )
 
 
+def _along_path(case: ChannelCase) -> Decisions:
+    if case.homogeneous is None or not _level_sections(case):
+        return
+    wanted = case.homogeneous.visibility
+    if wanted is None:
+        reason = "the campaign asks for no visibility along the sections: no such variable"
+        yield case.without(StepName.ALONG_PATH, reason)
+    else:
+        reason = "the campaign asks for visibility along the sections: variables of it"
+        yield case.step(StepName.ALONG_PATH, reason, number=wanted.threshold)
+
+
 @dataclass(frozen=True, slots=True)
 class _Clean:
     """Where along a beam air without aerosol is looked for."""
@@ -415,7 +404,7 @@ class _Clean:
     """Why it is looked for nowhere; empty where it is."""
 
 
-def _clean(case: _Case, settings: ElasticSettings) -> _Clean:
+def _clean(case: ChannelCase, settings: ElasticSettings) -> _Clean:
     zenith, reason = steady_zenith(case)
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     window = settings.reference
@@ -432,13 +421,13 @@ def _clean(case: _Case, settings: ElasticSettings) -> _Clean:
     return _Clean(bottom, top, window.width * stretch, reason)
 
 
-def _elastic_settings(case: _Case) -> ElasticSettings | None:
+def _elastic_settings(case: ChannelCase) -> ElasticSettings | None:
     """Return the settings of the elastic product, where there is one."""
     settings = case.elastic
     return None if settings is None or _clean(case, settings).reason else settings
 
 
-def _average(case: _Case) -> Decisions:
+def _average(case: ChannelCase) -> Decisions:
     settings = _elastic_settings(case)
     if settings is not None:
         seconds = settings.average.total_seconds()
@@ -446,7 +435,7 @@ def _average(case: _Case) -> Decisions:
         yield case.step(StepName.AVERAGE, reason, number=seconds, seconds=seconds)
 
 
-def _known_shape(case: _Case) -> Decisions:
+def _known_shape(case: ChannelCase) -> Decisions:
     settings = _elastic_settings(case)
     if settings is None:
         return
@@ -458,7 +447,7 @@ def _known_shape(case: _Case) -> Decisions:
         yield case.without(StepName.KNOWN_SHAPE, reason)
 
 
-def _reference(case: _Case) -> Decisions:
+def _reference(case: ChannelCase) -> Decisions:
     settings = _elastic_settings(case)
     if settings is None:
         return
@@ -476,7 +465,7 @@ def _reference(case: _Case) -> Decisions:
     )
 
 
-def _elastic(case: _Case) -> Decisions:
+def _elastic(case: ChannelCase) -> Decisions:
     settings = case.elastic
     if settings is None:
         yield case.without(StepName.ELASTIC, "the campaign does not ask for it")
@@ -494,7 +483,7 @@ def _elastic(case: _Case) -> Decisions:
     )
 
 
-def _molecular(case: _Case) -> Decisions:
+def _molecular(case: ChannelCase) -> Decisions:
     scans = case.multiangle is not None and not no_scan(case)
     if _elastic_settings(case) is None and not scans:
         return
@@ -505,39 +494,6 @@ def _molecular(case: _Case) -> Decisions:
         return
     reason = "the campaign gives no molecular_profile: US Standard Atmosphere 1976"
     yield case.step(StepName.MOLECULAR, reason)
-
-
-def _gradient(case: _Case) -> Decisions:
-    if case.multiangle is None or no_scan(case):
-        return
-    largest = case.multiangle.largest_gradient
-    if largest > 0:
-        reason = "backscatter may change along the horizontal: retrieved or allowed for"
-        yield case.step(StepName.GRADIENT, reason, number=largest)
-    else:
-        reason = "the campaign says that no horizontal gradient is to be allowed for"
-        yield case.without(StepName.GRADIENT, reason, number=0.0)
-
-
-def _multiangle(case: _Case) -> Decisions:
-    settings = case.multiangle
-    if settings is None:
-        yield case.without(StepName.MULTIANGLE, "the campaign does not ask for it")
-        return
-    reason = no_scan(case)
-    if reason:
-        yield case.without(StepName.MULTIANGLE, reason)
-        return
-    yield case.step(
-        StepName.MULTIANGLE,
-        "the campaign asks for it, and the beam scans",
-        highest=settings.highest,
-        step=settings.step,
-        method=settings.method,
-        largest_gradient=settings.largest_gradient,
-        layers=[list(layer) for layer in settings.layers],
-        background_range=[0.9 * case.last, case.last],
-    )
 
 
 CHANNEL: Final = Rule(
@@ -553,13 +509,13 @@ PRODUCTS: Final = (
     Rule("section_level", StepName.HOMOGENEOUS, "May the path be level?", _level),
     Rule("look", StepName.LOOK, "May sections turn out to hold no light?", _look),
     Rule("homogeneous", StepName.HOMOGENEOUS, "Is a section left to retrieve?", _homogeneous),
+    Rule("along_path", StepName.ALONG_PATH, "Are variables of visibility wanted?", _along_path),
     Rule("average", StepName.AVERAGE, "Does a retrieval need less noise?", _average),
     Rule("molecular", StepName.MOLECULAR, "Does a retrieval need the air's density?", _molecular),
     Rule("known_shape", StepName.KNOWN_SHAPE, "Which background is asked for?", _known_shape),
     Rule("reference", StepName.REFERENCE, "Where may air be without aerosol?", _reference),
     Rule("elastic", StepName.ELASTIC, "Does one beam reach air without aerosol?", _elastic),
-    Rule("gradient", StepName.GRADIENT, "May the air differ along the horizontal?", _gradient),
-    Rule("multiangle", StepName.MULTIANGLE, "Does the beam scan over zenith angle?", _multiangle),
+    *scan_rules.SCANS,
 )
 """Of the products of a channel, in the order in which they run."""
 ABSENT: Final = Rule(

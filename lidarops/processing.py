@@ -104,9 +104,11 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     final : bool
         False where a disk, a network or memory failed: another try may do better.
     """
+    begin = time.thread_time()
     try:
         with _Archive.of(job.campaign.archive).local(job.scene) as root:
-            return _process(job, root), True
+            outcome = _process(job, root)
+        return replace(outcome, cpu_seconds=time.thread_time() - begin), True
     except _FAILURES as error:
         text = str(error) if isinstance(error, LidarOpsError | OSError) else repr(error)
         return failed(job, text), not isinstance(error, ProductError | OSError | MemoryError)

@@ -273,6 +273,10 @@ class SceneOutcome:
     """Wall time by stage."""
     bytes_read: int = 0
     """Of raw files, headers apart."""
+    cpu_seconds: float = 0.0
+    """CPU time of the thread that processed it; 0 where it was not measured."""
+    estimated_seconds: float = 0.0
+    """CPU time that was reckoned with before; 0 where nothing was."""
 
     @property
     def empty(self) -> bool:
@@ -303,6 +307,8 @@ class RunRecord:
     """Granules that the catalog refused."""
     truth: str = ""
     """Path of the truth file of a simulated campaign, empty for real data."""
+    costs: str = ""
+    """Whence the costs were that times were estimated with; empty where nothing was estimated."""
 
     @property
     def failed(self) -> bool:

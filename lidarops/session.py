@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from lidarops import __version__
+from lidarops import __version__, costs
 from lidarops.campaign import Campaign
 from lidarops.catalog import versions
 from lidarops.catalog.ledger import Entry, NewProduct, Run, RunStatus
@@ -56,6 +56,7 @@ class Session:
         self._kept: dict[str, str] = {}
         self._outcomes: list[SceneOutcome] = []
         self._named = 0
+        self._tally = costs.Tally(costs.load())
         self.started = started or datetime.now(UTC)
         self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
 
@@ -100,6 +101,7 @@ class Session:
         SceneOutcome
             As it was entered: failed where its files are not there any more.
         """
+        outcome = replace(outcome, estimated_seconds=self._estimated(judged))
         new, outcome = self._new_products(judged, outcome)
         entry = Entry(
             outcome=outcome,
@@ -139,7 +141,15 @@ class Session:
             scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
             refused=refused,
             truth=_truth(self._campaign),
+            costs=self._tally.costs.words,
         )
+
+    def _estimated(self, judged: Judgement) -> float:
+        """Return the CPU time that a scene was to take, s, with what it is the first to load."""
+        before = self._tally.loading
+        whole = self._campaign.all_steps
+        own = self._tally.add(judged.scene, judged.needed(), whole=whole)
+        return own + self._tally.loading - before
 
     def _new_products(
         self, judged: Judgement, outcome: SceneOutcome

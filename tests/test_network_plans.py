@@ -195,7 +195,8 @@ class TestPlans:
         assert all(s.reason.startswith(f"{s.instrument}: ") for s in per_member)
         names = [s.name for s in found.steps if s.instrument == "west-lidar"]
         assert names == ["read", "overlap", "noise", "background"]
-        assert [s.name for s in found.steps if not s.instrument] == ["average", "visibility"]
+        joint = [s.name for s in found.steps if not s.instrument]
+        assert joint == ["average", "prior", "visibility"]
 
     def test_it_is_plain_data(self):
         found = planned(campaign({"exponents": {"east-lidar": 1.2}}))

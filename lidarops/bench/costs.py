@@ -6,6 +6,7 @@ product. The costs are those of least relative squares, none of them negative.
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -126,7 +127,7 @@ def calibrate(
         progress(1)
         measured = _scenes(campaign, rounds, progress)
         seconds = fitted(measured)
-        seconds |= _report(campaign, record)
+        seconds |= _report(campaign, record) | _loads(campaign)
         progress(1)
         seconds[Term.RUN] = _beside(campaign, Costs(seconds | {Term.RUN: 0.0}))
         progress(1)
@@ -137,9 +138,7 @@ def calibrate(
         date=date,
         machine=here,
         seconds={term.value: seconds[term] for term in Term},
-        observations=tuple(
-            replace(each, estimated=model.of(each.amounts)) for each in measured
-        ),
+        observations=tuple(replace(each, estimated=model.of(each.amounts)) for each in measured),
         path=str(kept),
     )
 
@@ -210,14 +209,58 @@ def _report(campaign: Campaign, record: RunRecord) -> dict[Term, float]:
     page = _page(campaign, replace(record, scenes=()))
     found = {Term.PAGE: page}
     for kind in ProductKind:
-        some = next(
-            replace(scene, products=mine)
-            for scene in reversed(record.scenes)
-            if (mine := tuple(made for made in scene.products if made.kind is kind)[:1])
-        )
-        whole = _page(campaign, replace(record, scenes=(some,)))
-        found[costs.figure(kind)] = max(whole - page, 0.0)
+        some = sorted(
+            (replace(scene, products=mine)
+             for scene in record.scenes
+             if (mine := tuple(made for made in scene.products if made.kind is kind)[:1])),
+            key=lambda scene: scene.products[0].values,
+        )  # fmt: skip
+        least = max(_page(campaign, replace(record, scenes=(some[0],))) - page, 0.0)
+        found[costs.figure(kind)] = least
+        if kind is ProductKind.SIGNAL:
+            most = max(_page(campaign, replace(record, scenes=(some[-1],))) - page, least)
+            few, many = (some[place].products[0].values for place in (0, -1))
+            found[Term.FIGURE_VALUE] = (most - least) / (many - few)
     return found
+
+
+def _loads(campaign: Campaign) -> dict[Term, float]:
+    """Return what a process of its own loads with the first product of each kind, s."""
+    told = _child(
+        "from lidarops.bench.costs import first_times; first_times(sys.argv[1])", campaign
+    )
+    found: dict[str, list[float]] = json.loads(told)
+    return {costs.load_of(kind): max(first - again, 0.0) for kind, (first, again) in found.items()}
+
+
+def first_times(path: str) -> None:
+    """Write for each kind of product what the first scene and the same again cost, as JSON."""
+    campaign = load(path)
+    jobs: dict[str, Job] = {}
+    for judged in pipeline.assess(campaign, force=True):
+        for kind, channel in dependence.wanted(judged.plan):
+            mine = dependence.part(judged.plan, [(kind, channel)])
+            jobs.setdefault(kind.value, Job(campaign, judged.scene, mine))
+    found = {}
+    # What all kinds load counts for the first of them, signals.
+    for kind in ProductKind:
+        found[kind.value] = [process(jobs[kind.value]).cpu_seconds for _ in range(2)]
+    sys.stdout.write(json.dumps(found))
+
+
+def _child(code: str, campaign: Campaign, *words: str) -> str:
+    """Run Python in a process of its own, and return what it writes."""
+    path = str(campaign.folder / _FILE)
+    done = subprocess.run(  # noqa: S603 - this very Python and a file of our own
+        [sys.executable, "-c", f"import sys; {code}", path, *words],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    # 1 tells of scenes without a value to use, which cost as much.
+    if done.returncode not in (0, 1) or not done.stdout:
+        raise CampaignError(f"a process of the calibration failed: {done.stderr[-500:]}")
+    return done.stdout
 
 
 def _page(campaign: Campaign, record: RunRecord) -> float:
@@ -232,12 +275,8 @@ def _beside(campaign: Campaign, model: Costs) -> float:
     for judged in pipeline.assess(campaign, force=True):
         tally.add(judged.scene, judged.plan)
     before = _of_children()
-    command = "import sys; from lidarops.cli import app; sys.argv[0] = 'lidarops'; app()"
-    subprocess.run(  # noqa: S603 - this very Python and a file of our own
-        [sys.executable, "-c", command, "reprocess", str(campaign.folder / _FILE), "--force"],
-        check=False,
-        capture_output=True,
-    )
+    command = "from lidarops.cli import app; sys.argv.insert(1, 'reprocess'); app()"
+    _child(command, campaign, "--force", "--json")
     return max(_of_children() - before - tally.total, 0.0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lidarops.campaign import Campaign
+    from lidarops.costs import Tally
     from lidarops.pipeline import Result
     from lidarops.records import Granule, Plan
     from lidarops.staleness import Judgement, Selection
@@ -109,22 +111,44 @@ def show_plan(
 ) -> None:
     """Show the scenes, their steps, what is left out and why, and what is stale. Runs nothing.
 
+    With the CPU time that it is going to take.
+
     Example: lidarops plan catalogs/demo.yaml
     """
+    from lidarops import costs
     from lidarops.pipeline import assess
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
     found = assess(settings, selection=wanted, everything=not stale)
-    if as_json:
-        typer.echo(json.dumps([_plain(each) for each in found], indent=2))
-        return
+    machine = costs.load()
+    making, everything = costs.Tally(machine), costs.Tally(machine)
+    scenes = []
     for each in found:
-        scene = each.scene
+        scene, whole = each.scene, settings.all_steps
+        times = {
+            "to_be_made": making.add(scene, each.needed(), whole=whole),
+            "everything": everything.add(scene, each.plan, whole=whole),
+        }
+        if as_json:
+            scenes.append({**_plain(each), "estimated_cpu_seconds": times})
+            continue
         title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
         if not stale:
-            show(_plan_table(title, each.plan))
-        show(_stale_table(title, each))
+            took = f"about {times['everything']:.2g} s of CPU time"
+            show(_plan_table(f"{title}, {took}", each.plan))
+        show(_stale_table(f"{title}, about {times['to_be_made']:.2g} s of CPU time", each))
+    # What is fresh too was not looked at.
+    told = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
+    if as_json:
+        total = {
+            name.partition(",")[0].replace(" ", "_"): each.parts for name, each in told.items()
+        }
+        estimate = {**total, "costs": machine.words, "calibrated": not machine.note}
+        typer.echo(json.dumps({"scenes": scenes, "estimated_cpu_seconds": estimate}, indent=2))
+        return
+    show(_time_table(told))
+    typer.echo(f"estimated CPU time: {machine.words}")
 
 
 @app.command()
@@ -273,12 +297,24 @@ def _refused_table(refused: list[Granule]) -> Table:
 
 
 def _plan_table(title: str, plan: Plan) -> Table:
-    table = make_table(title, "channel", "step", "does", "why", "rule")
+    from lidarops.reports.words import decided_on
+
+    table = make_table(title, "channel", "step", "does", "why", "rule", "number")
     for step in plan.steps:
         settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
-        add_row(table, step.channel, step.name, settings or "yes", step.reason, step.rule)
+        does = (step.channel, step.name, settings or "yes", step.reason)
+        add_row(table, *does, step.rule, decided_on(step.number))
     for left in plan.left_out:
-        add_row(table, left.channel, left.name, "left out", left.reason, left.rule)
+        told = (left.channel, left.name, "left out", left.reason)
+        add_row(table, *told, left.rule, decided_on(left.number))
+    return table
+
+
+def _time_table(told: Mapping[str, Tally]) -> Table:
+    table = make_table("Estimated CPU time in s", "", "scenes", "theirs", "start", "report", "all")
+    for name, tally in told.items():
+        spent = (f"{seconds:.2g}" for seconds in tally.parts.values())
+        add_row(table, name, tally.count, *spent)
     return table
 
 

@@ -37,8 +37,7 @@ def bench(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, costs, elastic, homogeneous, multiangle, multiposition, pipeline or"
-            " reader."
+            help="all, costs, elastic, homogeneous, multiangle, multiposition, pipeline or reader."
         ),
     ] = None,
     data: Annotated[

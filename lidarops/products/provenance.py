@@ -19,7 +19,7 @@ from uuid import NAMESPACE_URL, uuid5
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.records import InputRecord, Provenance
+from lidarops.records import InputRecord, LeftOut, Provenance
 
 RELEASE_DATE: Final = date(2026, 11, 21)
 """Of this version of lidarops; a product is dated no earlier."""
@@ -33,6 +33,7 @@ _NOT_COMPUTING: Final = (
     "catalog/",
     "cli/",
     "clusters.py",
+    "costs.py",
     "engine.py",
     "inspection.py",
     "kubernetes.py",
@@ -130,9 +131,15 @@ def _plan(provenance: Provenance) -> dict[str, Any]:
         # The very text whose digest that is.
         "lidarops:json": _canonical(plan.as_dict()),
         "lidarops:left_out": [
-            f"{left.name} of {left.channel}: {left.reason}" for left in plan.left_out
+            f"{left.name} of {left.channel}: {left.reason}{_rule(left)}" for left in plan.left_out
         ],
     }
+
+
+def _rule(left: LeftOut) -> str:
+    """Return the rule that decided and its number, in brackets."""
+    number = "" if left.number is None else f", {left.number:g}"
+    return f" [{left.rule}{number}]" if left.rule else ""
 
 
 def _input(records: list[InputRecord]) -> dict[str, Any]:

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.flags import Quality, Severity
-from lidarops.records import ProductKind, RunRecord, SceneOutcome
-from lidarops.reports.words import counted, duration, percent
+from lidarops.records import LeftOut, Plan, ProductKind, RunRecord, SceneOutcome, Step
+from lidarops.reports.words import counted, decided_on, duration, percent
 
 _NAMED: Final = 8
 """Most names listed in one cell."""
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOutRow:
-    """One thing that was not done, over all scenes where it was not done for this reason."""
+class DecisionRow:
+    """One thing that was done or not, over all scenes where that was so for this reason."""
 
     step: str
     reason: str
+    rule: str
+    """Name of the rule that decided."""
+    number: str
+    """That it decided on, over these scenes: one, or the least and the largest."""
     channels: str
     instruments: str
     scenes: int
@@ -95,6 +99,7 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
         ("Version", record.version),
         ("Started", moment(record.started)),
         ("Duration", duration((record.finished - record.started).total_seconds())),
+        *_cpu_time(record),
         ("Scenes", counted(len(record.scenes), "scene") + f", {failed:,} failed"),
         ("Products", f"{products.total():,}" + (f": {kinds}" if kinds else "")),
         ("Granules", f"{processed:,} processed, {refused:,} refused"),
@@ -103,6 +108,16 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
             for kind, values, flagged in _flagged_by_kind(record)
         ),
     ]
+
+
+def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
+    """Return what scenes took and were to take, where that was measured."""
+    took = sum(scene.cpu_seconds for scene in record.scenes)
+    if not took:
+        return []
+    estimated = sum(scene.estimated_seconds for scene in record.scenes)
+    told = f"; {duration(estimated)} were estimated ({record.costs})" if estimated else ""
+    return [("CPU time of scenes", f"{duration(took)}{told}")]
 
 
 def verdict(record: RunRecord) -> str:
@@ -135,21 +150,39 @@ def instruments(record: RunRecord) -> list[InstrumentRow]:
     ]
 
 
-def left_out(record: RunRecord) -> list[LeftOutRow]:
+def left_out(record: RunRecord) -> list[DecisionRow]:
     """Group what was not done by step and reason, the most frequent of a step first."""
-    scenes: dict[tuple[str, str], set[str]] = defaultdict(set)
-    channels: dict[tuple[str, str], set[str]] = defaultdict(set)
-    names: dict[tuple[str, str], set[str]] = defaultdict(set)
+    return _decisions(record, lambda plan: ((left, left.reason) for left in plan.left_out))
+
+
+def done(record: RunRecord) -> list[DecisionRow]:
+    """Group what was done by step and reason, the most frequent of a step first."""
+    return _decisions(record, lambda plan: ((step, step.reason) for step in plan.steps))
+
+
+def _decisions(
+    record: RunRecord, of: Callable[[Plan], Iterable[tuple[Step | LeftOut, str]]]
+) -> list[DecisionRow]:
+    scenes: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    channels: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    names: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    numbers: dict[tuple[str, str, str], set[float]] = defaultdict(set)
     for scene in record.scenes:
-        for item in scene.plan.left_out if scene.plan else ():
-            key = (item.name, item.reason)
+        for item, reason in of(scene.plan) if scene.plan else ():
+            key = (item.name, reason, item.rule)
             scenes[key].add(scene.scene)
             channels[key].add(item.channel)
             names[key].add(scene.instrument)
+            if item.number is not None:
+                numbers[key].add(item.number)
     return [
-        LeftOutRow(
+        DecisionRow(
             step=key[0],
             reason=key[1],
+            rule=key[2],
+            number=" to ".join(dict.fromkeys(decided_on(end(numbers[key])) for end in (min, max)))
+            if numbers[key]
+            else "",
             channels=listed(channels[key]),
             instruments=listed(names[key]),
             scenes=len(scenes[key]),

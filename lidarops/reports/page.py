@@ -135,6 +135,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
             for scene in record.scenes[:ROWS]
         ],
         left_out=content.left_out(record),
+        steps=content.done(record),
         flags=content.flags(record),
         refused=content.refused(record),
         failed=[scene for scene in record.scenes if scene.error],

@@ -72,3 +72,8 @@ def _is_control(character: str) -> bool:
 
 def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
+
+
+def decided_on(number: float | None) -> str:
+    """Return the number that a rule decided on; empty where there is none."""
+    return "" if number is None else f"{number:.4g}"
