@@ -71,6 +71,24 @@ CALM = wanted(multiangle={"channels": ["photon_532o"], "largest_gradient": 0.0})
 FEW = wanted(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_000]})
 OF_ANALOG = wanted(homogeneous={**SECTIONS, "channels": ["analog_532o"]})
 OFFSET = told(channels={"photon_532o": {"range_offset": 5}})
+SEEN = wanted(homogeneous={**SECTIONS, "visibility": {}})
+
+
+def scans(*beams: tuple[float, float | None]) -> list[Any]:
+    """Return granules of beams, by zenith angle and azimuth."""
+    return [
+        factories.granule(k, path=f"coast/h{k}", zenith_angle=zenith, azimuth=azimuth)
+        for k, (zenith, azimuth) in enumerate(beams)
+    ]
+
+
+def multi(**settings: Any) -> dict[str, Any]:
+    return wanted(multiangle={"channels": ["photon_532o"], **settings})
+
+
+ONE_SIDE = scans(*((15.0 * k, 90.0) for k in range(6)))
+BOTH_SIDES = scans(*((15.0 * k, side) for k in range(6) for side in (90.0, 270.0)))
+TWO_BEAMS = scans((0.0, 90.0), (60.0, 90.0))
 BEYOND = wanted(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 16_000]]})
 
 
@@ -90,6 +108,16 @@ BEYOND = wanted(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 
         ("elastic", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
         ("gradient", (SCAN, MULTI), (SCAN, CALM)),
         ("multiangle", (SCAN, MULTI), ([UP], MULTI)),
+        ("along_path", ([LEVEL], SEEN), ([LEVEL], {})),
+        ("gradient_regressor", (BOTH_SIDES, MULTI), (ONE_SIDE, MULTI)),
+        ("gradient_regressor", (BOTH_SIDES, MULTI), (SCAN, MULTI)),
+        ("gradient_regressor", (BOTH_SIDES, MULTI), (BOTH_SIDES, multi(method="mld"))),
+        ("robust", (ONE_SIDE, MULTI), (TWO_BEAMS, MULTI)),
+        ("vertical", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="kano_hamilton"))),
+        ("vertical", (ONE_SIDE, MULTI), (TWO_BEAMS, MULTI)),
+        ("correlation", (ONE_SIDE, MULTI), (TWO_BEAMS, multi(method="joint"))),
+        ("correlation", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="mld"))),
+        ("layers", (ONE_SIDE, multi(layers=[[600, 1200]])), (ONE_SIDE, MULTI)),
     ],
 )  # fmt: skip
 def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, needing, needless):
@@ -133,6 +161,43 @@ def test_a_question_that_does_not_arise_is_not_answered(rule, asked, unasked):
 def test_what_cannot_be_is_left_out_by_name(rule, changes):
     assert decided(planned(LEVEL, **changes), rule)[1]
     assert decided(planned(LEVEL), rule) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("granules", "rule", "number"),
+    [
+        (ONE_SIDE, "gradient_regressor", 360.0),
+        (BOTH_SIDES, "gradient_regressor", 180.0),
+        (scans((0.0, 0.0), (30.0, 0.0), (30.0, 120.0), (30.0, 240.0)), "gradient_regressor", 120.0),
+        # The azimuths of a beam near the zenith are one direction, negative angles the other side.
+        (scans((0.0, 0.0), (0.0, 200.0), (50.0, 10.0)), "robust", 2.0),
+        (scans((60.0, 90.0), (-60.0, 90.0), (0.0, 90.0)), "gradient_regressor", 180.0),
+        (ONE_SIDE, "correlation", 4.0),
+        (ONE_SIDE, "vertical", 100.0),
+    ],
+)
+def test_numbers_of_scans(granules, rule, number):
+    made = planned(*granules, **MULTI)
+    (found,) = (each for each in (*made.steps, *made.left_out) if each.rule == rule)
+    assert found.number == pytest.approx(number)
+
+
+def test_every_decision_has_a_rule_of_the_table():
+    names = {rule.name for rule in RULES}
+    for granules, changes in (
+        ([LEVEL, DARK], {}), ([UP], ELASTIC), ([UP], LATE), (BOTH_SIDES, MULTI), ([LEVEL], FEW),
+    ):  # fmt: skip
+        made = planned(*granules, **changes)
+        assert {each.rule for each in (*made.steps, *made.left_out)} <= names
+
+
+def test_every_row_is_asked_for_here():
+    """No row of the table without a test that names it."""
+    here = Path(__file__)
+    told = here.read_text() + (here.parent / "test_network_plans.py").read_text()
+    missing = {rule.name for rule in RULES if f'"{rule.name}"' not in told}
+    # Tested by the bit that they set.
+    assert missing <= {"section_saturated", "member_background"}
 
 
 # Headers --------------------------------------------------------------------------------------

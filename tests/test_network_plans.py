@@ -16,6 +16,7 @@ from lidarops.campaign import Campaign
 from lidarops.network_plans import apart
 from lidarops.plans import plan
 from lidarops.records import Granule, Plan, Scene
+from lidarops.rules import RULES
 from lidarops.scenes import cut
 
 PLACES = {
@@ -85,6 +86,14 @@ def planned(told: Campaign, given_: list[Granule] | None = None) -> Plan:
 
 def reasons(found: Plan) -> str:
     return "; ".join(left.reason for left in found.left_out if left.name == "visibility")
+
+
+RED = replace(granules()[2], layout=(replace(PHOTON, wavelength=1064e-9),))
+
+
+def turned(degree: float) -> list[Granule]:
+    """One granule of each member, whose beams are turned."""
+    return [replace(g, azimuth=(g.azimuth or 0.0) + degree) for g in granules(10 + degree)]
 
 
 class TestCampaign:
@@ -240,6 +249,52 @@ class TestPlans:
     def test_a_cycle_is_asked_of_one_cycle(self):
         found = planned(campaign({"method": "cycle"}))
         assert found.steps[-1].settings["method"] == "cycle"
+
+    @pytest.mark.parametrize(
+        ("rule", "told", "given_", "number"),
+        [
+            ("member_present", {}, granules()[:2], 0.0),
+            ("member", {"facts": {"west-lidar": [{}]}}, None, 0.0),
+            ("beams_meet", {}, granules(zenith_angle=0.0), 0.0),
+            ("some_meet", {}, granules(zenith_angle=0.0), 0.0),
+            ("one_colour", {}, [*granules()[:2], RED], 532e-9),
+            ("few_beams", {}, [g for k in range(180) for g in turned(k)], 540.0),
+            ("cycle", {"visibility": {"method": "cycle"}}, [*granules(), *turned(4)], 6.0),
+            ("prior", {"visibility": {"prior": "none"}}, None, None),
+            ("prior", {"visibility": {"method": "klett"}}, None, None),
+        ],
+    )
+    def test_rules_of_what_cannot_be(self, rule, told, given_, number):
+        found = planned(campaign(**told), given_)
+        left = [each for each in found.left_out if each.rule == rule]
+        assert left
+        assert all(each.number == pytest.approx(number) for each in left)
+        fine = planned(campaign())
+        assert not [each for each in fine.left_out if each.rule == rule]
+
+    @pytest.mark.parametrize(
+        ("rule", "number"),
+        [
+            ("member_channel", 532e-9),
+            ("member_background", 200.0),
+            ("network_average", 600.0),
+            ("prior", 36.0),
+            ("visibility", 3.0),
+        ],
+    )
+    def test_rules_of_what_runs(self, rule, number):
+        found = planned(campaign())
+        steps = [each for each in found.steps if each.rule == rule]
+        assert steps
+        assert all(each.number == pytest.approx(number) for each in steps)
+        apart_ = planned(campaign(), granules(zenith_angle=0.0))
+        assert not [each for each in apart_.steps if each.rule == rule]
+
+    def test_every_decision_has_a_rule_of_the_table(self):
+        names = {rule.name for rule in RULES}
+        for given_ in (granules(), granules(zenith_angle=0.0), granules()[:2]):
+            found = planned(campaign(), given_)
+            assert {each.rule for each in (*found.steps, *found.left_out)} <= names
 
     def test_facts_win_over_headers(self):
         facts = [{"full_overlap_range": 150.0, "zenith_angle": 90.0, "azimuth": 70.0}]

@@ -71,7 +71,11 @@ def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> 
     assert not (archive.folder / "out/report").exists()
     archive.flip("raw/poor/h10")
     planned = runner.invoke(app, ["plan", file, "--stale", "--json"])
-    (scene,) = json.loads(planned.stdout)
+    told = json.loads(planned.stdout)
+    (scene,) = told["scenes"]
+    times = scene["estimated_cpu_seconds"]
+    assert 0 < times["to_be_made"] <= times["everything"]
+    assert told["estimated_cpu_seconds"]["to_be_made"]["scenes"] == times["to_be_made"]
     assert {stale["reason"] for stale in scene["stale"]} == {"changed: signal poor/h10"}
     log = archive.folder / "log.jsonl"
     words = ["--log-json", "--log-level", "info", "--log-file", str(log), "--json"]

@@ -1,0 +1,78 @@
+"""Costs of a machine: what is fitted, and that estimates hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mixed_campaign
+import numpy as np
+import pytest
+
+from lidarops import costs, pipeline
+from lidarops.bench import costs as calibration
+from lidarops.bench.costs import Observation, fitted
+from lidarops.bench.terms import Effort, Kind
+from lidarops.costs import DEFAULTS, Costs, Term
+from lidarops.errors import CampaignError
+from lidarops.records import RunRecord
+from lidarops.simulate.campaign import simulate
+
+FACTOR = 1.5
+
+
+def observed(truth: Costs, count: int = 60, noise: float = 0.0) -> list[Observation]:
+    """Return scenes of random amounts that cost what a machine says."""
+    rng = np.random.default_rng(2)
+    found = []
+    for _ in range(count):
+        terms = {term: float(rng.uniform(0, 1) / DEFAULTS[term]) for term in Term}
+        seconds = truth.of(terms) * float(np.exp(noise * rng.standard_normal()))
+        found.append(Observation("", (), terms, seconds, 0.0))
+    return found
+
+
+def test_costs_are_found_again():
+    rng = np.random.default_rng(1)
+    truth = Costs({term: cost * float(rng.uniform(0.5, 2)) for term, cost in DEFAULTS.items()})
+    found = fitted(observed(truth, count=1500))
+    assert [found[term] for term in Term] == pytest.approx(
+        [truth.seconds[term] for term in Term], rel=0.1
+    )
+    model = Costs(fitted(observed(truth, noise=0.2)))
+    for each in observed(truth):
+        assert model.of(each.amounts) == pytest.approx(each.seconds, rel=0.25)
+
+
+def test_no_cost_is_negative_and_what_is_not_seen_stays():
+    scenes = [Observation("", (), {Term.SCENE: 1.0, Term.FILE: 9.0 * k}, 0.3, 0.0) for k in (1, 9)]
+    found = fitted(scenes)
+    assert min(found.values()) >= 0
+    assert found[Term.VISIBILITY] == pytest.approx(DEFAULTS[Term.VISIBILITY])
+
+
+def test_costs_have_no_accuracy():
+    with pytest.raises(CampaignError, match="throughput"):
+        calibration.run(Kind.ACCURACY, effort=Effort())
+
+
+@pytest.mark.slow
+def test_estimates_hold_within_a_factor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    campaign = mixed_campaign.write(tmp_path, profiles=40)
+    simulate(campaign)
+    # What is compiled once on a machine is compiled here.
+    first = pipeline.reprocess(campaign)
+    assert first is not None
+    assert first.costs.startswith("not calibrated")
+    found = calibration.calibrate(date="today", rounds=2)
+    assert found.farthest < FACTOR
+    assert costs.load().words == "calibrated on this machine on today"
+    record = pipeline.reprocess(campaign, options=pipeline.Options(force=True))
+    assert isinstance(record, RunRecord)
+    took = sum(scene.cpu_seconds for scene in record.scenes)
+    estimated = sum(scene.estimated_seconds for scene in record.scenes)
+    # All is loaded by now, which a process of its own would have to do.
+    model = costs.load()
+    loads = {costs.load_of(product.kind) for scene in record.scenes for product in scene.products}
+    estimated -= model.of(dict.fromkeys(loads | {Term.LOAD}, 1.0))
+    assert 1 / FACTOR < estimated / took < FACTOR
