@@ -38,7 +38,7 @@ def test_costs_are_found_again():
     assert [found[term] for term in Term] == pytest.approx(
         [truth.seconds[term] for term in Term], rel=0.1
     )
-    model = Costs(fitted(observed(truth, noise=0.2)))
+    model = Costs(fitted(observed(truth, count=600, noise=0.2)))
     for each in observed(truth):
         assert model.of(each.amounts) == pytest.approx(each.seconds, rel=0.25)
 

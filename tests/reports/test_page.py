@@ -271,6 +271,17 @@ class TestDegenerateRuns:
         )
 
 
+class TestDecisions:
+    def test_rule_and_number_of_what_was_done(self, archive, tmp_path):
+        step = Step("look", CHANNEL, {}, "sections may be dark", rule="look", number=16.0)
+        plan = replace(fab.plan("one"), steps=(step,))
+        scene = outcome("one", START, plan=plan, cpu_seconds=3.0, estimated_seconds=2.0)
+        run = replace(run_record(archive.root, [scene]), costs="calibrated yesterday")
+        found = built(run, tmp_path / "report")
+        assert f"look sections may be dark look 16 {CHANNEL}" in found.text
+        assert "were estimated (calibrated yesterday)" in found.text
+
+
 class TestManyScenes:
     @pytest.fixture
     def many(self, archive, tmp_path):
@@ -282,7 +293,10 @@ class TestManyScenes:
             left = (
                 LeftOut("dark", CHANNEL, "no dark files within 24 h of the scene"),
                 LeftOut("dark", "analog_355o", "no dark files within 24 h of the scene"),
-                LeftOut("overlap", CHANNEL, f"the campaign gives none for {name}"),
+                LeftOut(
+                    "overlap", CHANNEL, f"the campaign gives none for {name}",
+                    rule="overlap", number=float(i // 100),
+                ),
             )
             products = ()
             if i % 50 == 0:
@@ -305,7 +319,8 @@ class TestManyScenes:
         reason = "no dark files within 24 h of the scene"
         assert found.text.count(reason) == 1
         assert f"dark {reason} analog_355o, {CHANNEL} horizontal, vertical 300" in found.text
-        assert "the campaign gives none for vertical photon_532o vertical 150" in found.text
+        told = "the campaign gives none for vertical overlap 0 to 2 photon_532o vertical 150"
+        assert told in found.text
         assert found.text.count("is truncated") == 1
         assert "300 files" in found.text
         # One figure for the instrument over all its scenes, and the flags.
