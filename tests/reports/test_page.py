@@ -294,8 +294,11 @@ class TestManyScenes:
                 LeftOut("dark", CHANNEL, "no dark files within 24 h of the scene"),
                 LeftOut("dark", "analog_355o", "no dark files within 24 h of the scene"),
                 LeftOut(
-                    "overlap", CHANNEL, f"the campaign gives none for {name}",
-                    rule="overlap", number=float(i // 100),
+                    "overlap",
+                    CHANNEL,
+                    f"the campaign gives none for {name}",
+                    rule="overlap",
+                    number=float(i // 100),
                 ),
             )
             products = ()
