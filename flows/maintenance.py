@@ -3,7 +3,7 @@
 A worker that loses power leaves its run in the state Running for ever, where it occupies the one
 slot of its deployment: nothing is scheduled any more. Such a run gives no sign of life.
 
-``python -m flows.maintenance`` looks once; with ``--every 30`` it stays and looks every 30 s,
+``python -m flows.maintenance`` looks once; with ``--every 15`` it stays and looks every 15 s,
 which needs no worker and is what ``deploy/`` starts.
 """
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import base64
 import time
-from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 from uuid import UUID
@@ -48,7 +48,7 @@ _T = TypeVar("_T")
 Workers = Annotated[int, Field(ge=1, le=10_000)]
 Seconds = Annotated[float, Field(ge=0, le=86_400)]
 
-_TOLD_EVERY = 5.0
+_TOLD_EVERY = 15.0
 """s between reports of progress, each of which is a request to the server."""
 
 
@@ -109,14 +109,11 @@ def process_task(
     """Bring catalog and products up to date."""
     progress = _Progress(campaign.name)
     options = Options(force=full, wait=wait, progress=progress.advance, expect=progress.expect)
-    with ExitStack() as stack:
-        client = None
-        if isinstance(cluster, clusters.Local):
-            # Started by the pipeline itself, and only where something is due.
-            options = replace(options, workers=cluster.workers, memory=cluster.memory)
-        else:
-            client = stack.enter_context(clusters.client(cluster))
-        result = bring_up_to_date(campaign, selection=selection, options=options, client=client)
+    if isinstance(cluster, clusters.Local):
+        options = replace(options, workers=cluster.workers, memory=cluster.memory)
+    else:
+        options = replace(options, cluster=partial(clusters.client, cluster))
+    result = bring_up_to_date(campaign, selection=selection, options=options)
     progress.end()
     if result.status is not RunStatus.FINISHED:
         raise SceneError(f"the run is {result.status}", remedy="run again: what is done stays done")

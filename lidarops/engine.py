@@ -45,6 +45,14 @@ GRACE: Final = 20.0
 """s that scenes in hand get to end, on a cluster that is asked to stop."""
 TRIES: Final = 3
 """Times that a scene may take its worker down before it is refused."""
+_DASK: Final = {
+    # Every death of a worker is to be seen here, where it is counted for its scene alone.
+    "distributed.scheduler.allowed-failures": 0,
+    # Every process would wake a hundred times a second to sample stacks, for a page that is not
+    # served, and fifty times to look how late it is.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+}
 
 _LOG = logging.getLogger(__name__)
 
@@ -222,8 +230,7 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
 
     with (
-        # Every death of a worker is to be seen here, where it is counted for its scene alone.
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        dask.config.set(_DASK),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -63,6 +63,8 @@ class Options:
     workers: int = 1
     memory: str | None = None
     """Most memory of a worker that is started here, such as ``2GiB``."""
+    cluster: Callable[[], AbstractContextManager[Client]] | None = None
+    """Starts or reaches a cluster to run on instead; called only where something is stale."""
     wait: float = 0.0
     """s to wait for another run on the same catalog."""
     profiles_per_chunk: int | None = None
@@ -86,6 +88,8 @@ class Result:
     orphans: tuple[Orphan, ...]
     failures: Mapping[str, str]
     """Scene -> error, of every scene whose last try failed."""
+    empty: tuple[str, ...]
+    """Scenes whose retrievals left nothing to use."""
     barren: int
     """Scenes that can give no product."""
     set_aside: int
@@ -99,6 +103,7 @@ class Result:
         return bool(
             self.summary.refused
             or self.failures
+            or self.empty
             or self.barren
             or self.set_aside
             or self.status is not RunStatus.FINISHED
@@ -316,6 +321,7 @@ class _Work:
             fresh=found.fresh,
             orphans=tuple(found.orphans),
             failures=self._store.failures(),
+            empty=tuple(self._store.empty()),
             barren=found.barren + sum(barren for _, barren, _ in clean),
             set_aside=len(found.set_aside) + sum(aside for _, _, aside in clean),
             signal=caught,
@@ -335,8 +341,10 @@ class _Work:
         options = self._options
         with ExitStack() as stack:
             used = client
-            if client is None and options.workers > 1:
-                used = stack.enter_context(local_client(options.workers, memory=options.memory))
+            if client is None and (options.cluster or options.workers > 1):
+                # First, as a run that this one has to wait for may leave nothing to do.
+                self._write()
+                used = stack.enter_context(self._started())
             serial = used is None
             taken = self._take_noted if serial else self._take
             if first is not None:
@@ -348,6 +356,12 @@ class _Work:
                 for job in self._suspects:
                     self._take(job)
                 self._enter(alone(self._suspects, client=used, stop=stop), stop)
+
+    def _started(self) -> AbstractContextManager[Client]:
+        options = self._options
+        if options.cluster:
+            return options.cluster()
+        return local_client(options.workers, memory=options.memory)
 
     def _enter(self, ended: Iterator[Ended], stop: Stop) -> None:
         session = self._running()

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final
 
 
 class DetectionMode(StrEnum):
@@ -253,6 +253,10 @@ class ProductRecord:
     """Number of values that no bit rejects; None where it was not counted."""
 
 
+JUDGE_THEMSELVES: Final = (ProductKind.ELASTIC, ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
+"""Products whose retrieval rejects its own values."""
+
+
 @dataclass(frozen=True, slots=True)
 class SceneOutcome:
     """What became of one scene."""
@@ -280,12 +284,8 @@ class SceneOutcome:
 
     @property
     def empty(self) -> bool:
-        """Whether every value of the retrievals that judge themselves is rejected.
-
-        Those of the ``elastic``, ``multiangle`` and ``visibility`` products.
-        """
-        kinds = (ProductKind.ELASTIC, ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
-        retrieved = [product for product in self.products if product.kind in kinds]
+        """Whether every value of the retrievals that judge themselves is rejected."""
+        retrieved = [product for product in self.products if product.kind in JUDGE_THEMSELVES]
         return bool(retrieved) and all(product.usable == 0 for product in retrieved)
 
 

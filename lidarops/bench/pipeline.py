@@ -17,6 +17,7 @@ import yaml
 from scipy import stats
 
 from lidarops import pipeline
+from lidarops.bench import orchestration
 from lidarops.bench.story import facts
 from lidarops.bench.terms import RESULT, Effort, Finding, Kind
 from lidarops.bench.timing import Machine, machine
@@ -33,6 +34,7 @@ _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _INTERVAL: Final = 60
 """s, of a file."""
 _NOTHING: Final = "-"
+_FILE: Final = "campaign.yaml"
 _MILLI: Final = 1e3
 _SHORTEST: Final = 1e-4
 """s; the clock of a fast machine with little work may not have moved."""
@@ -107,6 +109,8 @@ class Pipeline:
     growths: tuple[Growth, ...]
     workers: Mapping[int, float]
     """Seconds on the wall of a run, by number of worker processes."""
+    ways: tuple[orchestration.Way, ...] = ()
+    """Whole commands, on campaigns of `OF_WAYS`."""
 
 
 _ALONG: Final[Mapping[str, tuple[Size, ...]]] = {
@@ -119,6 +123,7 @@ _QUICK: Final[Mapping[str, tuple[Size, ...]]] = {
     name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
 }
 _OF_WORKERS: Final = Size(scenes=16, profiles=60)
+OF_WAYS: Final = (Size(scenes=16), Size(scenes=128))
 
 
 def run(kind: Kind, *, effort: Effort) -> Finding:
@@ -166,7 +171,8 @@ def measure(
         growths.append(Growth(name, costs, dict(_slopes(name, costs))))
     counts = workers if workers is not None else (() if quick else (1, 2))
     times = {count: _wall(count, progress) for count in counts}
-    return Pipeline(date, machine(), tuple(growths), times)
+    ways = _ways(progress) if workers is None and not quick else ()
+    return Pipeline(date, machine(), tuple(growths), times, ways)
 
 
 def _cost(size: Size, progress: Callable[[int], object]) -> Cost:
@@ -207,6 +213,19 @@ def _wall(workers: int, progress: Callable[[int], object]) -> float:
     return seconds
 
 
+def _ways(progress: Callable[[int], object]) -> tuple[orchestration.Way, ...]:
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        files = []
+        for size in OF_WAYS:
+            place = Path(folder) / str(size.scenes)
+            place.mkdir()
+            simulated(size, place)
+            files.append(place / _FILE)
+        found = orchestration.measure(files)
+    progress(1)
+    return found
+
+
 def _timed(call: Callable[[], object]) -> float:
     begin = time.process_time()
     call()
@@ -221,7 +240,7 @@ def simulated(size: Size, folder: Path) -> Campaign:
     Campaign
         With products of all profiles.
     """
-    path = folder / "campaign.yaml"
+    path = folder / _FILE
     path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
     campaign = load(path)
     written = carry_out(plan(campaign))
@@ -324,9 +343,17 @@ def report(found: Pipeline, data: str = "") -> Report:
     return Report(
         title="Pipeline: cost of a campaign",
         facts=facts(found.date, found.machine),
-        parts=(_stages(found), *([_workers(found)] if found.workers else [])),
+        parts=tuple(_parts_of_page(found)),
         data=data,
     )
+
+
+def _parts_of_page(found: Pipeline) -> Iterator[Part]:
+    yield _stages(found)
+    if found.workers:
+        yield _workers(found)
+    if found.ways:
+        yield orchestration.part(found.ways, [size.scenes for size in OF_WAYS])
 
 
 def _stages(found: Pipeline) -> Part:

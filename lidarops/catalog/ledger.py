@@ -29,7 +29,15 @@ from lidarops.catalog.schema import (
     VERDICT,
 )
 from lidarops.errors import CatalogError
-from lidarops.records import Granule, InputRecord, ProductRecord, Role, SceneOutcome, Status
+from lidarops.records import (
+    JUDGE_THEMSELVES,
+    Granule,
+    InputRecord,
+    ProductRecord,
+    Role,
+    SceneOutcome,
+    Status,
+)
 
 
 class RunStatus(StrEnum):
@@ -292,6 +300,7 @@ class Ledger(Granules):
             "inputs_hash": depends_on.inputs_hash,
             "code_version": depends_on.code_version,
             "run": run,
+            "usable": record.usable,
         }
 
     def _enter_inputs(self, connection: sa.Connection, products: Sequence[NewProduct]) -> None:
@@ -468,6 +477,21 @@ class Ledger(Granules):
         )
         with self.transaction() as connection:
             return {row.scene: row.error for row in connection.execute(query)}
+
+    def empty(self) -> list[str]:
+        """Return the scenes whose retrievals left nothing to use, as `SceneOutcome.empty`."""
+        # Not counted by day: a run over a part of a scene leaves its other products as they are.
+        kinds = [kind.value for kind in JUDGE_THEMSELVES]
+        something = sa.case((_P.usable == 0, 0), else_=1)
+        query = (
+            sa.select(_P.scene)
+            .where(_P.campaign == self.campaign, _P.kind.in_(kinds))
+            .group_by(_P.scene)
+            .having(sa.func.max(something) == 0)
+            .order_by(_P.scene)
+        )
+        with self.transaction() as connection:
+            return list(connection.scalars(query))
 
     def forget_scenes(self, scenes: Collection[str]) -> None:
         """Remove what is noted of scenes that are no more."""

@@ -6,7 +6,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 """Raised with every change of a table: a database of another version is refused by name."""
 
 METADATA: Final = sa.MetaData()
@@ -93,6 +93,8 @@ PRODUCT = sa.Table(
     sa.Column("inputs_hash", _DIGEST, nullable=False),
     sa.Column("code_version", _NAME, nullable=False),
     sa.Column("run", sa.ForeignKey("run.id"), nullable=False),
+    # Values that may be used; null where the kind does not judge them.
+    sa.Column("usable", sa.BigInteger),
     sa.Index("product_by_day", "campaign", "day"),
     sqlite_with_rowid=False,
 )

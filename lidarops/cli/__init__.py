@@ -3,7 +3,17 @@
 Exit codes: 0 all well, 1 something was refused or failed, 2 wrong use.
 """
 
-from lidarops.cli import aggregate, archive, audit, bench, files, reproduce, simulation, site
+from lidarops.cli import (
+    aggregate,
+    archive,
+    audit,
+    bench,
+    files,
+    publish,
+    reproduce,
+    simulation,
+    site,
+)
 from lidarops.cli.app import app
 
 __all__ = [
@@ -13,6 +23,7 @@ __all__ = [
     "audit",
     "bench",
     "files",
+    "publish",
     "reproduce",
     "simulation",
     "site",

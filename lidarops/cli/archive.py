@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from contextlib import ExitStack
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,6 +36,9 @@ from lidarops.cli.app import (
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractContextManager
+
     from distributed import Client
     from rich.table import Table
 
@@ -208,20 +211,19 @@ def reprocess(
     set_up(log_level, as_json=log_json, file=log_file)
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
-    with growing_bar("reprocess", "granules") as bar, ExitStack() as stack:
-        client = _client(stack, workers, scheduler, tls, cluster)
+    asked = _cluster(workers, scheduler, tls, cluster)
+    with growing_bar("reprocess", "granules") as bar:
         options = pipeline.Options(
             force=force,
             workers=workers or 1,
             memory=memory_limit,
+            cluster=asked,
             wait=wait,
             profiles_per_chunk=profiles_per_chunk,
             progress=lambda outcome: bar.advance(outcome.granules),
             expect=bar.grow,
         )
-        result = pipeline.bring_up_to_date(
-            settings, selection=wanted, options=options, client=client
-        )
+        result = pipeline.bring_up_to_date(settings, selection=wanted, options=options)
     removed = None
     if remove_orphans:
         removed = pipeline.remove_orphans(settings, result.orphans, wait=wait)
@@ -244,14 +246,13 @@ def _loaded(
     return settings.model_copy(update={"all_steps": all_steps or settings.all_steps})
 
 
-def _client(
-    stack: ExitStack,
+def _cluster(
     workers: int | None,
     scheduler: str | None,
     tls: tuple[Path, Path, Path] | None,
     cluster: str | None,
-) -> Client | None:
-    """Reach the cluster that is asked for; None for this machine."""
+) -> Callable[[], AbstractContextManager[Client]] | None:
+    """Return what reaches the cluster that is asked for; None for this machine."""
     if tls and scheduler is None:
         raise typer.BadParameter("--tls is for --scheduler; a cluster's file has its own")
     if scheduler is None and cluster is None:
@@ -263,7 +264,7 @@ def _client(
         ca, certificate, key = tls
         files = clusters.Tls(ca=ca, certificate=certificate, key=key)
         chosen = chosen.model_copy(update={"tls": files})
-    return stack.enter_context(clusters.client(chosen))
+    return partial(clusters.client, chosen)
 
 
 def _selection(
@@ -347,6 +348,7 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             **result.failures,
             **{scene.scene: scene.error for scene in scenes if scene.error},
         },
+        "empty_scenes": list(result.empty),
         "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
         "products": [product.path for scene in scenes for product in scene.products],
         "orphans": {orphan.path: orphan.reason for orphan in result.orphans},
@@ -376,8 +378,8 @@ def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | 
     show(table)
     show(_refused_table(_refused(campaign, result)))
     show(_orphans_table(result, removed))
+    show(_failures_table(result))
     if page is None:
-        show(_failures_table(result))
         typer.echo("nothing to do: every product that is asked for is fresh or cannot be made")
     else:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
@@ -393,7 +395,12 @@ def _orphans_table(result: Result, removed: int | None) -> Table:
 
 
 def _failures_table(result: Result) -> Table:
-    table = make_table("Failed before, and nothing has changed since", "scene", "error")
+    told = {scene.scene for scene in (() if result.record is None else result.record.scenes)}
+    table = make_table("Of earlier runs, and nothing has changed since", "scene", "problem")
     for scene, error in result.failures.items():
-        add_row(table, scene, error)
+        if scene not in told:
+            add_row(table, scene, error)
+    for scene in result.empty:
+        if scene not in told:
+            add_row(table, scene, "its retrievals left nothing to use")
     return table

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import pytest
 
-from lidarops.bench import cases, pipeline
+from lidarops.bench import cases, orchestration, pipeline
 from lidarops.bench.pipeline import Cost, Growth, Size, Stage
 from lidarops.bench.terms import Effort, Kind
 from lidarops.bench.timing import machine
-from lidarops.errors import CampaignError
+from lidarops.errors import CampaignError, SceneError
 from lidarops.pipeline import reprocess
 
 SMALL = Size(scenes=2, profiles=15, bins=500)
@@ -71,3 +71,24 @@ def test_slopes_are_those_of_the_times(found, tmp_path):
 def test_there_is_no_accuracy_of_the_pipeline():
     with pytest.raises(CampaignError, match="no accuracy"):
         pipeline.run(Kind.ACCURACY, effort=Effort())
+
+
+def test_the_overhead_of_a_way_is_a_line_over_the_plain_loop():
+    serial = orchestration.Way("plain loop", (10.0, 110.0), (11.0, 120.0))
+    flow = orchestration.Way("flow", (10.0 + 16.5, 110.0 + 21.5), (30.0, 140.0))
+    line = orchestration.overhead(flow, serial)
+    assert line.fixed == pytest.approx(16.0)
+    assert line.share == pytest.approx(0.05)
+    assert line.of(300.0) == pytest.approx(16.0 / 300.0 + 0.05)
+    (table,) = orchestration.part((serial, flow), (2, 22)).tables
+    assert table.rows[1] == ("flow", "131.5", "140.0", "16.0", "5.0 %", "10.3 %")
+
+
+def test_a_whole_command_is_measured_with_its_processes(tmp_path):
+    pipeline.simulated(Size(scenes=1, profiles=15, bins=500), tmp_path)
+    (way,) = orchestration.measure([tmp_path / "campaign.yaml"], ways=("plain loop",))
+    assert way.cpu[0] > 0.0
+    assert list((tmp_path / "plain loop" / "products").rglob("*.nc"))
+    (tmp_path / "campaign.yaml").write_text("name: 3")
+    with pytest.raises(SceneError, match="failed"):
+        orchestration.measure([tmp_path / "campaign.yaml"], ways=("plain loop",))

@@ -66,8 +66,11 @@ def test_the_command_line_tells_what_the_ledger_knows(archive: Archive) -> None:
 def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> None:
     runner, file = CliRunner(), str(archive.file)
     nothing = runner.invoke(app, ["reprocess", file, "--json"])
-    assert nothing.exit_code == 0
-    assert json.loads(nothing.stdout)["run"] is None
+    # Its elastic retrievals have nothing to rest on, and every run says so.
+    assert nothing.exit_code == 1
+    told = json.loads(nothing.stdout)
+    assert told["run"] is None
+    assert told["empty_scenes"] == ["rich_20260301T000000", "rich_20260302T000000"]
     assert not (archive.folder / "out/report").exists()
     archive.flip("raw/poor/h10")
     planned = runner.invoke(app, ["plan", file, "--stale", "--json"])
@@ -80,7 +83,7 @@ def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> 
     log = archive.folder / "log.jsonl"
     words = ["--log-json", "--log-level", "info", "--log-file", str(log), "--json"]
     done = runner.invoke(app, ["reprocess", file, *words])
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == 1, done.output
     assert len(json.loads(done.stdout)["products"]) == 2
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert any("changed: signal poor/h10" in line["message"] for line in lines)

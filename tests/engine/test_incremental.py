@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import quick
@@ -255,6 +258,45 @@ def test_refused_files_are_told_by_a_run_with_nothing_to_do(archive: Archive) ->
     assert again.troubled
     assert (again.summary.refused, again.set_aside) == (1, 1)
     assert archive.contents() == before
+
+
+def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
+    archive: Archive,
+) -> None:
+    campaign = archive.write()
+    record = reprocess(campaign, options=Options(force=True))
+    assert record is not None
+    usable = {each.path: each.usable for scene in record.scenes for each in scene.products}
+    with Store(campaign.catalog_url, campaign.name) as store:
+        rows = {row["path"]: row for row in store.products()}
+        assert {path: row["usable"] for path, row in rows.items()} == usable
+        assert store.empty() == [scene.scene for scene in record.scenes if scene.empty]
+    poorest = next(path for path, row in rows.items() if row["kind"] == "elastic")
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        connection.execute("update product set usable = 0 where kind = 'elastic'")
+        connection.execute("update product set usable = 1 where path = ?", (poorest,))
+    scenes = {row["scene"] for path, row in rows.items() if row["kind"] == "elastic"}
+    again = bring_up_to_date(campaign)
+    assert again.record is None
+    assert set(again.empty) == scenes - {rows[poorest]["scene"]}
+    assert again.troubled
+
+
+def test_a_cluster_is_started_only_where_something_is_stale(archive: Archive) -> None:
+    started = []
+
+    @contextmanager
+    def cluster() -> Iterator[Any]:
+        started.append(True)
+        yield client
+
+    with engine.local_client(1) as client:
+        options = Options(cluster=cluster)
+        assert reprocess(archive.write(), options=options) is None
+        assert not started
+        next((archive.folder / "out/products").rglob("*poor*signal*.nc")).unlink()
+        assert len(made(reprocess(archive.write(), options=options))) == 1
+        assert started == [True]
 
 
 def test_a_scene_that_cannot_but_fail_is_not_tried_until_something_changes(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from pathlib import Path
 
 import factories
 import pytest
 import rawfiles
 import yaml
+from typer.testing import CliRunner
 
 from lidarops.campaign import load
+from lidarops.cli import app
 from lidarops.pipeline import reprocess
 from lidarops.publication import publish
 from lidarops.stores import RemoteStore
@@ -63,3 +66,27 @@ def test_raw_from_s3_and_products_to_s3(tmp_path: Path, campaign_file: Path, s3:
     assert reprocess(in_store) is None
     again = publish(in_store, f"{url}/products")
     assert (again.uploaded, again.unchanged, again.others) == ((), 2, 0)
+
+
+def test_the_command_line_publishes_and_says_what_it_did(
+    tmp_path: Path, campaign_file: Path
+) -> None:
+    campaign = load(campaign_file)
+    assert reprocess(campaign) is not None
+    runner, store = CliRunner(), tmp_path / "store"
+    words = ["publish", str(campaign_file), store.as_uri()]
+    first = runner.invoke(app, [*words, "--json"])
+    assert first.exit_code == 0, first.output
+    expected = digests(campaign.products_root)
+    assert sorted(json.loads(first.stdout)["uploaded"]) == sorted(expected)
+    assert digests(store) == expected
+    (store / "note.txt").write_text("of somebody else")
+    again = runner.invoke(app, words, env={"COLUMNS": "300"})
+    assert "0 sent, 2 unchanged, 1 others in the store left alone" in again.stdout
+    product = next(campaign.products_root.rglob("*.nc"))
+    product.write_bytes(product.read_bytes()[:-1] + b"?")
+    next(store.rglob(product.name)).unlink()
+    damaged = runner.invoke(app, words)
+    assert damaged.exit_code == 1
+    assert "is not what the ledger says" in damaged.output
+    assert digests(store).items() <= expected.items()
