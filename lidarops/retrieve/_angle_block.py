@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
@@ -31,6 +32,8 @@ GRADIENT_LIMIT: Final = 4.0
 _GRADIENT_NOISE: Final = 0.02
 """Variance of a logarithm (a signal of 7 times its noise) above which its skew, in the mean over
 many profiles, looks like a gradient."""
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,11 +245,14 @@ def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Arr
     return np.interp(gates, gates[known], variance), freedom
 
 
+@_compiled
 def _windowed(values: Array) -> Array:
     """Return sums over the window around each gate, as far as there are gates."""
     half = WINDOW // 2
-    padded = np.pad(values, half)
-    total: Array = np.lib.stride_tricks.sliding_window_view(padded, WINDOW).sum(axis=-1)
+    total = np.zeros(values.size)
+    for k in range(values.size):
+        for j in range(max(k - half, 0), min(k + half + 1, values.size)):
+            total[k] += values[j]
     return total
 
 

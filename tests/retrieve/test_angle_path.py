@@ -10,7 +10,7 @@ from scipy.special import erfc
 
 from lidarops.bench import multiangle_cases as cases
 from lidarops.retrieve import _angle_block, _slant
-from lidarops.retrieve._angle_path import path_varies
+from lidarops.retrieve._angle_path import GROWTH, path_varies
 from lidarops.retrieve.multiangle import solve
 
 
@@ -37,8 +37,27 @@ def test_variation_in_a_cloud_is_seen(largest, correlation):
     assert all(varies(scattered.draw(8, seed, 1)) for seed in range(8))
     assert all(varies(replace(scene, variation=0.5).draw(24, seed, 2)) for seed in range(4))
     assert not any(varies(scene.draw(8, seed, 1)) for seed in range(8))
-    # One profile of six rays holds too little to tell.
-    assert not varies(scattered.draw(1, 3))
+
+
+def test_variation_is_seen_where_scatter_itself_grows_little():
+    """Where layers scatter independently: what rays have lost adds up to little, but to much in
+    the mean over altitudes, which is what the optical depth of a smooth profile follows."""
+    scene = replace(cases.cloud(0.0, largest=45.0), variation=0.5)
+    assert all(varies(scene.draw(24, seed, 5)) for seed in range(8))
+    found = cases.retrieve(scene.draw(24, 0, 5), cases.JOINT)
+    lower, upper = found.inhomogeneity[0, :13].mean(), found.inhomogeneity[0, -13:].mean()
+    assert (upper / lower) ** 2 < GROWTH
+
+
+def test_variation_is_seen_in_most_random_clouds():
+    """With 3 to 20 rays, outliers, gradients, and all scatters and correlations."""
+    told = []
+    for seed in range(120):
+        scene = cases.random_scene(seed, 8)
+        if scene.backscatter.std() == 0.0:
+            strength = 0.3 + 0.7 * np.random.default_rng(seed).random()
+            told.append(varies(replace(scene, variation=strength).draw(8, seed, 6)))
+    assert np.mean(told) >= 0.75
 
 
 def test_noise_that_is_larger_than_stated_aloft_is_no_variation():
