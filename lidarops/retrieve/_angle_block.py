@@ -181,6 +181,43 @@ def weights_of(rays: Rays, fit: Regression) -> Array:
     return _weights(rays, fit)
 
 
+def kept_information(rays: Rays, fit: Regression) -> Array:
+    """Return the information that outliers leave over that of all rays, (profile, altitude).
+
+    An altitude that lost a ray has all the noise that it shares with others, and more of its own.
+    """
+    if not fit.robust:
+        return np.ones((rays.noise.shape[0], rays.noise.shape[2]))
+    kept = _squares_of_path(rays, _weights(rays, fit))
+    whole = _squares_of_path(rays, 1.0 / (rays.noise + fit.inhomogeneity))
+    return np.where(whole > 0.0, np.minimum(kept / np.where(whole > 0.0, whole, 1.0), 1.0), 1.0)
+
+
+def _squares_of_path(rays: Rays, weights: Array) -> Array:
+    whole = weights.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centre = np.einsum("tak,ak->tk", weights, rays.path) / whole
+        square = np.einsum("tak,ak->tk", weights, rays.path**2) - whole * centre**2
+    return np.nan_to_num(square)
+
+
+def common_scale(rays: Rays, fit: Regression) -> Array:
+    """Return what makes residuals of two altitudes as alike as their errors, (profile, altitude).
+
+    The bisquare makes residuals small; and with other rays left out, other parts of the errors
+    are left in the residuals.
+    """
+    shape = (rays.noise.shape[0], rays.noise.shape[2])
+    if not fit.robust:
+        return np.ones(shape)
+    of_chi2 = _angle_robust.clean_moments(_angle_robust.PASS_WIDTH)[0]
+    count = np.count_nonzero(rays.noise < np.inf, axis=1) - 2.0 - fit.column(kh.SIDES)
+    expected = fit.column(kh.EXPECTED)
+    told = expected > 0.0
+    ratio = np.where(told, count / np.where(told, expected, 1.0), 1.0)
+    return np.sqrt(np.maximum(ratio, 1.0) / of_chi2)
+
+
 def _weights(rays: Rays, fit: Regression) -> Array:
     weights = 1.0 / (rays.noise + fit.inhomogeneity)
     return weights * fit.keep if fit.keep.shape[1] > 0 else weights

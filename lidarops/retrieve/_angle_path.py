@@ -10,6 +10,7 @@ must not pass for it.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numba
@@ -29,6 +30,7 @@ CERTAINTY: Final = 2.5
 """Standard errors by which the logarithm of that ratio must exceed zero. In simulated scenes
 without variation, 0.3 percent exceed both."""
 _FEWEST_GATES: Final = 6
+_FEWEST_PROFILES: Final = 4
 _CLIP: Final = 3.0
 """Standard errors to which residuals are cut, so that no outlier decides."""
 _DEPENDENT: Final = 1e-8
@@ -38,19 +40,23 @@ _COLUMNS: Final = 4
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def path_varies(rays: Rays, fit: Regression) -> bool:
-    r"""Tell whether the common scatter of altitudes grows from the lower to the upper ones.
+def doubted_from(rays: Rays, fit: Regression) -> int | None:
+    r"""Return the altitude from which on extinction varies along paths; None where it does not.
 
     With the inhomogeneity of the lower third of the altitudes, residuals are formed anew about a
     constant, the slant path and the horizontal distances, which take a gradient away. Each ray is
-    averaged over the altitudes of a third; the sums of squares Q of these means over rays and
-    profiles are compared,
+    averaged over the altitudes of a third, as far as inhomogeneity exceeds its noise; the sums of
+    squares Q of these means over rays and profiles are compared,
 
     .. math:: \ln \frac{Q_u / \nu_u}{Q_l / \nu_l}, \qquad
               \sigma^2 = \psi'(\nu_u / 2) + \psi'(\nu_l / 2) ,
 
     with the degrees of freedom :math:`\nu` that an altitude has, as a ray has one mean, however
     its altitudes are correlated.
+
+    Where this holds of what differs from profile to profile, all altitudes are doubted. What all
+    profiles of a block share may as well be an error of the instrument, as of a background,
+    which grows with the range; it counts for altitudes above the lower third.
 
     Parameters
     ----------
@@ -59,30 +65,59 @@ def path_varies(rays: Rays, fit: Regression) -> bool:
 
     Returns
     -------
-    bool
+    int, optional
+        Index.
     """
     seen = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
     if seen.size < _FEWEST_GATES:
-        return False
+        return None
     third = seen.size // 3
     thirds = seen[:third], seen[-third:]
     low = float(np.mean(fit.inhomogeneity[thirds[0]]))
-    squares, freedom = zip(*(_of_means(rays, fit, part, low) for part in thirds), strict=True)
-    told = (freedom[0] > 0) & (freedom[1] > 0)
-    (lower, upper), (few, many) = (
-        [float(one[told].sum()) for one in pair] for pair in (squares, freedom)
+    lower, upper = (_ray_means(rays, fit, part, low) for part in thirds)
+    told = (lower.freedom > 0) & (upper.freedom > 0)
+    if not _grows(lower.of(told), upper.of(told)):
+        return None
+    if np.count_nonzero(told) < _FEWEST_PROFILES:
+        return 0
+    return (
+        0 if _grows(lower.of(told).varying(), upper.of(told).varying()) else int(thirds[0][-1]) + 1
     )
-    if not (lower > 0.0 and upper > 0.0):
+
+
+@dataclass(frozen=True, slots=True)
+class _Means:
+    """Means of rays over a third of the altitudes, in units that are 1 for white noise."""
+
+    value: Array
+    """(profile, ray)"""
+    freedom: Array
+    """(profile,)"""
+
+    def of(self, profiles: npt.NDArray[np.bool_]) -> _Means:
+        """Return those of some profiles."""
+        return _Means(self.value[profiles], self.freedom[profiles])
+
+    def varying(self) -> _Means:
+        """Return what differs from profile to profile."""
+        there = self.value != 0.0
+        mean = self.value.sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+        left = 1.0 - 1.0 / self.freedom.size
+        return _Means(np.where(there, self.value - mean, 0.0), left * self.freedom)
+
+
+def _grows(lower: _Means, upper: _Means) -> bool:
+    squares = [float((one.value**2).sum()) for one in (lower, upper)]
+    freedom = [float(one.freedom.sum()) for one in (lower, upper)]
+    if min(squares + freedom) <= 0.0:
         return False
-    growth = upper / many / (lower / few)
-    spread = math.sqrt(polygamma(1, 0.5 * many) + polygamma(1, 0.5 * few))
+    growth = squares[1] / freedom[1] / (squares[0] / freedom[0])
+    spread = math.sqrt(sum(polygamma(1, 0.5 * one) for one in freedom))
     return growth > GROWTH and math.log(growth) > CERTAINTY * spread
 
 
-def _of_means(
-    rays: Rays, fit: Regression, gates: Gates, inhomogeneity: float
-) -> tuple[Array, Array]:
-    """Return squares of the means of rays over a third, and their freedom, (profile,)."""
+def _ray_means(rays: Rays, fit: Regression, gates: Gates, inhomogeneity: float) -> _Means:
+    """Average each ray of each profile over a third."""
     count, angles, _ = rays.noise.shape
     residual = np.zeros((count * angles, gates.size))
     freedom = np.zeros((count, gates.size))
@@ -98,12 +133,12 @@ def _of_means(
         freedom,
     )
     filled = np.count_nonzero(freedom > 0, axis=1)
-    of_ray = residual.sum(axis=1).reshape(count, angles)
     # Fewer altitudes would be another third of another air.
     on = 2 * filled >= gates.size
-    # Of white noise, too, all third have one variance, however many altitudes they miss.
-    square = (of_ray**2).sum(axis=1) / np.maximum(filled, 1)
-    return np.where(on, square, 0.0), np.where(on, freedom.sum(axis=1) / np.maximum(filled, 1), 0.0)
+    # Of white noise, too, all have one variance, however many altitudes they miss.
+    mean = residual.sum(axis=1).reshape(count, angles) / np.sqrt(np.maximum(filled, 1))[:, None]
+    each = freedom.sum(axis=1) / np.maximum(filled, 1)
+    return _Means(np.where(on[:, np.newaxis], mean, 0.0), np.where(on, each, 0.0))
 
 
 @_compiled
@@ -144,7 +179,7 @@ def _standardise(
             count = 0
             for a in range(angles):
                 kept = keep[t, a, k] if keep.shape[1] > 0 else 1.0
-                if noise[t, a, k] < np.inf and kept > _LEAST_WEIGHT:
+                if noise[t, a, k] < inhomogeneity and kept > _LEAST_WEIGHT:
                     rays[count] = a
                     root[count] = math.sqrt(kept / (noise[t, a, k] + inhomogeneity))
                     left[count] = y[t, a, k] * root[count]

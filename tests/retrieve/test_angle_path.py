@@ -10,14 +10,15 @@ from scipy.special import erfc
 
 from lidarops.bench import multiangle_cases as cases
 from lidarops.retrieve import _angle_block, _slant
-from lidarops.retrieve._angle_path import GROWTH, path_varies
+from lidarops.retrieve._angle_path import GROWTH, doubted_from
 from lidarops.retrieve.multiangle import solve
 
 
 def varies(scan: cases.Scan) -> bool:
     grid = _slant.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
     rays = _angle_block.make_rays(scan.signal, scan.variance, grid)
-    return path_varies(rays, _angle_block.regress(rays, inhomogeneity=None, robust=True))
+    found = doubted_from(rays, _angle_block.regress(rays, inhomogeneity=None, robust=True))
+    return found is not None
 
 
 def test_false_alarms_are_fewer_than_one_in_a_hundred():
@@ -58,6 +59,19 @@ def test_variation_is_seen_in_most_random_clouds():
             strength = 0.3 + 0.7 * np.random.default_rng(seed).random()
             told.append(varies(replace(scene, variation=strength).draw(8, seed, 6)))
     assert np.mean(told) >= 0.75
+
+
+def test_what_all_profiles_share_leaves_the_lower_altitudes_alone():
+    """As of a background that is a little off, always by the same."""
+    scene = cases.clear(1e5)
+    scan = scene.draw(16, 1)
+    slant = scene.path[:, np.newaxis] * scene.altitude
+    dim = scan.signal.mean(axis=0)[-1, -1] / slant[-1, -1] ** 2
+    offset = 0.3 * dim * np.random.default_rng(3).normal(size=(12, 1)) * slant**2
+    found = cases.retrieve(replace(scan, signal=scan.signal + offset), cases.JOINT)
+    doubted = found.flags.poor_stratification
+    assert not doubted[:, :60].any()
+    assert doubted[:, 70:].all()
 
 
 def test_noise_that_is_larger_than_stated_aloft_is_no_variation():
