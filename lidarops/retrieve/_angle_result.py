@@ -40,10 +40,10 @@ class MultiAngleFlags:
     saturated: Mask
     """The data ask for no less smoothness than the least admitted."""
     undersmoothed: Mask
-    """More than 10 degrees of freedom and more than 0.1 per altitude: the standard error may be
+    """More than 10 degrees of freedom and more than 0.4 per altitude: the standard error may be
     too small."""
     high_correlation: Mask
-    """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too
+    """Neighbouring altitudes are correlated by more than 0.93: the standard error may be too
     small."""
     outlier: Mask
     """At least one ray or estimate was weighted down as an outlier."""
