@@ -198,7 +198,8 @@ def _squares_of_path(rays: Rays, weights: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = np.einsum("tak,ak->tk", weights, rays.path) / whole
         square = np.einsum("tak,ak->tk", weights, rays.path**2) - whole * centre**2
-    return np.nan_to_num(square)
+    squares: Array = np.nan_to_num(square)
+    return squares
 
 
 def common_scale(rays: Rays, fit: Regression) -> Array:
@@ -215,7 +216,8 @@ def common_scale(rays: Rays, fit: Regression) -> Array:
     expected = fit.column(kh.EXPECTED)
     told = expected > 0.0
     ratio = np.where(told, count / np.where(told, expected, 1.0), 1.0)
-    return np.sqrt(np.maximum(ratio, 1.0) / of_chi2)
+    scale: Array = np.sqrt(np.maximum(ratio, 1.0) / of_chi2)
+    return scale
 
 
 def _weights(rays: Rays, fit: Regression) -> Array:

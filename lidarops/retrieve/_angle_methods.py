@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve import _angle_block, _angle_path, _mld_profiles, vertical
+from lidarops.retrieve import _angle_block, _angle_neighbours, _angle_path, _mld_profiles, vertical
 from lidarops.retrieve import _kano_hamilton as kh
 from lidarops.retrieve._angle_block import Rays, Regression
 from lidarops.retrieve._angle_result import Profiles
@@ -71,7 +71,8 @@ def solve_block(
     method, why = _chosen(rays, fit, settings)
     steps.append((method, True, why))
     part = _METHODS[method](rays, fit, prior, settings)
-    doubted = _angle_path.doubted_from(rays, fit)
+    alike = _angle_neighbours.neighbours_alike(rays, fit)
+    doubted = 0 if alike else _angle_path.doubted_from(rays, fit)
     if doubted is not None:
         part.flags["poor_stratification"][:, doubted:] = True
         _withhold_extinction(part, part.flags["poor_stratification"])

@@ -192,7 +192,7 @@ def _standardise(
             known = 0
             for one in columns:
                 basis[known] = one
-                known += 1 if _orthogonal(basis, known, count, left) else 0
+                known += 1 if orthogonal(basis, known, count, left) else 0
             freedom[t, j] = max(count - known, 0)
             if count > known:
                 for i in range(count):
@@ -200,7 +200,7 @@ def _standardise(
 
 
 @_compiled
-def _orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
+def orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
     """Make a column orthogonal to those before, and take it out of what is left of the data."""
     one = basis[known]
     raw = _dot(one, one, count)

@@ -126,11 +126,10 @@ def precision(information: Array, share: Array, correlation: float) -> Array:
 
     Noise of which only a share is correlated is no such process. The one here has its variance
     and its power at low frequencies, which is where the smooth profile lies:
-    :math:`q = 1 + 2 f \rho / (1 - \rho)`, :math:`r = (q - 1) / (q + 1)`, with the geometric mean
-    of the shares of two heights. A height that shares less than half as much as one of the two
-    on either side is no link of the chain: its noise is its own, and would tell wrongly of that
-    of its neighbours. It is bridged, as a single missing height is; a longer hole breaks the
-    chain.
+    :math:`q = 1 + 2 f \rho / (1 - \rho)`, :math:`r = (q - 1) / (q + 1)`. A height that
+    shares less than half as much as one of the two on either side is no link of the chain: its
+    noise is its own, and would tell wrongly of that of its neighbours. It is bridged, as a single
+    missing height is; a longer hole breaks the chain.
 
     Parameters
     ----------
@@ -153,8 +152,6 @@ def precision(information: Array, share: Array, correlation: float) -> Array:
         last, joint = -1, 0.0
         for k in range(heights):
             q = share[t, k] * decay
-            if last >= 0 and information[t, k] > 0.0:
-                q = np.sqrt(share[t, k] * share[t, last]) * decay
             joint *= q / (q + 2.0)
             if not information[t, k] > 0.0:
                 continue
