@@ -45,7 +45,7 @@ class MultiAngleFlags:
     """More than 10 degrees of freedom and more than 0.4 per altitude: the standard error may be
     too small."""
     high_correlation: Mask
-    """Neighbouring altitudes are correlated by more than 0.93: the standard error may be too
+    """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too
     small."""
     outlier: Mask
     """At least one ray or estimate was weighted down as an outlier."""

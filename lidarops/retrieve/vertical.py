@@ -23,8 +23,8 @@ Booleans = npt.NDArray[np.bool_]
 
 LARGEST_GRADIENT: Final = 5e-5
 """m-1, of ln backscatter along the horizontal, where the user declares none."""
-HIGHEST_CORRELATION: Final = 0.93
-"""In random scenes, of up to 0.95, errors are as stated below it."""
+HIGHEST_CORRELATION: Final = 0.85
+"""Random scenes bear more; where the energy of the laser jitters from file to file they do not."""
 MOST_FREEDOM: Final = 10.0
 ROUGHEST: Final = 0.4
 """Degrees of freedom per estimate, beyond which smoothing does little. In random scenes, with
@@ -87,7 +87,7 @@ class VerticalResult:
     undersmoothed: Booleans
     """(profile,): more than 10 degrees of freedom and more than 0.4 per height."""
     high_correlation: Booleans
-    """(profile,): the correlation exceeds 0.93; standard errors may be too small."""
+    """(profile,): the correlation exceeds 0.85; standard errors may be too small."""
     no_residual: Booleans
     """(profile,): no ray is redundant; correlation and inhomogeneity are unknown."""
     no_data: Booleans
