@@ -428,7 +428,7 @@ def _outliers(found: Sequence[OutlierScore]) -> Part:
 def _safety(found: Sequence[SafetyScore]) -> Part:
     rows = tuple(
         (
-            f"{one.way}, {one.quantity}",
+            f"{one.air}, {one.way}, {one.quantity}",
             f"{one.values:,}",
             *(
                 _rare(share)
@@ -461,13 +461,15 @@ def _safety(found: Sequence[SafetyScore]) -> Part:
     )
     return Part(
         title="False and not flagged",
-        text=f"{found[0].scenes:,} scenes of which nothing is as assumed, 8 profiles each with "
-        "its own truth: 3 to 20 rays on one side to 15-75°, clear air or a cloud, scatter 0.5 to "
-        "40 % with a correlation of 0 to 0.95, signal over noise 10 to 1e5; half with up to 10 % "
-        "outliers; three in five with a horizontal gradient of up to 10 % per km, twice what the "
-        "retrieval allows for by default; one in seven with extinction that varies along the "
-        "paths. A one-sided scan does not see the gradient: without its bound, random errors "
-        "alone would say far too little.",
+        text=f"{found[0].scenes:,} scenes ({found[-1].scenes:,} of calm air) of which nothing is "
+        "as assumed, 8 profiles each with its own truth: 3 to 20 rays on one side to 15-75°, "
+        "clear air or a cloud, scatter up to 40 % (of calm air drawn by its logarithm, from "
+        "0.5 %) with "
+        "a correlation of 0 to 0.95, signal over noise 10 to 1e5; half with up to 10 % outliers; "
+        "three in five with a horizontal gradient of up to 10 % per km, twice what the retrieval "
+        "allows for by default; one in seven with extinction that varies along the paths. A "
+        "one-sided scan does not see the gradient: without its bound, random errors alone would "
+        "say far too little.",
         tables=(table,),
         details=tuple(_flag_table(one) for one in found),
     )
@@ -475,7 +477,7 @@ def _safety(found: Sequence[SafetyScore]) -> Part:
 
 def _flag_table(found: SafetyScore) -> Table:
     return Table(
-        title=f"Flags of {found.way}, {found.quantity}",
+        title=f"Flags of {found.air}, {found.way}, {found.quantity}",
         columns=("flag", "share of values", "false of these"),
         rows=tuple(
             (one.flag, percent(one.values), _NONE if one.false is None else _rare(one.false))

@@ -267,12 +267,20 @@ def uniform_deviation(share: float) -> float:
     return float(np.sqrt((next(squares) - next(squares)) / (2.0 * share) - mean**2))
 
 
-def random_scene(seed: int, profiles: int) -> Scene:
+def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
     """Return a scene of which nothing is as assumed, with another truth for each profile.
 
-    3 to 20 rays to 15-75 degrees, clear air or a cloud, scatter 0.5-40 % with a correlation of
+    3 to 20 rays to 15-75 degrees, clear air or a cloud, scatter up to 40 % with a correlation of
     0-0.95, SNR 10 to 1e5; half with up to 10 % outliers, three in five with a gradient of up to
     10 % per km, one in seven with extinction that varies along the paths.
+
+    Parameters
+    ----------
+    seed : int
+    profiles : int
+    calm : bool
+        Whether the scatter is drawn by its logarithm, from 0.5 %, not by its amount: little
+        scatter makes stated errors small.
     """
     rng = np.random.default_rng((7, seed))
     angles = np.linspace(0.0, rng.uniform(15.0, 75.0), int(rng.integers(3, 21)))
@@ -292,7 +300,9 @@ def random_scene(seed: int, profiles: int) -> Scene:
         extinction=extinction,
         backscatter=backscatter,
         ratio=10.0 ** rng.uniform(1.0, 5.0),
-        inhomogeneity=float(np.exp(rng.uniform(np.log(0.005), np.log(0.4)))),
+        inhomogeneity=float(
+            np.exp(rng.uniform(np.log(0.005), np.log(0.4))) if calm else rng.uniform(0.0, 0.4)
+        ),
         correlation=rng.uniform(0.0, 0.95),
         outliers=rng.uniform(0.0, 0.1) * (rng.random() < 0.5),
         gradient=rng.uniform(-1e-4, 1e-4) * (rng.random() < 0.6),

@@ -30,6 +30,8 @@ NOTHING: Final = "answer 0"
 PRIORS: Final = (0.0, 0.5, 1.0, 1.5)
 CORRELATIONS: Final = (0.0, 0.5, 0.9, 0.99, 1.0)
 OUTLIERS: Final = (0.0, 0.05, 0.1)
+ANY: Final = "any air"
+CALM: Final = "calm air"
 LOW: Final = 2000.0
 """m, up to which outliers are judged altitude by altitude."""
 FALSE: Final = 4.0
@@ -52,11 +54,11 @@ class Size:
     published: int
     """Profiles of a block of the published experiment, which has 5 blocks or as many as others."""
     random: int
-    """Random scenes."""
+    """Random scenes, and a quarter of that of calm ones."""
 
 
 QUICK: Final = Size(blocks=8, profiles=32, slow=1, published=150, random=300)
-FULL: Final = Size(blocks=24, profiles=64, slow=2, published=250, random=1500)
+FULL: Final = Size(blocks=24, profiles=64, slow=2, published=250, random=6000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +180,8 @@ class FlagShare:
 class SafetyScore:
     """Values that are off by more than 4 stated errors, in random scenes."""
 
+    air: str
+    """How the scatter was drawn."""
     way: str
     quantity: str
     scenes: int
@@ -259,16 +263,15 @@ Marks = dict[str, float]
 
 
 def _mean(values: Mask | Array) -> float:
-    finite = np.asarray(values, dtype=np.float64)
-    finite = finite[np.isfinite(finite)]
+    finite = np.asarray(values, dtype=np.float64)[np.isfinite(values)]
     return float(finite.mean()) if finite.size else float("nan")
 
 
 def over_blocks(means: Sequence[float]) -> Measured:
     """Return the mean of independent blocks with its Monte Carlo error."""
     finite = np.array(means)[np.isfinite(means)]
-    spread = float(finite.std(ddof=1)) if finite.size > 1 else 0.0
-    return Measured(float(finite.mean()), spread / float(np.sqrt(finite.size)))
+    error = float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else 0.0
+    return Measured(float(finite.mean()), error)
 
 
 def root(square: Measured) -> Measured:
@@ -362,7 +365,7 @@ def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -
 
 
 def _marks(found: Found, scene: Scene, mask: Mask) -> Marks:
-    """Return what is averaged over the altitudes of one block that count."""
+    """Return means over the altitudes of one block that count."""
     error = np.where(mask, found.optical_depth - scene.optical_depth, np.nan)
     slope = _differences(found.optical_depth, scene.altitude) - scene.extinction
     top = max(int(mask.all(axis=0).sum()) - 1, 0)
@@ -487,10 +490,8 @@ def _outliers(share: float, size: Size) -> Iterator[OutlierScore]:
         results = [cases.retrieve(scan, method, robust=robust) for scan in scans]
         errors = [one.optical_depth - scene.optical_depth for one in results]
         stated = [one.optical_depth_standard_error for one in results]
-        inside = [
-            over_blocks([_inside(e, s, sigmas) for e, s in zip(errors, stated, strict=True)])
-            for sigmas in SIGMAS
-        ]
+        pairs = list(zip(errors, stated, strict=True))
+        inside = [over_blocks([_inside(e, s, n) for e, s in pairs]) for n in SIGMAS]
         yield OutlierScore(
             way=f"{method}, {'robust' if robust else 'plain'}",
             outliers=share,
@@ -519,16 +520,17 @@ class _Judged:
 
 
 def _safety(size: Size) -> Iterator[SafetyScore]:
-    judged: dict[tuple[str, str], list[_Judged]] = {}
-    for seed in range(size.random):
-        scene = cases.random_scene(seed, _SCENE_PROFILES)
-        scan = scene.draw(_SCENE_PROFILES, seed, 6)
-        for method in (cases.KANO_HAMILTON, cases.JOINT):
-            result = cases.retrieve(scan, method)
-            for quantity, one in _judge(result, scene).items():
-                judged.setdefault((method, quantity), []).append(one)
-    for (method, quantity), scenes in judged.items():
-        yield _safety_score(method, quantity, scenes)
+    judged: dict[tuple[str, str, str], list[_Judged]] = {}
+    for calm, count in ((False, size.random), (True, -(-size.random // 4))):
+        for seed in range(count):
+            scene = cases.random_scene(seed, _SCENE_PROFILES, calm=calm)
+            scan = scene.draw(_SCENE_PROFILES, seed, 6)
+            for method in (cases.KANO_HAMILTON, cases.JOINT):
+                result = cases.retrieve(scan, method)
+                for quantity, one in _judge(result, scene).items():
+                    kind = (CALM if calm else ANY, method, quantity)
+                    judged.setdefault(kind, []).append(one)
+    yield from (_safety_score(kind, scenes) for kind, scenes in judged.items())
 
 
 def _judge(result: MultiAngleResult, scene: Scene) -> dict[str, _Judged]:
@@ -549,8 +551,7 @@ def _judge(result: MultiAngleResult, scene: Scene) -> dict[str, _Judged]:
 
 
 def _counts(error: Array, random: Array, bound: Array, flags: MultiAngleFlags) -> _Judged:
-    size, doubted = np.abs(error), flags.doubtful()
-    stated = np.hypot(random, bound)
+    size, doubted, stated = np.abs(error), flags.doubtful(), np.hypot(random, bound)
     valued = np.isfinite(error)
     # A value without a stated error is false whatever it is.
     false = valued & ~(size <= FALSE * stated)
@@ -567,19 +568,18 @@ def _counts(error: Array, random: Array, bound: Array, flags: MultiAngleFlags) -
     counts = {name: float(mask.sum()) for name, mask in masks.items()}
     counts["profiles"] = float(valued.any(axis=1).sum())
     counts["false_ok_profiles"] = float((false & plain).any(axis=1).sum())
-    raised = {one.name: valued & getattr(flags, one.name) for one in fields(flags)}
-    by_flag = {
-        name: (float(mask.sum()), float((mask & false).sum())) for name, mask in raised.items()
-    }
+    by_flag = {}
+    for one in fields(flags):
+        raised = valued & getattr(flags, one.name)
+        by_flag[one.name] = (float(raised.sum()), float((raised & false).sum()))
     return _Judged(counts, by_flag)
 
 
-def _safety_score(way: str, quantity: str, scenes: Sequence[_Judged]) -> SafetyScore:
+def _safety_score(kind: tuple[str, str, str], scenes: Sequence[_Judged]) -> SafetyScore:
     counts = {name: np.array([one.counts[name] for one in scenes]) for name in scenes[0].counts}
     values = counts["values"]
     return SafetyScore(
-        way=way,
-        quantity=quantity,
+        *kind,
         scenes=len(scenes),
         profiles=int(counts["profiles"].sum()),
         values=int(values.sum()),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
@@ -31,6 +32,8 @@ GRADIENT_LIMIT: Final = 4.0
 _GRADIENT_NOISE: Final = 0.02
 """Variance of a logarithm (a signal of 7 times its noise) above which its skew, in the mean over
 many profiles, looks like a gradient."""
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +181,45 @@ def weights_of(rays: Rays, fit: Regression) -> Array:
     return _weights(rays, fit)
 
 
+def kept_information(rays: Rays, fit: Regression) -> Array:
+    """Return the information that outliers leave over that of all rays, (profile, altitude).
+
+    An altitude that lost a ray has all the noise that it shares with others, and more of its own.
+    """
+    if not fit.robust:
+        return np.ones((rays.noise.shape[0], rays.noise.shape[2]))
+    kept = _squares_of_path(rays, _weights(rays, fit))
+    whole = _squares_of_path(rays, 1.0 / (rays.noise + fit.inhomogeneity))
+    return np.where(whole > 0.0, np.minimum(kept / np.where(whole > 0.0, whole, 1.0), 1.0), 1.0)
+
+
+def _squares_of_path(rays: Rays, weights: Array) -> Array:
+    whole = weights.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centre = np.einsum("tak,ak->tk", weights, rays.path) / whole
+        square = np.einsum("tak,ak->tk", weights, rays.path**2) - whole * centre**2
+    squares: Array = np.nan_to_num(square)
+    return squares
+
+
+def common_scale(rays: Rays, fit: Regression) -> Array:
+    """Return what makes residuals of two altitudes as alike as their errors, (profile, altitude).
+
+    The bisquare makes residuals small; and with other rays left out, other parts of the errors
+    are left in the residuals.
+    """
+    shape = (rays.noise.shape[0], rays.noise.shape[2])
+    if not fit.robust:
+        return np.ones(shape)
+    of_chi2 = _angle_robust.clean_moments(_angle_robust.PASS_WIDTH)[0]
+    count = np.count_nonzero(rays.noise < np.inf, axis=1) - 2.0 - fit.column(kh.SIDES)
+    expected = fit.column(kh.EXPECTED)
+    told = expected > 0.0
+    ratio = np.where(told, count / np.where(told, expected, 1.0), 1.0)
+    scale: Array = np.sqrt(np.maximum(ratio, 1.0) / of_chi2)
+    return scale
+
+
 def _weights(rays: Rays, fit: Regression) -> Array:
     weights = 1.0 / (rays.noise + fit.inhomogeneity)
     return weights * fit.keep if fit.keep.shape[1] > 0 else weights
@@ -242,11 +284,14 @@ def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Arr
     return np.interp(gates, gates[known], variance), freedom
 
 
+@_compiled
 def _windowed(values: Array) -> Array:
     """Return sums over the window around each gate, as far as there are gates."""
     half = WINDOW // 2
-    padded = np.pad(values, half)
-    total: Array = np.lib.stride_tricks.sliding_window_view(padded, WINDOW).sum(axis=-1)
+    total = np.zeros(values.size)
+    for k in range(values.size):
+        for j in range(max(k - half, 0), min(k + half + 1, values.size)):
+            total[k] += values[j]
     return total
 
 

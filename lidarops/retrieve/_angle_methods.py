@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve import _angle_block, _angle_path, _mld_profiles, vertical
+from lidarops.retrieve import _angle_block, _angle_neighbours, _angle_path, _mld_profiles, vertical
 from lidarops.retrieve import _kano_hamilton as kh
 from lidarops.retrieve._angle_block import Rays, Regression
 from lidarops.retrieve._angle_result import Profiles
@@ -71,8 +71,10 @@ def solve_block(
     method, why = _chosen(rays, fit, settings)
     steps.append((method, True, why))
     part = _METHODS[method](rays, fit, prior, settings)
-    if _angle_path.path_varies(rays, fit):
-        part.flags["poor_stratification"][:] = True
+    alike = _angle_neighbours.neighbours_alike(rays, fit)
+    doubted = 0 if alike else _angle_path.doubted_from(rays, fit)
+    if doubted is not None:
+        part.flags["poor_stratification"][:, doubted:] = True
         _withhold_extinction(part, part.flags["poor_stratification"])
     _raise_common_flags(part, rays, fit)
     if method in _BLIND:
@@ -155,9 +157,9 @@ def _joint(rays: Rays, fit: Regression, _prior: Array | None, settings: Settings
     """Join the estimates of single altitudes into smooth profiles."""
     part = _start(rays, fit, settings)
     within = np.isfinite(part.optical_depth)
-    share = fit.column(kh.SHARE) * fit.inhomogeneity
+    share = fit.column(kh.SHARE) * fit.inhomogeneity * _angle_block.kept_information(rays, fit)
     residuals = vertical.residual_moments(
-        fit.residual,
+        fit.residual * _angle_block.common_scale(rays, fit)[:, np.newaxis],
         np.where(np.isfinite(fit.residual), _angle_block.weights_of(rays, fit), 0.0),
         np.nan_to_num(fit.leverage, nan=1.0),
         np.broadcast_to(fit.inhomogeneity, share.shape),

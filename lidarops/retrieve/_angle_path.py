@@ -1,19 +1,22 @@
 """Whether extinction varies along the paths of a scan: a test of how its rays scatter.
 
 Where the extinction of level air varies along the horizontal, what a ray has lost adds up on its
-way, and rays differ the more the higher they are. Scatter that grows by chance, by a gradient, by
-noise or by a few outliers must not pass for that.
+way: it differs from that of other rays, the more the higher they are, and alike at neighbouring
+altitudes. Scatter of backscatter averages out over altitudes; this does not, and no smoothing over
+altitude takes it away. Scatter that grows by chance, by a gradient, by noise or by a few outliers
+must not pass for it.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.special import digamma, polygamma
+from scipy.special import polygamma
 
 from lidarops.retrieve import _kano_hamilton as kh
 from lidarops.retrieve._angle_block import Rays, Regression
@@ -23,10 +26,11 @@ Gates = npt.NDArray[np.intp]
 
 GROWTH: Final = 1.5**2
 """Ratio of the variances in the upper and the lower third below which they count as alike."""
-CERTAINTY: Final = 3.0
+CERTAINTY: Final = 2.5
 """Standard errors by which the logarithm of that ratio must exceed zero. In simulated scenes
-without variation, 0.9 percent exceed both; most of them hold outliers as well."""
+without variation, 0.3 percent exceed both."""
 _FEWEST_GATES: Final = 6
+_FEWEST_PROFILES: Final = 4
 _CLIP: Final = 3.0
 """Standard errors to which residuals are cut, so that no outlier decides."""
 _DEPENDENT: Final = 1e-8
@@ -36,19 +40,23 @@ _COLUMNS: Final = 4
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def path_varies(rays: Rays, fit: Regression) -> bool:
-    r"""Tell whether the scatter of the rays of a block grows with altitude.
+def doubted_from(rays: Rays, fit: Regression) -> int | None:
+    r"""Return the altitude from which on extinction varies along paths; None where it does not.
 
     With the inhomogeneity of the lower third of the altitudes, residuals are formed anew about a
-    constant, the slant path and the horizontal distances, which take a gradient away. Their mean
-    squares Q over the upper and the lower third are compared profile by profile,
+    constant, the slant path and the horizontal distances, which take a gradient away. Each ray is
+    averaged over the altitudes of a third, as far as inhomogeneity exceeds its noise; the sums of
+    squares Q of these means over rays and profiles are compared,
 
-    .. math:: \ln Q_u - \ln Q_l, \qquad
+    .. math:: \ln \frac{Q_u / \nu_u}{Q_l / \nu_l}, \qquad
               \sigma^2 = \psi'(\nu_u / 2) + \psi'(\nu_l / 2) ,
 
-    weighted by :math:`1/\sigma^2`. Errors go along a ray; the effective degrees of freedom of a
-    third are those of one altitude times :math:`(tr A)^2 / tr A^2`, with A the products of
-    residuals at all its altitudes, summed over profiles and rays.
+    with the degrees of freedom :math:`\nu` that an altitude has, as a ray has one mean, however
+    its altitudes are correlated.
+
+    Where this holds of what differs from profile to profile, all altitudes are doubted. What all
+    profiles of a block share may as well be an error of the instrument, as of a background,
+    which grows with the range; it counts for altitudes above the lower third.
 
     Parameters
     ----------
@@ -57,42 +65,59 @@ def path_varies(rays: Rays, fit: Regression) -> bool:
 
     Returns
     -------
-    bool
-
-    References
-    ----------
-    satterthwaite1946.
+    int, optional
+        Index.
     """
     seen = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
     if seen.size < _FEWEST_GATES:
-        return False
+        return None
     third = seen.size // 3
     thirds = seen[:third], seen[-third:]
-    low, high = (float(np.mean(fit.inhomogeneity[part])) for part in thirds)
-    # Noise can only lessen the ratio; this spares nearly all scans the rest.
-    if not high > GROWTH * low:
+    low = float(np.mean(fit.inhomogeneity[thirds[0]]))
+    lower, upper = (_ray_means(rays, fit, part, low) for part in thirds)
+    told = (lower.freedom > 0) & (upper.freedom > 0)
+    if not _grows(lower.of(told), upper.of(told)):
+        return None
+    if np.count_nonzero(told) < _FEWEST_PROFILES:
+        return 0
+    return (
+        0 if _grows(lower.of(told).varying(), upper.of(told).varying()) else int(thirds[0][-1]) + 1
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Means:
+    """Means of rays over a third of the altitudes, in units that are 1 for white noise."""
+
+    value: Array
+    """(profile, ray)"""
+    freedom: Array
+    """(profile,)"""
+
+    def of(self, profiles: npt.NDArray[np.bool_]) -> _Means:
+        """Return those of some profiles."""
+        return _Means(self.value[profiles], self.freedom[profiles])
+
+    def varying(self) -> _Means:
+        """Return what differs from profile to profile."""
+        there = self.value != 0.0
+        mean = self.value.sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+        left = 1.0 - 1.0 / self.freedom.size
+        return _Means(np.where(there, self.value - mean, 0.0), left * self.freedom)
+
+
+def _grows(lower: _Means, upper: _Means) -> bool:
+    squares = [float((one.value**2).sum()) for one in (lower, upper)]
+    freedom = [float(one.freedom.sum()) for one in (lower, upper)]
+    if min(squares + freedom) <= 0.0:
         return False
-    squares, freedom = zip(*(_mean_squares(rays, fit, part, low) for part in thirds), strict=True)
-    told = (freedom[0] > 0) & (freedom[1] > 0) & (squares[0] > 0) & (squares[1] > 0)
-    if not told.any():
-        return False
-    (lower, upper), (few, many) = ([one[told] for one in pair] for pair in (squares, freedom))
-    difference = np.log(upper / lower) - _log_bias(many) + _log_bias(few)
-    weight = 1.0 / (polygamma(1, 0.5 * many) + polygamma(1, 0.5 * few))
-    certainty = (weight * difference).sum() / math.sqrt(weight.sum())
-    growth = np.average(upper, weights=many) / np.average(lower, weights=few)
-    return bool(growth > GROWTH and certainty > CERTAINTY)
+    growth = squares[1] / freedom[1] / (squares[0] / freedom[0])
+    spread = math.sqrt(sum(polygamma(1, 0.5 * one) for one in freedom))
+    return growth > GROWTH and math.log(growth) > CERTAINTY * spread
 
 
-def _log_bias(freedom: Array) -> Array:
-    """Return the mean of the logarithm of a chi-square over its degrees of freedom."""
-    return np.asarray(digamma(0.5 * freedom) - np.log(0.5 * freedom))
-
-
-def _mean_squares(
-    rays: Rays, fit: Regression, gates: Gates, inhomogeneity: float
-) -> tuple[Array, Array]:
-    """Return mean squares of residuals over a third, and their effective freedom, (profile,)."""
+def _ray_means(rays: Rays, fit: Regression, gates: Gates, inhomogeneity: float) -> _Means:
+    """Average each ray of each profile over a third."""
     count, angles, _ = rays.noise.shape
     residual = np.zeros((count * angles, gates.size))
     freedom = np.zeros((count, gates.size))
@@ -107,15 +132,13 @@ def _mean_squares(
         residual,
         freedom,
     )
-    square = (residual**2).reshape(count, angles, gates.size).sum(axis=1)
-    total = freedom.sum(axis=1)
     filled = np.count_nonzero(freedom > 0, axis=1)
     # Fewer altitudes would be another third of another air.
     on = 2 * filled >= gates.size
-    products = residual.T @ residual
-    whole = np.trace(products) ** 2 / max(float(np.sum(products**2)), np.finfo(np.float64).tiny)
-    mean = np.where(on, square.sum(axis=1) / np.maximum(total, 1.0), 0.0)
-    return mean, np.where(on, whole * total / np.maximum(filled, 1), 0.0)
+    # Of white noise, too, all have one variance, however many altitudes they miss.
+    mean = residual.sum(axis=1).reshape(count, angles) / np.sqrt(np.maximum(filled, 1))[:, None]
+    each = freedom.sum(axis=1) / np.maximum(filled, 1)
+    return _Means(np.where(on[:, np.newaxis], mean, 0.0), np.where(on, each, 0.0))
 
 
 @_compiled
@@ -156,7 +179,7 @@ def _standardise(
             count = 0
             for a in range(angles):
                 kept = keep[t, a, k] if keep.shape[1] > 0 else 1.0
-                if noise[t, a, k] < np.inf and kept > _LEAST_WEIGHT:
+                if noise[t, a, k] < inhomogeneity and kept > _LEAST_WEIGHT:
                     rays[count] = a
                     root[count] = math.sqrt(kept / (noise[t, a, k] + inhomogeneity))
                     left[count] = y[t, a, k] * root[count]
@@ -169,7 +192,7 @@ def _standardise(
             known = 0
             for one in columns:
                 basis[known] = one
-                known += 1 if _orthogonal(basis, known, count, left) else 0
+                known += 1 if orthogonal(basis, known, count, left) else 0
             freedom[t, j] = max(count - known, 0)
             if count > known:
                 for i in range(count):
@@ -177,7 +200,7 @@ def _standardise(
 
 
 @_compiled
-def _orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
+def orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
     """Make a column orthogonal to those before, and take it out of what is left of the data."""
     one = basis[known]
     raw = _dot(one, one, count)

@@ -32,15 +32,17 @@ class MultiAngleFlags:
     gradient: Mask
     """The residuals show a horizontal gradient that the fit does not account for."""
     poor_stratification: Mask
-    """The scatter of the rays grows with altitude, more than noise, chance and a gradient make
-    it, as it does where extinction itself varies along the horizontal. Extinction is withheld."""
+    """The mean scatter of rays over altitudes grows with altitude, more than noise, chance and a
+    gradient make it, as it does where extinction itself varies along the horizontal; or
+    neighbouring rays scatter alike, as in patches of air that are wider than rays are apart.
+    Extinction is withheld."""
     prior_dominated: Mask
     """Smoothness or a prior, not the data, decides on the value. Extinction is withheld where
     the data share lies outside 0.9-1.1."""
     saturated: Mask
     """The data ask for no less smoothness than the least admitted."""
     undersmoothed: Mask
-    """More than 10 degrees of freedom and more than 0.1 per altitude: the standard error may be
+    """More than 10 degrees of freedom and more than 0.4 per altitude: the standard error may be
     too small."""
     high_correlation: Mask
     """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too

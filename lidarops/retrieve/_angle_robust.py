@@ -118,26 +118,27 @@ def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
 
 
 @_compiled
-def _bounded_sum(y: Array, x: Array, unit: Array, slope: float, level: float) -> float:
-    """Return the sum of Tukey's bounded squares about a line, in units of each deviation."""
+def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float) -> float:
+    """Return how far points are from the bounds of Tukey's bounded squares about a line."""
     total = 0.0
     for i in range(y.size):
-        share = ((y[i] - level - slope * x[i]) / (unit[i] * START_WIDTH)) ** 2
-        total += 1.0 - (1.0 - share) ** 3 if share < 1.0 else 1.0
+        share = ((y[i] - level - slope * x[i]) * per_width[i]) ** 2
+        within = max(1.0 - share, 0.0)
+        total += within * within * within
     return total
 
 
 @_compiled
-def _best_pair(y: Array, x: Array, unit: Array) -> tuple[float, float]:
+def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
     """Return slope and level of the line with the least bounded sum: zero, or through two rays."""
-    best, slope, level = _bounded_sum(y, x, unit, 0.0, 0.0), 0.0, 0.0
+    best, slope, level = _agreement(y, x, per_width, 0.0, 0.0), 0.0, 0.0
     closest = _CLOSEST * (np.max(x) - np.min(x))
     for i in range(y.size):
         for j in range(i):
             if abs(x[i] - x[j]) > closest:
                 tilt = (y[i] - y[j]) / (x[i] - x[j])
-                total = _bounded_sum(y, x, unit, tilt, y[i] - tilt * x[i])
-                if total < best:
+                total = _agreement(y, x, per_width, tilt, y[i] - tilt * x[i])
+                if total > best:
                     best, slope, level = total, tilt, y[i] - tilt * x[i]
     return slope, level
 
@@ -164,7 +165,7 @@ def pair_residuals(
     """
     profiles, angles, gates = y.shape
     rays = np.empty(angles, np.int64)
-    all_y, all_x, all_unit = np.empty(angles), np.empty(angles), np.empty(angles)
+    all_y, all_x, all_per_width = np.empty(angles), np.empty(angles), np.empty(angles)
     for t in range(profiles):
         for k in range(gates):
             count = 0
@@ -172,12 +173,13 @@ def pair_residuals(
                 if not math.isnan(residuals[t, a, k]):
                     rays[count] = a
                     all_y[count], all_x[count] = residuals[t, a, k], x[a, k]
-                    all_unit[count] = math.sqrt(noise[t, a, k] + inhomogeneity[k])
+                    spread = math.sqrt(noise[t, a, k] + inhomogeneity[k])
+                    all_per_width[count] = 1.0 / (START_WIDTH * spread)
                     count += 1
             if count == 0:
                 continue
-            ys, xs, unit = all_y[:count], all_x[:count], all_unit[:count]
-            slope, level = _best_pair(ys, xs, unit)
+            ys, xs = all_y[:count], all_x[:count]
+            slope, level = _best_pair(ys, xs, all_per_width[:count])
             for i in range(count):
                 residuals[t, rays[i], k] -= level + slope * xs[i]
 

@@ -43,16 +43,19 @@ def penalty(altitude: Array, station_altitude: float) -> Array:
     (3, height) float64
         m-3: diagonal, first and second off-diagonal.
     """
-    step = np.diff(altitude, prepend=station_altitude)
+    return _penalty(np.diff(altitude, prepend=station_altitude))
+
+
+@_compiled
+def _penalty(step: Array) -> Array:
     heights = step.size
     bands = np.zeros((3, heights))
+    row = np.empty(3)
     for k in range(heights - 1):
         root = math.sqrt(2.0 / (step[k] + step[k + 1]))
-        row = (
-            root / step[k],
-            -root * (1.0 / step[k] + 1.0 / step[k + 1]),
-            root / step[k + 1],
-        )
+        row[0] = root / step[k]
+        row[1] = -root * (1.0 / step[k] + 1.0 / step[k + 1])
+        row[2] = root / step[k + 1]
         # The row acts on the optical depths at k-1, k and k+1; that of the lidar is zero.
         for i in range(3):
             for j in range(i, 3):

@@ -213,7 +213,9 @@ def _telling(problem: _vertical_inputs.Problem, member: Integers) -> Integers:
 def _fit(block: _Block, information: Array) -> _Fit:
     """Choose the smoothness of a block and solve."""
     profiles = information.shape[0]
-    bands = _vertical_correlation.precision(information, block.share, block.correlation)
+    # What is believed less has more noise of its own, not more of what it shares.
+    share = block.share * _ratio(information, block.information)
+    bands = _vertical_correlation.precision(information, share, block.correlation)
     unit = _usual_information(information) * block.extent**3
     choice = _smoothing_choice.choose(
         _smoothing_choice.score(bands, block.estimates, block.stiffness, unit)
@@ -245,8 +247,14 @@ def _fit(block: _Block, information: Array) -> _Fit:
     )
 
 
+def _ratio(reduced: Array, whole: Array) -> Array:
+    """Return reduced over whole information, 1 where there is none."""
+    return np.where(whole > 0.0, reduced / np.where(whole > 0.0, whole, 1.0), 1.0)
+
+
 def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calibration:
-    information, share = _calibration.typical(fit.information, block.share)
+    share = block.share * _ratio(fit.information, block.information)
+    information, share = _calibration.typical(fit.information, share)
     smoothing = float(fit.pairs.smoothing[0])
     pilot = replace(fit.pairs, smoothing=fit.pairs.smoothing * _calibration.PILOT)
     right = _banded.multiply_rows(fit.bands, block.estimates)
@@ -327,7 +335,7 @@ def _solve_block(block: _Block, *, gate_pass: bool) -> _Fit:
     screened = _vertical_outliers.screen(block.estimates, block.information)
     fit = _fit(block, _vertical_outliers.believed(block.information, screened))
     doubted = _vertical_outliers.doubted(
-        block.estimates, block.information, fit.depth, fit.variance
+        block.estimates, block.information, block.share, fit.depth, fit.variance
     )
     return fit if doubted is None else _fit(block, doubted)
 

@@ -16,6 +16,7 @@ LARGEST: Final = 0.97
 _NONE_BELOW: Final = 0.05
 _SIMPLE_BELOW: Final = 0.1
 _AMPLITUDES: Final = (0.5, 1.05)
+_LINKED: Final = 0.5
 _CANDIDATES: Final = np.arange(99) / 100.0
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -125,8 +126,10 @@ def precision(information: Array, share: Array, correlation: float) -> Array:
 
     Noise of which only a share is correlated is no such process. The one here has its variance
     and its power at low frequencies, which is where the smooth profile lies:
-    :math:`q = 1 + 2 f \rho / (1 - \rho)`, :math:`r = (q - 1) / (q + 1)`. A single missing
-    height is bridged; a longer hole breaks the chain.
+    :math:`q = 1 + 2 f \rho / (1 - \rho)`, :math:`r = (q - 1) / (q + 1)`. A height that
+    shares less than half as much as one of the two on either side is no link of the chain: its
+    noise is its own, and would tell wrongly of that of its neighbours. It is bridged, as a single
+    missing height is; a longer hole breaks the chain.
 
     Parameters
     ----------
@@ -153,6 +156,8 @@ def precision(information: Array, share: Array, correlation: float) -> Array:
             if not information[t, k] > 0.0:
                 continue
             bands[0, t, k] = information[t, k]
+            if share[t, k] < _LINKED * np.max(share[t, max(k - 2, 0) : k + 3]):
+                continue
             step = k - last
             if last >= 0 and step <= 2 and joint > 0.0:
                 rest = 1.0 - joint * joint

@@ -77,12 +77,16 @@ def screen(estimates: Array, information: Array) -> Array:
     return out
 
 
-def doubted(estimates: Array, information: Array, depth: Array, variance: Array) -> Array | None:
+def doubted(
+    estimates: Array, information: Array, share: Array, depth: Array, variance: Array
+) -> Array | None:
     """Return the information with outlying estimates weighted down; None where there is none.
 
     Parameters
     ----------
     estimates, information : (profile, height) float64
+    share : (profile, height) float64
+        Of the variance that is correlated along height.
     depth, variance : (profile, height) float64
         The solution.
     """
@@ -90,6 +94,9 @@ def doubted(estimates: Array, information: Array, depth: Array, variance: Array)
     total = 1.0 / np.where(used, information, 1.0)
     # The fit follows an estimate that stands alone: what is left to it is no error of its own.
     left = np.maximum(total - variance, LEAST_WEIGHT * total)
+    # A precision of three bands knows the noise at low frequencies; its solution takes away what
+    # is correlated, not the rest.
+    left = np.maximum(left, (1.0 - share) * total)
     deviation = np.where(used, np.abs(estimates - depth) / np.sqrt(left), 0.0)
     if not np.any(deviation > OUTLYING):
         return None

@@ -24,9 +24,11 @@ Booleans = npt.NDArray[np.bool_]
 LARGEST_GRADIENT: Final = 5e-5
 """m-1, of ln backscatter along the horizontal, where the user declares none."""
 HIGHEST_CORRELATION: Final = 0.85
+"""Random scenes bear more; where the energy of the laser jitters from file to file they do not."""
 MOST_FREEDOM: Final = 10.0
-ROUGHEST: Final = 0.1
-"""Degrees of freedom per estimate."""
+ROUGHEST: Final = 0.4
+"""Degrees of freedom per estimate, beyond which smoothing does little. In random scenes, with
+fewer, not more values are false than without any flag."""
 LEAST_SHARE: Final = 0.9
 LARGEST_SHARE: Final = 1.1
 
@@ -83,7 +85,7 @@ class VerticalResult:
     saturated: Booleans
     """(profile,): the data ask for no less smoothness than the least admitted."""
     undersmoothed: Booleans
-    """(profile,): more than 10 degrees of freedom and more than 0.1 per height."""
+    """(profile,): more than 10 degrees of freedom and more than 0.4 per height."""
     high_correlation: Booleans
     """(profile,): the correlation exceeds 0.85; standard errors may be too small."""
     no_residual: Booleans

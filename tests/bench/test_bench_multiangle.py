@@ -125,6 +125,11 @@ def test_random_scenes_cover_what_is_said_of_them():
     for name, share in (("outliers", 0.5), ("gradient", 0.6), ("variation", 0.15)):
         raised = np.mean([getattr(scene, name) != 0.0 for scene in scenes])
         assert raised == pytest.approx(share, abs=0.12)
+    scatters = np.array([scene.inhomogeneity for scene in scenes])
+    assert np.median(scatters) == pytest.approx(0.2, abs=0.03)
+    calm = [multiangle_cases.random_scene(seed, 2, calm=True) for seed in range(200)]
+    assert np.median([scene.inhomogeneity for scene in calm]) == pytest.approx(0.045, rel=0.4)
+    assert max(scene.inhomogeneity for scene in scenes + calm) <= 0.4
     same = multiangle_cases.random_scene(3, 2)
     assert np.array_equal(same.extinction, scenes[3].extinction)
     assert not np.array_equal(same.extinction[0], same.extinction[1])
@@ -303,14 +308,16 @@ def test_outliers_hurt_the_plain_method(found):
 
 
 def test_random_scenes_are_counted_whole(found):
-    assert [(one.way, one.quantity) for one in found.safety] == [
-        (way, quantity)
+    assert [(one.air, one.way, one.quantity) for one in found.safety] == [
+        (air, way, quantity)
+        for air in (multiangle_scores.ANY, multiangle_scores.CALM)
         for way in ("kano_hamilton", "joint")
         for quantity in ("optical depth", "extinction")
     ]
     for one in found.safety:
-        assert one.scenes == SMALL.random
-        assert one.profiles <= 8 * SMALL.random
+        count = -(-SMALL.random // (4 if one.air == multiangle_scores.CALM else 1))
+        assert one.scenes == count
+        assert one.profiles <= 8 * count
         assert one.false.value <= one.random_only.value
         assert one.needless <= one.flagged
         assert {share.flag for share in one.flags} == {f.name for f in fields(MultiAngleFlags)}

@@ -10,14 +10,15 @@ from scipy.special import erfc
 
 from lidarops.bench import multiangle_cases as cases
 from lidarops.retrieve import _angle_block, _slant
-from lidarops.retrieve._angle_path import path_varies
+from lidarops.retrieve._angle_path import GROWTH, doubted_from
 from lidarops.retrieve.multiangle import solve
 
 
 def varies(scan: cases.Scan) -> bool:
     grid = _slant.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
     rays = _angle_block.make_rays(scan.signal, scan.variance, grid)
-    return path_varies(rays, _angle_block.regress(rays, inhomogeneity=None, robust=True))
+    found = doubted_from(rays, _angle_block.regress(rays, inhomogeneity=None, robust=True))
+    return found is not None
 
 
 def test_false_alarms_are_fewer_than_one_in_a_hundred():
@@ -37,8 +38,40 @@ def test_variation_in_a_cloud_is_seen(largest, correlation):
     assert all(varies(scattered.draw(8, seed, 1)) for seed in range(8))
     assert all(varies(replace(scene, variation=0.5).draw(24, seed, 2)) for seed in range(4))
     assert not any(varies(scene.draw(8, seed, 1)) for seed in range(8))
-    # One profile of six rays holds too little to tell.
-    assert not varies(scattered.draw(1, 3))
+
+
+def test_variation_is_seen_where_scatter_itself_grows_little():
+    """Where layers scatter independently: what rays have lost adds up to little, but to much in
+    the mean over altitudes, which is what the optical depth of a smooth profile follows."""
+    scene = replace(cases.cloud(0.0, largest=45.0), variation=0.5)
+    assert all(varies(scene.draw(24, seed, 5)) for seed in range(8))
+    found = cases.retrieve(scene.draw(24, 0, 5), cases.JOINT)
+    lower, upper = found.inhomogeneity[0, :13].mean(), found.inhomogeneity[0, -13:].mean()
+    assert (upper / lower) ** 2 < GROWTH
+
+
+def test_variation_is_seen_in_most_random_clouds():
+    """With 3 to 20 rays, outliers, gradients, and all scatters and correlations."""
+    told = []
+    for seed in range(120):
+        scene = cases.random_scene(seed, 8)
+        if scene.backscatter.std() == 0.0:
+            strength = 0.3 + 0.7 * np.random.default_rng(seed).random()
+            told.append(varies(replace(scene, variation=strength).draw(8, seed, 6)))
+    assert np.mean(told) >= 0.75
+
+
+def test_what_all_profiles_share_leaves_the_lower_altitudes_alone():
+    """As of a background that is a little off, always by the same."""
+    scene = cases.clear(1e5)
+    scan = scene.draw(16, 1)
+    slant = scene.path[:, np.newaxis] * scene.altitude
+    dim = scan.signal.mean(axis=0)[-1, -1] / slant[-1, -1] ** 2
+    offset = 0.3 * dim * np.random.default_rng(3).normal(size=(12, 1)) * slant**2
+    found = cases.retrieve(replace(scan, signal=scan.signal + offset), cases.JOINT)
+    doubted = found.flags.poor_stratification
+    assert not doubted[:, :60].any()
+    assert doubted[:, 70:].all()
 
 
 def test_noise_that_is_larger_than_stated_aloft_is_no_variation():
