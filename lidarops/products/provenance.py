@@ -28,6 +28,7 @@ NAMESPACE: Final = "urn:lidarops:"
 
 _PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
 _NOT_COMPUTING: Final = (
+    "__main__.py",
     "aggregate/",
     "bench/",
     "catalog/",

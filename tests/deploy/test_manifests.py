@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -214,6 +216,12 @@ def test_container_file(repository: Path) -> None:
     assert int(user.partition(":")[0]) >= 1000
     installs = [rest for word, rest in instructions if word == "RUN" and "pip install" in rest]
     assert all("--require-hashes" in rest or "--no-deps" in rest for rest in installs)
+    (entry,) = (rest for word, rest in instructions if word == "ENTRYPOINT")
+    (command,) = (rest for word, rest in instructions if word == "CMD")
+    assert json.loads(entry) == ["python", "-m"]
+    run = [sys.executable, "-m", *json.loads(command)]
+    told = subprocess.run(run, check=True, capture_output=True, text=True)
+    assert "Usage: lidarops" in told.stdout
     ignored = (repository / "deploy" / "Containerfile.dockerignore").read_text().split()
     assert {".git", ".venv", "deploy/.env"} <= set(ignored)
 
