@@ -70,7 +70,8 @@ def neighbours_alike(rays: Rays, fit: Regression) -> bool:
     excess = product - variance * expected
     mean, spread = float(excess.mean()), float(excess.std(ddof=1))
     certain = -float(stdtrit(len(told) - 1.0, CHANCE))
-    alike = mean / (variance * float(freedom.mean()))
+    # White noise has 1; of less, what is left may be rounding alone.
+    alike = mean / (max(variance, 1.0) * float(freedom.mean()))
     return alike > LEAST and mean > certain * spread / math.sqrt(len(told))
 
 

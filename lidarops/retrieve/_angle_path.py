@@ -111,7 +111,9 @@ def _grows(lower: _Means, upper: _Means) -> bool:
     freedom = [float(one.freedom.sum()) for one in (lower, upper)]
     if min(squares + freedom) <= 0.0:
         return False
-    growth = squares[1] / freedom[1] / (squares[0] / freedom[0])
+    # White noise has 1: less is of an inhomogeneity that was told too large, and growth from
+    # there is that of the detector's noise.
+    growth = squares[1] / freedom[1] / max(squares[0] / freedom[0], 1.0)
     spread = math.sqrt(sum(polygamma(1, 0.5 * one) for one in freedom))
     return growth > GROWTH and math.log(growth) > CERTAINTY * spread
 

@@ -112,3 +112,34 @@ def test_robust_passes_run_by_chance_in_few_clean_blocks_and_wherever_outliers_a
     clean = [ran(cases.clear(ratio), 60, seed) for ratio in (3000.0, 300.0) for seed in range(8)]
     assert np.mean(clean) <= 0.1
     assert all(ran(cases.clear(3000.0, outliers=0.01), 8, seed) for seed in range(4))
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.005])
+def test_a_scatter_that_is_told_too_large_makes_no_noise_a_variation(scatter):
+    scene = replace(cases.clear(1e5, gates=60), inhomogeneity=scatter)
+    noise = np.linspace(1e-3, 3e-2, 60)
+    rng = np.random.default_rng(4)
+    air = np.exp(scatter * rng.normal(size=(8, scene.zenith_angle.size, 60)))
+    clean = np.exp(-2.0 * np.outer(scene.path, scene.optical_depth)) * air
+    signal = clean * (1.0 + noise * rng.normal(size=clean.shape))
+    found = solve(
+        signal,
+        scene.zenith_angle,
+        scene.altitude,
+        variance=(noise * clean) ** 2,
+        inhomogeneity=0.05,
+    )
+    assert not found.flags.poor_stratification.any()
+    assert np.isfinite(found.extinction).any()
+
+
+def test_signals_without_any_scatter_are_no_variation():
+    scene = cases.clear(1e5, gates=49)
+    found = solve(
+        np.ones((6, scene.zenith_angle.size, 49)),
+        scene.zenith_angle,
+        scene.altitude,
+        variance=np.full((6, scene.zenith_angle.size, 49), 1e-6),
+        inhomogeneity=0.05,
+    )
+    assert not found.flags.poor_stratification.any()
