@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lidarops.errors import CatalogError
-from lidarops.plan_rules import GLUED, StepName, parts_of
+from lidarops.plan_rules import GLUED, StepName, gates, parts_of
 from lidarops.records import Granule, Plan, ProductKind, Scene, Step
 
 _FORMAT: Final = "lidarops costs"
@@ -274,11 +274,7 @@ def _bins(part: Scene) -> dict[str, int]:
 def _conditioned(part: Scene, plan: Plan) -> float:
     """Return profiles times bins that are read and conditioned; joined channels read their own."""
     held = _bins(part)
-    gated = {
-        step.channel: int(step.settings["bins"])
-        for step in _of(plan, part)
-        if step.name == StepName.RANGE_GATE
-    }
+    gated = gates(tuple(_of(plan, part)))
     total = 0
     for step in _of(plan, part):
         if step.name == StepName.READ and not _only_a_part(step.channel, plan):

@@ -13,7 +13,7 @@ from dask.base import compute
 
 from lidarops.ancillary import Ancillaries
 from lidarops.flags import Quality
-from lidarops.plan_rules import GLUED, StepName, parts_of
+from lidarops.plan_rules import GLUED, WHOLE, StepName, parts_of
 from lidarops.records import Plan, ProductKind, Step
 from lidarops.refinement import WITHOUT
 from lidarops.retrieve import (
@@ -37,8 +37,6 @@ FULL_OVERLAP: Final = 0.99
 AT_ONCE: Final = 2_000_000
 """Bytes of counts up to which a scene is read before it is worked on: to put off so little costs
 more than to do it, and of more the arrays would leave the cache."""
-_WHOLE: Final = (StepName.SIGNAL, StepName.ELASTIC, StepName.MULTIANGLE)
-"""Products that need all bins of a channel."""
 _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 
 
@@ -124,7 +122,7 @@ def at_hand(bench: Bench, channels: Sequence[str]) -> Bench:
 
 def _is_read(steps: Mapping[str, Step]) -> bool:
     """Whether a step looks at the counts of the channel."""
-    if any(name in steps for name in _WHOLE):
+    if any(name in steps for name in WHOLE):
         return True
     settings = steps[StepName.HOMOGENEOUS].settings if StepName.HOMOGENEOUS in steps else {}
     return len(settings.get(WITHOUT, ())) < len(settings.get("sections", ()))
@@ -133,19 +131,6 @@ def _is_read(steps: Mapping[str, Step]) -> bool:
 def source_of(bench: Bench, channel: str) -> Plain | Glued:
     """Return what gives the profiles of a channel."""
     return Glued(bench, channel) if channel.startswith(GLUED) else Plain(bench, channel)
-
-
-def gates(plan: Plan) -> dict[str, int]:
-    """Return the channels of which only the nearest bins are needed, and how many."""
-    whole = {step.channel for step in plan.steps if step.name in _WHOLE}
-    for step in plan.steps:
-        if step.name == StepName.GLUE:
-            whole |= set(step.settings.values())
-    return {
-        step.channel: int(step.settings["bins"])
-        for step in plan.steps
-        if step.name == StepName.RANGE_GATE and step.channel not in whole
-    }
 
 
 class Plain:

@@ -61,6 +61,12 @@ def test_what_is_known_is_not_digested():
 
 
 def test_dark_files_cost_where_they_are_subtracted():
+def test_sections_beside_a_product_of_all_bins_read_all_of_them():
+    signal = {"signal": {"channels": ["photon_532o"]}}
+    assert of(products={**signal, **LEVEL})[Term.VALUE] == of(products=signal)[Term.VALUE]
+    assert of(products=LEVEL)[Term.VALUE] < of(products=signal)[Term.VALUE]
+
+
     analog = {"signal": {"channels": ["analog_532o"]}}
     photon = {"signal": {"channels": ["photon_532o"]}}
     assert of(products=analog, dark=3)[Term.FILE] == 13
