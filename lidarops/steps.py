@@ -11,6 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 from dask.base import compute
 
+from lidarops import scan_rules
 from lidarops.ancillary import Ancillaries
 from lidarops.flags import Quality
 from lidarops.plan_rules import GLUED, WHOLE, StepName, parts_of
@@ -364,7 +365,7 @@ def _rays(source: Plain | Glued, steps: Mapping[str, Step], bench: Bench) -> xr.
     settings = steps[StepName.MULTIANGLE].settings
     profiles, geometry = source.profiles(), source.geometry
     near, far = settings["background_range"]
-    heights = np.arange(settings["step"], settings["highest"] + 1e-6, settings["step"])
+    heights = scan_rules.heights(settings["step"], settings["highest"])
     return labeled_scan.on_altitudes(
         profiles,
         zenith_angle=geometry["zenith_angle"].to_numpy(),
