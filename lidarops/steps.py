@@ -118,7 +118,7 @@ def at_hand(bench: Bench, channels: Sequence[str]) -> Bench:
     """Return a bench with the counts of channels in memory, where they are few."""
     counts = bench.archive[[name for name in channels if name in bench.archive]]
     small = counts.nbytes <= AT_ONCE
-    return replace(bench, archive=bench.archive.assign(counts.load())) if small else bench
+    return replace(bench, archive=bench.archive.assign(counts.compute())) if small else bench
 
 
 def _is_read(steps: Mapping[str, Step]) -> bool:
