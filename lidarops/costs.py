@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lidarops.errors import CatalogError
-from lidarops.plan_rules import GLUED, StepName, parts_of
+from lidarops.plan_rules import GLUED, StepName, gates, parts_of
 from lidarops.records import Granule, Plan, ProductKind, Scene, Step
 
 _FORMAT: Final = "lidarops costs"
@@ -274,11 +274,7 @@ def _bins(part: Scene) -> dict[str, int]:
 def _conditioned(part: Scene, plan: Plan) -> float:
     """Return profiles times bins that are read and conditioned; joined channels read their own."""
     held = _bins(part)
-    gated = {
-        step.channel: int(step.settings["bins"])
-        for step in _of(plan, part)
-        if step.name == StepName.RANGE_GATE
-    }
+    gated = gates(tuple(_of(plan, part)))
     total = 0
     for step in _of(plan, part):
         if step.name == StepName.READ and not _only_a_part(step.channel, plan):
@@ -346,8 +342,20 @@ def processor() -> str:
 
 
 def calibration_path() -> Path:
-    """Return where this user's calibration of this machine is kept."""
-    folder = os.environ.get(_CACHE_VARIABLE) or str(Path.home() / ".cache")
+    """Return where this user's calibration of this machine is kept.
+
+    Raises
+    ------
+    CatalogError
+        Where neither the environment nor the system tells.
+    """
+    try:
+        folder = os.environ.get(_CACHE_VARIABLE) or str(Path.home() / ".cache")
+    except RuntimeError as error:
+        # A container may run as a user that it does not know.
+        raise CatalogError(
+            f"a calibration has no place: {error}", remedy=f"set {_CACHE_VARIABLE}"
+        ) from error
     return Path(folder) / "lidarops" / "costs.json"
 
 
@@ -357,7 +365,7 @@ def save(costs: Costs, path: Path | None = None) -> Path:
     Raises
     ------
     CatalogError
-        Where the file cannot be written.
+        Where the file cannot be written, or has no place.
     """
     target = path or calibration_path()
     document = {
@@ -391,13 +399,16 @@ def load(path: Path | None = None) -> Costs:
     Costs
         Never raises: an estimate is no reason for a command to fail.
     """
-    source = path or calibration_path()
+    source = path
     try:
+        source = path or calibration_path()
         document = json.loads(source.read_text(encoding="utf-8"))
         return _read(document)
     except FileNotFoundError:
         note = UNCALIBRATED
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except CatalogError as error:
+        note = f"{UNCALIBRATED} ({error})"
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         note = f"{UNCALIBRATED} ({source} cannot be used: {error})"
     return Costs(DEFAULTS, note=note)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Final
@@ -61,6 +61,10 @@ class StepName(StrEnum):
     MULTIANGLE = "multiangle"
     PRIOR = "prior"
     VISIBILITY = "visibility"
+
+
+WHOLE: Final = (StepName.SIGNAL, StepName.ELASTIC, StepName.MULTIANGLE)
+"""Products that need all bins of a channel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,6 +291,19 @@ def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
     known = channel_facts(facts, channel.name)
     late = known.lag * channel.bin_width if isinstance(known.lag, float) else 0.0
     return (known.range_offset or 0.0) - late
+
+
+def gates(steps: Collection[Step]) -> dict[str, int]:
+    """Return the channels of which only the nearest bins are needed, and how many."""
+    whole = {step.channel for step in steps if step.name in WHOLE}
+    for step in steps:
+        if step.name == StepName.GLUE:
+            whole |= set(step.settings.values())
+    return {
+        step.channel: int(step.settings["bins"])
+        for step in steps
+        if step.name == StepName.RANGE_GATE and step.channel not in whole
+    }
 
 
 def ranged_by(channel: str) -> str:

@@ -23,7 +23,7 @@ from lidarops.ancillary import Ancillaries
 from lidarops.campaign import Campaign, InstrumentFacts, Station, as_settings
 from lidarops.errors import LidarOpsError, ProductError, SceneError
 from lidarops.flags import Quality
-from lidarops.plan_rules import StepName
+from lidarops.plan_rules import StepName, gates
 from lidarops.plans import glued_channels
 from lidarops.products import build, provenance, write
 from lidarops.raw import licel
@@ -300,7 +300,7 @@ def _bench(job: Job, scene: Scene, plan: Plan, root: Path) -> steps.Bench:
             scene.granules,
             root,
             [name for name in read if name in present],
-            steps.gates(plan),
+            gates(plan.steps),
         ),
         dark=_open(job, scene, scene.dark, root, subtracted) if subtracted and scene.dark else None,
         ancillaries=Ancillaries.read(job.campaign.folder, plan),

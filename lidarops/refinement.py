@@ -24,7 +24,7 @@ GAP: Final = timedelta(minutes=10)
 """Longest time between profiles that are looked at where the first ones show nothing."""
 DARK: Final = 3.0
 """Significance below which no first profile shows light; a retrieval is accepted above 5. Noise
-alone lifts one of 16 profiles above in 2 % of scenes, and 1.2 in all of them in half."""
+alone lifts the largest of 16 above 3 in 2 % of scenes, above 1.7 in half."""
 STILL_DARK: Final = 3.5
 """The same for the many profiles of the second look, of which noise alone lifts some."""
 WITHOUT: Final = "left_out"

@@ -7,15 +7,21 @@ tells in the attribute ``steps`` how that came out.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
 from lidarops.plan_rules import ChannelCase, Decisions, Rule, StepName, no_scan
 from lidarops.product_settings import MultiAngleSettings
+from lidarops.retrieve import _slant, scan_cycles
+from lidarops.retrieve._angle_robust import FEWEST_RAYS
 
-APART: Final = 0.25
-"""degree, beyond which beams have two directions."""
-REDUNDANT: Final = 4
-"""Directions that tell which of them is an outlier."""
+Array = npt.NDArray[np.float64]
+
 _HALF_TURN: Final = 180.0
 _SIMPLE: Final = frozenset({"kano_hamilton", "two_angle"})
 """Methods that take every altitude by itself."""
@@ -29,45 +35,55 @@ def _scanned(case: ChannelCase) -> MultiAngleSettings | None:
     return None if no_scan(case) else case.multiangle
 
 
-def directions(case: ChannelCase) -> list[tuple[float, float | None]]:
-    """Return the zenith angles and azimuths of a scan that differ, degree."""
-    told = {
-        (
-            granule.zenith_angle,
-            granule.azimuth if case.facts.azimuth is None else case.facts.azimuth,
-        )
+def heights(step: float, highest: float) -> Array:
+    """Return the altitudes of a multi-angle product, m above the station."""
+    return np.arange(step, highest + 1e-6, step)
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """The directions of a scan that the retrieval uses."""
+
+    count: int
+    sides_known: bool
+    """Whether an azimuth is told."""
+    free: float
+    """degree, the largest angle around the zenith that is free of them."""
+    surround: bool
+    """Whether no half turn is free, so that a horizontal gradient can be retrieved."""
+
+
+def rays(case: ChannelCase, settings: MultiAngleSettings) -> Rays:
+    """Return the rays that the retrieval will find in the files of a scan."""
+    side = case.facts.azimuth
+    pointings = tuple(
+        (_number(granule.zenith_angle), _number(granule.azimuth if side is None else side))
         for granule in case.scene.granules
-        if granule.zenith_angle is not None
-    }
-    kept: list[tuple[float, float | None]] = []
-    for zenith, azimuth in sorted(told, key=lambda pair: (pair[0], pair[1] or 0.0)):
-        if not any(_alike(zenith, azimuth, *other) for other in kept):
-            kept.append((zenith, azimuth))
-    return kept
+    )
+    return _rays(pointings, settings.step, settings.highest)
 
 
-def _alike(zenith: float, azimuth: float | None, other: float, side: float | None) -> bool:
-    if abs(zenith - other) > APART:
-        return False
-    if azimuth is None or side is None:
-        return azimuth is side
-    turn = abs((azimuth - side + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN)
-    # Near the zenith all azimuths are one.
-    return turn * math.sin(math.radians(zenith)) <= APART
+def _number(angle: float | None) -> float:
+    return math.nan if angle is None else angle
 
 
-def free_turn(case: ChannelCase) -> float:
-    """Return the largest angle around the zenith that is free of beams, degree; NaN if unknown."""
-    slanted = [pair for pair in directions(case) if abs(pair[0]) > APART]
-    sides = [azimuth if zenith > 0 else (azimuth or 0.0) + _HALF_TURN
-             for zenith, azimuth in slanted]  # fmt: skip
-    if any(side is None for side in sides):
-        return math.nan
-    ordered = sorted(side % (2 * _HALF_TURN) for side in sides if side is not None)
-    if not ordered:
-        return 2 * _HALF_TURN
-    following = [*ordered[1:], ordered[0] + 2 * _HALF_TURN]
-    return max(after - before for before, after in zip(ordered, following, strict=True))
+# The rules of a channel ask one after the other, and its channels look the same way.
+@lru_cache(maxsize=1)
+def _rays(pointings: tuple[tuple[float, float], ...], step: float, highest: float) -> Rays:
+    zenith_angle, azimuth = np.array(pointings).T
+    sides_known = bool(np.isfinite(azimuth).any())
+    try:
+        found = scan_cycles.directions(zenith_angle, azimuth)
+    except RetrievalInputError:
+        # The retrieval tells what is wrong with them.
+        return Rays(0, sides_known, 2 * _HALF_TURN, surround=False)
+    altitude = heights(step, highest)
+    up = _slant.rising(found.zenith_angle, altitude)
+    if up.size == 0:
+        return Rays(0, sides_known, 2 * _HALF_TURN, surround=False)
+    leaning = _slant.make_scan(found.zenith_angle[up], altitude, found.azimuth[up]).leaning
+    free = math.degrees(_slant.free_turn(leaning))
+    return Rays(up.size, sides_known, free, _slant.surrounds_zenith(leaning))
 
 
 def _gradient(case: ChannelCase) -> Decisions:
@@ -107,27 +123,28 @@ def _regressor(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    free = free_turn(case)
+    found = rays(case, settings)
     if settings.method in _BLIND:
         reason = f"method {settings.method} fits no horizontal gradient"
         yield case.without(StepName.GRADIENT_REGRESSOR, reason)
-    elif math.isnan(free):
-        reason = "headers do not tell all azimuths: beams are taken to lead to one side"
+    elif not found.sides_known:
+        reason = "headers do not tell azimuths: beams are taken to lead to one side"
         yield case.without(StepName.GRADIENT_REGRESSOR, reason)
-    elif free > _HALF_TURN + APART:
-        reason = f"{free:g} degree around the zenith are free of beams, more than a half turn"
-        yield case.without(StepName.GRADIENT_REGRESSOR, reason, number=free)
+    elif not found.surround:
+        reason = f"{found.free:g} degree around the zenith are free of beams, more than a half turn"
+        yield case.without(StepName.GRADIENT_REGRESSOR, reason, number=found.free)
     else:
         reason = "beams lead to all sides: decided from the data, at altitudes where their light is"
-        yield case.step(StepName.GRADIENT_REGRESSOR, reason, number=free)
+        yield case.step(StepName.GRADIENT_REGRESSOR, reason, number=found.free)
 
 
 def _robust(case: ChannelCase) -> Decisions:
-    if _scanned(case) is None:
+    settings = _scanned(case)
+    if settings is None:
         return
-    count = float(len(directions(case)))
-    if count < REDUNDANT:
-        reason = f"fewer than {REDUNDANT} directions do not tell which of them is an outlier"
+    count = float(rays(case, settings).count)
+    if count < FEWEST_RAYS:
+        reason = f"fewer than {FEWEST_RAYS} directions do not tell which of them is an outlier"
         yield case.without(StepName.ROBUST, reason, number=count)
     else:
         reason = "decided from the data: where a residual is too large for chance"
@@ -138,7 +155,7 @@ def _vertical(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    count = len(directions(case))
+    count = rays(case, settings).count
     gates = float(round(settings.highest / settings.step))
     if settings.method in _SIMPLE:
         reason = f"method {settings.method} takes every altitude by itself"
@@ -155,7 +172,7 @@ def _correlation(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    spare = float(len(directions(case)) - 2)
+    spare = float(rays(case, settings).count - 2)
     if settings.method not in _JOINT:
         reason = f"method {settings.method} takes the errors of altitudes as independent"
         yield case.without(StepName.CORRELATION, reason)

@@ -101,7 +101,6 @@ class Session:
         SceneOutcome
             As it was entered: failed where its files are not there any more.
         """
-        outcome = replace(outcome, estimated_seconds=self._estimated(judged))
         new, outcome = self._new_products(judged, outcome)
         entry = Entry(
             outcome=outcome,
@@ -111,6 +110,8 @@ class Session:
             products=tuple(new),
         )
         self._store.record(entry, self.id, self._lock.token)
+        # Once it is entered, as an estimate is no reason to lose a scene.
+        outcome = replace(outcome, estimated_seconds=self._estimated(judged))
         self._settle_versions(judged, outcome)
         self._tell(outcome)
         self._named += outcome.granules

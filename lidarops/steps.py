@@ -11,9 +11,10 @@ import numpy.typing as npt
 import xarray as xr
 from dask.base import compute
 
+from lidarops import scan_rules
 from lidarops.ancillary import Ancillaries
 from lidarops.flags import Quality
-from lidarops.plan_rules import GLUED, StepName, parts_of
+from lidarops.plan_rules import GLUED, WHOLE, StepName, parts_of
 from lidarops.records import Plan, ProductKind, Step
 from lidarops.refinement import WITHOUT
 from lidarops.retrieve import (
@@ -37,8 +38,6 @@ FULL_OVERLAP: Final = 0.99
 AT_ONCE: Final = 2_000_000
 """Bytes of counts up to which a scene is read before it is worked on: to put off so little costs
 more than to do it, and of more the arrays would leave the cache."""
-_WHOLE: Final = (StepName.SIGNAL, StepName.ELASTIC, StepName.MULTIANGLE)
-"""Products that need all bins of a channel."""
 _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 
 
@@ -119,12 +118,12 @@ def at_hand(bench: Bench, channels: Sequence[str]) -> Bench:
     """Return a bench with the counts of channels in memory, where they are few."""
     counts = bench.archive[[name for name in channels if name in bench.archive]]
     small = counts.nbytes <= AT_ONCE
-    return replace(bench, archive=bench.archive.assign(counts.load())) if small else bench
+    return replace(bench, archive=bench.archive.assign(counts.compute())) if small else bench
 
 
 def _is_read(steps: Mapping[str, Step]) -> bool:
     """Whether a step looks at the counts of the channel."""
-    if any(name in steps for name in _WHOLE):
+    if any(name in steps for name in WHOLE):
         return True
     settings = steps[StepName.HOMOGENEOUS].settings if StepName.HOMOGENEOUS in steps else {}
     return len(settings.get(WITHOUT, ())) < len(settings.get("sections", ()))
@@ -133,19 +132,6 @@ def _is_read(steps: Mapping[str, Step]) -> bool:
 def source_of(bench: Bench, channel: str) -> Plain | Glued:
     """Return what gives the profiles of a channel."""
     return Glued(bench, channel) if channel.startswith(GLUED) else Plain(bench, channel)
-
-
-def gates(plan: Plan) -> dict[str, int]:
-    """Return the channels of which only the nearest bins are needed, and how many."""
-    whole = {step.channel for step in plan.steps if step.name in _WHOLE}
-    for step in plan.steps:
-        if step.name == StepName.GLUE:
-            whole |= set(step.settings.values())
-    return {
-        step.channel: int(step.settings["bins"])
-        for step in plan.steps
-        if step.name == StepName.RANGE_GATE and step.channel not in whole
-    }
 
 
 class Plain:
@@ -379,7 +365,7 @@ def _rays(source: Plain | Glued, steps: Mapping[str, Step], bench: Bench) -> xr.
     settings = steps[StepName.MULTIANGLE].settings
     profiles, geometry = source.profiles(), source.geometry
     near, far = settings["background_range"]
-    heights = np.arange(settings["step"], settings["highest"] + 1e-6, settings["step"])
+    heights = scan_rules.heights(settings["step"], settings["highest"])
     return labeled_scan.on_altitudes(
         profiles,
         zenith_angle=geometry["zenith_angle"].to_numpy(),

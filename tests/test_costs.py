@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from lidarops import costs
 from lidarops.costs import DEFAULTS, Costs, Tally, Term, amounts
+from lidarops.errors import CatalogError
 from lidarops.plans import plan
 from lidarops.records import ChannelLayout, Plan, Role, Scene
 from lidarops.reports import gallery
@@ -58,6 +59,12 @@ def test_what_is_known_is_not_digested():
     assert Term.DIGEST not in of(sha256="0" * 64)
     scene, made = planned(sha256="0" * 64)
     assert amounts(scene, made, whole=True)[Term.DIGEST] == 10 * 1000
+
+
+def test_sections_beside_a_product_of_all_bins_read_all_of_them():
+    signal = {"signal": {"channels": ["photon_532o"]}}
+    assert of(products={**signal, **LEVEL})[Term.VALUE] == of(products=signal)[Term.VALUE]
+    assert of(products=LEVEL)[Term.VALUE] < of(products=signal)[Term.VALUE]
 
 
 def test_dark_files_cost_where_they_are_subtracted():
@@ -156,6 +163,27 @@ def test_a_strange_calibration_is_not_used_and_told(cache: Path, change: Any, sa
     assert found.seconds == DEFAULTS
     assert "not calibrated" in found.note
     assert said in found.note
+
+
+@pytest.fixture
+def homeless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container that runs as a user that its system does not know."""
+
+    def unknown(*_: object) -> None:
+        raise KeyError("getpwuid(): uid not found")
+
+    for name in ("XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+
+
+@pytest.mark.usefixtures("homeless")
+def test_without_a_home_there_is_no_calibration():
+    found = costs.load()
+    assert found.seconds == DEFAULTS
+    assert "XDG_CACHE_HOME" in found.words
+    with pytest.raises(CatalogError, match="XDG_CACHE_HOME"):
+        costs.save(Costs(DEFAULTS))
 
 
 def test_all_terms_have_defaults():

@@ -21,6 +21,8 @@ from lidarops.plans import CHANNEL, GATE, PRODUCTS, plan
 from lidarops.processing import Job, process
 from lidarops.records import Plan, Role, RunRecord
 from lidarops.refinement import GAP, WITHOUT, refine
+from lidarops.retrieve import _angle_block, _slant, labeled_scan
+from lidarops.retrieve.molecular import MolecularProfile
 from lidarops.rules import RULES
 from lidarops.scenes import cut
 from lidarops.simulate.campaign import simulate
@@ -180,6 +182,64 @@ def test_numbers_of_scans(granules, rule, number):
     made = planned(*granules, **MULTI)
     (found,) = (each for each in (*made.steps, *made.left_out) if each.rule == rule)
     assert found.number == pytest.approx(number)
+
+
+JITTER = scans(
+    *((zenith + off, 90.0) for zenith in (10.0, 30.0, 50.0) for off in (-0.2, -0.07, 0.07, 0.2))
+)
+NEARLY_OPPOSITE = scans((0.0, 0.0), (30.0, 0.0), (60.0, 0.0), (30.0, 180.1), (60.0, 180.1))
+FLAT = scans((0.0, 90.0), (30.0, 90.0), (60.0, 90.0), (88.0, 270.0))
+
+
+@pytest.mark.parametrize(
+    ("granules", "count"), [(JITTER, 3), (NEARLY_OPPOSITE, 5), (FLAT, 3), (BOTH_SIDES, 11)]
+)
+def test_the_rays_of_a_plan_are_those_of_the_retrieval(granules, count):
+    made = planned(*granules, **MULTI)
+    told = {each.rule: each for each in (*made.steps, *made.left_out)}
+    found, surrounded = retrieved(granules, highest=6000.0, step=60.0)
+    assert found == told["robust"].number == count
+    assert surrounded == (told["gradient_regressor"] in made.steps)
+
+
+def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int, bool]:
+    """Return how many rays the retrieval uses, and whether it can find a gradient."""
+    times = np.datetime64("2026-03-01", "ns") + np.arange(len(granules)) * np.timedelta64(60, "s")
+    distance = 7.5 * (np.arange(4000) + 0.5)
+    power = np.tile(1e6 / distance**2, (len(granules), 1))
+    flat = (("time", "range"), np.zeros(power.shape, dtype=np.int32))
+    profiles = xr.Dataset(
+        {"power": (("time", "range"), power), "variance": flat, "quality": flat},
+        coords={"range": distance},
+    )
+    rays = labeled_scan.on_altitudes(
+        profiles,
+        zenith_angle=np.array([granule.zenith_angle for granule in granules]),
+        azimuth=np.array([granule.azimuth for granule in granules]),
+        time=times,
+        time_bnds=np.stack([times, times + np.timedelta64(60, "s")], axis=-1),
+        shots=np.ones(len(granules)),
+        altitude_grid=np.arange(step, highest + 1e-6, step) + 20.0,
+        station_altitude=20.0,
+        background=labeled_scan.Background(
+            (27_000.0, 30_000.0), MolecularProfile.us_standard(), 532e-9
+        ),
+    ).compute()
+    scan = _slant.make_scan(
+        rays["ray_zenith_angle"].to_numpy(),
+        rays["altitude"].to_numpy() - 20.0,
+        rays["ray_azimuth"].to_numpy(),
+    )
+    signal = rays["signal"].to_numpy()
+    return rays.sizes["ray"], _angle_block.make_rays(signal, np.ones(signal.shape), scan).sides
+
+
+def test_angles_that_cannot_be_leave_the_plan_to_the_retrieval():
+    made = planned(*scans((-30.0, None), (0.0, None), (30.0, None)), **MULTI)
+    assert decided(made, "robust") == (
+        [],
+        ["fewer than 4 directions do not tell which of them is an outlier"],
+    )
 
 
 def test_every_decision_has_a_rule_of_the_table():

@@ -501,3 +501,12 @@ def test_the_background_is_found_as_the_campaign_asks() -> None:
     left = count_rate(distance)[-120:].mean()
     assert kinds["known_shape"] == pytest.approx(SKY, abs=0.2 * left)
     assert kinds["tail_mean"] == pytest.approx(SKY + left, abs=0.2 * left)
+
+
+def test_counts_at_hand_are_not_those_of_the_caller():
+    lazy = archive(profiles=3)
+    bench = steps.Bench(planned(campaign({"signal": {}})), lazy, None, NONE, STATION)
+    near = steps.at_hand(bench, ["photon_532o"]).archive
+    assert isinstance(near["photon_532o"].data, np.ndarray)
+    assert isinstance(near["analog_532o"].data, da.Array)
+    assert isinstance(lazy["photon_532o"].data, da.Array)

@@ -111,13 +111,21 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
-    """Return what scenes took and were to take, where that was measured."""
-    took = sum(scene.cpu_seconds for scene in record.scenes)
-    if not took:
+    """Return what scenes took and were to take, where that was measured.
+
+    What a process loads with its first scenes is estimated once, while each worker pays it.
+    """
+    # Of scenes that failed no time is known, and their estimates have nothing beside them.
+    measured = [scene for scene in record.scenes if scene.cpu_seconds]
+    if not measured:
         return []
-    estimated = sum(scene.estimated_seconds for scene in record.scenes)
-    told = f"; {duration(estimated)} were estimated ({record.costs})" if estimated else ""
-    return [("CPU time of scenes", f"{duration(took)}{told}")]
+    took = sum(scene.cpu_seconds for scene in measured)
+    estimated = sum(scene.estimated_seconds for scene in measured)
+    told = (
+        f"; {duration(estimated)} were estimated ({record.costs}), with loading counted once,"
+        " which each worker pays"
+    )
+    return [("CPU time of scenes", f"{duration(took)}{told if estimated else ''}")]
 
 
 def verdict(record: RunRecord) -> str:

@@ -92,14 +92,13 @@ def make_rays(signal: npt.NDArray[np.floating], variance: Array, scan: Scan) -> 
     _angle_mask.take_logarithms(signal, variance, scan.usable, logarithm, noise, ends)
     gates = np.arange(signal.shape[-1])
     alive = (ends[:, :, np.newaxis] > gates).sum(axis=1)
-    off = np.abs(scan.east[:, 0]) + np.abs(scan.north[:, 0]) > 1e-9
     return Rays(
         logarithm,
         noise,
         np.nan_to_num(scan.path, nan=1.0),
         np.nan_to_num(np.stack([scan.east, scan.north])),
         alive,
-        surrounds_zenith(scan.azimuth[scan.usable & off]),
+        surrounds_zenith(scan.leaning),
         min(3, max(int(scan.usable.sum()), 2)),
     )
 

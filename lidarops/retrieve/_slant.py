@@ -13,6 +13,7 @@ from lidarops.retrieve._inputs import real_array
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
 
 EARTH_RADIUS: Final = 6_371_000.0
 """m, mean."""
@@ -20,6 +21,8 @@ SPHERICAL_BEYOND: Final = 75.0
 """degree. Up to here the secant errs by less than 0.3 percent of the optical depth."""
 LONGEST: Final = 10.0
 """Slant over vertical path beyond which refraction and curvature make the model wrong."""
+_UPRIGHT: Final = 1e-9
+"""Horizontal distance over altitude up to which a ray has no azimuth."""
 _OPPOSITE: Final = 1e-6
 """radian by which a gap between azimuths may exceed half a turn."""
 
@@ -38,6 +41,12 @@ class Scan:
     """(angle,) radian, of where the ray leads (a negative zenith angle leads backwards)."""
     usable: Mask
     """(angle,): false for rays whose path is longer than ten times the vertical one."""
+
+    @property
+    def leaning(self) -> Array:
+        """Azimuths of the usable rays that leave the zenith, radian."""
+        off = np.abs(self.east[:, 0]) + np.abs(self.north[:, 0]) > _UPRIGHT
+        return self.azimuth[self.usable & off]
 
 
 def make_scan(
@@ -85,6 +94,20 @@ def make_scan(
     return _scan(slant_path(np.abs(angle), height), angle, heading)
 
 
+def rising(zenith_angle: Array, altitude: Array) -> Integers:
+    """Return which rays lead up, and are usable at all altitudes.
+
+    Parameters
+    ----------
+    zenith_angle : (angle,) float
+        degree, 0 to 180.
+    altitude : (altitude,) float
+        m above the lidar, ascending.
+    """
+    upward = np.flatnonzero(zenith_angle < 90.0)
+    return upward[make_scan(zenith_angle[upward], altitude).usable] if upward.size else upward
+
+
 def slant_path(angle: Array, altitude: Array) -> Array:
     """Return slant over vertical path of `make_scan` as (angle, altitude); inf at the horizon."""
     cosine = np.cos(np.radians(angle))[:, np.newaxis]
@@ -107,11 +130,21 @@ def surrounds_zenith(azimuth: Array) -> bool:
     azimuth : (angle,) float
         radian; only of rays that leave the zenith.
     """
-    if azimuth.size < 2:
-        return False
+    return free_turn(azimuth) <= np.pi + _OPPOSITE
+
+
+def free_turn(azimuth: Array) -> float:
+    """Return the largest angle around the zenith that is free of rays, radian.
+
+    Parameters
+    ----------
+    azimuth : (angle,) float
+        radian; only of rays that leave the zenith.
+    """
+    if azimuth.size == 0:
+        return 2.0 * np.pi
     ordered = np.sort(np.mod(azimuth, 2.0 * np.pi))
-    gaps = np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))
-    return bool(np.max(gaps) <= np.pi + _OPPOSITE)
+    return float(np.max(np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))))
 
 
 def altitude_grid(altitude: npt.ArrayLike, station_altitude: float) -> Array:

@@ -211,10 +211,7 @@ class _Clear:
 
 
 def _order(found: scan_cycles.Directions, numbers: Integers, height: Array) -> _Order:
-    upward = np.flatnonzero(found.zenith_angle < 90.0)
-    usable = np.empty(0, dtype=np.intp)
-    if upward.size:
-        usable = upward[_slant.make_scan(found.zenith_angle[upward], height).usable]
+    usable = _slant.rising(found.zenith_angle, height)
     if usable.size == 0:
         raise RetrievalInputError(
             "holds no direction that rises from the horizon by more than about 6 degree",

@@ -281,6 +281,19 @@ class TestDecisions:
         assert f"look sections may be dark look 16 {CHANNEL}" in found.text
         assert "were estimated (calibrated yesterday)" in found.text
 
+    def test_scenes_that_failed_have_no_part_in_the_estimate(self, tmp_path):
+        done = outcome("one", START, cpu_seconds=3.0, estimated_seconds=2.0)
+        failed = outcome("two", START, error="unreadable", estimated_seconds=500.0)
+        with_it, without = (
+            [
+                value
+                for name, value in content.summary(run_record(tmp_path, scenes))
+                if "CPU" in name
+            ]
+            for scenes in ([done, failed], [done])
+        )
+        assert with_it == without != []
+
 
 class TestManyScenes:
     @pytest.fixture
