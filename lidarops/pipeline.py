@@ -89,7 +89,7 @@ class Result:
     failures: Mapping[str, str]
     """Scene -> error, of every scene whose last try failed."""
     empty: tuple[str, ...]
-    """Scenes whose retrievals left nothing to use."""
+    """Scenes whose retrievals left nothing to use; what is found orphaned does not count."""
     barren: int
     """Scenes that can give no product."""
     set_aside: int
@@ -321,7 +321,8 @@ class _Work:
             fresh=found.fresh,
             orphans=tuple(found.orphans),
             failures=self._store.failures(),
-            empty=tuple(self._store.empty()),
+            # Nothing would ever make these again, so that they would be told for ever.
+            empty=tuple(self._store.empty(without={each.path for each in found.orphans})),
             barren=found.barren + sum(barren for _, barren, _ in clean),
             set_aside=len(found.set_aside) + sum(aside for _, _, aside in clean),
             signal=caught,

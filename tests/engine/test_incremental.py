@@ -282,6 +282,19 @@ def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
     assert again.troubled
 
 
+def test_products_that_nothing_asks_for_are_not_told_as_empty(archive: Archive) -> None:
+    archive.write()
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        connection.execute("update product set usable = 0 where kind = 'elastic'")
+    assert bring_up_to_date(archive.write()).empty
+    del archive.told["instruments"]["rich"]["products"]["elastic"]
+    for _ in range(2):
+        result = bring_up_to_date(archive.write())
+        assert result.orphans
+        assert not result.empty
+        assert not result.troubled
+
+
 def test_a_cluster_is_started_only_where_something_is_stale(archive: Archive) -> None:
     started = []
 
