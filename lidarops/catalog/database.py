@@ -6,16 +6,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
-from lidarops.catalog.schema import GRANULE, METADATA, SCHEMA, SCHEMA_VERSION
+from lidarops.catalog.schema import GRANULE, METADATA, PRODUCT, SCHEMA, SCHEMA_VERSION
 from lidarops.errors import CatalogError
 
 BATCH = 1000
 """Rows a statement, where a list of them is asked for."""
+_WITHOUT_USABLE: Final = 2
+"""The version of the tables before products had `usable`."""
 
 
 class Database:
@@ -98,7 +100,11 @@ class Database:
             METADATA.create_all(connection)
             statement = self.insert(SCHEMA).on_conflict_do_nothing()
             connection.execute(statement, {"version": SCHEMA_VERSION})
-        found = connection.scalar(sa.select(sa.func.max(SCHEMA.c.version)))
+        newest = sa.select(sa.func.max(SCHEMA.c.version))
+        found = connection.scalar(newest)
+        if found == _WITHOUT_USABLE:
+            _add_usable(connection)
+            found = connection.scalar(newest)
         if found != SCHEMA_VERSION:
             raise self._other_version(found)
 
@@ -121,6 +127,20 @@ class Database:
         else:
             remedy = "check that the folder is writable and the file is a lidarops catalog"
         return CatalogError(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
+
+
+def _add_usable(connection: sa.Connection) -> None:
+    """Bring a catalog of version 2 up to date: of its products nothing was judged."""
+    # First, as SQLite begins no transaction with a change of a table, and only one of two
+    # processes finds the old number.
+    raised = connection.execute(
+        sa.update(SCHEMA)
+        .where(SCHEMA.c.version == _WITHOUT_USABLE)
+        .values(version=_WITHOUT_USABLE + 1)
+    )
+    if raised.rowcount == 1:
+        column = sa.schema.CreateColumn(PRODUCT.c.usable).compile(dialect=connection.dialect)
+        connection.execute(sa.text(f"ALTER TABLE {PRODUCT.name} ADD COLUMN {column}"))
 
 
 def _parsed(url: str) -> sa.URL:
