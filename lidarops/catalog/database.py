@@ -29,18 +29,24 @@ class Database:
         SQLAlchemy URL, such as ``sqlite:///catalog.sqlite`` or ``postgresql+psycopg://...``.
     campaign : str
         Name of the campaign; several may share a database.
+    create : bool
+        Whether to make the catalog where there is none.
 
     Raises
     ------
     CatalogError
-        If the database cannot be opened, or is of another version of lidarops.
+        If the database cannot be opened, is of another version of lidarops, or is not there.
     """
 
-    def __init__(self, url: str, campaign: str) -> None:
+    def __init__(self, url: str, campaign: str, *, create: bool = True) -> None:
+        self._create = create
         self.campaign = campaign
         self._url = _parsed(url)
         self._sqlite = self._url.get_backend_name() == "sqlite"
         if self._sqlite and self._url.database:
+            # Asked first, because opening it would make it.
+            if not create and not Path(self._url.database).exists():
+                raise self._absent()
             _make_folder(Path(self._url.database).parent)
         self._engine = _engine(self._url)
         if self._sqlite:
@@ -97,6 +103,8 @@ class Database:
         if not inspector.has_table(SCHEMA.name):
             if inspector.has_table(GRANULE.name):
                 raise self._other_version(1)
+            if not self._create:
+                raise self._absent()
             METADATA.create_all(connection)
             statement = self.insert(SCHEMA).on_conflict_do_nothing()
             connection.execute(statement, {"version": SCHEMA_VERSION})
@@ -107,6 +115,11 @@ class Database:
             found = connection.scalar(newest)
         if found != SCHEMA_VERSION:
             raise self._other_version(found)
+
+    def _absent(self) -> CatalogError:
+        return CatalogError(
+            "there is no catalog yet", file=self.place, remedy="run lidarops reprocess first"
+        )
 
     def _other_version(self, found: int | None) -> CatalogError:
         older = found is None or found < SCHEMA_VERSION

@@ -149,6 +149,15 @@ def test_a_catalog_that_cannot_be_brought_up_to_date_stays_as_it_was(
         assert connection.execute("select version from schema_version").fetchall() == [(2,)]
 
 
+def test_a_catalog_is_not_made_where_it_is_only_read(tmp_path: Path) -> None:
+    with pytest.raises(CatalogError, match=r"there is no catalog yet.*reprocess"):
+        Store(f"sqlite:///{tmp_path}/none/catalog.sqlite", "test", create=False)
+    assert not (tmp_path / "none").exists()
+    (tmp_path / "other.sqlite").touch()
+    with pytest.raises(CatalogError, match="there is no catalog yet"):
+        Store(f"sqlite:///{tmp_path}/other.sqlite", "test", create=False)
+
+
 def test_what_is_no_url_is_told() -> None:
     with pytest.raises(CatalogError, match="postgresql"):
         Store("not a url", "test")
