@@ -70,13 +70,15 @@ class Ended:
 class Stop:
     """A wish to stop: by signal, or by whoever calls `now`.
 
-    The first SIGINT or SIGTERM lets scenes in hand end; the second abandons them.
+    The first SIGINT or SIGTERM lets scenes in hand end; the second abandons them. Where none is in
+    hand, as told by `idle`, the first one breaks off at once.
     """
 
     def __init__(self) -> None:
         self.reason = ""
         self.signal = 0
         self._before: dict[int, Any] = {}
+        self._idle = False
 
     def __bool__(self) -> bool:
         return bool(self.reason)
@@ -84,6 +86,22 @@ class Stop:
     def now(self, reason: str) -> None:
         """Ask to stop."""
         self.reason = self.reason or reason
+
+    @contextmanager
+    def idle(self) -> Iterator[None]:
+        """Let a signal break off what is done within: no scene is in hand that is to end first.
+
+        Whoever calls looks afterwards whether it came to that.
+        """
+        self._idle = True
+        try:
+            yield
+        except KeyboardInterrupt:
+            # Raised on, it would end the process as Ctrl-C does, whatever the signal was.
+            if not self.signal:
+                raise
+        finally:
+            self._idle = False
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
@@ -100,6 +118,9 @@ class Stop:
             raise KeyboardInterrupt
         self.signal = number
         self.now(f"stopped by {signal.Signals(number).name}")
+        if self._idle:
+            _LOG.warning("%s: no scene is in hand", self.reason)
+            raise KeyboardInterrupt
         _LOG.warning("%s: scenes in hand are ended; once more to abandon them", self.reason)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,7 +90,7 @@ class Result:
     failures: Mapping[str, str]
     """Scene -> error, of every scene whose last try failed."""
     empty: tuple[str, ...]
-    """Scenes whose retrievals left nothing to use."""
+    """Scenes whose retrievals left nothing to use; what is found orphaned does not count."""
     barren: int
     """Scenes that can give no product."""
     set_aside: int
@@ -321,7 +322,8 @@ class _Work:
             fresh=found.fresh,
             orphans=tuple(found.orphans),
             failures=self._store.failures(),
-            empty=tuple(self._store.empty()),
+            # Nothing would ever make these again, so that they would be told for ever.
+            empty=tuple(self._store.empty(without={each.path for each in found.orphans})),
             barren=found.barren + sum(barren for _, barren, _ in clean),
             set_aside=len(found.set_aside) + sum(aside for _, _, aside in clean),
             signal=caught,
@@ -344,7 +346,7 @@ class _Work:
             if client is None and (options.cluster or options.workers > 1):
                 # First, as a run that this one has to wait for may leave nothing to do.
                 self._write()
-                used = stack.enter_context(self._started())
+                used = self._reached(self._started, stack, stop)
             serial = used is None
             taken = self._take_noted if serial else self._take
             if first is not None:
@@ -352,10 +354,31 @@ class _Work:
                 self._enter(carry_out(others, client=used, stop=stop, taken=taken), stop)
             if self._suspects and not stop:
                 if used is None:
-                    used = stack.enter_context(local_client(1, memory=options.memory))
-                for job in self._suspects:
-                    self._take(job)
-                self._enter(alone(self._suspects, client=used, stop=stop), stop)
+                    own = partial(local_client, 1, memory=options.memory)
+                    used = self._reached(own, stack, stop)
+                if used is not None:
+                    self._enter_suspects(used, stop)
+
+    def _enter_suspects(self, client: Client, stop: Stop) -> None:
+        for job in self._suspects:
+            self._take(job)
+        self._enter(alone(self._suspects, client=client, stop=stop), stop)
+
+    def _reached(
+        self,
+        start: Callable[[], AbstractContextManager[Client]],
+        stack: ExitStack,
+        stop: Stop,
+    ) -> Client | None:
+        """Start a cluster; None where a signal came first, which the run is then entered with."""
+        # A queue may take an hour, in which a signal would wait for no scene at all.
+        if not stop:
+            with stop.idle():
+                client = stack.enter_context(start())
+        if stop:
+            self._running()
+            return None
+        return client
 
     def _started(self) -> AbstractContextManager[Client]:
         options = self._options

@@ -27,11 +27,15 @@ def publish(campaign: Campaign, url: str) -> Published:
     Raises
     ------
     CatalogError
-        If the ledger cannot be read, or the URL is unknown.
+        If there is no ledger or it cannot be read, or the URL is unknown.
     ProductError
-        If the store cannot be written, or a product is not what the ledger says.
+        If the store cannot be written, or a product is missing or not what the ledger
+        says.
     """
-    with Store(campaign.catalog_url, campaign.name) as store, store.all_made() as made:
+    with (
+        Store(campaign.catalog_url, campaign.name, create=False) as store,
+        store.all_made() as made,
+    ):
         products = {each.path: each.sha256 for each in made}
     # One a store: what was sent to one says nothing of another.
     name = hashlib.sha256(url.encode()).hexdigest()[:12]

@@ -8,6 +8,7 @@ endpoints come from where the drivers look for them, such as ``AWS_ACCESS_KEY_ID
 from __future__ import annotations
 
 import hashlib
+import re
 import secrets
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +22,9 @@ from lidarops.errors import CatalogError, LidarOpsError, ProductError
 _READ_ONLY: Final = frozenset({"http", "https"})
 # Here an object appears when its upload is complete, or not at all.
 _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
+# A secret may hold slashes, so what looks like one goes up to the last @; the @ of Azure parts a
+# container from its account.
+_KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/\s]*)@")
 _BATCH: Final = 100
 """Files on their way at the same time."""
 
@@ -61,6 +65,11 @@ def is_url(location: str) -> bool:
     return "://" in location
 
 
+def without_keys(text: str) -> str:
+    """Return a URL, or a text that holds some, without what stands before an @ in the address."""
+    return _KEYS.sub("", text)
+
+
 class RemoteStore:
     """The objects below one URL.
 
@@ -77,14 +86,15 @@ class RemoteStore:
     def __init__(self, url: str) -> None:
         import fsspec  # noqa: PLC0415 - most archives are local, and the import takes 0.1 s
 
-        self.url = url
+        self.url = without_keys(url)
+        """As it may be told."""
         self._scheme = url.partition("://")[0]
         try:
             self._fs, prefix = fsspec.core.url_to_fs(url)
         except (ValueError, ImportError) as error:
             raise CatalogError(
-                f"the URL cannot be opened: {error}",
-                file=url,
+                f"the URL cannot be opened: {without_keys(str(error))}",
+                file=self.url,
                 remedy="use a URL that fsspec knows and install its driver: lidarops[s3] for s3://",
             ) from error
         self._prefix = prefix.rstrip("/")
@@ -193,7 +203,7 @@ class RemoteStore:
         ------
         ProductError
             If the store is read-only, cannot be reached, or holds less than was sent, or if a
-            product is no longer what the ledger says.
+            product is missing or no longer what the ledger says.
         """
         if self._scheme in _READ_ONLY:
             raise ProductError(
@@ -204,7 +214,7 @@ class RemoteStore:
         due = [
             path
             for path, sha256 in sorted(products.items())
-            if sent.get(path) != sha256 or there.get(path) != (root / path).stat().st_size
+            if sent.get(path) != sha256 or there.get(path) != _size(root / path)
         ]
         for first in range(0, len(due), _BATCH):
             batch = {path: products[path] for path in due[first : first + _BATCH]}
@@ -223,7 +233,7 @@ class RemoteStore:
 
     def _upload(self, root: Path, products: Mapping[str, str]) -> None:
         for path, sha256 in products.items():
-            with (root / path).open("rb") as file:
+            with _reading(root / path), (root / path).open("rb") as file:
                 if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
                     raise ProductError(
                         "is not what the ledger says", file=root / path, remedy="reprocess"
@@ -236,9 +246,9 @@ class RemoteStore:
             for source, target in zip(sources, targets, strict=True):
                 self._put_and_rename(source, target)
         for path, target in zip(products, targets, strict=True):
-            sent, held = (root / path).stat().st_size, int(self._fs.info(target)["size"])
+            sent, held = _size(root / path), int(self._fs.info(target)["size"])
             if sent != held:
-                raise ProductError(f"holds {held} of {sent} bytes", file=target)
+                raise ProductError(f"holds {held} of {sent} bytes", file=f"{self.url}/{path}")
 
     def _put_and_rename(self, source: str, target: str) -> None:
         where = PurePosixPath(target)
@@ -263,8 +273,29 @@ class RemoteStore:
             raise
         except _failures() as error:
             raise kind(
-                f"{problem}: {error!r}", file=self.url, remedy="check address, network and keys"
+                f"{problem}: {without_keys(repr(error))}",
+                file=self.url,
+                remedy="check address, network and keys",
             ) from error
+
+
+@contextmanager
+def _reading(product: Path) -> Iterator[None]:
+    """Tell a product that cannot be read from a store that cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        missing = isinstance(error, FileNotFoundError)
+        raise ProductError(
+            "is missing" if missing else f"cannot be read: {error.strerror}",
+            file=product,
+            remedy="run lidarops reprocess",
+        ) from error
+
+
+def _size(product: Path) -> int:
+    with _reading(product):
+        return product.stat().st_size
 
 
 def _columns(pairs: Sequence[tuple[str, str]]) -> tuple[list[str], list[str]]:

@@ -6,16 +6,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
-from lidarops.catalog.schema import GRANULE, METADATA, SCHEMA, SCHEMA_VERSION
+from lidarops.catalog.schema import GRANULE, METADATA, PRODUCT, SCHEMA, SCHEMA_VERSION
 from lidarops.errors import CatalogError
 
 BATCH = 1000
 """Rows a statement, where a list of them is asked for."""
+_WITHOUT_USABLE: Final = 2
+"""The version of the tables before products had `usable`."""
 
 
 class Database:
@@ -27,18 +29,24 @@ class Database:
         SQLAlchemy URL, such as ``sqlite:///catalog.sqlite`` or ``postgresql+psycopg://...``.
     campaign : str
         Name of the campaign; several may share a database.
+    create : bool
+        Whether to make the catalog where there is none.
 
     Raises
     ------
     CatalogError
-        If the database cannot be opened, or is of another version of lidarops.
+        If the database cannot be opened, is of another version of lidarops, or is not there.
     """
 
-    def __init__(self, url: str, campaign: str) -> None:
+    def __init__(self, url: str, campaign: str, *, create: bool = True) -> None:
+        self._create = create
         self.campaign = campaign
         self._url = _parsed(url)
         self._sqlite = self._url.get_backend_name() == "sqlite"
         if self._sqlite and self._url.database:
+            # Asked first, because opening it would make it.
+            if not create and not Path(self._url.database).exists():
+                raise self._absent()
             _make_folder(Path(self._url.database).parent)
         self._engine = _engine(self._url)
         if self._sqlite:
@@ -95,12 +103,23 @@ class Database:
         if not inspector.has_table(SCHEMA.name):
             if inspector.has_table(GRANULE.name):
                 raise self._other_version(1)
+            if not self._create:
+                raise self._absent()
             METADATA.create_all(connection)
             statement = self.insert(SCHEMA).on_conflict_do_nothing()
             connection.execute(statement, {"version": SCHEMA_VERSION})
-        found = connection.scalar(sa.select(sa.func.max(SCHEMA.c.version)))
+        newest = sa.select(sa.func.max(SCHEMA.c.version))
+        found = connection.scalar(newest)
+        if found == _WITHOUT_USABLE:
+            _add_usable(connection)
+            found = connection.scalar(newest)
         if found != SCHEMA_VERSION:
             raise self._other_version(found)
+
+    def _absent(self) -> CatalogError:
+        return CatalogError(
+            "there is no catalog yet", file=self.place, remedy="run lidarops reprocess first"
+        )
 
     def _other_version(self, found: int | None) -> CatalogError:
         older = found is None or found < SCHEMA_VERSION
@@ -121,6 +140,20 @@ class Database:
         else:
             remedy = "check that the folder is writable and the file is a lidarops catalog"
         return CatalogError(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
+
+
+def _add_usable(connection: sa.Connection) -> None:
+    """Bring a catalog of version 2 up to date: of its products nothing was judged."""
+    # First, as SQLite begins no transaction with a change of a table, and only one of two
+    # processes finds the old number.
+    raised = connection.execute(
+        sa.update(SCHEMA)
+        .where(SCHEMA.c.version == _WITHOUT_USABLE)
+        .values(version=_WITHOUT_USABLE + 1)
+    )
+    if raised.rowcount == 1:
+        column = sa.schema.CreateColumn(PRODUCT.c.usable).compile(dialect=connection.dialect)
+        connection.execute(sa.text(f"ALTER TABLE {PRODUCT.name} ADD COLUMN {column}"))
 
 
 def _parsed(url: str) -> sa.URL:

@@ -478,20 +478,28 @@ class Ledger(Granules):
         with self.transaction() as connection:
             return {row.scene: row.error for row in connection.execute(query)}
 
-    def empty(self) -> list[str]:
-        """Return the scenes whose retrievals left nothing to use, as `SceneOutcome.empty`."""
+    def empty(self, *, without: Collection[str] = ()) -> list[str]:
+        """Return the scenes whose retrievals left nothing to use, as `SceneOutcome.empty`.
+
+        Parameters
+        ----------
+        without : collection of str
+            Paths of products that do not count.
+        """
         # Not counted by day: a run over a part of a scene leaves its other products as they are.
-        kinds = [kind.value for kind in JUDGE_THEMSELVES]
-        something = sa.case((_P.usable == 0, 0), else_=1)
-        query = (
-            sa.select(_P.scene)
-            .where(_P.campaign == self.campaign, _P.kind.in_(kinds))
-            .group_by(_P.scene)
-            .having(sa.func.max(something) == 0)
-            .order_by(_P.scene)
+        judged = (
+            _P.campaign == self.campaign,
+            _P.kind.in_([kind.value for kind in JUDGE_THEMSELVES]),
         )
-        with self.transaction() as connection:
-            return list(connection.scalars(query))
+        # Few, so that the paths can be compared here: a statement takes only so many of them.
+        suspects = sa.select(_P.scene).where(*judged, _P.usable == 0)
+        query = sa.select(_P.scene, _P.path, _P.usable).where(*judged, _P.scene.in_(suspects))
+        found: dict[str, bool] = {}
+        with self.stream(query) as rows:
+            for scene, path, usable in rows:
+                if path not in without:
+                    found[scene] = found.get(scene, True) and usable == 0
+        return sorted(scene for scene, empty in found.items() if empty)
 
     def forget_scenes(self, scenes: Collection[str]) -> None:
         """Remove what is noted of scenes that are no more."""

@@ -7,7 +7,8 @@ from typing import Final
 import sqlalchemy as sa
 
 SCHEMA_VERSION: Final = 3
-"""Raised with every change of a table: a database of another version is refused by name."""
+"""Raised with every change of a table: a database of another version is refused by name, if it
+cannot be brought up to date as one of version 2 can."""
 
 METADATA: Final = sa.MetaData()
 

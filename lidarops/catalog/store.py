@@ -14,9 +14,11 @@ class Store(Ledger):
         SQLAlchemy URL, such as ``sqlite:///catalog.sqlite`` or ``postgresql+psycopg://...``.
     campaign : str
         Name of the campaign; several may share a database.
+    create : bool
+        Whether to make the catalog where there is none.
 
     Raises
     ------
     CatalogError
-        If the database cannot be opened, or is of another version of lidarops.
+        If the database cannot be opened, or is of another version of lidarops, or is not there.
     """

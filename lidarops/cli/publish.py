@@ -26,6 +26,7 @@ def publish(
     """
     from lidarops.campaign import load
     from lidarops.publication import publish as copy
+    from lidarops.stores import without_keys
 
     settings = load(campaign, output=out, catalog=catalog)
     done = copy(settings, url)
@@ -33,4 +34,6 @@ def publish(
         typer.echo(json.dumps(asdict(done), indent=2))
         return
     others = f", {done.others} others in the store left alone" if done.others else ""
-    typer.echo(f"{url}: {len(done.uploaded)} sent, {done.unchanged} unchanged{others}")
+    typer.echo(
+        f"{without_keys(url)}: {len(done.uploaded)} sent, {done.unchanged} unchanged{others}"
+    )

@@ -5,14 +5,16 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
 
 from lidarops.catalog import lock as lock_module
+from lidarops.catalog.ledger import Run, RunStatus
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.schema import LOCK, SCHEMA_VERSION
+from lidarops.catalog.schema import LOCK, PRODUCT, SCHEMA_VERSION
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 
@@ -104,6 +106,56 @@ def test_a_catalog_of_another_version_is_told(url: str, tmp_path: Path) -> None:
         connection.execute("drop table schema_version")
     with pytest.raises(CatalogError, match=r"version 1.*move it away"):
         Store(url, "test")
+
+
+def test_a_catalog_of_version_2_is_brought_up_to_date(url: str, tmp_path: Path) -> None:
+    run = Run(
+        "one", datetime(2026, 3, 1, tzinfo=UTC), None, RunStatus.RUNNING, "me", "0.1", "abc"
+    )  # fmt: skip
+    with Store(url, "test") as store, Lock(store) as lock:
+        lock.acquire()
+        store.begin_run(run, lock.token)
+        with store.transaction() as connection:
+            row = {
+                column.name: 1 if isinstance(column.type, sa.Integer) else "one"
+                for column in PRODUCT.columns
+            }
+            connection.execute(sa.insert(PRODUCT), {**row, "campaign": "test"})
+            before = connection.execute(sa.select(PRODUCT)).mappings().one()
+    with sqlite3.connect(tmp_path / "catalog.sqlite") as connection:
+        connection.execute("alter table product drop column usable")
+        connection.execute("update schema_version set version = 2")
+    for _ in range(2):
+        with Store(url, "test") as store:
+            assert store.products() == [{**before, "usable": None}]
+            assert [each.id for each in store.runs()] == ["one"]
+            assert store.empty() == []
+            with store.transaction() as connection:
+                assert connection.scalars(sa.text("select version from schema_version")).all() == [
+                    SCHEMA_VERSION
+                ]
+
+
+def test_a_catalog_that_cannot_be_brought_up_to_date_stays_as_it_was(
+    url: str, tmp_path: Path
+) -> None:
+    Store(url, "test").close()
+    with sqlite3.connect(tmp_path / "catalog.sqlite") as connection:
+        # The column is there already, so that adding it fails.
+        connection.execute("update schema_version set version = 2")
+    with pytest.raises(CatalogError, match="duplicate column"):
+        Store(url, "test")
+    with sqlite3.connect(tmp_path / "catalog.sqlite") as connection:
+        assert connection.execute("select version from schema_version").fetchall() == [(2,)]
+
+
+def test_a_catalog_is_not_made_where_it_is_only_read(tmp_path: Path) -> None:
+    with pytest.raises(CatalogError, match=r"there is no catalog yet.*reprocess"):
+        Store(f"sqlite:///{tmp_path}/none/catalog.sqlite", "test", create=False)
+    assert not (tmp_path / "none").exists()
+    (tmp_path / "other.sqlite").touch()
+    with pytest.raises(CatalogError, match="there is no catalog yet"):
+        Store(f"sqlite:///{tmp_path}/other.sqlite", "test", create=False)
 
 
 def test_what_is_no_url_is_told() -> None:

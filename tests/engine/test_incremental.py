@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +18,7 @@ from small_archive import DAY, Archive, made
 
 from lidarops import engine
 from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.pipeline import (
     Options,
@@ -280,6 +283,50 @@ def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
     assert again.record is None
     assert set(again.empty) == scenes - {rows[poorest]["scene"]}
     assert again.troubled
+
+
+def test_products_that_nothing_asks_for_are_not_told_as_empty(archive: Archive) -> None:
+    archive.write()
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        connection.execute("update product set usable = 0 where kind = 'elastic'")
+    assert bring_up_to_date(archive.write()).empty
+    del archive.told["instruments"]["rich"]["products"]["elastic"]
+    for _ in range(2):
+        result = bring_up_to_date(archive.write())
+        assert result.orphans
+        assert not result.empty
+        assert not result.troubled
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_wait_for_a_cluster_at_once(archive: Archive, number: int) -> None:
+    ended = []
+
+    @contextmanager
+    def cluster() -> Iterator[Any]:
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(60.0)
+            yield None
+        finally:
+            ended.append(True)
+
+    before = archive.contents("out/products")
+    next((archive.folder / "out/products").rglob("*poor*signal*.nc")).unlink()
+    began = time.monotonic()
+    result = bring_up_to_date(archive.write(), options=Options(cluster=cluster))
+    assert time.monotonic() - began < 30.0
+    assert ended == [True]
+    assert (result.signal, result.status) == (number, RunStatus.INTERRUPTED)
+    assert result.troubled
+    assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        assert lock.holder() is None
+        assert (store.runs()[0].status, store.runs()[0].scenes) == (RunStatus.INTERRUPTED, 0)
+        assert store.failures() == {}
+    assert len(made(reprocess(campaign))) == 1
+    assert archive.contents("out/products") == before
 
 
 def test_a_cluster_is_started_only_where_something_is_stale(archive: Archive) -> None:

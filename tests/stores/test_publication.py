@@ -90,3 +90,43 @@ def test_the_command_line_publishes_and_says_what_it_did(
     assert damaged.exit_code == 1
     assert "is not what the ledger says" in damaged.output
     assert digests(store).items() <= expected.items()
+
+
+def test_publishing_before_any_run_is_refused(tmp_path: Path, campaign_file: Path) -> None:
+    words = ["publish", str(campaign_file), (tmp_path / "store").as_uri()]
+    refused = CliRunner().invoke(app, words, env={"COLUMNS": "300"})
+    assert refused.exit_code == 1
+    assert "there is no catalog yet (run lidarops reprocess first)" in refused.output
+    assert not list(tmp_path.rglob("catalog.sqlite"))
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_product_that_vanished_is_told_before_and_after_it_was_sent(
+    tmp_path: Path, campaign_file: Path
+) -> None:
+    campaign = load(campaign_file)
+    assert reprocess(campaign) is not None
+    words = ["publish", str(campaign_file), (tmp_path / "store").as_uri()]
+    product = next(campaign.products_root.rglob("*.nc"))
+    content = product.read_bytes()
+    for _ in range(2):
+        product.unlink()
+        refused = CliRunner().invoke(app, words, env={"COLUMNS": "300"})
+        assert refused.exit_code == 1
+        assert f"{product}: is missing (run lidarops reprocess)" in refused.output
+        product.write_bytes(content)
+        assert CliRunner().invoke(app, words).exit_code == 0
+
+
+def test_keys_in_the_url_are_not_told(campaign_file: Path) -> None:
+    campaign = load(campaign_file)
+    assert reprocess(campaign) is not None
+    place = f"bucket/{campaign_file.parent.name}"
+    done = CliRunner().invoke(app, ["publish", str(campaign_file), f"memory://key:sec/ret@{place}"])
+    assert done.exit_code == 0, done.output
+    assert done.output.startswith(f"memory://{place}: 2 sent")
+    for url in (f"http://key:sec/ret@{place}", f"luck://key:sec/ret@{place}"):
+        refused = CliRunner().invoke(app, ["publish", str(campaign_file), url])
+        assert refused.exit_code == 1
+        assert "://bucket" in refused.output
+        assert "ret" not in refused.output

@@ -12,7 +12,7 @@ import pytest
 from s3server import KEYS, free_port
 
 from lidarops.errors import CatalogError, ProductError
-from lidarops.stores import RemoteStore
+from lidarops.stores import RemoteStore, without_keys
 
 
 @pytest.fixture(params=["s3", "memory", "file"])
@@ -188,3 +188,20 @@ def test_a_store_that_does_not_answer_is_told(
     with pytest.raises(ProductError, match="cannot be listed"):
         store.publish(tmp_path, products(tmp_path, a=b"1"), tmp_path / "journal")
     s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("s3://key:secret@bucket/a", "s3://bucket/a"),
+        ("s3://key:se/c@ret@bucket/a", "s3://bucket/a"),
+        ("https://token@host:8080/a", "https://host:8080/a"),
+        ("simplecache::s3://key:secret@bucket", "simplecache::s3://bucket"),
+        ("s3://bucket/a@b", "s3://bucket/a@b"),
+        ("file:///folder/a@b", "file:///folder/a@b"),
+        ("abfs://container@account.dfs.core.windows.net/a",) * 2,
+        ("no address at all", "no address at all"),
+    ],
+)
+def test_keys_are_left_out_of_what_is_told(url: str, told: str) -> None:
+    assert without_keys(url) == told
