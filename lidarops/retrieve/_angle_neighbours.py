@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 
 from lidarops.retrieve._angle_block import Rays, Regression
-from lidarops.retrieve._angle_path import orthogonal
+from lidarops.retrieve._angle_path import taken_away
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -118,10 +118,7 @@ def _products(
                     columns[2, count] = distance[0, a, k] * root
                     columns[3, count] = distance[1, a, k] * root
                     count += 1
-            known = 0
-            for one in columns:
-                basis[known] = one
-                known += 1 if orthogonal(basis, known, count, left) else 0
+            known = taken_away(columns, basis, count, left)
             if count <= known:
                 continue
             _add(left[:count], share, basis[:known], sums[t])

@@ -191,10 +191,7 @@ def _standardise(
                 columns[1, i] = path[rays[i], k] * root[i]
                 columns[2, i] = distance[0, rays[i], k] * root[i]
                 columns[3, i] = distance[1, rays[i], k] * root[i]
-            known = 0
-            for one in columns:
-                basis[known] = one
-                known += 1 if orthogonal(basis, known, count, left) else 0
+            known = taken_away(columns, basis, count, left)
             freedom[t, j] = max(count - known, 0)
             if count > known:
                 for i in range(count):
@@ -202,7 +199,17 @@ def _standardise(
 
 
 @_compiled
-def orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
+def taken_away(columns: Array, basis: Array, count: int, left: Array) -> int:
+    """Take columns out of residuals, fill an orthonormal basis of them, and return its size."""
+    known = 0
+    for one in columns:
+        basis[known] = one
+        known += 1 if _orthogonal(basis, known, count, left) else 0
+    return known
+
+
+@_compiled
+def _orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
     """Make a column orthogonal to those before, and take it out of what is left of the data."""
     one = basis[known]
     raw = _dot(one, one, count)
