@@ -21,6 +21,7 @@ from typing import Any, Final
 
 from lidarops.errors import CatalogError
 from lidarops.plan_rules import GLUED, StepName, gates, parts_of
+from lidarops.raw.model import bins_of
 from lidarops.records import Granule, Plan, ProductKind, Scene, Step
 
 _FORMAT: Final = "lidarops costs"
@@ -279,7 +280,9 @@ def _conditioned(part: Scene, plan: Plan) -> float:
     for step in _of(plan, part):
         if step.name == StepName.READ and not _only_a_part(step.channel, plan):
             names = parts_of(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
-            total += sum(gated.get(name, held.get(name, 0)) for name in names)
+            total += sum(
+                bins_of(gated[name]) if name in gated else held.get(name, 0) for name in names
+            )
     return float(len(part.granules) * total)
 
 

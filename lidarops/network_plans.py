@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lidarops.campaign import Campaign, InstrumentFacts, channel_facts
 from lidarops.errors import RetrievalInputError
 from lidarops.plan_rules import (
+    ALL_STEPS,
     GLUED,
     Case,
     Decisions,
@@ -25,11 +26,13 @@ from lidarops.plan_rules import (
     parts_of,
     range_offset,
     ranged_by,
+    reaching,
     wavelength,
 )
 from lidarops.product_settings import NetworkVisibilitySettings, VisibilitySettings
-from lidarops.records import ChannelLayout, Granule, LeftOut, Plan, Scene, Step
+from lidarops.records import ChannelLayout, DetectionMode, Granule, LeftOut, Plan, Scene, Step
 from lidarops.retrieve import geometry
+from lidarops.retrieve.labeled_network import BEFORE_TAIL, BEYOND
 
 SAME_POINTING: Final = 0.1
 """degree, within which beams of one instrument point alike: what headers tell."""
@@ -203,6 +206,13 @@ class MemberCase:
         """The channel that the network wants."""
         return channel_of(self.scene, self.settings.channel)
 
+    @property
+    def tail(self) -> tuple[float, float]:
+        """The ranges in m whose mean is the background."""
+        last = self.channel.bins * self.channel.bin_width
+        start, stop = self.settings.background_range or (0.9 * last, last)
+        return start, min(stop, last)
+
     def of(self, channel: ChannelLayout) -> Case:
         """Return what the rules of a channel look at."""
         known = channel_facts(self.facts, channel.name)
@@ -303,14 +313,12 @@ def _background(case: MemberCase) -> Decisions:
     if case.why_not()[0]:
         return
     channel, told = case.channel, case.settings.background_range
-    last = channel.bins * channel.bin_width
     reason = (
         "the last tenth of the bins: signal left there biases it"
         if told is None
         else "background_range of the campaign: signal left there biases it"
     )
-    start, stop = told or (0.9 * last, last)
-    stop = min(stop, last)
+    start, stop = case.tail
     yield case.of(channel).step(
         StepName.BACKGROUND,
         reason,
@@ -426,6 +434,47 @@ def _cycle(case: Meeting) -> Decisions:
         yield case.none(f"method {method}: {error}", float(len(case.kept)))
 
 
+def _gate(case: Meeting) -> Decisions:
+    """Decide, for every instrument, which bins its beams and its background need."""
+    net = case.net(case.kept)
+    for member in case.asked.scene.members:
+        mine = [n for n, ray in enumerate(case.kept) if ray.instrument == member.instrument]
+        if mine:
+            farthest = max(float(net.on_ray(n)[1][-1]) for n in mine)
+            yield _gate_of(MemberCase(member, case.asked.campaign, case.asked.settings), farthest)
+
+
+def _gate_of(case: MemberCase, farthest: float) -> Step | LeftOut:
+    channel = case.channel
+    counts = case.of(channel)
+    if channel.name.startswith(GLUED) or channel.mode is not DetectionMode.PHOTON:
+        reason = "noise of analog records is estimated from the whole of them"
+        return counts.without(StepName.RANGE_GATE, reason)
+    if case.campaign.all_steps:
+        return counts.without(StepName.RANGE_GATE, ALL_STEPS)
+    width, (start, stop) = channel.bin_width, case.tail
+    low, high = (share * (start + width) for share in BEFORE_TAIL)
+    wanted = ((0.0, farthest + BEYOND * width), (low - width, high), (start, stop))
+    kept = _merged([reaching(near, far, counts) for near, far in wanted], channel.bins)
+    number = float(sum(past - first for first, past in kept))
+    if len(kept) == 1 and number == channel.bins:
+        reason = "beams and background reach over all bins"
+        return counts.without(StepName.RANGE_GATE, reason, number=number)
+    reason = "no bins between the farthest point and those that tell the background are needed"
+    return counts.step(StepName.RANGE_GATE, reason, number=number, bins=kept)
+
+
+def _merged(stretches: Iterable[tuple[int, int]], bins: int) -> list[list[int]]:
+    """Return stretches of bins, those that touch as one."""
+    kept: list[list[int]] = []
+    for first, past in sorted((first, min(past, bins)) for first, past in stretches):
+        if kept and first <= kept[-1][1]:
+            kept[-1][1] = max(kept[-1][1], past)
+        elif first < past:
+            kept.append([first, past])
+    return kept
+
+
 def _average(case: Meeting) -> Decisions:
     seconds = case.asked.settings.average.total_seconds()
     reason = "signals are averaged before they are solved: noise biases what is averaged afterwards"
@@ -491,6 +540,7 @@ MEETING: Final = (
 )
 """Of all beams of a network; the first that finds that there is none ends it."""
 JOINT: Final = (
+    Rule("member_gate", StepName.RANGE_GATE, "Which bins do beams and background need?", _gate),
     Rule("network_average", StepName.AVERAGE, "How long are signals averaged?", _average),
     Rule("prior", StepName.PRIOR, "Is a mean field held beforehand?", _prior),
     Rule("visibility", StepName.VISIBILITY, "Do beams meet, and where?", _visibility),

@@ -15,11 +15,14 @@ from lidarops.product_settings import (
     MultiAngleSettings,
     SignalSettings,
 )
+from lidarops.raw.model import Stretches
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Scene, Step
+from lidarops.retrieve.signal import MIN_NOISE_BINS, NOISE_WINDOW
 
 GLUED = "glued_"
 """Prefix of the channels that join ``analog_`` and ``photon_`` ones of the same light."""
 
+ALL_STEPS: Final = "all steps are asked for: nothing is left out for giving nothing"
 
 STEEPEST = 80.0
 """degree; largest zenith angle at which a beam reaches air without aerosol."""
@@ -293,17 +296,37 @@ def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
     return (known.range_offset or 0.0) - late
 
 
-def gates(steps: Collection[Step]) -> dict[str, int]:
-    """Return the channels of which only the nearest bins are needed, and how many."""
+def gates(steps: Collection[Step]) -> dict[str, Stretches]:
+    """Return the channels of which only some bins are needed, and which."""
     whole = {step.channel for step in steps if step.name in WHOLE}
     for step in steps:
         if step.name == StepName.GLUE:
             whole |= set(step.settings.values())
     return {
-        step.channel: int(step.settings["bins"])
+        step.channel: tuple((first, past) for first, past in step.settings["bins"])
         for step in steps
         if step.name == StepName.RANGE_GATE and step.channel not in whole
     }
+
+
+def reaching(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m, with those that tell their noise.
+
+    The variance of counts is that of their mean over a share of the range on either side.
+
+    Returns
+    -------
+    (int, int)
+        The first, and the one past the last; it may lie beyond the bins of the channel.
+    """
+    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+
+    def beside(distance: float) -> int:
+        # Two for rounding.
+        return max(math.ceil(NOISE_WINDOW * distance / width), MIN_NOISE_BINS) + 2
+
+    first = math.floor((nearest - offset) / width) - beside(nearest)
+    return max(first, 0), math.ceil((farthest - offset) / width) + beside(farthest)
 
 
 def ranged_by(channel: str) -> str:

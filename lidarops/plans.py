@@ -13,6 +13,7 @@ from typing import Final, TypeVar
 from lidarops import network_plans, scan_rules
 from lidarops.campaign import Campaign, Instrument, InstrumentFacts, channel_facts
 from lidarops.plan_rules import (
+    ALL_STEPS,
     CONDITIONING,
     GLUED,
     ChannelCase,
@@ -26,6 +27,7 @@ from lidarops.plan_rules import (
     parts_of,
     range_offset,
     ranged_by,
+    reaching,
     steady_zenith,
     wavelength,
 )
@@ -37,13 +39,11 @@ from lidarops.product_settings import (
 )
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, Scene, Step
 from lidarops.retrieve.labeled import LEVEL
-from lidarops.retrieve.signal import MIN_NOISE_BINS, NOISE_WINDOW
 
 MIN_SECTION_BINS = 8
 
 LOOKED_AT: Final = 16
 """Profiles of a scene that are looked at first."""
-ALL_STEPS: Final = "all steps are asked for: nothing is left out for giving nothing"
 
 _ROUNDING: Final = 1e-6
 """Relative; angles of headers and of files are rounded in ways of their own."""
@@ -240,17 +240,13 @@ def _gate(case: ChannelCase) -> Decisions:
     farthest = max((far for _, far in _level_sections(case)), default=math.nan)
     if math.isnan(farthest):
         return
-    offset = range_offset(case.channel, case.facts)
-    # The variance of counts is that of their mean over a share of the range on either side.
-    width = case.channel.bin_width
-    beyond = max(math.ceil(NOISE_WINDOW * farthest / width), MIN_NOISE_BINS)
-    bins = math.ceil((farthest - offset) / width) + beyond + 2
+    bins = reaching(0.0, farthest, case)[1]
     if not 0 < bins < case.channel.bins:
         reason = "a section reaches the end of the bins"
         yield case.without(StepName.RANGE_GATE, reason, number=float(case.channel.bins))
         return
     reason = "homogeneous sections need no farther bins, and counts none to tell their noise"
-    yield case.step(StepName.RANGE_GATE, reason, number=float(bins), bins=bins)
+    yield case.step(StepName.RANGE_GATE, reason, number=float(bins), bins=[[0, bins]])
 
 
 def _background(case: ChannelCase) -> Decisions:

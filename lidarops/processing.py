@@ -28,6 +28,7 @@ from lidarops.plans import glued_channels
 from lidarops.products import build, provenance, write
 from lidarops.raw import licel
 from lidarops.raw.archive import counting, open_archive
+from lidarops.raw.model import Stretches
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
@@ -262,7 +263,7 @@ def _open(
     granules: Sequence[Granule],
     root: Path,
     channels: list[str],
-    nearest: Mapping[str, int] | None = None,
+    stretches: Mapping[str, Stretches] | None = None,
 ) -> xr.Dataset:
     archive = open_archive(
         list(granules),
@@ -271,7 +272,7 @@ def _open(
         mask_and_scale=False,
         profiles_per_chunk=job.profiles_per_chunk,
         header_position="ignore",
-        nearest=nearest,
+        stretches=stretches,
     )
     # What the campaign says of the pointing wins over the headers.
     facts = dependence.facts_of(job.campaign, scene)

@@ -50,7 +50,7 @@ def test_amounts_of_sections():
     assert found[Term.FILE] == 10
     assert found[Term.DIGEST] == 10 * 1000
     assert found[Term.CHANNEL] == found[Term.HOMOGENEOUS] == found[Term.LOOK] == 1
-    assert found[Term.VALUE] == 10 * gate.settings["bins"]
+    assert found[Term.VALUE] == 10 * gate.number
     assert found[Term.HOMOGENEOUS_VALUE] == 10 * (4500 - 750) / 7.5
     assert Term.SIGNAL not in found
 

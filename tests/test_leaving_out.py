@@ -291,12 +291,12 @@ def test_the_gate_holds_the_farthest_section_and_what_tells_its_noise():
     # 7500 m, a tenth more for the variance, and two bins for rounding.
     made = planned(products=HOMOGENEOUS)
     (gate,) = (step for step in made.steps if step.name == "range_gate")
-    assert gate.settings == {"bins": 1102}
+    assert gate.settings == {"bins": [[0, 1102]]}
     assert gate.number == 1102
     assert gate.as_dict()["rule"] == "range_gate"
     moved = told(channels={"photon_532o": {"range_offset": -75.0}})
     (gate,) = (s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_gate")
-    assert gate.settings == {"bins": 1112}
+    assert gate.settings == {"bins": [[0, 1112]]}
 
 
 # Looks ----------------------------------------------------------------------------------------

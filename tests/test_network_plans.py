@@ -203,7 +203,7 @@ class TestPlans:
         assert {s.instrument for s in per_member} == set(MEMBERS)
         assert all(s.reason.startswith(f"{s.instrument}: ") for s in per_member)
         names = [s.name for s in found.steps if s.instrument == "west-lidar"]
-        assert names == ["read", "overlap", "noise", "background"]
+        assert names == ["read", "overlap", "noise", "background", "range_gate"]
         joint = [s.name for s in found.steps if not s.instrument]
         assert joint == ["average", "prior", "visibility"]
 
@@ -289,6 +289,40 @@ class TestPlans:
         assert all(each.number == pytest.approx(number) for each in steps)
         apart_ = planned(campaign(), granules(zenith_angle=0.0))
         assert not [each for each in apart_.steps if each.rule == rule]
+
+    def test_the_gate_holds_beams_and_what_tells_their_background(self):
+        found = planned(campaign())
+        farthest = {ray["instrument"]: 0.0 for ray in found.steps[-1].settings["rays"]}
+        assert set(farthest) == set(MEMBERS)
+        for gate in (step for step in found.steps if step.rule == "member_gate"):
+            kept = gate.settings["bins"]
+            assert gate.number == sum(past - first for first, past in kept)
+            assert kept[0][0] == 0
+            assert kept[-1][1] == PHOTON.bins
+            # The points are 4 km away; the tail begins at 13.5 km, and what its noise is made of
+            # a tenth nearer.
+            assert 4000.0 < kept[0][1] * PHOTON.bin_width < 8000.0
+            assert 12_000.0 < kept[-1][0] * PHOTON.bin_width < 12_150.0
+            (before,) = kept[1:-1]
+            assert before[0] * PHOTON.bin_width < 0.6 * 13_500 < 0.7 * 13_500
+            assert before[1] * PHOTON.bin_width > 0.7 * 13_500
+
+    @pytest.mark.parametrize(
+        ("told", "layout", "said"),
+        [
+            ({"all_steps": True}, PHOTON, "all steps"),
+            ({"visibility": {"channel": "analog_532o"}}, ANALOG, "noise of analog records"),
+            ({}, replace(PHOTON, bins=650), "reach over all bins"),
+        ],
+    )
+    def test_all_bins_are_read_where_they_are_needed(self, told, layout, said):
+        given_ = granules(layout=(layout,))
+        found = planned(campaign(**told), given_)
+        assert found.steps[-1].name == "visibility"
+        left = [each for each in found.left_out if each.rule == "member_gate"]
+        assert len(left) == len(MEMBERS)
+        assert all(said in each.reason for each in left)
+        assert not [step for step in found.steps if step.rule == "member_gate"]
 
     def test_every_decision_has_a_rule_of_the_table(self):
         names = {rule.name for rule in RULES}

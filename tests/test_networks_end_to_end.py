@@ -85,6 +85,24 @@ def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
     assert digests[0] == digests[1] == digests[2]
 
 
+def test_the_gate_leaves_the_product_as_it_is(tmp_path):
+    told = made.tree(made.PLUME, duration=1200)
+    campaign, _ = made.written(tmp_path, told)
+    (job,) = jobs_of(campaign)
+    gates = [step for step in job.plan.steps if step.rule == "member_gate"]
+    assert gates
+    steps = tuple(step for step in job.plan.steps if step not in gates)
+    (gated,) = process_all([job])
+    near = opened(campaign, gated)
+    (whole,) = process_all([replace(job, plan=replace(job.plan, steps=steps))])
+    full = opened(campaign, whole)
+    assert gated.bytes_read < whole.bytes_read
+    np.testing.assert_array_equal(near["quality_flag"], full["quality_flag"])
+    for name in ("extinction", "extinction_standard_error", "extinction_systematic_error"):
+        # Sums over windows begin elsewhere, and are rounded differently.
+        np.testing.assert_allclose(near[name], full[name], rtol=1e-6)
+
+
 def test_thin_air_is_flagged_and_never_believed(tmp_path):
     air = {
         "homogeneous": {

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.licel import Dataset, RawFile, channel_names, to_physical
-from lidarops.raw.model import Columns, Position, build
+from lidarops.raw.model import Columns, Position, Stretches, build
 from lidarops.records import Granule
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
@@ -61,7 +61,7 @@ def open_archive(
     profiles_per_chunk: int | None = None,
     header_position: Position = "longitude_first",
     root: str | os.PathLike[str] | None = None,
-    nearest: Mapping[str, int] | None = None,
+    stretches: Mapping[str, Stretches] | None = None,
 ) -> xr.Dataset:
     """Open raw files of one layout as one Dataset.
 
@@ -81,8 +81,9 @@ def open_archive(
         Which coordinate the instrument writes first.
     root : path or str, optional
         Folder that relative paths start from; the working directory where not given.
-    nearest : mapping of str to int, optional
-        Of these channels only so many of the nearest bins, at least 1; the others stay on disk.
+    stretches : mapping of str to tuple of (int, int), optional
+        Of these channels only some bins, the others stay on disk: the first bin of each stretch
+        and the one past its last, ascending. ``{"photon_532o": ((0, 500),)}`` are the nearest 500.
 
     Returns
     -------
@@ -102,21 +103,20 @@ def open_archive(
             columns.append(file.read_header())
             stamps.append((path, file.size, file.mtime_ns))
     columns.sort()
-    stored = {dataset.name: dataset.bins for dataset in columns.datasets}
-    columns.shorten(nearest or {})
+    columns.keep(stretches or {})
     chunks = _chunks(columns, profiles_per_chunk)
-    token = tokenize(stamps, nearest)
+    token = tokenize(stamps, columns.kept)
 
     def signal(channel: int, dataset: Dataset) -> da.Array:
         offsets = columns.fact(channel, "offset").astype(np.int64)
         scales = columns.fact(channel, "scale") if mask_and_scale else None
         lengths = tuple(len(files.paths) for _, files in chunks)
-        whole = dataset.bins == stored[dataset.name]
+        kept = columns.kept.get(dataset.name)
         name = f"licel-{dataset.name}-{tokenize(token, offsets, scales, lengths)}"
         graph = {}
         for index, (part, files) in enumerate(chunks):
             scale = None if scales is None else scales[part]
-            graph[name, index, 0] = (_Chunk(files, offsets[part], dataset.bins, whole, scale),)
+            graph[name, index, 0] = (_Chunk(files, offsets[part], dataset.bins, kept, scale),)
         shape = (lengths, (dataset.bins,))
         dtype = np.int32 if scales is None else np.float32
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
@@ -139,8 +139,8 @@ class _Chunk:
     files: _Files
     offsets: NDArray[np.int64]
     bins: int
-    whole: bool
-    """Whether these are all bins of the channel."""
+    kept: Stretches | None
+    """Which bins of the channel these are; None for all."""
     scales: NDArray[np.float64] | None
     """None for counts."""
 
@@ -153,10 +153,10 @@ class _Chunk:
             with RawFile(path) as file:
                 file.expect(size)
                 offset = int(self.offsets[index])
-                if self.whole:
+                if self.kept is None:
                     file.read_counts(offset, [row])
                 else:
-                    row = file.read_part(offset, self.bins)
+                    _read_stretches(file, offset, self.kept, row)
             if self.scales is None:
                 values[index] = row
             else:
@@ -165,6 +165,16 @@ class _Chunk:
         if tally is not None:
             tally.bytes += len(self.offsets) * self.bins * row.itemsize
         return values
+
+
+def _read_stretches(
+    file: RawFile, offset: int, stretches: Stretches, row: NDArray[np.int32]
+) -> None:
+    place = 0
+    for first, past in stretches:
+        bins = past - first
+        row[place : place + bins] = file.read_part(offset + row.itemsize * first, bins)
+        place += bins
 
 
 def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]]:

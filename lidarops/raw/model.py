@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from itertools import pairwise
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -29,6 +30,9 @@ from lidarops.errors import RawFormatError
 from lidarops.raw.licel import CONVENTION, Dataset, Header, check_layout, select_signals
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]
+
+Stretches = tuple[tuple[int, int], ...]
+"""Bins of a channel, ascending: the first of each stretch, and the one past its last."""
 
 POSITIONS: Final = ("longitude_first", "latitude_first", "ignore")
 
@@ -83,6 +87,8 @@ class Columns:
     )
     """All datasets of a header -> number of the variant, chosen datasets."""
     variant: list[int] = field(default_factory=list)
+    kept: dict[str, Stretches] = field(default_factory=dict)
+    """Of the channels of which not all bins are kept."""
 
     def __post_init__(self) -> None:
         if self.order not in POSITIONS:
@@ -140,29 +146,46 @@ class Columns:
         """Of the chosen datasets."""
         return tuple(dataset.name for dataset in self.datasets)
 
-    def shorten(self, nearest: Mapping[str, int]) -> None:
-        """Keep only so many of the nearest bins of these channels.
+    def keep(self, stretches: Mapping[str, Stretches]) -> None:
+        """Keep only some bins of these channels.
 
         Raises
         ------
         RawFormatError
-            Where a channel is not opened, or is to keep no bin.
+            Where a channel is not opened, or its stretches do not follow one another.
         """
-        for name, bins in nearest.items():
-            if name not in self.names or bins < 1:
+        stored = {dataset.name: dataset.bins for dataset in self.datasets}
+        for name, asked in stretches.items():
+            edges = [edge for stretch in asked for edge in stretch]
+            rising = all(low < high for low, high in pairwise(edges))
+            if not (rising and edges and 0 <= edges[0] < stored.get(name, 0)):
                 raise RawFormatError(
-                    f"{bins} bins of {name} cannot be kept",
-                    field="nearest",
-                    remedy=f"give at least 1 bin of {', '.join(self.names)}",
+                    f"bins {list(asked)} of {name} cannot be kept",
+                    field="stretches",
+                    remedy=f"give the first and the past bin of parts of {', '.join(stored)}",
                 )
-        for stored, (number, chosen) in self.variants.items():
-            kept = (replace(d, bins=min(d.bins, nearest.get(d.name, d.bins))) for d in chosen)
-            self.variants[stored] = (number, tuple(kept))
+            there = [(first, min(past, stored[name])) for first, past in asked]
+            self.kept[name] = tuple(stretch for stretch in there if stretch[0] < stretch[1])
+            if self.kept[name] == ((0, stored[name]),):
+                del self.kept[name]
+        self.variants = {
+            datasets: (number, tuple(replace(d, bins=bins_of(self.stretches(d))) for d in chosen))
+            for datasets, (number, chosen) in self.variants.items()
+        }
+
+    def stretches(self, dataset: Dataset) -> Stretches:
+        """Return which bins of a chosen dataset are kept."""
+        return self.kept.get(dataset.name, ((0, dataset.bins),))
 
     def _rank(self, name: str) -> int:
         if not self.variants:
             return 0
         return next(i for i, dataset in enumerate(self.datasets) if dataset.name == name)
+
+
+def bins_of(stretches: Stretches) -> int:
+    """Return how many bins stretches hold."""
+    return sum(past - first for first, past in stretches)
 
 
 Signal = Callable[[int, Dataset], Any]
@@ -180,10 +203,10 @@ def build(columns: Columns, signal: Signal, *, scaled: bool) -> xr.Dataset:
     scaled : bool
         Whether `signal` gives physical values or counts.
     """
-    grids = _grids(columns.datasets)
+    grids = _grids(columns)
     variables: dict[str, xr.Variable] = {}
     for channel, dataset in enumerate(columns.datasets):
-        dims = ("time", grids[dataset.bins, dataset.bin_width])
+        dims = ("time", grids[columns.stretches(dataset), dataset.bin_width])
         facts, attributes = _facts(columns, channel, scaled=scaled)
         variables[dataset.name] = xr.Variable(dims, signal(channel, dataset), attributes)
         variables.update(facts)
@@ -198,9 +221,9 @@ def build(columns: Columns, signal: Signal, *, scaled: bool) -> xr.Dataset:
     )
 
 
-def _grids(datasets: tuple[Dataset, ...]) -> dict[tuple[int, float], str]:
+def _grids(columns: Columns) -> dict[tuple[Stretches, float], str]:
     # The most common grid is "range"; the others follow in file order.
-    uses = Counter((dataset.bins, dataset.bin_width) for dataset in datasets)
+    uses = Counter((columns.stretches(each), each.bin_width) for each in columns.datasets)
     ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
     return {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
 
@@ -286,14 +309,14 @@ def _time(columns: Columns) -> dict[str, xr.Variable]:
     }
 
 
-def _ranges(grids: Mapping[tuple[int, float], str]) -> dict[str, xr.Variable]:
+def _ranges(grids: Mapping[tuple[Stretches, float], str]) -> dict[str, xr.Variable]:
     return {
         name: xr.Variable(
             (name,),
-            (np.arange(bins) + 0.5) * width,
+            (np.concatenate([np.arange(*stretch) for stretch in stretches]) + 0.5) * width,
             {"units": "m", "long_name": "distance of the bin centre from the lidar"},
         )
-        for (bins, width), name in grids.items()
+        for (stretches, width), name in grids.items()
     }
 
 

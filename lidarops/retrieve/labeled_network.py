@@ -41,13 +41,13 @@ _QUALITY_OF_FLAG: Final = {
     "not_measured": Quality.INPUT_MISSING,
 }
 """Of `VertexFlags`; `not_finite` is told where nothing else rejects the value."""
-_BEFORE_TAIL: Final = (0.6, 0.7)
+BEFORE_TAIL: Final = (0.6, 0.7)
 """Of the start of the tail: where the signal is taken that may be left in the tail."""
 _SEEN: Final = 3.0
 """Standard errors by which bins before the tail are then brighter than it."""
 _PROBE: Final = 1e-2
 """Relative change of signals, by which sensitivities are found."""
-_BEYOND: Final = 200
+BEYOND: Final = 200
 """Bins kept beyond the farthest vertex of a beam: more than twice the widest window of a gate."""
 _MOST_APART: Final = 16
 """Beams whose errors are looked at one by one; of more, those of an instrument together."""
@@ -234,7 +234,7 @@ def _gathered(beams: Sequence[BeamSignals], intervals: Integers, network: Networ
 def _bins_used(grid: Array, network: Network) -> int:
     """Return how many of the bins of the beams reach beyond their farthest vertices."""
     reached = [int(np.sum(row <= network.on_ray(ray)[1][-1])) for ray, row in enumerate(grid)]
-    return max(reached) + _BEYOND
+    return max(reached) + BEYOND
 
 
 def _left_in_tail(net: Array, noise: Array, distance: Array, tail: npt.NDArray[np.bool_]) -> Array:
@@ -244,7 +244,7 @@ def _left_in_tail(net: Array, noise: Array, distance: Array, tail: npt.NDArray[n
     falls with the square of range at least.
     """
     start = distance[tail][0] if tail.any() else 0.0
-    low, high = (share * start for share in _BEFORE_TAIL)
+    low, high = (share * start for share in BEFORE_TAIL)
     before = (distance >= low) & (distance < high)
     if not before.any():
         return np.zeros(len(net))

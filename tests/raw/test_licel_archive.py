@@ -123,7 +123,7 @@ def test_threads_and_pickled_graphs_agree(pilar, stacked):
 
 
 def test_only_the_nearest_bins_are_read(pilar, stacked, monkeypatch):
-    near = open_archive(pilar, nearest={"photon_532s": 100}, profiles_per_chunk=4)
+    near = open_archive(pilar, stretches={"photon_532s": ((0, 100),)}, profiles_per_chunk=4)
     whole = near.analog_532p
     assert near.photon_532s.shape == (len(pilar), 100)
     read = []
@@ -139,13 +139,35 @@ def test_only_the_nearest_bins_are_read(pilar, stacked, monkeypatch):
     assert np.array_equal(near[near.photon_532s.dims[1]], stacked.range[:100])
     assert np.array_equal(whole, stacked.analog_532p)
     every = stacked.photon_532s.shape[1]
-    assert open_archive(pilar, nearest={"photon_532s": every + 5}).photon_532s.shape[1] == every
+    assert (
+        open_archive(pilar, stretches={"photon_532s": ((0, every + 5),)}).photon_532s.shape[1]
+        == every
+    )
 
 
-@pytest.mark.parametrize("nearest", [{"photon_1o": 4}, {"photon_532s": 0}])
-def test_nearest_bins_that_cannot_be_kept(pilar, nearest):
+def test_stretches_of_bins_lie_where_their_ranges_say(pilar, stacked):
+    some = open_archive(pilar, stretches={"photon_532s": ((3, 40), (200, 201), (900, 1000))})
+    kept = np.r_[3:40, 200, 900:1000]
+    grid = some.photon_532s.dims[1]
+    assert np.array_equal(some.photon_532s, stacked.photon_532s.values[:, kept])
+    assert np.array_equal(some[grid], stacked.range[kept])
+    assert np.array_equal(some.analog_532p, stacked.analog_532p)
+
+
+@pytest.mark.parametrize(
+    "stretches",
+    [
+        {"photon_1o": ((0, 4),)},
+        {"photon_532s": ((0, 0),)},
+        {"photon_532s": ()},
+        {"photon_532s": ((-3, 4),)},
+        {"photon_532s": ((0, 8), (7, 9))},
+        {"photon_532s": ((10**6, 10**6 + 1),)},
+    ],
+)
+def test_stretches_that_cannot_be_kept(pilar, stretches):
     with pytest.raises(RawFormatError, match="cannot be kept"):
-        open_archive(pilar, nearest=nearest)
+        open_archive(pilar, stretches=stretches)
 
 
 def test_sources(tmp_path):
