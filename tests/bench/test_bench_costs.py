@@ -54,6 +54,7 @@ def test_costs_have_no_accuracy():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_a_calibration_serves_the_next_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """How close estimates come is told by the page of the calibration, not here."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
