@@ -423,10 +423,7 @@ def _quiet(
     span: tuple[int, int, int, int],
     planned: tuple[Indices, Array, Array],
 ) -> bool:
-    """Return whether no gate that is used lies off, where all are good: as `_measure`, but fast.
-
-    Most rays end here.
-    """
+    """Return whether no gate that is used lies off, where all are good, as on most rays."""
     logs, noise, plain, wide = row
     first, low, stop, last = span
     loud = (_LOUD * exponent) ** 2
