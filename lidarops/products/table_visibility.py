@@ -31,6 +31,7 @@ FLAGS: Final = (
     | Quality.POORLY_DETERMINED
     | Quality.POOR_FIT
     | Quality.NOT_HOMOGENEOUS
+    | Quality.OUTLIER
     | Quality.NO_REAL_SOLUTION
     | Quality.BACKGROUND_UNCERTAIN
     | Quality.UNSTABLE_INVERSION
@@ -206,7 +207,9 @@ VISIBILITY: Final = Layout(
             comment="In this kind of product poorly_determined means a standard error above a third"
             " of extinction, of the value or as the median of its block; low_leverage a beam that"
             " is too weak to be used beside the others; poor_fit beams that disagree by more than"
-            " their noise allows.",
+            " their noise allows, or a beam that ends before the point at bins that lie off their"
+            " neighbours; outlier a beam with single bins that lie more than 6 standard errors off"
+            " their neighbours, which took their place: the value stands.",
         ),
         _per_time(
             "optical_depth",

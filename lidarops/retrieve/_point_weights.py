@@ -17,6 +17,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve import _gate_outliers
 from lidarops.retrieve.geometry import Crossings, Network
 
 Array = npt.NDArray[np.float64]
@@ -26,6 +27,7 @@ Codes = npt.NDArray[np.uint8]
 
 MISSING: Final = 1
 NOT_POSITIVE: Final = 2
+OUTLYING: Final = 3
 LOWEST_OVERLAP: Final = 0.5
 """1. Of an overlap function less than this, the error dominates what is left of the signal."""
 _SERIES_BELOW: Final = 0.03
@@ -58,6 +60,11 @@ class Layout:
     """(ray, bin) logarithm of what turns power into range- and overlap-corrected signal."""
     range: Array
     """(ray, bin) m."""
+    limits: Indices
+    """(ray, 2) first gate that may be used, and the one behind the last."""
+    neighbours: tuple[Indices, Array, Array]
+    """(ray, bin, neighbour) gates that tell a gate, their shares, and (ray, bin) what air may
+    leave; see `lidarops.retrieve._gate_outliers.plan`."""
     offset: Indices
     """(ray + 1,) where the covariances of a ray start."""
 
@@ -81,13 +88,16 @@ class Condensed:
     """(profile, crossing, 4) m-1: extinction of the segment behind, if homogeneous, from all its
     gates and from its farther half, each followed by its variance."""
     status: Codes
-    """(profile, ray) MISSING or NOT_POSITIVE."""
+    """(profile, ray) MISSING, NOT_POSITIVE or OUTLYING."""
+    bridged: Codes
+    """(profile, ray) 1 where a gate lay off its neighbours, which took its place."""
 
     def take(self, profiles: Indices) -> Condensed:
         """Return some of the profiles."""
         return Condensed(
             self.log_value[profiles], self.integral[profiles], self.usable[profiles],
             self.covariance[profiles], self.slope[profiles], self.status[profiles],
+            self.bridged[profiles],
         )  # fmt: skip
 
 
@@ -127,10 +137,19 @@ def lay_out(
     window, weights, cell, fraction = _fits(kept, range_, limits, gates)
     sizes = np.maximum(2 * count - 1, 0) ** 2
     offset = np.concatenate([[0], np.cumsum(sizes)]).astype(np.intp)
+    bounds = np.array(limits, dtype=np.intp).reshape(-1, 2)
     return Layout(
         kept, net.vertices, measured, near, first, window, weights, cell, fraction,
-        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, offset,
+        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds,
+        _neighbours(range_, bounds), offset,
     )  # fmt: skip
+
+
+def _neighbours(range_: Array, limits: Indices) -> tuple[Indices, Array, Array]:
+    shape = (*range_.shape, _gate_outliers.NODES)
+    out = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.full(range_.shape, np.nan)
+    _gate_outliers.plan(range_, limits, *out)
+    return out
 
 
 def _bounds(usable: Booleans) -> tuple[int, int]:
@@ -170,6 +189,7 @@ def condense(
     layout: Layout,
     *,
     relative: bool,
+    screened: bool,
 ) -> Condensed:
     """Condense power to values at vertices and integrals between them.
 
@@ -189,6 +209,8 @@ def condense(
     layout : Layout
     relative : bool
         Whether variances are relative.
+    screened : bool
+        Whether to look for single gates that lie off their neighbours, and to bridge them.
     """
     profiles, total = power.shape[0], layout.crossings.ray.size
     out = Condensed(
@@ -198,12 +220,13 @@ def condense(
         np.zeros((profiles, int(layout.offset[-1]))),
         np.full((profiles, total, 4), np.nan),
         np.zeros((profiles, power.shape[1]), dtype=np.uint8),
+        np.zeros((profiles, power.shape[1]), dtype=np.uint8),
     )
     _condense(
         power, variance, variance_row, relative, exponent, layout.log_factor, layout.range,
         layout.first_crossing, layout.window, layout.weights, layout.cell, layout.fraction,
-        layout.offset, out.log_value, out.integral, out.usable, out.covariance, out.slope,
-        out.status,
+        layout.offset, screened, layout.limits, layout.neighbours, out.log_value, out.integral,
+        out.usable, out.covariance, out.slope, out.status, out.bridged,
     )  # fmt: skip
     return out
 
@@ -265,17 +288,22 @@ def _add_segment(
 
 @_compiled
 def _slope_of(
-    logs: Array, noise: Array, grid: Array, first: int, last: int, exponent: float
+    logs: Array, noise: Array, grid: Array, codes: Codes, first: int, last: int, exponent: float
 ) -> tuple[float, float]:
     """Return the extinction that a straight line through logarithms gives, and its variance."""
-    count = last - first + 1
+    count = 0
+    for g in range(first, last + 1):
+        count += codes[g] & _gate_outliers.KIND == _gate_outliers.GOOD
     if count < 2:
         return math.nan, math.nan
     mean = 0.0
     for g in range(first, last + 1):
-        mean += grid[g] / count
+        if codes[g] & _gate_outliers.KIND == _gate_outliers.GOOD:
+            mean += grid[g] / count
     square = product = spread = 0.0
     for g in range(first, last + 1):
+        if codes[g] & _gate_outliers.KIND != _gate_outliers.GOOD:
+            continue
         lever = grid[g] - mean
         square += lever * lever
         product += lever * logs[g]
@@ -338,6 +366,7 @@ def _join_points(
     noise: Array,
     exponent: float,
     grid: Array,
+    codes: Codes,
     crossings: tuple[int, int, int],
     cell: Indices,
     fraction: Array,
@@ -357,12 +386,74 @@ def _join_points(
         )  # fmt: skip
         bounds[q, 0], bounds[q, 1] = cell[c], cell[c + 1] + 2
         middle = (cell[c] + cell[c + 1] + 1) // 2
-        slopes[c, 0], slopes[c, 1] = _slope_of(logs, noise, grid, cell[c], cell[c + 1], exponent)
-        slopes[c, 2], slopes[c, 3] = _slope_of(logs, noise, grid, middle, cell[c + 1], exponent)
+        slopes[c, 0], slopes[c, 1] = _slope_of(
+            logs, noise, grid, codes, cell[c], cell[c + 1], exponent
+        )
+        slopes[c, 2], slopes[c, 3] = _slope_of(
+            logs, noise, grid, codes, middle, cell[c + 1], exponent
+        )
     for q in range(count + max(good - 1, 0), 2 * count - 1):
         bounds[q, 0], bounds[q, 1] = 0, 0
     for q in range(good, count):
         bounds[q, 0], bounds[q, 1] = 0, 0
+
+
+@_compiled
+def _look_beyond(
+    row: Array,
+    variance: Array,
+    log_factor: Array,
+    exponent: float,
+    relative: bool,
+    span: tuple[int, int],
+    out: tuple[Array, Array, Codes],
+) -> None:
+    """Fill logarithms, their variances and codes of gates that only judge others."""
+    logs, noise, codes = out
+    for g in range(span[0], span[1]):
+        codes[g] = _gate_outliers.LOST
+        if not abs(row[g]) < 1e300 or row[g] <= 0.0:
+            continue
+        codes[g] = _gate_outliers.GOOD
+        logs[g] = exponent * (math.log(row[g]) + log_factor[g])
+        spread = variance[g]
+        noise[g] = exponent * exponent * (spread if relative else spread / row[g] ** 2)
+
+
+@_compiled
+def _screen(
+    signal: tuple[Array, Array, Array],
+    exponent: float,
+    relative: bool,
+    grid: Array,
+    span: tuple[int, int, int, int],
+    planned: tuple[Indices, Array, Array],
+    row: tuple[Array, Array, Codes],
+    work: tuple[Array, Array, Array, Indices, Array],
+) -> tuple[int, int]:
+    """Bridge gates that lie off their neighbours.
+
+    Return behind which gate the ray is not to be believed, and how many are bridged before.
+    """
+    power, variance, log_factor = signal
+    logs, noise, codes = row
+    plain, wide, off, nodes, shares = work
+    first, low, stop, last = span
+    for beyond in ((first, low), (stop, last)):
+        _look_beyond(power, variance, log_factor, exponent, relative, beyond, row)
+    _gate_outliers.make_plain(logs, noise, exponent, codes, span, plain, wide)
+    number, end = _gate_outliers.find(
+        (logs, noise, plain, wide), exponent, relative, grid, span, planned, codes, off
+    )
+    end = min(end, stop)
+    if number > 0:
+        end = _gate_outliers.bridge(
+            logs, noise, exponent, grid, (first, last, end), codes, nodes, shares
+        )
+    number = 0
+    for g in range(low, end):
+        number += codes[g] & _gate_outliers.KIND == _gate_outliers.BRIDGED
+    return end, number
 
 
 @_compiled
@@ -380,19 +471,25 @@ def _condense(
     cell: Indices,
     fraction: Array,
     offset: Indices,
+    screened: bool,
+    limits: Indices,
+    neighbours: tuple[Indices, Array, Array],
     values: Array,
     integrals: Array,
     usable: Codes,
     covariance: Array,
     slopes: Array,
     status: Codes,
+    bridged: Codes,
 ) -> None:
     bins, most = power.shape[2], 1
     for ray in range(exponent.size):
         most = max(most, first_crossing[ray + 1] - first_crossing[ray])
     gradients = np.zeros((2 * most, bins))
     bounds = np.zeros((2 * most, 2), dtype=np.intp)
-    logs, noise = np.zeros(bins), np.zeros(bins)
+    logs, noise, codes = np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.uint8)
+    nodes = np.zeros((bins, _gate_outliers.NODES), dtype=np.intp)
+    work = np.zeros(bins), np.zeros(bins), np.zeros(bins), nodes, np.zeros(nodes.shape)
     for n in range(power.shape[0]):
         for ray in range(exponent.size):
             first, last = first_crossing[ray], first_crossing[ray + 1]
@@ -402,18 +499,37 @@ def _condense(
             low, high = window[first], window[last - 1] + weights.shape[1]
             m = exponent[ray]
             stop, reason = _first_bad(power[n, ray], log_factor[ray], m, low, high, logs)
-            status[n, ray] = reason
+            spread_row = variance[variance_row[n], ray]
             for g in range(low, stop):
-                spread = variance[variance_row[n], ray, g]
+                spread = spread_row[g]
                 noise[g] = m * m * (spread if relative else spread / power[n, ray, g] ** 2)
-            gradients[:, low:high] = 0.0
+                codes[g] = _gate_outliers.GOOD
+            start = max(limits[ray, 0], low - _gate_outliers.BEYOND)
+            end = min(limits[ray, 1], stop + _gate_outliers.BEYOND)
+            found = 0
+            if screened and stop > low:
+                believed, found = _screen(
+                    (power[n, ray], spread_row, log_factor[ray]), m, relative, range_[ray],
+                    (start, low, stop, end),
+                    (neighbours[0][ray], neighbours[1][ray], neighbours[2][ray]),
+                    (logs, noise, codes), work,
+                )  # fmt: skip
+                reason = OUTLYING if believed < stop else reason
+                stop = believed
+            status[n, ray] = reason
+            bridged[n, ray] = min(found, 1)
+            gradients[:, start : max(end, high)] = 0.0
             good = _fit_points(
                 logs, noise, m, stop, (first, last), window, weights, values[n], usable[n],
                 gradients, bounds,
             )  # fmt: skip
             _join_points(
-                logs, noise, m, range_[ray], (first, count, good), cell, fraction,
+                logs, noise, m, range_[ray], codes, (first, count, good), cell, fraction,
                 values[n, first], integrals[n], slopes[n], gradients, bounds,
+            )  # fmt: skip
+            _gate_outliers.hand_on(
+                gradients, bounds, 2 * count - 1, (low, stop if found > 0 else low), codes, nodes,
+                work[4],
             )  # fmt: skip
             _covariance_of(
                 gradients, bounds, 2 * count - 1, noise,

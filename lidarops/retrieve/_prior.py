@@ -8,7 +8,9 @@ the one that makes all profiles of a block likeliest. Nothing is said of the lev
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -34,6 +36,13 @@ _WELL_TOLD: Final = 0.15
 _CONTRADICTION: Final = 3.5
 _HARMLESS: Final = 0.5
 """Of the standard error that is reported."""
+_ENOUGH: Final = 8
+"""Profiles of a block whose mean is asked."""
+_SEEN_BY: Final = 0.9
+"""Share of the profiles that see what their mean is taken to see."""
+_TOLD_BY_MEAN: Final = 0.3
+_APART: Final = 2.5
+"""Standard errors, of both, between the mean of solutions and the solution of the mean."""
 _UNDETERMINED_COST: Final = 1e3
 _FIRST_PASSES: Final = 12
 _NEXT_PASSES: Final = 4
@@ -156,20 +165,60 @@ def solve_blocks(
     )  # fmt: skip
     for b in np.unique(block):
         mine = np.flatnonzero(block == b)
-        part = _solve_block(_Problem(data.take(mine), layout, vertex, exponent, position))
+        told = data.take(mine)
+        part = _solve_block(
+            _Problem(told, layout, vertex, exponent, position),
+            partial(_solve_mean, told, layout, vertex, exponent, position),
+        )
         for field in fields(Solution):
             getattr(out, field.name)[mine] = getattr(part, field.name)
     return out
 
 
-def _solve_block(problem: _Problem) -> Solution:
-    """Solve with the strongest prior that the rays do not contradict."""
+def _solve_mean(
+    data: Condensed, layout: Layout, vertex: Indices, exponent: Array, position: Array
+) -> Solution | None:
+    """Solve the mean of profiles without prior; None where too few see the same."""
+    pooled = _pooled(data)
+    if pooled is None:
+        return None
+    return solve_without_prior(pooled, layout, vertex, exponent, position)
+
+
+def _pooled(data: Condensed) -> Condensed | None:
+    """Return the mean of profiles as one; None where too few see the same.
+
+    Of values and integrals relative to each ray's first value: the energy of a laser changes from
+    profile to profile.
+    """
+    seen = data.usable.mean(axis=0) >= _SEEN_BY
+    whole = data.usable[:, seen].all(axis=1)
+    number = int(whole.sum())
+    if number < _ENOUGH:
+        return None
+
+    def mean(values: Array) -> Array:
+        return np.asarray(values[whole].sum(axis=0, keepdims=True) / number)
+
+    slope = mean(data.slope)
+    slope[..., 1::2] /= number
+    return Condensed(
+        mean(data.log_value), mean(data.integral), seen[np.newaxis].astype(np.uint8),
+        mean(data.covariance) / number, slope, data.status[:1], data.bridged[:1],
+    )  # fmt: skip
+
+
+def _solve_block(problem: _Problem, solve_mean: Callable[[], Solution | None]) -> Solution:
+    """Solve with the strongest prior that the rays do not contradict, each and on average."""
     start = problem.constants.copy()
     alone = problem.solve(np.inf, 2 * _FIRST_PASSES)
+    # What profiles tell well by themselves, their mean need not tell.
+    with np.errstate(invalid="ignore"):
+        whole = None if np.all(alone.variance < _WELL_TOLD**2) else solve_mean()
     for strength in _STRENGTHS:
         problem.constants[:] = start
         result = _likeliest(problem, strength)
-        if not _contradicted(result, alone):
+        if not (_contradicted(result, alone) or (whole and _apart(result, whole))):
             return result
     return alone
 
@@ -209,6 +258,24 @@ def _contradicted(result: Solution, alone: Solution) -> bool:
     apart = np.maximum(apart, _HARMLESS * np.sqrt(less))
     told = (whole < _WELL_TOLD**2) & (known.sum(axis=0) > 0.9 * len(known))
     return bool(np.any(told & (np.abs(gap) > apart + whole)))
+
+
+def _apart(result: Solution, whole: Solution) -> bool:
+    """Return whether solutions are, on average, off that of their mean at a vertex.
+
+    Noise that lets a prior decide each profile is less in the mean. What a prior has wrong, all
+    profiles share.
+    """
+    known = np.isfinite(result.variance)
+    number = np.maximum(known.sum(axis=0), 1)
+    middle = np.where(known, result.logarithm, 0.0).sum(axis=0) / number
+    stated = np.where(known, result.variance, 0.0).sum(axis=0) / number
+    told = whole.variance[0] < _TOLD_BY_MEAN**2
+    told &= (known.sum(axis=0) > 0.5 * len(known)) & (whole.status[0] == _network.SOLVED)
+    with np.errstate(invalid="ignore"):
+        spread = np.sqrt(stated + whole.variance[0])
+        off = np.abs(whole.logarithm[0] - middle) > _APART * spread + 0.5 * whole.variance[0]
+    return bool(np.any(told & off))
 
 
 def _gradient(position: Array) -> Array:

@@ -22,6 +22,8 @@ LOUDEST_GATE: Final = 0.3
 what is positive by chance would be selected, and the logarithm turns noise into bias."""
 _OF_MEDIAN: Final = np.pi / 2.0
 """Variance of a median over that of a mean."""
+_BELOW: Final = 4.0
+"""Standard errors by which a mean signal is then less than zero."""
 _SMOOTHED: Final = 31
 """Gates over which an estimated noise is averaged."""
 
@@ -77,12 +79,15 @@ def prepare(
     else:
         rows, row = _variances(variance, signal.shape, turn=turn)
     mean, mean_rows, single, averaged = _means(signal, rows, row, members, layout)
-    data = _point_weights.condense(signal, rows, row, powers, layout, relative=relative)
-    means = _point_weights.condense(
-        mean, mean_rows, np.arange(count), powers, layout, relative=relative
+    data = _point_weights.condense(
+        signal, rows, row, powers, layout, relative=relative, screened=True
     )
-    loudness = _loudness(mean, single, layout, relative=relative)
-    weak = ~(loudness <= LOUDEST_GATE**2) & (means.usable == 1)
+    # No single gate spoils a median, and its variance is but an estimate.
+    means = _point_weights.condense(
+        mean, mean_rows, np.arange(count), powers, layout, relative=relative, screened=False
+    )
+    loudness, below = _loudness(mean, single, averaged, layout, relative=relative)
+    weak = ~(loudness <= LOUDEST_GATE**2) & ((means.usable == 1) | _faded(means, below, layout))
     with np.errstate(invalid="ignore"):
         heard = np.where(weak | (means.usable == 0), np.nan, loudness)
     means.usable[weak] = 0
@@ -279,10 +284,27 @@ def _means(
     return mean, spread, single, averaged
 
 
-def _loudness(mean: Array, single: Array, layout: Layout, *, relative: bool) -> Array:
-    """Return (block, crossing) relative variances of a gate of one profile about a vertex."""
+def _faded(means: Condensed, below: Booleans, layout: Layout) -> Booleans:
+    """Return (block, crossing) where noise alone made a signal that was there not positive.
+
+    What is weaker than weak is no worse for the other rays. A ray that has no signal at all, or
+    that is less than noise makes it, is out of order, and told.
+    """
+    ray, first = layout.crossings.ray, layout.first_crossing[layout.crossings.ray]
+    negative = (means.status == _point_weights.NOT_POSITIVE)[:, ray]
+    return np.asarray(negative & (means.usable == 0) & (means.usable[:, first] == 1) & ~below)
+
+
+def _loudness(
+    mean: Array, single: Array, averaged: Indices, layout: Layout, *, relative: bool
+) -> tuple[Array, Booleans]:
+    """Return (block, crossing) relative variances of a gate of one profile about a vertex.
+
+    And where the mean signal is less than zero by more than its noise.
+    """
     total, gates = layout.crossings.ray.size, layout.weights.shape[1]
-    out = np.zeros((mean.shape[0], total))
+    out, below = np.zeros((mean.shape[0], total)), np.zeros((mean.shape[0], total), dtype=np.bool_)
+    number = np.maximum(averaged, 1) * gates / _OF_MEDIAN
     for c in range(total):
         ray, gate = layout.crossings.ray[c], slice(layout.window[c], layout.window[c] + gates)
         # A wild gate may be so large that its square is none.
@@ -290,7 +312,9 @@ def _loudness(mean: Array, single: Array, layout: Layout, *, relative: bool) -> 
             level = mean[:, ray, gate].sum(axis=1) / gates
             spread = single[:, ray, gate].sum(axis=1) / gates
             out[:, c] = spread if relative else np.where(level > 0, spread / level**2, np.inf)
-    return out
+            if not relative:
+                below[:, c] = ~(level >= -_BELOW * np.sqrt(spread / number))
+    return out, below
 
 
 def average(

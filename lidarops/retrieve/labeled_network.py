@@ -34,6 +34,8 @@ _QUALITY_OF_FLAG: Final = {
     "signal_not_positive": Quality.LOW_SIGNAL,
     "signal_missing": Quality.INPUT_MISSING,
     "weak_signal": Quality.LOW_LEVERAGE,
+    "bridged": Quality.OUTLIER,
+    "outlying": Quality.POOR_FIT,
     "pole": Quality.UNSTABLE_INVERSION,
     "unsettled": Quality.POOR_FIT,
     "poor_fit": Quality.POOR_FIT,

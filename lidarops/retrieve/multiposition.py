@@ -26,7 +26,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve import _closed, _inputs, _network, _prior, _rays
 from lidarops.retrieve import geometry as rays_geometry
 from lidarops.retrieve import visibility as sight
-from lidarops.retrieve._point_weights import MISSING, NOT_POSITIVE
+from lidarops.retrieve._point_weights import MISSING, NOT_POSITIVE, OUTLYING
 from lidarops.retrieve.geometry import Cycle, Network
 
 Array = npt.NDArray[np.float64]
@@ -58,6 +58,10 @@ class Method(StrEnum):
 _HOMOGENEOUS: Final = frozenset({Method.MULTIPLIER, Method.UNBIASED, Method.SLOPE, Method.KLETT})
 
 
+_HARMLESS: Final = frozenset({"weak_signal", "bridged"})
+"""Flags that do not speak against a value."""
+
+
 class Prior(StrEnum):
     """What a network is told about the field beforehand."""
 
@@ -87,6 +91,11 @@ class VertexFlags:
     """A ray of the vertex has a gate before it that is not finite."""
     weak_signal: Booleans
     """A ray of the vertex is too noisy there, and was left out; the others stand."""
+    bridged: Booleans
+    """A ray of the vertex has gates that lie far off their neighbours, which took their place:
+    the value stands."""
+    outlying: Booleans
+    """A ray of the vertex has so many such gates before it that it was left out."""
     pole: Booleans
     """The multiplier makes the determinant vanish or turn its sign: no value."""
     unsettled: Booleans
@@ -100,10 +109,10 @@ class VertexFlags:
 
     @property
     def flagged(self) -> Booleans:
-        """Union of all but `weak_signal`, which does no harm where a value is left."""
+        """Union of all but `weak_signal` and `bridged`, which do a value that is left no harm."""
         union = np.zeros_like(self.far_start)
         for field in fields(self):
-            if field.name != "weak_signal":
+            if field.name not in _HARMLESS:
                 union = union | getattr(self, field.name)
         return union
 
@@ -337,6 +346,8 @@ def _judged(
         signal_not_positive=_lost(rays, NOT_POSITIVE),
         signal_missing=_lost(rays, MISSING),
         weak_signal=_by_vertex(rays, rays.weak[rays.block]),
+        bridged=_by_vertex(rays, rays.data.bridged[:, rays.layout.crossings.ray] == 1),
+        outlying=_lost(rays, OUTLYING),
         pole=estimate.pole,
         unsettled=np.broadcast_to(unsettled[:, np.newaxis], shape),
         poor_fit=np.broadcast_to(poor[..., np.newaxis], shape),

@@ -254,6 +254,22 @@ def test_prior_that_the_rays_contradict_is_weakened_or_given_up():
     assert np.nanmedian(errors[0]) < 0.7 * np.nanmedian(errors[1])
 
 
+def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
+    """Each profile tells little without the prior; all together tell that it is wrong."""
+
+    def steep(x, y, z):
+        return 1e-3 * np.exp(-z / 350.0)
+
+    net = fan([-600.0, -200.0, 200.0, 600.0], [(40, 55), (60, 85), (95, 120), (125, 140)],
+              farthest=1500.0)  # fmt: skip
+    result = with_noise(net, steep, 0.2, 100, seed=11)
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    score = (result.extinction - at_vertices(net, steep)) / result.extinction_standard_error
+    assert np.mean((np.abs(score) > 4.0) & kept) < 0.02
+    weaker = (result.prior_deviation > 0.015) | np.isinf(result.prior_deviation)
+    assert weaker.all()
+
+
 def test_average_signals_before_not_solutions_afterwards():
     net = triangle()
     r = grid(net)

@@ -53,7 +53,7 @@ def condensed(net, power, variance, exponent=1.0, gates=7, step=5.0):
     data = _point_weights.condense(
         np.atleast_3d(power).reshape(-1, net.rays, r.size), variance[np.newaxis],
         np.zeros(power.size // (net.rays * r.size), dtype=np.intp),
-        np.full(net.rays, exponent), layout, relative=False,
+        np.full(net.rays, exponent), layout, relative=False, screened=False,
     )  # fmt: skip
     return layout, data
 

@@ -1,0 +1,318 @@
+"""Single gates of a network's rays that lie off their neighbours: found, bridged, or told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from oracle_multiposition import FIELDS, fan, grid, noisy, signals, triangle
+from scipy.interpolate import BarycentricInterpolator
+
+from lidarops.retrieve import _gate_outliers, _point_weights
+from lidarops.retrieve.multiposition import solve
+
+GATES = 7
+
+
+def narrow(x, y, z):
+    """Return a plume of 50 m, of four times the air about it, below layers of 300 m."""
+    apart = ((x + 40.0) ** 2 + (z - 650.0) ** 2) / (2 * 50.0**2)
+    return 1e-3 * (1 + 3 * np.exp(-apart)) * np.exp(-z / 300.0)
+
+
+ALL = {**FIELDS, "narrow plume": narrow}
+
+
+def scene(field=ALL["homogeneous"], relative=0.01, profiles=50, step=5.0, seed=3, additive=0.01):
+    net = triangle()
+    r = grid(net, step)
+    power, variance = noisy(net, r, signals(net, r, field), relative, profiles, seed, additive)
+    return net, r, power, variance
+
+
+def solved(net, r, power, variance, **settings):
+    settings = {"full_overlap_range": 100.0, **settings}
+    return solve(power, r, net, variance=variance, **settings)
+
+
+def condensed(net, r, power, variance, *, screened=True, relative=False, nearest=100.0):
+    ranges = np.tile(r, (net.rays, 1))
+    layout = _point_weights.lay_out(net, ranges, None, np.full(net.rays, nearest), GATES)
+    rows = np.broadcast_to(variance, (1, *power.shape[1:]))
+    data = _point_weights.condense(
+        power, np.ascontiguousarray(rows), np.zeros(len(power), dtype=np.intp),
+        np.ones(net.rays), layout, relative=relative, screened=screened,
+    )  # fmt: skip
+    return data, layout
+
+
+def hit(power, variance, profile, ray, gate, size):
+    """Return power with gates of a ray moved by so many standard errors."""
+    out = power.copy()
+    out[profile, ray, gate] += size * np.sqrt(np.broadcast_to(variance, power.shape[1:])[ray, gate])
+    return out
+
+
+def gate_at(r, where):
+    return int(np.argmin(np.abs(r - where)))
+
+
+def apart(one, other):
+    """Return by how many of its standard errors the one differs from the other."""
+    return np.abs(one.extinction - other.extinction) / one.extinction_standard_error
+
+
+# Where nothing is wrong ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(ALL))
+@pytest.mark.parametrize("step", [5.0, 7.5])
+def test_air_and_noise_are_left_alone_to_the_bit(name, step):
+    for relative in (1e-3, 0.02, 0.1, 0.3):
+        net, r, power, variance = scene(ALL[name], relative, 60, step)
+        screened, _ = condensed(net, r, power, variance)
+        plain, _ = condensed(net, r, power, variance, screened=False)
+        assert not screened.bridged.any()
+        for one in ("log_value", "integral", "usable", "covariance", "slope", "status"):
+            np.testing.assert_array_equal(getattr(screened, one), getattr(plain, one))
+
+
+@pytest.mark.parametrize("relative", [2e-3, 0.01, 0.05, 0.2])
+def test_what_is_left_of_gates_is_normal(relative):
+    """So that the threshold means what it says: beyond 6, once in 5e8 gates."""
+    rng = np.random.default_rng(5)
+    rows, bins = 400, 200
+    slope = -0.01 * np.arange(bins)
+    plain = np.exp(slope) * (1 + relative * rng.standard_normal((rows, bins)))
+    codes, limits = np.zeros(bins, dtype=np.uint8), np.array([[0, bins]])
+    ranges = 5.0 * np.arange(1.0, bins + 1)
+    planned = np.zeros((1, bins, 6), np.intp), np.zeros((1, bins, 6)), np.zeros((1, bins))
+    _gate_outliers.plan(ranges[None], limits, *planned)
+    nodes, shares, air = (one[0] for one in planned)
+    off = np.empty((rows, bins))
+    for n in range(rows):
+        noise = (relative * np.exp(slope) / plain[n]) ** 2
+        row = np.log(np.maximum(plain[n], 1e-9)), noise, plain[n], (relative * np.exp(slope)) ** 2
+        _gate_outliers._measure(
+            row, 1.0, False, ranges, codes, (0, bins, 0, bins), (nodes, shares, 0.0 * air), off[n]
+        )
+    for many, chance in ((2.0, 4.55e-2), (3.0, 2.7e-3), (4.0, 6.3e-5)):
+        expected = chance * off.size
+        # A gate of noise shows in 7 of them: so many fewer are independent.
+        assert abs(np.sum(off > many) - expected) < 4 * np.sqrt(7 * expected) + 3
+    assert off.max() < _gate_outliers.OUTLYING
+
+
+def test_counts_at_low_light_are_not_taken_for_outliers():
+    rng = np.random.default_rng(6)
+    net = triangle()
+    r = grid(net)
+    level = signals(net, r, ALL["homogeneous"])
+    counts = rng.poisson(np.maximum(60 * level / level[:, [60]], 15), (300, *level.shape))
+    found = solved(net, r, counts.astype(float), counts.astype(float))
+    assert not found.flags.bridged.any()
+    assert not found.flags.outlying.any()
+
+
+# Where gates are hit ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("relative", [1e-3, 0.02, 0.1])
+@pytest.mark.parametrize("size", [15.0, 40.0, 1e3, 1e9])
+def test_a_spike_at_a_vertex_is_bridged_and_told(relative, size):
+    net, r, power, variance = scene(relative=relative)
+    at = gate_at(r, net.on_ray(0)[1][0])
+    clean = solved(net, r, power, variance)
+    found = solved(net, r, hit(power, variance, 7, 0, at, size), variance)
+    mine = net.on_ray(0)[0]
+    assert found.flags.bridged[7, mine].all()
+    assert not found.flags.bridged[np.arange(50) != 7].any()
+    np.testing.assert_array_equal(found.flags.flagged, clean.flags.flagged)
+    assert np.nanmax(apart(found, clean)[7]) < 1.0
+    np.testing.assert_allclose(
+        found.extinction_standard_error[7], clean.extinction_standard_error[7], rtol=0.3
+    )
+
+
+@pytest.mark.parametrize("size", [-20.0, 15.0, 100.0])
+def test_a_spike_in_the_middle_of_a_long_ray_costs_nothing(size):
+    net, r, power, variance = scene(relative=0.02)
+    low, high = net.on_ray(1)[1][[0, -1]]
+    at = gate_at(r, (low + high) / 2)
+    clean = solved(net, r, power, variance)
+    found = solved(net, r, hit(power, variance, 3, 1, at, size), variance)
+    np.testing.assert_array_equal(found.flags.flagged, clean.flags.flagged)
+    assert np.nanmax(apart(found, clean)[3]) < 0.3
+
+
+@pytest.mark.parametrize("sizes", [(40.0, 40.0), (90.0, 30.0), (25.0, -25.0), (60.0, 0.0, 60.0)])
+def test_spikes_that_lie_together_are_told_apart(sizes):
+    net, r, power, variance = scene(relative=0.02)
+    at = gate_at(r, net.on_ray(0)[1][0])
+    damaged = power
+    for k, size in enumerate(sizes):
+        damaged = hit(damaged, variance, slice(None), 0, at + k, size)
+    clean, found = solved(net, r, power, variance), solved(net, r, damaged, variance)
+    assert found.flags.bridged[:, net.on_ray(0)[0]].mean() > 0.95
+    good = ~found.flags.flagged & ~clean.flags.flagged & np.isfinite(found.extinction)
+    assert np.mean(good[:, clean.near_vertex]) > 0.8 * np.mean(
+        ~clean.flags.flagged[:, clean.near_vertex]
+    )
+    assert np.mean(apart(found, clean)[good] < 2.0) > 0.95
+
+
+@pytest.mark.parametrize("place", ["first", "last"])
+def test_the_ends_of_a_ray_are_looked_at_too(place):
+    """Beyond the last vertex a gate is missing; before the first there are none."""
+    net, r, power, variance = scene(relative=0.02)
+    ranges = net.on_ray(0)[1]
+    first, last = gate_at(r, ranges[0]), gate_at(r, ranges[-1])
+    if place == "first":
+        at, nearest = first - 3, np.array([r[first - 3] - 0.1, 100.0, 100.0])
+    else:
+        at, nearest = last + 3, 100.0
+        power[:, 0, last + 4 :] = np.nan
+    clean = solved(net, r, power, variance, full_overlap_range=nearest)
+    found = solved(
+        net, r, hit(power, variance, 9, 0, at, 120.0), variance, full_overlap_range=nearest
+    )
+    assert (found.flags.bridged | found.flags.outlying)[9, net.on_ray(0)[0]].any()
+    kept = ~found.flags.flagged & ~clean.flags.flagged & np.isfinite(found.extinction)
+    assert (apart(found, clean)[9][kept[9]] < 1.5).all()
+
+
+def test_gaps_among_neighbours_are_passed_over():
+    net, r, power, variance = scene(relative=0.02)
+    last = gate_at(r, net.on_ray(0)[1][-1])
+    power[:, 0, last + 5] = np.nan
+    clean = solved(net, r, power, variance)
+    found = solved(net, r, hit(power, variance, 9, 0, last + 3, 60.0), variance)
+    assert found.flags.bridged[9, net.on_ray(0)[0]].all()
+    assert np.nanmax(apart(found, clean)[9]) < 1.0
+
+
+def test_a_crowd_of_spikes_ends_the_ray_and_is_told():
+    net, r, power, variance = scene(relative=0.01)
+    ranges = net.on_ray(0)[1]
+    at = gate_at(r, (ranges[0] + ranges[-1]) / 2)
+    rng = np.random.default_rng(1)
+    damaged = power.copy()
+    damaged[4, 0, at : at + 9] *= rng.uniform(0.3, 3.0, 9)
+    found = solved(net, r, damaged, variance)
+    beyond = net.on_ray(0)[0][1:]
+    assert found.flags.outlying[4, beyond].all()
+    assert found.flags.flagged[4, beyond].all()
+    assert not found.flags.outlying[np.arange(50) != 4].any()
+
+
+@pytest.mark.parametrize("step", [0.3, 1.1, 4.0])
+def test_an_edge_of_a_layer_is_no_crowd(step):
+    net, r, power, variance = scene(relative=0.01)
+    ranges = net.on_ray(0)[1]
+    beyond = r > (ranges[0] + ranges[-1]) / 2
+    power[:, 0, beyond] *= step
+    variance[0, beyond] *= step**2
+    found, _ = condensed(net, r, power, variance)
+    plain, _ = condensed(net, r, power, variance, screened=False)
+    np.testing.assert_array_equal(found.integral, plain.integral)
+    assert not found.bridged.any()
+
+
+def test_noise_far_above_what_is_stated_is_told():
+    net, r, power, variance = scene(relative=0.05)
+    found = solved(net, r, power, variance / 400.0)
+    used = np.isfinite(found.extinction)
+    assert (found.flags.outlying | found.flags.poor_fit | ~used).all()
+
+
+@pytest.mark.parametrize("variance", [0.0, None])
+def test_noise_that_is_not_stated_alarms_nobody(variance):
+    net, r, power, _ = scene(ALL["plume"], relative=0.02)
+    found = solved(net, r, power, variance)
+    assert not found.flags.bridged.any()
+    assert not found.flags.outlying.any()
+
+
+def test_spikes_are_seen_where_signals_tell_the_noise():
+    net, r, power, variance = scene(relative=0.01, additive=0.0)
+    at = gate_at(r, net.on_ray(0)[1][0])
+    clean = solved(net, r, power, None)
+    found = solved(net, r, hit(power, variance, 7, 0, at, 60.0), None)
+    assert found.flags.bridged[7, net.on_ray(0)[0]].all()
+    assert np.nanmax(apart(found, clean)[7]) < 1.0
+
+
+# Honesty ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("where", ["vertex", "between"])
+@pytest.mark.parametrize("relative", [0.01, 0.2])
+def test_variances_of_bridged_rays_are_those_of_many_draws(where, relative):
+    net, r, power, variance = scene(relative=relative, profiles=3000)
+    ranges = net.on_ray(0)[1]
+    at = gate_at(r, ranges[0] if where == "vertex" else (ranges[0] + ranges[-1]) / 2)
+    data, layout = condensed(
+        net, r, hit(power, variance, slice(None), 0, [at, at + 5], 100.0), variance
+    )
+    assert data.bridged[:, 0].all()
+    first, last = layout.first_crossing[:2]
+    count = last - first
+    size = 2 * count - 1
+    told = data.covariance[:, layout.offset[0] : layout.offset[1]].reshape(-1, size, size)
+    good = (data.usable[:, first:last] == 1).all(axis=1)
+    truth, _ = condensed(
+        net, r, signals(net, r, ALL["homogeneous"])[None], variance, screened=False
+    )
+    for c in range(1, count):
+        # The far value less the near one, and the integral, in units of the near value.
+        difference = data.log_value[good, first + c] - truth.log_value[0, first + c]
+        spread = told[good, c, c] + told[good, 0, 0] - 2 * told[good, 0, c]
+        assert np.std(difference / np.sqrt(spread)) == pytest.approx(1.0, abs=0.08)
+        assert (
+            abs(np.mean(difference))
+            < 4 * np.std(difference) / np.sqrt(good.sum()) + 0.02 * relative
+        )
+
+
+def test_shares_are_those_of_polynomials():
+    rng = np.random.default_rng(2)
+    x = np.cumsum(rng.uniform(3.0, 9.0, 9))
+    nodes, shares = np.array([0, 1, 3, 5, 6, 8, 0, 0]), np.empty(8)
+    y = rng.standard_normal(9)
+    _gate_outliers._fit_shares(x, 4, nodes, 6, 5, shares)
+    through = BarycentricInterpolator(x[nodes[:6]], y[nodes[:6]])(x[4])
+    assert shares[:6] @ y[nodes[:6]] == pytest.approx(through, rel=1e-10)
+    _gate_outliers._fit_shares(x, 4, nodes, 6, 3, shares)
+    fitted = np.polynomial.Polynomial.fit(x[nodes[:6]], y[nodes[:6]], 3)(x[4])
+    assert shares[:6] @ y[nodes[:6]] == pytest.approx(fitted, rel=1e-10)
+
+
+def test_results_do_not_depend_on_what_else_is_solved():
+    net, r, power, variance = scene(relative=0.05, profiles=24)
+    rng = np.random.default_rng(8)
+    damaged = power + (rng.random(power.shape) < 0.02) * 50 * np.sqrt(variance)
+    together = solved(net, r, damaged, variance, prior="none")
+    assert together.flags.bridged.any()
+    for n in (0, 11, 23):
+        alone = solved(net, r, damaged[n], variance, prior="none")
+        np.testing.assert_array_equal(alone.extinction, together.extinction[n])
+        np.testing.assert_array_equal(alone.flags.bridged, together.flags.bridged[n])
+    turned = solved(net, r, damaged[::-1], variance, prior="none")
+    np.testing.assert_array_equal(turned.extinction[::-1], together.extinction)
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.6])
+def test_one_percent_of_wild_gates_leaves_values_within_their_errors(exponent):
+    net = fan([-500.0, 0.0, 400.0], [(50, 68), (78, 103), (112, 130)], farthest=1000.0)
+    r = grid(net)
+    clean = signals(net, r, ALL["homogeneous"], exponent)
+    power, variance = noisy(net, r, clean, 0.02, 150)
+    rng = np.random.default_rng(9)
+    wild = (rng.random(power.shape) < 0.01) * rng.uniform(5.0, 100.0, power.shape)
+    found = solved(
+        net, r, power + wild * np.sqrt(variance), variance, exponent=exponent,
+        blocks=np.arange(150) // 50,
+    )  # fmt: skip
+    kept = ~found.flags.flagged & np.isfinite(found.extinction)
+    score = ((found.extinction - 2e-3) / found.extinction_standard_error)[kept]
+    assert kept[:, found.near_vertex].mean() > 0.9
+    assert np.mean(np.abs(score) > 4.0) <= 5e-3
