@@ -121,15 +121,15 @@ def process_task(
 
 
 @task(name="report", **_RETRY)
-def report_task(campaign: Campaign, record: RunRecord) -> Path:
+def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
     """Write the report of a run and publish its table, its link and its quicklook."""
-    built = report_run(campaign, record)
+    built = report_run(campaign, record, workers=workers)
     key = campaign.name.lower()
     create_table_artifact(
         key=f"{key}-products", table=page.summary_rows(record), description=f"Run {record.id}"
     )
     create_link_artifact(built.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
-    picture = page.quicklook(record, built.parent)
+    picture = page.quicklook(record, built.parent, workers=workers)
     if picture is not None:
         # The server may stand on another machine, so the picture travels in the artifact.
         encoded = base64.b64encode(picture.read_bytes()).decode()
@@ -207,7 +207,8 @@ def reprocess(
     if result.record is None:
         get_run_logger().info("campaign %s is up to date", settings.name)
         return result, None
-    built = report_task(_opaque(settings), _opaque(result.record))
+    local = chosen.workers if isinstance(chosen, clusters.Local) else 1
+    built = report_task(_opaque(settings), _opaque(result.record), local)
     scenes = len(result.record.scenes)
     get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
     return result, built

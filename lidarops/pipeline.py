@@ -552,8 +552,15 @@ def prepare(
     return Cut(chosen, everything.set_aside)
 
 
-def report_run(campaign: Campaign, run: RunRecord) -> Path:
+def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> Path:
     """Keep the record of a run and build its page.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    run : RunRecord
+    workers : int, optional
+        Most processes of this machine to read products with; changes nothing that is shown.
 
     Returns
     -------
@@ -562,4 +569,4 @@ def report_run(campaign: Campaign, run: RunRecord) -> Path:
     """
     folder = campaign.report_root / run.id
     record.save(run, folder)
-    return page.build(run, folder)
+    return page.build(run, folder, workers=workers)

@@ -227,7 +227,9 @@ def reprocess(
     removed = None
     if remove_orphans:
         removed = pipeline.remove_orphans(settings, result.orphans, wait=wait)
-    page = None if result.record is None else pipeline.report_run(settings, result.record)
+    page = None
+    if result.record is not None:
+        page = pipeline.report_run(settings, result.record, workers=options.workers)
     if as_json:
         typer.echo(json.dumps(_run_summary(settings, result, page), indent=2))
     else:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import functools
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeVar
@@ -17,20 +18,37 @@ import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
+from lidarops.products.read import profiles_in
 from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
 from lidarops.reports import figures, network_figures, panels
 from lidarops.reports.networks import (
-    VertexSeries,
+    MAP_VARIABLES,
+    VERTEX_VARIABLES,
     instruments_of,
     join_vertices,
     read_map,
     read_vertices,
 )
-from lidarops.reports.profiles import clearest_profile
-from lidarops.reports.raster import COLUMNS, Raster, read_raster
+from lidarops.reports.profiles import PROFILE_VARIABLES, clearest_profile
+from lidarops.reports.raster import COLUMNS, Raster, raster_variables, read_raster
+from lidarops.reports.reading import UNREADABLE, Readers, Reading, Unread, reason
 from lidarops.reports.record import write_atomically
-from lidarops.reports.scans import clearest_cycle, read_extinction, read_residuals
-from lidarops.reports.series import QUANTITIES, Comparison, Section, compare, join, read_sections
+from lidarops.reports.scans import (
+    CYCLE_VARIABLES,
+    EXTINCTION_VARIABLES,
+    RESIDUAL_VARIABLES,
+    clearest_cycle,
+    read_extinction,
+    read_residuals,
+)
+from lidarops.reports.series import (
+    QUANTITIES,
+    SECTION_VARIABLES,
+    Comparison,
+    compare,
+    join,
+    read_sections,
+)
 from lidarops.reports.words import counted
 
 FIGURES: Final = 40
@@ -45,9 +63,6 @@ _KINDS: Final = (
     ProductKind.ELASTIC,
     ProductKind.SIGNAL,
 )
-# What opening and reading a damaged or foreign file has been seen to raise.
-_UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, ProductError)
-
 Found = TypeVar("Found")
 
 
@@ -99,10 +114,82 @@ class _Group:
     instrument: str
     channel: str
     members: tuple[tuple[SceneOutcome, ProductRecord], ...]
+    root: Path
+    """Folder that the paths of products start from."""
 
     @property
     def label(self) -> str:
         return f"{self.instrument} \N{MIDDLE DOT} {self.channel}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Sources:
+    """What figures are made from; products that cannot be read are noted in the gallery."""
+
+    readers: Readers
+    truth: xr.Dataset | None
+    gallery: Gallery
+
+    def each(
+        self,
+        group: _Group,
+        names: tuple[str, ...],
+        reads: Iterable[Callable[..., Found]],
+        *,
+        with_truth: bool = False,
+    ) -> Iterator[Found]:
+        """Give what is read of each product of a group that can be read."""
+        paths = [product.path for _, product in group.members]
+        readings = [
+            Reading(group.root / path, names, read, with_truth)
+            for path, read in zip(paths, reads, strict=True)
+        ]
+        yield from self._read(paths, readings)
+
+    def rasters(
+        self, group: _Group, names: tuple[str, ...], read: Callable[..., Raster]
+    ) -> list[Raster]:
+        """Reduce all products of a group alike, as coarsely as their number asks for."""
+        sizes: dict[str, int] = {}
+        for _, product in group.members:
+            try:
+                sizes[product.path] = profiles_in(group.root / product.path)
+            except UNREADABLE as error:
+                self._note(product.path, reason(group.root / product.path, error))
+        profiles = -(-sum(sizes.values()) // COLUMNS)
+        reduced = functools.partial(read, profiles=profiles)
+        readings = [Reading(group.root / path, names, reduced) for path in sizes]
+        return list(self._read(list(sizes), readings))
+
+    def first(
+        self,
+        group: _Group,
+        names: tuple[str, ...],
+        read: Callable[..., Found | None],
+        *,
+        with_truth: bool = False,
+    ) -> Found | None:
+        """Return what is read of the first product of a group that has it."""
+        told = {problem.path for problem in self.gallery.problems}
+        for _, product in group.members:
+            reading = Reading(group.root / product.path, names, read, with_truth)
+            found = self.readers.one(reading)
+            if isinstance(found, Unread):
+                if product.path not in told:
+                    self._note(product.path, found.reason)
+            elif found is not None:
+                return found
+        return None
+
+    def _read(self, paths: list[str], readings: list[Reading[Found]]) -> Iterator[Found]:
+        for path, found in zip(paths, self.readers.each(readings), strict=True):
+            if isinstance(found, Unread):
+                self._note(path, found.reason)
+            else:
+                yield found
+
+    def _note(self, path: str, words: str) -> None:
+        self.gallery.problems.append(Problem(path, words))
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +199,7 @@ class _Drawn:
     figure: figures.Rendered
 
 
-def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES) -> Gallery:
+def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
     """Draw the figures of a run into a folder.
 
     Parameters
@@ -122,6 +209,8 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES) -> Gallery:
         Existing folder for the PNG files.
     limit : int, optional
         Most figures of products; comparisons with the truth are made for all.
+    workers : int, optional
+        Most processes to read products with; changes no figure.
 
     Returns
     -------
@@ -129,23 +218,23 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES) -> Gallery:
         One or more figures for every instrument and channel over all scenes.
     """
     gallery = Gallery()
-    truth = _truth(record, gallery)
     taken: Counter[str] = Counter()
-    for group in _groups(record):
-        full = len(gallery.pictures) >= limit
-        if full:
-            gallery.undrawn.append(f"{group.label}, {group.kind}")
-        for drawn in _draw(group, record, truth, gallery, full=full):
-            name = _unique(drawn.name, taken)
-            write_atomically(folder / name, drawn.figure.png)
-            gallery.pictures.append(
-                Picture(name, group.instrument, drawn.caption, drawn.figure.alt)
-            )
+    with _sources(record, gallery, workers) as sources:
+        for group in _groups(record):
+            full = len(gallery.pictures) >= limit
+            if full:
+                gallery.undrawn.append(f"{group.label}, {group.kind}")
+            for drawn in _draw(group, sources, full=full):
+                name = _unique(drawn.name, taken)
+                write_atomically(folder / name, drawn.figure.png)
+                gallery.pictures.append(
+                    Picture(name, group.instrument, drawn.caption, drawn.figure.alt)
+                )
     gallery.flags = _flags(record, folder)
     return gallery
 
 
-def first_picture(record: RunRecord, folder: Path) -> Path | None:
+def first_picture(record: RunRecord, folder: Path, *, workers: int = 1) -> Path | None:
     """Draw one figure of a run: of the first instrument and channel whose products are readable.
 
     Returns
@@ -153,14 +242,13 @@ def first_picture(record: RunRecord, folder: Path) -> Path | None:
     Path or None
         A PNG file in `folder`; None where no product can be drawn.
     """
-    gallery = Gallery()
-    truth = _truth(record, gallery)
-    for group in _groups(record):
-        for drawn in _draw(group, record, truth, gallery, full=False):
-            folder.mkdir(parents=True, exist_ok=True)
-            path = folder / "quicklook.png"
-            write_atomically(path, drawn.figure.png)
-            return path
+    with _sources(record, Gallery(), workers) as sources:
+        for group in _groups(record):
+            for drawn in _draw(group, sources, full=False):
+                folder.mkdir(parents=True, exist_ok=True)
+                path = folder / "quicklook.png"
+                write_atomically(path, drawn.figure.png)
+                return path
     return None
 
 
@@ -187,50 +275,41 @@ def _groups(record: RunRecord) -> list[_Group]:
     for (kind, instrument, channel), found in sorted(members.items()):
         turn = turns[kind, instrument]
         turns[kind, instrument] += 1
-        group = _Group(kind, instrument, channel, tuple(found))
+        group = _Group(kind, instrument, channel, tuple(found), Path(record.products))
         ordered.append((_KINDS.index(kind), turn, instrument, channel, group))
     return [group for *_, group in sorted(ordered, key=lambda row: row[:4])]
 
 
-def _draw(
-    group: _Group, record: RunRecord, truth: xr.Dataset | None, gallery: Gallery, *, full: bool
-) -> Iterator[_Drawn]:
+def _draw(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
     if group.kind is ProductKind.HOMOGENEOUS:
-        if not full or truth is not None:
-            yield from _homogeneous(group, record, truth, gallery, full=full)
+        if not full or sources.truth is not None:
+            yield from _homogeneous(group, sources, full=full)
     elif group.kind is ProductKind.VISIBILITY:
-        yield from _visibility(group, record, truth, gallery, full=full)
+        yield from _visibility(group, sources, full=full)
     elif full:
         return
     elif group.kind is ProductKind.MULTIANGLE:
-        yield from _multiangle(group, record, truth, gallery)
+        yield from _multiangle(group, sources)
     elif group.kind is ProductKind.ELASTIC:
-        yield from _elastic(group, record, gallery)
+        yield from _elastic(group, sources)
     else:
-        yield from _signal(group, record, gallery)
+        yield from _signal(group, sources)
 
 
-def _homogeneous(
-    group: _Group, record: RunRecord, truth: xr.Dataset | None, gallery: Gallery, *, full: bool
-) -> Iterator[_Drawn]:
-    found: list[Section] = []
-    scenes = 0
-    for scene, product in group.members:
-        path = Path(record.products) / product.path
-        paths = [item.path for item in scene.inputs if item.role is Role.SIGNAL]
-        try:
-            with _opened(path) as opened:
-                found += read_sections(
-                    opened,
-                    truth,
-                    instrument=group.instrument,
-                    channel=group.channel,
-                    paths=paths,
-                    dark_subtracted=_dark_subtracted(scene, group.channel),
-                )
-            scenes += 1
-        except _UNREADABLE as error:
-            gallery.problems.append(Problem(product.path, _reason(path, error)))
+def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
+    read = [
+        functools.partial(
+            read_sections,
+            instrument=group.instrument,
+            channel=group.channel,
+            paths=[item.path for item in scene.inputs if item.role is Role.SIGNAL],
+            dark_subtracted=_dark_subtracted(scene, group.channel),
+        )
+        for scene, _ in group.members
+    ]
+    by_scene = list(sources.each(group, SECTION_VARIABLES, read, with_truth=True))
+    scenes = len(by_scene)
+    found = [section for sections in by_scene for section in sections]
     sections = [section for section in join(found) if section.time.size > 0]
     compared = [
         Compared(group.instrument, group.channel, comparison)
@@ -238,7 +317,7 @@ def _homogeneous(
         for quantity in QUANTITIES
         if (comparison := compare(section, quantity)) is not None
     ]
-    gallery.compared += compared
+    sources.gallery.compared += compared
     for first in range(0, 0 if full else len(sections), panels.SECTIONS):
         few = sections[first : first + panels.SECTIONS]
         where = f"{group.label}, {', '.join(section.label for section in few)}"
@@ -256,19 +335,14 @@ def _homogeneous(
             )
 
 
-def _visibility(
-    group: _Group, record: RunRecord, truth: xr.Dataset | None, gallery: Gallery, *, full: bool
-) -> Iterator[_Drawn]:
-    found: list[VertexSeries] = []
-    for scene, product in group.members:
-        path = Path(record.products) / product.path
-        try:
-            with _opened(path) as opened:
-                found += read_vertices(opened, truth, instruments=instruments_of(scene))
-        except _UNREADABLE as error:
-            gallery.problems.append(Problem(product.path, _reason(path, error)))
-    series = join_vertices(found)
-    gallery.compared += [
+def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
+    read = [
+        functools.partial(read_vertices, instruments=instruments_of(scene))
+        for scene, _ in group.members
+    ]
+    by_scene = list(sources.each(group, VERTEX_VARIABLES, read, with_truth=True))
+    series = join_vertices([one for vertices in by_scene for one in vertices])
+    sources.gallery.compared += [
         Compared(group.instrument, group.channel, comparison)
         for one in series
         if (comparison := compare(one, "extinction")) is not None
@@ -276,9 +350,8 @@ def _visibility(
     if full or not series:
         return
     scene = group.members[0][0]
-    network = _first(
-        group, record, gallery, functools.partial(read_map, instruments=instruments_of(scene))
-    )
+    read_network = functools.partial(read_map, instruments=instruments_of(scene))
+    network = sources.first(group, MAP_VARIABLES, read_network)
     if network is not None:
         yield _Drawn(
             f"network_{group.instrument}_{group.channel}",
@@ -300,8 +373,8 @@ def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:
     return any(step.name == _DARK_STEP and step.channel == channel for step in steps)
 
 
-def _signal(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Drawn]:
-    rasters = _rasters(group, record, gallery, read_raster)
+def _signal(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
+    rasters = sources.rasters(group, raster_variables(), read_raster)
     if rasters:
         yield _Drawn(
             f"signal_{group.instrument}_{group.channel}",
@@ -311,9 +384,10 @@ def _signal(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Dra
         )
 
 
-def _elastic(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Drawn]:
-    read = functools.partial(read_raster, quantity="attenuated_backscatter")
-    rasters = _rasters(group, record, gallery, read)
+def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
+    quantity = "attenuated_backscatter"
+    read = functools.partial(read_raster, quantity=quantity)
+    rasters = sources.rasters(group, raster_variables(quantity), read)
     if rasters:
         yield _Drawn(
             f"elastic_{group.instrument}_{group.channel}",
@@ -321,7 +395,7 @@ def _elastic(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Dr
             f" {counted(len(rasters), 'scene')}.",
             figures.render(figures.draw_backscatter(rasters, title=group.label)),
         )
-    profile = _first(group, record, gallery, clearest_profile)
+    profile = sources.first(group, PROFILE_VARIABLES, clearest_profile)
     if profile is not None:
         yield _Drawn(
             f"profile_{group.instrument}_{group.channel}",
@@ -331,25 +405,23 @@ def _elastic(group: _Group, record: RunRecord, gallery: Gallery) -> Iterator[_Dr
         )
 
 
-def _multiangle(
-    group: _Group, record: RunRecord, truth: xr.Dataset | None, gallery: Gallery
-) -> Iterator[_Drawn]:
-    rasters = _rasters(group, record, gallery, read_extinction)
+def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
+    rasters = sources.rasters(group, EXTINCTION_VARIABLES, read_extinction)
     if rasters:
         yield _Drawn(
             f"multiangle_{group.instrument}_{group.channel}",
             f"Extinction over time and altitude: {group.label}; {counted(len(rasters), 'scene')}.",
             figures.render(figures.draw_extinction(rasters, title=group.label)),
         )
-    clearest = functools.partial(clearest_cycle, truth=truth, instrument=group.instrument)
-    profile = _first(group, record, gallery, clearest)
+    clearest = functools.partial(clearest_cycle, instrument=group.instrument)
+    profile = sources.first(group, CYCLE_VARIABLES, clearest, with_truth=True)
     if profile is not None:
         yield _Drawn(
             f"scan-profile_{group.instrument}_{group.channel}",
             f"The cycle of a scene with most unflagged values: {group.label}.",
             figures.render(figures.scan_profile(profile, title=group.label)),
         )
-    residuals = _first(group, record, gallery, read_residuals)
+    residuals = sources.first(group, RESIDUAL_VARIABLES, read_residuals)
     if residuals is not None:
         yield _Drawn(
             f"scan-residuals_{group.instrument}_{group.channel}",
@@ -357,51 +429,6 @@ def _multiangle(
             f" {group.label}.",
             figures.render(figures.scan_residuals(residuals, title=group.label)),
         )
-
-
-def _first(
-    group: _Group,
-    record: RunRecord,
-    gallery: Gallery,
-    read: Callable[[xr.Dataset], Found | None],
-) -> Found | None:
-    """Return what is read of the first product of a group that has it."""
-    told = {problem.path for problem in gallery.problems}
-    for _, product in group.members:
-        path = Path(record.products) / product.path
-        try:
-            with _opened(path) as opened:
-                found = read(opened)
-        except _UNREADABLE as error:
-            if product.path not in told:
-                gallery.problems.append(Problem(product.path, _reason(path, error)))
-            continue
-        if found is not None:
-            return found
-    return None
-
-
-def _rasters(
-    group: _Group, record: RunRecord, gallery: Gallery, read: Callable[..., Raster]
-) -> list[Raster]:
-    root = Path(record.products)
-    sizes: dict[str, int] = {}
-    for _, product in group.members:
-        try:
-            with _opened(root / product.path) as opened:
-                sizes[product.path] = opened.sizes.get("time", 0)
-        except _UNREADABLE as error:
-            reason = _reason(root / product.path, error)
-            gallery.problems.append(Problem(product.path, reason))
-    rasters: list[Raster] = []
-    profiles = -(-sum(sizes.values()) // COLUMNS)
-    for path in sizes:
-        try:
-            with _opened(root / path) as opened:
-                rasters.append(read(opened, profiles=profiles))
-        except _UNREADABLE as error:
-            gallery.problems.append(Problem(path, _reason(root / path, error)))
-    return rasters
 
 
 def _flags(record: RunRecord, folder: Path) -> Picture | None:
@@ -434,32 +461,30 @@ def _shares(record: RunRecord) -> Mapping[str, Mapping[Quality, float]]:
     return {label: rows[label] for label in sorted(worst[:_FLAG_ROWS])}
 
 
+@contextmanager
+def _sources(record: RunRecord, gallery: Gallery, workers: int) -> Iterator[_Sources]:
+    truth = _truth(record, gallery)
+    products = sum(len(scene.products) for scene in record.scenes)
+    with Readers(workers, products, truth) as readers:
+        yield _Sources(readers, truth, gallery)
+
+
 def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
     if not record.truth:
         return None
     path = Path(record.truth)
     try:
-        with _opened(path) as opened:
-            truth: xr.Dataset = opened.load()
+        if not path.is_file():
+            raise ProductError("the file is missing")
+        with xr.open_dataset(path, engine="netcdf4", decode_timedelta=False) as opened:
+            truth = opened.load()
         for name in ("path", "instrument", "time", "extinction"):
             if name not in truth.variables or truth[name].dims != ("granule",):
                 raise ProductError("is not a variable along granule", field=name)
-    except _UNREADABLE as error:
-        gallery.problems.append(Problem(record.truth, _reason(path, error)))
+    except UNREADABLE as error:
+        gallery.problems.append(Problem(record.truth, reason(path, error)))
         return None
     return truth
-
-
-def _opened(path: Path) -> xr.Dataset:
-    if not path.is_file():
-        raise ProductError("the file is missing")
-    return xr.open_dataset(path, engine="netcdf4", decode_timedelta=False)
-
-
-def _reason(path: Path, error: BaseException) -> str:
-    # The path stands beside the reason: no need to have it twice, in full.
-    words = str(error).replace(str(path), path.name)
-    return words or type(error).__name__
 
 
 def _unique(name: str, taken: Counter[str]) -> str:

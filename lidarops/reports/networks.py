@@ -21,6 +21,23 @@ Floats = NDArray[np.float64]
 QUANTITIES: Final = ("extinction", "visibility")
 """Of a series."""
 
+_EXTINCTION: Final = (
+    "extinction",
+    "extinction_standard_error",
+    "extinction_systematic_error",
+)
+_VISIBILITY: Final = ("visibility_in_air", "visibility_in_air_lower", "visibility_in_air_upper")
+_ANGLES: Final = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
+_SHARED: Final = ("time", "vertex_id", "ray_range", "quality_flag")
+VERTEX_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY, "time_bnds", "ray_zenith_angle")
+"""What `read_vertices` reads of a product."""
+MAP_VARIABLES: Final = (
+    *_SHARED,
+    "visibility_in_air",
+    *(f"ray_{name}" for name in _ANGLES),
+    *_ANGLES[:3],
+)
+"""What `read_map` reads of a product."""
 _PAIR: Final = ("time", "vertex")
 _SAME_BEAM: Final = 0.2
 """degree, within which a file of the truth points as a beam does."""
@@ -95,15 +112,13 @@ def read_vertices(
     ProductError
         Where a variable is missing, or does not have the dims of its kind.
     """
-    wanted = ("extinction", "extinction_standard_error", "extinction_systematic_error")
-    more = ("visibility_in_air", "visibility_in_air_lower", "visibility_in_air_upper")
     require(
         product,
         {"time": ("time",), "vertex_id": ("vertex",), "ray_range": ("ray", "vertex")}
-        | dict.fromkeys((*wanted, *more, "quality_flag"), _PAIR),
+        | dict.fromkeys((*_EXTINCTION, *_VISIBILITY, "quality_flag"), _PAIR),
     )
-    value, random, systematic = (_floats(product, name) for name in wanted)
-    seen, low, high = (_floats(product, name) for name in more)
+    value, random, systematic = (_floats(product, name) for name in _EXTINCTION)
+    seen, low, high = (_floats(product, name) for name in _VISIBILITY)
     flags = product["quality_flag"].values.astype(np.int64)
     known = _truth(product, truth, instruments)
     time = product["time"].values.astype("datetime64[ns]")
@@ -177,21 +192,20 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
     ProductError
         Where a variable is missing, or does not have the dims of its kind.
     """
-    angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
     require(
         product,
         {"time": ("time",), "ray_range": ("ray", "vertex"), "visibility_in_air": _PAIR}
         | {"quality_flag": _PAIR, "vertex_id": ("vertex",)}
-        | {f"ray_{name}": ("ray",) for name in angles},
+        | {f"ray_{name}": ("ray",) for name in _ANGLES},
     )
-    columns = [_floats(product, f"ray_{name}") for name in angles]
+    columns = [_floats(product, f"ray_{name}") for name in _ANGLES]
     rays = [
         Ray(lat, lon, alt, azimuth, 90.0 - zenith)
         for lat, lon, alt, zenith, azimuth in zip(*columns, strict=True)
     ]
     origin, direction = locate(rays)
     reach = np.nanmax(_floats(product, "ray_range"), axis=1, initial=0.0)
-    place = [_floats(product, name) for name in ("latitude", "longitude", "altitude")]
+    place = [_floats(product, name) for name in _ANGLES[:3]]
     first = to_earth_centred(rays[0].latitude, rays[0].longitude, rays[0].altitude)
     turn = local_axes(rays[0].latitude, rays[0].longitude)
     vertices = (to_earth_centred(*place) - first) @ turn.T

@@ -56,7 +56,9 @@ class SceneRow:
     plan_hash: str
 
 
-def build(record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES) -> Path:
+def build(
+    record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES, workers: int = 1
+) -> Path:
     """Write the report of a run.
 
     Parameters
@@ -68,6 +70,8 @@ def build(record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES) ->
         relative, and the page needs neither network nor script.
     figures : int, optional
         Most figures of products.
+    workers : int, optional
+        Most processes to read products with; changes nothing that is shown.
 
     Returns
     -------
@@ -82,7 +86,7 @@ def build(record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES) ->
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        filled = gallery.fill(record, folder, limit=figures)
+        filled = gallery.fill(record, folder, limit=figures, workers=workers)
         target = folder / INDEX
         write_atomically(target, _render(record, folder, filled).encode())
     except OSError as error:
@@ -94,9 +98,9 @@ def build(record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES) ->
     return target
 
 
-def quicklook(record: RunRecord, folder: Path) -> Path | None:
+def quicklook(record: RunRecord, folder: Path, *, workers: int = 1) -> Path | None:
     """Write one figure of a run, ``quicklook.png``; None where no product can be drawn."""
-    return gallery.first_picture(record, Path(folder))
+    return gallery.first_picture(record, Path(folder), workers=workers)
 
 
 def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:

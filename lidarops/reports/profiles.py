@@ -17,6 +17,21 @@ Floats = NDArray[np.float64]
 CAUSES: Final = ("noise", "background", "reference", "lidar_ratio", "molecular")
 """Of the errors of backscatter, as in the names of variables."""
 
+_ALONG_TIME: Final = ("time", "reference_bottom", "reference_top")
+_ALONG_BOTH: Final = (
+    "backscatter",
+    "backscatter_standard_error",
+    "quality_flag",
+    *(f"backscatter_error_{cause}" for cause in CAUSES),
+)
+PROFILE_VARIABLES: Final = (
+    *_ALONG_TIME,
+    "range",
+    "molecular_backscatter",
+    "lidar_ratio",
+    *_ALONG_BOTH,
+)
+"""What `clearest_profile` reads of a product."""
 _REJECTED: Final = int(Quality.rejecting())
 _WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
 _BEYOND: Final = 1.15
@@ -63,15 +78,11 @@ def clearest_profile(product: xr.Dataset) -> Profile | None:
     ProductError
         Where a variable is missing or has other dims.
     """
-    both = ("time", "range")
-    gates = ("backscatter", "backscatter_standard_error", "quality_flag")
-    budget = tuple(f"backscatter_error_{cause}" for cause in CAUSES)
-    along = {"time": ("time",), "reference_bottom": ("time",), "reference_top": ("time",)}
     require(
         product,
-        along
+        dict.fromkeys(_ALONG_TIME, ("time",))
         | {"range": ("range",), "molecular_backscatter": ("range",), "lidar_ratio": ()}
-        | dict.fromkeys((*gates, *budget), both),
+        | dict.fromkeys(_ALONG_BOTH, ("time", "range")),
     )
     r = product["range"].values.astype(np.float64)
     top = product["reference_top"].values.astype(np.float64)

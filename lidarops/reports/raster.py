@@ -23,6 +23,7 @@ COLUMNS: Final = 1500
 """Most columns of an image: about the pixels of a figure's width."""
 ROWS: Final = 800
 """Most rows of an image."""
+_ALONG_TIME: Final = ("time", "background", "background_standard_error")
 _READ_ROWS: Final = 4096
 """Most rows while reading: the part that is shown is known only afterwards."""
 _READ_BYTES: Final = 48_000_000
@@ -126,6 +127,15 @@ class Raster:
         )
 
 
+def raster_variables(quantity: str = "signal") -> tuple[str, ...]:
+    """Return the variables that `read_raster` reads, those too that a product need not have."""
+    return (*_ALONG_TIME, "range", *_along_both(quantity), "cloud_base_range", "altitude")
+
+
+def _along_both(quantity: str) -> tuple[str, ...]:
+    return quantity, f"{quantity}_standard_error", "quality_flag"
+
+
 def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int = 0) -> Raster:
     """Reduce one quantity of a product to block means.
 
@@ -150,9 +160,10 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
         Where a variable is missing or has other dims, or nothing was measured.
     """
     _check(product, quantity)
-    if not product.indexes["time"].is_monotonic_increasing:
-        product = product.sortby("time")
     time = product["time"].values.astype("datetime64[ns]")
+    if np.any(time[1:] < time[:-1]):
+        order = np.argsort(time, kind="stable")
+        product, time = product.isel(time=order), time[order]
     span = product["range"].values.astype(np.float64)
     size = profiles or -(-time.size // COLUMNS)
     columns = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(time)])
@@ -212,7 +223,10 @@ def _sums(
     def total(values: Floats | NDArray[np.bool_]) -> Sums:
         if values.dtype == np.bool_ and not values.any():
             return np.zeros((columns.size, rows.size), dtype=np.float32)
-        by_row = np.add.reduceat(values.astype(np.float64, copy=False), rows, axis=1)
+        by_row = values.astype(np.float64, copy=False)
+        # Up to as many gates as rows a row is a gate.
+        if rows.size < values.shape[1]:
+            by_row = np.add.reduceat(by_row, rows, axis=1)
         return np.asarray(np.add.reduceat(by_row, columns, axis=0), dtype=np.float32)
 
     signal = part[quantity].values.astype(np.float64)
@@ -286,10 +300,9 @@ def _altitude(product: xr.Dataset, span: Floats) -> tuple[float, float] | None:
 
 
 def _check(product: xr.Dataset, quantity: str) -> None:
-    both = ("time", "range")
-    names = (quantity, f"{quantity}_standard_error", "quality_flag")
-    along_time = dict.fromkeys(("time", "background", "background_standard_error"), ("time",))
-    require(product, along_time | {"range": ("range",)} | dict.fromkeys(names, both))
+    wanted: dict[str, tuple[str, ...]] = dict.fromkeys(_ALONG_TIME, ("time",))
+    wanted |= {"range": ("range",)} | dict.fromkeys(_along_both(quantity), ("time", "range"))
+    require(product, wanted)
     if product.sizes["time"] < 1 or product.sizes["range"] < 2:
         raise ProductError("holds no profile of at least 2 gates", field=quantity)
 

@@ -22,6 +22,25 @@ Mask = NDArray[np.bool_]
 QUANTITIES: Final = ("optical_depth", "extinction")
 """Retrieved quantities of a profile, by the name of their variable."""
 
+_ERRORS: Final = ("", "_standard_error", "_gradient_error")
+_ALONG_BOTH: Final = (
+    *(f"{name}{error}" for name in QUANTITIES for error in _ERRORS),
+    "quality_flag",
+)
+_PROFILES: Final = ("time", "altitude", "reach", *_ALONG_BOTH)
+CYCLE_VARIABLES: Final = (*_PROFILES, "time_bnds", "station_altitude", "wavelength")
+"""What `clearest_cycle` reads of a product."""
+EXTINCTION_VARIABLES: Final = _PROFILES
+"""What `read_extinction` reads of a product."""
+RESIDUAL_VARIABLES: Final = (
+    "time",
+    "altitude",
+    "ray_zenith_angle",
+    "ray_azimuth",
+    "quality_flag",
+    "residual",
+)
+"""What `read_residuals` reads of a product."""
 _REJECTED: Final = int(Quality.rejecting())
 _WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
 _UNITS: Final = {"optical_depth": "1", "extinction": "m-1"}
@@ -194,12 +213,10 @@ def _estimate(chosen: xr.Dataset, name: str, bits: NDArray[np.int64]) -> Estimat
 
 
 def _check_profiles(product: xr.Dataset) -> None:
-    errors = ("", "_standard_error", "_gradient_error")
-    both = [f"{name}{error}" for name in QUANTITIES for error in errors]
     require(
         product,
         {"time": ("time",), "altitude": ("altitude",), "reach": ("time",)}
-        | dict.fromkeys((*both, "quality_flag"), ("time", "altitude")),
+        | dict.fromkeys(_ALONG_BOTH, ("time", "altitude")),
     )
     for name, wanted in _UNITS.items():
         units = product[name].attrs.get("units")

@@ -61,6 +61,15 @@ class Section:
         return np.asarray((self.flag & int(Quality.rejecting())) != 0)
 
 
+_ALONG_BOTH: Final = (
+    *QUANTITIES,
+    *(f"{name}_standard_error" for name in QUANTITIES),
+    "quality_flag",
+)
+SECTION_VARIABLES: Final = ("time", *_ALONG_BOTH, "section_bounds")
+"""What `read_sections` reads of a product."""
+
+
 class Verdict(StrEnum):
     """What a comparison with the truth says of the stated standard errors."""
 
@@ -336,8 +345,7 @@ def _gathered(parts: list[Floats], order: NDArray[np.intp]) -> Floats:
 
 
 def _check(product: xr.Dataset) -> None:
-    names = [*QUANTITIES, *(f"{name}_standard_error" for name in QUANTITIES), "quality_flag"]
-    require(product, {"time": ("time",)} | dict.fromkeys(names, ("time", "section")))
+    require(product, {"time": ("time",)} | dict.fromkeys(_ALONG_BOTH, ("time", "section")))
     if "section_bounds" not in product or product["section_bounds"].shape[1:] != (2,):
         raise ProductError("has no bounds of sections", field="section_bounds")
     units = product["extinction"].attrs.get("units")
