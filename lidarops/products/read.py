@@ -139,9 +139,9 @@ class _File:
             found = {name: self._stored(name, there) for name in names}
         stored = {name: variable for name, variable in found.items() if variable is not None}
         for variable in list(stored.values()):
-            # Bounds have the units of what they bound.
+            # Bounds of times have no units of their own.
             bounds = variable.attrs.pop("bounds", None)
-            if bounds in stored and "units" in variable.attrs:
+            if bounds in stored and _is_time(variable):
                 stored[bounds].attrs.setdefault("units", variable.attrs["units"])
         return {name: self._decoded(name, variable) for name, variable in stored.items()}
 
@@ -232,9 +232,12 @@ def _is_ours(dataset: h5py.Dataset) -> bool:
 
 def _is_plain(stored: xr.Variable) -> bool:
     """Whether a variable holds what is in the file: a number that nothing says how to take."""
-    units = str(stored.attrs.get("units", ""))
-    coded = stored.attrs.keys() - {"units"} or " since " in units
+    coded = stored.attrs.keys() - {"units"} or _is_time(stored)
     return stored.dtype.kind in "iuf" and not coded
+
+
+def _is_time(stored: xr.Variable) -> bool:
+    return " since " in str(stored.attrs.get("units", ""))
 
 
 def _count(size: int, step: int) -> int:
