@@ -24,7 +24,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from lidarops.flags import Quality
-from lidarops.reports.raster import Raster, share_with_care
+from lidarops.reports.raster import Raster, joined, share_with_care
 from lidarops.reports.series import Section, compare, normalised_error, thin
 from lidarops.reports.timeaxis import TimeAxis, Times, segments
 from lidarops.reports.words import bit_name, percent, visible
@@ -333,7 +333,7 @@ def image(
     full = max(float(raster.edges[-1]) for raster in rasters)
     reach = max(raster.reach for raster in rasters)
     far = min(full, 1.2 * reach) if reach > 0 else full
-    cut = [raster.shown_to(far) for raster in rasters]
+    cut = joined([raster.shown_to(far) for raster in rasters])
     panel.set_ylabel("range (km)")
     panel.set_ylim(min(0.0, *(float(r.edges[0]) for r in cut)) / 1e3, far / 1e3)
     panel.spines[["top", "right"]].set_visible(False)

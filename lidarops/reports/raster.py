@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -24,6 +26,19 @@ COLUMNS: Final = 1500
 ROWS: Final = 800
 """Most rows of an image."""
 _ALONG_TIME: Final = ("time", "background", "background_standard_error")
+_COLUMNWISE: Final = (
+    "start",
+    "stop",
+    "total",
+    "variance",
+    "used",
+    "rejected",
+    "profiles",
+    "background",
+    "background_error",
+    "clouds",
+)
+"""What a raster has along its columns."""
 _READ_ROWS: Final = 4096
 """Most rows while reading: the part that is shown is known only afterwards."""
 _READ_BYTES: Final = 48_000_000
@@ -189,6 +204,48 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
         background_units=str(product["background"].attrs.get("units", "")),
         bits=Quality(int(np.bitwise_or.reduce([part.bits for part in parts]))),
         altitude=_altitude(product, span),
+    )
+
+
+def joined(rasters: Sequence[Raster]) -> list[Raster]:
+    """Join rasters that follow one another in time and have the same rows: one is drawn sooner.
+
+    Parameters
+    ----------
+    rasters : sequence of Raster
+        Of one quantity.
+
+    Returns
+    -------
+    list of Raster
+        With the columns of all in their order. One that starts before another ends is not joined
+        to it.
+    """
+    found: list[list[Raster]] = []
+    for raster in rasters:
+        last = found[-1][-1] if found else None
+        if (
+            last is not None
+            and last.stop[-1] <= raster.start[0]
+            and np.array_equal(last.edges, raster.edges)
+        ):
+            found[-1].append(raster)
+        else:
+            found.append([raster])
+    return [_joined(following) for following in found]
+
+
+def _joined(rasters: Sequence[Raster]) -> Raster:
+    if len(rasters) == 1:
+        return rasters[0]
+    along_time = {
+        name: np.concatenate([getattr(raster, name) for raster in rasters]) for name in _COLUMNWISE
+    }
+    return replace(
+        rasters[0],
+        **along_time,
+        with_care=sum(raster.with_care for raster in rasters),
+        bits=functools.reduce(operator.or_, (raster.bits for raster in rasters)),
     )
 
 
