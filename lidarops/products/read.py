@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -28,7 +28,6 @@ from lidarops.products.write import BULK_BYTES
 
 _ATTRIBUTES: Final = (
     "units",
-    "bounds",
     "calendar",
     "_FillValue",
     "missing_value",
@@ -141,22 +140,27 @@ class _File:
         for variable in list(stored.values()):
             # Bounds of times have no units of their own.
             bounds = variable.attrs.pop("bounds", None)
-            if bounds in stored and _is_time(variable):
+            if bounds in stored:
                 stored[bounds].attrs.setdefault("units", variable.attrs["units"])
         return {name: self._decoded(name, variable) for name, variable in stored.items()}
 
     def _stored(self, name: str, there: Container[str]) -> xr.Variable | None:
         foreign = f"{_OTHER_DIMENSION}{name}"
         inside = foreign if foreign in there else name
-        found = self._file[inside] if inside in there else None
-        if not isinstance(found, h5py.Dataset) or _is_bare_dimension(found):
+        if inside not in there:
             return None
-        attributes = _attributes(found)
+        # To get it from the file takes four times as long.
+        found = h5py.Dataset(h5py.h5d.open(self._file.id, inside.encode()))
+        if _is_bare_dimension(found):
+            return None
+        dims, attributes = _dimensions(found, name), _attributes(found)
+        fill = _own_fill(found.dtype, attributes)
         if found.size * found.dtype.itemsize < BULK_BYTES:
             # Most are small and asked for again and again.
-            return xr.Variable(_dimensions(found, name), found[()], attributes, fastpath=True)
-        lazy = indexing.LazilyIndexedArray(_Stored(self, found))
-        return xr.Variable(_dimensions(found, name), lazy, attributes, fastpath=True)
+            values = _unfilled(np.asarray(found[()]), fill)
+            return xr.Variable(dims, values, attributes, fastpath=True)
+        lazy = indexing.LazilyIndexedArray(_Stored(self, found, fill))
+        return xr.Variable(dims, lazy, attributes, fastpath=True)
 
     def _decoded(self, name: str, stored: xr.Variable) -> xr.Variable:
         if _is_plain(stored):
@@ -171,11 +175,12 @@ class _File:
 
 
 class _Stored(BackendArray):
-    """The values of a variable as they are in the file, read where they are indexed."""
+    """The values of a variable, read where they are indexed; NaN where they are missing."""
 
-    def __init__(self, file: _File, dataset: h5py.Dataset) -> None:
+    def __init__(self, file: _File, dataset: h5py.Dataset, fill: np.floating[Any] | None) -> None:
         self._file = file
         self._dataset = dataset
+        self._fill = fill
         self._deflated = _is_ours(dataset)
         self.shape = dataset.shape
         self.dtype = dataset.dtype
@@ -189,9 +194,10 @@ class _Stored(BackendArray):
         if self._deflated and all(isinstance(one, slice) for one in key):
             spans = [range(size)[one] for size, one in zip(self.shape, key, strict=True)]
             if all(span.step == 1 for span in spans):
-                return self._inflate(spans)
+                return _unfilled(self._inflate(spans), self._fill)
         with self._file.access():
-            return np.asarray(self._dataset[key])
+            values = np.asarray(self._dataset[key])
+        return _unfilled(values, self._fill)
 
     def _inflate(self, spans: list[range]) -> NDArray[Any]:
         """Read a block of whole chunks or parts of them, faster than HDF5's own filters do."""
@@ -230,14 +236,30 @@ def _is_ours(dataset: h5py.Dataset) -> bool:
     return plain and filters == _FILTERS and dataset.id.get_num_chunks() == chunks
 
 
+def _own_fill(dtype: np.dtype[Any], attributes: dict[str, Any]) -> np.floating[Any] | None:
+    """Take out the fill value of a number that nothing else is said of, as in our products."""
+    fill = attributes.get("_FillValue")
+    alone = attributes.keys() <= {"units", "_FillValue"} and not _told_as_time(attributes)
+    if isinstance(fill, np.floating) and dtype == fill.dtype and dtype.isnative and alone:
+        del attributes["_FillValue"]
+        return fill
+    return None
+
+
+def _unfilled(values: NDArray[Any], fill: np.floating[Any] | None) -> NDArray[Any]:
+    if fill is not None:
+        values[values == fill] = np.nan
+    return values
+
+
 def _is_plain(stored: xr.Variable) -> bool:
     """Whether a variable holds what is in the file: a number that nothing says how to take."""
-    coded = stored.attrs.keys() - {"units"} or _is_time(stored)
+    coded = stored.attrs.keys() - {"units"} or _told_as_time(stored.attrs)
     return stored.dtype.kind in "iuf" and not coded
 
 
-def _is_time(stored: xr.Variable) -> bool:
-    return " since " in str(stored.attrs.get("units", ""))
+def _told_as_time(attributes: Mapping[str, Any]) -> bool:
+    return " since " in str(attributes.get("units", ""))
 
 
 def _count(size: int, step: int) -> int:
@@ -264,14 +286,16 @@ def _dimensions(dataset: h5py.Dataset, name: str) -> tuple[str, ...]:
 
 
 def _attributes(dataset: h5py.Dataset) -> dict[str, Any]:
-    found = {}
-    for name in _ATTRIBUTES:
-        if h5py.h5a.exists(dataset.id, name.encode()):
-            value = dataset.attrs[name]
-            if isinstance(value, bytes):
-                value = value.decode()
-            elif isinstance(value, np.ndarray) and value.size == 1:
-                # What NetCDF holds as one number is an array of one in HDF5.
-                value = value[0]
-            found[name] = value
+    there = [name for name in _ATTRIBUTES if h5py.h5a.exists(dataset.id, name.encode())]
+    found = {name: _attribute(dataset, name) for name in there}
+    if _told_as_time(found) and "bounds" in dataset.attrs:
+        found["bounds"] = _attribute(dataset, "bounds")
     return found
+
+
+def _attribute(dataset: h5py.Dataset, name: str) -> Any:
+    value = dataset.attrs[name]
+    if isinstance(value, bytes):
+        return value.decode()
+    # What NetCDF holds as one number is an array of one in HDF5.
+    return value[0] if isinstance(value, np.ndarray) and value.size == 1 else value

@@ -6,7 +6,7 @@ import functools
 import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -238,7 +238,7 @@ def joined(rasters: Sequence[Raster]) -> list[Raster]:
 def _joined(rasters: Sequence[Raster]) -> Raster:
     if len(rasters) == 1:
         return rasters[0]
-    along_time = {
+    along_time: dict[str, Any] = {
         name: np.concatenate([getattr(raster, name) for raster in rasters]) for name in _COLUMNWISE
     }
     return replace(

@@ -78,16 +78,21 @@ def test_missing_values_are_nan(chunked: Path):
     assert missing.sum() == 1893 + 2000 + 1
 
 
+def slices(size: int) -> st.SearchStrategy[slice]:
+    # Of an empty one xarray cannot tell where it ends if it goes backwards.
+    return st.slices(size).filter(lambda part: len(range(size)[part]) > 0)
+
+
 KEYS = st.one_of(
     st.integers(0, 299),
-    st.slices(300),
+    slices(300),
     st.lists(st.integers(0, 299), min_size=1, max_size=5).map(np.array),
     st.lists(st.booleans(), min_size=300, max_size=300).map(np.array),
 )
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
-@given(time=KEYS, gates=st.one_of(st.integers(0, 1999), st.slices(2000)))
+@given(time=KEYS, gates=st.one_of(st.integers(0, 1999), slices(2000)))
 def test_any_part_is_that_part_of_the_whole(chunked: Path, time: object, gates: object):
     with open_product(chunked, ["signal", "quality_flag"]) as product:
         whole = product["signal"].values
