@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.reports import raster
-from lidarops.reports.raster import read_raster, share_with_care
+from lidarops.reports import figures, panels, raster
+from lidarops.reports.raster import joined, read_raster, share_with_care
 
 BAD = int(Quality.rejecting())
 CARE = [bit for bit in Quality if bit not in Quality.rejecting()]
@@ -142,3 +142,38 @@ def test_missing_variable_is_named(name):
 def test_empty_product_is_refused():
     with pytest.raises(ProductError, match="no profile"):
         read_raster(signal(times(START, 3, 60.0)).isel(time=slice(0)))
+
+
+def rasters_of(*starts: float, gates: int = 30) -> list[raster.Raster]:
+    """Rasters of an hour each, from so many hours after the start."""
+    return [
+        read_raster(signal(times(START + timedelta(hours=hours), 60, 60.0), gates=gates, seed=seed))
+        for seed, hours in enumerate(starts)
+    ]
+
+
+def test_joined_are_those_that_follow_one_another_with_the_same_rows():
+    following = rasters_of(0, 1, 5)
+    (whole,) = joined(following)
+    assert whole.start.size == 180
+    np.testing.assert_array_equal(whole.mean, np.concatenate([one.mean for one in following]))
+    np.testing.assert_array_equal(whole.flagged, np.concatenate([one.flagged for one in following]))
+    np.testing.assert_array_equal(whole.edges, following[0].edges)
+    assert whole.with_care == sum(one.with_care for one in following)
+    assert share_with_care([whole]) == pytest.approx(share_with_care(following))
+    assert whole.bits == following[0].bits | following[1].bits | following[2].bits
+
+
+def test_joined_are_no_others():
+    overlapping, backwards = rasters_of(0, 0.5), rasters_of(1, 0)
+    other_rows = [*rasters_of(0), *rasters_of(1, gates=31)]
+    for apart in (overlapping, backwards, other_rows):
+        assert joined(apart) == apart
+    assert joined([]) == []
+
+
+def test_the_picture_of_joined_rasters_is_that_of_each(monkeypatch):
+    parts = rasters_of(0, 1, 2, 6, 6.5)
+    one = figures.render(figures.draw_quicklook(parts, title="joined"))
+    monkeypatch.setattr(panels, "joined", list)
+    assert figures.render(figures.draw_quicklook(parts, title="joined")) == one
