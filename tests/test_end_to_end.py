@@ -163,7 +163,7 @@ def test_the_command_line_reprocesses_and_tells(
     assert len(told["refused_files"]) == summary["refused"]
     page = Path(told["report"])
     assert page.is_file()
-    result = runner.invoke(app, ["report", str(page.parent)])
+    result = runner.invoke(app, ["report", str(page.parent), "--workers", "2"])
     assert result.exit_code == 0
     assert result.stdout.strip() == str(page)
     product = tmp_path / "products" / told["products"][0]

@@ -15,15 +15,16 @@ from lidarops.cli.app import JsonOption, app, plainly, show
 @plainly
 def report(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or its run.json.", metavar="RUN")],
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
 ) -> None:
     """Build the HTML report and figures of a run again.
 
-    Example: lidarops report demo/report/20260301T000000-ab12cd
+    Example: lidarops report demo/report/20260301T000000-ab12cd --workers 2
     """
     from lidarops.reports import page, record
 
     folder = run if run.is_dir() else run.parent
-    typer.echo(str(page.build(record.load(run), folder)))
+    typer.echo(str(page.build(record.load(run), folder, workers=workers)))
 
 
 @app.command()
