@@ -17,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from lidarops import kubernetes
-from lidarops.engine import local_client
+from lidarops.engine import TRIMMING, local_client
 from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ Memory = Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$", description="
 Name = Annotated[str, Field(pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$", max_length=63)]
 Workers = Annotated[int, Field(ge=1, le=10_000)]
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+_ENVIRONMENT = f"""export DASK_DISTRIBUTED__NANNY__PRE_SPAWN_ENVIRON="{{'{TRIMMING}': None}}\""""
 
 
 class ClusterError(LidarOpsError):
@@ -258,7 +259,7 @@ def _slurm(cluster: Slurm) -> Any:
         security=_security(cluster.tls) or True,
         shared_temp_directory=str(folder),
         log_directory=str(folder),
-        job_script_prologue=list(cluster.prologue),
+        job_script_prologue=[_ENVIRONMENT, *cluster.prologue],
         job_extra_directives=list(cluster.directives),
         scheduler_options={"dashboard": False, "dashboard_address": None},
     )

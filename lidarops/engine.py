@@ -45,6 +45,8 @@ GRACE: Final = 20.0
 """s that scenes in hand get to end, on a cluster that is asked to stop."""
 TRIES: Final = 3
 """Times that a scene may take its worker down before it is refused."""
+TRIMMING: Final = "MALLOC_TRIM_THRESHOLD_"
+"""Variable by which dask has the C library give back small pieces of memory at once."""
 _DASK: Final = {
     # Every death of a worker is to be seen here, where it is counted for its scene alone.
     "distributed.scheduler.allowed-failures": 0,
@@ -52,6 +54,8 @@ _DASK: Final = {
     # served, and fifty times to look how late it is.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
+    # With it every array is mapped and given back for itself: a third of a worker's time.
+    f"distributed.nanny.pre-spawn-environ.{TRIMMING}": None,
 }
 
 _LOG = logging.getLogger(__name__)
