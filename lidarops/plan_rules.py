@@ -303,10 +303,15 @@ def gates(steps: Collection[Step]) -> dict[str, Stretches]:
         if step.name == StepName.GLUE:
             whole |= set(step.settings.values())
     return {
-        step.channel: tuple((first, past) for first, past in step.settings["bins"])
+        step.channel: _stretches(step.settings["bins"])
         for step in steps
         if step.name == StepName.RANGE_GATE and step.channel not in whole
     }
+
+
+def _stretches(told: Any) -> Stretches:
+    # Older products tell in their plan how many of the nearest bins were kept.
+    return ((0, told),) if isinstance(told, int) else tuple((low, past) for low, past in told)
 
 
 def reaching(nearest: float, farthest: float, case: Case) -> tuple[int, int]:

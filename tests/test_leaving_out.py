@@ -17,9 +17,10 @@ from lidarops import processing, steps
 from lidarops.engine import run
 from lidarops.flags import Quality
 from lidarops.pipeline import Options, prepare, reprocess
+from lidarops.plan_rules import gates
 from lidarops.plans import CHANNEL, GATE, PRODUCTS, plan
 from lidarops.processing import Job, process
-from lidarops.records import Plan, Role, RunRecord
+from lidarops.records import Plan, Role, RunRecord, Step
 from lidarops.refinement import GAP, WITHOUT, refine
 from lidarops.retrieve import _angle_block, _slant, labeled_scan
 from lidarops.retrieve.molecular import MolecularProfile
@@ -297,6 +298,11 @@ def test_the_gate_holds_the_farthest_section_and_what_tells_its_noise():
     moved = told(channels={"photon_532o": {"range_offset": -75.0}})
     (gate,) = (s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_gate")
     assert gate.settings == {"bins": [[0, 1112]]}
+
+
+def test_the_gate_of_an_older_product_is_understood():
+    step = Step("range_gate", "photon_532o", {"bins": 1102}, "as it was told")
+    assert gates([step]) == {"photon_532o": ((0, 1102),)}
 
 
 # Looks ----------------------------------------------------------------------------------------

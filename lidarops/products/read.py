@@ -208,15 +208,24 @@ class _Stored(BackendArray):
             for span, step in zip(spans, chunk, strict=True)
         )
         for corner in itertools.product(*corners):
-            with self._file.access():
-                _, data = self._dataset.id.read_direct_chunk(corner)
-            try:
-                part = inflated(data, chunk, self.dtype)
-            except ValueError as error:
-                raise self._file.damaged(error) from error
+            part = self._part(corner)
             into, out_of = zip(*map(_shared, spans, corner, chunk), strict=True)
             values[into] = part[out_of]
         return values
+
+    def _part(self, corner: tuple[int, ...]) -> NDArray[Any]:
+        """Read a chunk; of one that HDF5 itself must read, what lies within the values."""
+        chunk = self._dataset.chunks
+        with self._file.access():
+            skipped, data = self._dataset.id.read_direct_chunk(corner)
+            if skipped:
+                # HDF5 may store a chunk without some of the filters.
+                inside = (slice(at, at + step) for at, step in zip(corner, chunk, strict=True))
+                return np.asarray(self._dataset[tuple(inside)])
+        try:
+            return inflated(data, chunk, self.dtype)
+        except ValueError as error:
+            raise self._file.damaged(error) from error
 
 
 def _shared(span: range, corner: int, step: int) -> tuple[slice, slice]:

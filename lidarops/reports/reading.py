@@ -73,7 +73,8 @@ class Readers:
         self._truth = truth
         self._pool: ProcessPoolExecutor | None = None
         processes = min(workers, products // FEWEST)
-        if processes > 1:
+        # A daemonic process, as a worker of dask is, may not have any of its own.
+        if processes > 1 and not multiprocessing.current_process().daemon:
             # A fork would inherit the locks of whatever threads are running.
             self._pool = ProcessPoolExecutor(
                 processes,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -237,3 +238,23 @@ class TestDamage:
         # HDF5 refuses to write to a file that it has open for reading.
         with h5py.File(path, "a") as file:
             file.attrs["title"] = "still writable"
+
+
+@pytest.mark.parametrize("skipped", [1, 3])
+def test_chunks_stored_without_some_filters_are_as_hdf5_has_them(
+    chunked: Path, tmp_path: Path, skipped: int
+):
+    path = tmp_path / "other.nc"
+    path.write_bytes(chunked.read_bytes())
+    with h5py.File(path, "r+") as file:
+        target = file["signal"]
+        rows = target.chunks[0]
+        for corner in range(0, target.shape[0], rows):
+            whole = np.zeros(target.chunks, target.dtype)
+            part = target[corner : corner + rows]
+            whole[: len(part)] = part
+            plain = whole.tobytes()
+            stored = zlib.compress(plain) if skipped == 1 else plain
+            target.id.write_direct_chunk((corner, 0), stored, filter_mask=skipped)
+    with open_product(path, ["signal"]) as found:
+        assert_same(found["signal"][1:, 3:], by_xarray(chunked)["signal"][1:, 3:])

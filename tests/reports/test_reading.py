@@ -151,6 +151,11 @@ class TestReaders:
             assert set(readers.each(readings(paths, process))) == {os.getpid()}
         assert caplog.text.count("a process that read products was lost") == 1
 
+    def test_a_daemon_that_may_start_no_process_reads_itself(self, paths, monkeypatch):
+        monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
+        with Readers(2, 1000) as readers:
+            assert set(readers.each(readings(paths, process))) == {os.getpid()}
+
     def test_nothing_to_read(self):
         with Readers(2, 1000) as readers:
             assert list(readers.each([])) == []
