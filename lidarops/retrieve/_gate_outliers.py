@@ -1,10 +1,13 @@
 """Compiled search for single gates that lie off their neighbours, and what takes their place.
 
 Air leaves next to nothing in what is left of a gate when a polynomial through the three gates on
-either side is taken from it: a plume of 50 m less than 1e-5 of the signal at gates of 7.5 m. So
-what noise does not explain there is no air. Such a gate is bridged: the logarithm of the same
-polynomial takes its place, and its derivatives go to the gates that made it, so that variances
-stay those of the gates that were used. Where too many lie together to be told apart, the ray ends.
+either side is taken from it: a plume of 50 m less than 1e-5 of the signal at gates of 7.5 m. So a
+gate that alone lies off by more than noise explains is no air. It is bridged: the logarithm of the
+same polynomial takes its place, and its derivatives go to the gates that made it, so that
+variances stay those of the gates that were used. Edges of layers and clouds are air: they leave
+several gates off, or something beside the one that is taken out, and such a ray stays as it is.
+So do rays of wider gates than 10 m, where a layer may fill a single one. Where more gates lie off
+than could be wild, noise is not what is stated, and the ray is not believed.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -25,7 +28,7 @@ OUTLYING: Final = 6.0
 """Standard errors off; chance goes beyond once in 5e8 gates."""
 REACH: Final = 8
 """Gates to either side among which neighbours are sought."""
-BEYOND: Final = 4
+MARGIN: Final = 4
 """Gates before and behind those of a ray that are used, which judge them."""
 NODES: Final = 6
 """Neighbours through which a polynomial goes."""
@@ -33,10 +36,9 @@ GOOD: Final = 0
 LOST: Final = 1
 """Missing, or not positive."""
 BRIDGED: Final = 2
-KIND: Final = 3
-"""Mask of these three."""
-EDGE: Final = 4
-"""Bit of the gate that begins after a jump of the signal, across which none tells another."""
+
+LEFT: Final = -1
+"""Number of bridged gates of a ray with some that lie off together, which stay as they are."""
 
 _SIDE: Final = 3
 _OTHER_SIDE: Final = (6, 3, 4, 3)
@@ -51,13 +53,15 @@ _LOUD: Final = 0.02
 """Relative standard error of a gate from which on logarithms are not normal in their tails."""
 _LOUD_ESTIMATED: Final = 0.05
 """The same of an estimated one, that tells nothing of a single gate: louder ones are not tested."""
-_CROWD: Final = 3
-"""Bridged gates among 7; with more, nothing tells which gates are right."""
-_SUSPECT: Final = 3.5
-"""Standard errors off, of what is left about a bridged gate, from which on it may be an edge."""
-_FEW: Final = 2
-_SHARE: Final = 0.1
-"""Of the gates of a ray, beyond a few, that may be bridged."""
+WIDEST: Final = 10.0
+"""m, of gates of which a single one is too narrow for a layer of air."""
+_SUSPECT: Final = 4.5
+"""Standard errors off, of gates about a bridged one, from which on it may be an edge."""
+_STEP: Final = 0.1
+"""Logarithm by which air may change over 4 gates: that of 2 km of visibility."""
+_FEW: Final = 14
+_SHARE: Final = 0.2
+"""Of the gates of a ray, beyond those that two edges make, that may lie off."""
 _LARGEST_LOGARITHM: Final = 300.0
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -97,8 +101,8 @@ def _gather(
     """Fill the nearest good gates before and behind a gate, in order; return how many."""
     below = 0
     g = at - 1
-    while below < wanted[0] and g >= max(first, at - REACH) and codes[g + 1] & EDGE == 0:
-        if codes[g] & KIND == GOOD:
+    while below < wanted[0] and g >= max(first, at - REACH):
+        if codes[g] == GOOD:
             below += 1
             nodes[wanted[0] - below] = g
         g -= 1
@@ -106,8 +110,8 @@ def _gather(
         nodes[i] = nodes[wanted[0] - below + i]
     count = below
     g = at + 1
-    while count < below + wanted[1] and g < min(stop, at + REACH + 1) and codes[g] & EDGE == 0:
-        if codes[g] & KIND == GOOD:
+    while count < below + wanted[1] and g < min(stop, at + REACH + 1):
+        if codes[g] == GOOD:
             nodes[count] = g
             count += 1
         g += 1
@@ -119,13 +123,9 @@ def _sides(codes: Codes, at: int, first: int, stop: int) -> tuple[int, int]:
     """Return how many good gates before and behind a gate make its polynomial."""
     below = above = 0
     for g in range(at - 1, max(first, at - REACH) - 1, -1):
-        if codes[g + 1] & EDGE != 0:
-            break
-        below += codes[g] & KIND == GOOD
+        below += codes[g] == GOOD
     for g in range(at + 1, min(stop, at + REACH + 1)):
-        if codes[g] & EDGE != 0:
-            break
-        above += codes[g] & KIND == GOOD
+        above += codes[g] == GOOD
     if below >= _SIDE and above >= _SIDE:
         return _SIDE, _SIDE
     if below < above:
@@ -278,13 +278,12 @@ def _measure(
     nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     for g in range(start, end):
         off[g] = 0.0
-        if codes[g] & KIND != GOOD:
+        if codes[g] != GOOD:
             continue
         whole = first <= planned[0][g, 0] and planned[0][g, NODES - 1] < stop
         marks = 0
         for i in range(NODES):
             marks |= codes[planned[0][g, i]]
-        # An edge hides from a gate's neighbours only at themselves, at it, or where one is lost.
         whole = whole and marks | codes[g] == GOOD
         if whole:
             off[g] = _off(
@@ -316,7 +315,7 @@ def _worst(
     nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     found, most = hit, 0.0
     for g in range(max(first, hit - _SIDE), min(stop, hit + _SIDE + 1)):
-        if codes[g] & KIND != GOOD:
+        if codes[g] != GOOD:
             continue
         count = _gather(codes, g, first, stop, (_JUDGES, _JUDGES), nodes)
         if count < _SIDE:
@@ -329,64 +328,51 @@ def _worst(
 
 
 @_compiled
-def _company(codes: Codes, at: int, first: int, stop: int) -> int:
-    """Return how many gates about a bridged one are bridged, with it."""
-    number = 0
-    for g in range(max(first, at - _SIDE), min(stop, at + _SIDE + 1)):
-        number += codes[g] & KIND == BRIDGED
-    return number
+def _jumps(
+    logs: Array, noise: Array, exponent: float, codes: Codes, at: int, first: int, stop: int
+) -> bool:
+    """Return whether the signal before a gate and that behind it differ by more than air's slope.
+
+    The gate may then be the one in which a layer begins.
+    """
+    step = spread = 0.0
+    for way in (-1, 1):
+        count, total, variance, g = 0, 0.0, 0.0, at + way
+        while count < _SIDE and first <= g < stop and abs(g - at) <= REACH:
+            if codes[g] == GOOD:
+                count, total, variance = count + 1, total + logs[g], variance + noise[g]
+            g += way
+        if count == 0:
+            return False
+        step += way * total / count
+        spread += variance / (count * count)
+    return abs(step) > max(_STEP * exponent, OUTLYING * math.sqrt(spread))
 
 
 @_compiled
-def _cluster(codes: Codes, at: int, first: int, stop: int) -> tuple[int, int]:
-    """Return the first and the last of the gates that lie together with one that is off."""
-    begin = end = at
-    for g in range(at - 1, first - 1, -1):
-        if g < begin - _SIDE:
-            break
-        if codes[g] & KIND == BRIDGED:
-            begin = g
-    for g in range(at + 1, stop):
-        if g > end + _SIDE:
-            break
-        if codes[g] & KIND == BRIDGED:
-            end = g
-    return begin, end
-
-
-@_compiled
-def _is_edge(
+def _alone(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
-    relative: bool,
-    grid: Array,
     codes: Codes,
-    span: tuple[int, int, int, int],
-    bound: float,
-    planned: tuple[Indices, Array, Array],
     off: Array,
+    first: int,
+    stop: int,
 ) -> bool:
-    """Mark where the signal jumps, if gates then agree with those on their side within a bound.
+    """Return whether every bridged gate lies alone, and all gates about it are as they should be.
 
-    The edge of a layer is no crowd of wild gates; what the signal is on either side is right.
+    Several together, what is left beside one, or a jump from one side to the other may be the
+    edge of a layer or a cloud.
     """
-    first, stop, begin, end = span
-    start, last = max(first, begin - REACH), min(stop, end + REACH + 1)
-    before = codes[begin : end + 1].copy()
-    for g in range(begin, end + 1):
-        if codes[g] & KIND == BRIDGED:
-            codes[g] &= EDGE
-    for edge in range(max(begin, first + 1), min(end + 2, stop)):
-        known = codes[edge]
-        codes[edge] |= EDGE
-        if bound >= _measure(
-            row, exponent, relative, grid, codes, (first, stop, start, last), planned, off
-        ):
-            return True
-        codes[edge] = known
-    codes[begin : end + 1] = before
-    _measure(row, exponent, relative, grid, codes, (first, stop, start, last), planned, off)
-    return False
+    for at in range(first, stop):
+        if codes[at] != BRIDGED:
+            continue
+        for g in range(max(first, at - REACH), min(stop, at + REACH + 1)):
+            near = g != at and abs(g - at) <= _SIDE
+            if off[g] > _SUSPECT or (near and codes[g] == BRIDGED):
+                return False
+        if _jumps(row[0], row[1], exponent, codes, at, first, stop):
+            return False
+    return True
 
 
 @_compiled
@@ -482,49 +468,41 @@ def find(
     planned : (bin, NODES) intp, (bin, NODES) float64, (bin,) float64
         Of `plan`.
     codes : (bin,) uint8
-        In: GOOD or LOST; out: also BRIDGED, and EDGE where the signal jumps.
+        In: GOOD or LOST; out: also BRIDGED.
     off : (bin,) float64
         Scratch.
 
     Returns
     -------
     int
-        How many were found.
+        How many are to be bridged; LEFT where several lie together.
     int
         Behind the last gate to be believed.
     """
     first, _, _, stop = span
     most = _FEW + int(_SHARE * (stop - first))
-    number, end = 0, stop
-    if _quiet(row, exponent, relative, codes, span, planned):
-        return number, end
+    number = 0
+    if stop <= first or _quiet(row, exponent, relative, codes, span, planned):
+        return number, stop
     _measure(row, exponent, relative, grid, codes, (first, stop, first, stop), planned, off)
+    wild = int(np.sum(off[first:stop] > OUTLYING))
+    if wild > most:
+        codes[first:stop] = LOST
+        return wild, first
     while True:
-        hit = first
-        for g in range(first, end):
-            if off[g] > off[hit]:
-                hit = g
-        if end <= first or not off[hit] > OUTLYING:
-            return number, end
-        worst = _worst(row, exponent, relative, grid, codes, hit, first, end)
+        hit = first + int(np.argmax(off[first:stop]))
+        if number > most or not off[hit] > OUTLYING:
+            break
+        worst = _worst(row, exponent, relative, grid, codes, hit, first, stop)
         codes[worst] = BRIDGED
         number += 1
-        about = max(first, worst - REACH), min(end, worst + REACH + 1)
-        left = _measure(row, exponent, relative, grid, codes, (first, end, *about), planned, off)
-        begin, last = _cluster(codes, worst, first, end)
-        if left > _SUSPECT and _is_edge(
-            row, exponent, relative, grid, codes, (first, end, begin, last),
-            min(left, OUTLYING), planned, off,
-        ):  # fmt: skip
-            continue
-        if number > most or _company(codes, worst, first, end) > _CROWD:
-            end = begin
-            for g in range(end, stop):
-                codes[g] = LOST
-            _measure(
-                row, exponent, relative, grid, codes,
-                (first, end, max(first, end - REACH), end), planned, off,
-            )  # fmt: skip
+        about = max(first, worst - REACH), min(stop, worst + REACH + 1)
+        _measure(row, exponent, relative, grid, codes, (first, stop, *about), planned, off)
+    if number > 0 and not _alone(row, exponent, codes, off, first, stop):
+        for g in range(first, stop):
+            codes[g] = GOOD if codes[g] == BRIDGED else codes[g]
+        number = LEFT
+    return number, stop
 
 
 @_compiled
@@ -558,7 +536,7 @@ def bridge(
     """
     first, stop, end = span
     for g in range(first, end):
-        if codes[g] & KIND != BRIDGED:
+        if codes[g] != BRIDGED:
             continue
         count, _ = neighbours(grid, codes, g, first, stop, nodes[g], shares[g])
         if count == 0:
@@ -586,7 +564,7 @@ def hand_on(
 ) -> None:
     """Give the derivatives by bridged gates to the gates that made them."""
     for g in range(span[0], span[1]):
-        if codes[g] & KIND != BRIDGED:
+        if codes[g] != BRIDGED:
             continue
         for q in range(quantities):
             if not bounds[q, 0] <= g < bounds[q, 1]:

@@ -293,16 +293,16 @@ def _slope_of(
     """Return the extinction that a straight line through logarithms gives, and its variance."""
     count = 0
     for g in range(first, last + 1):
-        count += codes[g] & _gate_outliers.KIND == _gate_outliers.GOOD
+        count += codes[g] == _gate_outliers.GOOD
     if count < 2:
         return math.nan, math.nan
     mean = 0.0
     for g in range(first, last + 1):
-        if codes[g] & _gate_outliers.KIND == _gate_outliers.GOOD:
+        if codes[g] == _gate_outliers.GOOD:
             mean += grid[g] / count
     square = product = spread = 0.0
     for g in range(first, last + 1):
-        if codes[g] & _gate_outliers.KIND != _gate_outliers.GOOD:
+        if codes[g] != _gate_outliers.GOOD:
             continue
         lever = grid[g] - mean
         square += lever * lever
@@ -433,7 +433,8 @@ def _screen(
 ) -> tuple[int, int]:
     """Bridge gates that lie off their neighbours.
 
-    Return behind which gate the ray is not to be believed, and how many are bridged before.
+    Return behind which gate the ray is not to be believed, and how many are bridged before; one
+    where gates lie off that are left as they are.
     """
     power, variance, log_factor = signal
     logs, noise, codes = row
@@ -446,13 +447,15 @@ def _screen(
         (logs, noise, plain, wide), exponent, relative, grid, span, planned, codes, off
     )
     end = min(end, stop)
+    if number == _gate_outliers.LEFT:
+        return end, 1
     if number > 0:
         end = _gate_outliers.bridge(
             logs, noise, exponent, grid, (first, last, end), codes, nodes, shares
         )
     number = 0
     for g in range(low, end):
-        number += codes[g] & _gate_outliers.KIND == _gate_outliers.BRIDGED
+        number += codes[g] == _gate_outliers.BRIDGED
     return end, number
 
 
@@ -504,10 +507,11 @@ def _condense(
                 spread = spread_row[g]
                 noise[g] = m * m * (spread if relative else spread / power[n, ray, g] ** 2)
                 codes[g] = _gate_outliers.GOOD
-            start = max(limits[ray, 0], low - _gate_outliers.BEYOND)
-            end = min(limits[ray, 1], stop + _gate_outliers.BEYOND)
+            start = max(limits[ray, 0], low - _gate_outliers.MARGIN)
+            end = min(limits[ray, 1], stop + _gate_outliers.MARGIN)
             found = 0
-            if screened and stop > low:
+            narrow = range_[ray, low + 1] - range_[ray, low] <= _gate_outliers.WIDEST
+            if screened and narrow and stop > low:
                 believed, found = _screen(
                     (power[n, ray], spread_row, log_factor[ray]), m, relative, range_[ray],
                     (start, low, stop, end),

@@ -92,8 +92,8 @@ class VertexFlags:
     weak_signal: Booleans
     """A ray of the vertex is too noisy there, and was left out; the others stand."""
     bridged: Booleans
-    """A ray of the vertex has gates that lie far off their neighbours, which took their place:
-    the value stands."""
+    """A ray of the vertex has gates that lie far off their neighbours: these took the place of
+    single ones, several together were left as they are. The value stands."""
     outlying: Booleans
     """A ray of the vertex has so many such gates before it that it was left out."""
     pole: Booleans

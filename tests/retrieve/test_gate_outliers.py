@@ -145,19 +145,18 @@ def test_a_spike_in_the_middle_of_a_long_ray_costs_nothing(size):
 
 
 @pytest.mark.parametrize("sizes", [(40.0, 40.0), (90.0, 30.0), (25.0, -25.0), (60.0, 0.0, 60.0)])
-def test_spikes_that_lie_together_are_told_apart(sizes):
+def test_spikes_that_lie_together_are_told_and_left(sizes):
+    """They may be the edge of a layer, which is air."""
     net, r, power, variance = scene(relative=0.02)
     at = gate_at(r, net.on_ray(0)[1][0])
     damaged = power
     for k, size in enumerate(sizes):
         damaged = hit(damaged, variance, slice(None), 0, at + k, size)
-    clean, found = solved(net, r, power, variance), solved(net, r, damaged, variance)
-    assert found.flags.bridged[:, net.on_ray(0)[0]].mean() > 0.95
-    good = ~found.flags.flagged & ~clean.flags.flagged & np.isfinite(found.extinction)
-    assert np.mean(good[:, clean.near_vertex]) > 0.8 * np.mean(
-        ~clean.flags.flagged[:, clean.near_vertex]
-    )
-    assert np.mean(apart(found, clean)[good] < 2.0) > 0.95
+    found, _ = condensed(net, r, damaged, variance)
+    plain, _ = condensed(net, r, damaged, variance, screened=False)
+    assert found.bridged[:, 0].mean() > 0.95
+    left = np.all(found.log_value == plain.log_value, axis=1)
+    assert left.mean() > 0.95
 
 
 @pytest.mark.parametrize("place", ["first", "last"])
@@ -190,18 +189,18 @@ def test_gaps_among_neighbours_are_passed_over():
     assert np.nanmax(apart(found, clean)[9]) < 1.0
 
 
-def test_a_crowd_of_spikes_ends_the_ray_and_is_told():
+def test_a_crowd_of_spikes_is_told_and_left():
     net, r, power, variance = scene(relative=0.01)
     ranges = net.on_ray(0)[1]
     at = gate_at(r, (ranges[0] + ranges[-1]) / 2)
     rng = np.random.default_rng(1)
     damaged = power.copy()
-    damaged[4, 0, at : at + 9] *= rng.uniform(0.3, 3.0, 9)
-    found = solved(net, r, damaged, variance)
-    beyond = net.on_ray(0)[0][1:]
-    assert found.flags.outlying[4, beyond].all()
-    assert found.flags.flagged[4, beyond].all()
-    assert not found.flags.outlying[np.arange(50) != 4].any()
+    damaged[4, 0, at : at + 6] *= rng.uniform(0.3, 3.0, 6)
+    found, _ = condensed(net, r, damaged, variance)
+    plain, _ = condensed(net, r, damaged, variance, screened=False)
+    assert found.bridged[4, 0]
+    assert found.bridged.sum() == 1
+    np.testing.assert_array_equal(found.integral, plain.integral)
 
 
 @pytest.mark.parametrize("step", [0.3, 1.1, 4.0])
@@ -214,6 +213,30 @@ def test_an_edge_of_a_layer_is_no_crowd(step):
     found, _ = condensed(net, r, power, variance)
     plain, _ = condensed(net, r, power, variance, screened=False)
     np.testing.assert_array_equal(found.integral, plain.integral)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5, 3.0, 20.0])
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_an_edge_inside_a_gate_stays_as_it_is(step, share):
+    net, r, power, variance = scene(relative=0.01)
+    at = gate_at(r, net.on_ray(0)[1][0]) + 1
+    scale = np.where(np.arange(r.size) > at, step, 1.0)
+    scale[at] = 1.0 + share * (step - 1.0)
+    power[:, 0] *= scale
+    variance[0] *= scale**2
+    found, _ = condensed(net, r, power, variance)
+    plain, _ = condensed(net, r, power, variance, screened=False)
+    np.testing.assert_array_equal(found.integral, plain.integral)
+    np.testing.assert_array_equal(found.log_value, plain.log_value)
+
+
+def test_a_layer_may_fill_one_wide_gate():
+    net, r, power, variance = scene(relative=0.01)
+    wide = slice(None, None, 4)
+    at = r[wide].size // 3
+    layer = power[..., wide].copy()
+    layer[:, 0, at] *= 5.0
+    found, _ = condensed(net, r[wide], layer, variance[..., wide])
     assert not found.bridged.any()
 
 
@@ -250,15 +273,17 @@ def test_variances_of_bridged_rays_are_those_of_many_draws(where, relative):
     net, r, power, variance = scene(relative=relative, profiles=3000)
     ranges = net.on_ray(0)[1]
     at = gate_at(r, ranges[0] if where == "vertex" else (ranges[0] + ranges[-1]) / 2)
-    data, layout = condensed(
-        net, r, hit(power, variance, slice(None), 0, [at, at + 5], 100.0), variance
-    )
+    damaged = hit(power, variance, slice(None), 0, [at, at + 5], 100.0)
+    data, layout = condensed(net, r, damaged, variance)
+    plain, _ = condensed(net, r, damaged, variance, screened=False)
     assert data.bridged[:, 0].all()
+    left = np.all(data.integral == plain.integral, axis=1)
+    assert left.mean() < 0.1
     first, last = layout.first_crossing[:2]
     count = last - first
     size = 2 * count - 1
     told = data.covariance[:, layout.offset[0] : layout.offset[1]].reshape(-1, size, size)
-    good = (data.usable[:, first:last] == 1).all(axis=1)
+    good = (data.usable[:, first:last] == 1).all(axis=1) & ~left
     truth, _ = condensed(
         net, r, signals(net, r, ALL["homogeneous"])[None], variance, screened=False
     )
@@ -315,4 +340,5 @@ def test_one_percent_of_wild_gates_leaves_values_within_their_errors(exponent):
     kept = ~found.flags.flagged & np.isfinite(found.extinction)
     score = ((found.extinction - 2e-3) / found.extinction_standard_error)[kept]
     assert kept[:, found.near_vertex].mean() > 0.9
-    assert np.mean(np.abs(score) > 4.0) <= 5e-3
+    # Of those that lie together nothing tells that they are no layer.
+    assert np.mean(np.abs(score) > 4.0) <= 2e-2
