@@ -66,6 +66,9 @@ WaitOption = Annotated[
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
+_COLUMN = 12
+"""Characters, least width of a column of a table."""
+
 WRONG_USE = 2
 REFUSED = 1
 
@@ -183,7 +186,9 @@ def show(table: Table) -> None:
     from rich.console import Console
 
     if table.row_count:
-        Console().print(table)
+        # In narrower columns words fold to single letters.
+        least = _COLUMN * len(table.columns)
+        Console(width=max(Console().width, least)).print(table)
 
 
 def make_table(title: str, *columns: str) -> Table:
