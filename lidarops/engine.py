@@ -54,7 +54,7 @@ _DASK: Final = {
     # served, and fifty times to look how late it is.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
-    # With it every array is mapped and given back for itself: a third of a worker's time.
+    # With it every array is mapped and given back for itself: a sixth of the time of small scenes.
     f"distributed.nanny.pre-spawn-environ.{TRIMMING}": None,
 }
 

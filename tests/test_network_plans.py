@@ -292,9 +292,9 @@ class TestPlans:
 
     def test_the_gate_holds_beams_and_what_tells_their_background(self):
         found = planned(campaign())
-        farthest = {ray["instrument"]: 0.0 for ray in found.steps[-1].settings["rays"]}
-        assert set(farthest) == set(MEMBERS)
-        for gate in (step for step in found.steps if step.rule == "member_gate"):
+        gates = [step for step in found.steps if step.rule == "member_gate"]
+        assert len(gates) == len(MEMBERS)
+        for gate in gates:
             kept = gate.settings["bins"]
             assert gate.number == sum(past - first for first, past in kept)
             assert kept[0][0] == 0

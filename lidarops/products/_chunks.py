@@ -87,7 +87,7 @@ def inflated(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     try:
         # The size is that of its buffer at first, which grows.
         data = isal_zlib.decompress(data, bufsize=max(whole.nbytes, 1))
-    # The stub declares its error to be an instance.
+    # Its type declarations take the class of its error for an instance.
     except isal_zlib.IsalError as error:  # type: ignore[misc]
         raise ValueError(f"a chunk cannot be inflated: {error}") from error
     if len(data) != whole.nbytes:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Container, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -69,18 +69,17 @@ def open_product(path: str | Path, names: Iterable[str]) -> xr.Dataset:
     ProductError
         If there is no such file or it cannot be read, which may turn out while values are read.
     """
-    file = _File(Path(path))
-    try:
+    with ExitStack() as until_closed:
+        file = _File(Path(path))
+        until_closed.callback(file.close)
         variables = file.variables(names)
-    except BaseException:
-        file.close()
-        raise
+        close = until_closed.pop_all().close
     coordinates = {name: found for name, found in variables.items() if found.dims == (name,)}
     dataset = xr.Dataset(
         {name: found for name, found in variables.items() if name not in coordinates},
         coords=xr.Coordinates(coordinates, indexes={}),
     )
-    dataset.set_close(file.close)
+    dataset.set_close(close)
     return dataset
 
 

@@ -60,8 +60,9 @@ _SUSPECT: Final = 4.5
 _STEP: Final = 0.1
 """Logarithm by which air may change over 4 gates: that of 2 km of visibility."""
 _FEW: Final = 14
+"""Gates that two edges of layers put off."""
 _SHARE: Final = 0.2
-"""Of the gates of a ray, beyond those that two edges make, that may lie off."""
+"""Of the gates of a ray, that may lie off beside them."""
 _LARGEST_LOGARITHM: Final = 300.0
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -271,21 +272,19 @@ def _measure(
     span: tuple[int, int, int, int],
     planned: tuple[Indices, Array, Array],
     off: Array,
-) -> float:
-    """Fill how far off gates lie, from one gate to another; return the most."""
+) -> None:
+    """Fill how far off gates lie, from one gate to another."""
     first, stop, start, end = span
-    most = 0.0
     nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     for g in range(start, end):
         off[g] = 0.0
         if codes[g] != GOOD:
             continue
         whole = first <= planned[0][g, 0] and planned[0][g, NODES - 1] < stop
-        marks = 0
+        lost = 0
         for i in range(NODES):
-            marks |= codes[planned[0][g, i]]
-        whole = whole and marks | codes[g] == GOOD
-        if whole:
+            lost |= codes[planned[0][g, i]]
+        if whole and lost == GOOD:
             off[g] = _off(
                 row, exponent, relative, g, planned[0][g], planned[1][g], NODES, planned[2][g]
             )
@@ -293,8 +292,6 @@ def _measure(
             count, air = neighbours(grid, codes, g, first, stop, nodes, shares)
             if count > 0:
                 off[g] = _off(row, exponent, relative, g, nodes, shares, count, air)
-        most = max(most, off[g])
-    return most
 
 
 @_compiled
@@ -498,7 +495,7 @@ def find(
         number += 1
         about = max(first, worst - REACH), min(stop, worst + REACH + 1)
         _measure(row, exponent, relative, grid, codes, (first, stop, *about), planned, off)
-    if number > 0 and not _alone(row, exponent, codes, off, first, stop):
+    if number > most or (number > 0 and not _alone(row, exponent, codes, off, first, stop)):
         for g in range(first, stop):
             codes[g] = GOOD if codes[g] == BRIDGED else codes[g]
         number = LEFT
