@@ -6,6 +6,8 @@ Nothing that happens to one scene stops the others: not an error, not the death 
 from __future__ import annotations
 
 import logging
+import math
+import pickle
 import queue
 import signal
 import threading
@@ -41,6 +43,8 @@ Progress = Callable[[SceneOutcome], None]
 AHEAD: Final = 2
 """Scenes a worker thread has at hand, the one that it works on included."""
 LEAST_AHEAD: Final = 4
+RECOUNT: Final = 5.0
+"""s after which the threads of a cluster, which may grow and shrink, are counted anew."""
 GRACE: Final = 20.0
 """s that scenes in hand get to end, on a cluster that is asked to stop."""
 TRIES: Final = 3
@@ -54,6 +58,8 @@ _DASK: Final = {
     # served, and fifty times to look how late it is.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
+    # Each process would read a dozen files of the system twice a second, for the same page.
+    "distributed.admin.system-monitor.interval": "10s",
     # With it every array is mapped and given back for itself: a sixth of the time of small scenes.
     f"distributed.nanny.pre-spawn-environ.{TRIMMING}": None,
 }
@@ -339,7 +345,7 @@ def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]
         for _ in range(TRIES):
             if stop:
                 return
-            future = client.submit(_on_worker, job, code_version(), pure=False)
+            future = _submitted(client, job)
             ended = _ended(future, job)
             future.release()
             if ended is not None:
@@ -350,7 +356,13 @@ def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]
             yield Ended(job, failed(job, reason), final=True)
 
 
-def _on_worker(job: Job, code: str) -> tuple[SceneOutcome, bool]:
+def _submitted(client: Client, job: Job) -> Future:
+    # As bytes, which the scheduler hands on: a job it would unpickle and pickle again.
+    return client.submit(_on_worker, pickle.dumps(job), code_version(), pure=False)
+
+
+def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool]:
+    job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
     if code_version() != code:
         reason = f"the worker has other code of lidarops: {code_version()}, not {code}"
         return failed(job, reason), False
@@ -367,6 +379,8 @@ class _Window:
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._at_work: dict[Future, Job] = {}
         self._suspects: list[Job] = []
+        self._room = 0
+        self._recount = -math.inf
 
     def run(self, jobs: Iterable[Job]) -> Iterator[Ended]:
         source = iter(jobs)
@@ -395,14 +409,17 @@ class _Window:
         yield from alone(self._suspects, client=self._client, stop=self._stop)
 
     def _fill(self, source: Iterator[Job]) -> None:
-        room = max(LEAST_AHEAD, AHEAD * sum(self._client.nthreads().values()))
-        while len(self._at_work) < room and not self._stop:
+        now = time.monotonic()
+        if now > self._recount:
+            threads = sum(self._client.nthreads().values())
+            self._room, self._recount = max(LEAST_AHEAD, AHEAD * threads), now + RECOUNT
+        while len(self._at_work) < self._room and not self._stop:
             job = next(source, None)
             if job is None:
                 return
             if self._taken:
                 self._taken(job)
-            future = self._client.submit(_on_worker, job, code_version(), pure=False)
+            future = _submitted(self._client, job)
             self._at_work[future] = job
             future.add_done_callback(self._done.put)
 

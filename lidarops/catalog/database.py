@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -90,7 +91,15 @@ class Database:
 
     def insert(self, table: sa.Table) -> Any:
         """Return an insert that can say what to do with a row that is there."""
-        return sqlite.insert(table) if self._sqlite else postgresql.insert(table)
+        return _insert(table, in_sqlite=self._sqlite)
+
+    def insert_new(self, table: sa.Table) -> sa.TextClause:
+        """Return an insert of whole rows that leaves a row which is there as it is."""
+        return _conflicting(table, in_sqlite=self._sqlite, replacing=False)
+
+    def upsert(self, table: sa.Table) -> sa.TextClause:
+        """Return an insert of whole rows that takes the place of a row which is there."""
+        return _conflicting(table, in_sqlite=self._sqlite, replacing=True)
 
     def clock(self) -> sa.ColumnElement[float]:
         """Return the database's time in s: the one clock that all its users share."""
@@ -106,8 +115,7 @@ class Database:
             if not self._create:
                 raise self._absent()
             METADATA.create_all(connection)
-            statement = self.insert(SCHEMA).on_conflict_do_nothing()
-            connection.execute(statement, {"version": SCHEMA_VERSION})
+            connection.execute(self.insert_new(SCHEMA), {"version": SCHEMA_VERSION})
         newest = sa.select(sa.func.max(SCHEMA.c.version))
         found = connection.scalar(newest)
         if found == _WITHOUT_USABLE:
@@ -140,6 +148,32 @@ class Database:
         else:
             remedy = "check that the folder is writable and the file is a lidarops catalog"
         return CatalogError(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
+
+
+def _insert(table: sa.Table, *, in_sqlite: bool) -> Any:
+    return sqlite.insert(table) if in_sqlite else postgresql.insert(table)
+
+
+@cache
+def _conflicting(table: sa.Table, *, in_sqlite: bool, replacing: bool) -> sa.TextClause:
+    """Return an insert as text.
+
+    SQLAlchemy keeps no compiled form of one that says what to do with a row that is there, and to
+    compile it each time takes longer than to carry it out.
+    """
+    statement = _insert(table, in_sqlite=in_sqlite)
+    if replacing:
+        keys = table.primary_key.columns.keys()
+        others = {
+            column.name: statement.excluded[column.name]
+            for column in table.columns
+            if not column.primary_key
+        }
+        statement = statement.on_conflict_do_update(index_elements=keys, set_=others)
+    else:
+        statement = statement.on_conflict_do_nothing()
+    dialect = (sqlite if in_sqlite else postgresql).dialect(paramstyle="named")
+    return sa.text(str(statement.compile(dialect=dialect)))
 
 
 def _add_usable(connection: sa.Connection) -> None:

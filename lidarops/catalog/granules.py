@@ -90,9 +90,9 @@ class Granules(Database):
         if not rows:
             return
         with self.transaction() as connection:
-            new = self.insert(LAYOUT).on_conflict_do_nothing()
             connection.execute(
-                new, [{"hash": key, "channels": text} for key, text in layouts.items()]
+                self.insert_new(LAYOUT),
+                [{"hash": key, "channels": text} for key, text in layouts.items()],
             )
             self._remove(connection, [row["path"] for row in rows])
             connection.execute(sa.insert(GRANULE), rows)

@@ -278,7 +278,7 @@ class Ledger(Granules):
             if shas[path][0] != sha256
         ]  # fmt: skip
         if replaced:
-            connection.execute(self.insert(SUPERSEDED).on_conflict_do_nothing(), replaced)
+            connection.execute(self.insert_new(SUPERSEDED), replaced)
         self._drop_products(connection, paths)
         connection.execute(sa.insert(PRODUCT), rows)
         self._enter_inputs(connection, entry.products)
@@ -328,7 +328,7 @@ class Ledger(Granules):
             for used in members
         ]
         if files_of_sets:
-            connection.execute(self.insert(FILE_SET).on_conflict_do_nothing(), files_of_sets)
+            connection.execute(self.insert_new(FILE_SET), files_of_sets)
         if rows:
             connection.execute(sa.insert(PRODUCT_INPUT), rows)
 
@@ -339,19 +339,13 @@ class Ledger(Granules):
             "key": entry.key, "run": run, "error": outcome.error, "final": entry.final,
             "crashes": 0,
         }  # fmt: skip
-        changes = {key: row[key] for key in ("day", "key", "run", "error", "final", "crashes")}
-        connection.execute(
-            self.insert(SCENE).on_conflict_do_update(
-                index_elements=["campaign", "scene"], set_=changes
-            ),
-            row,
-        )
+        connection.execute(self.upsert(SCENE), row)
         stages = [
             {"run": run, "scene": outcome.scene, "stage": stage, "seconds": seconds}
             for stage, seconds in outcome.seconds.items()
         ]
         if stages:
-            connection.execute(self.insert(STAGE).on_conflict_do_nothing(), stages)
+            connection.execute(self.insert_new(STAGE), stages)
 
     def _refuse(self, connection: sa.Connection, refused: Iterable[Granule]) -> None:
         """Enter granules that turned out unreadable; the next scan looks at them again."""
@@ -533,20 +527,8 @@ class Ledger(Granules):
             }
             for day, (signature, barren, set_aside) in verdicts.items()
         ]  # fmt: skip
-        statement = self.insert(VERDICT)
-        new = statement.excluded
         with self.transaction() as connection:
-            connection.execute(
-                statement.on_conflict_do_update(
-                    index_elements=["campaign", "day"],
-                    set_={
-                        "signature": new.signature,
-                        "barren": new.barren,
-                        "set_aside": new.set_aside,
-                    },
-                ),
-                rows,
-            )
+            connection.execute(self.upsert(VERDICT), rows)
 
 
 def _set_id(files: Sequence[InputRecord]) -> str:
