@@ -149,7 +149,7 @@ class TestReaders:
             assert list(readers.each(readings(paths, deadly))) == list(range(2, 10))
             assert list(readers.each(readings(paths, shape)))[-1] == (9, 4)
             assert set(readers.each(readings(paths, process))) == {os.getpid()}
-        assert caplog.text.count("a process that read products was lost") == 1
+        assert caplog.text.count("a process was lost") == 1
 
     def test_a_daemon_that_may_start_no_process_reads_itself(self, paths, monkeypatch):
         monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
