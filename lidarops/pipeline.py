@@ -565,7 +565,8 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> Path:
     campaign : Campaign
     run : RunRecord
     workers : int, optional
-        Most processes of this machine to read products with; changes nothing that is shown.
+        Most processes of this machine to read products and to draw with; changes nothing that
+        is shown.
 
     Returns
     -------

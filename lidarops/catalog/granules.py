@@ -267,7 +267,7 @@ def _granule_row(granule: Granule, campaign: str, scan_key: str, layout: str) ->
         "role": granule.role.value,
         "status": granule.status.value,
         "reason": granule.reason,
-        "notes": json.dumps(granule.notes),
+        "notes": json.dumps(granule.notes) if granule.notes else "[]",
         "start": naive(granule.start),
         "stop": naive(granule.stop),
         "zenith_angle": granule.zenith_angle,

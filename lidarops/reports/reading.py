@@ -1,4 +1,4 @@
-"""Products read for a report: one after another, or by several processes at the same time.
+"""Products read, and figures drawn, for a report: by one process, or several at the same time.
 
 What is read is the same, and in the same order, whoever reads it. A product that is missing or
 cannot be read stops nothing: the reason is handed over in place of what it holds.
@@ -15,7 +15,7 @@ import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.processes import Processes
-from lidarops.products.read import open_product
+from lidarops.products.read import open_product, profiles_in
 
 FEWEST: Final = 50
 """Products that a process must have to read, to be worth its start."""
@@ -23,7 +23,9 @@ UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, Pr
 """What opening and reading a damaged or foreign file has been seen to raise."""
 _AT_A_TIME: Final = 8
 """Products handed to a process together, so that it waits less for the next."""
+_LENGTHS_AT_A_TIME: Final = 32
 
+Item = TypeVar("Item")
 Found = TypeVar("Found")
 _Found_co = TypeVar("_Found_co", covariant=True)
 
@@ -82,6 +84,20 @@ class Readers:
         for _, found in self._processes.each(_read, readings, at_a_time=_AT_A_TIME):
             yield found
 
+    def lengths(self, paths: Iterable[Path]) -> Iterator[int | Unread]:
+        """Count the profiles of products, in their order, without reading any."""
+        for _, found in self._processes.each(_length, paths, at_a_time=_LENGTHS_AT_A_TIME):
+            yield found
+
+    def later(self, task: Callable[[object, Item], Found], item: Item) -> Callable[[], Found]:
+        """Begin something else; see `lidarops.processes.Processes.later`."""
+        return self._processes.later(task, item)
+
+    @property
+    def processes(self) -> int:
+        """How many processes there may be beside this one."""
+        return self._processes.number
+
 
 def _read(truth: xr.Dataset | None, reading: Reading[Found]) -> Found | Unread:
     try:
@@ -89,6 +105,13 @@ def _read(truth: xr.Dataset | None, reading: Reading[Found]) -> Found | Unread:
             return reading.read(product, truth) if reading.with_truth else reading.read(product)
     except UNREADABLE as error:
         return Unread(reason(reading.path, error))
+
+
+def _length(_: object, path: Path) -> int | Unread:
+    try:
+        return profiles_in(path)
+    except UNREADABLE as error:
+        return Unread(reason(path, error))
 
 
 def reason(path: Path, error: BaseException) -> str:
