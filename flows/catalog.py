@@ -20,7 +20,11 @@ from lidarops.records import Status
 
 @flow(name="lidarops-catalog")
 def catalog(
-    campaign: str, archive: str | None = None, out: str | None = None, wait: float = 0.0
+    campaign: str,
+    archive: str | None = None,
+    out: str | None = None,
+    wait: float = 0.0,
+    workers: int = 1,
 ) -> ScanSummary:
     """Scan the archive of a campaign and publish what it refuses as an artifact.
 
@@ -32,13 +36,15 @@ def catalog(
         As on the command line.
     wait : float
         s to wait for another run on the same archive.
+    workers : int, optional
+        Processes, where thousands of files are new.
 
     Returns
     -------
     ScanSummary
     """
     settings = load(campaign, archive=archive, output=out)
-    summary = update_catalog(settings, wait=wait)
+    summary = update_catalog(settings, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.granules(status=Status.REFUSED)
     get_run_logger().info("catalog of %s: %s", settings.name, asdict(summary))

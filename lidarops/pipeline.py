@@ -62,6 +62,7 @@ class Options:
     force: bool = False
     """Process what is asked for though it is fresh."""
     workers: int = 1
+    """Processes of this machine, also where a cluster does the rest."""
     memory: str | None = None
     """Most memory of a worker that is started here, such as ``2GiB``."""
     cluster: Callable[[], AbstractContextManager[Client]] | None = None
@@ -206,22 +207,28 @@ def assess(
 
 
 def update_catalog(
-    campaign: Campaign, *, progress: Callable[[int], None] | None = None, wait: float = 0.0
+    campaign: Campaign,
+    *,
+    progress: Callable[[int], None] | None = None,
+    wait: float = 0.0,
+    workers: int = 1,
 ) -> ScanSummary:
     """Bring the catalog up to date with the archive; see `lidarops.catalog.scan.scan`."""
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
-        return _scan(campaign, store, lock, progress)
+        return _scan(campaign, store, lock, progress, workers)
 
 
 def _scan(
     campaign: Campaign,
     store: Store,
     lock: Lock,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] | None,
+    workers: int,
 ) -> ScanSummary:
+    write = _Writer(lock)
     while True:
         try:
-            return scan(campaign, store, progress=progress, before_write=_Writer(lock))
+            return scan(campaign, store, progress=progress, before_write=write, workers=workers)
         except _OvertakenError:
             continue
 
@@ -300,7 +307,9 @@ class _Work:
         self._failing = 0
 
     def carry_out(self, client: Client | None) -> Result:
-        self._summary = _scan_once(self._campaign, self._store, self._write)
+        self._summary = scan(
+            self._campaign, self._store, before_write=self._write, workers=self._options.workers
+        )
         self._judge = self._new_judge()
         signatures = self._judge.signatures()
         verdicts = self._store.verdicts()
@@ -473,10 +482,6 @@ class _Work:
         return self._session.finish(status, self._found.set_aside)
 
 
-def _scan_once(campaign: Campaign, store: Store, write: _Writer) -> ScanSummary:
-    return scan(campaign, store, before_write=write)
-
-
 def _chained(first: Job, rest: Iterator[Job]) -> Iterator[Job]:
     yield first
     yield from rest
@@ -560,7 +565,8 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> Path:
     campaign : Campaign
     run : RunRecord
     workers : int, optional
-        Most processes of this machine to read products with; changes nothing that is shown.
+        Most processes of this machine to read products and to draw with; changes nothing that
+        is shown.
 
     Returns
     -------

@@ -21,7 +21,7 @@ from lidarops import dependence
 from lidarops.campaign import Campaign, as_settings
 from lidarops.catalog.database import day_of
 from lidarops.catalog.ledger import Dependence, Made, Tried
-from lidarops.catalog.scan import Source
+from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.dependence import Wanted
 from lidarops.plans import plan

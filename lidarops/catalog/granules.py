@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
@@ -21,6 +22,7 @@ AGAIN: Final = ""
 
 _HALF: Final = (1 << 31) - 1
 _C = GRANULE.c
+_KEY: Final = tuple(column.name for column in GRANULE.primary_key)
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
 
@@ -94,8 +96,9 @@ class Granules(Database):
                 self.insert_new(LAYOUT),
                 [{"hash": key, "channels": text} for key, text in layouts.items()],
             )
-            self._remove(connection, [row["path"] for row in rows])
-            connection.execute(sa.insert(GRANULE), rows)
+            row = self.insert(GRANULE)
+            anew = {name: row.excluded[name] for name in rows[0] if name not in _KEY}
+            connection.execute(row.on_conflict_do_update(index_elements=_KEY, set_=anew), rows)
 
     def forget(self, paths: Collection[str]) -> None:
         """Remove the rows of files that are no longer in the archive."""
@@ -238,6 +241,8 @@ def stamp_of(granule: Granule, scan_key: str) -> tuple[int, int]:
     return stamp(granule, scan_key, _layout_row(granule.layout)[0])
 
 
+# The files of an archive share few layouts.
+@lru_cache(maxsize=128)
 def _layout_row(layout: tuple[ChannelLayout, ...]) -> tuple[str, str]:
     text = json.dumps([asdict(channel) for channel in layout], separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16], text
@@ -262,7 +267,7 @@ def _granule_row(granule: Granule, campaign: str, scan_key: str, layout: str) ->
         "role": granule.role.value,
         "status": granule.status.value,
         "reason": granule.reason,
-        "notes": json.dumps(granule.notes),
+        "notes": json.dumps(granule.notes) if granule.notes else "[]",
         "start": naive(granule.start),
         "stop": naive(granule.stop),
         "zenith_angle": granule.zenith_angle,

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
-import os
 import re
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
-from pathlib import Path
-from typing import NamedTuple
 
 from lidarops.campaign import Campaign
 from lidarops.catalog.granules import AGAIN, Fingerprint, stamp_of
+from lidarops.catalog.headers import UNREADABLE, Due, Headers, read_header
+from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError, RawFormatError
-from lidarops.raw import licel
+from lidarops.processes import Processes
 from lidarops.records import Granule, Role, Status
-from lidarops.stores import RemoteStore
 
 _BATCH = 2000
-_HEADER_BYTES = 16384
 _SCAN_VERSION = 1
-_FAR_FROM_STATION = 0.5
-"""degree; a header position farther than this from the station gets a note."""
-
-_UNREADABLE = "cannot be read"
+_TOGETHER = 250
+"""Headers that a process reads before it is asked again."""
+_WORTH_PROCESSES = 5000
+"""Headers to read, for which processes are worth their start."""
+_MOST_PROCESSES = 8
+"""The one process that writes the catalog keeps no more than a few others busy."""
 
 Progress = Callable[[int], None]
 
@@ -47,14 +43,6 @@ class ScanSummary:
     """Refused granules in the whole catalog, not only the new ones."""
     moved: int = 0
     """Files under a new path whose content was known: neither added nor vanished."""
-
-
-class RawFile(NamedTuple):
-    """A file of the archive as the file system lists it."""
-
-    path: str
-    size: int
-    mtime_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +63,7 @@ def scan(
     *,
     progress: Progress | None = None,
     before_write: Callable[[], object] | None = None,
+    workers: int = 1,
 ) -> ScanSummary:
     """Bring the catalog up to date with the archive.
 
@@ -94,6 +83,9 @@ def scan(
         Called with the number of files done since the last call.
     before_write : callable, optional
         Called before anything is written; may raise to prevent it.
+    workers : int, optional
+        Most processes of this machine to read headers with, where thousands of files are new or
+        changed; changes nothing that is entered. Those of a URL are read by this process.
 
     Returns
     -------
@@ -105,9 +97,16 @@ def scan(
         If the archive cannot be listed.
     """
     work = _Scan(campaign, store, progress, before_write)
-    with store.fingerprints() as known:
-        for file, before in _joined(work.source.files(), known):
-            work.compare(file, before)
+    remote = isinstance(work.source, RemoteSource)
+    processes = 1 if remote else min(workers, _MOST_PROCESSES)
+    with (
+        store.fingerprints() as known,
+        Processes(processes, Headers.of(campaign, work.source)) as readers,
+    ):
+        due = work.due(_joined(work.source.files(), known))
+        found = readers.each(read_header, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
+        for _, granule in found:
+            work.enter(granule)
     return work.finish()
 
 
@@ -118,7 +117,7 @@ def _joined(
     before = next(known, None)
     last = None
     for file in files:
-        path = _printable(file.path)
+        path = printable(file.path)
         if path == last:
             # A name that is no text and looks like another one's text: it has its own refusal.
             continue
@@ -147,7 +146,6 @@ class _Scan:
         before_write: Callable[[], object] | None,
     ) -> None:
         self.source = Source.of(campaign.archive)
-        self._campaign = campaign
         self._store = store
         self._progress = progress
         self._before_write = before_write
@@ -156,27 +154,30 @@ class _Scan:
         self._near: list[_Claim] = []
         self._files = self._changed = 0
         self._told = 0
+        self._judged: deque[tuple[str, Fingerprint | None]] = deque()
         self._pending: list[tuple[Granule, str]] = []
         self._added = 0
         self._gone: list[Fingerprint] = []
 
-    def compare(self, file: RawFile | None, before: Fingerprint | None) -> None:
-        """Judge one file, by what is there and what was known of it."""
-        owners = [] if file is None else self._owners(file.path)
-        if file is None or not owners:
-            if before is not None:
-                self._gone.append(before)
-            return
-        self._files += 1
-        if self._files % _BATCH == 0:
-            self._tell()
-        key = _key(owners)
-        if before is None or (before.size, before.mtime_ns, before.scan_key) != (
-            file.size,
-            file.mtime_ns,
-            key,
-        ):
-            self._enter(_granule(file, owners, self._campaign, self.source), key, before)
+    def due(self, pairs: Iterable[tuple[RawFile | None, Fingerprint | None]]) -> Iterator[Due]:
+        """Judge each file by what is there and what was known of it; give those to be read."""
+        for file, before in pairs:
+            owners = [] if file is None else self._owners(file.path)
+            if file is None or not owners:
+                if before is not None:
+                    self._gone.append(before)
+                continue
+            self._files += 1
+            if self._files % _BATCH == 0:
+                self._tell()
+            key = _key(owners)
+            if before is None or (before.size, before.mtime_ns, before.scan_key) != (
+                file.size,
+                file.mtime_ns,
+                key,
+            ):
+                self._judged.append((key, before))
+                yield _due(file, owners)
 
     def _owners(self, path: str) -> list[_Claim]:
         folder, slash, name = path.rpartition("/")
@@ -193,8 +194,10 @@ class _Scan:
             if claim.name.match(path if claim.folder is None else name)
         ]
 
-    def _enter(self, granule: Granule, key: str, before: Fingerprint | None) -> None:
-        if granule.reason.startswith(_UNREADABLE):
+    def enter(self, granule: Granule) -> None:
+        """Enter what was read of the next file that was due, if it is not what is known."""
+        key, before = self._judged.popleft()
+        if granule.reason.startswith(UNREADABLE):
             key = AGAIN
         if before is None:
             self._added += 1
@@ -320,178 +323,7 @@ def _regex(pattern: str) -> re.Pattern[str]:
     return re.compile("".join(parts.get(token, re.escape(token)) for token in tokens) + r"\Z")
 
 
-def _granule(file: RawFile, owners: list[_Claim], campaign: Campaign, source: Source) -> Granule:
+def _due(file: RawFile, owners: list[_Claim]) -> Due:
     owner = owners[0]
-    # Refused until its header has been read.
-    granule = Granule(
-        path=_printable(file.path),
-        size=file.size,
-        mtime_ns=file.mtime_ns,
-        instrument=owner.instrument,
-        role=owner.role,
-        status=Status.REFUSED,
-    )
-    if granule.path != file.path:
-        return replace(granule, reason="has a name that is not UTF-8 (rename it)")
-    rivals = sorted({claim.instrument for claim in owners} - {owner.instrument})
-    if rivals:
-        claimants = f"{owner.instrument} and {', '.join(rivals)}"
-        return replace(
-            granule,
-            reason=f"claimed by instruments {claimants} (make their patterns disjoint)",
-        )
-    try:
-        header = licel.parse_header(
-            source.head(file.path, _HEADER_BYTES), file=file.path, size=file.size
-        )
-        return _accept(granule, header, campaign)
-    except RawFormatError as error:
-        return replace(granule, reason=str(error).removeprefix(f"{file.path}: "))
-    except OSError as error:
-        return replace(granule, reason=f"{_UNREADABLE}: {error.strerror or error}")
-
-
-def _printable(path: str) -> str:
-    """Return a path that can be stored and shown: names may hold bytes that are no text."""
-    return path if path.isascii() else path.encode("utf-8", "backslashreplace").decode()
-
-
-def _accept(granule: Granule, header: licel.Header, campaign: Campaign) -> Granule:
-    instrument = campaign.instruments[granule.instrument]
-    station = campaign.stations[instrument.station]
-    facts = instrument.facts_at(header.start)
-    notes = list(header.notes)
-    latitude, longitude = station.latitude, station.longitude
-    if instrument.header_position != "ignore":
-        latitude, longitude = header.position(instrument.header_position)
-        away = max(abs(latitude - station.latitude), abs(longitude - station.longitude))
-        if away > _FAR_FROM_STATION:
-            notes.append(_position_note(latitude, longitude, station.latitude, station.longitude))
-    return replace(
-        granule,
-        status=Status.GOOD,
-        notes=tuple(notes),
-        start=header.start,
-        stop=header.stop,
-        zenith_angle=header.zenith_angle if facts.zenith_angle is None else facts.zenith_angle,
-        azimuth=header.azimuth if facts.azimuth is None else facts.azimuth,
-        latitude=latitude,
-        longitude=longitude,
-        altitude=header.altitude,
-        layout=licel.layout(header),
-    )
-
-
-def _position_note(latitude: float, longitude: float, north: float, east: float) -> str:
-    swapped = max(abs(longitude - north), abs(latitude - east)) <= _FAR_FROM_STATION
-    remedy = (
-        "they look swapped: set header_position of the instrument"
-        if swapped
-        else "the campaign's position is used; header_position: ignore silences this"
-    )
-    return (
-        f"header position {latitude:.1f} N {longitude:.1f} E is not the station's"
-        f" {north:.1f} N {east:.1f} E ({remedy})"
-    )
-
-
-def _rank(entry: os.DirEntry[str]) -> str:
-    """Return what puts entries into the order that the paths of their files have."""
-    name = _printable(entry.name)
-    return f"{name}/" if entry.is_dir(follow_symlinks=False) else name
-
-
-def _listed(entry: os.DirEntry[str], path: str) -> RawFile:
-    try:
-        about = entry.stat()
-    except OSError:
-        # A link to nowhere is a file that cannot be read, and must be said to be one.
-        return RawFile(path, 0, 0)
-    return RawFile(path, about.st_size, about.st_mtime_ns)
-
-
-class Source:
-    """Where the raw files are: a local folder."""
-
-    def __init__(self, root: Path) -> None:
-        self._root = root
-
-    @staticmethod
-    def of(archive: str) -> Source:
-        """Return the source of an archive, by its folder or URL."""
-        return RemoteSource(archive) if "://" in archive else Source(Path(archive))
-
-    def files(self) -> Iterator[RawFile]:
-        """List files in the order of their paths, whatever the file system's own."""
-        if not self._root.is_dir():
-            raise CatalogError(
-                "the archive is not a folder",
-                file=self._root,
-                remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
-            )
-        yield from self._walk(str(self._root), "")
-
-    def _walk(self, folder: str, prefix: str) -> Iterator[RawFile]:
-        try:
-            with os.scandir(folder) as listing:
-                entries = sorted(listing, key=_rank)
-        except OSError as error:
-            raise CatalogError(
-                f"cannot be listed: {error.strerror}", file=folder, remedy="check its permissions"
-            ) from error
-        for entry in entries:
-            path = f"{prefix}{entry.name}"
-            if entry.is_dir(follow_symlinks=False):
-                yield from self._walk(entry.path, f"{path}/")
-            else:
-                yield _listed(entry, path)
-
-    def head(self, path: str, size: int) -> bytes:
-        """Return the first bytes of a file."""
-        file = self._root / path
-        # Opening a pipe would wait for ever.
-        if not file.is_file():
-            raise OSError(errno.EINVAL, "is no regular file, or a link to nowhere")
-        with file.open("rb", buffering=0) as stream:
-            return stream.read(size)
-
-    def digest(self, path: str) -> str:
-        """Return the sha256 of a file."""
-        file = self._root / path
-        if not file.is_file():
-            raise OSError(errno.EINVAL, "is no regular file, or a link to nowhere")
-        with file.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-class RemoteSource(Source):
-    """A store behind an fsspec URL."""
-
-    def __init__(self, url: str) -> None:
-        self._store = RemoteStore(url)
-
-    def files(self) -> Iterator[RawFile]:
-        """List files in the order of their paths."""
-        for stored in self._store.files():
-            yield RawFile(stored.path, stored.size, stored.stamp)
-
-    def head(self, path: str, size: int) -> bytes:
-        """Return the first bytes of a file."""
-        with _of_one_file():
-            return self._store.head(path, size)
-
-    def digest(self, path: str) -> str:
-        """Return the sha256 of a file."""
-        with _of_one_file():
-            return self._store.digest(path)
-
-
-@contextmanager
-def _of_one_file() -> Iterator[None]:
-    """Tell a file that cannot be read, which is refused, from a store that is away."""
-    try:
-        yield
-    except CatalogError as error:
-        if isinstance(error.__cause__, FileNotFoundError | PermissionError):
-            raise error.__cause__ from error
-        raise
+    rivals = {claim.instrument for claim in owners} - {owner.instrument}
+    return Due(file, owner.instrument, owner.role, tuple(sorted(rivals)))

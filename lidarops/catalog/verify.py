@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarops.campaign import Campaign
-from lidarops.catalog.scan import Source
+from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.records import Role
 

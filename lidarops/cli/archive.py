@@ -63,6 +63,7 @@ def catalog(
     archive: ArchiveOption = None,
     out: OutOption = None,
     catalog: CatalogOption = None,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
     wait: WaitOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
@@ -78,7 +79,7 @@ def catalog(
 
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
     with progress_bar("catalog", None) as advance:
-        summary = update_catalog(settings, progress=advance, wait=wait)
+        summary = update_catalog(settings, progress=advance, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
     if as_json:

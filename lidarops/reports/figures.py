@@ -8,7 +8,7 @@ shows: `alt_text`.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -439,6 +439,16 @@ def overview(
 
 
 @dataclass(frozen=True, slots=True)
+class Sketch:
+    """A figure that is still to be drawn; goes to another process, so all of it can be pickled."""
+
+    draw: Callable[..., Figure]
+    """Called with what is to be seen, and the title."""
+    of: object
+    title: str
+
+
+@dataclass(frozen=True, slots=True)
 class Rendered:
     """A figure as a file."""
 
@@ -454,6 +464,11 @@ def render(figure: Figure) -> Rendered:
     FigureCanvasAgg(figure)
     figure.savefig(buffer, format="png", metadata={"Software": None, "Description": alt})
     return Rendered(buffer.getvalue(), alt)
+
+
+def draw(_: object, sketch: Sketch) -> Rendered:
+    """Return what comes of a sketch, in whatever process."""
+    return render(sketch.draw(sketch.of, title=sketch.title))
 
 
 def alt_text(figure: Figure) -> str:

@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import functools
 import re
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.read import profiles_in
 from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
 from lidarops.reports import figures, network_figures, panels
 from lidarops.reports.networks import (
@@ -64,6 +63,8 @@ _KINDS: Final = (
     ProductKind.SIGNAL,
 )
 Found = TypeVar("Found")
+Drawing = Callable[[], figures.Rendered]
+"""Gives a figure when it is done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,11 +152,13 @@ class _Sources:
     ) -> list[Raster]:
         """Reduce all products of a group alike, as coarsely as their number asks for."""
         sizes: dict[str, int] = {}
-        for _, product in group.members:
-            try:
-                sizes[product.path] = profiles_in(group.root / product.path)
-            except UNREADABLE as error:
-                self._note(product.path, reason(group.root / product.path, error))
+        paths = [product.path for _, product in group.members]
+        lengths = self.readers.lengths([group.root / path for path in paths])
+        for path, length in zip(paths, lengths, strict=True):
+            if isinstance(length, Unread):
+                self._note(path, length.reason)
+            else:
+                sizes[path] = length
         profiles = -(-sum(sizes.values()) // COLUMNS)
         reduced = functools.partial(read, profiles=profiles)
         readings = [Reading(group.root / path, names, reduced) for path in sizes]
@@ -181,6 +184,10 @@ class _Sources:
                 return found
         return None
 
+    def draw(self, draw: Callable[..., Any], of: object, title: str) -> Drawing:
+        """Begin a figure, in another process where there is one."""
+        return self.readers.later(figures.draw, figures.Sketch(draw, of, title))
+
     def _read(self, paths: list[str], readings: list[Reading[Found]]) -> Iterator[Found]:
         for path, found in zip(paths, self.readers.each(readings), strict=True):
             if isinstance(found, Unread):
@@ -196,7 +203,38 @@ class _Sources:
 class _Drawn:
     name: str
     caption: str
-    figure: figures.Rendered
+    figure: Drawing
+
+
+class _Album:
+    """Keeps figures as files in the order they come in, some of them while they are drawn."""
+
+    def __init__(self, folder: Path, ahead: int) -> None:
+        self.pictures: list[Picture] = []
+        self._folder = folder
+        # What a figure is made from is held until it is done.
+        self._ahead = ahead
+        self._waiting: deque[tuple[str, _Drawn]] = deque()
+        self._taken: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        return len(self.pictures) + len(self._waiting)
+
+    def add(self, instrument: str, drawn: _Drawn) -> None:
+        self._waiting.append((instrument, drawn))
+        self._keep(self._ahead)
+
+    def finish(self) -> list[Picture]:
+        self._keep(0)
+        return self.pictures
+
+    def _keep(self, ahead: int) -> None:
+        while len(self._waiting) > ahead:
+            instrument, drawn = self._waiting.popleft()
+            name = _unique(drawn.name, self._taken)
+            rendered = drawn.figure()
+            write_atomically(self._folder / name, rendered.png)
+            self.pictures.append(Picture(name, instrument, drawn.caption, rendered.alt))
 
 
 def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
@@ -210,7 +248,7 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
     limit : int, optional
         Most figures of products; comparisons with the truth are made for all.
     workers : int, optional
-        Most processes to read products with; changes no figure.
+        Most processes to read and draw with; changes no figure.
 
     Returns
     -------
@@ -218,19 +256,21 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
         One or more figures for every instrument and channel over all scenes.
     """
     gallery = Gallery()
-    taken: Counter[str] = Counter()
     with _sources(record, gallery, workers) as sources:
+        flags = _flags(record, sources)
+        album = _Album(folder, sources.readers.processes)
         for group in _groups(record):
-            full = len(gallery.pictures) >= limit
+            full = len(album) >= limit
             if full:
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
             for drawn in _draw(group, sources, full=full):
-                name = _unique(drawn.name, taken)
-                write_atomically(folder / name, drawn.figure.png)
-                gallery.pictures.append(
-                    Picture(name, group.instrument, drawn.caption, drawn.figure.alt)
-                )
-    gallery.flags = _flags(record, folder)
+                album.add(group.instrument, drawn)
+        gallery.pictures = album.finish()
+        if flags is not None:
+            name = f"{flags.name}.png"
+            rendered = flags.figure()
+            write_atomically(folder / name, rendered.png)
+            gallery.flags = Picture(name, "", flags.caption, rendered.alt)
     return gallery
 
 
@@ -247,7 +287,7 @@ def first_picture(record: RunRecord, folder: Path, *, workers: int = 1) -> Path 
             for drawn in _draw(group, sources, full=False):
                 folder.mkdir(parents=True, exist_ok=True)
                 path = folder / "quicklook.png"
-                write_atomically(path, drawn.figure.png)
+                write_atomically(path, drawn.figure().png)
                 return path
     return None
 
@@ -325,13 +365,13 @@ def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_D
             f"homogeneous_{group.instrument}_{group.channel}",
             f"Extinction and background with their standard errors: {where};"
             f" {counted(scenes, 'scene')}.",
-            figures.render(figures.draw_retrieval(few, title=group.label)),
+            sources.draw(figures.draw_retrieval, few, group.label),
         )
         if compared:
             yield _Drawn(
                 f"truth_{group.instrument}_{group.channel}",
                 f"Unflagged values against the truth of the simulation: {where}.",
-                figures.render(figures.draw_comparison(few, title=group.label)),
+                sources.draw(figures.draw_comparison, few, group.label),
             )
 
 
@@ -356,7 +396,7 @@ def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Dr
         yield _Drawn(
             f"network_{group.instrument}_{group.channel}",
             f"Beams, and visibility where they meet: {group.label}.",
-            figures.render(network_figures.draw_map(network, title=group.label)),
+            sources.draw(network_figures.draw_map, network, group.label),
         )
     for first in range(0, len(series), network_figures.VERTICES):
         few = series[first : first + network_figures.VERTICES]
@@ -364,7 +404,7 @@ def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Dr
             f"visibility_{group.instrument}_{group.channel}",
             f"Visibility and extinction with their errors:"
             f" {group.label}, {', '.join(one.label for one in few)}.",
-            figures.render(network_figures.draw_series(few, title=group.label)),
+            sources.draw(network_figures.draw_series, few, group.label),
         )
 
 
@@ -380,7 +420,7 @@ def _signal(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"signal_{group.instrument}_{group.channel}",
             f"Range-corrected signal and background: {group.label};"
             f" {counted(len(rasters), 'scene')}.",
-            figures.render(figures.draw_quicklook(rasters, title=group.label)),
+            sources.draw(figures.draw_quicklook, rasters, group.label),
         )
 
 
@@ -393,7 +433,7 @@ def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"elastic_{group.instrument}_{group.channel}",
             f"Attenuated backscatter, clouds and background: {group.label};"
             f" {counted(len(rasters), 'scene')}.",
-            figures.render(figures.draw_backscatter(rasters, title=group.label)),
+            sources.draw(figures.draw_backscatter, rasters, group.label),
         )
     profile = sources.first(group, PROFILE_VARIABLES, clearest_profile)
     if profile is not None:
@@ -401,7 +441,7 @@ def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"profile_{group.instrument}_{group.channel}",
             f"The profile of a scene with most unflagged gates, and its error budget:"
             f" {group.label}.",
-            figures.render(figures.error_budget(profile, title=group.label)),
+            sources.draw(figures.error_budget, profile, group.label),
         )
 
 
@@ -411,7 +451,7 @@ def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
         yield _Drawn(
             f"multiangle_{group.instrument}_{group.channel}",
             f"Extinction over time and altitude: {group.label}; {counted(len(rasters), 'scene')}.",
-            figures.render(figures.draw_extinction(rasters, title=group.label)),
+            sources.draw(figures.draw_extinction, rasters, group.label),
         )
     clearest = functools.partial(clearest_cycle, instrument=group.instrument)
     profile = sources.first(group, CYCLE_VARIABLES, clearest, with_truth=True)
@@ -419,7 +459,7 @@ def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
         yield _Drawn(
             f"scan-profile_{group.instrument}_{group.channel}",
             f"The cycle of a scene with most unflagged values: {group.label}.",
-            figures.render(figures.scan_profile(profile, title=group.label)),
+            sources.draw(figures.scan_profile, profile, group.label),
         )
     residuals = sources.first(group, RESIDUAL_VARIABLES, read_residuals)
     if residuals is not None:
@@ -427,19 +467,19 @@ def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"scan-residuals_{group.instrument}_{group.channel}",
             f"What the fit over angles leaves of the signal, mean of the cycles of a scene:"
             f" {group.label}.",
-            figures.render(figures.scan_residuals(residuals, title=group.label)),
+            sources.draw(figures.scan_residuals, residuals, group.label),
         )
 
 
-def _flags(record: RunRecord, folder: Path) -> Picture | None:
+def _flags(record: RunRecord, sources: _Sources) -> _Drawn | None:
     shares = _shares(record)
     if not shares:
         return None
-    rendered = figures.render(figures.flags_overview(shares, title="Flagged values"))
-    name = "flags.png"
-    write_atomically(folder / name, rendered.png)
-    caption = "Share of the values of every product that carry a quality bit, over all scenes."
-    return Picture(name, "", caption, rendered.alt)
+    return _Drawn(
+        "flags",
+        "Share of the values of every product that carry a quality bit, over all scenes.",
+        sources.draw(figures.flags_overview, shares, "Flagged values"),
+    )
 
 
 def _shares(record: RunRecord) -> Mapping[str, Mapping[Quality, float]]:

@@ -71,7 +71,7 @@ def build(
     figures : int, optional
         Most figures of products.
     workers : int, optional
-        Most processes to read products with; changes nothing that is shown.
+        Most processes to read products and to draw with; changes nothing that is shown.
 
     Returns
     -------

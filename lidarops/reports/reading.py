@@ -1,4 +1,4 @@
-"""Products read for a report: one after another, or by several processes at the same time.
+"""Products read, and figures drawn, for a report: by one process, or several at the same time.
 
 What is read is the same, and in the same order, whoever reads it. A product that is missing or
 cannot be read stops nothing: the reason is handed over in place of what it holds.
@@ -6,22 +6,16 @@ cannot be read stops nothing: the reason is handed over in place of what it hold
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Final, Generic, Self, TypeVar
 
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.products.read import open_product
+from lidarops.processes import Processes
+from lidarops.products.read import open_product, profiles_in
 
 FEWEST: Final = 50
 """Products that a process must have to read, to be worth its start."""
@@ -29,10 +23,11 @@ UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, Pr
 """What opening and reading a damaged or foreign file has been seen to raise."""
 _AT_A_TIME: Final = 8
 """Products handed to a process together, so that it waits less for the next."""
+_LENGTHS_AT_A_TIME: Final = 32
 
+Item = TypeVar("Item")
 Found = TypeVar("Found")
 _Found_co = TypeVar("_Found_co", covariant=True)
-_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,47 +66,40 @@ class Readers:
         self, workers: int = 1, products: int = 0, truth: xr.Dataset | None = None
     ) -> None:
         self._truth = truth
-        self._pool: ProcessPoolExecutor | None = None
-        processes = min(workers, products // FEWEST)
-        # A daemonic process, as a worker of dask is, may not have any of its own.
-        if processes > 1 and not multiprocessing.current_process().daemon:
-            # A fork would inherit the locks of whatever threads are running.
-            self._pool = ProcessPoolExecutor(
-                processes,
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_prepare,
-                initargs=(truth,),
-            )
+        self._processes = Processes(min(workers, products // FEWEST), truth)
 
     def __enter__(self) -> Self:
+        self._processes.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+    def __exit__(self, *error: object) -> None:
+        self._processes.__exit__(*error)
 
     def one(self, reading: Reading[Found]) -> Found | Unread:
         """Read one product, in this process."""
-        return _read(reading, self._truth)
+        return _read(self._truth, reading)
 
-    def each(self, readings: Sequence[Reading[Found]]) -> Iterator[Found | Unread]:
+    def each(self, readings: Iterable[Reading[Found]]) -> Iterator[Found | Unread]:
         """Read products; what is found of each, in their order."""
-        done = 0
-        if self._pool is not None and len(readings) > 1:
-            try:
-                for found in self._pool.map(_read_there, readings, chunksize=_AT_A_TIME):
-                    yield found
-                    done += 1
-            # A process that was killed, for its memory say; or one that cannot be started.
-            except (BrokenProcessPool, OSError) as error:
-                _LOG.warning("a process that read products was lost, they are read here: %s", error)
-                self._pool.shutdown(wait=False, cancel_futures=True)
-                self._pool = None
-        for reading in readings[done:]:
-            yield self.one(reading)
+        for _, found in self._processes.each(_read, readings, at_a_time=_AT_A_TIME):
+            yield found
+
+    def lengths(self, paths: Iterable[Path]) -> Iterator[int | Unread]:
+        """Count the profiles of products, in their order, without reading any."""
+        for _, found in self._processes.each(_length, paths, at_a_time=_LENGTHS_AT_A_TIME):
+            yield found
+
+    def later(self, task: Callable[[object, Item], Found], item: Item) -> Callable[[], Found]:
+        """Begin something else; see `lidarops.processes.Processes.later`."""
+        return self._processes.later(task, item)
+
+    @property
+    def processes(self) -> int:
+        """How many processes there may be beside this one."""
+        return self._processes.number
 
 
-def _read(reading: Reading[Found], truth: xr.Dataset | None) -> Found | Unread:
+def _read(truth: xr.Dataset | None, reading: Reading[Found]) -> Found | Unread:
     try:
         with open_product(reading.path, reading.names) as product:
             return reading.read(product, truth) if reading.with_truth else reading.read(product)
@@ -119,30 +107,14 @@ def _read(reading: Reading[Found], truth: xr.Dataset | None) -> Found | Unread:
         return Unread(reason(reading.path, error))
 
 
+def _length(_: object, path: Path) -> int | Unread:
+    try:
+        return profiles_in(path)
+    except UNREADABLE as error:
+        return Unread(reason(path, error))
+
+
 def reason(path: Path, error: BaseException) -> str:
     """Return the words of an error, without the path that stands beside them."""
     words = str(error).removeprefix(f"{path}: ").replace(str(path), path.name)
     return words or type(error).__name__
-
-
-_KEPT: dict[str, Any] = {}
-"""The truth, in a process that reads: sent once, not with every product."""
-
-
-def _prepare(truth: xr.Dataset | None) -> None:
-    # Ctrl-C goes to all processes of a terminal; the one that started this one ends it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    _KEPT["truth"] = truth
-
-
-def _end_with_parent() -> None:
-    """End this process where the one that started it was killed, and can no longer do so."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _read_there(reading: Reading[Found]) -> Found | Unread:
-    return _read(reading, _KEPT["truth"])

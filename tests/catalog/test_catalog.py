@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import multiprocessing
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,13 +13,17 @@ import factories
 import fsspec
 import pytest
 import rawfiles
+import sqlalchemy as sa
 
+from lidarops import processes
 from lidarops.campaign import Campaign
+from lidarops.catalog import headers
 from lidarops.catalog import scan as scan_module
 from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.schema import GRANULE, LAYOUT
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.records import Role, Status
+from lidarops.records import Granule, Role, Status
 
 
 @pytest.fixture
@@ -41,13 +47,13 @@ def store(campaign: Campaign) -> Iterator[Store]:
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the files whose headers were parsed."""
     names: list[str] = []
-    parse = scan_module.licel.parse_header
+    parse = headers.licel.parse_header
 
     def counting(buffer: bytes, *, file: str, size: int) -> object:
         names.append(file)
         return parse(buffer, file=file, size=size)
 
-    monkeypatch.setattr(scan_module.licel, "parse_header", counting)
+    monkeypatch.setattr(headers.licel, "parse_header", counting)
     return names
 
 
@@ -211,3 +217,91 @@ def test_a_name_that_is_no_text_is_refused_and_the_rest_goes_on(
     assert refused.path == "coast/h\\udcff"
     assert "not UTF-8" in refused.reason
     assert scan(campaign, store) == ScanSummary(7, 0, 0, 7, 0, 1)
+
+
+class TestManyFiles:
+    """What is entered does not depend on who reads the headers."""
+
+    @pytest.fixture(autouse=True)
+    def few_are_many(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(scan_module, "_WORTH_PROCESSES", 4)
+        monkeypatch.setattr(scan_module, "_TOGETHER", 2)
+        monkeypatch.setattr(scan_module, "_BATCH", 7)
+
+    def test_are_entered_alike_by_more_processes(self, campaign: Campaign, tmp_path: Path) -> None:
+        root = _fill(campaign, 20)
+        (root / "coast" / "h3").write_bytes(b"nonsense")
+        (root / "coast" / "h4").unlink()
+        (root / "coast" / "h4").symlink_to("nowhere")
+        (root / os.fsdecode(b"coast/h\xff")).write_bytes(rawfiles.content(40))
+        url = f"sqlite:///{tmp_path}"
+        with (
+            Store(f"{url}/one.sqlite", campaign.name) as one,
+            Store(f"{url}/two.sqlite", campaign.name) as two,
+        ):
+            first = scan(campaign, one)
+            assert scan(campaign, two, workers=2) == first
+            assert (first.files, first.refused) == (22, 3)
+            assert _rows(two) == _rows(one)
+            digests = {each.path: f"{k:064x}" for k, each in enumerate(one.granules())}
+            moved = one.granules(status=Status.GOOD)[0].path
+            digests[moved] = hashlib.sha256((root / moved).read_bytes()).hexdigest()
+            for store in (one, two):
+                store.store_digests(digests)
+            (root / moved).rename(root / "coast" / "hz")
+            (root / "coast" / "h7").unlink()
+            for k in range(8, 16):
+                rawfiles.write(root / "coast" / f"h{k}", rawfiles.content(k + 100))
+            (root / "coast" / "h9").write_bytes(b"nonsense")
+            second = scan(campaign, one)
+            assert scan(campaign, two, workers=2) == second
+            assert (second.changed, second.moved, second.vanished) == (8, 1, 1)
+            assert _rows(two) == _rows(one)
+
+    def test_survive_the_death_of_a_process(
+        self, campaign: Campaign, store: Store, monkeypatch, caplog
+    ) -> None:
+        _fill(campaign, 20)
+        monkeypatch.setattr(scan_module, "read_header", _deadly)
+        assert scan(campaign, store, workers=2) == ScanSummary(21, 21, 0, 0, 0, 0)
+        assert len(store.granules(status=Status.GOOD)) == 21
+        assert "a process was lost" in caplog.text
+
+    def test_leave_no_process_where_nothing_may_be_written(
+        self, campaign: Campaign, store: Store
+    ) -> None:
+        _fill(campaign, 20)
+        with pytest.raises(InterruptedError):
+            scan(campaign, store, workers=2, before_write=_forbid)
+        assert not multiprocessing.active_children()
+        assert store.count() == 0
+
+    def test_of_which_few_are_new_start_no_process(
+        self, campaign: Campaign, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        root = _fill(campaign, 20)
+        scan(campaign, store)
+        monkeypatch.setattr(processes, "ProcessPoolExecutor", None)
+        for k in range(20, 23):
+            rawfiles.write(root / "coast" / f"h{k}", rawfiles.content(k))
+        assert scan(campaign, store, workers=2).added == 3
+
+
+def _rows(store: Store) -> list[tuple[object, ...]]:
+    with store.transaction() as connection:
+        return [
+            tuple(row)
+            for table in (GRANULE, LAYOUT)
+            for row in connection.execute(sa.select(table).order_by(*table.primary_key))
+        ]
+
+
+def _deadly(read: headers.Headers, due: headers.Due) -> Granule:
+    """Take down any process but the first."""
+    if multiprocessing.parent_process() is not None and due.file.path == "coast/h13":
+        os._exit(9)
+    return headers.read_header(read, due)
+
+
+def _forbid() -> None:
+    raise InterruptedError

@@ -15,7 +15,7 @@ from lidarops.campaign import Campaign
 from lidarops.catalog import scan as scan_module
 from lidarops.catalog.ledger import Entry, NewProduct, Run, RunStatus
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.scan import RawFile, Source
+from lidarops.catalog.sources import RawFile, Source
 from lidarops.catalog.store import Store
 from lidarops.plans import plan
 from lidarops.records import Granule, InputRecord, ProductRecord, Role, SceneOutcome

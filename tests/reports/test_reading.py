@@ -1,4 +1,4 @@
-"""Figures do not depend on who reads the products, nor on whether he lives to the end."""
+"""Figures do not depend on who reads the products and draws, nor on whether he lives on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fabricated import START, Archive, homogeneous, outcome, run_record, signal,
 
 from lidarops.errors import ProductError
 from lidarops.records import InputRecord, ProductKind, Role, RunRecord
-from lidarops.reports import gallery, page, reading
+from lidarops.reports import figures, gallery, page, reading
 from lidarops.reports.raster import raster_variables, read_raster
 from lidarops.reports.reading import Readers, Reading, Unread
 
@@ -69,6 +69,17 @@ class TestFigures:
         assert alone.problems[0].reason == "the file is missing"
         assert alone.problems[2].reason == "background: is missing from the product"
         assert alone.compared
+
+    def test_are_drawn_by_the_same_processes(self, many, tmp_path, monkeypatch):
+        def refuse(_: object) -> None:
+            raise AssertionError("drawn in this process")
+
+        monkeypatch.setattr(reading, "FEWEST", 1)
+        alone = gallery.fill(many, tmp_path)
+        monkeypatch.setattr(figures, "render", refuse)
+        assert gallery.fill(many, tmp_path, workers=2) == alone
+        with pytest.raises(AssertionError, match="in this process"):
+            gallery.fill(many, tmp_path)
 
     def test_quicklook_too(self, many, tmp_path, monkeypatch):
         alone = page.quicklook(many, tmp_path / "one").read_bytes()
@@ -149,7 +160,7 @@ class TestReaders:
             assert list(readers.each(readings(paths, deadly))) == list(range(2, 10))
             assert list(readers.each(readings(paths, shape)))[-1] == (9, 4)
             assert set(readers.each(readings(paths, process))) == {os.getpid()}
-        assert caplog.text.count("a process that read products was lost") == 1
+        assert caplog.text.count("a process was lost") == 1
 
     def test_a_daemon_that_may_start_no_process_reads_itself(self, paths, monkeypatch):
         monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)

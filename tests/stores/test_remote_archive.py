@@ -13,7 +13,8 @@ import pytest
 import rawfiles
 
 from lidarops.campaign import Campaign
-from lidarops.catalog.scan import ScanSummary, Source, scan
+from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Status

@@ -1,0 +1,161 @@
+"""Raw files -> granules, by their headers.
+
+Other processes read headers too, and this is all that they import: little, to start quickly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
+
+from lidarops.catalog.sources import RawFile, Source, printable
+from lidarops.errors import RawFormatError
+from lidarops.raw import licel
+from lidarops.records import Granule, Role, Status
+
+if TYPE_CHECKING:
+    from lidarops.campaign import Campaign
+
+UNREADABLE: Final = "cannot be read"
+"""How the reason starts where a file is refused that may be readable another time."""
+
+_HEADER_BYTES = 16384
+_FAR_FROM_STATION = 0.5
+"""degree; a header position farther than this from the station gets a note."""
+
+
+class Due(NamedTuple):
+    """A file whose header is to be read."""
+
+    file: RawFile
+    instrument: str
+    role: Role
+    rivals: tuple[str, ...]
+    """Other instruments that claim the file."""
+
+
+class _Pointing(NamedTuple):
+    valid_from: datetime
+    valid_to: datetime
+    zenith_angle: float | None
+    azimuth: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where an instrument stands and looks, as far as the campaign says."""
+
+    latitude: float
+    longitude: float
+    header_position: licel.HeaderOrder | Literal["ignore"]
+    pointings: tuple[_Pointing, ...]
+
+    def pointing(self, moment: datetime) -> tuple[float | None, float | None]:
+        for fact in self.pointings:
+            if fact.valid_from <= moment < fact.valid_to:
+                return fact.zenith_angle, fact.azimuth
+        return None, None
+
+
+@dataclass(frozen=True, slots=True)
+class Headers:
+    """What headers are read with."""
+
+    source: Source
+    _places: Mapping[str, _Place]
+
+    @classmethod
+    def of(cls, campaign: Campaign, source: Source) -> Self:
+        """Take what matters for headers out of a campaign, whose import takes long."""
+        places = {
+            name: _Place(
+                campaign.stations[instrument.station].latitude,
+                campaign.stations[instrument.station].longitude,
+                instrument.header_position,
+                tuple(
+                    _Pointing(fact.valid_from, fact.valid_to, fact.zenith_angle, fact.azimuth)
+                    for fact in instrument.facts
+                ),
+            )
+            for name, instrument in campaign.instruments.items()
+        }
+        return cls(source, places)
+
+    def place(self, instrument: str) -> _Place:
+        """Return where an instrument stands and looks."""
+        return self._places[instrument]
+
+
+def read_header(headers: Headers, due: Due) -> Granule:
+    """Return the granule of a file; refused, with the reason, where it cannot be used."""
+    file = due.file
+    if printable(file.path) != file.path:
+        return _refused(due, "has a name that is not UTF-8 (rename it)")
+    if due.rivals:
+        claimants = f"{due.instrument} and {', '.join(due.rivals)}"
+        return _refused(due, f"claimed by instruments {claimants} (make their patterns disjoint)")
+    try:
+        header = licel.parse_header(
+            headers.source.head(file.path, _HEADER_BYTES), file=file.path, size=file.size
+        )
+        return _accepted(due, header, headers.place(due.instrument))
+    except RawFormatError as error:
+        return _refused(due, str(error).removeprefix(f"{file.path}: "))
+    except OSError as error:
+        return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
+
+
+def _refused(due: Due, reason: str) -> Granule:
+    return Granule(
+        path=printable(due.file.path),
+        size=due.file.size,
+        mtime_ns=due.file.mtime_ns,
+        instrument=due.instrument,
+        role=due.role,
+        status=Status.REFUSED,
+        reason=reason,
+    )
+
+
+def _accepted(due: Due, header: licel.Header, place: _Place) -> Granule:
+    zenith_angle, azimuth = place.pointing(header.start)
+    notes = header.notes
+    latitude, longitude = place.latitude, place.longitude
+    if place.header_position != "ignore":
+        latitude, longitude = header.position(place.header_position)
+        away = max(abs(latitude - place.latitude), abs(longitude - place.longitude))
+        if away > _FAR_FROM_STATION:
+            note = _position_note(latitude, longitude, place.latitude, place.longitude)
+            notes = (*notes, note)
+    return Granule(
+        path=due.file.path,
+        size=due.file.size,
+        mtime_ns=due.file.mtime_ns,
+        instrument=due.instrument,
+        role=due.role,
+        status=Status.GOOD,
+        notes=notes,
+        start=header.start,
+        stop=header.stop,
+        zenith_angle=header.zenith_angle if zenith_angle is None else zenith_angle,
+        azimuth=header.azimuth if azimuth is None else azimuth,
+        latitude=latitude,
+        longitude=longitude,
+        altitude=header.altitude,
+        layout=licel.layout(header),
+    )
+
+
+def _position_note(latitude: float, longitude: float, north: float, east: float) -> str:
+    swapped = max(abs(longitude - north), abs(latitude - east)) <= _FAR_FROM_STATION
+    remedy = (
+        "they look swapped: set header_position of the instrument"
+        if swapped
+        else "the campaign's position is used; header_position: ignore silences this"
+    )
+    return (
+        f"header position {latitude:.1f} N {longitude:.1f} E is not the station's"
+        f" {north:.1f} N {east:.1f} E ({remedy})"
+    )

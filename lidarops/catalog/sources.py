@@ -1,0 +1,132 @@
+"""Where the raw files of an archive are: listed by path, read one by one."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from lidarops.errors import CatalogError
+from lidarops.stores import RemoteStore
+
+
+class RawFile(NamedTuple):
+    """A file of the archive as the file system lists it."""
+
+    path: str
+    size: int
+    mtime_ns: int
+
+
+def printable(path: str) -> str:
+    """Return a path that can be stored and shown: names may hold bytes that are no text."""
+    return path if path.isascii() else path.encode("utf-8", "backslashreplace").decode()
+
+
+def _rank(entry: os.DirEntry[str]) -> str:
+    """Return what puts entries into the order that the paths of their files have."""
+    name = printable(entry.name)
+    return f"{name}/" if entry.is_dir(follow_symlinks=False) else name
+
+
+def _listed(entry: os.DirEntry[str], path: str) -> RawFile:
+    try:
+        about = entry.stat()
+    except OSError:
+        # A link to nowhere is a file that cannot be read, and must be said to be one.
+        return RawFile(path, 0, 0)
+    return RawFile(path, about.st_size, about.st_mtime_ns)
+
+
+class Source:
+    """Where the raw files are: a local folder."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    @staticmethod
+    def of(archive: str) -> Source:
+        """Return the source of an archive, by its folder or URL."""
+        return RemoteSource(archive) if "://" in archive else Source(Path(archive))
+
+    def files(self) -> Iterator[RawFile]:
+        """List files in the order of their paths, whatever the file system's own."""
+        if not self._root.is_dir():
+            raise CatalogError(
+                "the archive is not a folder",
+                file=self._root,
+                remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
+            )
+        yield from self._walk(str(self._root), "")
+
+    def _walk(self, folder: str, prefix: str) -> Iterator[RawFile]:
+        try:
+            with os.scandir(folder) as listing:
+                entries = sorted(listing, key=_rank)
+        except OSError as error:
+            raise CatalogError(
+                f"cannot be listed: {error.strerror}", file=folder, remedy="check its permissions"
+            ) from error
+        for entry in entries:
+            path = f"{prefix}{entry.name}"
+            if entry.is_dir(follow_symlinks=False):
+                yield from self._walk(entry.path, f"{path}/")
+            else:
+                yield _listed(entry, path)
+
+    def head(self, path: str, size: int) -> bytes:
+        """Return the first bytes of a file."""
+        descriptor = self._opened(path)
+        try:
+            return os.read(descriptor, size)
+        finally:
+            os.close(descriptor)
+
+    def digest(self, path: str) -> str:
+        """Return the sha256 of a file."""
+        with open(self._opened(path), "rb") as stream:  # noqa: PTH123 - is open already
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+    def _opened(self, path: str) -> int:
+        file = f"{self._root}/{path}"
+        # Opening a pipe would wait for ever.
+        if not os.path.isfile(file):  # noqa: PTH113 - a Path costs as much as reading the file
+            raise OSError(errno.EINVAL, "is no regular file, or a link to nowhere")
+        return os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+
+
+class RemoteSource(Source):
+    """A store behind an fsspec URL."""
+
+    def __init__(self, url: str) -> None:
+        self._store = RemoteStore(url)
+
+    def files(self) -> Iterator[RawFile]:
+        """List files in the order of their paths."""
+        for stored in self._store.files():
+            yield RawFile(stored.path, stored.size, stored.stamp)
+
+    def head(self, path: str, size: int) -> bytes:
+        """Return the first bytes of a file."""
+        with _of_one_file():
+            return self._store.head(path, size)
+
+    def digest(self, path: str) -> str:
+        """Return the sha256 of a file."""
+        with _of_one_file():
+            return self._store.digest(path)
+
+
+@contextmanager
+def _of_one_file() -> Iterator[None]:
+    """Tell a file that cannot be read, which is refused, from a store that is away."""
+    try:
+        yield
+    except CatalogError as error:
+        if isinstance(error.__cause__, FileNotFoundError | PermissionError):
+            raise error.__cause__ from error
+        raise

@@ -1,0 +1,196 @@
+"""Several processes of this machine for work that is done piece by piece.
+
+What is found is the same, and in the same order, whoever finds it: where no process may or can
+be started, or one is lost, the work is done in this one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from itertools import chain, islice
+from typing import Any, Final, Generic, Self, TypeVar
+
+_AHEAD: Final = 8
+"""Lots of items for a process that are on their way at the same time."""
+_MAPPED_ALONE: Final = (-3, 32 << 20)
+"""glibc's M_MMAP_THRESHOLD, and the most it admits in byte."""
+_GIVEN_BACK: Final = (-1, 64 << 20)
+"""glibc's M_TRIM_THRESHOLD, byte."""
+
+Kept = TypeVar("Kept")
+Item = TypeVar("Item")
+Found = TypeVar("Found")
+_LOG = logging.getLogger(__name__)
+
+
+class Processes(Generic[Kept]):
+    """Some processes, to be used in a with; started when there is work for them, one by one.
+
+    Parameters
+    ----------
+    number : int
+        Most processes beside this one; none is ever started for fewer than 2.
+    kept : object
+        What all tasks are called with, sent to each process once.
+    """
+
+    def __init__(self, number: int, kept: Kept) -> None:
+        self._kept = kept
+        self._number = number
+        self._pool: ProcessPoolExecutor | None = None
+        # A daemonic process, as a worker of dask is, may not have any of its own.
+        self._alone = number < 2 or bool(multiprocessing.current_process().daemon)
+
+    @property
+    def number(self) -> int:
+        """How many there may be beside this one: none where all is done here."""
+        return 0 if self._alone else self._number
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def each(
+        self,
+        task: Callable[[Kept, Item], Found],
+        items: Iterable[Item],
+        *,
+        at_a_time: int,
+        fewest: int = 2,
+    ) -> Iterator[tuple[Item, Found]]:
+        """Do a task for each item; items are taken as they are needed, some ahead.
+
+        Parameters
+        ----------
+        task : callable
+            Called with what is kept and an item. All three, and what it returns or raises, can
+            be pickled.
+        items : iterable
+        at_a_time : int
+            Items that are handed to a process together, so that it waits less for the next.
+        fewest : int, optional
+            Items for which processes are worth their start.
+
+        Yields
+        ------
+        item, found
+            In the order of items.
+        """
+        rest = iter(items)
+        if not self._alone:
+            first = list(islice(rest, fewest))
+            rest = chain(first, rest)
+            if len(first) == fewest:
+                yield from self._each_there(task, rest, at_a_time)
+                return
+        for item in rest:
+            yield item, task(self._kept, item)
+
+    def _each_there(
+        self, task: Callable[[Kept, Item], Found], items: Iterator[Item], at_a_time: int
+    ) -> Iterator[tuple[Item, Found]]:
+        lots = iter(lambda: list(islice(items, at_a_time)), [])
+        ahead: deque[tuple[list[Item], Callable[[], list[Found]]]] = deque()
+        while True:
+            for lot in islice(lots, _AHEAD * self._number - len(ahead)):
+                ahead.append((lot, self.later(partial(_lot, task), lot)))
+            if not ahead:
+                return
+            lot, found = ahead.popleft()
+            yield from zip(lot, found(), strict=True)
+
+    def later(self, task: Callable[[Kept, Item], Found], item: Item) -> Callable[[], Found]:
+        """Begin a task; return what gives, or raises, what it came to.
+
+        It waits for that. Without processes the task is done when it is asked for.
+        """
+        here = partial(task, self._kept, item)
+        there = self._submit(task, item)
+        return here if there is None else partial(self._waited, there, here)
+
+    def _submit(self, task: Callable[[Kept, Item], Found], item: Item) -> Future[Found] | None:
+        if self._alone:
+            return None
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(
+                self._number,
+                # A fork would inherit the locks of whatever threads are running.
+                mp_context=multiprocessing.get_context("spawn"),
+                initializer=_prepare,
+                initargs=(self._kept,),
+            )
+        try:
+            return self._pool.submit(_there, task, item)
+        # One was lost, or none can be started.
+        except (BrokenProcessPool, OSError) as error:
+            self._lost(error)
+            return None
+
+    def _waited(self, there: Future[Found], here: Callable[[], Found]) -> Found:
+        try:
+            if not (self._alone and there.cancel()):
+                return there.result()
+        # A process that was killed, for its memory say.
+        except BrokenProcessPool as error:
+            self._lost(error)
+        return here()
+
+    def _lost(self, error: BaseException) -> None:
+        if not self._alone:
+            _LOG.warning("a process was lost, its work is done here: %s", error)
+            self._alone = True
+            if self._pool is not None:
+                self._pool.shutdown(wait=False, cancel_futures=True)
+                self._pool = None
+
+
+_KEPT: list[Any] = []
+"""In a process that was started here: what it keeps for all tasks."""
+
+
+def _prepare(kept: object) -> None:
+    # Ctrl-C goes to all processes of a terminal; the one that started this one ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _keep_memory()
+    _KEPT[:] = [kept]
+
+
+def _end_with_parent() -> None:
+    """End this process where the one that started it was killed, and can no longer do so."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _keep_memory() -> None:
+    """Let the C library keep what arrays leave: to map each anew takes a third of the time."""
+    try:
+        set_option = ctypes.CDLL(None).mallopt
+    # Of another system.
+    except (OSError, TypeError, AttributeError):
+        return
+    for option, value in (_MAPPED_ALONE, _GIVEN_BACK):
+        set_option(option, value)
+
+
+def _there(task: Callable[[Any, Item], Found], item: Item) -> Found:
+    return task(_KEPT[0], item)
+
+
+def _lot(task: Callable[[Kept, Item], Found], kept: Kept, items: list[Item]) -> list[Found]:
+    return [task(kept, item) for item in items]

@@ -1,0 +1,128 @@
+"""Work that is spread over processes comes to the same, in the same order, whatever dies."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+from itertools import count, islice
+
+import pytest
+
+from lidarops import processes
+from lidarops.errors import CatalogError
+from lidarops.processes import Processes
+
+
+def product(kept: int, item: int) -> int:
+    return kept * item
+
+
+def process(kept: int, item: int) -> int:
+    return os.getpid()
+
+
+def deadly(kept: int, item: int) -> int:
+    """Take down any process but the first."""
+    if multiprocessing.parent_process() is not None and item == 5:
+        os._exit(9)
+    return kept * item
+
+
+def failing(kept: int, item: int) -> int:
+    if item == 5:
+        raise CatalogError("is away", file="archive", remedy="wait")
+    return item
+
+
+def doubled(items: range) -> list[tuple[int, int]]:
+    return [(item, 2 * item) for item in items]
+
+
+@pytest.fixture
+def no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a process is started")
+
+    monkeypatch.setattr(processes, "ProcessPoolExecutor", refuse)
+
+
+class TestEach:
+    @pytest.mark.parametrize("number", [1, 2])
+    def test_keeps_the_order(self, number: int) -> None:
+        with Processes(number, 2) as pool:
+            assert list(pool.each(product, range(40), at_a_time=3)) == doubled(range(40))
+            others = {found for _, found in pool.each(process, range(40), at_a_time=3)}
+            assert list(pool.each(product, [], at_a_time=3)) == []
+        assert (os.getpid() not in others) == (number > 1)
+
+    def test_takes_items_as_they_are_needed(self) -> None:
+        taken = count()
+        with Processes(2, 2) as pool:
+            found = pool.each(product, taken, at_a_time=1)
+            assert list(islice(found, 30)) == doubled(range(30))
+        assert next(taken) < 100
+
+    @pytest.mark.usefixtures("no_process")
+    def test_starts_no_process_for_few_items(self) -> None:
+        with Processes(2, 2) as pool:
+            found = pool.each(product, range(9), at_a_time=3, fewest=10)
+            assert list(found) == doubled(range(9))
+
+    @pytest.mark.usefixtures("no_process")
+    def test_a_daemon_that_may_start_no_process_does_it_itself(self, monkeypatch) -> None:
+        monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
+        with Processes(2, 2) as pool:
+            assert list(pool.each(product, range(9), at_a_time=3)) == doubled(range(9))
+            assert pool.later(product, 7)() == 14
+
+    def test_loses_nothing_with_a_process(self, caplog: pytest.LogCaptureFixture) -> None:
+        with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
+            last = pool.later(product, 7)
+            assert list(pool.each(deadly, range(40), at_a_time=2)) == doubled(range(40))
+            assert last() == 14
+            assert {found for _, found in pool.each(process, range(4), at_a_time=1)} == {
+                os.getpid()
+            }
+        assert caplog.text.count("a process was lost") == 1
+
+    def test_goes_on_here_where_none_can_be_started(self, monkeypatch, caplog) -> None:
+        context = multiprocessing.get_context("spawn")
+        monkeypatch.setattr(context, "Process", _unstartable)
+        with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
+            assert list(pool.each(product, range(9), at_a_time=2)) == doubled(range(9))
+        assert caplog.text.count("a process was lost") == 1
+
+    @pytest.mark.parametrize("number", [1, 2])
+    def test_raises_what_a_task_raises(self, number: int) -> None:
+        with Processes(number, 2) as pool:
+            found = pool.each(failing, range(40), at_a_time=1)
+            assert list(islice(found, 5)) == [(item, item) for item in range(5)]
+            with pytest.raises(CatalogError, match=r"archive: is away \(wait\)"):
+                next(found)
+            # That was no loss of a process.
+            others = {one for _, one in pool.each(process, [1, 2], at_a_time=1)}
+        assert (os.getpid() not in others) == (number > 1)
+
+    def test_leaves_no_process_where_who_asks_gives_up(self) -> None:
+        with pytest.raises(KeyboardInterrupt), Processes(2, 2) as pool:
+            _interrupted(pool)
+        assert not multiprocessing.active_children()
+
+
+def _interrupted(pool: Processes[int]) -> None:
+    for item, _ in pool.each(product, count(), at_a_time=1):
+        if item == 20:
+            raise KeyboardInterrupt
+
+
+def _unstartable(*_: object, **__: object) -> None:
+    raise BlockingIOError("no more processes")
+
+
+class TestLater:
+    @pytest.mark.parametrize("number", [1, 2])
+    def test_gives_what_it_came_to(self, number: int) -> None:
+        with Processes(number, 3) as pool:
+            begun = [pool.later(product, item) for item in range(9)]
+            assert [found() for found in begun] == [3 * item for item in range(9)]
