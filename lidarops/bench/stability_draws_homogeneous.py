@@ -260,7 +260,7 @@ def _solved(
     yield (
         Judged(
             failure, "background", found.background - paths.background[:, 0],
-            found.background_standard_error, 0.0, bits, solvable=likely,
+            found.background_standard_error, found.background_model_error, bits, solvable=likely,
         ),
         count,
     )  # fmt: skip

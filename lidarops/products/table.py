@@ -164,9 +164,23 @@ _HOMOGENEOUS = Layout(
             long_name="background as fitted in the section",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
-            ancillaries=_OF_FIT,
+            ancillaries=("background_model_error", *_OF_FIT),
             uncertain=True,
             comment=f"Not calibrated. {NO_NAME}",
+        ),
+        Row(
+            name="background_model_error",
+            dims=_SECTIONS,
+            dtype="f4",
+            units="{signal}",
+            long_name="systematic error of the background to allow for",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            error_kind=ErrorKind.SYSTEMATIC,
+            comment="Apart from the random error in background_standard_error: what the"
+            " background takes up of a signal whose logarithmic slope is 5 percent off that of"
+            " the model at one end of the section and -5 percent at the other, as where"
+            f" backscatter bends along the path. {NO_NAME}",
         ),
         Row(
             name="reduced_chi2",

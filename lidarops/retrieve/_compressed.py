@@ -68,6 +68,8 @@ RESULTS: Final = (
     "signal_to_noise",
     "reduced_chi2",
     "curvature_misfit",
+    "background_bend",
+    "extinction_bend",
 )
 """Rows of the results."""
 
@@ -153,7 +155,7 @@ def _scratch(power: Any, root: Any, envelope: Any, lanes: int) -> _Scratch:
         np.zeros(BLOCK, np.int64),
         np.zeros((8, BLOCK)),
         np.zeros(BLOCK),
-        np.zeros((8, BLOCK)),
+        np.zeros((_tables.SCALARS, BLOCK)),
         np.zeros((_FOUND, BLOCK)),
         np.zeros(12),
         np.ones(_tables.DEGREE + 2),
@@ -320,9 +322,9 @@ def _read_scalars(tables: Tables, s: _Scratch) -> None:
         square = t * t
         powers[1], powers[2], powers[3] = t, square, square * t
         powers[4], powers[5], powers[6] = square * square, square * square * t, square**3
-        here = tables.scalars.ctypes.data + 64 * terms * cell
-        project_1_8(powers.ctypes.data, 8, here, terms, out, out, 0)
-        for j in range(8):
+        here = tables.scalars.ctypes.data + 8 * _tables.SCALARS * terms * cell
+        project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
+        for j in range(_tables.SCALARS):
             s.scalars[j, p] = row[j]
 
 
@@ -461,6 +463,8 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
         results[7, p] = found[_ENERGY, p] / (noise * (bins - 3))
         curvature = found[_CURVATURE, p]
         results[8, p] = (curvature if curvature > 0.0 else 0.0) * tables.unit / noise
+        results[9, p] = size * s.scalars[_tables.BACKGROUND_BEND, p] * tables.length
+        results[10, p] = s.scalars[_tables.EXTINCTION_BEND, p]
 
 
 @_compiled

@@ -45,6 +45,10 @@ LEVEL_SLOPE: Final = 4
 LEVEL_SHAPE: Final = 5
 DECAY: Final = 6
 LOST_NORM: Final = 7
+BACKGROUND_BEND: Final = 8
+EXTINCTION_BEND: Final = 9
+SCALARS: Final = 12
+"""Columns, padded to whole vectors."""
 
 
 class Tables(NamedTuple):
@@ -62,7 +66,7 @@ class Tables(NamedTuple):
     directions: Array
     """(cell, power, lanes): polynomials of q."""
     scalars: Array
-    """(cell, power, 8): polynomials of what the results need beside y."""
+    """(cell, power, SCALARS): polynomials of what the results need beside y."""
     steepness: Array
     """(cell,): squared length of h dq/dtau at the centre."""
     centres: Array
@@ -198,8 +202,31 @@ def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _P
         mean / norm,
         np.exp(-2 * tau * step),
         _norm(family.centred(shapes)) ** 2 - norm**2,
+        *_bend(family, shapes),
     ]
+    scalars += [np.zeros_like(norm)] * (SCALARS - len(scalars))
     return _Projected(direction, turning, np.stack(scalars, axis=-1))
+
+
+def _bend(family: _Family, shapes: _Long) -> tuple[_Long, _Long]:
+    """Return what a signal bent by ``(x - 1/2)^2`` does to background and tau, by amplitude.
+
+    The normal equations of level, phi and phi x for a right-hand side of phi x^2, with x from the
+    middle.
+    """
+    powers = (family.x - np.longdouble(0.5))[:, np.newaxis] ** np.arange(4)
+    powers *= family.weights[:, np.newaxis]
+    once, twice = (shapes @ powers[:, :3]).T, ((shapes * shapes) @ powers).T
+
+    def left(i: int, j: int) -> _Long:
+        """Return the product of phi x^i and phi x^j without their means."""
+        return np.asarray(twice[i + j] - once[i] * once[j] / family.total, np.longdouble)
+
+    along = left(0, 1) / left(0, 0)
+    of_slope = (left(1, 2) - along * left(0, 2)) / (left(1, 1) - along * left(0, 1))
+    of_shape = (left(0, 2) - of_slope * left(0, 1)) / left(0, 0)
+    level = (once[2] - of_shape * once[0] - of_slope * once[1]) / family.total
+    return np.asarray(level, np.longdouble), np.asarray(-of_slope / 2, np.longdouble)
 
 
 def _interpolation(nodes: _Long) -> _Long:

@@ -75,12 +75,18 @@ class HomogeneousResult:
     Standard errors are conditional on the model. What changes the profile along the model's own
     shapes leaves no trace in the residuals: backscatter that falls along the path as
     ``exp(-R / H)`` is taken for 1 / (2 H) of extinction, on a vertical path as on any other.
-    `extinction_model_error` is an allowance for that, apart from the random error.
+    `extinction_model_error` and `background_model_error` are an allowance for that, apart from the
+    random error.
     """
 
     background: Array
     """P*, in the unit of the power."""
     background_standard_error: Array
+    """In the unit of the power; random error alone."""
+    background_model_error: Array
+    """In the unit of the power: what the background takes up, to first order, of a signal whose
+    logarithmic slope departs from the model by `model_error` times that of the model at either
+    end of the section, with opposite signs, as where backscatter bends along the path."""
     amplitude: Array
     """B of ``P = P* + B R^-2 exp(-2 extinction R)``, in the unit of the power times m2."""
     amplitude_standard_error: Array
@@ -175,9 +181,9 @@ def solve(
         OUTLIER. The standard deviation is not less than the median deviation tells, so that a
         bad fit does not shed most of its bins. Not with "cubic", which takes no gaps.
     model_error : float
-        Share of extinction + 1 / mean range that is stated as `extinction_model_error`. In
-        random violations of the model that no test on residuals could see, 5 percent covered
-        most of the excess error.
+        Share of extinction + 1 / mean range that is stated as `extinction_model_error`, and that
+        `background_model_error` allows the signal to bend by. In random violations of the model
+        that no test on residuals could see, 5 percent covered most of the excess error.
 
     Returns
     -------
@@ -455,8 +461,14 @@ def _result(found: Sequence[Flat], shape: tuple[int, ...], model_error: float) -
         field.name: _stacked([getattr(flat, field.name) for flat in found]).reshape(shape)
         for field in fields(Flat)
     }
-    scale = np.abs(columns["extinction"]) + 1.0 / columns.pop("mean_range")
-    return HomogeneousResult(**columns, extinction_model_error=model_error * scale)
+    departure = model_error * (np.abs(columns["extinction"]) + 1.0 / columns.pop("mean_range"))
+    bend = {name: np.abs(columns.pop(f"{name}_bend")) for name in ("background", "extinction")}
+    return HomogeneousResult(
+        **columns,
+        # A signal bent by c (x - 1/2)^2 has slopes of -c and c over the length at its ends.
+        background_model_error=2.0 * departure * bend["background"],
+        extinction_model_error=departure,
+    )
 
 
 def _stacked(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
