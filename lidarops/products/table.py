@@ -147,7 +147,7 @@ _HOMOGENEOUS = Layout(
             " extinction + 1 / range, and what the extinction takes up of a signal whose"
             " logarithmic slope is as much off at one end of the section and the opposite at the"
             f" other. {_UNTOLD} 7 percent with backscatter that changes along the section as an"
-            " exponential of range with a scale of 1 to 100 km, 10 with a plume, 9 where the top"
+            " exponential of range with a scale of 1 to 100 km, 10 with a plume, 8 where the top"
             " of the signal is cut off, 2.5 where backscatter bends, 0.5 at most otherwise."
             f" {NO_NAME}",
         ),

@@ -65,6 +65,9 @@ class Tables(NamedTuple):
     """(cell, K, 8): q at the centre, then the polynomial of h dq/dtau."""
     directions: Array
     """(cell, power, lanes): polynomials of q."""
+    squares: Array
+    """(cell, power, lanes): polynomials of the unit vector along what the model leaves over of
+    ``phi^2`` in the basis."""
     scalars: Array
     """(cell, power, SCALARS): polynomials of what the results need beside y."""
     steepness: Array
@@ -167,6 +170,8 @@ class _Projected(NamedTuple):
     slope: _Long
     """Derivative of the direction by tau."""
     scalars: _Long
+    square: _Long
+    """Unit vector along what level, shape and slope leave over of the squared shape."""
 
 
 def _norm(rows: _Long) -> _Long:
@@ -205,7 +210,15 @@ def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _P
         *_bend(family, shapes),
     ]
     scalars += [np.zeros_like(norm)] * (SCALARS - len(scalars))
-    return _Projected(direction, turning, np.stack(scalars, axis=-1))
+    square = shapes * shapes
+    square = (square - square[:, -1:]) @ exact[:, :size]
+    turned = turning / turn[:, np.newaxis]
+    # Twice, since little is left over.
+    for _ in range(2):
+        square = square - (square * direction).sum(axis=1)[:, np.newaxis] * direction
+        square = square - (square * turned).sum(axis=1)[:, np.newaxis] * turned
+    square = square / _norm(square)[:, np.newaxis]
+    return _Projected(direction, turning, np.stack(scalars, axis=-1), square)
 
 
 def _bend(family: _Family, shapes: _Long) -> tuple[_Long, _Long]:
@@ -279,6 +292,10 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
     directions = np.zeros((CELLS, order + 1, columns.shape[1]))
     directions[:, :, :size] = np.swapaxes(slopes, 1, 2)
     directions[:, 1:] /= np.arange(1, order + 1)[:, np.newaxis]
+    squares = np.zeros_like(directions)
+    squares[:, :order, :size] = np.einsum(
+        "ij,cjk->cik", matrix, at.square.reshape(CELLS, order, size)
+    )
     starts = np.zeros((CELLS, size, 4))
     starts[:, :, :2] = slopes[:, :, :2]
     scalars = np.einsum("ij,cjk->cik", matrix, at.scalars.reshape(CELLS, order, -1))
@@ -292,6 +309,7 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
         starts=starts,
         slopes=slopes,
         directions=directions,
+        squares=squares,
         scalars=np.ascontiguousarray(scalars.astype(np.float64)),
         steepness=steepness.astype(np.float64),
         centres=centres.astype(np.float64),
