@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy import stats
 
 from lidarops.bench.multiangle_cases import correlated
-from lidarops.bench.stability_draws import Failure, Judged, Mask
+from lidarops.bench.stability_draws import VISIBLE, Failure, Judged, Mask
 from lidarops.bench.stability_terms import Array
 from lidarops.retrieve import homogeneous
 
@@ -214,6 +214,16 @@ def least_relative_error(paths: Scenes) -> Array:
     return np.asarray(least / scale)
 
 
+def visible(range_: Array, signal: Array) -> Array:
+    """Return (profile,) what the model cannot take up of signals, over unit noise.
+
+    The norm of what the best fit leaves over of the signals without noise: to first order their
+    departure less its projections on what background, amplitude and extinction can change.
+    """
+    found = homogeneous.solve(signal, range_, variance=1.0)
+    return np.sqrt(found.reduced_chi2 * (found.valid_bins - 3))
+
+
 def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Solve random paths of one geometry, class by class."""
     paths, rng = scenes(cluster, profiles)
@@ -233,7 +243,8 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
         noise = None if "not stated" in failure.name else 1.0
         wider = _widening(paths.range.size) if noise is None else 1.0
         could: Mask = within & (wider * least <= _SOLVABLE)
-        yield from _solved(failure, paths, seen, power, noise, could)
+        hidden = None if violate is _none else visible(paths.range, seen.signal) < VISIBLE
+        yield from _solved(failure, paths, seen, power, (noise, could, hidden))
 
 
 def _widening(bins: int) -> float:
@@ -243,8 +254,13 @@ def _widening(bins: int) -> float:
 
 
 def _solved(
-    failure: Failure, paths: Scenes, seen: Seen, power: Array, noise: Any, could: Mask
+    failure: Failure,
+    paths: Scenes,
+    seen: Seen,
+    power: Array,
+    known: tuple[float | None, Mask, Mask | None],
 ) -> Iterator[tuple[Judged, int]]:
+    noise, could, hidden = known
     found = homogeneous.solve(power, paths.range, variance=noise)
     bits = np.asarray(found.quality)
     # Where bins are missing, less can be told than of all of them.
@@ -254,13 +270,15 @@ def _solved(
         Judged(
             failure, "extinction", found.extinction - seen.extinction,
             found.extinction_standard_error, found.extinction_model_error, bits, solvable=likely,
+            hidden=hidden,
         ),
         count,
     )  # fmt: skip
     yield (
         Judged(
             failure, "background", found.background - paths.background[:, 0],
-            found.background_standard_error, 0.0, bits, solvable=likely,
+            found.background_standard_error, found.background_model_error, bits, solvable=likely,
+            hidden=hidden,
         ),
         count,
     )  # fmt: skip

@@ -68,6 +68,8 @@ RESULTS: Final = (
     "signal_to_noise",
     "reduced_chi2",
     "curvature_misfit",
+    "background_bend",
+    "extinction_bend",
 )
 """Rows of the results."""
 
@@ -114,6 +116,7 @@ class _Scratch(NamedTuple):
     scalars: Array
     found: Array
     row: Array
+    left: Array
     powers: Array
     root: Any
     envelope: Any
@@ -139,7 +142,8 @@ _LARGEST: Final = 9
 _BENDS: Final = 10
 _BOUNDED: Final = 11
 _NOISE: Final = 12
-_FOUND: Final = 13
+_SQUARE: Final = 13
+_FOUND: Final = 14
 
 
 @_compiled
@@ -153,8 +157,9 @@ def _scratch(power: Any, root: Any, envelope: Any, lanes: int) -> _Scratch:
         np.zeros(BLOCK, np.int64),
         np.zeros((8, BLOCK)),
         np.zeros(BLOCK),
-        np.zeros((8, BLOCK)),
+        np.zeros((_tables.SCALARS, BLOCK)),
         np.zeros((_FOUND, BLOCK)),
+        np.zeros(12),
         np.zeros(12),
         np.ones(_tables.DEGREE + 2),
         root,
@@ -320,9 +325,9 @@ def _read_scalars(tables: Tables, s: _Scratch) -> None:
         square = t * t
         powers[1], powers[2], powers[3] = t, square, square * t
         powers[4], powers[5], powers[6] = square * square, square * square * t, square**3
-        here = tables.scalars.ctypes.data + 64 * terms * cell
-        project_1_8(powers.ctypes.data, 8, here, terms, out, out, 0)
-        for j in range(8):
+        here = tables.scalars.ctypes.data + 8 * _tables.SCALARS * terms * cell
+        project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
+        for j in range(_tables.SCALARS):
             s.scalars[j, p] = row[j]
 
 
@@ -352,7 +357,11 @@ def _estimate(tables: Tables, s: _Scratch) -> None:
 
 @_compiled
 def _seek_curvature(tables: Tables, s: _Scratch) -> None:
-    """Fill the energy of the first functionals that the model leaves over."""
+    """Fill the energy of the first functionals that the model leaves over.
+
+    And what all of them leave over along the square of the shape, where a detector leaves its
+    trace that is not linear or driven into saturation.
+    """
     lanes, terms, row, powers = s.y.shape[1], s.f.shape[0], s.row, s.powers
     out = row.ctypes.data
     for p in range(BLOCK):
@@ -367,10 +376,20 @@ def _seek_curvature(tables: Tables, s: _Scratch) -> None:
         else:
             project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
         energy = 0.0
+        for j in range(tables.size):
+            s.left[j] = s.y[p, j] - size * row[j]
         for j in range(CURVATURES):
-            rest = s.y[p, j] - size * row[j]
-            energy += rest * rest
+            energy += s.left[j] * s.left[j]
         s.found[_CURVATURE, p] = energy - _INTERPOLATED * size * size
+        here = tables.squares.ctypes.data + 8 * terms * lanes * s.cell[p]
+        if lanes == 8:
+            project_1_8(powers.ctypes.data, 8, here, terms, out, out, 0)
+        else:
+            project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
+        along = 0.0
+        for j in range(tables.size):
+            along += s.left[j] * row[j]
+        s.found[_SQUARE, p] = abs(along) - math.sqrt(_INTERPOLATED) * size
 
 
 @_compiled
@@ -461,6 +480,8 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
         results[7, p] = found[_ENERGY, p] / (noise * (bins - 3))
         curvature = found[_CURVATURE, p]
         results[8, p] = (curvature if curvature > 0.0 else 0.0) * tables.unit / noise
+        results[9, p] = size * s.scalars[_tables.BACKGROUND_BEND, p] * tables.length
+        results[10, p] = s.scalars[_tables.EXTINCTION_BEND, p]
 
 
 @_compiled
@@ -479,7 +500,9 @@ def _judge(tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> Non
         bits |= 0 if determined else _POORLY_DETERMINED
         bits |= 0 if s.sign[p] > 0.0 else _NEGATIVE_AMPLITUDE
         bits |= 0 if found[_BOUNDED, p] == 0.0 else _AT_BOUND
-        bits |= 0 if results[8, p] <= limits.curvature else _NOT_HOMOGENEOUS
+        straight = results[8, p] <= limits.curvature
+        straight &= found[_SQUARE, p] * math.sqrt(tables.unit / found[_NOISE, p]) <= limits.square
+        bits |= 0 if straight else _NOT_HOMOGENEOUS
         tested = 0 if fits else _POOR_FIT
         tested |= 0 if found[_LARGEST, p] <= largest else _OUTLIER
         s.bits[p] = bits | (tested if mode.with_residuals else 0)

@@ -19,6 +19,7 @@ from lidarops.retrieve._estimate import (
     AMPLITUDE,
     AMPLITUDE_RELATIVE_VARIANCE,
     BACKGROUND,
+    BACKGROUND_BEND,
     BACKGROUND_VARIANCE,
     BENDS,
     BINS,
@@ -37,7 +38,7 @@ from lidarops.retrieve._estimate import (
     TOO_SHORT,
     TREND,
 )
-from lidarops.retrieve._misfit import judge_residuals
+from lidarops.retrieve._misfit import describe_bend, describe_bend_given, judge_residuals
 from lidarops.retrieve._projection import (
     NODE_SCALE,
     NODES,
@@ -230,6 +231,9 @@ def _fit(g: Grid, s: Scratch, free: float, kind: int, tau: float, row: Array) ->
         _step(g, p, kind, tau, row)
         tau = row[EXTINCTION]
         p = _moved(evaluate(tau, g, s, w0, wz, free), row)
+    describe_bend(g, s, p, w0, free, row)
+    if kind == GIVEN:
+        describe_bend_given(p, row)
     row[MEAN_RANGE] = product(s.w, g.x) / w0
     judge_residuals(g, s, p, tau, (w0, wz, free), row)
     if kind == GIVEN:
@@ -243,6 +247,7 @@ def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> 
     sign = math.copysign(1.0, row[AMPLITUDE])
     logarithm = math.log(abs(row[AMPLITUDE])) + math.log(scale)
     logarithm += 2.0 * math.log(g.start) + 2.0 * row[EXTINCTION] * g.start / g.length
+    row[BACKGROUND_BEND] *= scale * row[AMPLITUDE] * g.length
     row[BACKGROUND] = reference + scale * row[BACKGROUND]
     row[AMPLITUDE] = sign * math.exp(logarithm)
     row[EXTINCTION] /= g.length

@@ -52,6 +52,11 @@ class Estimate:
     """Weighted, m."""
     bounded: Array
     """1 where the extinction lies at a bound."""
+    background_bend: Array
+    """What a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1 along the section,
+    does to the background, in the unit of the power times the length of the section."""
+    extinction_bend: Array
+    """The same of the extinction, times the length of the section."""
 
 
 COLUMNS: Final = tuple(field.name for field in fields(Estimate))
@@ -75,4 +80,6 @@ COLUMNS: Final = tuple(field.name for field in fields(Estimate))
     ROUNDING,
     MEAN_RANGE,
     BOUNDED,
+    BACKGROUND_BEND,
+    EXTINCTION_BEND,
 ) = range(len(COLUMNS))

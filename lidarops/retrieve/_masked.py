@@ -24,12 +24,14 @@ from lidarops.retrieve._estimate import (
     AMPLITUDE,
     AMPLITUDE_RELATIVE_VARIANCE,
     BACKGROUND,
+    BACKGROUND_BEND,
     BACKGROUND_VARIANCE,
     BEND_COUNT,
     BENDS,
     BINS,
     BOUNDED,
     EXTINCTION,
+    EXTINCTION_BEND,
     EXTINCTION_VARIANCE,
     FITTED,
     LARGEST,
@@ -375,6 +377,19 @@ def _components(
 
 
 @_compiled
+def _describe_bend(
+    before: _Fit, sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array
+) -> None:
+    """Write what a bent signal does to the fit, as `lidarops.retrieve._misfit` has it."""
+    norm, _, of_level, of_shape, shape = _normal(sums, whole)
+    one, along, across = _components(bent[0], bent[1], bent[2], sums, whole)
+    along, across = along / math.sqrt(shape), across / math.sqrt(norm)
+    mean = before.mean + sums[0] / whole
+    row[BACKGROUND_BEND] = one / whole - along * mean - across * (of_level - of_shape * mean)
+    row[EXTINCTION_BEND] = 0.5 - before.centre - 0.5 * across
+
+
+@_compiled
 def _trend(sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array) -> None:
     """Write the misfit, and the energy of the residuals in two shapes that the model lacks.
 
@@ -466,6 +481,7 @@ def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bo
     e1, e4 = _decays(g, before.tau)
     bent = bend_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
     _trend(sums, bent, whole, row)
+    _describe_bend(before, sums, bent, whole, row)
     row[BENDS], row[BEND_COUNT] = 0.0, 0.0
     if want_bends:
         _look_back(g, s, after, row)

@@ -130,11 +130,13 @@ def _above(problem: Problem, background: Array, gradients: Array) -> Estimate:
         background_variance=spread[:, 0],
         amplitude_relative_variance=spread[:, 1],
         extinction_variance=spread[:, 2],
+        background_bend=spread[:, 5],
+        extinction_bend=fit.extinction_bend + spread[:, 4] * spread[:, 5],
     )
 
 
 def _propagated(problem: Problem, fit: Estimate, gradients: Array) -> Array:
-    out = np.empty((fit.extinction.size, 5))
+    out = np.empty((fit.extinction.size, 6))
     _propagation.propagate(
         problem.power,
         problem.noise,
@@ -223,6 +225,8 @@ def _flat(
         reduced_chi2=of(verdict.reduced_chi2, fitted),
         curvature_misfit=np.full(fit.status.shape, np.nan),
         mean_range=of(fit.mean_range, fitted),
+        background_bend=of(fit.background_bend, fitted),
+        extinction_bend=of(fit.extinction_bend, fitted),
         valid_bins=np.nan_to_num(fit.bins).astype(np.int32),
         quality=verdict.quality | quality,
     )

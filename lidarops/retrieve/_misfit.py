@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve._estimate import (
+    BACKGROUND_BEND,
     BEND_COUNT,
     BENDS,
     BOUNDED,
+    EXTINCTION_BEND,
     LARGEST,
     MISFIT,
     TREND,
@@ -113,6 +115,43 @@ def _trend(g: Grid, s: Scratch, p: Point, w0: float) -> tuple[float, float]:
         energy += own * own / norm
         count += 1.0
     return energy, count
+
+
+@summing
+def _bent(g: Grid, s: Scratch, p: Point) -> tuple[float, float, float]:
+    """Return the products of ``phi (x - centroid)^2`` with the orthogonal shapes of the model."""
+    one = shape = slope = 0.0
+    for i in range(g.x.size):
+        lever = g.x[i] - p.centroid
+        weighted = s.w[i] * s.phi[i] * lever * lever
+        one += weighted
+        shape += weighted * (s.phi[i] - p.mean_phi)
+        slope += weighted * (-2.0 * lever * s.phi[i] - p.mean_t)
+    return one, shape, slope
+
+
+@compiled
+def describe_bend(g: Grid, s: Scratch, p: Point, w0: float, free: float, row: Array) -> None:
+    """Write what a bent signal does to the fit, relative to its amplitude.
+
+    About whichever range it bends, the parabolas differ by shapes of the model: the background
+    does not notice, the extinction is carried over to the middle of the section.
+    """
+    one, shape, slope = _bent(g, s, p)
+    across = slope / p.slope_norm
+    row[BACKGROUND_BEND] = free * one / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
+    row[EXTINCTION_BEND] = across + 0.5 - p.centroid
+
+
+@compiled
+def describe_bend_given(p: Point, row: Array) -> None:
+    """Write the same over for a given extinction, which takes up neither bend nor slope.
+
+    The slope is as large as that of the bend at either end, and independent of it.
+    """
+    bent = row[BACKGROUND_BEND] + row[EXTINCTION_BEND] * p.mean_t
+    row[BACKGROUND_BEND] = math.hypot(bent, 0.5 * p.mean_t)
+    row[EXTINCTION_BEND] = 0.0
 
 
 @compiled

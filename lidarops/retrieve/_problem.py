@@ -106,6 +106,11 @@ class Flat:
     """Energy of the curvature functionals over the noise; NaN where the solver has none."""
     mean_range: Array
     """m, weighted over the bins used; NaN where nothing was fitted."""
+    background_bend: Array
+    """What a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1 along the section,
+    does to the background, times the length of the section; NaN where nothing was fitted."""
+    extinction_bend: Array
+    """The same of the extinction."""
     valid_bins: Flags
     quality: Flags
 

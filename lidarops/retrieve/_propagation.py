@@ -49,9 +49,11 @@ def _propagate_profile(
     row[:] = 0.0
     row[4] = -tilted / (b * slope)
     row[3] = -whole / (b * norm) + 2.0 * centroid * row[4]
+    length, middle = range_[-1] - range_[0], 0.5 * (range_[0] + range_[-1])
     for i in range(phi.size):
         if weights[i] == 0.0:
             continue
+        row[5] += gradient[i] * b * phi[i] * (range_[i] - middle) ** 2 / length
         weighted = phi[i] * weights[i]
         lever = -2.0 * (range_[i] - centroid)
         of_extinction = lever * weighted / (b * slope)
@@ -88,10 +90,11 @@ def propagate(
         m.
     gradients : (profile or 1, bin) float64
         Derivatives of the background with respect to the power.
-    out : (profile, 5) float64
+    out : (profile, 6) float64
         Gets the variance of the background, the relative variance of the amplitude and the
         variance of the extinction; then the derivatives of the logarithm of the amplitude and
-        of the extinction with respect to the background.
+        of the extinction with respect to the background; and what a signal bent by
+        ``(x - 1/2)^2`` does to the background, times the length of the section.
     """
     start, phi, weights = range_[0], np.empty(range_.size), np.empty(range_.size)
     for k in range(extinction.size):

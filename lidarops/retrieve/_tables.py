@@ -45,6 +45,10 @@ LEVEL_SLOPE: Final = 4
 LEVEL_SHAPE: Final = 5
 DECAY: Final = 6
 LOST_NORM: Final = 7
+BACKGROUND_BEND: Final = 8
+EXTINCTION_BEND: Final = 9
+SCALARS: Final = 12
+"""Columns, padded to whole vectors."""
 
 
 class Tables(NamedTuple):
@@ -61,8 +65,11 @@ class Tables(NamedTuple):
     """(cell, K, 8): q at the centre, then the polynomial of h dq/dtau."""
     directions: Array
     """(cell, power, lanes): polynomials of q."""
+    squares: Array
+    """(cell, power, lanes): polynomials of the unit vector along what the model leaves over of
+    ``phi^2`` in the basis."""
     scalars: Array
-    """(cell, power, 8): polynomials of what the results need beside y."""
+    """(cell, power, SCALARS): polynomials of what the results need beside y."""
     steepness: Array
     """(cell,): squared length of h dq/dtau at the centre."""
     centres: Array
@@ -163,6 +170,8 @@ class _Projected(NamedTuple):
     slope: _Long
     """Derivative of the direction by tau."""
     scalars: _Long
+    square: _Long
+    """Unit vector along what level, shape and slope leave over of the squared shape."""
 
 
 def _norm(rows: _Long) -> _Long:
@@ -198,8 +207,39 @@ def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _P
         mean / norm,
         np.exp(-2 * tau * step),
         _norm(family.centred(shapes)) ** 2 - norm**2,
+        *_bend(family, shapes),
     ]
-    return _Projected(direction, turning, np.stack(scalars, axis=-1))
+    scalars += [np.zeros_like(norm)] * (SCALARS - len(scalars))
+    square = shapes * shapes
+    square = (square - square[:, -1:]) @ exact[:, :size]
+    turned = turning / turn[:, np.newaxis]
+    # Twice, since little is left over.
+    for _ in range(2):
+        square = square - (square * direction).sum(axis=1)[:, np.newaxis] * direction
+        square = square - (square * turned).sum(axis=1)[:, np.newaxis] * turned
+    square = square / _norm(square)[:, np.newaxis]
+    return _Projected(direction, turning, np.stack(scalars, axis=-1), square)
+
+
+def _bend(family: _Family, shapes: _Long) -> tuple[_Long, _Long]:
+    """Return what a signal bent by ``(x - 1/2)^2`` does to background and tau, by amplitude.
+
+    The normal equations of level, phi and phi x for a right-hand side of phi x^2, with x from the
+    middle.
+    """
+    powers = (family.x - np.longdouble(0.5))[:, np.newaxis] ** np.arange(4)
+    powers *= family.weights[:, np.newaxis]
+    once, twice = (shapes @ powers[:, :3]).T, ((shapes * shapes) @ powers).T
+
+    def left(i: int, j: int) -> _Long:
+        """Return the product of phi x^i and phi x^j without their means."""
+        return np.asarray(twice[i + j] - once[i] * once[j] / family.total, np.longdouble)
+
+    along = left(0, 1) / left(0, 0)
+    of_slope = (left(1, 2) - along * left(0, 2)) / (left(1, 1) - along * left(0, 1))
+    of_shape = (left(0, 2) - of_slope * left(0, 1)) / left(0, 0)
+    level = (once[2] - of_shape * once[0] - of_slope * once[1]) / family.total
+    return np.asarray(level, np.longdouble), np.asarray(-of_slope / 2, np.longdouble)
 
 
 def _interpolation(nodes: _Long) -> _Long:
@@ -252,6 +292,10 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
     directions = np.zeros((CELLS, order + 1, columns.shape[1]))
     directions[:, :, :size] = np.swapaxes(slopes, 1, 2)
     directions[:, 1:] /= np.arange(1, order + 1)[:, np.newaxis]
+    squares = np.zeros_like(directions)
+    squares[:, :order, :size] = np.einsum(
+        "ij,cjk->cik", matrix, at.square.reshape(CELLS, order, size)
+    )
     starts = np.zeros((CELLS, size, 4))
     starts[:, :, :2] = slopes[:, :, :2]
     scalars = np.einsum("ij,cjk->cik", matrix, at.scalars.reshape(CELLS, order, -1))
@@ -265,6 +309,7 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
         starts=starts,
         slopes=slopes,
         directions=directions,
+        squares=squares,
         scalars=np.ascontiguousarray(scalars.astype(np.float64)),
         steepness=steepness.astype(np.float64),
         centres=centres.astype(np.float64),

@@ -70,6 +70,8 @@ class CommonLimits(NamedTuple):
     least_misfit: float
     most_misfit: float
     curvature: float
+    square: float
+    """Of the residuals along the square of the shape, in standard deviations."""
     outlier: float
     widening: float
     """Of standard errors, which is no limit but depends on the same counts."""
@@ -88,7 +90,21 @@ def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimi
     of_kind = _known_limits if known_variance else _estimated_limits
     one, bends, other = (np.array([float(count)]) for count in (bins, bins - 2, shapes))
     tests = (float(limit[0]) for limit in of_kind(one, bends, other, 3))
-    return CommonLimits(LOWEST_SIGNAL, LARGEST_RELATIVE_ERROR, *tests)
+    least, most, _, outlier, widening = tests
+    curvature, square = _shape_limits(bins, shapes, known_variance=known_variance)
+    return CommonLimits(
+        LOWEST_SIGNAL, LARGEST_RELATIVE_ERROR, least, most, curvature, square, outlier, widening
+    )
+
+
+def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[float, float]:
+    """Return the limits of two tests for shapes, which share the rate of one."""
+    rate = 0.5 * FALSE_ALARM
+    if known_variance:
+        return float(special.chdtri(shapes, rate)), -float(special.ndtri(0.5 * rate))
+    dof = _BEND_DOF * (bins - 2)
+    energy = shapes * special.fdtri(shapes, dof, 1.0 - rate)
+    return float(energy), -float(special.stdtrit(dof, 0.5 * rate))
 
 
 def judge(fit: Estimate, *, known_variance: bool, unknowns: int = 3) -> Verdict:

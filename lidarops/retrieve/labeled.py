@@ -27,6 +27,7 @@ _METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
 _TAIL: Final = {"background": "{}", "background_standard_error": "{}"}
 _SECTION: Final = {
     **_TAIL,
+    "background_model_error": "{}",
     "amplitude": "{} m2",
     "amplitude_standard_error": "{} m2",
     "extinction": "m-1",
@@ -75,9 +76,10 @@ def homogeneous(
     -------
     xr.Dataset, (..., section)
         ``background``, ``amplitude``, ``extinction``, each with ``_standard_error``,
-        ``extinction_model_error``, ``reduced_chi2``, ``valid_bins`` and ``quality_flag``, with
-        the coordinates ``section``, ``section_range`` (its middle) and ``section_bounds``; as
-        lazy as the input, and the same to the last bit for any chunking.
+        ``background_model_error``, ``extinction_model_error``, ``reduced_chi2``, ``valid_bins``
+        and ``quality_flag``, with the coordinates ``section``, ``section_range`` (its middle)
+        and ``section_bounds``; as lazy as the input, and the same to the last bit for any
+        chunking.
 
     Raises
     ------

@@ -7,16 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 from typer.testing import CliRunner
 
 from lidarops.bench import results, stability, stability_draws_homogeneous, stability_report
 from lidarops.bench.homogeneous import Scenario, difficulty
-from lidarops.bench.stability_draws import ALL, Failure, Judged, Tally, collect, share
+from lidarops.bench.stability_draws import (
+    ALL,
+    VISIBLE,
+    Failure,
+    Judged,
+    Tally,
+    collect,
+    share,
+)
 from lidarops.bench.stability_terms import Outcome, Retrieval
 from lidarops.bench.terms import Effort
 from lidarops.cli import app
 from lidarops.flags import Quality
 from lidarops.reports.benchmark import build
+from lidarops.retrieve import homogeneous
+from lidarops.retrieve._verdict import FALSE_ALARM
 
 HOLDS = Failure("none", satisfied=True)
 HIDDEN = Failure("hidden", unseen="it has the shape of the answer")
@@ -69,8 +80,49 @@ def test_systematic_errors_and_doubts_count_apart():
     assert rate.false_random.value == 1.0
     assert rate.false.value == 0.5
     assert rate.false_undoubted.value == 0.0
-    assert rate.judged is rate.false_undoubted
+    assert rate.judged == rate.false_undoubted
     assert rate.needless is None
+
+
+def test_what_no_test_can_see_is_false_but_told_apart():
+    hidden = np.array([True, True, False, False])
+    bits = [0, BAD, 0, 0]
+    rate = counted(judged(Failure("bent"), [9.0, 9.0, 9.0, 0.0], bits, hidden=hidden))["bent"]
+    assert rate.false_undoubted.value == pytest.approx(2 / 3)
+    assert rate.false_hidden.value == pytest.approx(1 / 3)
+    assert rate.judged is rate.false_seen
+    assert rate.false_seen.value == pytest.approx(1 / 3)
+    rates = counted(judged(Failure("bent"), [9.0], hidden=np.array([True])), judged(HOLDS, [0.0]))
+    assert rates["none"].false_hidden is None
+    assert rates[ALL].false_hidden.value == 0.5
+    assert rates[ALL].false_seen.value == 0.0
+
+
+def test_what_can_be_seen_is_what_three_tangents_leave_over():
+    r = np.linspace(2000.0, 9000.0, 300)
+    x = (r - r[0]) / np.ptp(r)
+    for extinction, amount in ((2e-5, 0.02), (3e-4, 0.05)):
+        shape = 1e3 * (r[0] / r) ** 2 * np.exp(-2.0 * extinction * (r - r[0]))
+        tangents = np.linalg.qr(np.stack([np.ones_like(r), shape, shape * x], axis=1))[0]
+        departure = amount * (x - 0.5) ** 2 * shape
+        left = np.linalg.norm(departure - tangents @ (tangents.T @ departure))
+        found = stability_draws_homogeneous.visible(r, (shape + departure)[np.newaxis])
+        assert found == pytest.approx(left, rel=0.02)
+
+
+def test_the_best_test_misses_few_of_what_can_be_seen_and_ours_not_many_more():
+    limit = stats.norm.isf(0.5 * FALSE_ALARM)
+    assert 0.05 < stats.norm.sf(VISIBLE - limit) < 0.08
+    assert stats.norm.sf(3.5 - limit) == pytest.approx(0.5, abs=0.02)
+    r = np.linspace(2000.0, 9000.0, 300)
+    x = (r - r[0]) / np.ptp(r)
+    shape = 1e3 * (r[0] / r) ** 2 * np.exp(-6e-5 * (r - r[0]))
+    unit = stability_draws_homogeneous.visible(r, (shape * (1.0 + 0.02 * x**2))[np.newaxis])
+    power = shape * (1.0 + 0.02 * VISIBLE / unit * x**2)
+    noise = np.random.default_rng(5).standard_normal((2000, r.size))
+    found = homogeneous.solve(power + noise, r, variance=1.0)
+    missed = np.mean((found.quality & int(Quality.NOT_HOMOGENEOUS)) == 0)
+    assert 0.05 < missed < 0.3
 
 
 def test_a_value_without_a_stated_error_is_false():

@@ -135,6 +135,7 @@ def test_what_has_no_standard_name_is_what_the_table_does_not_know():
             "amplitude_standard_error",
             "background",
             "background_standard_error",
+            "background_model_error",
             "reduced_chi2",
         },
     }

@@ -6,6 +6,7 @@ from oracle_homogeneous import GEOMETRIES, lowest_errors, section, signal
 
 from lidarops.flags import Quality
 from lidarops.retrieve import _masked
+from lidarops.retrieve._estimate import COLUMNS
 from lidarops.retrieve.homogeneous import solve
 
 KM = 1e-3
@@ -112,7 +113,7 @@ def test_profiles_that_do_not_work_out_go_to_the_direct_fit():
     np.testing.assert_array_equal(found.quality[:30], exact.quality[:30])
     np.testing.assert_array_equal(found.background[10:30], exact.background[10:30])
     plan = _masked.make_plan(r, (-0.3 / r[-1], 60.0 / 8000.0))
-    solved, table = np.empty(40, bool), np.empty((40, 18))
+    solved, table = np.empty(40, bool), np.empty((40, len(COLUMNS)))
     _masked.solve_profiles(power, np.ones((1, 225)), False, 1e-16, plan, table, solved)
     assert solved[:10].all()
     assert not solved[10:30].any()
