@@ -45,6 +45,9 @@ AHEAD: Final = 2
 LEAST_AHEAD: Final = 4
 RECOUNT: Final = 5.0
 """s after which the threads of a cluster, which may grow and shrink, are counted anew."""
+PATIENCE: Final = 120.0
+"""s without any worker after which one is missed: on this machine, where none will come, for good.
+"""
 GRACE: Final = 20.0
 """s that scenes in hand get to end, on a cluster that is asked to stop."""
 TRIES: Final = 3
@@ -381,6 +384,7 @@ class _Window:
         self._suspects: list[Job] = []
         self._room = 0
         self._recount = -math.inf
+        self._staffed = time.monotonic()
 
     def run(self, jobs: Iterable[Job]) -> Iterator[Ended]:
         source = iter(jobs)
@@ -395,6 +399,7 @@ class _Window:
             try:
                 future = self._done.get(timeout=0.2)
             except queue.Empty:
+                self._count()
                 continue
             job = self._at_work.pop(future)
             # First, so that no worker waits while the outcome is entered.
@@ -409,10 +414,7 @@ class _Window:
         yield from alone(self._suspects, client=self._client, stop=self._stop)
 
     def _fill(self, source: Iterator[Job]) -> None:
-        now = time.monotonic()
-        if now > self._recount:
-            threads = sum(self._client.nthreads().values())
-            self._room, self._recount = max(LEAST_AHEAD, AHEAD * threads), now + RECOUNT
+        self._count()
         while len(self._at_work) < self._room and not self._stop:
             job = next(source, None)
             if job is None:
@@ -422,6 +424,30 @@ class _Window:
             future = _submitted(self._client, job)
             self._at_work[future] = job
             future.add_done_callback(self._done.put)
+
+    def _count(self) -> None:
+        """Count the threads of the cluster, where that was not done just now."""
+        now = time.monotonic()
+        if now < self._recount:
+            return
+        threads = sum(self._client.nthreads().values())
+        self._room, self._recount = max(LEAST_AHEAD, AHEAD * threads), now + RECOUNT
+        if threads:
+            self._staffed = now
+        elif now - self._staffed > PATIENCE:
+            self._staffed = now
+            if _is_local(self._client):
+                raise SceneError(
+                    "the workers on this machine are gone, and none takes their place",
+                    remedy="see what ended them, and run again: what is done stays done",
+                )
+            _LOG.warning("no worker is there: %d scenes wait for one", len(self._at_work))
+
+
+def _is_local(client: Client) -> bool:
+    from distributed import LocalCluster  # noqa: PLC0415 - takes a second to import
+
+    return isinstance(client.cluster, LocalCluster)
 
 
 def _ended(future: Future, job: Job) -> Ended | None:

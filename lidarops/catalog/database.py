@@ -94,11 +94,11 @@ class Database:
         return _insert(table, in_sqlite=self._sqlite)
 
     def insert_new(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of whole rows that leaves a row which is there as it is."""
+        """Return an insert of whole rows, of texts and numbers, that leaves a row which is there."""
         return _conflicting(table, in_sqlite=self._sqlite, replacing=False)
 
     def upsert(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of whole rows that takes the place of a row which is there."""
+        """Return an insert of whole rows, of texts and numbers, that replaces a row there."""
         return _conflicting(table, in_sqlite=self._sqlite, replacing=True)
 
     def clock(self) -> sa.ColumnElement[float]:

@@ -15,6 +15,7 @@ from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.engine import Ended, Stop, carry_out, local_client
+from lidarops.errors import SceneError
 from lidarops.pipeline import Options, Selection, bring_up_to_date, prepare, reprocess
 from lidarops.processing import Job, failed
 from lidarops.session import Session
@@ -125,6 +126,19 @@ def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
         done += 1
     assert done == len(jobs)
     assert most <= engine.LEAST_AHEAD + 1
+
+
+def test_workers_that_are_gone_for_good_are_not_waited_for(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "PATIENCE", 1.0)
+    monkeypatch.setattr(engine, "RECOUNT", 0.5)
+    campaign = archive.write()
+    jobs = engine.make_jobs(campaign, prepare(campaign))
+    with local_client(1) as client:
+        client.retire_workers()
+        with pytest.raises(SceneError, match="workers on this machine are gone"):
+            list(carry_out(jobs, client=client))
 
 
 def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> None:
