@@ -94,7 +94,7 @@ class Database:
         return _insert(table, in_sqlite=self._sqlite)
 
     def insert_new(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of whole rows, of texts and numbers, that leaves a row which is there."""
+        """Return an insert of whole rows, of texts and numbers, that leaves a row there."""
         return _conflicting(table, in_sqlite=self._sqlite, replacing=False)
 
     def upsert(self, table: sa.Table) -> sa.TextClause:
