@@ -14,7 +14,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from itertools import chain, islice
@@ -140,11 +140,12 @@ class Processes(Generic[Kept]):
             return None
 
     def _waited(self, there: Future[Found], here: Callable[[], Found]) -> Found:
+        # Never cancelled here: the thread that marks what a lost process leaves undone would stop
+        # at a future that was, and the processes that are left would wait for ever.
         try:
-            if not (self._alone and there.cancel()):
-                return there.result()
-        # A process that was killed, for its memory say.
-        except BrokenProcessPool as error:
+            return there.result()
+        # A process was killed, for its memory say; or not begun when one could not be started.
+        except (BrokenProcessPool, CancelledError) as error:
             self._lost(error)
         return here()
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import time
+from concurrent.futures import Future
 from itertools import count, islice
 
 import pytest
@@ -85,6 +87,25 @@ class TestEach:
                 os.getpid()
             }
         assert caplog.text.count("a process was lost") == 1
+
+    def test_leaves_none_behind_where_one_is_lost(self, monkeypatch) -> None:
+        before = Future.set_exception
+
+        def slowly(future: Future, error: BaseException) -> None:
+            before(future, error)
+            # What waited for it goes on meanwhile.
+            time.sleep(0.02)
+
+        monkeypatch.setattr(Future, "set_exception", slowly)
+        with Processes(2, 2) as pool:
+            assert list(pool.each(deadly, range(40), at_a_time=2)) == doubled(range(40))
+        left = multiprocessing.active_children()
+        for child in left:
+            child.join(10)
+        alive = [child for child in left if child.is_alive()]
+        for child in alive:
+            child.kill()
+        assert not alive
 
     def test_goes_on_here_where_none_can_be_started(self, monkeypatch, caplog) -> None:
         context = multiprocessing.get_context("spawn")
