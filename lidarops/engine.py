@@ -344,11 +344,13 @@ def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]
     Ended
         A scene that takes its worker down every time ends as failed, by name.
     """
+    staff = _Staff(client)
     for job in jobs:
         for _ in range(TRIES):
             if stop:
                 return
             future = _submitted(client, job)
+            _wait(future, staff)
             ended = _ended(future, job)
             future.release()
             if ended is not None:
@@ -372,6 +374,56 @@ def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool]:
     return attempt(job)
 
 
+def _wait(future: Future, staff: _Staff) -> None:
+    """Wait for a scene to end, while there is somebody who may end it."""
+    done: queue.SimpleQueue[Future] = queue.SimpleQueue()
+    future.add_done_callback(done.put)
+    while True:
+        staff.count()
+        try:
+            done.get(timeout=RECOUNT)
+        except queue.Empty:
+            continue
+        return
+
+
+class _Staff:
+    """The threads of a cluster, which may grow in number, shrink, or be gone for good."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._threads = 0
+        self._recount = -math.inf
+        self._missed_since: float | None = None
+
+    def count(self) -> int:
+        """Return their number, counted anew where that was not done just now."""
+        now = time.monotonic()
+        if now >= self._recount:
+            try:
+                self._threads = sum(self._client.nthreads().values())
+            except OSError as gone:
+                raise _lost() from gone
+            self._recount = now + RECOUNT
+            self._miss(now)
+        return self._threads
+
+    def _miss(self, now: float) -> None:
+        if self._threads:
+            self._missed_since = None
+        # From the first count on, as the last one may lie far back.
+        elif self._missed_since is None:
+            self._missed_since = now
+        elif now - self._missed_since > PATIENCE:
+            self._missed_since = now
+            if _is_local(self._client):
+                raise SceneError(
+                    "the workers on this machine are gone, and none takes their place",
+                    remedy="see what ended them, and run again: what is done stays done",
+                )
+            _LOG.warning("no worker is there: scenes wait for one")
+
+
 class _Window:
     """Keeps a cluster busy with a few scenes a worker, whatever the number of scenes."""
 
@@ -382,9 +434,7 @@ class _Window:
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._at_work: dict[Future, Job] = {}
         self._suspects: list[Job] = []
-        self._room = 0
-        self._recount = -math.inf
-        self._staffed = time.monotonic()
+        self._staff = _Staff(client)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[Ended]:
         source = iter(jobs)
@@ -399,7 +449,8 @@ class _Window:
             try:
                 future = self._done.get(timeout=0.2)
             except queue.Empty:
-                self._count()
+                # There may be more workers by now.
+                self._fill(source)
                 continue
             job = self._at_work.pop(future)
             # First, so that no worker waits while the outcome is entered.
@@ -414,8 +465,8 @@ class _Window:
         yield from alone(self._suspects, client=self._client, stop=self._stop)
 
     def _fill(self, source: Iterator[Job]) -> None:
-        self._count()
-        while len(self._at_work) < self._room and not self._stop:
+        room = max(LEAST_AHEAD, AHEAD * self._staff.count())
+        while len(self._at_work) < room and not self._stop:
             job = next(source, None)
             if job is None:
                 return
@@ -424,24 +475,6 @@ class _Window:
             future = _submitted(self._client, job)
             self._at_work[future] = job
             future.add_done_callback(self._done.put)
-
-    def _count(self) -> None:
-        """Count the threads of the cluster, where that was not done just now."""
-        now = time.monotonic()
-        if now < self._recount:
-            return
-        threads = sum(self._client.nthreads().values())
-        self._room, self._recount = max(LEAST_AHEAD, AHEAD * threads), now + RECOUNT
-        if threads:
-            self._staffed = now
-        elif now - self._staffed > PATIENCE:
-            self._staffed = now
-            if _is_local(self._client):
-                raise SceneError(
-                    "the workers on this machine are gone, and none takes their place",
-                    remedy="see what ended them, and run again: what is done stays done",
-                )
-            _LOG.warning("no worker is there: %d scenes wait for one", len(self._at_work))
 
 
 def _is_local(client: Client) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from lidarops import engine
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
-from lidarops.engine import Ended, Stop, carry_out, local_client
+from lidarops.engine import Ended, Stop, alone, carry_out, local_client
 from lidarops.errors import SceneError
 from lidarops.pipeline import Options, Selection, bring_up_to_date, prepare, reprocess
 from lidarops.processing import Job, failed
@@ -139,6 +139,51 @@ def test_workers_that_are_gone_for_good_are_not_waited_for(
         client.retire_workers()
         with pytest.raises(SceneError, match="workers on this machine are gone"):
             list(carry_out(jobs, client=client))
+        with pytest.raises(SceneError, match="workers on this machine are gone"):
+            list(alone(jobs, client=client, stop=Stop()))
+
+
+class Growing:
+    """A cluster that has its workers after a while, and ends no scene before eight have begun."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self.open = False
+        self.begun: list[Callable[[], None]] = []
+
+    def nthreads(self) -> dict[str, int]:
+        self.asked += 1
+        assert self.asked < 60, "no scene was handed on to the workers that came"
+        return {} if self.asked == 1 else {"worker": 4}
+
+    def begin(self, end: Callable[[], None]) -> None:
+        self.begun.append(end)
+        self.open = self.open or len(self.begun) == 8
+        while self.open and self.begun:
+            self.begun.pop()()
+
+
+class Begun:
+    """A scene in the hands of a cluster."""
+
+    def __init__(self, cluster: Growing, _job: Job) -> None:
+        self.cluster = cluster
+
+    def add_done_callback(self, told: Callable[[Begun], None]) -> None:
+        self.cluster.begin(lambda: told(self))
+
+    def release(self) -> None:
+        """Have nothing to give back."""
+
+
+def test_workers_that_come_later_get_scenes_before_one_has_ended(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "RECOUNT", 0.0)
+    monkeypatch.setattr(engine, "_submitted", Begun)
+    monkeypatch.setattr(engine, "_ended", lambda _, job: Ended(job, failed(job, "no"), final=True))
+    jobs = engine.make_jobs(archive.write(), prepare(archive.write())) * 4
+    assert len(list(carry_out(jobs, client=Growing()))) == len(jobs)
 
 
 def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> None:
