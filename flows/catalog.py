@@ -11,6 +11,7 @@ import typer
 from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
+from flows.reprocess import Seconds, Workers
 from lidarops.campaign import load
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
@@ -23,8 +24,8 @@ def catalog(
     campaign: str,
     archive: str | None = None,
     out: str | None = None,
-    wait: float = 0.0,
-    workers: int = 1,
+    wait: Seconds = 0.0,
+    workers: Workers = 1,
 ) -> ScanSummary:
     """Scan the archive of a campaign and publish what it refuses as an artifact.
 

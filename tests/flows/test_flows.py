@@ -11,9 +11,10 @@ import factories
 import pytest
 import rawfiles
 import yaml
-from prefect import get_client
+from prefect import Flow, get_client
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.objects import State, StateType
+from prefect.exceptions import ParameterTypeError
 from prefect.states import Completed, Pending, Running
 
 from flows import maintenance
@@ -41,6 +42,13 @@ def campaign_file(tmp_path: Path) -> Path:
     path = tmp_path / "campaign.yaml"
     path.write_text(yaml.safe_dump(campaign))
     return path
+
+
+@pytest.mark.parametrize("flow", [catalog, reprocess])
+@pytest.mark.parametrize("wrong", [{"workers": 0}, {"wait": -1.0}])
+def test_parameters_out_of_range_are_refused(flow: Flow, wrong: dict[str, float]) -> None:
+    with pytest.raises(ParameterTypeError, match=next(iter(wrong))):
+        flow.validate_parameters({"campaign": "campaign.yaml"} | wrong)
 
 
 @pytest.mark.usefixtures("prefect_server")
