@@ -20,10 +20,10 @@ FINE: Final = 2.5
 """Stated standard errors within which a value needed no flag."""
 VISIBLE: Final = 5.0
 """Least size of what a model cannot take up of a violation, in standard deviations of the noise,
-for the data to tell it. The most powerful test there is, which knows the very shape of the
-violation, sees it by one number of that mean and unit variance: with a false alarm in 2500, as our
-tests have it, it misses half of the violations of 3.5 and 7 percent of those of 5; one that does
-not know the shape misses more."""
+for the data to tell it. The best test that knows the very shape of the violation, but not its
+sign, goes by the size of one number of that mean and unit variance: with a false alarm in 2500, as
+our tests have it, it misses half of the violations of 3.5 and 7 percent of those of 5 (told the
+sign too, 5 percent); one that does not know the shape misses more."""
 ALL: Final = "all together"
 """Class that holds every scene of a retrieval."""
 _COUNTS: Final = (

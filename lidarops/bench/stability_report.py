@@ -180,10 +180,10 @@ def _table(name: str, rates: list[Rate]) -> Table:
         "independently. Not rejected: no bit that says not to use the value. Not doubted: no "
         "flag of the retrieval that doubts the stated error. Not to be seen: what the model cannot "
         f"take up of the violation is less than {VISIBLE:g} standard deviations of the noise, so "
-        "that even the most powerful test, which knows its very shape, misses more than 7 % of "
-        "such at our rate of false alarms; the target is for the rest. Fine of the rejected, and "
-        f"needlessly flagged: off by less than {FINE:g}, and flagged though the value could be "
-        "determined.",
+        "that even the best test that knows its very shape, though not its sign, misses 7 % "
+        "or more of such at our rate of false alarms; the target is for the rest, as a share of "
+        f"all. Fine of the rejected, and needlessly flagged: off by less than {FINE:g}, and "
+        "flagged though the value could be determined.",
     )
 
 

@@ -90,6 +90,10 @@ _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
 _OF_EXTINCTION = ("extinction_model_error", *_OF_FIT)
 
+_BENT = (
+    "whose logarithmic slope is off by 5 percent of that at mean range at one end of the section,"
+    " and by the opposite at the other"
+)
 _UNTOLD = (
     "No bound: violations of the model that its own shapes take up leave no trace for any test to"
     " see. In simulated random violations, this share of the values that no flag rejects was off"
@@ -144,11 +148,10 @@ _HOMOGENEOUS = Layout(
             valid_min=0.0,
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Apart from the random error in extinction_standard_error: 5 percent of"
-            " extinction + 1 / range, and what the extinction takes up of a signal whose"
-            " logarithmic slope is as much off at one end of the section and the opposite at the"
-            f" other. {_UNTOLD} 7 percent with backscatter that changes along the section as an"
-            " exponential of range with a scale of 1 to 100 km, 10 with a plume, 8 where the top"
-            " of the signal is cut off, 2.5 where backscatter bends, 0.5 at most otherwise."
+            " extinction + 1 / mean range, and in quadrature what the extinction takes up of a"
+            f" signal {_BENT}. {_UNTOLD} 7 percent with backscatter that changes along the section"
+            " as an exponential of range with a scale of 1 to 100 km, 10 with a plume, 8 where the"
+            " top of the signal is cut off, 2.5 where backscatter bends, 0.5 at most otherwise."
             f" {NO_NAME}",
         ),
         *visibility(
@@ -188,10 +191,9 @@ _HOMOGENEOUS = Layout(
             valid_min=0.0,
             error_kind=ErrorKind.SYSTEMATIC,
             comment="Apart from the random error in background_standard_error: what the"
-            " background takes up of a signal whose logarithmic slope is 5 percent off that of"
-            " the model at one end of the section and -5 percent at the other, as where"
-            f" backscatter bends along the path. {_UNTOLD} 5 percent where it bends more, 2.4"
-            f" with an afterpulse, 1.1 with a plume, 0.5 at most otherwise. {NO_NAME}",
+            f" background takes up of a signal {_BENT}, as where backscatter bends along the path."
+            f" {_UNTOLD} 5 percent where it bends more, 2.4 with an afterpulse, 1.1 with a plume,"
+            f" 0.5 at most otherwise. {NO_NAME}",
         ),
         Row(
             name="reduced_chi2",
