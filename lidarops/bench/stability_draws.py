@@ -34,6 +34,7 @@ _COUNTS: Final = (
     "false random",
     "false",
     "false plain",
+    "plain hidden",
     "false hidden",
     "false bare",
     "rejected",
@@ -97,6 +98,9 @@ class Rate:
     where that is not known."""
     false_seen: Measured
     """The rest of it."""
+    false_of_seen: Measured | None
+    """That rest as a share of the values alone whose violation could be seen and was not; None
+    where that is not known, or there are none."""
     false_bare: Measured | None
     """The same of the values without any bit; None where there are none."""
     fine_of_rejected: Measured
@@ -175,6 +179,13 @@ class Tally:
                 if (name, quantity) in self.measured
                 else None,
                 false_seen=share(column["false plain"] - column["false hidden"], column["plain"]),
+                false_of_seen=share(
+                    column["false plain"] - column["false hidden"],
+                    column["plain"] - column["plain hidden"],
+                )
+                if (name, quantity) in self.measured
+                and (column["plain"] > column["plain hidden"]).any()
+                else None,
                 false_bare=share(column["false bare"], column["bare"])
                 if column["bare"].any()
                 else None,
@@ -242,6 +253,7 @@ def _counted(judged: Judged) -> dict[str, float]:
         "false random": kept & wild,
         "false": kept & false,
         "false plain": plain & false,
+        "plain hidden": plain & hidden,
         "false hidden": plain & false & hidden,
         "false bare": bare & false,
         "rejected": valued & rejected,

@@ -90,10 +90,11 @@ def test_what_no_test_can_see_is_false_but_told_apart():
     rate = counted(judged(Failure("bent"), [9.0, 9.0, 9.0, 0.0], bits, hidden=hidden))["bent"]
     assert rate.false_undoubted.value == pytest.approx(2 / 3)
     assert rate.false_hidden.value == pytest.approx(1 / 3)
+    assert rate.false_of_seen.value == pytest.approx(1 / 2)
     assert rate.judged is rate.false_seen
     assert rate.false_seen.value == pytest.approx(1 / 3)
     rates = counted(judged(Failure("bent"), [9.0], hidden=np.array([True])), judged(HOLDS, [0.0]))
-    assert rates["none"].false_hidden is None
+    assert rates["none"].false_hidden is rates["none"].false_of_seen is None
     assert rates[ALL].false_hidden.value == 0.5
     assert rates[ALL].false_seen.value == 0.0
 
