@@ -366,11 +366,12 @@ def _submitted(client: Client, job: Job) -> Future:
     return client.submit(_on_worker, pickle.dumps(job), code_version(), pure=False)
 
 
-def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool]:
-    job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
+def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool] | str:
+    """Process a scene; return its outcome and whether it is final, or why it cannot be tried."""
+    # First, as other code may know other jobs.
     if code_version() != code:
-        reason = f"the worker has other code of lidarops: {code_version()}, not {code}"
-        return failed(job, reason), False
+        return f"the worker has other code of lidarops: {code_version()}, not {code}"
+    job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
     return attempt(job)
 
 
@@ -489,8 +490,10 @@ def _ended(future: Future, job: Job) -> Ended | None:
 
     error = None if future.status == "finished" else _error_of(future)
     if error is None:
-        outcome, final = future.result()
-        return Ended(job, outcome, final)
+        found = future.result()
+        if isinstance(found, str):
+            return Ended(job, failed(job, found), final=False)
+        return Ended(job, *found)
     if isinstance(error, KilledWorker):
         return None
     return Ended(job, failed(job, f"the worker failed: {error!r}"), final=False)

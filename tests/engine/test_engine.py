@@ -186,6 +186,17 @@ def test_workers_that_come_later_get_scenes_before_one_has_ended(
     assert len(list(carry_out(jobs, client=Growing()))) == len(jobs)
 
 
+def test_a_worker_with_other_code_is_named_and_makes_nothing(
+    archive: Archive, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "code_version", lambda: "newer")
+    campaign = archive.write()
+    ended = list(carry_out(engine.make_jobs(campaign, prepare(campaign))[:1], client=client))
+    assert [each.final for each in ended] == [False]
+    assert "the worker has other code of lidarops" in ended[0].outcome.error
+    assert not (archive.folder / "out" / "products").exists()
+
+
 def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> None:
     campaign = archive.write()
     stop = Stop()
