@@ -94,11 +94,11 @@ class Database:
         return _insert(table, in_sqlite=self._sqlite)
 
     def insert_new(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of whole rows, of texts and numbers, that leaves a row there."""
+        """Return an insert of whole rows that leaves a row which is there as it is."""
         return _conflicting(table, in_sqlite=self._sqlite, replacing=False)
 
     def upsert(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of whole rows, of texts and numbers, that replaces a row there."""
+        """Return an insert of whole rows that takes the place of a row which is there."""
         return _conflicting(table, in_sqlite=self._sqlite, replacing=True)
 
     def clock(self) -> sa.ColumnElement[float]:
@@ -173,7 +173,9 @@ def _conflicting(table: sa.Table, *, in_sqlite: bool, replacing: bool) -> sa.Tex
     else:
         statement = statement.on_conflict_do_nothing()
     dialect = (sqlite if in_sqlite else postgresql).dialect(paramstyle="named")
-    return sa.text(str(statement.compile(dialect=dialect)))
+    # Text alone does not know how the database holds times.
+    typed = [sa.bindparam(column.name, type_=column.type) for column in table.columns]
+    return sa.text(str(statement.compile(dialect=dialect))).bindparams(*typed)
 
 
 def _add_usable(connection: sa.Connection) -> None:

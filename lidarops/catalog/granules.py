@@ -22,7 +22,6 @@ AGAIN: Final = ""
 
 _HALF: Final = (1 << 31) - 1
 _C = GRANULE.c
-_KEY: Final = tuple(column.name for column in GRANULE.primary_key)
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
 
@@ -96,9 +95,7 @@ class Granules(Database):
                 self.insert_new(LAYOUT),
                 [{"hash": key, "channels": text} for key, text in layouts.items()],
             )
-            row = self.insert(GRANULE)
-            anew = {name: row.excluded[name] for name in rows[0] if name not in _KEY}
-            connection.execute(row.on_conflict_do_update(index_elements=_KEY, set_=anew), rows)
+            connection.execute(self.upsert(GRANULE), rows)
 
     def forget(self, paths: Collection[str]) -> None:
         """Remove the rows of files that are no longer in the archive."""
