@@ -25,6 +25,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
 from lidarops.plans import plan
+from lidarops.processes import start_method
 from lidarops.processing import Job, attempt, failed
 from lidarops.products.provenance import code_version
 from lidarops.records import RunRecord, SceneOutcome
@@ -263,8 +264,9 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
     import dask  # noqa: PLC0415 - takes a second to import
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
 
+    started = {"distributed.worker.multiprocessing-method": start_method()}
     with (
-        dask.config.set(_DASK),
+        dask.config.set({**_DASK, **started}),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

@@ -6,13 +6,14 @@ The command line and the Prefect flows call these; neither holds logic of its ow
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign import Campaign
 from lidarops.catalog.ledger import RunStatus
@@ -21,6 +22,7 @@ from lidarops.catalog.scan import ScanSummary, scan
 from lidarops.catalog.store import Store
 from lidarops.engine import Ended, Stop, alone, carry_out, local_client, size
 from lidarops.errors import SceneError
+from lidarops.processes import load_ahead
 from lidarops.processing import Job, failed
 from lidarops.records import Granule, RunRecord, SceneOutcome
 from lidarops.reports import page, record
@@ -46,6 +48,9 @@ __all__ = [
 
 GIVE_UP = 5
 """Scenes in a row that fail for the sake of a disk, after which the others are not tried."""
+
+_OF_WORKERS: Final = ("distributed.nanny", "lidarops.engine", "lidarops.reports.gallery")
+"""Modules that a worker needs, for scenes and then for the report."""
 
 Progress = Callable[[SceneOutcome], None]
 _LOG = logging.getLogger(__name__)
@@ -278,9 +283,10 @@ class _Found:
     set_aside: list[Granule] = field(default_factory=list)
     held: list[Judgement] = field(default_factory=list)
     barren: int = 0
-    settled: dict[int, tuple[int, int]] = field(default_factory=dict)
-    worked: set[int] = field(default_factory=set)
-    """Days on which something was processed."""
+    told: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """Days that are settled, or will be where they are in `open` and all goes well."""
+    open: dict[int, set[str]] = field(default_factory=lambda: defaultdict(set))
+    """Days on which something is stale -> scenes."""
 
 
 class _Work:
@@ -317,6 +323,9 @@ class _Work:
         clean = [verdicts[day] for day in signatures.keys() - set(days) if day in verdicts]
         status, caught = RunStatus.FINISHED, 0
         if days:
+            if self._options.workers > 1 and not self._options.cluster and client is None:
+                # Meanwhile it is judged what they are to do.
+                load_ahead(_OF_WORKERS)
             with Stop() as stop:
                 self._process(days, client, stop)
                 caught = stop.signal
@@ -417,7 +426,8 @@ class _Work:
                 for each in stale
             ]
             self._judgements.update((each.scene.id, each) for each in stale)
-            self._found.worked.update(each.day for each in stale)
+            for each in stale:
+                self._found.open[each.day].add(each.scene.id)
             if self._options.expect:
                 self._options.expect(sum(len(each.scene.granules) for each in stale))
             suspect = {each.scene.id for each in stale if each.suspect}
@@ -432,7 +442,7 @@ class _Work:
         found.fresh += sum(each.fresh for each in judged.judgements)
         found.orphans += judged.orphans
         found.set_aside += judged.set_aside
-        found.settled.update(judged.settled)
+        found.told.update(judged.told)
         found.barren += sum(each.barren for each in judged.judgements)
         found.held += [each for each in judged.judgements if each.held]
         if self._judge.digests or judged.touched or judged.gone:
@@ -460,13 +470,23 @@ class _Work:
     def _settle(self, signatures: Mapping[int, str]) -> None:
         """Note the days on which everything is fresh, so that they need no second look."""
         found = self._found
-        settled = {day: (signatures[day], *counts) for day, counts in found.settled.items()}
-        if found.worked and self._selection.everything:
+        done = self._session.settled if self._session else set()
+        # A day on which not all went as it was planned is looked at again, and else nothing is.
+        unclear = {day for day, scenes in found.open.items() if not scenes <= done}
+        settled = {
+            day: (signatures[day], *told) for day, told in found.told.items() if day not in unclear
+        }
+        if found.open and self._selection.everything:
             judge = self._new_judge(again=True)
-            again = judge.signatures(found.worked)
-            for batch in judge.batches(found.worked & again.keys()):
-                counts = judge.days(batch).settled
-                settled.update((day, (again[day], *told)) for day, told in counts.items())
+            again = judge.signatures(found.open)
+            settled.update((day, (again[day], *found.told[day])) for day in again.keys() & settled)
+            for batch in judge.batches(unclear & again.keys()):
+                judged = judge.days(batch)
+                settled.update(
+                    (day, (again[day], *told))
+                    for day, told in judged.told.items()
+                    if day not in judged.open
+                )
         known = self._store.verdicts()
         new = {day: told for day, told in settled.items() if told[0] and known.get(day) != told}
         if new:

@@ -11,13 +11,15 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from itertools import chain, islice
+from multiprocessing import forkserver, resource_tracker
 from typing import Any, Final, Generic, Self, TypeVar
 
 _AHEAD: Final = 8
@@ -26,11 +28,53 @@ _MAPPED_ALONE: Final = (-3, 32 << 20)
 """glibc's M_MMAP_THRESHOLD, and the most it admits in byte."""
 _GIVEN_BACK: Final = (-1, 64 << 20)
 """glibc's M_TRIM_THRESHOLD, byte."""
+_ONE_THREAD: Final = dict.fromkeys(
+    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+)
+"""What a library looks at as it is loaded; as dask has it for its workers."""
 
 Kept = TypeVar("Kept")
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 _LOG = logging.getLogger(__name__)
+
+
+def load_ahead(modules: Collection[str]) -> None:
+    """Begin a process that loads modules, and that those started here from now on are forked from.
+
+    Each of them would take seconds to load them for itself. It ends with the last process that
+    knows of it. Does nothing where forks are not safe, or where there is one.
+
+    Parameters
+    ----------
+    modules : collection of str
+    """
+    if not sys.platform.startswith("linux") or start_method() == "forkserver":
+        return
+    multiprocessing.set_forkserver_preload(list(modules))
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update({name: value or _ONE_THREAD[name] for name, value in before.items()})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    try:
+        # First, as it lets signals through again.
+        resource_tracker.ensure_running()
+        # Ctrl-C goes to all processes of a terminal; this one ends the others.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        forkserver.ensure_running()
+        _LOADED.append(os.getpid())
+    except OSError as error:
+        _LOG.warning("no process can be started to load modules: %s", error)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+
+
+def start_method() -> str:
+    """Return how processes are to be started, as `multiprocessing` names it."""
+    # A fork of this process would inherit the locks of whatever threads are running.
+    return "forkserver" if os.getpid() in _LOADED else "spawn"
 
 
 class Processes(Generic[Kept]):
@@ -127,8 +171,7 @@ class Processes(Generic[Kept]):
         if self._pool is None:
             self._pool = ProcessPoolExecutor(
                 self._number,
-                # A fork would inherit the locks of whatever threads are running.
-                mp_context=multiprocessing.get_context("spawn"),
+                mp_context=multiprocessing.get_context(start_method()),
                 initializer=_prepare,
                 initargs=(self._kept,),
             )
@@ -158,6 +201,8 @@ class Processes(Generic[Kept]):
                 self._pool = None
 
 
+_LOADED: list[int] = []
+"""This process, where one that loads modules was begun."""
 _KEPT: list[Any] = []
 """In a process that was started here: what it keeps for all tasks."""
 

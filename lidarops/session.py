@@ -56,6 +56,8 @@ class Session:
         self._kept: dict[str, str] = {}
         self._outcomes: list[SceneOutcome] = []
         self._named = 0
+        self.settled: set[str] = set()
+        """Scenes of which another look would find every product fresh."""
         self._tally = costs.Tally(costs.load())
         self.started = started or datetime.now(UTC)
         self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
@@ -110,6 +112,7 @@ class Session:
             products=tuple(new),
         )
         self._store.record(entry, self.id, self._lock.token)
+        self._settle(judged, outcome, new)
         # Once it is entered, as an estimate is no reason to lose a scene.
         outcome = replace(outcome, estimated_seconds=self._estimated(judged))
         self._settle_versions(judged, outcome)
@@ -120,6 +123,14 @@ class Session:
             outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
         )
         return outcome
+
+    def _settle(self, judged: Judgement, outcome: SceneOutcome, new: Sequence[NewProduct]) -> None:
+        # What was refused is no part of the scene any more.
+        if outcome.error or outcome.refused:
+            return
+        made = {(each.record.kind, each.record.channel): each.depends_on for each in new}
+        if self._judge.settles(judged, outcome.inputs, made):
+            self.settled.add(judged.scene.id)
 
     def add(self, outcome: SceneOutcome) -> None:
         """Add to the record of the run what was not tried."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from math import ceil
@@ -126,8 +126,10 @@ class DaysJudged:
     judgements: tuple[Judgement, ...]
     orphans: tuple[Orphan, ...]
     set_aside: tuple[Granule, ...]
-    settled: Mapping[int, tuple[int, int]]
-    """Days with nothing to do -> barren scenes, granules set aside."""
+    told: Mapping[int, tuple[int, int]]
+    """Days that may be settled -> barren scenes, granules set aside."""
+    open: frozenset[int]
+    """Days with something to do, after which they may be."""
     gone: frozenset[str]
     """Scenes of which the ledger notes a failure, and that are no more or all fresh."""
     touched: Mapping[str, int]
@@ -255,8 +257,7 @@ class Judge:
         everything = [self._scene(scene, made, tried, touched) for scene in found.scenes]
         chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
         orphans = _orphans(everything, made)
-        unsettled = {day_of(_start(each.scene)) for each in everything if each.stale}
-        unsettled |= {made[key].day for key in orphans}
+        orphaned = {made[key].day for key in orphans}
         counts = _counts(everything, found.set_aside)
         gone = {each.scene.id for each in everything if self._healed(each, tried)}
         if len(wanted) == last - first + 1:
@@ -265,9 +266,10 @@ class Judge:
             judgements=tuple(each for each in everything if each.scene.id in chosen),
             orphans=tuple(Orphan(made[key].path, why) for key, why in orphans.items()),
             set_aside=found.set_aside,
-            settled={day: counts[day] for day in days if day not in unsettled}
-            if self._selection.everything and not self._force
+            told={day: counts[day] for day in days if day not in orphaned}
+            if self._selection.everything
             else {},
+            open=frozenset(each.day for each in everything if each.stale),
             gone=frozenset(gone),
             touched=touched,
         )
@@ -362,6 +364,37 @@ class Judge:
         )
         return found, used
 
+    def settles(
+        self, judged: Judgement, files: Sequence[InputRecord], made: Mapping[Wanted, Dependence]
+    ) -> bool:
+        """Return whether another look at a scene would find all that was stale to be fresh.
+
+        Parameters
+        ----------
+        judged : Judgement
+        files : sequence of InputRecord
+            What its products were made from.
+        made : mapping of (ProductKind, str) to Dependence
+            What each depends on, by kind and channel.
+        """
+        contents = {used.path: used.sha256 for used in files}
+        scene, whole = judged.scene, judged.plan
+        for granule in (*scene.granules, *scene.dark):
+            # Other products may have been found fresh by what is no longer there.
+            if granule.sha256 and contents.get(granule.path, granule.sha256) != granule.sha256:
+                return False
+        now = self._files(
+            scene, whole, lambda granule: contents.get(granule.path) or granule.sha256 or ""
+        )
+        for stale in judged.stale:
+            product = (stale.kind, stale.channel)
+            used = dependence.inputs(dependence.part(whole, [product]), now)
+            if product not in made:
+                return False
+            if made[product].inputs_hash != dependence.digest_of_inputs(used):
+                return False
+        return True
+
     def _reason(
         self,
         scene: Scene,
@@ -383,7 +416,7 @@ class Judge:
         ):
             return _changed(was, mine.hash)
         # Only now, as files may have to be read for it.
-        used = dependence.inputs(mine, self._files(scene, whole))
+        used = dependence.inputs(mine, self._files(scene, whole, self._content))
         if was.inputs_hash != dependence.digest_of_inputs(used):
             return _difference(self._store.inputs_of(known.path), used)
         return self._file_reason(known, touched)
@@ -405,10 +438,12 @@ class Judge:
             return f"its file cannot be read: {error.strerror or error}"
         return "its file is not the one that was recorded"
 
-    def _files(self, scene: Scene, whole: Plan) -> tuple[InputRecord, ...]:
+    def _files(
+        self, scene: Scene, whole: Plan, content: Callable[[Granule], str]
+    ) -> tuple[InputRecord, ...]:
         """Return the inputs of a scene as they are now."""
         raw = [
-            InputRecord(granule.path, granule.role, self._content(granule))
+            InputRecord(granule.path, granule.role, content(granule))
             for granule in (*scene.granules, *scene.dark)
         ]
         return (

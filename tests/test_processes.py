@@ -5,9 +5,13 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import Future
 from itertools import count, islice
+from pathlib import Path
 
 import pytest
 
@@ -139,6 +143,59 @@ def _interrupted(pool: Processes[int]) -> None:
 
 def _unstartable(*_: object, **__: object) -> None:
     raise BlockingIOError("no more processes")
+
+
+AHEAD = """
+import multiprocessing, os, signal, sys, time
+from lidarops import processes
+from lidarops.processes import Processes, load_ahead, start_method
+
+def seen(kept, item):
+    held = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    return "colorsys" in sys.modules, os.getpid(), os.environ.get("OMP_NUM_THREADS"), held
+
+if __name__ == "__main__":
+    assert start_method() == "spawn"
+    load_ahead(["colorsys", "no_such_module"])
+    load_ahead(["wave"])
+    assert start_method() == "forkserver"
+    assert "OMP_NUM_THREADS" not in os.environ
+    with Processes(2, 2) as pool:
+        found = dict(pool.each(seen, range(6), at_a_time=1))
+    assert all(loaded for loaded, *_ in found.values()), found
+    assert "colorsys" not in sys.modules
+    assert os.getpid() not in {pid for _, pid, *_ in found.values()}
+    assert {threads for _, _, threads, _ in found.values()} == {"1"}
+    # Ctrl-C reaches all processes of a terminal, and what is loaded is still of use.
+    assert {held for _, _, _, held in found.values()} == {True}
+    with Processes(2, 2) as pool:
+        print(pool.later(seen, 1)()[1], flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks are not safe elsewhere")
+class TestLoadAhead:
+    def test_processes_have_the_modules_and_end_with_the_first_one(self, tmp_path: Path) -> None:
+        script = tmp_path / "ahead.py"
+        script.write_text(AHEAD)
+        environment = {key: os.environ[key] for key in os.environ if key != "OMP_NUM_THREADS"}
+        done = subprocess.run(
+            [sys.executable, str(script)],
+            capture_output=True, text=True, env=environment, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        assert _ends(int(done.stdout))
+
+
+def _ends(pid: int) -> bool:
+    for _ in range(200):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
 
 
 class TestLater:

@@ -462,7 +462,13 @@ def render(figure: Figure) -> Rendered:
     buffer = io.BytesIO()
     alt = alt_text(figure)
     FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png", metadata={"Software": None, "Description": alt})
+    figure.savefig(
+        buffer,
+        format="png",
+        metadata={"Software": None, "Description": alt},
+        # To make the files smaller by another 4 % takes a twelfth of the time to draw them.
+        pil_kwargs={"compress_level": 3},
+    )
     return Rendered(buffer.getvalue(), alt)
 
 

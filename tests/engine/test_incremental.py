@@ -7,7 +7,7 @@ import shutil
 import signal
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import quick
 from small_archive import DAY, Archive, made
 
 from lidarops import engine
+from lidarops.catalog.database import day_of
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
@@ -29,6 +30,7 @@ from lidarops.pipeline import (
     reprocess,
 )
 from lidarops.records import ProductKind
+from lidarops.staleness import DaysJudged, Judge
 
 RICH = ("signal analog", "signal photon", "homogeneous photon", "elastic analog")
 
@@ -390,3 +392,95 @@ def test_a_day_of_more_is_a_day_of_work(archive: Archive) -> None:
     for k in range(3):
         archive.raw(f"rich/h9{k}", 9 * DAY + k, seed=k)
     assert made(reprocess(archive.write())) == _all(range(10, 11))
+
+
+def _judged_anew(archive: Archive) -> dict[int, tuple[str, int, int]]:
+    """Signature, barren scenes and granules set aside of the days on which all is fresh."""
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        judge = Judge(campaign, store)
+        signatures = judge.signatures()
+        found = [judge.days(batch) for batch in judge.batches(signatures)]
+    return {
+        day: (signatures[day], *told)
+        for each in found
+        for day, told in each.told.items()
+        if day not in each.open
+    }
+
+
+def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
+    """What the ledger holds of the days that look as they did then."""
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        signatures = Judge(campaign, store).signatures()
+        known = store.verdicts()
+    return {day: told for day, told in known.items() if told[0] == signatures[day]}
+
+
+def _unreadable_later(archive: Archive) -> None:
+    """Add a file whose header is good, and what follows it is not there."""
+    path = archive.raw("rich/h19", 2 * DAY + 620, seed=7)
+    header = path.read_bytes()
+    path.write_bytes(header[:400] + bytes(len(header) - 400))
+
+
+def _failing(archive: Archive) -> None:
+    (archive.folder / "air.csv").write_text("altitude,pressure\n0,1013\n")
+
+
+def _twin(archive: Archive) -> None:
+    archive.raw("poor/h-twin", 600, seed=1)
+
+
+def _vanished(archive: Archive) -> None:
+    for path in (archive.folder / "raw/poor").glob("h1*"):
+        path.unlink()
+
+
+def _nothing_asked(archive: Archive) -> None:
+    archive.told["instruments"]["poor"]["products"] = {}
+    _title(archive)
+
+
+def _dark(archive: Archive) -> None:
+    archive.flip("raw/rich/d0")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [_title, _sections, _lidar_ratio, _dark, _twin, _vanished, _failing, _unreadable_later,
+     _nothing_asked],
+)  # fmt: skip
+def test_days_are_settled_as_another_look_would_settle_them(
+    archive: Archive, change: Callable[[Archive], object]
+) -> None:
+    assert _verdicts(archive)
+    change(archive)
+    reprocess(archive.write())
+    assert _verdicts(archive) == _judged_anew(archive)
+    reprocess(archive.write(), options=Options(force=True))
+    assert _verdicts(archive) == _judged_anew(archive)
+
+
+def test_only_days_on_which_something_failed_are_looked_at_again(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[int] = []
+    days = Judge.days
+
+    def counting(judge: Judge, wanted: Sequence[int]) -> DaysJudged:
+        looked.extend(wanted)
+        return days(judge, wanted)
+
+    monkeypatch.setattr(Judge, "days", counting)
+    _title(archive)
+    reprocess(archive.write())
+    every = sorted(_verdicts(archive))
+    assert looked == every
+    looked.clear()
+    _failing(archive)
+    record = reprocess(archive.write())
+    failed = {day_of(scene.start) for scene in record.scenes if scene.error}
+    assert len(failed) == 2
+    assert looked == [*every, *sorted(failed)]
