@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,7 +23,7 @@ from lidarops.catalog.scan import ScanSummary, scan
 from lidarops.catalog.store import Store
 from lidarops.engine import Ended, Stop, alone, carry_out, local_client, size
 from lidarops.errors import SceneError
-from lidarops.processes import load_ahead
+from lidarops.processes import load_ahead, one_ahead
 from lidarops.processing import Job, failed
 from lidarops.records import Granule, RunRecord, SceneOutcome
 from lidarops.reports import page, record
@@ -354,7 +355,7 @@ class _Work:
     # Processing
 
     def _process(self, days: Sequence[int], client: Client | None, stop: Stop) -> None:
-        jobs = self._jobs(days)
+        jobs = self._jobs(days, client)
         first = next(jobs, None)
         if first is None and not self._suspects:
             return
@@ -368,7 +369,7 @@ class _Work:
             serial = used is None
             taken = self._take_noted if serial else self._take
             if first is not None:
-                others = _chained(first, jobs)
+                others = chain([first], jobs)
                 self._enter(carry_out(others, client=used, stop=stop, taken=taken), stop)
             if self._suspects and not stop:
                 if used is None:
@@ -415,10 +416,15 @@ class _Work:
             if self._options.progress:
                 self._options.progress(outcome)
 
-    def _jobs(self, days: Sequence[int]) -> Iterator[Job]:
+    def _judged(self, days: Sequence[int], client: Client | None) -> Iterator[DaysJudged]:
+        judged = map(self._judge.days, self._judge.batches(days))
+        apart = client is not None or self._options.cluster or self._options.workers > 1
+        # Workers would wait while this process looks at what they are to do next.
+        return one_ahead(judged) if apart else judged
+
+    def _jobs(self, days: Sequence[int], client: Client | None) -> Iterator[Job]:
         """Give what is stale, the largest scenes of some days first."""
-        for batch in self._judge.batches(days):
-            judged = self._judge.days(batch)
+        for judged in self._judged(days, client):
             self._note(judged)
             stale = [each for each in judged.judgements if each.stale]
             jobs = [
@@ -445,12 +451,11 @@ class _Work:
         found.told.update(judged.told)
         found.barren += sum(each.barren for each in judged.judgements)
         found.held += [each for each in judged.judgements if each.held]
-        if self._judge.digests or judged.touched or judged.gone:
+        if judged.digests or judged.touched or judged.gone:
             self._write()
-            self._store.store_digests(self._judge.digests)
+            self._store.store_digests(judged.digests)
             self._store.touch_products(judged.touched)
             self._store.forget_scenes(judged.gone)
-            self._judge.digests.clear()
 
     def _take(self, job: Job) -> None:
         self._running().take(self._judgements[job.scene.id], note=False)
@@ -500,11 +505,6 @@ class _Work:
             job = Job(self._campaign, each.scene, each.plan)
             self._session.add(failed(job, f"{each.held} (not tried again: nothing has changed)"))
         return self._session.finish(status, self._found.set_aside)
-
-
-def _chained(first: Job, rest: Iterator[Job]) -> Iterator[Job]:
-    yield first
-    yield from rest
 
 
 def _status(stop: Stop) -> RunStatus:

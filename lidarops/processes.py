@@ -1,4 +1,4 @@
-"""Several processes of this machine for work that is done piece by piece.
+"""Several processes of this machine, or threads, for work that is done piece by piece.
 
 What is found is the same, and in the same order, whoever finds it: where no process may or can
 be started, or one is lost, the work is done in this one.
@@ -15,7 +15,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from itertools import chain, islice
@@ -32,6 +32,8 @@ _ONE_THREAD: Final = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 )
 """What a library looks at as it is loaded; as dask has it for its workers."""
+
+_NO_MORE: Final[Any] = object()
 
 Kept = TypeVar("Kept")
 Item = TypeVar("Item")
@@ -75,6 +77,25 @@ def start_method() -> str:
     """Return how processes are to be started, as `multiprocessing` names it."""
     # A fork of this process would inherit the locks of whatever threads are running.
     return "forkserver" if os.getpid() in _LOADED else "spawn"
+
+
+def one_ahead(items: Iterable[Item]) -> Iterator[Item]:
+    """Give items, the next of which another thread finds while one is in use.
+
+    Raises
+    ------
+    Exception
+        What finding an item raises, in its place.
+    """
+    rest = iter(items)
+    with ThreadPoolExecutor(1, "ahead") as thread:
+        coming = thread.submit(next, rest, _NO_MORE)
+        while True:
+            item = coming.result()
+            if item is _NO_MORE:
+                return
+            coming = thread.submit(next, rest, _NO_MORE)
+            yield item
 
 
 class Processes(Generic[Kept]):

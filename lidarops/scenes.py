@@ -13,13 +13,14 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 
 from lidarops.campaign import Campaign, InstrumentFacts
 from lidarops.errors import SceneError
-from lidarops.records import Granule, Role, Scene, Status
+from lidarops.records import ChannelLayout, Granule, Role, Scene, Status
 
 DARK_REACH = timedelta(hours=24)
 """Dark files serve a scene when they were taken at most this long before or after it."""
@@ -57,10 +58,10 @@ def cut(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     signal, twins = _without_twins([g for g in good if g.role is Role.SIGNAL])
     dark = [granule for granule in good if granule.role is Role.DARK]
     groups: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
-    for granule in signal:
-        if granule.instrument in campaign.instruments:
-            window = _window(campaign, (granule.instrument,), granule)
-            groups[granule.instrument, *window].append(granule)
+    for instrument, own in itertools.groupby(signal, key=lambda granule: granule.instrument):
+        if instrument in campaign.instruments:
+            for granule, window in _in_windows(campaign, (instrument,), own):
+                groups[instrument, *window].append(granule)
     scenes = [
         scene
         for (instrument, start, stop), members in sorted(groups.items())
@@ -83,9 +84,9 @@ def _of_network(
     groups: dict[tuple[datetime, datetime], dict[str, list[Granule]]] = defaultdict(
         lambda: defaultdict(list)
     )
-    for granule in signal:
-        if granule.instrument in names:
-            groups[_window(campaign, names, granule)][granule.instrument].append(granule)
+    own = (granule for granule in signal if granule.instrument in names)
+    for granule, window in _in_windows(campaign, names, own):
+        groups[window][granule.instrument].append(granule)
     scenes = []
     for (start, stop), found in sorted(groups.items()):
         parts = [
@@ -172,6 +173,17 @@ def _without_twins(granules: list[Granule]) -> tuple[list[Granule], list[Granule
     return kept, twins
 
 
+def _in_windows(
+    campaign: Campaign, instruments: Sequence[str], granules: Iterable[Granule]
+) -> Iterator[tuple[Granule, tuple[datetime, datetime]]]:
+    """Give granules with their windows, quickly where they come by time."""
+    opens = closes = datetime.min.replace(tzinfo=UTC)
+    for granule in granules:
+        if not opens <= _start(granule) < closes:
+            opens, closes = _window(campaign, instruments, granule)
+        yield granule, (opens, closes)
+
+
 def _window(
     campaign: Campaign, instruments: Sequence[str], granule: Granule
 ) -> tuple[datetime, datetime]:
@@ -237,5 +249,11 @@ def _by_layout(
 
 
 def _layout_key(granule: Granule) -> str:
-    text = repr([(c.name, c.bins, c.bin_width, c.adc_bits) for c in granule.layout])
+    return _key_of(granule.layout)
+
+
+# The files of an archive share few layouts.
+@lru_cache(maxsize=128)
+def _key_of(layout: tuple[ChannelLayout, ...]) -> str:
+    text = repr([(c.name, c.bins, c.bin_width, c.adc_bits) for c in layout])
     return hashlib.sha256(text.encode()).hexdigest()[:6]

@@ -134,6 +134,8 @@ class DaysJudged:
     """Scenes of which the ledger notes a failure, and that are no more or all fresh."""
     touched: Mapping[str, int]
     """Products with a new modification time, but the recorded content."""
+    digests: Mapping[str, str]
+    """Contents of files that had to be read whole, by path; for the catalog."""
 
 
 class Judge:
@@ -163,8 +165,7 @@ class Judge:
         self._settings = dependence.Settings(campaign)
         self._profiles: dict[str, str] = {}
         self._source = Source.of(campaign.archive)
-        self.digests: dict[str, str] = {}
-        """Contents of files that had to be read whole, by path; for the catalog."""
+        self._digests: dict[str, str] = {}
 
     # Days
 
@@ -258,6 +259,7 @@ class Judge:
         chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
         orphans = _orphans(everything, made)
         orphaned = {made[key].day for key in orphans}
+        digests, self._digests = self._digests, {}
         counts = _counts(everything, found.set_aside)
         gone = {each.scene.id for each in everything if self._healed(each, tried)}
         if len(wanted) == last - first + 1:
@@ -272,6 +274,7 @@ class Judge:
             open=frozenset(each.day for each in everything if each.stale),
             gone=frozenset(gone),
             touched=touched,
+            digests=digests,
         )
 
     def _healed(self, judged: Judgement, tried: Mapping[str, Tried]) -> bool:
@@ -453,10 +456,10 @@ class Judge:
 
     def _content(self, granule: Granule) -> str:
         """Return the sha256 of a granule, or what no sha256 is where it cannot be read."""
-        known = granule.sha256 or self.digests.get(granule.path)
+        known = granule.sha256 or self._digests.get(granule.path)
         if known is None:
             try:
-                known = self.digests[granule.path] = self._source.digest(granule.path)
+                known = self._digests[granule.path] = self._source.digest(granule.path)
             except OSError:
                 known = None
         return known or f"{granule.size}:{granule.mtime_ns}:{granule.path}"

@@ -8,7 +8,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future
 from itertools import count, islice
 from pathlib import Path
@@ -17,7 +19,7 @@ import pytest
 
 from lidarops import processes
 from lidarops.errors import CatalogError
-from lidarops.processes import Processes
+from lidarops.processes import Processes, one_ahead
 
 
 def product(kept: int, item: int) -> int:
@@ -172,6 +174,36 @@ if __name__ == "__main__":
         print(pool.later(seen, 1)()[1], flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
 """
+
+
+class TestOneAhead:
+    def test_gives_all_in_order(self) -> None:
+        assert list(one_ahead(range(9))) == list(range(9))
+        assert list(one_ahead([])) == []
+
+    def test_finds_the_next_one_meanwhile_and_no_more(self) -> None:
+        begun = [threading.Event() for _ in range(4)]
+
+        def found() -> Iterator[int]:
+            for number, event in enumerate(begun):
+                event.set()
+                yield number
+
+        items = one_ahead(found())
+        assert next(items) == 0
+        assert begun[1].wait(10)
+        items.close()
+        assert not begun[2].is_set()
+
+    def test_raises_in_the_place_of_an_item(self) -> None:
+        def found() -> Iterator[int]:
+            yield 1
+            raise CatalogError("is away", file="archive", remedy="wait")
+
+        items = one_ahead(found())
+        assert next(items) == 1
+        with pytest.raises(CatalogError, match="is away"):
+            next(items)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks are not safe elsewhere")
