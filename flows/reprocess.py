@@ -128,13 +128,12 @@ def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
     create_table_artifact(
         key=f"{key}-products", table=page.summary_rows(record), description=f"Run {record.id}"
     )
-    create_link_artifact(built.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
-    picture = page.quicklook(record, built.parent, workers=workers)
-    if picture is not None:
+    create_link_artifact(built.page.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
+    if built.quicklook is not None:
         # The server may stand on another machine, so the picture travels in the artifact.
-        encoded = base64.b64encode(picture.read_bytes()).decode()
+        encoded = base64.b64encode(built.quicklook.read_bytes()).decode()
         create_image_artifact(image_url=f"data:image/png;base64,{encoded}", key=f"{key}-quicklook")
-    return built
+    return built.page
 
 
 @task(name="publish", **_RETRY)

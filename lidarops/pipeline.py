@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign import Campaign
@@ -577,7 +576,7 @@ def prepare(
     return Cut(chosen, everything.set_aside)
 
 
-def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> Path:
+def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> page.Report:
     """Keep the record of a run and build its page.
 
     Parameters
@@ -590,8 +589,7 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> Path:
 
     Returns
     -------
-    Path
-        Of the page.
+    Report
     """
     folder = campaign.report_root / run.id
     record.save(run, folder)

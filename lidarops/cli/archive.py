@@ -230,7 +230,7 @@ def reprocess(
         removed = pipeline.remove_orphans(settings, result.orphans, wait=wait)
     page = None
     if result.record is not None:
-        page = pipeline.report_run(settings, result.record, workers=options.workers)
+        page = pipeline.report_run(settings, result.record, workers=options.workers).page
     if as_json:
         typer.echo(json.dumps(_run_summary(settings, result, page), indent=2))
     else:

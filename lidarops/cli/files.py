@@ -24,7 +24,7 @@ def report(
     from lidarops.reports import page, record
 
     folder = run if run.is_dir() else run.parent
-    typer.echo(str(page.build(record.load(run), folder, workers=workers)))
+    typer.echo(str(page.build(record.load(run), folder, workers=workers).page))
 
 
 @app.command()

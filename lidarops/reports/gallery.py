@@ -274,24 +274,6 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
     return gallery
 
 
-def first_picture(record: RunRecord, folder: Path, *, workers: int = 1) -> Path | None:
-    """Draw one figure of a run: of the first instrument and channel whose products are readable.
-
-    Returns
-    -------
-    Path or None
-        A PNG file in `folder`; None where no product can be drawn.
-    """
-    with _sources(record, Gallery(), workers) as sources:
-        for group in _groups(record):
-            for drawn in _draw(group, sources, full=False):
-                folder.mkdir(parents=True, exist_ok=True)
-                path = folder / "quicklook.png"
-                write_atomically(path, drawn.figure().png)
-                return path
-    return None
-
-
 def missing(record: RunRecord) -> frozenset[str]:
     """Return the paths of the recorded products whose file is not there."""
     root = Path(record.products)

@@ -56,9 +56,18 @@ class SceneRow:
     plan_hash: str
 
 
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Files of a report."""
+
+    page: Path
+    quicklook: Path | None
+    """Its first figure of products; None where none can be drawn."""
+
+
 def build(
     record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES, workers: int = 1
-) -> Path:
+) -> Report:
     """Write the report of a run.
 
     Parameters
@@ -75,8 +84,8 @@ def build(
 
     Returns
     -------
-    Path
-        ``index.html`` in the folder. Products that are missing or unreadable are named on it.
+    Report
+        Products that are missing or unreadable are named on the page.
 
     Raises
     ------
@@ -95,12 +104,8 @@ def build(
             file=folder,
             remedy="choose a folder you can write to",
         ) from error
-    return target
-
-
-def quicklook(record: RunRecord, folder: Path, *, workers: int = 1) -> Path | None:
-    """Write one figure of a run, ``quicklook.png``; None where no product can be drawn."""
-    return gallery.first_picture(record, Path(folder), workers=workers)
+    pictures = filled.pictures
+    return Report(target, folder / pictures[0].file if pictures else None)
 
 
 def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:

@@ -66,7 +66,7 @@ class Page(HTMLParser):
 
 def built(run, folder: Path, **options) -> Page:
     """Build a page and check what must hold of any page."""
-    path = page.build(run, folder, **options)
+    path = page.build(run, folder, **options).page
     assert path == folder / "index.html"
     found = Page(path)
     assert found.tags.count("h1") == 1
@@ -86,7 +86,7 @@ def built(run, folder: Path, **options) -> Page:
 class TestSimulatedRun:
     def test_holds_every_section_and_figure_and_is_the_same_again(self, simulated, tmp_path):
         found = built(simulated, tmp_path / "report")
-        again = page.build(simulated, tmp_path / "report-again").parent
+        again = page.build(simulated, tmp_path / "report-again").page.parent
         for path in found.folder.iterdir():
             assert path.read_bytes() == (again / path.name).read_bytes()
         for words in (
@@ -236,7 +236,7 @@ class TestDegenerateRuns:
         assert found.sources == []
         assert "truth" not in found.ids
         assert page.summary_rows(run_record(tmp_path)) == []
-        assert page.quicklook(run_record(tmp_path), tmp_path / "q") is None
+        assert page.build(run_record(tmp_path), tmp_path / "q").quicklook is None
 
     def test_failures_only(self, tmp_path):
         scenes = [
@@ -440,9 +440,10 @@ def test_long_reasons_fold(tmp_path):
     assert found.text.count("because") >= 4000
 
 
-def test_quicklook_is_one_picture(simulated, tmp_path):
-    path = page.quicklook(simulated, tmp_path / "q")
-    assert path == tmp_path / "q" / "quicklook.png"
+def test_quicklook_is_the_first_picture(simulated, tmp_path):
+    report = page.build(simulated, tmp_path / "q")
+    path = report.quicklook
+    assert path.name == next(name for name in Page(report.page).sources if "flags" not in name)
     with Image.open(path) as image:
         assert image.width == 1500
 

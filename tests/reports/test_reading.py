@@ -81,11 +81,6 @@ class TestFigures:
         with pytest.raises(AssertionError, match="in this process"):
             gallery.fill(many, tmp_path)
 
-    def test_quicklook_too(self, many, tmp_path, monkeypatch):
-        alone = page.quicklook(many, tmp_path / "one").read_bytes()
-        monkeypatch.setattr(reading, "FEWEST", 1)
-        assert page.quicklook(many, tmp_path / "two", workers=2).read_bytes() == alone
-
     def test_no_product_is_read_twice(self, many, tmp_path, monkeypatch):
         read = []
         before = reading.open_product
