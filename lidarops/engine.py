@@ -49,6 +49,9 @@ RECOUNT: Final = 5.0
 PATIENCE: Final = 120.0
 """s without any worker after which one is missed: on this machine, where none will come, for good.
 """
+FIRM: Final = 1.0
+"""s that a new worker is left without a scene that may take it down: dask starts no other for one
+that dies before its nanny, which looks every few hundredths of a second, has seen that it runs."""
 GRACE: Final = 20.0
 """s that scenes in hand get to end, on a cluster that is asked to stop."""
 TRIES: Final = 3
@@ -349,6 +352,7 @@ def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]
     staff = _Staff(client)
     for job in jobs:
         for _ in range(TRIES):
+            staff.ready(stop)
             if stop:
                 return
             future = _submitted(client, job)
@@ -410,6 +414,15 @@ class _Staff:
             self._recount = now + RECOUNT
             self._miss(now)
         return self._threads
+
+    def ready(self, stop: Stop) -> None:
+        """Wait for a worker, and until another one would take its place."""
+        while not stop:
+            self._recount = -math.inf
+            if self.count():
+                break
+            time.sleep(0.1)
+        time.sleep(FIRM)
 
     def _miss(self, now: float) -> None:
         if self._threads:
