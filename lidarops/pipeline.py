@@ -474,17 +474,21 @@ class _Work:
     def _settle(self, signatures: Mapping[int, str]) -> None:
         """Note the days on which everything is fresh, so that they need no second look."""
         found = self._found
-        done = self._session.settled if self._session else set()
-        # A day on which not all went as it was planned is looked at again, and else nothing is.
-        unclear = {day for day, scenes in found.open.items() if not scenes <= done}
         settled = {
-            day: (signatures[day], *told) for day, told in found.told.items() if day not in unclear
+            day: (signatures[day], *told)
+            for day, told in found.told.items()
+            if day not in found.open
         }
         if found.open and self._selection.everything:
             judge = self._new_judge(again=True)
             again = judge.signatures(found.open)
-            settled.update((day, (again[day], *found.told[day])) for day in again.keys() & settled)
-            for batch in judge.batches(unclear & again.keys()):
+            clear = {day for day in again if self._went_as_planned(day, judge)}
+            settled.update(
+                (day, (again[day], *found.told[day])) for day in clear & found.told.keys()
+            )
+            # A day with scenes that were not tried stays open, whatever became of the others.
+            waiting = {each.day for each in self._judgements.values()}
+            for batch in judge.batches(again.keys() - clear - waiting):
                 judged = judge.days(batch)
                 settled.update(
                     (day, (again[day], *told))
@@ -496,6 +500,15 @@ class _Work:
         if new:
             self._write()
             self._store.store_verdicts(new)
+
+    def _went_as_planned(self, day: int, judge: Judge) -> bool:
+        """Return whether another look at a day would find all fresh.
+
+        Not where files joined or left it, or a profile changed, after its scenes had ended.
+        """
+        done = self._session.settled if self._session else set()
+        same = judge.sources[day] == self._judge.sources[day]
+        return same and self._found.open[day] <= done
 
     def _conclude(self, status: RunStatus) -> RunRecord | None:
         if self._session is None:

@@ -32,6 +32,10 @@ _ONE_THREAD: Final = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 )
 """What a library looks at as it is loaded; as dask has it for its workers."""
+_OF_LIBRARIES: Final = frozenset(
+    {*_ONE_THREAD, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
+)
+"""Variables that dask sets in this process too, as it starts workers, and netCDF4 for itself."""
 
 _NO_MORE: Final[Any] = object()
 
@@ -51,11 +55,11 @@ def load_ahead(modules: Collection[str]) -> None:
     ----------
     modules : collection of str
     """
-    if not sys.platform.startswith("linux") or start_method() == "forkserver":
+    if not sys.platform.startswith("linux") or os.getpid() in _LOADED:
         return
     multiprocessing.set_forkserver_preload(list(modules))
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update({name: value or _ONE_THREAD[name] for name, value in before.items()})
+    unset = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
+    os.environ.update(unset)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:
         # First, as it lets signals through again.
@@ -63,20 +67,27 @@ def load_ahead(modules: Collection[str]) -> None:
         # Ctrl-C goes to all processes of a terminal; this one ends the others.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         forkserver.ensure_running()
-        _LOADED.append(os.getpid())
+        _LOADED[os.getpid()] = _environment()
     except OSError as error:
         _LOG.warning("no process can be started to load modules: %s", error)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
+        for name in unset:
+            os.environ.pop(name, None)
 
 
 def start_method() -> str:
-    """Return how processes are to be started, as `multiprocessing` names it."""
+    """Return how processes are to be started, as `multiprocessing` names it.
+
+    They have the environment of this process as it is now, the one of `load_ahead` only where
+    that is the same.
+    """
     # A fork of this process would inherit the locks of whatever threads are running.
-    return "forkserver" if os.getpid() in _LOADED else "spawn"
+    return "forkserver" if _LOADED.get(os.getpid()) == _environment() else "spawn"
+
+
+def _environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name not in _OF_LIBRARIES}
 
 
 def one_ahead(items: Iterable[Item]) -> Iterator[Item]:
@@ -198,8 +209,8 @@ class Processes(Generic[Kept]):
             )
         try:
             return self._pool.submit(_there, task, item)
-        # One was lost, or none can be started.
-        except (BrokenProcessPool, OSError) as error:
+        # One was lost, or none can be started; or what forks them ended as it was asked to.
+        except (BrokenProcessPool, OSError, EOFError) as error:
             self._lost(error)
             return None
 
@@ -222,8 +233,8 @@ class Processes(Generic[Kept]):
                 self._pool = None
 
 
-_LOADED: list[int] = []
-"""This process, where one that loads modules was begun."""
+_LOADED: dict[int, dict[str, str]] = {}
+"""This process, where one that loads modules was begun -> the environment that it has."""
 _KEPT: list[Any] = []
 """In a process that was started here: what it keeps for all tasks."""
 

@@ -166,6 +166,8 @@ class Judge:
         self._profiles: dict[str, str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
+        self.sources: dict[int, str] = {}
+        """What days are made from, products apart, as `signatures` last found it."""
 
     # Days
 
@@ -192,6 +194,7 @@ class Judge:
         for day in sums.keys() | products.keys():
             if days is None or day in days:
                 digest = hashlib.sha256(f"{base}{day}{sorted(sums[day], key=repr)}".encode())
+                self.sources[day] = digest.hexdigest()
                 digest.update(products[day].digest() if day in products else b"")
                 found[day] = "" if day in broken else digest.hexdigest()
         return found
@@ -563,7 +566,3 @@ def _named(word: str, files: Sequence[InputRecord]) -> str:
 
 def _moment(granule: Granule) -> datetime:
     return granule.start or datetime.min.replace(tzinfo=UTC)
-
-
-def _start(scene: Scene) -> datetime:
-    return scene.start

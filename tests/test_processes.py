@@ -113,9 +113,18 @@ class TestEach:
             child.kill()
         assert not alive
 
-    def test_goes_on_here_where_none_can_be_started(self, monkeypatch, caplog) -> None:
-        context = multiprocessing.get_context("spawn")
-        monkeypatch.setattr(context, "Process", _unstartable)
+    @pytest.mark.parametrize(
+        "error", [BlockingIOError("no more processes"), EOFError("unexpected EOF")]
+    )
+    def test_goes_on_here_where_none_can_be_started(
+        self, monkeypatch, caplog, error: Exception
+    ) -> None:
+        def unstartable(*_: object, **__: object) -> None:
+            raise error
+
+        # Whichever is used.
+        for method in ("spawn", "forkserver"):
+            monkeypatch.setattr(multiprocessing.get_context(method), "Process", unstartable)
         with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
             assert list(pool.each(product, range(9), at_a_time=2)) == doubled(range(9))
         assert caplog.text.count("a process was lost") == 1
@@ -143,10 +152,6 @@ def _interrupted(pool: Processes[int]) -> None:
             raise KeyboardInterrupt
 
 
-def _unstartable(*_: object, **__: object) -> None:
-    raise BlockingIOError("no more processes")
-
-
 AHEAD = """
 import multiprocessing, os, signal, sys, time
 from lidarops import processes
@@ -155,6 +160,9 @@ from lidarops.processes import Processes, load_ahead, start_method
 def seen(kept, item):
     held = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
     return "colorsys" in sys.modules, os.getpid(), os.environ.get("OMP_NUM_THREADS"), held
+
+def variable(kept, name):
+    return os.environ.get(name)
 
 if __name__ == "__main__":
     assert start_method() == "spawn"
@@ -170,9 +178,30 @@ if __name__ == "__main__":
     assert {threads for _, _, threads, _ in found.values()} == {"1"}
     # Ctrl-C reaches all processes of a terminal, and what is loaded is still of use.
     assert {held for _, _, _, held in found.values()} == {True}
+    # It may date products, or open a store.
+    os.environ["LIDAROPS_SEEN"] = "later"
+    with Processes(2, 2) as pool:
+        assert pool.later(variable, "LIDAROPS_SEEN")() == "later"
+    del os.environ["LIDAROPS_SEEN"]
+    assert start_method() == "forkserver"
     with Processes(2, 2) as pool:
         print(pool.later(seen, 1)()[1], flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+WORKERS = """
+import os
+from lidarops.engine import local_client
+from lidarops.processes import load_ahead, start_method
+
+if __name__ == "__main__":
+    load_ahead(["distributed.nanny"])
+    with local_client(2) as client:
+        parents = set(client.run(os.getppid).values())
+    import netCDF4
+    assert len(parents) == 1, parents
+    assert os.getpid() not in parents
+    assert start_method() == "forkserver"
 """
 
 
@@ -218,6 +247,14 @@ class TestLoadAhead:
         )  # fmt: skip
         assert done.returncode == -signal.SIGKILL, done.stderr
         assert _ends(int(done.stdout))
+
+    def test_serves_workers_and_whoever_comes_after_them(self, tmp_path: Path) -> None:
+        script = tmp_path / "workers.py"
+        script.write_text(WORKERS)
+        done = subprocess.run(
+            [sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 0, done.stderr
 
 
 def _ends(pid: int) -> bool:

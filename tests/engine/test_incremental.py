@@ -20,6 +20,7 @@ from lidarops import engine
 from lidarops.catalog.database import day_of
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.scan import scan
 from lidarops.catalog.store import Store
 from lidarops.pipeline import (
     Options,
@@ -29,7 +30,7 @@ from lidarops.pipeline import (
     remove_orphans,
     reprocess,
 )
-from lidarops.records import ProductKind
+from lidarops.records import ProductKind, SceneOutcome
 from lidarops.staleness import DaysJudged, Judge
 
 RICH = ("signal analog", "signal photon", "homogeneous photon", "elastic analog")
@@ -415,7 +416,7 @@ def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
     with Store(campaign.catalog_url, campaign.name) as store:
         signatures = Judge(campaign, store).signatures()
         known = store.verdicts()
-    return {day: told for day, told in known.items() if told[0] == signatures[day]}
+    return {day: told for day, told in known.items() if told[0] == signatures.get(day)}
 
 
 def _unreadable_later(archive: Archive) -> None:
@@ -484,3 +485,40 @@ def test_only_days_on_which_something_failed_are_looked_at_again(
     failed = {day_of(scene.start) for scene in record.scenes if scene.error}
     assert len(failed) == 2
     assert looked == [*every, *sorted(failed)]
+
+
+def _elsewhere(archive: Archive) -> None:
+    """Another sounding."""
+    from small_archive import SOUNDING
+
+    (archive.folder / "air.csv").write_text(SOUNDING.replace("288.15", "287.15"))
+
+
+def _without_dark(archive: Archive) -> None:
+    (archive.folder / "raw/rich/d0").unlink()
+
+
+def _joined(archive: Archive) -> None:
+    """A file that another process enters in the catalog."""
+    campaign = archive.write()
+    archive.raw("rich/h08", 620, seed=44)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan(campaign, store)
+
+
+@pytest.mark.parametrize("change", [_elsewhere, _without_dark, _joined])
+def test_what_changes_behind_a_scene_leaves_its_day_to_be_looked_at(
+    archive: Archive, change: Callable[[Archive], None]
+) -> None:
+    _title(archive)
+
+    def once(outcome: SceneOutcome) -> None:
+        if outcome.instrument == "rich" and not changed:
+            changed.append(outcome.start.day)
+            change(archive)
+
+    changed: list[int] = []
+    reprocess(archive.write(), options=Options(progress=once))
+    assert changed == [1]
+    assert _verdicts(archive).items() <= _judged_anew(archive).items()
+    assert f"rich {changed[0]} elastic analog" in made(reprocess(archive.write()))
