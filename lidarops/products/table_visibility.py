@@ -205,12 +205,14 @@ VISIBILITY: Final = Layout(
         replace(
             quality(_SERIES, FLAGS),
             comment="In this kind of product poorly_determined means a standard error above a third"
-            " of extinction, of the value or as the median of its block; low_leverage a beam that"
+            " of extinction, of the value or as the median of its block, before the doubt in the"
+            " prior is added; low_leverage a beam that"
             " is too weak to be used beside the others; poor_fit beams that disagree by more than"
             " their noise allows, or a beam that ends before the point at bins that lie off their"
             " neighbours; outlier a beam with bins that lie more than 6 standard errors off their"
             " neighbours: these took the place of single ones, while several together, which may be"
-            " the edge of a layer, were left. The value stands.",
+            " the edge of a layer, were left, and what they change is part of the standard error."
+            " The value stands.",
         ),
         _per_time(
             "optical_depth",

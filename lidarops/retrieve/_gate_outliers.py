@@ -6,6 +6,7 @@ gate that alone lies off by more than noise explains is no air. It is bridged: t
 same polynomial takes its place, and its derivatives go to the gates that made it, so that
 variances stay those of the gates that were used. Edges of layers and clouds are air: they leave
 several gates off, or something beside the one that is taken out, and such a ray stays as it is.
+As wild gates may lie together too, what bridging them would change is added to its covariance.
 So do rays of wider gates than 10 m, where a layer may fill a single one. Where more gates lie off
 than could be wild, noise is not what is stated, and the ray is not believed.
 """
@@ -445,6 +446,7 @@ def find(
     span: tuple[int, int, int, int],
     planned: tuple[Indices, Array, Array],
     codes: Codes,
+    marked: Codes,
     off: Array,
 ) -> tuple[int, int]:
     """Mark the gates of a ray that are to be bridged.
@@ -466,6 +468,8 @@ def find(
         Of `plan`.
     codes : (bin,) uint8
         In: GOOD or LOST; out: also BRIDGED.
+    marked : (bin,) uint8
+        Where gates lie together that are left: `codes` as if they were wild.
     off : (bin,) float64
         Scratch.
 
@@ -497,6 +501,7 @@ def find(
         _measure(row, exponent, relative, grid, codes, (first, stop, *about), planned, off)
     if number > most or (number > 0 and not _alone(row, exponent, codes, off, first, stop)):
         for g in range(first, stop):
+            marked[g] = codes[g]
             codes[g] = GOOD if codes[g] == BRIDGED else codes[g]
         number = LEFT
     return number, stop

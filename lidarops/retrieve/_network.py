@@ -39,6 +39,8 @@ _THINNEST: Final = 1e-3
 _SETTLED: Final = 1e-3
 _TINIEST_PIVOT: Final = 1e-13
 _NEARLY_NONE: Final = 1e-2
+_DOUBT: Final = 2.0
+"""Times the standard deviation of the prior, by which a field may deviate, for what is stated."""
 _LARGEST_VARIANCE: Final = 4.0
 """Of ln extinction; beyond, it is not determined."""
 
@@ -373,6 +375,7 @@ def solve_profiles(
     constants: Array,
     logarithms: Array,
     variances: Array,
+    believed: Array,
     summary: Array,
     status: Codes,
 ) -> None:
@@ -393,8 +396,9 @@ def solve_profiles(
     passes : int
     constants : (profile, ray) float64
         In: where to start; out: where the passes ended.
-    logarithms, variances : (profile, vertex) float64
-        Get ln(extinction / m-1) and its variance; NaN where undetermined, or unseen.
+    logarithms, variances, believed : (profile, vertex) float64
+        Get ln(extinction / m-1), its variance where fields deviate by more than the prior has it
+        (`_DOUBT`), and where they do not; NaN where undetermined, or unseen.
     summary : (profile, COLUMNS) float64
     status : (profile,) uint8
     """
@@ -429,7 +433,9 @@ def solve_profiles(
         summary[n, 1], summary[n, 3] = free
         summary[n, 4] = summary[n, 2] + determinants + norm
         status[n] = UNDETERMINED if not fine else (SOLVED if moved < _SETTLED else UNSETTLED)
-        _hand_over(matrix, side, seen, fine, inverse, logarithms[n], variances[n])
+        _hand_over(
+            matrix, side, precision, seen, fine, inverse, logarithms[n], variances[n], believed[n]
+        )
 
 
 @_compiled
@@ -456,16 +462,29 @@ def _least_square(matrix: Array, side: Array, seen: Codes, square: float, fine: 
 def _hand_over(
     factor: Array,
     solution: Array,
+    precision: Array,
     seen: Codes,
     fine: bool,
     inverse: Array,
     logarithms: Array,
     variances: Array,
+    believed: Array,
 ) -> None:
-    """Fill the solution and its variances where vertices are seen, NaN elsewhere."""
+    """Fill the solution and its variances where vertices are seen, NaN elsewhere.
+
+    The inverse C of all information is the covariance of a field of which the prior P is true;
+    C + (d^2 - 1) C P C that of one which deviates by d times as much.
+    """
     if fine:
         _invert_system(factor, solution.size, inverse)
     for v in range(solution.size):
         good = fine and seen[v] == 1 and inverse[v, v] < _LARGEST_VARIANCE
         logarithms[v] = solution[v] if good else math.nan
-        variances[v] = inverse[v, v] if good else math.nan
+        variances[v], believed[v] = math.nan, math.nan
+        if good:
+            believed[v] = inverse[v, v]
+            told = 0.0
+            for i in range(solution.size):
+                for k in range(solution.size):
+                    told += inverse[v, i] * precision[i, k] * inverse[k, v]
+            variances[v] = inverse[v, v] + (_DOUBT * _DOUBT - 1.0) * max(told, 0.0)

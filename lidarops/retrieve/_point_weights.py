@@ -429,12 +429,14 @@ def _screen(
     span: tuple[int, int, int, int],
     planned: tuple[Indices, Array, Array],
     row: tuple[Array, Array, Codes],
+    other: tuple[Array, Array, Codes],
     work: tuple[Array, Array, Array, Indices, Array],
 ) -> tuple[int, int]:
     """Bridge gates that lie off their neighbours.
 
-    Return behind which gate the ray is not to be believed, and how many are bridged before; one
-    where gates lie off that are left as they are.
+    Return behind which gate the ray is not to be believed, and how many are bridged before; LEFT
+    where gates lie off that are left as they are and may be wild: the other row then is the one
+    without them.
     """
     power, variance, log_factor = signal
     logs, noise, codes = row
@@ -444,11 +446,17 @@ def _screen(
         _look_beyond(power, variance, log_factor, exponent, relative, beyond, row)
     _gate_outliers.make_plain(logs, noise, exponent, codes, span, plain, wide)
     number, end = _gate_outliers.find(
-        (logs, noise, plain, wide), exponent, relative, grid, span, planned, codes, off
+        (logs, noise, plain, wide), exponent, relative, grid, span, planned, codes, other[2], off
     )
     end = min(end, stop)
     if number == _gate_outliers.LEFT:
-        return end, 1
+        for g in range(first, last):
+            other[0][g], other[1][g] = logs[g], noise[g]
+        reached = _gate_outliers.bridge(
+            other[0], other[1], exponent, grid, (first, last, end), other[2], nodes, shares
+        )
+        # So many side by side are no wild ones.
+        return end, number if reached == end else 1
     if number > 0:
         end = _gate_outliers.bridge(
             logs, noise, exponent, grid, (first, last, end), codes, nodes, shares
@@ -457,6 +465,30 @@ def _screen(
     for g in range(low, end):
         number += codes[g] == _gate_outliers.BRIDGED
     return end, number
+
+
+@_compiled
+def _widen(
+    one: tuple[Array, Array, Array],
+    other: tuple[Array, Array, Array],
+    crossings: tuple[int, int, int],
+    packed: Array,
+) -> None:
+    """Add to covariances what two readings of a ray differ by, of which either may be true."""
+    first, count, good = crossings
+    quantities = 2 * count - 1
+    apart = np.zeros(quantities)
+    for c in range(good):
+        apart[c] = other[0][first + c] - one[0][first + c]
+    for c in range(good - 1):
+        apart[count + c] = other[1][first + c] - one[1][first + c]
+        for k in (0, 2):
+            step = other[2][first + c, k] - one[2][first + c, k]
+            if abs(step) < math.inf:
+                one[2][first + c, k + 1] += step * step
+    for i in range(quantities):
+        for j in range(quantities):
+            packed[i * quantities + j] += apart[i] * apart[j]
 
 
 @_compiled
@@ -493,6 +525,10 @@ def _condense(
     logs, noise, codes = np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.uint8)
     nodes = np.zeros((bins, _gate_outliers.NODES), dtype=np.intp)
     work = np.zeros(bins), np.zeros(bins), np.zeros(bins), nodes, np.zeros(nodes.shape)
+    other = np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.uint8)
+    total = values.shape[1]
+    without = np.zeros(total), np.zeros(total), np.zeros((total, 4))
+    reached = np.zeros(total, dtype=np.uint8)
     for n in range(power.shape[0]):
         for ray in range(exponent.size):
             first, last = first_crossing[ray], first_crossing[ray + 1]
@@ -516,12 +552,12 @@ def _condense(
                     (power[n, ray], spread_row, log_factor[ray]), m, relative, range_[ray],
                     (start, low, stop, end),
                     (neighbours[0][ray], neighbours[1][ray], neighbours[2][ray]),
-                    (logs, noise, codes), work,
+                    (logs, noise, codes), other, work,
                 )  # fmt: skip
                 reason = OUTLYING if believed < stop else reason
                 stop = believed
             status[n, ray] = reason
-            bridged[n, ray] = min(found, 1)
+            bridged[n, ray] = min(abs(found), 1)
             gradients[:, start : max(end, high)] = 0.0
             good = _fit_points(
                 logs, noise, m, stop, (first, last), window, weights, values[n], usable[n],
@@ -539,5 +575,18 @@ def _condense(
                 gradients, bounds, 2 * count - 1, noise,
                 covariance[n, offset[ray] : offset[ray + 1]],
             )  # fmt: skip
+            if found == _gate_outliers.LEFT:
+                _fit_points(
+                    other[0], other[1], m, stop, (first, last), window, weights, without[0],
+                    reached, gradients, bounds,
+                )  # fmt: skip
+                _join_points(
+                    other[0], other[1], m, range_[ray], other[2], (first, count, good), cell,
+                    fraction, values[n, first], without[1], without[2], gradients, bounds,
+                )  # fmt: skip
+                _widen(
+                    (values[n], integrals[n], slopes[n]), without, (first, count, good),
+                    covariance[n, offset[ray] : offset[ray + 1]],
+                )  # fmt: skip
             for c in range(first + good - 1, first - 1, -1):
                 values[n, c] -= values[n, first]

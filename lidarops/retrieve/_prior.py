@@ -3,7 +3,9 @@
 Along a ray, a gradient of extinction looks like attenuation, and what tells them apart is weak.
 So a gradient over the network is held to tens of percent beforehand: that much must be said, for
 no likelihood tells it. What else a vertex deviates by, the rays that cross there see: its size is
-the one that makes all profiles of a block likeliest. Nothing is said of the level of a profile.
+the one that makes all profiles of a block likeliest, and no less than their mean wants. Nothing
+is said of the level of a profile. As a single field is no sample of many, errors are stated for
+one that deviates by twice as much (`lidarops.retrieve._network`).
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from lidarops.retrieve import _network
 from lidarops.retrieve._point_weights import Condensed, Layout
@@ -43,6 +46,8 @@ _SEEN_BY: Final = 0.9
 _TOLD_BY_MEAN: Final = 0.3
 _APART: Final = 2.5
 """Standard errors, of both, between the mean of solutions and the solution of the mean."""
+_UNLIKELY: Final = 1e-2
+"""Probability of a chi-square of the mean, told by the prior, below which the field is another."""
 _UNDETERMINED_COST: Final = 1e3
 _FIRST_PASSES: Final = 12
 _NEXT_PASSES: Final = 4
@@ -56,7 +61,9 @@ class Solution:
     logarithm: Array
     """(profile, vertex) of extinction in m-1."""
     variance: Array
-    """(profile, vertex)."""
+    """(profile, vertex), with doubt in the prior."""
+    believed: Array
+    """(profile, vertex) variance where the prior is true."""
     chi_square: Array
     """(profile,) of the rays alone, whatever the prior."""
     degrees_of_freedom: Array
@@ -87,11 +94,18 @@ class _Problem:
             data.integral, data.usable, data.slope, lengths(layout), exponent,
             layout.first_crossing, self.constants,
         )  # fmt: skip
+        self.start = self.constants.copy()
+
+    def afresh(self, deviation: float, strength: float = 1.0) -> Solution:
+        """Solve all profiles from where the first solution started."""
+        self.constants[:] = self.start
+        return self.solve(deviation, 2 * _FIRST_PASSES, strength)
 
     def solve(self, deviation: float, passes: int, strength: float = 1.0) -> Solution:
         """Solve all profiles; move the constants."""
         shape = (self.constants.shape[0], self.vertices)
         logarithm, variance = np.full(shape, np.nan), np.full(shape, np.nan)
+        believed = np.full(shape, np.nan)
         summary, status = (
             np.full((shape[0], _network.COLUMNS), np.nan),
             np.zeros(shape[0], dtype=np.uint8),
@@ -105,15 +119,16 @@ class _Problem:
         data = self.data
         _network.solve_profiles(
             data.log_value, data.integral, data.usable, data.covariance, self.geometry,
-            precision, norm, flat, passes, self.constants, logarithm, variance, summary, status,
+            precision, norm, flat, passes, self.constants, logarithm, variance, believed, summary,
+            status,
         )  # fmt: skip
         fine = status != _network.UNDETERMINED
         # A profile that one prior leaves undetermined must not make it likelier than others.
         terms = np.where(fine, summary[:, _network.LIKELIHOOD], _UNDETERMINED_COST)
         self.likelihood = float(np.sum(terms))
         return Solution(
-            logarithm, variance, summary[:, 0], summary[:, 1], summary[:, 2], summary[:, 3],
-            np.full(shape[0], strength * deviation), status,
+            logarithm, variance, believed, summary[:, 0], summary[:, 1], summary[:, 2],
+            summary[:, 3], np.full(shape[0], strength * deviation), status,
         )  # fmt: skip
 
 
@@ -156,33 +171,32 @@ def solve_blocks(
     """
     shape = (block.size, position.shape[0])
 
-    def nothing() -> Array:
-        return np.full(shape[0], np.nan)
+    def nothing(*size: int) -> Array:
+        return np.full(size, np.nan)
 
+    n = block.size
     out = Solution(
-        np.full(shape, np.nan), np.full(shape, np.nan), nothing(), nothing(), nothing(), nothing(),
-        nothing(), np.full(shape[0], _network.UNDETERMINED, dtype=np.uint8),
+        nothing(*shape), nothing(*shape), nothing(*shape), nothing(n), nothing(n), nothing(n),
+        nothing(n), nothing(n), np.full(n, _network.UNDETERMINED, dtype=np.uint8),
     )  # fmt: skip
     for b in np.unique(block):
         mine = np.flatnonzero(block == b)
         told = data.take(mine)
         part = _solve_block(
             _Problem(told, layout, vertex, exponent, position),
-            partial(_solve_mean, told, layout, vertex, exponent, position),
+            partial(_mean_problem, told, layout, vertex, exponent, position),
         )
         for field in fields(Solution):
             getattr(out, field.name)[mine] = getattr(part, field.name)
     return out
 
 
-def _solve_mean(
+def _mean_problem(
     data: Condensed, layout: Layout, vertex: Indices, exponent: Array, position: Array
-) -> Solution | None:
-    """Solve the mean of profiles without prior; None where too few see the same."""
+) -> _Problem | None:
+    """Return the mean of profiles as a problem; None where too few see the same."""
     pooled = _pooled(data)
-    if pooled is None:
-        return None
-    return solve_without_prior(pooled, layout, vertex, exponent, position)
+    return None if pooled is None else _Problem(pooled, layout, vertex, exponent, position)
 
 
 def _pooled(data: Condensed) -> Condensed | None:
@@ -208,26 +222,58 @@ def _pooled(data: Condensed) -> Condensed | None:
     )  # fmt: skip
 
 
-def _solve_block(problem: _Problem, solve_mean: Callable[[], Solution | None]) -> Solution:
+def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solution:
     """Solve with the strongest prior that the rays do not contradict, each and on average."""
-    start = problem.constants.copy()
-    alone = problem.solve(np.inf, 2 * _FIRST_PASSES)
+    alone = problem.afresh(np.inf)
     # What profiles tell well by themselves, their mean need not tell.
     with np.errstate(invalid="ignore"):
-        whole = None if np.all(alone.variance < _WELL_TOLD**2) else solve_mean()
+        mean = None if np.all(alone.variance < _WELL_TOLD**2) else pool()
+    whole = None if mean is None else mean.afresh(np.inf)
     for strength in _STRENGTHS:
-        problem.constants[:] = start
-        result = _likeliest(problem, strength)
-        if not (_contradicted(result, alone) or (whole and _apart(result, whole))):
+        least = 0.0 if mean is None else _least(mean, strength)
+        result = _likeliest(problem, strength, least)
+        if _contradicted(result, alone) or (whole and _apart(result, whole)):
+            continue
+        if mean is None or not _unlikely(mean, result, strength):
             return result
     return alone
 
 
-def _likeliest(problem: _Problem, strength: float) -> Solution:
+def _unlikely(mean: _Problem, result: Solution, strength: float) -> bool:
+    """Return whether the mean of profiles does not fit the prior that each of them fits.
+
+    Noise hides in each profile what a prior has wrong; in their mean there is less of it. Asked
+    in values along rays, where `_apart` asks in extinction, of which thin air tells nothing.
+    """
+    told = mean.afresh(float(result.deviation[0]) / strength, strength)
+    square, freedom = float(told.prior_chi_square[0]), float(told.prior_degrees_of_freedom[0])
+    if not (np.isfinite(square) and freedom > 0):
+        return False
+    return bool(special.gammaincc(freedom / 2.0, max(square, 0.0) / 2.0) < _UNLIKELY)
+
+
+def _likeliest(problem: _Problem, strength: float, least: float) -> Solution:
     """Solve with the largest deviation that is not much less likely than the likeliest.
 
-    What is not told apart by the likelihood is told less sharply, rather than too sharply.
+    What is not told apart by the likelihood is told less sharply, rather than too sharply. Nor
+    more sharply than by the mean of profiles, which wants this deviation at least.
     """
+    costs, constants = _costs(problem, strength)
+    chosen = int(np.flatnonzero(costs <= costs.min() + _NOT_MUCH_LESS)[-1])
+    chosen = max(chosen, int(np.searchsorted(DEVIATIONS, least)))
+    problem.constants[:] = constants[chosen]
+    return problem.solve(DEVIATIONS[chosen], _LAST_PASSES, strength)
+
+
+def _least(mean: _Problem, strength: float) -> float:
+    """Return the least deviation that is not much less likely than the likeliest."""
+    costs, _ = _costs(mean, strength)
+    return DEVIATIONS[int(np.flatnonzero(costs <= costs.min() + _NOT_MUCH_LESS)[0])]
+
+
+def _costs(problem: _Problem, strength: float) -> tuple[Array, list[Array]]:
+    """Return -2 ln likelihood of each deviation, and the constants at which it was found."""
+    problem.constants[:] = problem.start
     problem.solve(DEVIATIONS[-1], _FIRST_PASSES, strength)
     costs = np.empty(len(DEVIATIONS))
     constants: list[Array] = []
@@ -235,9 +281,7 @@ def _likeliest(problem: _Problem, strength: float) -> Solution:
         problem.solve(DEVIATIONS[k], _NEXT_PASSES, strength)
         costs[k] = problem.likelihood
         constants.insert(0, problem.constants.copy())
-    chosen = int(np.flatnonzero(costs <= costs.min() + _NOT_MUCH_LESS)[-1])
-    problem.constants[:] = constants[chosen]
-    return problem.solve(DEVIATIONS[chosen], _LAST_PASSES, strength)
+    return costs, constants
 
 
 def _contradicted(result: Solution, alone: Solution) -> bool:
@@ -248,12 +292,12 @@ def _contradicted(result: Solution, alone: Solution) -> bool:
     only by more than their variance: the solution without prior is biased by that much. A
     difference of less than half of the standard error that is reported does no harm.
     """
-    known = np.isfinite(alone.variance) & np.isfinite(result.variance)
+    known = np.isfinite(alone.variance) & np.isfinite(result.believed)
     known &= (alone.status == _network.SOLVED)[:, np.newaxis]
     number = np.maximum(known.sum(axis=0), 1)
     gap = np.where(known, alone.logarithm - result.logarithm, 0.0).sum(axis=0) / number
     whole = np.where(known, alone.variance, 0.0).sum(axis=0) / number
-    less = np.where(known, result.variance, 0.0).sum(axis=0) / number
+    less = np.where(known, result.believed, 0.0).sum(axis=0) / number
     apart = _CONTRADICTION * np.sqrt(np.maximum(whole - less, 0.0) / number)
     apart = np.maximum(apart, _HARMLESS * np.sqrt(less))
     told = (whole < _WELL_TOLD**2) & (known.sum(axis=0) > 0.9 * len(known))
@@ -266,10 +310,10 @@ def _apart(result: Solution, whole: Solution) -> bool:
     Noise that lets a prior decide each profile is less in the mean. What a prior has wrong, all
     profiles share.
     """
-    known = np.isfinite(result.variance)
+    known = np.isfinite(result.believed)
     number = np.maximum(known.sum(axis=0), 1)
     middle = np.where(known, result.logarithm, 0.0).sum(axis=0) / number
-    stated = np.where(known, result.variance, 0.0).sum(axis=0) / number
+    stated = np.where(known, result.believed, 0.0).sum(axis=0) / number
     told = whole.variance[0] < _TOLD_BY_MEAN**2
     told &= (known.sum(axis=0) > 0.5 * len(known)) & (whole.status[0] == _network.SOLVED)
     with np.errstate(invalid="ignore"):

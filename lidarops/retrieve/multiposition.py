@@ -10,6 +10,9 @@ vertex n and a far one v
 Nothing in it needs calibration: a lidar's constant multiplies the whole row. The overlap does
 not cancel: an error of 1, 3 and 10 percent at the first vertex changes extinction there by 5, 14
 and 34 percent.
+
+A gradient over the whole network looks like attenuation where air is thin or noise is high, and
+no test tells it there: what the prior allows is then most of the standard error.
 """
 
 from __future__ import annotations
@@ -93,7 +96,8 @@ class VertexFlags:
     """A ray of the vertex is too noisy there, and was left out; the others stand."""
     bridged: Booleans
     """A ray of the vertex has gates that lie far off their neighbours: these took the place of
-    single ones, several together were left as they are. The value stands."""
+    single ones. Several together, which may be air, were left as they are, and what they change
+    is part of the standard error. The value stands."""
     outlying: Booleans
     """A ray of the vertex has so many such gates before it that it was left out."""
     pole: Booleans
@@ -124,7 +128,8 @@ class MultiPositionResult:
     extinction: Array
     """(..., vertex) m-1; NaN at vertices that are near ones on no ray, and where there is none."""
     extinction_standard_error: Array
-    """m-1."""
+    """m-1, by noise and by what a field may deviate from the prior: twice the prior's standard
+    deviation is counted."""
     visibility: sight.VisibilityResult
     """(..., vertex) m, at the wavelength of the lidars."""
     flags: VertexFlags
@@ -280,11 +285,14 @@ def _solve_network(
         fit = _prior.solve_blocks(rays.data, layout, vertex, rays.exponent, position, rays.block)
     shape = (rays.block.size, layout.vertices)
     extinction, variance = np.full(shape, np.nan), np.full(shape, np.nan)
+    believed = np.full(shape, np.nan)
     with np.errstate(over="ignore", under="ignore"):
         extinction[:, layout.measured] = np.exp(fit.logarithm)
         variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
+        believed[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.believed
     none = np.zeros(shape, dtype=np.bool_)
-    shaky = _closed.shaky(extinction, variance, rays.block)
+    # Doubt in the prior, which is stated, is no noise that makes a value lie anywhere.
+    shaky = _closed.shaky(extinction, believed, rays.block)
     estimate = _closed.Estimate(
         extinction, variance, shaky, none, np.zeros(shape[1], dtype=np.bool_),
         np.full(shape[0], np.nan),

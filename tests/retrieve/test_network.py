@@ -210,10 +210,15 @@ def test_solution_is_the_least_squares_one(deviation):
         bound = 1e-6 if np.isfinite(deviation) else 2e-3
         np.testing.assert_allclose(best.x[net.rays :], result.logarithm[n], atol=bound)
         covariance = np.linalg.inv(best.jac.T @ best.jac)[net.rays :, net.rays :]
-        np.testing.assert_allclose(np.diag(covariance), result.variance[n], rtol=0.02)
+        np.testing.assert_allclose(np.diag(covariance), result.believed[n], rtol=0.02)
         if np.isfinite(deviation):
+            # A field that deviates by twice the prior's standard deviation.
+            doubt = covariance @ precision @ covariance
+            stated = np.diag(covariance + 3.0 * doubt)
+            np.testing.assert_allclose(stated, result.variance[n], rtol=0.02)
             assert 2 * best.cost == pytest.approx(result.prior_chi_square[n], rel=1e-5)
         else:
+            np.testing.assert_array_equal(result.variance[n], result.believed[n])
             assert 2 * best.cost == pytest.approx(result.chi_square[n], rel=0.02)
     assert result.degrees_of_freedom[0] == layout.crossings.ray.size - net.rays - net.vertices
 
