@@ -9,9 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench import elastic_cases
-from lidarops.bench.stability_draws import Failure, Judged
+from lidarops.bench.stability_draws import VISIBLE, Failure, Judged, Mask
 from lidarops.bench.stability_terms import Array
 from lidarops.flags import Quality
+from lidarops.product_settings import ReferenceSettings
 from lidarops.retrieve import elastic, known_shape, layers, reference
 from lidarops.retrieve.molecular import MolecularProfile
 
@@ -21,10 +22,14 @@ _RATIO_ERROR: Final = 0.2
 """Declared relative standard error of the lidar ratio."""
 _AIR_ERROR: Final = 0.02
 """Declared, of the density of the air."""
+_REFERENCE_ERROR: Final = ReferenceSettings().relative_error
+"""Declared, of the scattering ratio of the reference window: as products do."""
 _CARRIED: Final = 1.5
 """Standard errors of the window's mean that particles in it may add unseen."""
 _CLEAN_FROM: Final = 6000.0
 _COMPARED: Final = (500.0, 6000.0)
+_STEPS: Final = 30
+"""Of Newton's method."""
 _SHOTS: Final = elastic_cases.SHOTS
 
 
@@ -68,9 +73,13 @@ def _as_is(sky: Sky, _: Random) -> Sky:
     return sky
 
 
-def _hazy(sky: Sky, rng: Random) -> Sky:
-    haze = np.exp(rng.uniform(np.log(1e-9), np.log(1e-7)))
+def _hazy(sky: Sky, rng: Random, *, least: float = 1e-9) -> Sky:
+    haze = np.exp(rng.uniform(np.log(least), np.log(100.0 * least)))
     return replace(sky, particles=sky.particles + haze * np.exp(-elastic_cases.RANGE / 5000.0))
+
+
+def _hazier(sky: Sky, rng: Random) -> Sky:
+    return _hazy(sky, rng, least=1e-8)
 
 
 def _dense(sky: Sky, rng: Random) -> Sky:
@@ -99,8 +108,8 @@ def _bent_ratio(sky: Sky, rng: Random) -> Sky:
 
 _DECLARED: Final = "no elastic signal tells the lidar ratio: the declared error has to cover it"
 _ALIKE: Final = (
-    "haze that falls off as the air does looks like air in the window: only what the noise hides"
-    " is declared"
+    "haze that falls off nearly as the air does looks like air in the window: only the declared"
+    " error of the scattering ratio there can cover it"
 )
 _NEAR: Final = "a signal that is too low near the lidar is a signal of less haze"
 FAILURES: Final[tuple[tuple[Failure, Callable[[Sky, Random], Sky]], ...]] = (
@@ -113,6 +122,7 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Sky, Random], Sky]], ...]] = (
     (Failure("slow baseline"), _drifting),
     (Failure("cloud in the far range"), _clouded),
     (Failure("overlap error", unseen=_NEAR), _partly_seen),
+    (Failure("more haze than is declared", unseen=_ALIKE), _hazier),
 )
 
 
@@ -136,6 +146,121 @@ def _signal(sky: Sky) -> Array:
     return np.asarray(signal / bright)
 
 
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What is made of profiles of one sky."""
+
+    background: known_shape.KnownShapeResult
+    clouds: layers.Layers
+    window: reference.ReferenceWindow
+    solved: elastic.ElasticResult
+
+
+def _process(counts: Array, noise: Array, base: elastic_cases.Sky) -> _Found:
+    r = base.range
+    found = known_shape.solve(counts, r, base.shape, variance=noise)
+    power = np.where(base.inverted, counts - found.background[:, np.newaxis], np.nan)
+    clouds = layers.screen(power, r, noise, molecular_attenuated=base.shape)
+    window = reference.choose(
+        power, r, noise, molecular_attenuated=base.shape,
+        candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
+    )  # fmt: skip
+    solved = _solve(power, noise, base, window.edges, _doubts(found, window))
+    return _Found(found, clouds, window, solved)
+
+
+def _doubts(found: known_shape.KnownShapeResult, window: reference.ReferenceWindow) -> Array:
+    """Return standard errors of the background and relative ones of the reference."""
+    unseen = np.nan_to_num(_CARRIED * window.scale_standard_error / window.scale)
+    background = np.nan_to_num(found.background_standard_error)
+    return np.stack([background, np.hypot(_REFERENCE_ERROR, unseen)])
+
+
+def _solve(
+    power: Array, noise: Array, base: elastic_cases.Sky, edges: tuple[Array, Array], doubts: Array
+) -> elastic.ElasticResult:
+    return elastic.solve(
+        power, base.range, molecular_backscatter=base.molecular_backscatter,
+        molecular_extinction=base.molecular_extinction, lidar_ratio=elastic_cases.LIDAR_RATIO,
+        reference=edges, variance=noise, background_standard_error=doubts[0],
+        lidar_ratio_standard_error=_RATIO_ERROR * elastic_cases.LIDAR_RATIO,
+        reference_relative_error=doubts[1], molecular_relative_error=_AIR_ERROR,
+    )  # fmt: skip
+
+
+def visible(mean: Array, noise: Array, base: elastic_cases.Sky, found: _Found) -> Array:
+    """Return (profile,) what the model cannot take up of signals without noise.
+
+    What is assumed leaves few signs: the bins that give the background and those of the
+    reference window have the shape of air, and nowhere is there less than air. So it is the norm
+    of three misfits: that of the fit of the background, that of air in the window, and that of
+    bins of negative backscatter after the declared causes have done what they can to raise them,
+    each standard error of theirs counted as one of noise. The first two share bins, which makes
+    more of it than there is: less is taken for hidden.
+
+    Parameters
+    ----------
+    mean, noise : (range,) float
+        Signals with their background, without noise, and the variance of it.
+    base : elastic_cases.Sky
+    found : _Found
+        What was made of (profile, range) noisy signals: the windows that were chosen.
+    """
+    # Profiles of the same windows have the same misfits.
+    chosen = np.stack([found.background.start, found.background.stop, *found.window.edges], -1)
+    _, first, which = np.unique(
+        np.nan_to_num(chosen), axis=0, return_index=True, return_inverse=True
+    )
+    starts, stops, bottom, top = chosen[first].T
+    rows = np.broadcast_to(mean, (first.size, mean.size))
+    fitted = known_shape.solve(
+        rows, base.range, base.shape, variance=noise, start=starts, stop=stops
+    )
+    power = np.where(base.inverted, rows - fitted.background[:, np.newaxis], np.nan)
+    inside = (base.range >= bottom[:, np.newaxis]) & (base.range <= top[:, np.newaxis])
+    inside &= base.inverted
+    weight = np.where(inside, 1.0 / noise, 0.0)
+    signal = np.where(inside, power, 0.0)
+    norm = np.maximum(np.sum(weight * base.shape**2, axis=1), np.finfo(float).tiny)
+    scale = np.sum(weight * base.shape * signal, axis=1) / norm
+    misfit = np.sum(weight * (signal - scale[:, np.newaxis] * base.shape) ** 2, axis=1)
+    doubts = _doubts(found.background, found.window)
+    solved = _solve(
+        power, np.broadcast_to(noise, rows.shape), base, (bottom, top), doubts[:, first]
+    )
+    seen = np.sqrt(fitted.chi2 + misfit + _negative(solved, power, noise))
+    return np.asarray(seen[which.reshape(-1)])
+
+
+def _negative(solved: elastic.ElasticResult, power: Array, noise: Array) -> Array:
+    """Return (profile,) chi-square of negative backscatter and of what the causes do against it.
+
+    With the changes B of backscatter over its noise that a standard error of each cause makes,
+    it is the least of |k|^2 + sum min(0, y - B k)^2 over the deviates k: by Newton's method.
+    """
+    total = solved.backscatter + solved.molecular_backscatter
+    with np.errstate(invalid="ignore", divide="ignore"):
+        own = np.abs(total) * np.sqrt(noise) / np.abs(power)
+        known = solved.valid & (own > 0.0) & np.isfinite(own)
+        y = np.where(known, solved.backscatter / own, 1.0)
+    budget = solved.budget
+    causes = (budget.background, budget.reference, budget.lidar_ratio, budget.molecular)
+    change = np.stack([np.where(known, c, 0.0) / np.where(known, own, 1.0) for c in causes], -1)
+    deviates = np.zeros((len(y), len(causes)))
+    before = np.zeros_like(known)
+    for _ in range(_STEPS):
+        below = y - (change @ deviates[..., np.newaxis])[..., 0] < 0.0
+        if np.array_equal(below, before):
+            break
+        before = below
+        active = np.where(below[..., np.newaxis], change, 0.0)
+        matrix = np.eye(len(causes)) + np.swapaxes(active, 1, 2) @ active
+        side = np.sum(active * np.where(below, y, 0.0)[..., np.newaxis], axis=1)
+        deviates = np.linalg.solve(matrix, side[..., np.newaxis])[..., 0]
+    left = np.minimum(y - (change @ deviates[..., np.newaxis])[..., 0], 0.0)
+    return np.asarray(np.sum(deviates**2, axis=1) + np.sum(left**2, axis=1))
+
+
 def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Invert profiles of one random sky, class by class."""
     base = elastic_cases.simulated()
@@ -150,34 +275,26 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
         counts = rng.poisson(np.broadcast_to(mean, (profiles, mean.size))) / _SHOTS
         if sky.gaps:
             counts = np.where(rng.random(counts.shape) < sky.gaps, np.nan, counts)
-        yield _inverted(failure, sky, counts, base), profiles
+        noise = np.broadcast_to(_smoothed(counts), counts.shape)
+        found = _process(counts, noise, base)
+        hidden = None
+        if not failure.satisfied:
+            hidden = visible(mean / _SHOTS, noise[0], base, found) < VISIBLE
+        yield _judged(failure, sky, found, base, hidden), profiles
 
 
-def _inverted(failure: Failure, sky: Sky, counts: Array, base: elastic_cases.Sky) -> Judged:
+def _judged(
+    failure: Failure, sky: Sky, found: _Found, base: elastic_cases.Sky, hidden: Mask | None
+) -> Judged:
     r = base.range
-    noise = np.broadcast_to(_smoothed(counts), counts.shape)
-    found = known_shape.solve(counts, r, base.shape, variance=noise)
-    power = np.where(base.inverted, counts - found.background[:, np.newaxis], np.nan)
-    clouds = layers.screen(power, r, noise, molecular_attenuated=base.shape)
-    window = reference.choose(
-        power, r, noise, molecular_attenuated=base.shape,
-        candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
-    )  # fmt: skip
-    hidden = np.nan_to_num(_CARRIED * window.scale_standard_error / window.scale)
-    solved = elastic.solve(
-        power, r, molecular_backscatter=base.molecular_backscatter,
-        molecular_extinction=base.molecular_extinction, lidar_ratio=elastic_cases.LIDAR_RATIO,
-        reference=window.edges, variance=noise,
-        background_standard_error=np.nan_to_num(found.background_standard_error),
-        lidar_ratio_standard_error=_RATIO_ERROR * elastic_cases.LIDAR_RATIO,
-        reference_relative_error=hidden, molecular_relative_error=_AIR_ERROR,
-    )  # fmt: skip
+    window, clouds, solved = found.window, found.clouds, found.solved
     inside = (r >= _COMPARED[0]) & (r <= _COMPARED[1])
     bits = np.where(solved.valid, np.int32(0), np.int32(Quality.UNSTABLE_INVERSION))
     bits |= np.where(window.chosen, np.int32(0), np.int32(Quality.NO_REFERENCE))[:, np.newaxis]
     bits |= np.where(clouds.mask, np.int32(Quality.CLOUD), np.int32(0))
     # What rests on a background that its own fit doubts is not to be relied on.
-    bits |= (np.asarray(found.quality) & int(Quality.NOT_HOMOGENEOUS))[:, np.newaxis]
+    doubted = np.asarray(found.background.quality) & int(Quality.NOT_HOMOGENEOUS)
+    bits |= doubted[:, np.newaxis]
     # As in the product: what lies before a cloud was inverted through it.
     with np.errstate(invalid="ignore"):
         through = (window.top > clouds.cloud_base_range)[:, np.newaxis]
@@ -190,6 +307,7 @@ def _inverted(failure: Failure, sky: Sky, counts: Array, base: elastic_cases.Sky
     return Judged(
         failure, "backscatter", error, budget.noise[:, inside], systematic[:, inside],
         bits[:, inside], doubted=(bits[:, inside] & int(Quality.CLOUD)) != 0,
+        hidden=None if hidden is None else np.broadcast_to(hidden[:, np.newaxis], error.shape),
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench import elastic_cases
-from lidarops.bench.stability_draws import Failure, Judged
+from lidarops.bench.stability_draws import VISIBLE, Failure, Judged
 from lidarops.bench.stability_signal import RANGE
 from lidarops.bench.stability_terms import Array
 from lidarops.flags import Quality
@@ -29,7 +29,8 @@ _MEAN_OF: Final = slice(100, 300)
 """Bins whose mean is judged: single ones hold too few counts for Gaussian errors."""
 
 Found = tuple[str, Array, Array, Any, Any]
-"""Quantity, error, its random and its systematic standard error, bits."""
+"""Quantity, error, its random standard error, whether the violation is hidden (None where that is
+not known), bits."""
 
 
 def _logarithmic(rng: Random, low: float, high: float) -> float:
@@ -45,7 +46,7 @@ def _mean(found: signal.Signal, truth: float, quantity: str) -> Found:
         error = np.where(good, part, 0.0).sum(axis=1) / count - truth
         variance = np.where(good, found.variance[:, _MEAN_OF], 0.0).sum(axis=1) / count**2
     bits = np.bitwise_or.reduce(found.quality[:, _MEAN_OF], axis=1)
-    return quantity, error, np.sqrt(variance), 0.0, bits
+    return quantity, error, np.sqrt(variance), None, bits
 
 
 def _bin(found: signal.Signal, truth: float, quantity: str) -> Found:
@@ -53,7 +54,7 @@ def _bin(found: signal.Signal, truth: float, quantity: str) -> Found:
     k = _BINS // 2
     error = np.asarray(found.power[:, k] - truth, dtype=np.float64)
     stated = np.sqrt(np.asarray(found.variance[:, k], dtype=np.float64))
-    return f"{quantity} of a bin", error, stated, 0.0, found.quality[:, k]
+    return f"{quantity} of a bin", error, stated, None, found.quality[:, k]
 
 
 def _counts(rng: Random, rate: float, dead_time: float, shots: int, profiles: int, *,
@@ -99,39 +100,48 @@ def _analog(
     return taken(found, level * _STEP, "voltage")
 
 
-def _far(rng: Random, profiles: int) -> tuple[elastic_cases.Sky, Array, Array, float]:
-    """Return the far range of a profile above a background."""
+def _far(rng: Random, profiles: int) -> tuple[elastic_cases.Sky, Array, Array, Array, float]:
+    """Return the far range of profiles above a background: mean, counts and their variance."""
     sky = elastic_cases.simulated()
     level = _logarithmic(rng, 1.0, 1e8)
     scale = _logarithmic(rng, 1e-3, 10.0)
     mean = elastic_cases.SHOTS * (scale * sky.signal + level)
     counts = rng.poisson(np.broadcast_to(mean, (profiles, mean.size))) / elastic_cases.SHOTS
     variance = np.maximum(counts.mean(axis=0), 1e-3) / elastic_cases.SHOTS
-    return sky, np.asarray(counts), np.asarray(variance), level
+    clean = np.asarray(mean / elastic_cases.SHOTS)
+    return sky, clean, np.asarray(counts), np.asarray(variance), level
 
 
 def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Found:
-    sky, counts, variance, level = _far(rng, profiles)
+    sky, clean, counts, variance, level = _far(rng, profiles)
     added = haze * rng.uniform(0.2, 1.0) * np.exp(-sky.range / 3000.0)
     shape = sky.shape * (1.0 + added)
     found = known_shape.solve(counts, sky.range, shape, variance=variance)
     bits = found.quality | np.where(
         found.singular, np.int32(Quality.POORLY_DETERMINED), np.int32(0)
     )
+    hidden = None
+    if haze:
+        # What the window that was chosen shows of the wrong shape without noise.
+        rows = np.broadcast_to(clean, counts.shape)
+        left = known_shape.solve(
+            rows, sky.range, shape, variance=variance, start=found.start, stop=found.stop
+        )
+        hidden = np.sqrt(left.chi2) < VISIBLE
     error = found.background - level
-    return "background, known shape", error, found.background_standard_error, 0.0, bits
+    return "background, known shape", error, found.background_standard_error, hidden, bits
 
 
 def _tail(rng: Random, profiles: int) -> Found:
-    sky, counts, variance, level = _far(rng, profiles)
+    sky, _, counts, variance, level = _far(rng, profiles)
     found = background.tail_mean(counts, sky.range, variance=variance)
     error = found.background - level
     return (
         "background, mean of the tail",
         error,
         found.background_standard_error,
-        0.0,
-        (found.quality),
+        None,
+        found.quality,
     )
 
 
@@ -144,7 +154,7 @@ def _cubic(rng: Random, profiles: int) -> Found:
     power = model + rng.standard_normal((profiles, from_range.size))
     found = background.cubic(power, from_range, variance=1.0)
     error = found.background - level
-    return "background, cubic", error, found.background_standard_error, 0.0, found.quality
+    return "background, cubic", error, found.background_standard_error, None, found.quality
 
 
 _LEFT: Final = (
@@ -187,11 +197,12 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Process random counts, class by class."""
     for number, (failure, process) in enumerate(FAILURES):
         rng = np.random.default_rng((75, cluster, number))
-        quantity, error, random, systematic, bits = process(rng, profiles)
+        quantity, error, random, hidden, bits = process(rng, profiles)
         could = np.isfinite(error) if failure.satisfied and "cubic" not in failure.name else None
         yield (
             Judged(
-                failure, quantity, error, random, systematic, np.asarray(bits), solvable=could
+                failure, quantity, error, random, 0.0, np.asarray(bits), solvable=could,
+                hidden=hidden,
             ),
             profiles,
         )  # fmt: skip

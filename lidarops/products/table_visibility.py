@@ -135,7 +135,12 @@ VISIBILITY: Final = Layout(
     comment="Model: along a beam, a = (P r^2 / overlap)^m is proportional to extinction times"
     " exp(-2 m optical depth), with m the exponent of backscatter ~ extinction^(1/m); where two"
     " beams meet, both see the same extinction. Signals were averaged before they were solved."
-    " Stations stand where ray_latitude, ray_longitude and ray_altitude say.",
+    " Stations stand where ray_latitude, ray_longitude and ray_altitude say. A gradient over the"
+    " whole network looks like attenuation where air is thin or noise is high, and no test tells"
+    " it there: extinction_standard_error counts with twice the gradient that is typical. In"
+    " simulated random networks 0.3 percent of the values that no flag rejects were off by more"
+    " than 4 standard errors; in plumes 0.7, nearly all of these in one network of 800. More"
+    " profiles in a block and more beams tell more.",
     sampled="vertex",
     feature_type="timeSeries",
     unused_steps=frozenset({"molecular", "known_shape", "reference"}),

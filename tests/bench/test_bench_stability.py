@@ -10,7 +10,15 @@ import pytest
 from scipy import stats
 from typer.testing import CliRunner
 
-from lidarops.bench import results, stability, stability_draws_homogeneous, stability_report
+from lidarops.bench import (
+    elastic_cases,
+    results,
+    stability,
+    stability_draws_elastic,
+    stability_draws_homogeneous,
+    stability_draws_signal,
+    stability_report,
+)
 from lidarops.bench.homogeneous import Scenario, difficulty
 from lidarops.bench.stability_draws import (
     ALL,
@@ -253,3 +261,64 @@ def test_command_refuses_what_stability_does_not_take(option):
     made = CliRunner().invoke(app, ["bench", "stability", *option])
     assert made.exit_code == 2
     assert "leave it out" in made.output
+
+
+# What an elastic signal shows ---------------------------------------------------------------
+
+
+def elastic_scene(change=1.0, level=1e6):
+    """Return what is visible of a clean sky whose signal without noise is changed."""
+    base = elastic_cases.simulated()
+    mean = np.broadcast_to(base.signal * change + 10.0, base.range.shape)
+    noise = (base.signal + 10.0) / level
+    rng = np.random.default_rng(6)
+    draws = base.signal + 10.0 + np.sqrt(noise) * rng.standard_normal((5, mean.size))
+    found = stability_draws_elastic._process(draws, np.broadcast_to(noise, draws.shape), base)
+    return base, noise, found, stability_draws_elastic.visible(mean, noise, base, found)
+
+
+def test_a_sky_as_the_inversion_has_it_shows_nothing():
+    _, _, found, seen = elastic_scene()
+    assert found.window.chosen.all()
+    assert np.all(seen < 1.0)
+
+
+def test_what_has_another_shape_in_the_reference_window_is_seen_by_its_norm():
+    base = elastic_cases.simulated()
+    wave = 1e-3 * (-1.0) ** np.arange(base.range.size)
+    _, noise, found, seen = elastic_scene(1.0 + wave * (base.range > 6000.0))
+    part = (base.range >= found.window.bottom[0]) & (base.range <= found.window.top[0])
+    norm = np.linalg.norm((wave * base.signal / np.sqrt(noise))[part])
+    assert norm > 2.0 * VISIBLE
+    assert norm < seen[0] < 2.0 * norm
+
+
+def test_less_than_air_is_seen_and_more_than_air_is_haze():
+    base = elastic_cases.simulated()
+    part = (base.range > 3000.0) & (base.range < 3600.0)
+    assert np.all(elastic_scene(1.0 - 0.5 * part, 1e4)[-1] > VISIBLE)
+    haze = 0.5 * part * (base.backscatter + base.molecular_backscatter)
+    depth = elastic_cases.LIDAR_RATIO * np.cumsum(haze) * 15.0
+    assert np.all(elastic_scene((1.0 + 0.5 * part) * np.exp(-2.0 * depth), 1e4)[-1] < VISIBLE)
+
+
+def test_a_lidar_ratio_that_is_off_is_never_seen_by_more_than_is_declared():
+    """The declared error takes it up: by twice, that is 5 of its standard errors."""
+    base = elastic_cases.simulated()
+    other = 2.0 * elastic_cases.LIDAR_RATIO
+    more = (other - elastic_cases.LIDAR_RATIO) * np.cumsum(base.backscatter) * 15.0
+    seen = elastic_scene(np.exp(-2.0 * more))[-1]
+    assert np.all(seen < 1.2 * VISIBLE)
+
+
+def test_haze_in_the_shape_of_the_background_is_told_apart_where_it_is_hidden():
+    found = [
+        stability_draws_signal._known_shape(np.random.default_rng((75, cluster)), 5, haze=3.0)
+        for cluster in range(150)
+    ]
+    _, error, random, hidden, bits = (np.array(column) for column in zip(*found, strict=True))
+    told = (bits & int(Quality.NOT_HOMOGENEOUS)) != 0
+    assert 0.5 < hidden.mean() < 1.0
+    assert np.any(np.abs(error[hidden]) > 4.0 * random[hidden])
+    assert told[~hidden].mean() > 0.5
+    assert told[hidden].mean() < 0.1
