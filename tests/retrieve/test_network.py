@@ -305,3 +305,41 @@ def test_prior_with_an_only_vertex_is_finite():
     precision, norm = _prior._free_level(_prior._gradient(np.zeros((1, 3))), 0.1)
     assert np.isfinite(precision).all()
     assert np.isfinite(norm)
+
+
+def steep(x, y, z):
+    """Fall off with height by more than the prior's gradient has it, in thin air."""
+    return 1e-5 * np.exp(-(z - 500.0) / 250.0 + 0.0 * x)
+
+
+@pytest.mark.parametrize(("field", "told"), [(homogeneous(1e-3), False), (steep, True)])
+def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told):
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field), 0.15, 50, additive=0.0)
+    layout, data = condensed(net, power, variance)
+    where = (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    problem, mean = _prior._Problem(data, *where), _prior._mean_problem(data, *where)
+    sharp = problem.afresh(_prior.DEVIATIONS[0])
+    # Profiles fit by themselves, the steep ones hardly worse.
+    assert np.median(sharp.prior_chi_square / sharp.prior_degrees_of_freedom) < 2.0
+    assert _prior._unlikely(mean, sharp, 1.0) == told
+
+
+def test_a_field_that_the_mean_tells_to_vary_is_not_told_to_be_even():
+    net = three_by_two()
+    r = grid(net)
+    uneven = 0.2 * np.sin(7.0 * np.arange(net.vertices))
+
+    def field(x, y, z):
+        apart = [(x - v[0]) ** 2 + (z - v[2]) ** 2 for v in net.vertex]
+        bumps = [u * np.exp(-a / (2.0 * 40.0**2)) for u, a in zip(uneven, apart, strict=True)]
+        return 2e-3 * np.exp(np.sum(bumps, axis=0))
+
+    power, variance = noisy(net, r, signals(net, r, field), 0.05, 50, additive=0.0)
+    layout, data = condensed(net, power, variance)
+    where = (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    least = _prior._least(_prior._mean_problem(data, *where), 1.0)
+    assert 0.03 < least < 0.4
+    problem = _prior._Problem(data, *where)
+    assert _prior._likeliest(problem, 1.0, least).deviation[0] >= least
