@@ -31,7 +31,8 @@ from lidarops.scenes import DARK_REACH, Cut, cut, select
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
-"""Granules that are held in memory at a time, unless one day has more."""
+"""Granules that are judged at a time, unless one day has more; held in memory are those at work
+and, where workers process them, those that come next."""
 CRASHES: Final = 3
 """Tries in which a scene may take its process down before it is refused."""
 
