@@ -30,11 +30,11 @@ from lidarops.bench.timing import Machine, machine
 from lidarops.retrieve.background import cubic
 from lidarops.retrieve.homogeneous import Method
 
-PROFILES: Final = 20_000
+PROFILES: Final = 10_000
 QUICK_PROFILES: Final = 4_000
 _SLOW: Final = "scipy"
 """Ways whose names begin so are too slow for every profile."""
-_SLOW_SHARE: Final = 40
+_SLOW_SHARE: Final = 20
 _WARM: Final = 64
 _TWO_SIDED: Final = 1.959963984540054
 """Standard deviations that hold 95 percent of a normal distribution."""
@@ -146,7 +146,7 @@ def measure(
     date : str
         When it is run, as it is to be stated.
     profiles : int, optional
-        Of each scenario; the peers of scipy get a fortieth of them, at least 16.
+        Of each scenario; the peers of scipy get a twentieth of them, at least 16.
     progress : callable
         Is given 1 after each scenario.
     """

@@ -161,6 +161,7 @@ Way = Callable[[Array, Sky], Found]
 KNOWN_SHAPE: Final = "known_shape"
 TOLD: Final = "known_shape, told 6 km"
 TAIL_MEAN: Final = "tail_mean"
+HOMOGENEOUS: Final = "homogeneous"
 
 
 def ways() -> dict[str, Way]:
@@ -173,7 +174,7 @@ def ways() -> dict[str, Way]:
         KNOWN_SHAPE: _known_shape,
         TOLD: _told,
         TAIL_MEAN: _tail_mean,
-        "homogeneous": _homogeneous,
+        HOMOGENEOUS: _homogeneous,
         "cubic": _cubic,
     }
 

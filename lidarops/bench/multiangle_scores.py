@@ -58,7 +58,7 @@ class Size:
 
 
 QUICK: Final = Size(blocks=8, profiles=32, slow=1, published=150, random=300)
-FULL: Final = Size(blocks=24, profiles=64, slow=2, published=250, random=6000)
+FULL: Final = Size(blocks=16, profiles=64, slow=2, published=250, random=3000)
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,11 +41,11 @@ from lidarops.retrieve.multiposition import MultiPositionResult
 
 Booleans = npt.NDArray[np.bool_]
 
-PROFILES: Final = 5000
+PROFILES: Final = 3000
 QUICK_PROFILES: Final = 1000
 CONTRASTS: Final = (sight.MOR_CONTRAST, sight.KOSCHMIEDER_CONTRAST, sight.PAPER_CONTRAST)
 
-_PEER_PROFILES: Final = 250
+_PEER_PROFILES: Final = 150
 _QUICK_PEER_PROFILES: Final = 50
 _CHUNK_BLOCKS: Final = 5
 _TIMED_PROFILES: Final = 250
