@@ -12,12 +12,15 @@ import numpy.typing as npt
 from lidarops.retrieve import _banded
 
 Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
 PILOT: Final = 0.01
 """Weight of smoothness of the pilot solution over that of the solution."""
 _MOST_ROWS: Final = 256
 _LARGEST_DEVIATION: Final = 3.0
+_LEAST_SCALE: Final = 0.25
+"""A profile of little optical depth may have structure all the same."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -42,6 +45,8 @@ class Calibration:
     """In the unit of the system."""
     bias: Array
     """(profile, height): pilot solution less its smoothed self; NaN beyond the reach."""
+    scale: Array
+    """(profile,): from `relative_squares`."""
 
 
 @_compiled
@@ -167,6 +172,41 @@ def typical(information: Array, share: Array) -> tuple[Array, Array]:
     return mean, np.where(used, share, 0.0).sum(axis=0) / divisor
 
 
+def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
+    r"""Return the square of each profile's optical depth over the usual one of its block.
+
+    What smoothing takes from a profile is in proportion to its extinction: of a haze that is
+    three times as thick, three times as much. At the highest altitude within the reach of a
+    profile, with the variance V of its optical depth and the weighted mean R of the squares of
+    all that reach it,
+
+    .. math:: \max\left(\tfrac14, \frac{\tau^2 + V}{R + V}\right),
+
+    which is 1 where noise hides the optical depth.
+
+    Parameters
+    ----------
+    depth, variance : (profile, height) float64
+    within : (profile, height) bool
+        The reach; of every profile at least one height.
+
+    Returns
+    -------
+    (profile,) float64
+    """
+    tops, own = np.unique(within.sum(axis=1) - 1, return_inverse=True)
+    reached = within[:, tops]
+    square = np.where(reached, depth[:, tops] ** 2, np.nan)
+    noise = np.where(reached, variance[:, tops], np.nan)
+    # The median, as one profile of much noise may have the largest square of all.
+    usual = np.maximum(np.nanmedian(square, axis=0), np.finfo(np.float64).tiny)
+    weight = (usual / (usual + noise)) ** 2
+    typical = np.nansum(weight * square, axis=0) / np.nansum(weight, axis=0)
+    relative = (square + noise) / (typical + noise)
+    scale: Array = np.maximum(relative[np.arange(len(own)), own], _LEAST_SCALE)
+    return scale
+
+
 def _observed(bias: Array, known: Array) -> Array:
     r"""Return the square of the smoothing error, from what the model and the pilot say of it.
 
@@ -228,7 +268,7 @@ def ratio(calibration: Calibration, upper: Integers, lower: Integers, bias: Arra
 
     Returns
     -------
-    (difference,) float64
+    (profile, difference) float64
         Of many differences some are calculated and the rest interpolated between them.
     """
     every = -(-upper.size // _MOST_ROWS)
@@ -245,7 +285,8 @@ def ratio(calibration: Calibration, upper: Integers, lower: Integers, bias: Arra
     )
     if every > 1:
         known = _interpolated(known, chosen, upper.size)
-    factor: Array = (known[1] + _observed(bias, known)) / known[0]
+    taken = calibration.scale[:, np.newaxis] * _observed(bias, known)
+    factor: Array = (known[1] + taken) / known[0]
     return factor
 
 

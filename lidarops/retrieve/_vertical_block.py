@@ -61,7 +61,10 @@ class BlockNoise:
     """(height,): factor on the variance for a noise that is known from few residuals."""
 
     def ratio(self, upper: Integers, lower: Integers) -> Array:
-        """Return the factor on the posterior variance of differences of optical depths."""
+        """Return the factor on the posterior variance of differences of optical depths.
+
+        (member, difference), or (difference,) where it is that of all members.
+        """
         below = np.where(lower >= 0, self.inflation[np.maximum(lower, 0)], 1.0)
         few: Array = np.maximum(self.inflation[upper], below)
         if self.calibration is None:
@@ -272,6 +275,7 @@ def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calib
         block.stiffness,
         smoothing,
         np.where(within, rough - smooth, np.nan),
+        _calibration.relative_squares(fit.depth, fit.variance, within),
     )
 
 

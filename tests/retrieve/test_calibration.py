@@ -30,6 +30,7 @@ def calibration(correlation=0.6, profiles=1, heights=HEIGHTS):
         stiffness,
         1e7,
         np.zeros((profiles, heights)),
+        np.ones(profiles),
     )
 
 
@@ -113,6 +114,7 @@ def test_rows_left_out_are_interpolated():
         bias=np.tile(np.sin(every / 60.0), (20, 1)),
         information=np.geomspace(80.0, 2.0, 600),
         share=np.linspace(1.0, 0.2, 600),
+        scale=np.linspace(0.3, 3.0, 20),
     )
     bands = precision(c.information[np.newaxis], c.share[np.newaxis], c.correlation)
     c = replace(c, bands=np.ascontiguousarray(bands[:, 0]))
@@ -121,10 +123,10 @@ def test_rows_left_out_are_interpolated():
         thinned = _calibration.ratio(c, every, lower, bias)
         exact = np.array(
             [
-                _calibration.ratio(c, every[k : k + 1], lower[k : k + 1], bias[:, k : k + 1])[0]
+                _calibration.ratio(c, every[k : k + 1], lower[k : k + 1], bias[:, k : k + 1])[:, 0]
                 for k in every
             ]
-        )
+        ).T
         error = np.abs(thinned / exact - 1.0)
         assert np.median(error) < 0.003
         assert np.percentile(error, 95) < 0.04
@@ -137,3 +139,53 @@ def test_typical_profile_leaves_out_what_few_have():
     mean, part = _calibration.typical(information, share)
     np.testing.assert_allclose(mean, [4.0, 6.0, 0.0])
     np.testing.assert_allclose(part, [0.4, 0.6, 0.5])
+
+
+# In proportion to the optical depth ------------------------------------------------------------
+
+
+def hazes(amounts, heights=20):
+    """Optical depths of one shape, well known, within reach everywhere."""
+    depth = np.outer(amounts, np.linspace(0.01, 0.2, heights))
+    return depth, np.full(depth.shape, 1e-12), np.ones(depth.shape, dtype=np.bool_)
+
+
+def test_smoothing_error_goes_with_the_square_of_the_optical_depth():
+    amounts = np.array([1.5, 2.0, 3.0, 2.0])
+    scale = _calibration.relative_squares(*hazes(amounts))
+    np.testing.assert_allclose(scale, amounts**2 / np.mean(amounts**2), rtol=1e-6)
+    assert _calibration.relative_squares(*hazes(np.array([1.0, 1e-3, 1.0])))[1] == 0.25
+
+
+def test_smoothing_error_is_scaled_and_noise_is_not():
+    c = replace(calibration(profiles=2), scale=np.array([1.0, 4.0]))
+    bias = np.full((2, HEIGHTS), 5.0)
+    one, four = _calibration.ratio(c, EVERY, np.full(HEIGHTS, -1), bias)
+    known = _calibration.sandwich(
+        c.bands, c.information, c.share, 0.6, c.stiffness, c.smoothing, EVERY, np.full(HEIGHTS, -1)
+    )
+    noise = known[1] / known[0]
+    np.testing.assert_allclose(four - noise, 4.0 * (one - noise), rtol=1e-9)
+
+
+def test_noise_that_hides_the_optical_depth_leaves_the_scale_alone():
+    depth, _, within = hazes(np.array([1.0, 2.0, 3.0, 2.0]))
+    scale = _calibration.relative_squares(depth, np.full(depth.shape, 1e3), within)
+    np.testing.assert_allclose(scale, 1.0, rtol=1e-3)
+
+
+def test_one_noisy_profile_does_not_make_the_others_look_thin():
+    depth, variance, within = hazes(np.ones(8))
+    depth[3], variance[3] = 5.0, 20.0
+    scale = _calibration.relative_squares(depth, variance, within)
+    np.testing.assert_allclose(np.delete(scale, 3), 1.0, rtol=0.02)
+    assert scale[3] < 3.0
+
+
+def test_profiles_are_compared_at_the_reach_of_each():
+    """What a thick cloud swallows low down is compared with the others down there."""
+    depth, variance, within = hazes(np.array([1.0, 1.0, 1.0, 4.0]))
+    within[3, 5:] = False
+    depth[3, 5:] = variance[3, 5:] = np.nan
+    scale = _calibration.relative_squares(depth, variance, within)
+    np.testing.assert_allclose(scale, [1.0, 1.0, 1.0, 16.0 / 4.75], rtol=1e-6)

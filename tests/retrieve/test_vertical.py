@@ -212,6 +212,24 @@ def test_standard_errors_cover_truths_that_differ_within_a_block(correlation):
     assert coverage(result.extinction, result.extinction_standard_error, extinction)[1] >= 0.87
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_standard_errors_are_as_honest_of_thick_hazes_as_of_thin_ones(correlation):
+    rng = np.random.default_rng(3)
+    amounts, deviations = [], []
+    for _ in range(12):
+        aerosol = np.exp(0.7 * rng.normal(size=32))
+        scene = clear(3000.0, aerosol=aerosol, layer=rng.uniform(1500.0, 4500.0, 32))
+        result = solve(scene, estimates(scene, 32, rng, correlation))
+        error = result.extinction - truth_of(scene, result)[1]
+        amounts.append(aerosol)
+        deviations.append(error / result.extinction_standard_error)
+    amount, deviation = np.concatenate(amounts), np.concatenate(deviations)
+    thin, thick = (amount < np.quantile(amount, 0.25)), (amount > np.quantile(amount, 0.75))
+    assert 0.7 < rms(deviation[thick]) / rms(deviation[thin]) < 1.4
+    assert rms(deviation) < 1.0
+    assert np.nanmax(np.abs(deviation)) < 5.0
+
+
 @pytest.mark.parametrize("correlation", [0.5, 0.8, 0.95])
 def test_correlation_is_found_within_2_percent(correlation):
     found = joined(cloud(), correlation, 32, 8, seed=2)[0]["correlation"]
