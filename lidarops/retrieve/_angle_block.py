@@ -181,15 +181,31 @@ def weights_of(rays: Rays, fit: Regression) -> Array:
 
 
 def kept_information(rays: Rays, fit: Regression) -> Array:
-    """Return the information that outliers leave over that of all rays, (profile, altitude).
+    """Return the information that outliers and gaps leave of that of all rays, (profile, altitude).
 
     An altitude that lost a ray has all the noise that it shares with others, and more of its own.
     """
-    if not fit.robust:
+    noise = _without_gaps(rays.noise)
+    if noise is rays.noise and not fit.robust:
         return np.ones((rays.noise.shape[0], rays.noise.shape[2]))
     kept = _squares_of_path(rays, _weights(rays, fit))
-    whole = _squares_of_path(rays, 1.0 / (rays.noise + fit.inhomogeneity))
+    whole = _squares_of_path(rays, 1.0 / (noise + fit.inhomogeneity))
     return np.where(whole > 0.0, np.minimum(kept / np.where(whole > 0.0, whole, 1.0), 1.0), 1.0)
+
+
+def _without_gaps(noise: Array) -> Array:
+    """Return variances of samples that are missing between others, too, as these have them."""
+    there = noise < np.inf
+    if not np.any(there[..., 1:] & ~there[..., :-1]):
+        return noise
+    gates = np.arange(noise.shape[-1])
+    below = np.maximum.accumulate(np.where(there, gates, -1), axis=-1)
+    above = np.where(there, gates, gates.size)[..., ::-1]
+    above = np.minimum.accumulate(above, axis=-1)[..., ::-1]
+    ends = np.maximum(below, 0), np.minimum(above, gates.size - 1)
+    first, last = (np.sqrt(np.take_along_axis(noise, end, axis=-1)) for end in ends)
+    between = (below >= 0) & (above < gates.size)
+    return np.where(there, noise, np.where(between, first * last, np.inf))
 
 
 def _squares_of_path(rays: Rays, weights: Array) -> Array:

@@ -319,3 +319,35 @@ def test_inhomogeneity_that_changes_with_height_is_followed():
 def test_student_factor_widens_for_few_residuals():
     factor = _angle_block.student_factor(np.array([0.0, 5.0, 30.0, 1e6]))
     assert factor == pytest.approx([1.0, np.sqrt(5 / 3), np.sqrt(30 / 28), 1.0], rel=1e-5)
+
+
+# Gaps -----------------------------------------------------------------------------------------
+
+
+def gappy(signal):
+    """Rays and their fit, altitude by altitude, of signals at six angles."""
+    angles = np.linspace(0.0, 60.0, signal.shape[1])
+    scan = _slant.make_scan(angles, HEIGHT, None)
+    rays = _angle_block.make_rays(signal, np.full(signal.shape, 1e-4), scan)
+    return rays, _angle_block.regress(rays, inhomogeneity=0.05, robust=False)
+
+
+def test_information_is_whole_where_rays_begin_late_or_end():
+    signal = np.ones((2, 6, HEIGHT.size))
+    signal[0, 2, :5] = signal[1, 4, 40:] = np.nan
+    np.testing.assert_array_equal(_angle_block.kept_information(*gappy(signal)), 1.0)
+
+
+def test_information_that_gaps_leave_is_that_of_the_other_rays():
+    signal = np.ones((2, 6, HEIGHT.size))
+    signal[1, 5, 7] = signal[1, 1, 20:23] = np.nan
+    kept = _angle_block.kept_information(*gappy(signal))
+    path = 1.0 / np.cos(np.radians(np.linspace(0.0, 60.0, 6)))
+
+    def spread(rays):
+        return np.sum((rays - rays.mean()) ** 2)
+
+    expected = np.ones(kept.shape)
+    expected[1, 7] = spread(path[:5]) / spread(path)
+    expected[1, 20:23] = spread(np.delete(path, 1)) / spread(path)
+    np.testing.assert_allclose(kept, expected, rtol=1e-3)

@@ -258,6 +258,24 @@ def test_holes_are_bridged_or_left(small):
     assert rms(joint.optical_depth - tau) < 0.0125
 
 
+def test_gaps_cost_no_more_than_the_samples_they_take():
+    """Heights that see other rays than their neighbours share less of their noise with these."""
+    rng, atmosphere = np.random.default_rng(21), cloud()
+    errors, with_gaps, deviations = [], [], []
+    for _ in range(12):
+        signal, variance, tau = signals(
+            rng, 16, STEEP, atmosphere, ratio=1e7, inhomogeneity=0.144, correlation=0.8
+        )
+        gaps = np.where(rng.random(signal.shape) < 0.3, np.nan, signal)
+        whole = solve(signal, STEEP, atmosphere[0], variance=variance)
+        found = solve(gaps, STEEP, atmosphere[0], variance=variance)
+        errors.append(whole.optical_depth - tau)
+        with_gaps.append(found.optical_depth - tau)
+        deviations.append(with_gaps[-1] / found.optical_depth_standard_error)
+    assert rms(np.array(with_gaps)) < 1.35 * rms(np.array(errors))
+    assert np.mean(np.abs(deviations) > 4.0) < 0.01
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("gates", [1, 3])
 def test_few_altitudes_and_one_profile_run(small, method, gates):
