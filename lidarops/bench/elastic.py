@@ -29,9 +29,8 @@ from lidarops.reports.words import percent
 
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
-FEW: Final = 1000
-"""Profiles of a level that `homogeneous` gets, whose model is another and whose search is long:
-they tell its error to 2 percent."""
+FEW: Final = 5
+"""One in so many profiles is enough for `homogeneous`, which is slow: 2 percent of its error."""
 BLOCK: Final = 200
 """Profiles that are simulated and solved at once."""
 CLOSED_LEVELS: Final = (1.0, 1e4, 1e8)
@@ -145,10 +144,8 @@ def measure(
 
 
 def _level(sky: Sky, level: float, draws: int, seed: int) -> Level:
-    blocks = [
-        _block(sky, level, size, (seed, k), every=k * BLOCK < FEW)
-        for k, size in enumerate(_sizes(draws))
-    ]
+    sizes, few = enumerate(_sizes(draws)), draws / FEW
+    blocks = [_block(sky, level, size, (seed, k), every=k * BLOCK < few) for k, size in sizes]
     found = {
         name: _join([block[0][name] for block in blocks if name in block[0]])
         for name in elastic_cases.ways()
@@ -318,7 +315,7 @@ def _backgrounds(found: Elastic) -> Part:
         title="Background",
         text="Simulated as the EARLINET elastic intercomparison is: 532 nm, aerosol below 6 km "
         "(optical depth 1.4), 1005 bins of 15 m, means of 1000 shots with Poisson noise; "
-        f"{found.levels[0].profiles:,} profiles a level, {min(found.levels[0].profiles, FEW):,} of "
+        f"{found.levels[0].profiles:,} profiles a level, one in {FEW} of "
         "them for homogeneous. known_shape finds its window by itself "
         "or is told that air is clean from 6 km on; tail_mean averages the last tenth of the "
         "bins, and the signal there with them. The methods homogeneous and cubic are "

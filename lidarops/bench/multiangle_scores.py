@@ -57,7 +57,7 @@ class Size:
     """Random scenes, and a quarter of that of calm ones."""
 
 
-QUICK: Final = Size(blocks=8, profiles=32, slow=1, published=150, random=300)
+QUICK: Final = Size(blocks=6, profiles=24, slow=1, published=100, random=150)
 FULL: Final = Size(blocks=16, profiles=64, slow=2, published=250, random=3000)
 
 

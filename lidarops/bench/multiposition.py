@@ -42,11 +42,11 @@ from lidarops.retrieve.multiposition import MultiPositionResult
 Booleans = npt.NDArray[np.bool_]
 
 PROFILES: Final = 3000
-QUICK_PROFILES: Final = 1000
+QUICK_PROFILES: Final = 500
 CONTRASTS: Final = (sight.MOR_CONTRAST, sight.KOSCHMIEDER_CONTRAST, sight.PAPER_CONTRAST)
 
 _PEER_PROFILES: Final = 150
-_QUICK_PEER_PROFILES: Final = 50
+_QUICK_PEER_PROFILES: Final = 30
 _CHUNK_BLOCKS: Final = 5
 _TIMED_PROFILES: Final = 250
 _CYCLES: Final = {3: 500_000, 12: 100_000}
