@@ -19,8 +19,8 @@ from typing import Any, Final
 
 from lidarops import dependence
 from lidarops.campaign import Campaign, as_settings
-from lidarops.catalog.database import day_of
 from lidarops.catalog.ledger import Dependence, Made, Tried
+from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.dependence import Wanted

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, Self
@@ -234,18 +233,3 @@ def _tune_sqlite(connection: Any, _record: Any) -> None:
     cursor.execute("PRAGMA foreign_keys=ON")
     cursor.execute("PRAGMA busy_timeout=30000")
     cursor.close()
-
-
-def naive(moment: datetime | None) -> datetime | None:
-    """Return a time as the tables hold it: UTC, without a zone."""
-    return None if moment is None else moment.astimezone(UTC).replace(tzinfo=None)
-
-
-def aware(moment: datetime | None) -> datetime | None:
-    """Return a time of the tables with its zone."""
-    return None if moment is None else moment.replace(tzinfo=UTC)
-
-
-def day_of(moment: datetime) -> int:
-    """Return the days since 1970-01-01 of a time, in UTC."""
-    return (moment.astimezone(UTC).date() - datetime(1970, 1, 1, tzinfo=UTC).date()).days

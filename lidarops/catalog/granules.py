@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
 
-from lidarops.catalog.database import BATCH, Database, day_of, naive
+from lidarops.catalog.database import BATCH, Database
+from lidarops.catalog.rows import GranuleRow
 from lidarops.catalog.schema import GRANULE, LAYOUT
 from lidarops.records import ChannelLayout, DetectionMode, Granule, Role, Status
 
-AGAIN: Final = ""
-"""Scan key of a file that could not be read: it is looked at again with every scan."""
-
-_HALF: Final = (1 << 31) - 1
 _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
@@ -80,22 +75,17 @@ class Granules(Database):
         with self.stream(query) as rows:
             yield ((path, size, start) for path, size, start in rows)
 
-    def replace(self, granules: Iterable[tuple[Granule, str]]) -> None:
-        """Insert granules, each with its scan key, in place of rows of the same path."""
-        rows = []
-        layouts: dict[str, str] = {}
-        for granule, scan_key in granules:
-            digest, text = _layout_row(granule.layout)
-            layouts[digest] = text
-            rows.append(_granule_row(granule, self.campaign, scan_key, digest))
+    def replace(self, rows: Sequence[GranuleRow]) -> None:
+        """Insert granules in place of rows of the same path."""
         if not rows:
             return
+        layouts = {row.values["layout"]: row.layout for row in rows}
         with self.transaction() as connection:
             connection.execute(
                 self.insert_new(LAYOUT),
                 [{"hash": key, "channels": text} for key, text in layouts.items()],
             )
-            connection.execute(self.upsert(GRANULE), rows)
+            connection.execute(self.upsert(GRANULE), [row.values for row in rows])
 
     def forget(self, paths: Collection[str]) -> None:
         """Remove the rows of files that are no longer in the archive."""
@@ -212,72 +202,11 @@ _ROLES: Final = {role.value: role for role in Role}
 _STATUSES: Final = {status.value: status for status in Status}
 
 
-def stamp(granule: Granule, scan_key: str, layout: str) -> tuple[int, int]:
-    """Return two numbers that change with anything that a scan found of a file."""
-    facts = (
-        granule.path,
-        granule.size,
-        granule.mtime_ns,
-        scan_key,
-        granule.instrument,
-        granule.role.value,
-        granule.status.value,
-        granule.reason,
-        granule.start,
-        granule.stop,
-        granule.zenith_angle,
-        granule.azimuth,
-        layout,
-    )
-    digest = hashlib.sha256(repr(facts).encode("utf-8", "backslashreplace")).digest()
-    return int.from_bytes(digest[:4], "big") & _HALF, int.from_bytes(digest[4:8], "big") & _HALF
-
-
-def stamp_of(granule: Granule, scan_key: str) -> tuple[int, int]:
-    """Return the stamp that a granule's row would have."""
-    return stamp(granule, scan_key, _layout_row(granule.layout)[0])
-
-
-# The files of an archive share few layouts.
-@lru_cache(maxsize=128)
-def _layout_row(layout: tuple[ChannelLayout, ...]) -> tuple[str, str]:
-    text = json.dumps([asdict(channel) for channel in layout], separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16], text
-
-
 def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
     return tuple(
         ChannelLayout(**{**channel, "mode": DetectionMode(channel["mode"])})
         for channel in json.loads(text)
     )
-
-
-def _granule_row(granule: Granule, campaign: str, scan_key: str, layout: str) -> dict[str, Any]:
-    low, high = stamp(granule, scan_key, layout)
-    return {
-        "campaign": campaign,
-        "path": granule.path,
-        "size": granule.size,
-        "mtime_ns": granule.mtime_ns,
-        "scan_key": scan_key,
-        "instrument": granule.instrument,
-        "role": granule.role.value,
-        "status": granule.status.value,
-        "reason": granule.reason,
-        "notes": json.dumps(granule.notes) if granule.notes else "[]",
-        "start": naive(granule.start),
-        "stop": naive(granule.stop),
-        "zenith_angle": granule.zenith_angle,
-        "azimuth": granule.azimuth,
-        "latitude": granule.latitude,
-        "longitude": granule.longitude,
-        "altitude": granule.altitude,
-        "layout": layout,
-        "sha256": granule.sha256,
-        "day": None if granule.start is None else day_of(granule.start),
-        "stamp_low": low,
-        "stamp_high": high,
-    }
 
 
 def _granule_from(row: Any, layouts: Layouts) -> Granule:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 
+from lidarops.catalog.rows import AGAIN, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
@@ -18,7 +19,7 @@ from lidarops.records import Granule, Role, Status
 if TYPE_CHECKING:
     from lidarops.campaign import Campaign
 
-UNREADABLE: Final = "cannot be read"
+_UNREADABLE: Final = "cannot be read"
 """How the reason starts where a file is refused that may be readable another time."""
 
 _HEADER_BYTES = 16384
@@ -34,6 +35,8 @@ class Due(NamedTuple):
     role: Role
     rivals: tuple[str, ...]
     """Other instruments that claim the file."""
+    scan_key: str
+    """Digest of the settings that matter for it."""
 
 
 class _Pointing(NamedTuple):
@@ -64,6 +67,7 @@ class Headers:
     """What headers are read with."""
 
     source: Source
+    _campaign: str
     _places: Mapping[str, _Place]
 
     @classmethod
@@ -81,11 +85,21 @@ class Headers:
             )
             for name, instrument in campaign.instruments.items()
         }
-        return cls(source, places)
+        return cls(source, campaign.name, places)
 
     def place(self, instrument: str) -> _Place:
         """Return where an instrument stands and looks."""
         return self._places[instrument]
+
+    def row(self, due: Due, granule: Granule) -> GranuleRow:
+        """Return the row of a granule."""
+        later = granule.reason.startswith(_UNREADABLE)
+        return row_of(granule, self._campaign, AGAIN if later else due.scan_key)
+
+
+def read_row(headers: Headers, due: Due) -> GranuleRow:
+    """Return the row of what the header of a file tells; see `read_header`."""
+    return headers.row(due, read_header(headers, due))
 
 
 def read_header(headers: Headers, due: Due) -> Granule:
@@ -104,7 +118,7 @@ def read_header(headers: Headers, due: Due) -> Granule:
     except RawFormatError as error:
         return _refused(due, str(error).removeprefix(f"{file.path}: "))
     except OSError as error:
-        return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
+        return _refused(due, f"{_UNREADABLE}: {error.strerror or error}")
 
 
 def _refused(due: Due, reason: str) -> Granule:

@@ -14,8 +14,9 @@ from typing import Any, Final
 
 import sqlalchemy as sa
 
-from lidarops.catalog.database import BATCH, aware, naive
-from lidarops.catalog.granules import AGAIN, Granules
+from lidarops.catalog.database import BATCH
+from lidarops.catalog.granules import Granules
+from lidarops.catalog.rows import AGAIN, aware, naive
 from lidarops.catalog.schema import (
     FILE_SET,
     GRANULE,

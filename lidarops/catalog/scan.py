@@ -7,16 +7,17 @@ import json
 import re
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 
 from lidarops.campaign import Campaign
-from lidarops.catalog.granules import AGAIN, Fingerprint, stamp_of
-from lidarops.catalog.headers import UNREADABLE, Due, Headers, read_header
+from lidarops.catalog.granules import Fingerprint
+from lidarops.catalog.headers import Due, Headers, read_row
+from lidarops.catalog.rows import GranuleRow
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
 from lidarops.catalog.store import Store
 from lidarops.processes import Processes
-from lidarops.records import Granule, Role, Status
+from lidarops.records import Role, Status
 
 _BATCH = 2000
 _SCAN_VERSION = 1
@@ -104,9 +105,9 @@ def scan(
         Processes(processes, Headers.of(campaign, work.source)) as readers,
     ):
         due = work.due(_joined(work.source.files(), known))
-        found = readers.each(read_header, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
-        for _, granule in found:
-            work.enter(granule)
+        found = readers.each(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
+        for _, row in found:
+            work.enter(row)
     return work.finish()
 
 
@@ -154,8 +155,8 @@ class _Scan:
         self._near: list[_Claim] = []
         self._files = self._changed = 0
         self._told = 0
-        self._judged: deque[tuple[str, Fingerprint | None]] = deque()
-        self._pending: list[tuple[Granule, str]] = []
+        self._judged: deque[Fingerprint | None] = deque()
+        self._pending: list[GranuleRow] = []
         self._added = 0
         self._gone: list[Fingerprint] = []
 
@@ -176,8 +177,8 @@ class _Scan:
                 file.mtime_ns,
                 key,
             ):
-                self._judged.append((key, before))
-                yield _due(file, owners)
+                self._judged.append(before)
+                yield _due(file, owners, key)
 
     def _owners(self, path: str) -> list[_Claim]:
         folder, slash, name = path.rpartition("/")
@@ -194,23 +195,22 @@ class _Scan:
             if claim.name.match(path if claim.folder is None else name)
         ]
 
-    def enter(self, granule: Granule) -> None:
+    def enter(self, row: GranuleRow) -> None:
         """Enter what was read of the next file that was due, if it is not what is known."""
-        key, before = self._judged.popleft()
-        if granule.reason.startswith(UNREADABLE):
-            key = AGAIN
+        before = self._judged.popleft()
+        values = row.values
         if before is None:
             self._added += 1
-        elif (before.stamp_low, before.stamp_high) == stamp_of(granule, key):
+        elif (before.stamp_low, before.stamp_high) == (values["stamp_low"], values["stamp_high"]):
             return
         else:
             # Only a content that a product was made from is worth reading whole.
-            readable = before.sha256 and granule.status is Status.GOOD
-            digest = self._digest(granule.path) if readable else None
-            granule = replace(granule, sha256=digest)
+            readable = before.sha256 and values["status"] == Status.GOOD
+            digest = self._digest(values["path"]) if readable else None
+            values["sha256"] = digest
             same = digest is not None and digest == before.sha256
-            self._changed += not (same and before.scan_key == key)
-        self._pending.append((granule, key))
+            self._changed += not (same and before.scan_key == values["scan_key"])
+        self._pending.append(row)
         if len(self._pending) >= _BATCH:
             self._flush()
 
@@ -323,7 +323,7 @@ def _regex(pattern: str) -> re.Pattern[str]:
     return re.compile("".join(parts.get(token, re.escape(token)) for token in tokens) + r"\Z")
 
 
-def _due(file: RawFile, owners: list[_Claim]) -> Due:
+def _due(file: RawFile, owners: list[_Claim], key: str) -> Due:
     owner = owners[0]
     rivals = {claim.instrument for claim in owners} - {owner.instrument}
-    return Due(file, owner.instrument, owner.role, tuple(sorted(rivals)))
+    return Due(file, owner.instrument, owner.role, tuple(sorted(rivals)), key)

@@ -19,11 +19,12 @@ from lidarops import processes
 from lidarops.campaign import Campaign
 from lidarops.catalog import headers
 from lidarops.catalog import scan as scan_module
+from lidarops.catalog.rows import GranuleRow, row_of
 from lidarops.catalog.scan import ScanSummary, scan
 from lidarops.catalog.schema import GRANULE, LAYOUT
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.records import Granule, Role, Status
+from lidarops.records import Role, Status
 
 
 @pytest.fixture
@@ -189,14 +190,14 @@ def test_granules_round_trip(store: Store) -> None:
         factories.granule(1, status=Status.REFUSED, reason="odd", start=None, layout=()),
         factories.granule(2, notes=("a", "b"), azimuth=12.5, sha256="0" * 64),
     ]
-    store.replace((granule, "key") for granule in granules)
+    store.replace([row_of(granule, store.campaign, "key") for granule in granules])
     assert sorted(store.granules(), key=lambda g: g.path) == granules
-    store.replace([(replace(granules[0], size=7), "key")])
+    store.replace([row_of(replace(granules[0], size=7), store.campaign, "key")])
     assert len(store.granules()) == 3
 
 
 def test_campaigns_share_a_database(campaign: Campaign, store: Store) -> None:
-    store.replace([(factories.granule(0), "key")])
+    store.replace([row_of(factories.granule(0), store.campaign, "key")])
     other = Store(campaign.catalog_url, "other")
     assert other.granules() == []
     other.close()
@@ -262,7 +263,7 @@ class TestManyFiles:
         self, campaign: Campaign, store: Store, monkeypatch, caplog
     ) -> None:
         _fill(campaign, 20)
-        monkeypatch.setattr(scan_module, "read_header", _deadly)
+        monkeypatch.setattr(scan_module, "read_row", _deadly)
         assert scan(campaign, store, workers=2) == ScanSummary(21, 21, 0, 0, 0, 0)
         assert len(store.granules(status=Status.GOOD)) == 21
         assert "a process was lost" in caplog.text
@@ -296,11 +297,11 @@ def _rows(store: Store) -> list[tuple[object, ...]]:
         ]
 
 
-def _deadly(read: headers.Headers, due: headers.Due) -> Granule:
+def _deadly(read: headers.Headers, due: headers.Due) -> GranuleRow:
     """Take down any process but the first."""
     if multiprocessing.parent_process() is not None and due.file.path == "coast/h13":
         os._exit(9)
-    return headers.read_header(read, due)
+    return headers.read_row(read, due)
 
 
 def _forbid() -> None:

@@ -15,6 +15,7 @@ from lidarops.campaign import Campaign
 from lidarops.catalog import scan as scan_module
 from lidarops.catalog.ledger import Entry, NewProduct, Run, RunStatus
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.rows import row_of
 from lidarops.catalog.sources import RawFile, Source
 from lidarops.catalog.store import Store
 from lidarops.plans import plan
@@ -84,7 +85,8 @@ def make(folder: Path, *, instruments: int, days: int) -> Simulated:
         store.begin_run(run, lock.token)
         for day in range(days):
             granules = list(simulated.day(day))
-            store.replace((granule, keys[granule.instrument]) for granule in granules)
+            rows = [row_of(each, store.campaign, keys[each.instrument]) for each in granules]
+            store.replace(rows)
             for scene in cut(campaign, granules).scenes:
                 store.record(_entry(judge, campaign, scene), "r", lock.token)
     return simulated

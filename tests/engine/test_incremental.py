@@ -17,9 +17,9 @@ import quick
 from small_archive import DAY, Archive, made
 
 from lidarops import engine
-from lidarops.catalog.database import day_of
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.rows import day_of
 from lidarops.catalog.scan import scan
 from lidarops.catalog.store import Store
 from lidarops.pipeline import (
