@@ -107,7 +107,7 @@ class TestEach:
             assert list(pool.each(deadly, range(40), at_a_time=2)) == doubled(range(40))
         left = multiprocessing.active_children()
         for child in left:
-            child.join(10)
+            child.join(60)
         alive = [child for child in left if child.is_alive()]
         for child in alive:
             child.kill()
