@@ -30,7 +30,8 @@ from lidarops.reports.words import percent
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
 FEW: Final = 5
-"""One in so many profiles is enough for `homogeneous`, which is slow: 2 percent of its error."""
+"""One in so many profiles is enough for `homogeneous`, which is slow: 2 percent of its error, 5 in
+the quick run."""
 BLOCK: Final = 200
 """Profiles that are simulated and solved at once."""
 CLOSED_LEVELS: Final = (1.0, 1e4, 1e8)

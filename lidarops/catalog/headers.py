@@ -71,8 +71,11 @@ class Headers:
     _places: Mapping[str, _Place]
 
     @classmethod
-    def of(cls, campaign: Campaign, source: Source) -> Self:
-        """Take what matters for headers out of a campaign, whose import takes long."""
+    def of(cls, campaign: Campaign, source: Source, entered_as: str) -> Self:
+        """Take what matters for headers out of a campaign, whose import takes long.
+
+        Rows are entered under the name that the catalog has for it.
+        """
         places = {
             name: _Place(
                 campaign.stations[instrument.station].latitude,
@@ -85,7 +88,7 @@ class Headers:
             )
             for name, instrument in campaign.instruments.items()
         }
-        return cls(source, campaign.name, places)
+        return cls(source, entered_as, places)
 
     def place(self, instrument: str) -> _Place:
         """Return where an instrument stands and looks."""

@@ -102,7 +102,7 @@ def scan(
     processes = 1 if remote else min(workers, _MOST_PROCESSES)
     with (
         store.fingerprints() as known,
-        Processes(processes, Headers.of(campaign, work.source)) as readers,
+        Processes(processes, Headers.of(campaign, work.source, store.campaign)) as readers,
     ):
         due = work.due(_joined(work.source.files(), known))
         found = readers.each(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)

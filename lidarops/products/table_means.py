@@ -94,6 +94,9 @@ BUDGETS: Final = {
     (ProductKind.ELASTIC, "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
     # Nothing tells the noise of its calibration from that of its gates.
     (ProductKind.ELASTIC, "attenuated_backscatter"): Budget(()),
+    # What the prior allows, which all profiles share, is most of them.
+    (ProductKind.VISIBILITY, "extinction"): Budget(()),
+    (ProductKind.VISIBILITY, "visibility_in_air"): Budget(()),
 }
 """Quantities whose errors are not all independent from profile to profile."""
 

@@ -138,9 +138,10 @@ VISIBILITY: Final = Layout(
     " Stations stand where ray_latitude, ray_longitude and ray_altitude say. A gradient over the"
     " whole network looks like attenuation where air is thin or noise is high, and no test tells"
     " it there: extinction_standard_error counts with twice the gradient that is typical. In"
-    " simulated random networks 0.3 percent of the values that no flag rejects were off by more"
-    " than 4 standard errors; in plumes 0.7, nearly all of these in one network of 800. More"
-    " profiles in a block and more beams tell more.",
+    " simulated random networks 0.3(1) percent of the values that no flag rejects were off by more"
+    " than 4 standard errors; in plumes 0.7(6), nearly all of these in one network of 800. More"
+    " profiles in a block and more beams tell more. All profiles share what the prior allows, so"
+    " that a mean over time does not make it smaller.",
     sampled="vertex",
     feature_type="timeSeries",
     unused_steps=frozenset({"molecular", "known_shape", "reference"}),
@@ -161,11 +162,15 @@ VISIBILITY: Final = Layout(
         _place("wavelength"),
     ),
     data=(
-        *visibility(
-            _SERIES,
-            called="at the point where beams meet",
-            ancillaries=("extinction_systematic_error", *_OF_VALUE),
-            optional=False,
+        *(
+            # What the prior allows is most of the error, and the same for all profiles.
+            replace(row, error_kind=ErrorKind.BOTH) if row.uncertain else row
+            for row in visibility(
+                _SERIES,
+                called="at the point where beams meet",
+                ancillaries=("extinction_systematic_error", *_OF_VALUE),
+                optional=False,
+            )
         ),
         Row(
             name="extinction",
@@ -178,6 +183,7 @@ VISIBILITY: Final = Layout(
             ancillaries=("extinction_systematic_error", *_OF_VALUE),
             significant_bits=_BITS,
             uncertain=True,
+            error_kind=ErrorKind.BOTH,
             comment="Molecules and particles together, at the wavelength of the channel."
             f" {NO_NAME}",
         ),
@@ -191,7 +197,7 @@ VISIBILITY: Final = Layout(
             valid_min=0.0,
             significant_bits=8,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Apart from the random error in extinction_standard_error: what the errors of"
+            comment="Apart from extinction_standard_error, of noise and prior: what the errors of"
             " exponent, lidar ratio and overlap that the settings declare would do, and the signal"
             f" that may be left in the background. {NO_NAME}",
         ),
@@ -216,7 +222,8 @@ VISIBILITY: Final = Layout(
             " their noise allows, or a beam that ends before the point at bins that lie off their"
             " neighbours; outlier a beam with bins that lie more than 6 standard errors off their"
             " neighbours: these took the place of single ones, while several together, which may be"
-            " the edge of a layer, were left, and what they change is part of the standard error."
+            " the edge of a layer, were left, and what they change is part of the standard error"
+            " unless so many lie side by side that nothing tells what is between them."
             " The value stands.",
         ),
         _per_time(

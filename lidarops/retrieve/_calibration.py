@@ -201,9 +201,14 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     # The median, as one profile of much noise may have the largest square of all.
     usual = np.maximum(np.nanmedian(square, axis=0), np.finfo(np.float64).tiny)
     weight = (usual / (usual + noise)) ** 2
-    typical = np.nansum(weight * square, axis=0) / np.nansum(weight, axis=0)
-    relative = (square + noise) / (typical + noise)
-    scale: Array = np.maximum(relative[np.arange(len(own)), own], _LEAST_SCALE)
+    told = np.nansum(weight, axis=0)
+    # Nothing where no profile is known, or most have no optical depth at all.
+    mean = np.nansum(weight * square, axis=0) / np.where(told > 0.0, told, 1.0)
+    each = np.arange(len(own)), own
+    over, of = (square + noise)[each], (np.where(told > 0.0, mean, square) + noise)[each]
+    known = np.isfinite(over) & np.isfinite(of) & (of > 0.0)
+    relative = np.where(known, over, 1.0) / np.where(known, of, 1.0)
+    scale: Array = np.maximum(relative, _LEAST_SCALE)
     return scale
 
 

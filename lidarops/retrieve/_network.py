@@ -420,7 +420,8 @@ def solve_profiles(
                 for w in range(vertices):
                     inverse[v, w] = matrix[v, w]
             _add_prior(matrix, side, level, precision, flat)
-            fine = fine and math.isfinite(square) and factorise(matrix, vertices)
+            # The covariance of a ray that is singular leaves what was there before it.
+            fine = fine and math.isfinite(square + determinants) and factorise(matrix, vertices)
             if not fine:
                 break
             substitute(matrix, vertices, side)

@@ -229,8 +229,9 @@ def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solu
     with np.errstate(invalid="ignore"):
         mean = None if np.all(alone.variance < _WELL_TOLD**2) else pool()
     whole = None if mean is None else mean.afresh(np.inf)
+    settled = whole is not None and bool(whole.status[0] == _network.SOLVED)
     for strength in _STRENGTHS:
-        least = 0.0 if mean is None else _least(mean, strength)
+        least = _least(mean, strength) if mean is not None and settled else 0.0
         result = _likeliest(problem, strength, least)
         if _contradicted(result, alone) or (whole and _apart(result, whole)):
             continue
@@ -246,8 +247,10 @@ def _unlikely(mean: _Problem, result: Solution, strength: float) -> bool:
     in values along rays, where `_apart` asks in extinction, of which thin air tells nothing.
     """
     told = mean.afresh(float(result.deviation[0]) / strength, strength)
+    if told.status[0] != _network.SOLVED:
+        return True
     square, freedom = float(told.prior_chi_square[0]), float(told.prior_degrees_of_freedom[0])
-    if not (np.isfinite(square) and freedom > 0):
+    if freedom <= 0:
         return False
     return bool(special.gammaincc(freedom / 2.0, max(square, 0.0) / 2.0) < _UNLIKELY)
 

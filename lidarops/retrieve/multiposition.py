@@ -13,8 +13,8 @@ and 34 percent.
 
 A gradient over the whole network looks like attenuation where air is thin or noise is high, and
 no test tells it there: what the prior allows is then most of the standard error. In random
-networks 0.3 percent of the values without a flag are off by more than 4 standard errors, 0.7 in
-plumes, where nearly all of them stand in one network of 800 (`lidarops bench stability`). More
+networks 0.3(1) percent of the values without a flag are off by more than 4 standard errors, 0.7(6)
+in plumes, where nearly all of them stand in one network of 800 (`lidarops bench stability`). More
 profiles in a block and more rays tell more.
 """
 

@@ -189,3 +189,25 @@ def test_profiles_are_compared_at_the_reach_of_each():
     depth[3, 5:] = variance[3, 5:] = np.nan
     scale = _calibration.relative_squares(depth, variance, within)
     np.testing.assert_allclose(scale, [1.0, 1.0, 1.0, 16.0 / 4.75], rtol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6])
+def test_profiles_without_optical_depth_are_as_usual(noise):
+    within = np.ones((9, 4), dtype=bool)
+    depth = np.zeros((9, 4))
+    one = _calibration.relative_squares(depth, np.full((9, 4), noise), within)
+    np.testing.assert_array_equal(one, 1.0)
+    depth[4] = 0.1
+    beside = _calibration.relative_squares(depth, np.full((9, 4), noise), within)
+    assert np.isfinite(beside).all()
+    assert beside[4] >= 1.0
+    assert (np.delete(beside, 4) <= 1.0).all()
+
+
+def test_profiles_without_an_error_are_as_usual():
+    within = np.ones((3, 4), dtype=bool)
+    variance = np.full((3, 4), 1e-6)
+    variance[1] = np.inf
+    found = _calibration.relative_squares(np.full((3, 4), 0.2), variance, within)
+    assert found[1] == 1.0
+    np.testing.assert_allclose(found, 1.0)

@@ -357,7 +357,8 @@ def test_spikes_that_are_left_are_part_of_the_standard_error(sizes):
     told, own = (
         each.covariance[:, : layout.offset[1]].reshape(-1, size, size) for each in (found, plain)
     )
-    left = found.bridged[:, 0] & np.all(found.log_value == plain.log_value, axis=1)
+    left = (found.bridged[:, 0] == 1) & np.all(found.log_value == plain.log_value, axis=1)
+    assert left.all()
     added = (told - own)[left]
     # One direction, by as much as the spikes have moved the ray, but for noise.
     assert np.all(np.linalg.matrix_rank(added, tol=1e-9 * np.abs(added).max()) == 1)
