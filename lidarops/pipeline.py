@@ -329,7 +329,8 @@ class _Work:
             with Stop() as stop:
                 self._process(days, client, stop)
                 caught = stop.signal
-                status = _status(stop)
+                if stop:
+                    status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
         run = self._conclude(status)
         found = self._found
@@ -365,8 +366,7 @@ class _Work:
                 # First, as a run that this one has to wait for may leave nothing to do.
                 self._write()
                 used = self._reached(self._started, stack, stop)
-            serial = used is None
-            taken = self._take_noted if serial else self._take
+            taken = partial(self._take, note=used is None)
             if first is not None:
                 others = chain([first], jobs)
                 self._enter(carry_out(others, client=used, stop=stop, taken=taken), stop)
@@ -456,11 +456,8 @@ class _Work:
             self._store.touch_products(judged.touched)
             self._store.forget_scenes(judged.gone)
 
-    def _take(self, job: Job) -> None:
-        self._running().take(self._judgements[job.scene.id], note=False)
-
-    def _take_noted(self, job: Job) -> None:
-        self._running().take(self._judgements[job.scene.id], note=True)
+    def _take(self, job: Job, *, note: bool = False) -> None:
+        self._running().take(self._judgements[job.scene.id], note=note)
 
     def _running(self) -> Session:
         if self._session is None:
@@ -517,12 +514,6 @@ class _Work:
             job = Job(self._campaign, each.scene, each.plan)
             self._session.add(failed(job, f"{each.held} (not tried again: nothing has changed)"))
         return self._session.finish(status, self._found.set_aside)
-
-
-def _status(stop: Stop) -> RunStatus:
-    if stop.signal:
-        return RunStatus.INTERRUPTED
-    return RunStatus.STOPPED if stop else RunStatus.FINISHED
 
 
 def remove_orphans(campaign: Campaign, orphans: Sequence[Orphan], *, wait: float = 0.0) -> int:
