@@ -144,14 +144,19 @@ def test_a_spike_in_the_middle_of_a_long_ray_costs_nothing(size):
     assert np.nanmax(apart(found, clean)[3]) < 0.3
 
 
+def spiked(net, r, power, variance, sizes):
+    """Put spikes side by side on the first ray of all profiles, where beams meet."""
+    at = gate_at(r, net.on_ray(0)[1][0])
+    for k, size in enumerate(sizes):
+        power = hit(power, variance, slice(None), 0, at + k, size)
+    return power
+
+
 @pytest.mark.parametrize("sizes", [(40.0, 40.0), (90.0, 30.0), (25.0, -25.0), (60.0, 0.0, 60.0)])
 def test_spikes_that_lie_together_are_told_and_left(sizes):
     """They may be the edge of a layer, which is air."""
     net, r, power, variance = scene(relative=0.02)
-    at = gate_at(r, net.on_ray(0)[1][0])
-    damaged = power
-    for k, size in enumerate(sizes):
-        damaged = hit(damaged, variance, slice(None), 0, at + k, size)
+    damaged = spiked(net, r, power, variance, sizes)
     found, _ = condensed(net, r, damaged, variance)
     plain, _ = condensed(net, r, damaged, variance, screened=False)
     assert found.bridged[:, 0].mean() > 0.95
@@ -346,10 +351,7 @@ def test_one_percent_of_wild_gates_leaves_values_within_their_errors(exponent):
 @pytest.mark.parametrize("sizes", [(40.0, 40.0), (90.0, 30.0), (60.0, 0.0, 60.0)])
 def test_spikes_that_are_left_are_part_of_the_standard_error(sizes):
     net, r, power, variance = scene(relative=0.02)
-    at = gate_at(r, net.on_ray(0)[1][0])
-    damaged = power
-    for k, size in enumerate(sizes):
-        damaged = hit(damaged, variance, slice(None), 0, at + k, size)
+    damaged = spiked(net, r, power, variance, sizes)
     found, layout = condensed(net, r, damaged, variance)
     plain, _ = condensed(net, r, damaged, variance, screened=False)
     clean, _ = condensed(net, r, power, variance)
