@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -28,7 +28,7 @@ from lidarops.records import Granule, RunRecord, SceneOutcome
 from lidarops.reports import page, record
 from lidarops.scenes import Cut, cut, select
 from lidarops.session import Session
-from lidarops.staleness import DaysJudged, Judge, Judgement, Orphan, Selection
+from lidarops.staleness import DaysJudged, Judge, Judgement, Orphan, Selection, Signature
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -256,7 +256,9 @@ def _dirty(judge: Judge, store: Store, selection: Selection, *, force: bool) -> 
     if force:
         return days
     return [
-        day for day in days if not signatures[day] or verdicts.get(day, ("",))[0] != signatures[day]
+        day
+        for day in days
+        if not signatures[day].whole or verdicts.get(day, ("",))[0] != signatures[day].whole
     ]
 
 
@@ -468,44 +470,35 @@ class _Work:
 
     # The end
 
-    def _settle(self, signatures: Mapping[int, str]) -> None:
+    def _settle(self, signatures: Mapping[int, Signature]) -> None:
         """Note the days on which everything is fresh, so that they need no second look."""
         found = self._found
-        settled = {
-            day: (signatures[day], *told)
-            for day, told in found.told.items()
-            if day not in found.open
-        }
+        settled = _verdicts(signatures, found.told, found.told.keys() - found.open.keys())
         if found.open and self._selection.everything:
             judge = self._new_judge(again=True)
             again = judge.signatures(found.open)
-            clear = {day for day in again if self._went_as_planned(day, judge)}
-            settled.update(
-                (day, (again[day], *found.told[day])) for day in clear & found.told.keys()
-            )
+            clear = {
+                day
+                for day, now in again.items()
+                # Files may have joined or left it, or a profile changed, after its scenes ended.
+                if now.sources == signatures[day].sources and self._went_as_planned(day)
+            }
+            settled |= _verdicts(again, found.told, clear & found.told.keys())
             # A day with scenes that were not tried stays open, whatever became of the others.
             waiting = {each.day for each in self._judgements.values()}
             for batch in judge.batches(again.keys() - clear - waiting):
                 judged = judge.days(batch)
-                settled.update(
-                    (day, (again[day], *told))
-                    for day, told in judged.told.items()
-                    if day not in judged.open
-                )
+                settled |= _verdicts(again, judged.told, judged.told.keys() - judged.open)
         known = self._store.verdicts()
         new = {day: told for day, told in settled.items() if told[0] and known.get(day) != told}
         if new:
             self._write()
             self._store.store_verdicts(new)
 
-    def _went_as_planned(self, day: int, judge: Judge) -> bool:
-        """Return whether another look at a day would find all fresh.
-
-        Not where files joined or left it, or a profile changed, after its scenes had ended.
-        """
+    def _went_as_planned(self, day: int) -> bool:
+        """Return whether another look would find all that was stale on a day to be fresh."""
         done = self._session.settled if self._session else set()
-        same = judge.sources[day] == self._judge.sources[day]
-        return same and self._found.open[day] <= done
+        return self._found.open[day] <= done
 
     def _conclude(self, status: RunStatus) -> RunRecord | None:
         if self._session is None:
@@ -514,6 +507,12 @@ class _Work:
             job = Job(self._campaign, each.scene, each.plan)
             self._session.add(failed(job, f"{each.held} (not tried again: nothing has changed)"))
         return self._session.finish(status, self._found.set_aside)
+
+
+def _verdicts(
+    signatures: Mapping[int, Signature], told: Mapping[int, tuple[int, int]], days: Iterable[int]
+) -> dict[int, tuple[str, int, int]]:
+    return {day: (signatures[day].whole, *told[day]) for day in days}
 
 
 def remove_orphans(campaign: Campaign, orphans: Sequence[Orphan], *, wait: float = 0.0) -> int:

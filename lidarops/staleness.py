@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from math import ceil
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from lidarops import dependence
 from lidarops.campaign import Campaign, as_settings
@@ -120,6 +120,15 @@ class Orphan:
     reason: str
 
 
+class Signature(NamedTuple):
+    """What a day looks like: equal where nothing can have become stale."""
+
+    sources: str
+    """What its products are made from."""
+    whole: str
+    """That, and its products; empty where the file of one is not as recorded."""
+
+
 @dataclass(frozen=True, slots=True)
 class DaysJudged:
     """What was found for some days."""
@@ -167,19 +176,16 @@ class Judge:
         self._profiles: dict[str, str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
-        self.sources: dict[int, str] = {}
-        """What days are made from, products apart, as `signatures` last found it."""
 
     # Days
 
-    def signatures(self, days: Collection[int] | None = None) -> dict[int, str]:
-        """Return what every day looks like: equal where nothing can have become stale.
+    def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
+        """Return what every day looks like.
 
         Parameters
         ----------
         days : collection of int, optional
-            Only of these; all with granules or products where not given. A product whose file is
-            not as recorded gives its day a signature that nothing equals.
+            Only of these; all with granules or products where not given.
         """
         sums: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
         for each in self._store.day_sums():
@@ -195,9 +201,9 @@ class Judge:
         for day in sums.keys() | products.keys():
             if days is None or day in days:
                 digest = hashlib.sha256(f"{base}{day}{sorted(sums[day], key=repr)}".encode())
-                self.sources[day] = digest.hexdigest()
+                sources = digest.hexdigest()
                 digest.update(products[day].digest() if day in products else b"")
-                found[day] = "" if day in broken else digest.hexdigest()
+                found[day] = Signature(sources, "" if day in broken else digest.hexdigest())
         return found
 
     def _product_days(self) -> tuple[dict[int, Any], set[int]]:

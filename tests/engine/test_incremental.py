@@ -403,7 +403,7 @@ def _judged_anew(archive: Archive) -> dict[int, tuple[str, int, int]]:
         signatures = judge.signatures()
         found = [judge.days(batch) for batch in judge.batches(signatures)]
     return {
-        day: (signatures[day], *told)
+        day: (signatures[day].whole, *told)
         for each in found
         for day, told in each.told.items()
         if day not in each.open
@@ -414,9 +414,9 @@ def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
     """What the ledger holds of the days that look as they did then."""
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
-        signatures = Judge(campaign, store).signatures()
+        now = Judge(campaign, store).signatures()
         known = store.verdicts()
-    return {day: told for day, told in known.items() if told[0] == signatures.get(day)}
+    return {day: told for day, told in known.items() if day in now and told[0] == now[day].whole}
 
 
 def _unreadable_later(archive: Archive) -> None:
