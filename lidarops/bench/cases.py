@@ -9,6 +9,7 @@ from typing import Final, TypeVar
 
 from lidarops.bench import (
     accuracy,
+    archive,
     costs,
     elastic,
     everything,
@@ -34,6 +35,7 @@ class Case(StrEnum):
     """What is measured."""
 
     ALL = "all"
+    ARCHIVE = "archive"
     COSTS = "costs"
     ELASTIC = "elastic"
     HOMOGENEOUS = "homogeneous"
@@ -78,6 +80,7 @@ def run(
     _check(kind, chosen, files, data)
     ways: dict[Case, Callable[[], Finding]] = {
         Case.ALL: lambda: everything.run(effort, data=data),
+        Case.ARCHIVE: lambda: archive.run(kind, effort=effort),
         Case.COSTS: lambda: costs.run(kind, effort=effort),
         Case.ELASTIC: lambda: elastic.run(kind, data=data, effort=effort),
         Case.HOMOGENEOUS: lambda: _homogeneous(kind, effort),

@@ -74,6 +74,8 @@ class Size:
     bins: int = 1000
     angles: int = 0
     """Directions of a scan; 0 is a horizontal lidar."""
+    retrieved: bool = True
+    """Whether paths are solved, or only their signals kept."""
 
     @property
     def files(self) -> int:
@@ -254,7 +256,7 @@ def _settings(size: Size) -> dict[str, Any]:
     products: dict[str, Any] = {"signal": {}}
     if scans:
         products["multiangle"] = {"channels": [channel], "highest": 6000, "step": 60}
-    else:
+    elif size.retrieved:
         products["homogeneous"] = {
             "channels": [channel],
             "sections": [[750, 0.9 * 7.5 * size.bins]],

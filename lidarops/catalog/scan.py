@@ -277,6 +277,17 @@ class _Scan:
         return found
 
 
+def scan_keys(campaign: Campaign) -> dict[tuple[str, Role], str]:
+    """Return what changes with the settings that the files of an instrument and role are read with.
+
+    Returns
+    -------
+    dict
+        (instrument, role) -> scan key of the files that no other claims.
+    """
+    return {(claim.instrument, claim.role): claim.scan_key for claim in _claims(campaign)}
+
+
 def _claims(campaign: Campaign) -> list[_Claim]:
     claims: list[_Claim] = []
     for key, instrument in campaign.instruments.items():

@@ -37,7 +37,8 @@ def bench(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, costs, elastic, homogeneous, multiangle, multiposition, pipeline or reader."
+            help="all, archive, costs, elastic, homogeneous, multiangle, multiposition, pipeline "
+            "or reader."
         ),
     ] = None,
     data: Annotated[
