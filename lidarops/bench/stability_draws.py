@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
@@ -42,6 +43,15 @@ _COUNTS: Final = (
     "solvable",
     "solvable rejected",
 )
+
+
+class Verdict(StrEnum):
+    """How a share stands to a target that it is not to exceed."""
+
+    MET = "met"
+    UNTOLD = "not told by so few"
+    """Above it, by less than 2 Monte Carlo errors."""
+    MISSED = "MISSED"
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,16 +131,23 @@ class Rate:
         return self.false_random if self.satisfied else self.false_seen
 
     @property
-    def met(self) -> bool:
-        """Whether the target is met, or missed by less than 2 Monte Carlo errors."""
-        return self.judged.value - 2.0 * self.judged.error <= self.target
+    def verdict(self) -> Verdict:
+        """How the false values stand to their target."""
+        return _held(self.judged, self.target)
 
     @property
-    def needed(self) -> bool:
-        """Whether flags are as rarely needless as they have to be."""
+    def needless_verdict(self) -> Verdict | None:
+        """How the needless flags stand to theirs; None where they have none."""
         if self.needless is None or self.needless_target is None:
-            return True
-        return self.needless.value - 2.0 * self.needless.error <= self.needless_target
+            return None
+        return _held(self.needless, self.needless_target)
+
+
+def _held(found: Measured, target: float) -> Verdict:
+    if found.value <= target:
+        return Verdict.MET
+    above = found.value - 2.0 * found.error > target
+    return Verdict.MISSED if above else Verdict.UNTOLD
 
 
 @dataclass(slots=True)

@@ -15,6 +15,7 @@ from lidarops.bench.stability_draws import (
     VIOLATED,
     VISIBLE,
     Rate,
+    Verdict,
 )
 from lidarops.bench.stability_terms import Outcome
 from lidarops.bench.story import facts
@@ -133,7 +134,6 @@ def _all_of(outcomes: tuple[Outcome, ...], name: str) -> Table:
 def _rates(rates: tuple[Rate, ...]) -> Iterator[Part]:
     for name in dict.fromkeys(one.retrieval for one in rates):
         own = [one for one in rates if one.retrieval == name]
-        missed = [one for one in own if one.failure != ALL and not (one.met and one.needed)]
         scenes = sum(one.scenes for one in own if one.quantity == own[0].quantity
                      and one.failure == ALL)  # fmt: skip
         yield Part(
@@ -143,16 +143,23 @@ def _rates(rates: tuple[Rate, ...]) -> Iterator[Part]:
             f"flag rejects where the model holds, by random errors alone; {_percent(VIOLATED)} "
             "elsewhere, with the declared systematic errors, without values that the "
             "retrieval's own flags doubt and without violations that, as measured, no test can be "
-            f"relied on to see. {_told(missed)}",
+            f"relied on to see. {_told([one for one in own if one.failure != ALL])}",
             tables=(_table(name, own),),
         )
 
 
-def _told(missed: list[Rate]) -> str:
-    if not missed:
-        return "All targets are met."
-    names = ", ".join(f"{one.failure} ({one.quantity})" for one in missed)
-    return f"Not met: {names}."
+def _told(rates: list[Rate]) -> str:
+    """Say which classes miss their targets, and of which so few scenes do not tell."""
+    parts = []
+    for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNTOLD, "Not told by so few")):
+        names = [
+            f"{one.failure} ({one.quantity})"
+            for one in rates
+            if verdict in {one.verdict, one.needless_verdict}
+        ]
+        if names:
+            parts.append(f"{words}: {', '.join(names)}.")
+    return " ".join(parts) or "All targets are met."
 
 
 def _table(name: str, rates: list[Rate]) -> Table:
@@ -185,6 +192,7 @@ def _table(name: str, rates: list[Rate]) -> Table:
         "or more of such at our rate of false alarms (of 3.5 deviations, half); the target is for "
         "the rest, as a share of all. Share of what could be seen: false ones among the few "
         "values alone whose violation could be seen and still raised no flag. "
+        "Target: not told by so few where the share is above it by less than 2 Monte Carlo errors. "
         f"Fine of the rejected, and needlessly flagged: off by less than {FINE:g}, and "
         "flagged though the value could be determined.",
     )
@@ -211,10 +219,10 @@ def _row(one: Rate) -> tuple[str, ...]:
 
 
 def _goal(one: Rate) -> str:
-    goal = f"{_percent(one.target)} {'met' if one.met else 'MISSED'}"
-    if one.needless is None or one.needless_target is None:
+    goal = f"{_percent(one.target)} {one.verdict}"
+    if one.needless_verdict is None or one.needless_target is None:
         return goal
-    return f"{goal}; needless {_percent(one.needless_target)} {'met' if one.needed else 'MISSED'}"
+    return f"{goal}; needless {_percent(one.needless_target)} {one.needless_verdict}"
 
 
 def _percent(share: float) -> str:

@@ -45,7 +45,7 @@ def bench(
         Path | None,
         typer.Option(help="Folder of the EARLINET elastic intercomparison, for the case elastic."),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A minute at most.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Two minutes or so.")] = False,
     repeats: Annotated[
         int | None, typer.Option(min=1, max=100, help="Counted repeats of each timing.")
     ] = None,

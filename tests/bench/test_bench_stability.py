@@ -26,6 +26,7 @@ from lidarops.bench.stability_draws import (
     Failure,
     Judged,
     Tally,
+    Verdict,
     collect,
     share,
 )
@@ -63,13 +64,27 @@ def test_a_value_is_false_beyond_four_errors_and_not_before():
     assert rate.false_random.value == pytest.approx(1 / 3)
 
 
-@pytest.mark.parametrize(("false", "met"), [(1, True), (2, True), (20, False)])
-def test_a_target_is_missed_by_more_than_two_monte_carlo_errors(false, met):
+@pytest.mark.parametrize(
+    ("false", "verdict"),
+    [(1, Verdict.MET), (10, Verdict.MET), (11, Verdict.UNTOLD), (20, Verdict.MISSED)],
+)
+def test_a_target_is_missed_by_more_than_two_monte_carlo_errors(false, verdict):
     errors = np.zeros((20, 500))
     errors[:false, 0] = 9.0
     rate = counted(*(judged(HOLDS, row) for row in errors))["none"]
     assert rate.false_random.value == pytest.approx(false / 10_000)
-    assert rate.met is met
+    assert rate.verdict is verdict
+
+
+def test_one_cluster_of_false_values_does_not_pass_for_a_target_that_is_met():
+    errors = np.zeros((30, 500))
+    errors[:3] = 9.0
+    chunks = [judged(HOLDS, row, solvable=np.ones(500, bool)) for row in errors]
+    rate = counted(*chunks)["none"]
+    assert rate.false_random.value == pytest.approx(0.1)
+    assert (rate.verdict, rate.needless_verdict) == (Verdict.UNTOLD, Verdict.MET)
+    assert stability_report._told([rate]) == "Not told by so few: none (x)."
+    assert stability_report._row(rate)[13] == "0.1 % not told by so few; needless 5 % met"
 
 
 def test_what_is_rejected_is_not_false_and_may_be_needless():
@@ -187,7 +202,7 @@ def test_where_the_model_holds_homogeneous_paths_are_not_false():
     tally = collect(lambda cluster: draws.judged(cluster, 300), 6, lambda _: None)
     rates = {(r.failure, r.quantity): r for r in tally.rates("homogeneous", 1e-3)}
     held = rates["none", "extinction"]
-    assert held.met
+    assert held.verdict is not Verdict.MISSED
     assert 0.2 < held.kept.value < 0.8
     bent = rates["plume", "extinction"]
     assert bent.kept.value < 0.5 * held.kept.value
