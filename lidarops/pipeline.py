@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -21,11 +21,12 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan
 from lidarops.catalog.store import Store
 from lidarops.engine import Ended, Stop, alone, carry_out, local_client, size
-from lidarops.errors import SceneError
+from lidarops.errors import CatalogError, SceneError
 from lidarops.processes import load_ahead, one_ahead
-from lidarops.processing import Job, failed
-from lidarops.records import Granule, RunRecord, SceneOutcome
+from lidarops.processing import Job, failed, nothing_to_do
+from lidarops.records import Granule, RunRecord
 from lidarops.reports import page, record
+from lidarops.runs import Options, Result
 from lidarops.scenes import Cut, cut, select
 from lidarops.session import Session
 from lidarops.staleness import DaysJudged, Judge, Judgement, Orphan, Selection, Signature
@@ -49,73 +50,17 @@ __all__ = [
 GIVE_UP = 5
 """Scenes in a row that fail for the sake of a disk, after which the others are not tried."""
 
+AGAIN: Final = 30
+"""Days in which nothing changed that are looked at again, to tell what is wrong with them."""
+
 _OF_WORKERS: Final = ("distributed.nanny", "lidarops.engine", "lidarops.reports.gallery")
 """Modules that a worker needs, for scenes and then for the report."""
 
-Progress = Callable[[SceneOutcome], None]
 _LOG = logging.getLogger(__name__)
 
 
 class _OvertakenError(Exception):
     """Another run has worked on the catalog since it was read."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How to run; changes no result."""
-
-    force: bool = False
-    """Process what is asked for though it is fresh."""
-    workers: int = 1
-    """Processes of this machine, also where a cluster does the rest."""
-    memory: str | None = None
-    """Most memory of a worker that is started here, such as ``2GiB``."""
-    cluster: Callable[[], AbstractContextManager[Client]] | None = None
-    """Starts or reaches a cluster to run on instead; called only where something is stale."""
-    wait: float = 0.0
-    """s to wait for another run on the same catalog."""
-    profiles_per_chunk: int | None = None
-    progress: Progress | None = None
-    """Called with the outcome of each scene as it ends."""
-    expect: Callable[[int], None] | None = None
-    """Called with numbers of granules that are found to be processed."""
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """What a run did, and how the archive stands after it."""
-
-    record: RunRecord | None
-    """None where there was nothing to do."""
-    status: RunStatus
-    summary: ScanSummary
-    fresh: int
-    """Products that were looked at and found fresh; those of days in which nothing at all changed
-    are not counted."""
-    orphans: tuple[Orphan, ...]
-    failures: Mapping[str, str]
-    """Scene -> error, of every scene whose last try failed."""
-    empty: tuple[str, ...]
-    """Scenes whose retrievals left nothing to use; what is found orphaned does not count."""
-    barren: int
-    """Scenes that can give no product."""
-    set_aside: int
-    """Granules that are good and stand in no scene."""
-    signal: int = 0
-    """The signal that stopped the run."""
-
-    @property
-    def troubled(self) -> bool:
-        """Whether anything was refused or failed, in this run or before and still so."""
-        return bool(
-            self.summary.refused
-            or self.failures
-            or self.empty
-            or self.barren
-            or self.set_aside
-            or self.status is not RunStatus.FINISHED
-            or (self.record is not None and self.record.failed)
-        )
 
 
 def reprocess(
@@ -284,7 +229,7 @@ class _Found:
     orphans: list[Orphan] = field(default_factory=list)
     set_aside: list[Granule] = field(default_factory=list)
     held: list[Judgement] = field(default_factory=list)
-    barren: int = 0
+    barren: list[Judgement] = field(default_factory=list)
     told: dict[int, tuple[int, int]] = field(default_factory=dict)
     """Days that are settled, or will be where they are in `open` and all goes well."""
     open: dict[int, set[str]] = field(default_factory=lambda: defaultdict(set))
@@ -322,7 +267,12 @@ class _Work:
         signatures = self._judge.signatures()
         verdicts = self._store.verdicts()
         days = _dirty(self._judge, self._store, self._selection, force=self._options.force)
-        clean = [verdicts[day] for day in signatures.keys() - set(days) if day in verdicts]
+        clean = [
+            day
+            for day in sorted(signatures.keys() - set(days))
+            if day in verdicts and any(verdicts[day][1:])
+        ]
+        self._forget(self._store.tried_on_others(signatures))
         status, caught = RunStatus.FINISHED, 0
         if days:
             if self._options.workers > 1 and not self._options.cluster and client is None:
@@ -336,6 +286,7 @@ class _Work:
             self._settle(signatures)
         run = self._conclude(status)
         found = self._found
+        self._look_again(clean[:AGAIN])
         return Result(
             record=run,
             status=status,
@@ -345,10 +296,19 @@ class _Work:
             failures=self._store.failures(),
             # Nothing would ever make these again, so that they would be told for ever.
             empty=tuple(self._store.empty(without={each.path for each in found.orphans})),
-            barren=found.barren + sum(barren for _, barren, _ in clean),
-            set_aside=len(found.set_aside) + sum(aside for _, _, aside in clean),
+            barren={each.scene.id: nothing_to_do(each.plan) for each in found.barren},
+            set_aside={each.path: each.reason for each in found.set_aside},
+            untold=sum(sum(verdicts[day][1:]) for day in clean[AGAIN:]),
             signal=caught,
         )
+
+    def _look_again(self, days: Sequence[int]) -> None:
+        """Find out what it was that days were settled with."""
+        judge = Judge(self._campaign, self._store)
+        for batch in judge.batches(days):
+            judged = judge.days(batch)
+            self._found.set_aside += judged.set_aside
+            self._found.barren += [each for each in judged.judgements if each.barren]
 
     def _new_judge(self, *, again: bool = False) -> Judge:
         force = self._options.force and not again
@@ -450,13 +410,18 @@ class _Work:
         found.orphans += judged.orphans
         found.set_aside += judged.set_aside
         found.told.update(judged.told)
-        found.barren += sum(each.barren for each in judged.judgements)
+        found.barren += [each for each in judged.judgements if each.barren]
         found.held += [each for each in judged.judgements if each.held]
         if judged.digests or judged.touched or judged.gone:
             self._write()
             self._store.store_digests(judged.digests)
             self._store.touch_products(judged.touched)
-            self._store.forget_scenes(judged.gone)
+            self._forget(judged.gone)
+
+    def _forget(self, scenes: Collection[str]) -> None:
+        if scenes:
+            self._write()
+            self._store.forget_scenes(scenes)
 
     def _take(self, job: Job, *, note: bool = False) -> None:
         self._running().take(self._judgements[job.scene.id], note=note)
@@ -515,24 +480,50 @@ def _verdicts(
     return {day: (signatures[day].whole, *told[day]) for day in days}
 
 
-def remove_orphans(campaign: Campaign, orphans: Sequence[Orphan], *, wait: float = 0.0) -> int:
+def remove_orphans(campaign: Campaign, found: Result, *, wait: float = 0.0) -> int:
     """Remove products that nothing asks for any more, files and ledger rows.
+
+    Products that another run has made again since are left.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    found : Result
+        Of the run that found them.
+    wait : float
+        s to wait for another run on the same catalog.
 
     Returns
     -------
     int
         How many files were removed.
+
+    Raises
+    ------
+    CatalogError
+        If the archive holds no file at all, as where it is not mounted, or another run holds the
+        catalog.
     """
-    if not orphans:
+    if not found.orphans:
         return 0
+    if not found.summary.files:
+        raise CatalogError(
+            f"holds no raw file, so that {len(found.orphans)} products would be removed",
+            file=campaign.archive,
+            field="archive",
+            remedy="see that it is mounted; where it is to be empty, remove the products by hand",
+        )
     removed = 0
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         lock.acquire()
-        for orphan in orphans:
-            path = campaign.products_root / orphan.path
+        with store.all_made() as made:
+            runs = {each.path: each.run for each in made}
+        still = [each.path for each in found.orphans if runs.get(each.path) == each.run]
+        for name in still:
+            path = campaign.products_root / name
             removed += path.exists()
             path.unlink(missing_ok=True)
-        store.forget_products([orphan.path for orphan in orphans], lock.token)
+        store.forget_products(still, lock.token)
     return removed
 
 

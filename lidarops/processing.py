@@ -133,7 +133,7 @@ def _process(job: Job, root: Path) -> SceneOutcome:
     clock = _Clock()
     wanted = [step for step in job.plan.steps if step.name in tuple(ProductKind)]
     if not wanted:
-        return failed(job, _nothing_to_do(job.plan))
+        return failed(job, nothing_to_do(job.plan))
     usable, inputs, refused, read = _digest(job, root)
     clock.lap("digest")
     failure = replace(failed(job, ""), refused=refused, inputs=inputs, bytes_read=read)
@@ -164,7 +164,7 @@ def _process(job: Job, root: Path) -> SceneOutcome:
     )
 
 
-def _nothing_to_do(plan: Plan) -> str:
+def nothing_to_do(plan: Plan) -> str:
     """Say why a plan gives no product: what was asked for first, what nobody asked for not."""
     kinds = tuple(ProductKind)
     unasked = ("does not ask", "no product of the campaign asks")

@@ -23,6 +23,8 @@ from lidarops.errors import SceneError
 from lidarops.records import ChannelLayout, Granule, Role, Scene, Status
 
 DARK_REACH = timedelta(hours=24)
+_STAMP = "%Y%m%dT%H%M%S"
+"""Of the start of a scene, in its name."""
 """Dark files serve a scene when they were taken at most this long before or after it."""
 
 
@@ -99,7 +101,7 @@ def _of_network(
             suffix = f"-{_grids_key(members)}" if len(chosen) > 1 else ""
             scenes.append(
                 Scene(
-                    id=f"{key}_{start:%Y%m%dT%H%M%S}{suffix}",
+                    id=f"{key}_{start:{_STAMP}}{suffix}",
                     campaign=campaign.name,
                     station=key,
                     instrument=key,
@@ -120,6 +122,12 @@ def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
 def _grids_key(members: Sequence[Scene]) -> str:
     text = " ".join(_layout_key(member.granules[0]) for member in members)
     return hashlib.sha256(text.encode()).hexdigest()[:6]
+
+
+def instrument_and_start(scene: str) -> tuple[str, datetime]:
+    """Return the instrument, or network, and the start that the name of a scene tells."""
+    instrument, _, rest = scene.rpartition("_")
+    return instrument, datetime.strptime(rest.partition("-")[0], _STAMP).replace(tzinfo=UTC)
 
 
 def select(
@@ -227,7 +235,7 @@ def _by_layout(
         suffix = f"-{key}" if len(layouts) > 1 else ""
         scenes.append(
             Scene(
-                id=f"{instrument}_{start:%Y%m%dT%H%M%S}{suffix}",
+                id=f"{instrument}_{start:{_STAMP}}{suffix}",
                 campaign=campaign.name,
                 station=campaign.instruments[instrument].station,
                 instrument=instrument,

@@ -27,7 +27,7 @@ from lidarops.dependence import Wanted
 from lidarops.plans import plan
 from lidarops.products.provenance import code_version
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
-from lidarops.scenes import DARK_REACH, Cut, cut, select
+from lidarops.scenes import DARK_REACH, Cut, cut, instrument_and_start, select
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
@@ -63,6 +63,18 @@ class Selection:
         return [
             day for day in days if (first is None or day >= first) and (last is None or day <= last)
         ]
+
+    def product(self, made: Made, campaign: Campaign) -> bool:
+        """Return whether a product, whose scene may be gone, is one of what is asked for."""
+        instrument, start = instrument_and_start(made.scene)
+        owner = campaign.instruments.get(instrument)
+        return (
+            (not self.kinds or made.kind in self.kinds)
+            and (not self.instruments or instrument in self.instruments)
+            and (not self.stations or (owner.station if owner else instrument) in self.stations)
+            and (self.since is None or start >= self.since)
+            and (self.until is None or start < self.until)
+        )
 
     def scenes(self, scenes: Sequence[Scene]) -> tuple[Scene, ...]:
         """Return those of the scenes that are asked for."""
@@ -118,6 +130,8 @@ class Orphan:
 
     path: str
     reason: str
+    run: str
+    """The one that made it."""
 
 
 class Signature(NamedTuple):
@@ -272,11 +286,15 @@ class Judge:
         digests, self._digests = self._digests, {}
         counts = _counts(everything, found.set_aside)
         gone = {each.scene.id for each in everything if self._healed(each, tried)}
-        if len(wanted) == last - first + 1:
-            gone |= tried.keys() - {scene.id for scene in found.scenes}
+        there = {scene.id for scene in found.scenes}
+        gone |= {name for name, each in tried.items() if each.day in wanted and name not in there}
         return DaysJudged(
             judgements=tuple(each for each in everything if each.scene.id in chosen),
-            orphans=tuple(Orphan(made[key].path, why) for key, why in orphans.items()),
+            orphans=tuple(
+                Orphan(made[key].path, why, made[key].run)
+                for key, why in orphans.items()
+                if self._selection.product(made[key], self._campaign)
+            ),
             set_aside=found.set_aside,
             told={day: counts[day] for day in days if day not in orphaned}
             if self._selection.everything

@@ -116,6 +116,7 @@ class Tried:
     error: str
     final: bool
     crashes: int
+    day: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -458,11 +459,21 @@ class Ledger(Granules):
     def tried(self, first: int, last: int) -> dict[str, Tried]:
         """Return how the last try of every scene of these days ended."""
         known = SCENE.c
-        query = sa.select(known.scene, known.key, known.error, known.final, known.crashes).where(
-            known.campaign == self.campaign, known.day.between(first, last)
-        )
+        query = sa.select(
+            known.scene, known.key, known.error, known.final, known.crashes, known.day
+        ).where(known.campaign == self.campaign, known.day.between(first, last))
         with self.transaction() as connection:
             return {row[0]: Tried(*row[1:]) for row in connection.execute(query)}
+
+    def tried_on_others(self, days: Collection[int]) -> list[str]:
+        """Return the scenes that were tried on other days than these."""
+        known = SCENE.c
+        where = known.campaign == self.campaign
+        with self.transaction() as connection:
+            tried = set(connection.scalars(sa.select(known.day).where(where).distinct()))
+            others = sorted(tried.difference(days))
+            query = sa.select(known.scene).where(where, known.day == sa.bindparam("other"))
+            return [scene for day in others for scene in connection.scalars(query, {"other": day})]
 
     def failures(self) -> dict[str, str]:
         """Return scene -> error of the scenes whose last try failed."""

@@ -157,6 +157,8 @@ class _Scan:
         self._told = 0
         self._judged: deque[Fingerprint | None] = deque()
         self._pending: list[GranuleRow] = []
+        # What is new in an empty catalog cannot have been moved.
+        self._new: set[str] | None = set() if store.count() else None
         self._added = 0
         self._gone: list[Fingerprint] = []
 
@@ -201,6 +203,8 @@ class _Scan:
         values = row.values
         if before is None:
             self._added += 1
+            if self._new is not None:
+                self._new.add(values["path"])
         elif (before.stamp_low, before.stamp_high) == (values["stamp_low"], values["stamp_high"]):
             return
         else:
@@ -265,11 +269,11 @@ class _Scan:
             if before.sha256:
                 lost[before.size, before.start][before.sha256] += 1
         found: dict[str, str] = {}
-        if not (lost and self._added):
+        if not (lost and self._new):
             return found
         with self._store.unread() as rows:
             for path, size, start in rows:
-                candidates = lost.get((size, start))
+                candidates = lost.get((size, start)) if path in self._new else None
                 digest = self._digest(path) if candidates else None
                 if candidates and digest and candidates[digest] > 0:
                     candidates[digest] -= 1

@@ -36,7 +36,7 @@ from lidarops.cli.app import (
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
     from contextlib import AbstractContextManager
 
     from distributed import Client
@@ -227,7 +227,7 @@ def reprocess(
         result = pipeline.bring_up_to_date(settings, selection=wanted, options=options)
     removed = None
     if remove_orphans:
-        removed = pipeline.remove_orphans(settings, result.orphans, wait=wait)
+        removed = pipeline.remove_orphans(settings, result, wait=wait)
     page = None
     if result.record is not None:
         page = pipeline.report_run(settings, result.record, workers=options.workers).page
@@ -354,6 +354,9 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "empty_scenes": list(result.empty),
         "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
         "products": [product.path for scene in scenes for product in scene.products],
+        "files_set_aside": dict(result.set_aside),
+        "barren_scenes": dict(result.barren),
+        "more_of_both": result.untold,
         "orphans": {orphan.path: orphan.reason for orphan in result.orphans},
     }
 
@@ -379,7 +382,9 @@ def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | 
         if scene.error:
             add_row(table, scene.scene, "none", "", "", "", scene.error)
     show(table)
-    show(_refused_table(_refused(campaign, result)))
+    refused = _refused(campaign, result)
+    show(_refused_table(refused))
+    show(_unused_table(result, {granule.path for granule in refused}))
     show(_orphans_table(result, removed))
     show(_failures_table(result))
     if page is None:
@@ -387,6 +392,17 @@ def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | 
     else:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
         typer.echo(f"products: {campaign.products_root}{ended}\nreport:   {page}")
+
+
+def _unused_table(result: Result, told: Collection[str]) -> Table:
+    title = "Not used" + (f" ({result.untold} more on other days)" if result.untold else "")
+    table = make_table(title, "file or scene", "because")
+    for path, reason in result.set_aside.items():
+        if path not in told:
+            add_row(table, path, reason)
+    for scene, reason in result.barren.items():
+        add_row(table, scene, reason)
+    return table
 
 
 def _orphans_table(result: Result, removed: int | None) -> Table:

@@ -1,0 +1,217 @@
+"""What a run tells, forgets and removes of files and scenes that are gone or were never used."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+import quick
+from small_archive import DAY, Archive, made
+from typer.testing import CliRunner
+
+from lidarops import engine, pipeline
+from lidarops.catalog.ledger import Run, RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.errors import CatalogError
+from lidarops.pipeline import Options, Selection, bring_up_to_date, remove_orphans, reprocess
+from lidarops.records import ProductKind
+
+FIRST = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quick() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "attempt", quick.attempt)
+        yield
+
+
+@pytest.fixture(scope="module")
+def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small archive, processed."""
+    made_here = Archive(tmp_path_factory.mktemp("processed"))
+    assert made(reprocess(made_here.write()))
+    return made_here.folder
+
+
+@pytest.fixture
+def archive(processed: Path, tmp_path: Path) -> Archive:
+    """A copy of it, with the same modification times."""
+    shutil.copytree(processed, tmp_path / "archive")
+    return Archive(tmp_path / "archive")
+
+
+# Told ----------------------------------------------------------------------------------------
+
+
+def _told(archive: Archive) -> dict[str, object]:
+    """What the command tells programs; one that exits with 1 gives a reason."""
+    result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
+    told = json.loads(result.stdout)
+    reasons = ("failed_scenes", "empty_scenes", "refused_files", "files_set_aside", "barren_scenes")
+    assert result.exit_code == int(any(told[name] for name in reasons))
+    return dict(told)
+
+
+def test_a_file_that_is_used_in_no_scene_is_named_by_every_run(archive: Archive) -> None:
+    archive.raw("poor/h-twin", 600, seed=1)
+    archive.write()
+    for _ in range(3):
+        told = _told(archive)["files_set_aside"]
+        assert list(told) == ["poor/h00"]
+        assert "poor/h-twin" in told["poor/h00"]
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file)])
+    assert "poor/h-twin" in shown.stdout
+    assert shown.exit_code == 1
+
+
+def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -> None:
+    archive.told["instruments"]["poor"]["products"] = {
+        "homogeneous": {"channels": ["photon_355o"], "sections": [[750, 840]]}
+    }
+    archive.write()
+    for _ in range(2):
+        told = _told(archive)["barren_scenes"]
+        assert len(told) == 4
+        assert all("photon_355o" in why for why in told.values())
+
+
+def test_of_very_many_days_some_are_told_and_the_rest_counted(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for day in range(4):
+        archive.raw(f"poor/h-twin{day}", day * DAY + 600, seed=1)
+    campaign = archive.write()
+    assert len(bring_up_to_date(campaign).set_aside) == 4
+    monkeypatch.setattr(pipeline, "AGAIN", 3)
+    again = bring_up_to_date(campaign)
+    assert (len(again.set_aside), again.untold, again.troubled) == (3, 1, True)
+
+
+# Forgotten -----------------------------------------------------------------------------------
+
+
+def _fail(archive: Archive, scenes: str, *, unmade: bool = False) -> None:
+    """Let scenes have failed for good."""
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        connection.execute(
+            "update scene set error = 'bad', final = 1 where scene like ?", (scenes,)
+        )
+        if unmade:
+            connection.execute(
+                "delete from product_input where product in"
+                " (select path from product where scene like ?)",
+                (scenes,),
+            )
+            connection.execute("delete from product where scene like ?", (scenes,))
+
+
+def test_failures_are_forgotten_on_days_with_others_between(archive: Archive) -> None:
+    _fail(archive, "poor_%")
+    for day in (0, 2):
+        for path in (archive.folder / "raw/poor").glob(f"h{day}*"):
+            path.unlink()
+    campaign = archive.write()
+    assert set(bring_up_to_date(campaign).failures) == {
+        "poor_20260302T000000",
+        "poor_20260304T000000",
+    }
+
+
+def test_failures_are_forgotten_with_the_last_trace_of_their_day(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["dark_files"] = "none/d*"
+    reprocess(archive.write())
+    _fail(archive, "%_20260304T%", unmade=True)
+    assert len(bring_up_to_date(archive.write()).failures) == 2
+    for path in (archive.folder / "raw").glob("*/h3*"):
+        path.unlink()
+    for _ in range(2):
+        found = bring_up_to_date(archive.write())
+        assert not found.failures
+        assert not found.troubled
+
+
+# Removed -------------------------------------------------------------------------------------
+
+
+def _without(archive: Archive, instrument: str) -> None:
+    for path in (archive.folder / "raw" / instrument).glob("h*"):
+        path.unlink()
+
+
+def test_what_is_not_asked_for_is_not_orphaned(archive: Archive) -> None:
+    _without(archive, "rich")
+    _without(archive, "poor")
+    archive.raw("other", 0, seed=1)
+    campaign = archive.write()
+    day = FIRST.replace(day=2)
+    parts = [
+        (Selection(instruments=("poor",)), 8),
+        (Selection(stations=("coast",)), 24),
+        (Selection(kinds=(ProductKind.ELASTIC,)), 4),
+        (Selection(since=day, until=day.replace(day=4)), 12),
+        (Selection(until=day), 6),
+    ]
+    for selection, number in parts:
+        assert len(bring_up_to_date(campaign, selection=selection).orphans) == number
+
+
+def test_a_product_that_another_run_made_again_is_not_removed(archive: Archive) -> None:
+    kept = {path: path.read_bytes() for path in (archive.folder / "raw/poor").glob("h1*")}
+    for path in kept:
+        path.unlink()
+    campaign = archive.write()
+    before = archive.contents("out/products")
+    found = bring_up_to_date(campaign)
+    assert len(found.orphans) == 2
+    for path, content in kept.items():
+        path.write_bytes(content)
+    assert reprocess(campaign, options=Options(force=True))
+    assert remove_orphans(campaign, found) == 0
+    assert archive.contents("out/products") == before
+    assert reprocess(campaign) is None
+
+
+def test_nothing_is_removed_for_an_archive_that_is_not_there(archive: Archive) -> None:
+    _without(archive, "rich")
+    _without(archive, "poor")
+    (archive.folder / "raw/rich/d0").unlink()
+    campaign = archive.write()
+    found = bring_up_to_date(campaign)
+    before = archive.contents("out/products")
+    assert len(found.orphans) == len(before) == 24
+    with pytest.raises(CatalogError, match="no raw file"):
+        remove_orphans(campaign, found)
+    assert archive.contents("out/products") == before
+
+
+# Runs and scans ------------------------------------------------------------------------------
+
+
+def test_a_run_whose_process_is_gone_is_told_as_died(archive: Archive) -> None:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        with Lock(store) as lock:
+            lock.acquire()
+            begun = Run("x", FIRST.replace(year=2030), None, RunStatus.RUNNING, "me", "0", "0")
+            store.begin_run(begun, lock.token)
+            assert store.runs()[0].status is RunStatus.RUNNING
+        assert [run.status for run in store.runs()] == [RunStatus.DIED, RunStatus.FINISHED]
+
+
+def test_a_file_that_was_there_before_is_not_told_as_moved(archive: Archive) -> None:
+    content = (archive.folder / "raw/poor/h00").read_bytes()
+    (archive.folder / "raw/poor/h-copy").write_bytes(content)
+    campaign = archive.write()
+    assert pipeline.update_catalog(campaign).added == 1
+    (archive.folder / "raw/poor/h00").unlink()
+    archive.raw("poor/h-new", 900, seed=77)
+    summary = pipeline.update_catalog(campaign)
+    assert (summary.added, summary.moved, summary.vanished) == (1, 0, 1)
