@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
-from lidarops.retrieve import _angle_mask, _angle_robust
+from lidarops.retrieve import _angle_mask, _angle_robust, _vertical_gaps
 from lidarops.retrieve import _kano_hamilton as kh
 from lidarops.retrieve._slant import Scan, surrounds_zenith
 
@@ -54,6 +54,8 @@ class Rays:
     """Whether rays lead to all sides."""
     needed: int
     """Rays that a height needs to be within the reach."""
+    gaps: npt.NDArray[np.bool_]
+    """(profile,): whether samples are missing between others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,7 @@ def make_rays(signal: npt.NDArray[np.floating], variance: Array, scan: Scan) -> 
         alive,
         surrounds_zenith(scan.leaning),
         min(3, max(int(scan.usable.sum()), 2)),
+        _vertical_gaps.between(noise < np.inf, signal, variance),
     )
 
 

@@ -164,6 +164,7 @@ def _joint(rays: Rays, fit: Regression, _prior: Array | None, settings: Settings
         np.nan_to_num(fit.leverage, nan=1.0),
         np.broadcast_to(fit.inhomogeneity, share.shape),
         np.where(within, share, 0.0),
+        rays.gaps,
     )
     smooth = vertical.smooth(
         part.optical_depth,

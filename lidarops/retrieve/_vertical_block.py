@@ -13,6 +13,7 @@ from lidarops.retrieve import (
     _calibration,
     _smoothing_choice,
     _vertical_correlation,
+    _vertical_gaps,
     _vertical_inputs,
     _vertical_outliers,
 )
@@ -158,6 +159,8 @@ class _Block:
     stiffness: Array
     extent: float
     """m, from the lidar to the highest estimate."""
+    gaps: Integers
+    """Rows of which neighbouring heights come from other rays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +221,7 @@ def _fit(block: _Block, information: Array) -> _Fit:
     profiles = information.shape[0]
     # What is believed less has more noise of its own, not more of what it shares.
     share = block.share * _ratio(information, block.information)
-    bands = _vertical_correlation.precision(information, share, block.correlation)
+    bands = _precision(block, information, share)
     unit = _usual_information(information) * block.extent**3
     choice = _smoothing_choice.choose(
         _smoothing_choice.score(bands, block.estimates, block.stiffness, unit)
@@ -248,6 +251,14 @@ def _fit(block: _Block, information: Array) -> _Fit:
         extinction_variance,
         pairs.total(own, profiles),
     )
+
+
+def _precision(block: _Block, information: Array, share: Array) -> Array:
+    bands = _vertical_correlation.precision(information, share, block.correlation)
+    rows = block.gaps
+    if rows.size and block.correlation > 0.0:
+        bands[:, rows] = _vertical_gaps.precision(information[rows], share[rows], block.correlation)
+    return bands
 
 
 def _ratio(reduced: Array, whole: Array) -> Array:
@@ -310,11 +321,13 @@ def _block(
     limit = _LARGEST_INFORMATION * float(np.median(information[used]))
     highest = int(np.flatnonzero(used.any(axis=0))[-1])
     correlation, amplitude, share = 0.0, 1.0, np.zeros_like(estimates)
+    gaps = np.zeros(0, dtype=np.int64)
     if moments is not None:
         correlation, amplitude = _vertical_correlation.fit(
             moments.lag_products[member], moments.lag_norms[member]
         )
         share = np.clip(moments.inhomogeneity_share[member] * amplitude, 0.0, 1.0)
+        gaps = np.flatnonzero(moments.gaps[member])
     return _Block(
         estimates,
         np.minimum(information, limit),
@@ -322,6 +335,7 @@ def _block(
         correlation,
         stiffness,
         float(problem.altitude[highest]) - problem.station_altitude,
+        gaps,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
 
 LAGS: Final = 3
 LARGEST: Final = 0.97
@@ -39,6 +40,9 @@ class ResidualMoments:
     """(profile, height): share of the inhomogeneity in the variance of the optical depth, 0..1."""
     degrees_of_freedom: Array
     """(profile, height): rays used less 2, at least 0."""
+    gaps: Booleans
+    """(profile,): whether samples are missing between others, so that neighbouring heights come
+    from other rays."""
 
 
 @_compiled

@@ -181,11 +181,12 @@ def moments(given: ResidualMoments, problem_: Problem) -> ResidualMoments:
         Where they are of other profiles or heights.
     """
     profiles = problem_.optical_depth.shape[0]
-    shapes = {
+    shapes: dict[str, tuple[int, ...]] = {
         "lag_products": (profiles, LAGS),
         "lag_norms": (profiles, LAGS),
         "inhomogeneity_share": problem_.optical_depth.shape,
         "degrees_of_freedom": problem_.optical_depth.shape,
+        "gaps": (profiles,),
     }
     for name, shape in shapes.items():
         if getattr(given, name).shape != shape:

@@ -94,6 +94,12 @@ def solve(
     down, starting from repeated medians and the pair of rays that most others agree
     with. Nothing is iterated to convergence.
 
+    Simulated scans of clear air and of a cloud, the air correlated by 0 to 0.9 at neighbouring
+    altitudes and up to 30 percent of the samples missing at random: with "joint", the errors of
+    optical depth are 0.93 to 1.1 times the stated ones in blocks of 32 profiles, those of
+    extinction 0.6 to 1.0 times. With gaps, a block of 8 profiles is told up to 15 percent too
+    uncertain.
+
     Parameters
     ----------
     signal : (..., angle, altitude) float

@@ -110,6 +110,7 @@ def residual_moments(
     leverage: npt.ArrayLike,
     inhomogeneity_variance: npt.ArrayLike,
     inhomogeneity_share: npt.ArrayLike,
+    gaps: npt.ArrayLike | None = None,
 ) -> ResidualMoments:
     r"""Sum what `smooth` needs to know of the residuals of a fit over rays.
 
@@ -126,6 +127,9 @@ def residual_moments(
     inhomogeneity_share : (profile, height) float
         :math:`f = s^2 \sum w^2 (x - \bar x)^2 / S_{xx}`, the share of :math:`s^2` in the
         variance of the optical depth.
+    gaps : (profile,) bool, optional
+        Whether samples are missing between others, so that neighbouring heights come from other
+        rays; none where not given.
 
     Returns
     -------
@@ -141,7 +145,9 @@ def residual_moments(
     variance = _vertical_inputs.matrix(inhomogeneity_variance, "inhomogeneity_variance", shape)
     share = _vertical_inputs.matrix(inhomogeneity_share, "inhomogeneity_share", shape)
     products, norms, freedom = _vertical_correlation.lag_sums(*rays, variance)
-    return ResidualMoments(products, norms, np.clip(np.nan_to_num(share), 0.0, 1.0), freedom)
+    holed = np.zeros(shape[0], dtype=np.bool_) if gaps is None else np.asarray(gaps, np.bool_)
+    share = np.clip(np.nan_to_num(share), 0.0, 1.0)
+    return ResidualMoments(products, norms, share, freedom, holed)
 
 
 def smooth(

@@ -634,6 +634,7 @@ def moments_of(profiles, *, ratio=0.0, share=1.0, freedom=10.0):
         np.ones((profiles, 3)),
         np.full(shape, share),
         np.full(shape, freedom),
+        np.zeros(profiles, dtype=np.bool_),
     )
 
 
