@@ -6,12 +6,16 @@ environment it starts one for the time of the run.
 One Prefect task processes all scenes that are due, with a dask cluster of its own: a task costs
 tens of milliseconds and a file fewer. What is done is entered scene by scene in the ledger, so
 that a task that is tried again goes on where it was.
+
+A run after which something is refused or failed, now or before and still so, ends in the state
+`flows.WITH_FAILURES`, as nobody sees the exit code of a run on a schedule.
 """
 
 from __future__ import annotations
 
 import base64
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -29,13 +33,16 @@ from prefect.artifacts import (
     update_progress_artifact,
 )
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.states import Completed
 from prefect.tasks import exponential_backoff
 from prefect.utilities.annotations import quote
 from pydantic import Field
 
+from flows import WITH_FAILURES
 from lidarops import clusters
 from lidarops.campaign import Campaign, load
 from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.pipeline import Options, Result, Selection, bring_up_to_date, report_run
 from lidarops.product_settings import Instant
@@ -50,6 +57,8 @@ Seconds = Annotated[float, Field(ge=0, le=86_400)]
 
 _TOLD_EVERY = 15.0
 """s between reports of progress, each of which is a request to the server."""
+_NAMED = 20
+"""Scenes or files of one kind of trouble that the log names: each line is kept by the server."""
 
 
 def _may_pass(_task: object, _run: TaskRun, state: State[Any]) -> bool:
@@ -116,8 +125,21 @@ def process_task(
     result = bring_up_to_date(campaign, selection=selection, options=options)
     progress.end()
     if result.status is not RunStatus.FINISHED:
-        raise SceneError(f"the run is {result.status}", remedy="run again: what is done stays done")
+        raise _unfinished(result)
     return result
+
+
+def _unfinished(result: Result) -> LidarOpsError:
+    """Return what a run is told by that did not come to its end."""
+    remedy = "run again: what is done stays done"
+    if result.status is not RunStatus.STOPPED:
+        return SceneError(f"the run is {result.status}", remedy=remedy)
+    errors = [
+        scene.error for scene in (result.record.scenes if result.record else ()) if scene.error
+    ]
+    told = f": {errors[-1]}" if errors else ""
+    # A run gives up where products cannot be written, which may pass; see `_may_pass`.
+    return ProductError(f"the run gave up, as scene after scene failed{told}", remedy=remedy)
 
 
 @task(name="report", **_RETRY)
@@ -195,6 +217,9 @@ def reprocess(
     result : Result
     report : Path or None
         The HTML page; None where there was nothing to do.
+
+    Both come as the data of a state of its own name, `flows.WITH_FAILURES`, where something is
+    refused or failed; who calls the flow gets the data.
     """
     chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
     settings = load(campaign, archive=archive, output=out)
@@ -203,14 +228,60 @@ def reprocess(
     # Also where nothing was due: an earlier copy may have failed.
     if publish is not None:
         publish_task(_opaque(settings), publish)
+    built = None
     if result.record is None:
-        get_run_logger().info("campaign %s is up to date", settings.name)
-        return result, None
-    local = chosen.workers if isinstance(chosen, clusters.Local) else 1
-    built = report_task(_opaque(settings), _opaque(result.record), local)
-    scenes = len(result.record.scenes)
-    get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
-    return result, built
+        get_run_logger().info("campaign %s: nothing to do", settings.name)
+    else:
+        local = chosen.workers if isinstance(chosen, clusters.Local) else 1
+        built = report_task(_opaque(settings), _opaque(result.record), local)
+        scenes = len(result.record.scenes)
+        get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
+    if not result.troubled:
+        return result, built
+    message = _tell_troubles(settings, result)
+    # Prefect takes a state that is returned for the flow's own, and gives callers its data.
+    ended = Completed(name=WITH_FAILURES, message=message, data=(result, built))
+    return cast("tuple[Result, Path | None]", ended)
+
+
+def _tell_troubles(campaign: Campaign, result: Result) -> str:
+    """Log what is refused or failed by name, as far as it is not too much; return the numbers."""
+    scenes = () if result.record is None else result.record.scenes
+    failed = {**result.failures, **{each.scene: each.error for each in scenes if each.error}}
+    named = {
+        "scenes failed": failed,
+        "scenes left nothing to use": dict.fromkeys(
+            (*result.empty, *(each.scene for each in scenes if each.empty)),
+            "its retrievals left nothing to use",
+        ),
+        "files refused": _refused(campaign, result),
+    }
+    counted = {
+        "scenes can give no product": result.barren,
+        "good files stand in no scene": result.set_aside,
+    }
+    logger = get_run_logger()
+    for what, troubles in named.items():
+        for name, reason in list(troubles.items())[:_NAMED]:
+            logger.warning("%s: %s", name, reason)
+        if len(troubles) > _NAMED:
+            logger.warning("... and %d more %s", len(troubles) - _NAMED, what)
+    numbers = {**{what: len(each) for what, each in named.items()}, **counted}
+    told = ", ".join(f"{number} {what}" for what, number in numbers.items() if number)
+    logger.warning("campaign %s: %s", campaign.name, told)
+    return told
+
+
+def _refused(campaign: Campaign, result: Result) -> Mapping[str, str]:
+    """Return file -> reason of what is refused, by the catalog or by a scene of the run."""
+    with Store(campaign.catalog_url, campaign.name) as store:
+        early = store.refused()
+    late = (
+        []
+        if result.record is None
+        else [granule for scene in result.record.scenes for granule in scene.refused]
+    )
+    return {granule.path: granule.reason for granule in (*early, *late)}
 
 
 def main(
