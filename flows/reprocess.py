@@ -38,7 +38,7 @@ from prefect.tasks import exponential_backoff
 from prefect.utilities.annotations import quote
 from pydantic import Field
 
-from flows import WITH_FAILURES
+from flows import WITH_FAILURES, usage
 from lidarops import clusters
 from lidarops.campaign import Campaign, load
 from lidarops.catalog.ledger import RunStatus
@@ -47,7 +47,7 @@ from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneErro
 from lidarops.pipeline import Options, Result, Selection, bring_up_to_date, report_run
 from lidarops.product_settings import Instant
 from lidarops.publication import publish as publish_products
-from lidarops.records import RunRecord, SceneOutcome
+from lidarops.records import ProductKind, RunRecord, SceneOutcome
 from lidarops.reports import page
 
 _T = TypeVar("_T")
@@ -186,6 +186,10 @@ def reprocess(
     cluster: str | None = None,
     wait: Seconds = 0.0,
     publish: str | None = None,
+    catalog: str | None = None,
+    stations: list[str] | None = None,
+    products: list[ProductKind] | None = None,
+    memory_limit: clusters.Memory | None = None,
     *,
     full: bool = False,
 ) -> tuple[Result, Path | None]:
@@ -199,8 +203,8 @@ def reprocess(
         As on the command line.
     workers : int, optional
         Processes; 1 where not given.
-    instruments : list of str, optional
-        Only these.
+    instruments, stations, products : list of str, optional
+        Only these; kinds of products.
     since, until : datetime, optional
         Only scenes that touch this interval.
     scheduler, cluster : str, optional
@@ -209,6 +213,10 @@ def reprocess(
         s to wait for another run on the same archive.
     publish : str, optional
         URL of an object store that the products are copied to.
+    catalog : str, optional
+        As on the command line: SQLAlchemy URL of catalog and ledger.
+    memory_limit : str, optional
+        Most memory of a worker of this machine, such as ``2GiB``.
     full : bool
         Also what is fresh.
 
@@ -221,9 +229,15 @@ def reprocess(
     Both come as the data of a state of its own name, `flows.WITH_FAILURES`, where something is
     refused or failed; who calls the flow gets the data.
     """
-    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
-    settings = load(campaign, archive=archive, output=out)
-    selection = Selection(instruments=tuple(instruments or ()), since=since, until=until)
+    chosen = _cluster(workers, scheduler, cluster, memory_limit)
+    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    selection = Selection(
+        stations=tuple(stations or ()),
+        instruments=tuple(instruments or ()),
+        kinds=tuple(products or ()),
+        since=since,
+        until=until,
+    )
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
     # Also where nothing was due: an earlier copy may have failed.
     if publish is not None:
@@ -240,8 +254,23 @@ def reprocess(
         return result, built
     message = _tell_troubles(settings, result)
     # Prefect takes a state that is returned for the flow's own, and gives callers its data.
-    ended = Completed(name=WITH_FAILURES, message=message, data=(result, built))
+    ended: State[Any] = Completed(name=WITH_FAILURES, message=message, data=(result, built))
     return cast("tuple[Result, Path | None]", ended)
+
+
+def _cluster(
+    workers: int | None, scheduler: str | None, cluster: str | None, memory: str | None
+) -> clusters.Cluster:
+    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
+    if memory is None:
+        return chosen
+    if not isinstance(chosen, clusters.Local):
+        raise clusters.ClusterError(
+            "is for workers of this machine",
+            field="memory_limit",
+            remedy="give the memory in the cluster's file",
+        )
+    return chosen.model_copy(update={"memory": memory})
 
 
 def _tell_troubles(campaign: Campaign, result: Result) -> str:
@@ -288,29 +317,55 @@ def main(
     campaign: str,
     archive: str | None = None,
     out: str | None = None,
+    catalog: Annotated[
+        str | None, typer.Option(help="SQLAlchemy URL of catalog and ledger")
+    ] = None,
+    instrument: Annotated[list[str] | None, typer.Option(help="only this one")] = None,
+    station: Annotated[list[str] | None, typer.Option(help="only this one")] = None,
+    product: Annotated[list[ProductKind] | None, typer.Option(help="only this kind")] = None,
+    since: Annotated[datetime | None, typer.Option(help="only scenes that end later, UTC")] = None,
+    until: Annotated[datetime | None, typer.Option(help="only scenes that start before")] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=10_000)] = None,
     scheduler: Annotated[str | None, typer.Option(help="address of a dask scheduler")] = None,
     cluster: Annotated[
         str | None, typer.Option(help="slurm, kubernetes, or a YAML file that describes one")
     ] = None,
+    memory_limit: Annotated[
+        str | None, typer.Option(help="most memory of a worker here, such as 2GiB")
+    ] = None,
+    wait: Annotated[float, typer.Option(min=0, help="s to wait for another run")] = 0.0,
     publish: Annotated[
         str | None, typer.Option(help="URL of a store that the products are copied to")
     ] = None,
     *,
-    full: Annotated[bool, typer.Option("--full", help="also what is fresh")] = False,
+    full: Annotated[bool, typer.Option("--force", "--full", help="also what is fresh")] = False,
 ) -> None:
     """Bring the products of a campaign up to date as a Prefect flow."""
+    asked = {
+        "campaign": campaign,
+        "archive": archive,
+        "out": out,
+        "catalog": catalog,
+        "instruments": instrument,
+        "stations": station,
+        "products": product,
+        "since": since,
+        "until": until,
+        "workers": workers,
+        "scheduler": scheduler,
+        "cluster": cluster,
+        "memory_limit": memory_limit,
+        "wait": wait,
+        "publish": publish,
+        "full": full,
+    }
+    # Within the flow all of this would be told after the start of a server, in tracebacks.
+    with usage.told():
+        reprocess.validate_parameters(asked)
+        load(campaign, archive=archive, output=out, catalog=catalog)
+        _cluster(workers, scheduler, cluster, memory_limit)
     try:
-        result, built = reprocess(
-            campaign,
-            archive,
-            out,
-            workers,
-            scheduler=scheduler,
-            cluster=cluster,
-            publish=publish,
-            full=full,
-        )
+        result, built = reprocess(**asked)
     except LidarOpsError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from error

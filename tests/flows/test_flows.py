@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -10,15 +11,21 @@ from typing import Any
 from uuid import UUID, uuid4
 
 import factories
+import jsonschema
 import pytest
 import rawfiles
+import typer
 import yaml
+from click.testing import Result as Called
 from prefect import Flow, get_client, runtime
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.objects import State, StateType
 from prefect.exceptions import ParameterTypeError
 from prefect.states import Completed, Failed, Pending, Running
+from prefect.utilities.callables import parameter_schema
+from typer.testing import CliRunner
 
+import flows.catalog
 import flows.reprocess
 from flows import WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
@@ -57,6 +64,83 @@ def campaign_file(tmp_path: Path) -> Path:
 def test_parameters_out_of_range_are_refused(flow: Flow, wrong: dict[str, float]) -> None:
     with pytest.raises(ParameterTypeError, match=next(iter(wrong))):
         flow.validate_parameters({"campaign": "campaign.yaml"} | wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"products": ["luck"]},
+        {"memory_limit": "foo"},
+        {"stations": "coast"},
+    ],
+)
+def test_parameters_of_a_selection_are_validated_before_a_run_is_accepted(
+    wrong: dict[str, Any],
+) -> None:
+    with pytest.raises(ParameterTypeError, match=next(iter(wrong))):
+        reprocess.validate_parameters({"campaign": "campaign.yaml"} | wrong)
+    # What a server refuses, without the code of the flow.
+    schema = parameter_schema(reprocess).model_dump()
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({"campaign": "campaign.yaml"} | wrong, schema)
+
+
+def called(command: Callable[..., None], *words: str) -> Called:
+    """Call a flow as its command line does."""
+    app = typer.Typer()
+    app.command()(command)
+    return CliRunner().invoke(app, list(words))
+
+
+@pytest.mark.parametrize("command", [flows.catalog.main, flows.reprocess.main])
+@pytest.mark.parametrize("content", [None, "name: ["])
+def test_a_missing_or_invalid_campaign_file_is_wrong_use(
+    command: Callable[..., None], content: str | None, tmp_path: Path
+) -> None:
+    """And told before any server is started."""
+    file = tmp_path / "campaign.yaml"
+    if content is not None:
+        file.write_text(content)
+    result = called(command, str(file))
+    assert result.exit_code == 2
+    assert result.output.startswith(f"error: {file}: ")
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--memory-limit", "foo"], "memory_limit"),
+        (["--memory-limit", "2GiB", "--cluster", "slurm"], "memory_limit"),
+        (["--product", "luck"], "homogeneous"),
+        (["--scheduler", "nowhere"], "address"),
+    ],
+)
+def test_wrong_options_of_the_flow_are_wrong_use(
+    words: list[str], said: str, campaign_file: Path
+) -> None:
+    result = called(flows.reprocess.main, str(campaign_file), *words)
+    assert result.exit_code == 2
+    assert said in result.output
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_the_flow_takes_the_options_of_the_command_line(campaign_file: Path) -> None:
+    def products(*words: str) -> int:
+        folder = campaign_file.parent / "out"
+        shutil.rmtree(folder, ignore_errors=True)
+        there = ["--out", str(folder), "--catalog", f"sqlite:///{folder}/other.sqlite"]
+        result = called(flows.reprocess.main, str(campaign_file), *there, *words)
+        # A file of the archive is refused.
+        assert result.exit_code == 1, result.output
+        assert (folder / "other.sqlite").exists()
+        return len(list(folder.rglob("*.nc")))
+
+    asked = ["--station", "coast", "--instrument", "lidar", "--product", "homogeneous"]
+    inside = ["--since", "2026-02-28", "--until", "2026-03-02"]
+    assert products(*asked, *inside, "--wait", "1", "--memory-limit", "1GiB") == 1
+    assert products("--product", "elastic") == 0
+    assert products("--since", "2026-03-05") == 0
 
 
 @pytest.mark.usefixtures("prefect_server")
