@@ -341,7 +341,7 @@ def main(
     full: Annotated[bool, typer.Option("--force", "--full", help="also what is fresh")] = False,
 ) -> None:
     """Bring the products of a campaign up to date as a Prefect flow."""
-    asked = {
+    asked: dict[str, Any] = {
         "campaign": campaign,
         "archive": archive,
         "out": out,

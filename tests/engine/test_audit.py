@@ -91,6 +91,16 @@ def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> 
     assert ended["scene"] == "poor_20260302T000000"
 
 
+@pytest.mark.parametrize("command", ["runs", "verify"])
+def test_what_asks_the_ledger_makes_none(command: str, archive: Archive) -> None:
+    """A wrong folder has nothing that is wrong, which is not the same as all being well."""
+    elsewhere = archive.folder / "elsewhere"
+    asked = CliRunner().invoke(app, [command, str(archive.file), "--out", str(elsewhere)])
+    assert asked.exit_code == 1
+    assert "there is no catalog yet" in asked.output
+    assert not elsewhere.exists()
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
