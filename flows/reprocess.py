@@ -39,7 +39,7 @@ from prefect.utilities.annotations import quote
 from pydantic import Field
 
 from flows import WITH_FAILURES, usage
-from lidarops import clusters
+from lidarops import asked, clusters
 from lidarops.campaign import Campaign, load
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.store import Store
@@ -231,20 +231,16 @@ def reprocess(
     """
     chosen = _cluster(workers, scheduler, cluster, memory_limit)
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
-    selection = Selection(
-        stations=tuple(stations or ()),
-        instruments=tuple(instruments or ()),
-        kinds=tuple(products or ()),
-        since=since,
-        until=until,
-    )
+    selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
     # Also where nothing was due: an earlier copy may have failed.
     if publish is not None:
         publish_task(_opaque(settings), publish)
     built = None
     if result.record is None:
-        get_run_logger().info("campaign %s: nothing to do", settings.name)
+        none = asked.none(settings, selection)
+        what = "no scene of the archive is asked for" if none else "nothing to do"
+        get_run_logger().info("campaign %s: %s", settings.name, what)
     else:
         local = chosen.workers if isinstance(chosen, clusters.Local) else 1
         built = report_task(_opaque(settings), _opaque(result.record), local)
@@ -256,6 +252,22 @@ def reprocess(
     # Prefect takes a state that is returned for the flow's own, and gives callers its data.
     ended: State[Any] = Completed(name=WITH_FAILURES, message=message, data=(result, built))
     return cast("tuple[Result, Path | None]", ended)
+
+
+def _selection(
+    instruments: list[str] | None,
+    stations: list[str] | None,
+    products: list[ProductKind] | None,
+    since: datetime | None,
+    until: datetime | None,
+) -> Selection:
+    return Selection(
+        stations=tuple(stations or ()),
+        instruments=tuple(instruments or ()),
+        kinds=tuple(products or ()),
+        since=since,
+        until=until,
+    )
 
 
 def _cluster(
@@ -341,7 +353,7 @@ def main(
     full: Annotated[bool, typer.Option("--force", "--full", help="also what is fresh")] = False,
 ) -> None:
     """Bring the products of a campaign up to date as a Prefect flow."""
-    asked: dict[str, Any] = {
+    given: dict[str, Any] = {
         "campaign": campaign,
         "archive": archive,
         "out": out,
@@ -361,11 +373,13 @@ def main(
     }
     # Within the flow all of this would be told after the start of a server, in tracebacks.
     with usage.told():
-        reprocess.validate_parameters(asked)
-        load(campaign, archive=archive, output=out, catalog=catalog)
+        valid = reprocess.validate_parameters(given)
+        settings = load(campaign, archive=archive, output=out, catalog=catalog)
+        of_selection = ("instruments", "stations", "products", "since", "until")
+        asked.refuse_unknown(settings, _selection(*(valid[name] for name in of_selection)))
         _cluster(workers, scheduler, cluster, memory_limit)
     try:
-        result, built = reprocess(**asked)
+        result, built = reprocess(**given)
     except LidarOpsError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from error

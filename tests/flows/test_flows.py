@@ -114,6 +114,8 @@ def test_a_missing_or_invalid_campaign_file_is_wrong_use(
         (["--memory-limit", "2GiB", "--cluster", "slurm"], "memory_limit"),
         (["--product", "luck"], "homogeneous"),
         (["--scheduler", "nowhere"], "address"),
+        (["--station", "nope"], "coast"),
+        (["--since", "2024-09-22", "--until", "2024-09-21"], "since"),
     ],
 )
 def test_wrong_options_of_the_flow_are_wrong_use(
