@@ -7,6 +7,13 @@ set-up, and what the reaper of dead runs relies on; a value in the environment w
 from __future__ import annotations
 
 import os
+from typing import Final
+
+WITH_FAILURES: Final = "Completed with failures"
+"""Name of the state of a run that did all it could, of an archive in which not all is well.
+
+Its event is ``prefect.flow-run.Completed with failures``: Prefect names events after states.
+"""
 
 # Prefect gives its own server 20 s to start, which a busy machine exceeds.
 os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "120")

@@ -11,6 +11,7 @@ import typer
 from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
+from flows import usage
 from flows.reprocess import Seconds, Workers
 from lidarops.campaign import load
 from lidarops.catalog.scan import ScanSummary
@@ -59,6 +60,8 @@ def catalog(
 
 def main(campaign: str, archive: str | None = None, out: str | None = None) -> None:
     """Bring the catalog of a campaign up to date as a Prefect flow."""
+    with usage.told():
+        load(campaign, archive=archive, output=out)
     summary = catalog(campaign, archive, out)
     raise typer.Exit(1 if summary.refused else 0)
 

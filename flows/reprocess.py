@@ -6,12 +6,16 @@ environment it starts one for the time of the run.
 One Prefect task processes all scenes that are due, with a dask cluster of its own: a task costs
 tens of milliseconds and a file fewer. What is done is entered scene by scene in the ledger, so
 that a task that is tried again goes on where it was.
+
+A run after which something is refused or failed, now or before and still so, ends in the state
+`flows.WITH_FAILURES`, as nobody sees the exit code of a run on a schedule.
 """
 
 from __future__ import annotations
 
 import base64
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -29,18 +33,21 @@ from prefect.artifacts import (
     update_progress_artifact,
 )
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.states import Completed
 from prefect.tasks import exponential_backoff
 from prefect.utilities.annotations import quote
 from pydantic import Field
 
-from lidarops import clusters
+from flows import WITH_FAILURES, usage
+from lidarops import asked, clusters
 from lidarops.campaign import Campaign, load
 from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.pipeline import Options, Result, Selection, bring_up_to_date, report_run
 from lidarops.product_settings import Instant
 from lidarops.publication import publish as publish_products
-from lidarops.records import RunRecord, SceneOutcome
+from lidarops.records import ProductKind, RunRecord, SceneOutcome
 from lidarops.reports import page
 
 _T = TypeVar("_T")
@@ -50,6 +57,8 @@ Seconds = Annotated[float, Field(ge=0, le=86_400)]
 
 _TOLD_EVERY = 15.0
 """s between reports of progress, each of which is a request to the server."""
+_NAMED = 20
+"""Scenes or files of one kind of trouble that the log names: each line is kept by the server."""
 
 
 def _may_pass(_task: object, _run: TaskRun, state: State[Any]) -> bool:
@@ -116,8 +125,21 @@ def process_task(
     result = bring_up_to_date(campaign, selection=selection, options=options)
     progress.end()
     if result.status is not RunStatus.FINISHED:
-        raise SceneError(f"the run is {result.status}", remedy="run again: what is done stays done")
+        raise _unfinished(result)
     return result
+
+
+def _unfinished(result: Result) -> LidarOpsError:
+    """Return what a run is told by that did not come to its end."""
+    remedy = "run again: what is done stays done"
+    if result.status is not RunStatus.STOPPED:
+        return SceneError(f"the run is {result.status}", remedy=remedy)
+    errors = [
+        scene.error for scene in (result.record.scenes if result.record else ()) if scene.error
+    ]
+    told = f": {errors[-1]}" if errors else ""
+    # A run gives up where products cannot be written, which may pass; see `_may_pass`.
+    return ProductError(f"the run gave up, as scene after scene failed{told}", remedy=remedy)
 
 
 @task(name="report", **_RETRY)
@@ -164,6 +186,10 @@ def reprocess(
     cluster: str | None = None,
     wait: Seconds = 0.0,
     publish: str | None = None,
+    catalog: str | None = None,
+    stations: list[str] | None = None,
+    products: list[ProductKind] | None = None,
+    memory_limit: clusters.Memory | None = None,
     *,
     full: bool = False,
 ) -> tuple[Result, Path | None]:
@@ -177,8 +203,8 @@ def reprocess(
         As on the command line.
     workers : int, optional
         Processes; 1 where not given.
-    instruments : list of str, optional
-        Only these.
+    instruments, stations, products : list of str, optional
+        Only these; kinds of products.
     since, until : datetime, optional
         Only scenes that touch this interval.
     scheduler, cluster : str, optional
@@ -187,6 +213,10 @@ def reprocess(
         s to wait for another run on the same archive.
     publish : str, optional
         URL of an object store that the products are copied to.
+    catalog : str, optional
+        As on the command line: SQLAlchemy URL of catalog and ledger.
+    memory_limit : str, optional
+        Most memory of a worker of this machine, such as ``2GiB``.
     full : bool
         Also what is fresh.
 
@@ -195,51 +225,160 @@ def reprocess(
     result : Result
     report : Path or None
         The HTML page; None where there was nothing to do.
+
+    Both come as the data of a state of its own name, `flows.WITH_FAILURES`, where something is
+    refused or failed; who calls the flow gets the data.
     """
-    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
-    settings = load(campaign, archive=archive, output=out)
-    selection = Selection(instruments=tuple(instruments or ()), since=since, until=until)
+    chosen = _cluster(workers, scheduler, cluster, memory_limit)
+    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
     # Also where nothing was due: an earlier copy may have failed.
     if publish is not None:
         publish_task(_opaque(settings), publish)
+    built = None
     if result.record is None:
-        get_run_logger().info("campaign %s is up to date", settings.name)
-        return result, None
-    local = chosen.workers if isinstance(chosen, clusters.Local) else 1
-    built = report_task(_opaque(settings), _opaque(result.record), local)
-    scenes = len(result.record.scenes)
-    get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
-    return result, built
+        none = asked.none(settings, selection)
+        what = "no scene of the archive is asked for" if none else "nothing to do"
+        get_run_logger().info("campaign %s: %s", settings.name, what)
+    else:
+        local = chosen.workers if isinstance(chosen, clusters.Local) else 1
+        built = report_task(_opaque(settings), _opaque(result.record), local)
+        scenes = len(result.record.scenes)
+        get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
+    if not result.troubled:
+        return result, built
+    message = _tell_troubles(settings, result)
+    # Prefect takes a state that is returned for the flow's own, and gives callers its data.
+    ended: State[Any] = Completed(name=WITH_FAILURES, message=message, data=(result, built))
+    return cast("tuple[Result, Path | None]", ended)
+
+
+def _selection(
+    instruments: list[str] | None,
+    stations: list[str] | None,
+    products: list[ProductKind] | None,
+    since: datetime | None,
+    until: datetime | None,
+) -> Selection:
+    return Selection(
+        stations=tuple(stations or ()),
+        instruments=tuple(instruments or ()),
+        kinds=tuple(products or ()),
+        since=since,
+        until=until,
+    )
+
+
+def _cluster(
+    workers: int | None, scheduler: str | None, cluster: str | None, memory: str | None
+) -> clusters.Cluster:
+    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
+    if memory is None:
+        return chosen
+    if not isinstance(chosen, clusters.Local):
+        raise clusters.ClusterError(
+            "is for workers of this machine",
+            field="memory_limit",
+            remedy="give the memory in the cluster's file",
+        )
+    return chosen.model_copy(update={"memory": memory})
+
+
+def _tell_troubles(campaign: Campaign, result: Result) -> str:
+    """Log what is refused or failed by name, as far as it is not too much; return the numbers."""
+    scenes = () if result.record is None else result.record.scenes
+    failed = {**result.failures, **{each.scene: each.error for each in scenes if each.error}}
+    named = {
+        "scenes failed": failed,
+        "scenes left nothing to use": dict.fromkeys(
+            (*result.empty, *(each.scene for each in scenes if each.empty)),
+            "its retrievals left nothing to use",
+        ),
+        "files refused": _refused(campaign, result),
+        "scenes can give no product": result.barren,
+        "good files stand in no scene": result.set_aside,
+    }
+    logger = get_run_logger()
+    for what, troubles in named.items():
+        for name, reason in list(troubles.items())[:_NAMED]:
+            logger.warning("%s: %s", name, reason)
+        if len(troubles) > _NAMED:
+            logger.warning("... and %d more %s", len(troubles) - _NAMED, what)
+    numbers = {what: len(each) for what, each in named.items()}
+    numbers["more on days in which nothing changed"] = result.untold
+    told = ", ".join(f"{number} {what}" for what, number in numbers.items() if number)
+    logger.warning("campaign %s: %s", campaign.name, told)
+    return told
+
+
+def _refused(campaign: Campaign, result: Result) -> Mapping[str, str]:
+    """Return file -> reason of what is refused, by the catalog or by a scene of the run."""
+    with Store(campaign.catalog_url, campaign.name) as store:
+        early = store.refused()
+    late = (
+        []
+        if result.record is None
+        else [granule for scene in result.record.scenes for granule in scene.refused]
+    )
+    return {granule.path: granule.reason for granule in (*early, *late)}
 
 
 def main(
     campaign: str,
     archive: str | None = None,
     out: str | None = None,
+    catalog: Annotated[
+        str | None, typer.Option(help="SQLAlchemy URL of catalog and ledger")
+    ] = None,
+    instrument: Annotated[list[str] | None, typer.Option(help="only this one")] = None,
+    station: Annotated[list[str] | None, typer.Option(help="only this one")] = None,
+    product: Annotated[list[ProductKind] | None, typer.Option(help="only this kind")] = None,
+    since: Annotated[datetime | None, typer.Option(help="only scenes that end later, UTC")] = None,
+    until: Annotated[datetime | None, typer.Option(help="only scenes that start before")] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=10_000)] = None,
     scheduler: Annotated[str | None, typer.Option(help="address of a dask scheduler")] = None,
     cluster: Annotated[
         str | None, typer.Option(help="slurm, kubernetes, or a YAML file that describes one")
     ] = None,
+    memory_limit: Annotated[
+        str | None, typer.Option(help="most memory of a worker here, such as 2GiB")
+    ] = None,
+    wait: Annotated[float, typer.Option(min=0, help="s to wait for another run")] = 0.0,
     publish: Annotated[
         str | None, typer.Option(help="URL of a store that the products are copied to")
     ] = None,
     *,
-    full: Annotated[bool, typer.Option("--full", help="also what is fresh")] = False,
+    full: Annotated[bool, typer.Option("--force", "--full", help="also what is fresh")] = False,
 ) -> None:
     """Bring the products of a campaign up to date as a Prefect flow."""
+    given: dict[str, Any] = {
+        "campaign": campaign,
+        "archive": archive,
+        "out": out,
+        "catalog": catalog,
+        "instruments": instrument,
+        "stations": station,
+        "products": product,
+        "since": since,
+        "until": until,
+        "workers": workers,
+        "scheduler": scheduler,
+        "cluster": cluster,
+        "memory_limit": memory_limit,
+        "wait": wait,
+        "publish": publish,
+        "full": full,
+    }
+    # Within the flow all of this would be told after the start of a server, in tracebacks.
+    with usage.told():
+        valid = reprocess.validate_parameters(given)
+        settings = load(campaign, archive=archive, output=out, catalog=catalog)
+        of_selection = ("instruments", "stations", "products", "since", "until")
+        asked.refuse_unknown(settings, _selection(*(valid[name] for name in of_selection)))
+        _cluster(workers, scheduler, cluster, memory_limit)
     try:
-        result, built = reprocess(
-            campaign,
-            archive,
-            out,
-            workers,
-            scheduler=scheduler,
-            cluster=cluster,
-            publish=publish,
-            full=full,
-        )
+        result, built = reprocess(**given)
     except LidarOpsError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from error

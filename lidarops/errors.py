@@ -63,7 +63,7 @@ class RawFormatError(LidarOpsError, ValueError):
 
 
 class CampaignError(LidarOpsError, ValueError):
-    """A campaign file that is missing, unreadable or inconsistent."""
+    """A campaign file that is missing, unreadable or inconsistent, or not what it is asked for."""
 
 
 class AncillaryError(LidarOpsError, ValueError):

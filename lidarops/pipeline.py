@@ -15,6 +15,7 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
+from lidarops.asked import refuse_unknown
 from lidarops.campaign import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
@@ -88,10 +89,12 @@ def reprocess(
 
     Raises
     ------
+    CampaignError
+        If what is asked for is unknown.
     CatalogError
         If archive or catalog cannot be used, or another run holds the catalog.
     SceneError
-        If what is asked for is unknown, or the cluster is lost.
+        If the cluster is lost.
     """
     found = bring_up_to_date(campaign, selection=selection, options=options, client=client)
     return found.record
@@ -107,7 +110,7 @@ def bring_up_to_date(
     """Do what `reprocess` does, and tell all that is known at the end."""
     selection = selection or Selection()
     options = options or Options()
-    _refuse_unknown(campaign, selection)
+    refuse_unknown(campaign, selection)
     with (
         Store(campaign.catalog_url, campaign.name) as store,
         Lock(store, wait=options.wait) as lock,
@@ -145,7 +148,7 @@ def assess(
     Judgement
     """
     selection = selection or Selection()
-    _refuse_unknown(campaign, selection)
+    refuse_unknown(campaign, selection)
     update_catalog(campaign)
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection, force=force)
@@ -205,20 +208,6 @@ def _dirty(judge: Judge, store: Store, selection: Selection, *, force: bool) -> 
         for day in days
         if not signatures[day].whole or verdicts.get(day, ("",))[0] != signatures[day].whole
     ]
-
-
-def _refuse_unknown(campaign: Campaign, selection: Selection) -> None:
-    known = {
-        "instrument": (selection.instruments, (*campaign.instruments, *campaign.networks)),
-        "station": (selection.stations, (*campaign.stations, *campaign.networks)),
-    }
-    for word, (asked, there) in known.items():
-        for name in asked:
-            if name not in there:
-                raise SceneError(
-                    f"the campaign has no {word} {name!r}",
-                    remedy=f"known: {', '.join(sorted(set(there)))}",
-                )
 
 
 @dataclass(slots=True)

@@ -48,12 +48,30 @@ if TYPE_CHECKING:
     from lidarops.records import Granule, Plan
     from lidarops.staleness import Judgement, Selection
 
+_LEAST_MEMORY = 2**20
+"""Bytes; what is less was given without its unit."""
+
 AllStepsOption = Annotated[
     bool,
     typer.Option(
         "--all-steps", help="Leave nothing out for giving nothing, and read every file whole."
     ),
 ]
+
+
+def _size(text: str | None) -> str | None:
+    """Refuse what is no size before the archive is looked at, which may take an hour."""
+    if text is None:
+        return None
+    from dask.utils import parse_bytes
+
+    try:
+        given = parse_bytes(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r} is no size such as 2GiB") from error
+    if given < _LEAST_MEMORY:
+        raise typer.BadParameter(f"{text!r} is too little for a worker: give a size such as 2GiB")
+    return text
 
 
 @app.command()
@@ -185,7 +203,10 @@ def reprocess(
         typer.Option("--cluster", help="slurm, kubernetes, or a YAML file of a cluster."),
     ] = None,
     memory_limit: Annotated[
-        str | None, typer.Option("--memory-limit", help="Most memory of a worker, such as 2GiB.")
+        str | None,
+        typer.Option(
+            "--memory-limit", help="Most memory of a worker, such as 2GiB.", callback=_size
+        ),
     ] = None,
     wait: WaitOption = 0.0,
     remove_orphans: Annotated[
@@ -207,18 +228,18 @@ def reprocess(
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
-    from lidarops import pipeline
+    from lidarops import asked, pipeline
 
     set_up(log_level, as_json=log_json, file=log_file)
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
-    asked = _cluster(workers, scheduler, tls, cluster)
+    there = _cluster(workers, scheduler, tls, cluster)
     with growing_bar("reprocess", "granules") as bar:
         options = pipeline.Options(
             force=force,
             workers=workers or 1,
             memory=memory_limit,
-            cluster=asked,
+            cluster=there,
             wait=wait,
             profiles_per_chunk=profiles_per_chunk,
             progress=lambda outcome: bar.advance(outcome.granules),
@@ -233,6 +254,8 @@ def reprocess(
         page = pipeline.report_run(settings, result.record, workers=options.workers).page
     if as_json:
         typer.echo(json.dumps(_run_summary(settings, result, page), indent=2))
+    elif result.record is None and asked.none(settings, wanted):
+        _tell_none(settings, result)
     else:
         _tell(settings, result, page, removed)
     if result.signal:
@@ -403,6 +426,14 @@ def _unused_table(result: Result, told: Collection[str]) -> Table:
     for scene, reason in result.barren.items():
         add_row(table, scene, reason)
     return table
+
+
+def _tell_none(campaign: Campaign, result: Result) -> None:
+    refused = _refused(campaign, result)
+    show(_refused_table(refused))
+    show(_unused_table(result, {granule.path for granule in refused}))
+    show(_failures_table(result))
+    typer.echo("nothing to do: no scene of the archive is asked for")
 
 
 def _orphans_table(result: Result, removed: int | None) -> Table:

@@ -44,7 +44,7 @@ def runs(
     from lidarops.catalog.store import Store
 
     settings = load(campaign, output=out, catalog=catalog)
-    with Store(settings.catalog_url, settings.name) as store:
+    with Store(settings.catalog_url, settings.name, create=False) as store:
         found = store.runs(limit=limit)
     if as_json:
         typer.echo(json.dumps([_plain(run) for run in found], indent=2))
@@ -91,7 +91,7 @@ def verify(
     looked = 0
 
     with (
-        Store(settings.catalog_url, settings.name) as store,
+        Store(settings.catalog_url, settings.name, create=False) as store,
         progress_bar("verify", None) as advance,
     ):
 

@@ -91,12 +91,26 @@ def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> 
     assert ended["scene"] == "poor_20260302T000000"
 
 
+@pytest.mark.parametrize("command", ["runs", "verify"])
+def test_what_asks_the_ledger_makes_none(command: str, archive: Archive) -> None:
+    """A wrong folder has nothing that is wrong, which is not the same as all being well."""
+    elsewhere = archive.folder / "elsewhere"
+    asked = CliRunner().invoke(app, [command, str(archive.file), "--out", str(elsewhere)])
+    assert asked.exit_code == 1
+    assert "there is no catalog yet" in asked.output
+    assert not elsewhere.exists()
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
         (["--product", "luck"], 2, "homogeneous"),
-        (["--instrument", "luck"], 1, "poor"),
-        (["--station", "luck"], 1, "coast"),
+        (["--instrument", "luck"], 2, "poor"),
+        (["--station", "luck"], 2, "coast"),
+        (["--since", "2026-03-02", "--until", "2026-03-01"], 2, "earlier"),
+        (["--since", "2026-03-02", "--until", "2026-03-02"], 2, "earlier"),
+        (["--memory-limit", "foo"], 2, "2GiB"),
+        (["--memory-limit", "2"], 2, "2GiB"),
         (["--log-level", "luck"], 2, "warning"),
         (["--catalog", "luck"], 1, "postgresql"),
     ],
@@ -107,3 +121,25 @@ def test_wrong_use_names_the_choices(
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), *words])
     assert result.exit_code == code
     assert said in result.output
+
+
+def test_a_size_of_memory_is_read_before_the_archive(tmp_path: Path) -> None:
+    fresh = Archive(tmp_path, days=1)
+    words = ["reprocess", str(fresh.file), "--workers", "2", "--memory-limit", "foo"]
+    assert CliRunner().invoke(app, words).exit_code == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_selection_without_any_scene_is_told_from_one_whose_products_are_fresh(
+    archive: Archive,
+) -> None:
+    def said(*words: str) -> str:
+        return CliRunner().invoke(app, ["reprocess", str(archive.file), *words]).output
+
+    none = "no scene of the archive is asked for"
+    assert none in said("--since", "2026-04-01")
+    assert none in said("--until", "2026-03-01", "--instrument", "poor")
+    for words in (["--since", "2026-03-02"], ["--station", "coast"], ["--product", "visibility"]):
+        fresh = said(*words)
+        assert "is fresh" in fresh
+        assert none not in fresh

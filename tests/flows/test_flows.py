@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 from uuid import UUID, uuid4
 
 import factories
+import jsonschema
 import pytest
 import rawfiles
+import typer
 import yaml
-from prefect import Flow, get_client
+from click.testing import Result as Called
+from prefect import Flow, get_client, runtime
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.objects import State, StateType
 from prefect.exceptions import ParameterTypeError
-from prefect.states import Completed, Pending, Running
+from prefect.states import Completed, Failed, Pending, Running
+from prefect.utilities.callables import parameter_schema
+from typer.testing import CliRunner
 
-from flows import maintenance
+import flows.catalog
+import flows.reprocess
+from flows import WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
 from flows.maintenance import reap_runs
-from flows.reprocess import reprocess
+from flows.reprocess import process_task, reprocess
+from lidarops.campaign import load
+from lidarops.catalog.ledger import RunStatus
+from lidarops.clusters import Local
+from lidarops.errors import LidarOpsError, ProductError, SceneError
+from lidarops.pipeline import Result, Selection, bring_up_to_date
 
 
 @pytest.fixture(scope="session")
@@ -51,6 +66,85 @@ def test_parameters_out_of_range_are_refused(flow: Flow, wrong: dict[str, float]
         flow.validate_parameters({"campaign": "campaign.yaml"} | wrong)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"products": ["luck"]},
+        {"memory_limit": "foo"},
+        {"stations": "coast"},
+    ],
+)
+def test_parameters_of_a_selection_are_validated_before_a_run_is_accepted(
+    wrong: dict[str, Any],
+) -> None:
+    with pytest.raises(ParameterTypeError, match=next(iter(wrong))):
+        reprocess.validate_parameters({"campaign": "campaign.yaml"} | wrong)
+    # What a server refuses, without the code of the flow.
+    schema = parameter_schema(reprocess).model_dump()
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({"campaign": "campaign.yaml"} | wrong, schema)
+
+
+def called(command: Callable[..., None], *words: str) -> Called:
+    """Call a flow as its command line does."""
+    app = typer.Typer()
+    app.command()(command)
+    return CliRunner().invoke(app, list(words))
+
+
+@pytest.mark.parametrize("command", [flows.catalog.main, flows.reprocess.main])
+@pytest.mark.parametrize("content", [None, "name: ["])
+def test_a_missing_or_invalid_campaign_file_is_wrong_use(
+    command: Callable[..., None], content: str | None, tmp_path: Path
+) -> None:
+    """And told before any server is started."""
+    file = tmp_path / "campaign.yaml"
+    if content is not None:
+        file.write_text(content)
+    result = called(command, str(file))
+    assert result.exit_code == 2
+    assert result.output.startswith(f"error: {file}: ")
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--memory-limit", "foo"], "memory_limit"),
+        (["--memory-limit", "2GiB", "--cluster", "slurm"], "memory_limit"),
+        (["--product", "luck"], "homogeneous"),
+        (["--scheduler", "nowhere"], "address"),
+        (["--station", "nope"], "coast"),
+        (["--since", "2024-09-22", "--until", "2024-09-21"], "since"),
+    ],
+)
+def test_wrong_options_of_the_flow_are_wrong_use(
+    words: list[str], said: str, campaign_file: Path
+) -> None:
+    result = called(flows.reprocess.main, str(campaign_file), *words)
+    assert result.exit_code == 2
+    assert said in result.output
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_the_flow_takes_the_options_of_the_command_line(campaign_file: Path) -> None:
+    def products(*words: str) -> int:
+        folder = campaign_file.parent / "out"
+        shutil.rmtree(folder, ignore_errors=True)
+        there = ["--out", str(folder), "--catalog", f"sqlite:///{folder}/other.sqlite"]
+        result = called(flows.reprocess.main, str(campaign_file), *there, *words)
+        # A file of the archive is refused.
+        assert result.exit_code == 1, result.output
+        assert (folder / "other.sqlite").exists()
+        return len(list(folder.rglob("*.nc")))
+
+    asked = ["--station", "coast", "--instrument", "lidar", "--product", "homogeneous"]
+    inside = ["--since", "2026-02-28", "--until", "2026-03-02"]
+    assert products(*asked, *inside, "--wait", "1", "--memory-limit", "1GiB") == 1
+    assert products("--product", "elastic") == 0
+    assert products("--since", "2026-03-05") == 0
+
+
 @pytest.mark.usefixtures("prefect_server")
 def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
     summary = catalog(str(campaign_file))
@@ -69,6 +163,92 @@ def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
     assert no_page is None
     forced, _ = reprocess(str(campaign_file), full=True)
     assert forced.record is not None
+
+
+def without_profile(campaign_file: Path) -> None:
+    """Let the scene of the campaign fail, for an overlap function that is not there."""
+    told = yaml.safe_load(campaign_file.read_text())
+    (facts,) = told["instruments"]["lidar"]["facts"]
+    facts.pop("full_overlap_range")
+    facts["overlap_profile"] = "nowhere.csv"
+    campaign_file.write_text(yaml.safe_dump(told))
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_a_troubled_night_ends_in_a_state_of_its_own_and_says_what_is_wrong(
+    campaign_file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    without_profile(campaign_file)
+    for night in range(2):
+        caplog.clear()
+        state = reprocess(str(campaign_file), return_state=True)
+        # In the second one nothing is tried again, and nothing is well.
+        assert (state.name, state.type) == (WITH_FAILURES, StateType.COMPLETED)
+        assert state.message == "1 scenes failed, 1 files refused"
+        result, _ = state.result()
+        assert (result.record is None) == (night == 1)
+        assert "nowhere.csv" in caplog.text
+        assert "coast/h9: " in caplog.text
+        assert "up to date" not in caplog.text
+    broken = campaign_file.parent / "raw" / "coast" / "h9"
+    broken.unlink()
+    mended = yaml.safe_load(campaign_file.read_text())
+    mended["instruments"]["lidar"]["facts"][0].pop("overlap_profile")
+    campaign_file.write_text(yaml.safe_dump(mended))
+    assert reprocess(str(campaign_file), return_state=True).name == "Completed"
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_the_log_of_a_troubled_night_is_bounded(
+    campaign_file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for k in range(30):
+        rawfiles.write(campaign_file.parent / "raw" / "coast" / f"hb{k:02d}", b"broken")
+    reprocess(str(campaign_file))
+    refused = [record for record in caplog.records if "coast/h" in record.getMessage()]
+    assert len(refused) == 20
+    assert "and 11 more files refused" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("status", "error", "again"),
+    [(RunStatus.STOPPED, ProductError, True), (RunStatus.INTERRUPTED, SceneError, False)],
+)
+def test_a_run_that_gives_up_is_tried_again_and_one_that_is_stopped_is_not(
+    status: RunStatus,
+    error: type[LidarOpsError],
+    *,
+    again: bool,
+    campaign_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    without_profile(campaign_file)
+
+    def given_up(*arguments: Any, **options: Any) -> Result:
+        return replace(bring_up_to_date(*arguments, **options), status=status)
+
+    for name in ("create_progress_artifact", "update_progress_artifact"):
+        monkeypatch.setattr(flows.reprocess, name, lambda *_, **__: None)
+    monkeypatch.setattr(flows.reprocess, "bring_up_to_date", given_up)
+    with pytest.raises(error) as raised:
+        process_task.fn(load(campaign_file), Selection(), Local(), full=False, wait=0.0)
+    assert ("nowhere.csv" in str(raised.value)) == again
+    monkeypatch.setitem(runtime.deployment.FIELDS, "id", lambda: str(uuid4()))
+    assert process_task.retry_condition_fn is not None
+    state = Failed(data=raised.value)
+    assert process_task.retry_condition_fn(process_task, None, state) == again
+
+
+def test_a_night_with_failures_counts_as_one_that_came() -> None:
+    within = timedelta(hours=26)
+    plain = notifications.automations(uuid4(), within=within)
+    assert [each.name for each in plain] == [notifications.FAILED, notifications.ABSENT]
+    event = f"prefect.flow-run.{WITH_FAILURES}"
+    assert event in plain[1].trigger.expect
+    assert event not in plain[0].trigger.expect
+    told = notifications.automations(uuid4(), within=within, failures=True)
+    (troubled,) = [each for each in told if each.name == notifications.TROUBLED]
+    assert troubled.trigger.expect == {event}
 
 
 def claimed(client: SyncPrefectClient, state: State, *tags: str) -> UUID:
