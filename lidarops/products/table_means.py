@@ -94,6 +94,10 @@ BUDGETS: Final = {
     (ProductKind.ELASTIC, "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
     # Nothing tells the noise of its calibration from that of its gates.
     (ProductKind.ELASTIC, "attenuated_backscatter"): Budget(()),
+    # Nothing tells noise from what smoothness takes, which profiles of one sky share.
+    (ProductKind.MULTIANGLE, "optical_depth"): Budget(()),
+    (ProductKind.MULTIANGLE, "extinction"): Budget(()),
+    (ProductKind.MULTIANGLE, "layer_optical_depth"): Budget(()),
     # What the prior allows, which all profiles share, is most of them.
     (ProductKind.VISIBILITY, "extinction"): Budget(()),
     (ProductKind.VISIBILITY, "visibility_in_air"): Budget(()),
@@ -130,7 +134,10 @@ _PARTLY: Final = (
     " ratio and molecules are taken as shared by all profiles, so that they are averaged and do"
     " not shrink with their number."
 )
-_ALL_SHARED: Final = "The errors of the profiles are taken as shared: they are averaged."
+_ALL_SHARED: Final = (
+    "The errors of the profiles are taken as shared: they are averaged. What of them is noise,"
+    " which their number makes smaller, is not told apart."
+)
 
 
 def error_comment(kind: ProductKind, name: str) -> str:

@@ -142,6 +142,38 @@ def test_errors_that_the_profiles_share_do_not_shrink(tmp_path: Path):
     assert (means.usable.to_numpy()[~some] == 2).all()
 
 
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (ProductKind.MULTIANGLE, ["optical_depth", "extinction", "layer_optical_depth"]),
+        (ProductKind.VISIBILITY, ["extinction", "visibility_in_air"]),
+    ],
+)
+def test_profiles_that_share_all_of_an_error_keep_it(
+    kind: ProductKind, names: list[str], tmp_path: Path
+):
+    """What smoothing takes from scans, and a prior from networks, it takes from all of them."""
+
+    def even(data: xr.Dataset) -> xr.Dataset:
+        for name in names:
+            error = data[f"{name}_standard_error"]
+            data[error.name] = error.where(error.isnull(), 0.25 * float(error.mean()))
+        return data
+
+    add_day(tmp_path, 0, kind, change=even)
+    means = only(tmp_path, means_of(tmp_path)).isel(time=0)
+    data = open_products(tmp_path).astype(np.float64).load()
+    for name in names:
+        assert float(means[f"{name}_observations"].max()) >= 4
+        found = means[f"{name}_standard_error"].to_numpy()
+        told = data[f"{name}_standard_error"].max("time").to_numpy()
+        some = np.isfinite(found)
+        assert some.any()
+        np.testing.assert_allclose(found[some], told[some], rtol=1e-6)
+        assert "they are averaged" in means[name].attrs["comment"]
+        assert data[f"{name}_standard_error"].attrs["error_kind"] == ErrorKind.BOTH
+
+
 def test_a_month_holds_all_of_its_days_and_a_year_its_own_file(tmp_path: Path):
     # 1 March 2026 is day 0: these are in February and March 2026, and in December 2025.
     for day in (-62, -3, 2, 4):
