@@ -16,7 +16,7 @@ from lidarops.aggregate.facts import Facts, opened, within
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.products.rows import QUALITY_FLAG, Row
-from lidarops.products.table_means import Budget, averaged, budget, systematic
+from lidarops.products.table_means import INTERVALS, Budget, averaged, budget, systematic
 from lidarops.records import ProductKind
 
 
@@ -71,16 +71,29 @@ def _sample(product: xr.Dataset, kind: ProductKind, row: Row, wanted: NDArray[np
     errors = numbers(product, f"{row.name}_standard_error")
     found = budget(kind, row.name)
     random, shared = (errors, ()) if found is None else _divided(product, found, errors)
-    apart = systematic(kind, row.name)
     judged = row.dims == product[QUALITY_FLAG].dims
     return Sample(
         values,
         errors,
         random,
         shared,
-        numbers(product, apart) if apart and apart in product else None,
+        _apart(product, kind, row.name, values, errors),
         wanted if judged else np.ones(values.shape, np.bool_),
     )
+
+
+def _apart(
+    product: xr.Dataset, kind: ProductKind, name: str, values: Array, errors: Array
+) -> Array | None:
+    """Return the error that stands apart from the standard error, or that an interval tells."""
+    if name in INTERVALS:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            whole = values / numbers(product, INTERVALS[name]) - 1.0
+            # Where there is nearly no systematic error, rounding may leave less than nothing.
+            apart: Array = values * np.sqrt(np.maximum(whole**2 - (errors / values) ** 2, 0.0))
+        return apart
+    found = systematic(kind, name)
+    return numbers(product, found) if found and found in product else None
 
 
 def _divided(product: xr.Dataset, found: Budget, errors: Array) -> tuple[Array, tuple[Array, ...]]:

@@ -94,6 +94,10 @@ BUDGETS: Final = {
     (ProductKind.ELASTIC, "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
     # Nothing tells the noise of its calibration from that of its gates.
     (ProductKind.ELASTIC, "attenuated_backscatter"): Budget(()),
+    # Nothing tells noise from what smoothness takes, which profiles of one sky share.
+    (ProductKind.MULTIANGLE, "optical_depth"): Budget(()),
+    (ProductKind.MULTIANGLE, "extinction"): Budget(()),
+    (ProductKind.MULTIANGLE, "layer_optical_depth"): Budget(()),
     # What the prior allows, which all profiles share, is most of them.
     (ProductKind.VISIBILITY, "extinction"): Budget(()),
     (ProductKind.VISIBILITY, "visibility_in_air"): Budget(()),
@@ -113,11 +117,21 @@ def systematic(kind: ProductKind, name: str) -> str | None:
     Returns
     -------
     str or None
-        Such as ``extinction_model_error``.
+        Such as ``extinction_model_error``; of products or, from `INTERVALS`, of means alone.
     """
+    if name in INTERVALS:
+        return f"{name}_systematic_error"
     names = (row.name for row in LAYOUTS[kind].data)
     found = (each for each in names if each.startswith(f"{name}_") and each.endswith("_error"))
     return next(found, None)
+
+
+INTERVALS: Final = {"visibility_in_air": "visibility_in_air_lower"}
+"""Quantities whose systematic error products tell by the lower end of an interval alone.
+
+They are reciprocals: of a quantity with the relative random and systematic errors r and s, the
+value over the lower end is 1 + sqrt(r^2 + s^2).
+"""
 
 
 _INDEPENDENT: Final = (
@@ -130,7 +144,10 @@ _PARTLY: Final = (
     " ratio and molecules are taken as shared by all profiles, so that they are averaged and do"
     " not shrink with their number."
 )
-_ALL_SHARED: Final = "The errors of the profiles are taken as shared: they are averaged."
+_ALL_SHARED: Final = (
+    "The errors of the profiles are taken as shared: they are averaged. What of them is noise,"
+    " which their number makes smaller, is not told apart."
+)
 
 
 def error_comment(kind: ProductKind, name: str) -> str:
@@ -191,10 +208,11 @@ _ADJECTIVE: Final = {Period.DAY: "Daily", Period.MONTH: "Monthly"}
 def _rows(source: Layout, kind: ProductKind, weights: Weights) -> Iterator[Row]:
     judged = source.row("quality_flag")
     for row in averaged(kind):
-        yield from _of(row, kind, weights)
         apart = systematic(kind, row.name)
+        yield from _of(row, kind, weights, apart)
         if apart:
-            yield _averaged_error(source.row(apart), row)
+            of = _of_interval(row, apart) if row.name in INTERVALS else source.row(apart)
+            yield _averaged_error(of, row)
     yield Row(
         name="usable_share",
         dims=judged.dims,
@@ -215,11 +233,13 @@ def _rows(source: Layout, kind: ProductKind, weights: Weights) -> Iterator[Row]:
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
 
 
-def _of(row: Row, kind: ProductKind, weights: Weights) -> Iterator[Row]:
+def _of(row: Row, kind: ProductKind, weights: Weights, apart: str | None) -> Iterator[Row]:
     """Give the rows of the mean of a quantity."""
     weighed, errors = f"Weights: {weights.description}.", error_comment(kind, row.name)
     count, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
     ancillaries: tuple[str, ...] = (spread, count)
+    if apart:
+        ancillaries = (apart, *ancillaries)
     if len(row.dims) > 1:
         ancillaries = (*ancillaries, "usable_share", "quality_flag")
     yield replace(
@@ -260,6 +280,25 @@ def _cell_methods(row: Row, method: str) -> str:
     rest = told.removeprefix("time: mean").strip()
     ours = f"time: {method} (of usable profiles)"
     return f"{ours} {rest}".strip()
+
+
+def _of_interval(row: Row, name: str) -> Row:
+    """Return the row of the systematic error that the interval of a quantity tells."""
+    lower = INTERVALS[row.name]
+    return replace(
+        row,
+        name=name,
+        long_name=f"systematic error of {row.long_name} to allow for",
+        coverage=Coverage.QUALITY,
+        standard_name=None,
+        valid_min=0.0,
+        ancillaries=(),
+        uncertain=False,
+        error_kind=ErrorKind.SYSTEMATIC,
+        comment=f"Apart from {row.name}_standard_error: {row.name} times the relative systematic"
+        f" error of extinction, sqrt(({row.name} / {lower} - 1)^2 - ({row.name}_standard_error /"
+        f" {row.name})^2) in each profile. {NO_NAME}",
+    )
 
 
 def _averaged_error(row: Row, of: Row) -> Row:

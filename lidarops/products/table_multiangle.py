@@ -103,7 +103,7 @@ def _gradient_error(quantity: str, called: str, units: str) -> Row:
         valid_min=0.0,
         significant_bits=8,
         error_kind=ErrorKind.SYSTEMATIC,
-        comment=f"Apart from the random error in {quantity}_standard_error: what the largest"
+        comment=f"Apart from {quantity}_standard_error, of noise and smoothing: what the largest"
         " horizontal gradient of ln backscatter that the settings declare would do. Near 0 where"
         f" rays lead to all sides. {NO_NAME}",
     )
@@ -128,7 +128,9 @@ MULTIANGLE: Final = Layout(
     comment="Model: the logarithm of the range-corrected signal at an altitude falls by twice the"
     " optical depth times the slant path over the vertical one, in air that is level over the"
     " scan. A profile is one scan cycle. Inhomogeneity and smoothness are common to all cycles"
-    " of the file.",
+    " of the file. What smoothness takes from a profile it takes from every profile of one sky, so"
+    " that a mean over time does not make the errors of optical depth and extinction smaller;"
+    " methods that do not smooth state noise alone, which a mean over time then overstates.",
     sampled="altitude",
     unused_steps=frozenset({"average", "reference"}),
     coordinates=(
@@ -159,6 +161,7 @@ MULTIANGLE: Final = Layout(
             ),
             significant_bits=_BITS,
             uncertain=True,
+            error_kind=ErrorKind.BOTH,
             comment="Vertical, molecules and particles together, at the wavelength of the channel."
             f" {NO_NAME}",
         ),
@@ -195,6 +198,7 @@ MULTIANGLE: Final = Layout(
             ),
             significant_bits=_BITS,
             uncertain=True,
+            error_kind=ErrorKind.BOTH,
             comment="Of the layer in altitude_bnds; molecules and particles together, at the"
             f" wavelength of the channel. {NO_NAME}",
         ),
@@ -257,6 +261,7 @@ MULTIANGLE: Final = Layout(
             ancillaries=("layer_optical_depth_gradient_error",),
             significant_bits=_BITS,
             uncertain=True,
+            error_kind=ErrorKind.BOTH,
             optional=True,
             comment="Vertical, molecules and particles together, at the wavelength of the channel."
             " Missing where quality_flag at a bound of the layer forbids the use of a value."

@@ -166,10 +166,16 @@ def typical(information: Array, share: Array) -> tuple[Array, Array]:
     """
     used = information > 0.0
     count = used.sum(axis=0)
-    kept = count >= max(0.5 * count.max(), 1.0)
+    kept = _common(count)
     divisor = np.maximum(count, 1)
     mean = np.where(kept, information.sum(axis=0) / divisor, 0.0)
     return mean, np.where(used, share, 0.0).sum(axis=0) / divisor
+
+
+def _common(count: Integers) -> Booleans:
+    """Return the heights that at least half as many profiles have as any height."""
+    common: Booleans = count >= max(0.5 * count.max(), 1.0)
+    return common
 
 
 def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
@@ -177,8 +183,8 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
 
     What smoothing takes from a profile is in proportion to its extinction: of a haze that is
     three times as thick, three times as much. At the highest altitude within the reach of a
-    profile, with the variance V of its optical depth and the weighted mean R of the squares of
-    all that reach it,
+    profile that half of the block reach too, with the variance V of its optical depth and the
+    weighted mean R of the squares of all that reach it,
 
     .. math:: \max\left(\tfrac14, \frac{\tau^2 + V}{R + V}\right),
 
@@ -194,7 +200,9 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     -------
     (profile,) float64
     """
-    tops, own = np.unique(within.sum(axis=1) - 1, return_inverse=True)
+    # Beyond that, a profile would be compared with few others, or with itself.
+    shared = int(np.flatnonzero(_common(within.sum(axis=0)))[-1])
+    tops, own = np.unique(np.minimum(within.sum(axis=1) - 1, shared), return_inverse=True)
     reached = within[:, tops]
     square = np.where(reached, depth[:, tops] ** 2, np.nan)
     noise = np.where(reached, variance[:, tops], np.nan)

@@ -23,6 +23,8 @@ from lidarops.products.rows import ErrorKind
 from lidarops.products.table import LAYOUTS
 from lidarops.products.table_means import BUDGETS, Period, Weights, averaged, layout, systematic
 from lidarops.records import DetectionMode, ProductKind
+from lidarops.retrieve.labeled_visibility import Definition, of_extinction
+from lidarops.retrieve.visibility import WavelengthLaw
 
 
 def findings(path: Path) -> list[set[str]]:
@@ -140,6 +142,81 @@ def test_errors_that_the_profiles_share_do_not_shrink(tmp_path: Path):
     assert np.isnan(means.backscatter.to_numpy()[~some]).all()
     assert (means.quality_flag.to_numpy()[~some] & int(Quality.rejecting()) != 0).all()
     assert (means.usable.to_numpy()[~some] == 2).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (ProductKind.MULTIANGLE, ["optical_depth", "extinction", "layer_optical_depth"]),
+        (ProductKind.VISIBILITY, ["extinction", "visibility_in_air"]),
+    ],
+)
+def test_profiles_that_share_all_of_an_error_keep_it(
+    kind: ProductKind, names: list[str], tmp_path: Path
+):
+    """What smoothing takes from scans, and a prior from networks, it takes from all of them."""
+
+    def even(data: xr.Dataset) -> xr.Dataset:
+        for name in names:
+            error = data[f"{name}_standard_error"]
+            data[error.name] = error.where(error.isnull(), 0.25 * float(error.mean()))
+        return data
+
+    add_day(tmp_path, 0, kind, change=even)
+    means = only(tmp_path, means_of(tmp_path)).isel(time=0)
+    data = open_products(tmp_path).astype(np.float64).load()
+    for name in names:
+        assert float(means[f"{name}_observations"].max()) >= 4
+        found = means[f"{name}_standard_error"].to_numpy()
+        told = data[f"{name}_standard_error"].max("time").to_numpy()
+        some = np.isfinite(found)
+        assert some.any()
+        np.testing.assert_allclose(found[some], told[some], rtol=1e-6)
+        assert "they are averaged" in means[name].attrs["comment"]
+        assert data[f"{name}_standard_error"].attrs["error_kind"] == ErrorKind.BOTH
+
+
+def test_means_of_visibility_state_the_systematic_error_of_extinction(tmp_path: Path):
+    add_day(tmp_path, 0, ProductKind.VISIBILITY)
+    means = only(tmp_path, means_of(tmp_path)).isel(time=0)
+    data = open_products(tmp_path, usable=1).astype(np.float64).load()
+    # The retrieval that was made up has a systematic error of 3 percent, a random one of 2.
+    expected = 0.03 * data.visibility_in_air.mean("time")
+    found = means.visibility_in_air_systematic_error
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert found.attrs["error_kind"] == "systematic"
+    assert found.name in means.visibility_in_air.attrs["ancillary_variables"].split()
+
+
+@pytest.mark.parametrize("law", [WavelengthLaw.NONE, WavelengthLaw.KRUSE])
+def test_many_profiles_do_not_hide_what_the_model_does_to_visibility(
+    law: WavelengthLaw, tmp_path: Path
+):
+    """Extinction is too large by its declared error in all profiles, which no mean removes."""
+    definition = Definition(wavelength=532e-9, law=law)
+    true, random, declared = 2e-4, 6e-6, 2e-5
+
+    def off(data: xr.Dataset) -> xr.Dataset:
+        noise = np.random.default_rng(8).normal(0.0, random, data.extinction.shape)
+        # `add_day` has scaled the extinction, which is none of ours.
+        data["extinction"] = data.extinction.dims, true + declared + noise
+        data["extinction_standard_error"] = xr.full_like(data.extinction, random)
+        data["extinction_model_error"] = xr.full_like(data.extinction, declared)
+        data["quality_flag"] = xr.zeros_like(data.quality_flag)
+        seen = of_extinction(
+            data.extinction, data.extinction_standard_error, data.extinction_model_error, definition
+        )
+        return data.assign(seen.data_vars)
+
+    add_day(tmp_path, 0, profiles=100, change=off)
+    means = only(tmp_path, means_of(tmp_path)).isel(time=0)
+    one = of_extinction(*(xr.DataArray(value) for value in (true, random, declared)), definition)
+    bias = np.abs(means.visibility_in_air - one.visibility_in_air)
+    error, apart = (means[f"visibility_in_air_{of}_error"] for of in ("standard", "systematic"))
+    assert (error < 0.02 * means.visibility_in_air).all()
+    assert (bias > 4.0 * error).all()
+    assert (bias < 1.3 * apart).all()
+    assert (bias > 0.7 * apart).all()
 
 
 def test_a_month_holds_all_of_its_days_and_a_year_its_own_file(tmp_path: Path):

@@ -191,6 +191,20 @@ def test_profiles_are_compared_at_the_reach_of_each():
     np.testing.assert_allclose(scale, [1.0, 1.0, 1.0, 16.0 / 4.75], rtol=1e-6)
 
 
+@pytest.mark.parametrize("farther", [1, 2])
+def test_profiles_that_reach_farther_are_not_compared_with_themselves(farther):
+    """Thick hazes that alone are seen one gate higher are as thick as without that gate."""
+    amounts = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 2.0])
+    depth, variance, within = hazes(amounts)
+    equal = _calibration.relative_squares(depth[:, :-1], variance[:, :-1], within[:, :-1])
+    few = slice(0, amounts.size - farther)
+    within[few, -1] = False
+    depth[few, -1] = variance[few, -1] = np.nan
+    scale = _calibration.relative_squares(depth, variance, within)
+    np.testing.assert_allclose(scale, equal, rtol=1e-9)
+    np.testing.assert_allclose(scale[5], 9.0 / np.mean(amounts**2), rtol=1e-6)
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-6])
 def test_profiles_without_optical_depth_are_as_usual(noise):
     within = np.ones((9, 4), dtype=bool)
