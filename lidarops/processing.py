@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import dask.config
 import numpy as np
@@ -57,6 +57,9 @@ _FAILURES = (
     RuntimeError,
     MemoryError,
 )
+
+
+_VANISHED: Final = "vanished after it was catalogued (run lidarops catalog again)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,6 +221,8 @@ def _digest(
             if known is None:
                 read += granule.size
                 known = _read_digest(granule, root)
+        except FileNotFoundError:
+            refused.append(replace(granule, status=Status.REFUSED, reason=_VANISHED))
         except (LidarOpsError, OSError) as error:
             reason = str(error).removeprefix(f"{granule.path}: ")
             refused.append(replace(granule, status=Status.REFUSED, reason=reason))

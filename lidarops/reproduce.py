@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -17,8 +17,9 @@ import numpy as np
 import xarray as xr
 from pydantic import ValidationError
 
-from lidarops.campaign import Campaign
-from lidarops.errors import LidarOpsError, ProductError
+from lidarops.campaign import CATALOG_VARIABLE, Campaign
+from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError, LidarOpsError, ProductError
 from lidarops.processing import Job, process
 from lidarops.products.provenance import (
     EPOCH_VARIABLE,
@@ -33,6 +34,10 @@ _RAW: Final = (Role.SIGNAL, Role.DARK)
 """Roles of files of the archive; those of the others lie beside the campaign file."""
 _SHOWN: Final = 20
 """Files of one kind of trouble that are told by name."""
+_IF_MOVED: Final = (
+    "Raw files that were moved are found by content in a catalog that has seen them since: run"
+    " lidarops catalog, and tell where it is with --catalog if it does not lie above the product."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,11 +150,13 @@ def reproduce(
     *,
     archive: str | Path | None = None,
     ancillary: str | Path | None = None,
+    catalog: str | None = None,
 ) -> Reproduction:
     """Make a product again in a temporary folder and compare it with what it is.
 
     Station, facts of the instrument, settings, plan and digests of all inputs are those that the
-    product itself holds; no campaign file or catalog is read.
+    product itself holds; no campaign file is read, and a catalog only where raw files are not
+    what they were under their names: there, files that were moved are found by content.
 
     Parameters
     ----------
@@ -161,6 +168,9 @@ def reproduce(
     ancillary : path or str, optional
         Folder of the campaign file, from which soundings and overlap functions are named;
         looked for like the archive where it is not given.
+    catalog : str, optional
+        SQLAlchemy URL of a catalog that has seen where raw files were moved to; without it that
+        of ``LIDAROPS_CATALOG``, or the nearest ``catalog.sqlite`` above the product.
 
     Returns
     -------
@@ -170,13 +180,15 @@ def reproduce(
     ------
     ProductError
         If the file is no product, does not tell enough, or its inputs are nowhere to be found.
+    CatalogError
+        If the catalog that is given cannot be used.
     """
     told = _Told.of(Path(product))
     raw = [record for record in told.inputs if record.role in _RAW]
     beside = [record for record in told.inputs if record.role not in _RAW]
-    with _staged(told, raw, archive, "--archive") as root:
-        folder = _folder_of(told, beside, ancillary, "--ancillary") if beside else root
-        changed = [*_changed(root, raw), *_changed(folder, beside)]
+    with _staged(told, raw, archive, catalog) as (root, wrong):
+        folder = _beside(told, beside, ancillary) if beside else root
+        changed = [*wrong, *_changed(folder, beside)]
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))
         software = tuple(_software(told))
@@ -190,35 +202,118 @@ def reproduce(
 
 @contextmanager
 def _staged(
-    told: _Told, records: Sequence[InputRecord], archive: str | Path | None, option: str
-) -> Iterator[Path]:
-    """Give a local folder of the raw files."""
-    if "://" not in str(archive):
-        yield _folder_of(told, records, archive, option)
-        return
+    told: _Told, records: Sequence[InputRecord], archive: str | Path | None, catalog: str | None
+) -> Iterator[tuple[Path, list[Difference]]]:
+    """Give a local folder of the raw files under their old names, and what is wrong with them."""
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
+        staged = Path(name)
+        there = {record.path: record.path for record in records}
+        if "://" in str(archive):
+            root, bring = staged, _from_store(str(archive), staged)
+            bring(there)
+        else:
+            root = _raw_folder(told, records, archive, catalog)
+            bring = _from_folder(root, staged)
+        changed = list(_changed(root, records))
+        wrong = {each.name for each in changed}
+        lost = [record for record in records if record.path in wrong]
+        moved = _moved(told, lost, catalog)
+        if moved:
+            bring({**there, **moved} if root is not staged else moved)
+            root = staged
+            wrong = {each.name for each in _changed(root, lost)}
+        yield root, [each for each in changed if each.name in wrong]
+
+
+def _from_store(archive: str, staged: Path) -> Callable[[Mapping[str, str]], None]:
+    """Return what copies files, old name -> name, from behind a URL."""
     import fsspec  # noqa: PLC0415 - most archives are local
 
-    store, prefix = fsspec.core.url_to_fs(str(archive))
-    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        for record in records:
-            target = Path(folder) / record.path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            source = f"{prefix.rstrip('/')}/{record.path}"
+    store, prefix = fsspec.core.url_to_fs(archive)
+
+    def bring(names: Mapping[str, str]) -> None:
+        for old, now in names.items():
+            source = f"{prefix.rstrip('/')}/{now}"
             if store.exists(source):
-                store.get_file(source, str(target))
-        yield Path(folder)
+                store.get_file(source, str(_cleared(staged / old)))
+
+    return bring
 
 
-def _folder_of(
-    told: _Told, records: Sequence[InputRecord], given: str | Path | None, option: str
+def _from_folder(folder: Path, staged: Path) -> Callable[[Mapping[str, str]], None]:
+    """Return what links to files of a folder, old name -> name."""
+
+    def bring(names: Mapping[str, str]) -> None:
+        for old, now in names.items():
+            if (folder / now).is_file():
+                _cleared(staged / old).symlink_to((folder / now).absolute())
+
+    return bring
+
+
+def _cleared(target: Path) -> Path:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    return target
+
+
+def _moved(told: _Told, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
+    """Return old name -> name of the files whose content a catalog knows under another name."""
+    url = catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(told.file)
+    if not lost or not url:
+        return {}
+    try:
+        with Store(url, str(told.about["lidarops:campaign"]), create=False) as store:
+            found = store.paths_by_digest({record.sha256 for record in lost})
+    except CatalogError:
+        # Nobody has asked for one that was only come across.
+        if catalog is not None:
+            raise
+        return {}
+    now = {record.path: found.get(record.sha256, record.path) for record in lost}
+    return {old: new for old, new in now.items() if old != new}
+
+
+def _nearest_catalog(file: Path) -> str:
+    for parent in file.resolve().parents:
+        if (parent / "catalog.sqlite").is_file():
+            return f"sqlite:///{parent / 'catalog.sqlite'}"
+    return ""
+
+
+def _raw_folder(
+    told: _Told, records: Sequence[InputRecord], given: str | Path | None, catalog: str | None
 ) -> Path:
     if given is not None:
         return Path(given)
-    for parent in told.file.resolve().parents:
+    found = _folder_with(told.file, [record.path for record in records])
+    if found is None:
+        found = _folder_with(told.file, list(_moved(told, records, catalog).values()))
+    if found is None:
+        raise _nowhere(told, records, "--archive")
+    return found
+
+
+def _beside(told: _Told, records: Sequence[InputRecord], given: str | Path | None) -> Path:
+    if given is not None:
+        return Path(given)
+    found = _folder_with(told.file, [record.path for record in records])
+    if found is None:
+        raise _nowhere(told, records, "--ancillary")
+    return found
+
+
+def _folder_with(file: Path, paths: Sequence[str]) -> Path | None:
+    """Return the nearest folder above a file, or in one above, that holds one of some paths."""
+    for parent in file.resolve().parents:
         for folder in (parent, *_folders_in(parent)):
-            if any((folder / record.path).is_file() for record in records):
+            if any((folder / path).is_file() for path in paths):
                 return folder
-    raise ProductError(
+    return None
+
+
+def _nowhere(told: _Told, records: Sequence[InputRecord], option: str) -> ProductError:
+    return ProductError(
         f"was made from {records[0].path}, which lies in no folder above the product",
         file=told.file,
         remedy=f"tell where with {option}",
@@ -479,4 +574,6 @@ def explain(result: Reproduction) -> str:
         lines += [f"  {what} {each.name}: {each.problem}" for each in named[:_SHOWN]]
         if len(named) > _SHOWN:
             lines.append(f"  ... and {len(named) - _SHOWN} more of {what}")
+    if any(each.what == "input" for each in result.differences):
+        lines.append(f"  {_IF_MOVED}")
     return "\n".join(lines)

@@ -16,6 +16,9 @@ from lidarops.errors import CatalogError
 
 BATCH = 1000
 """Rows a statement, where a list of them is asked for."""
+_MOVE_AWAY: Final = "move it away: a new one is made from the archive, and products are made again"
+_BROKEN: Final = ("malformed", "not a database")
+"""Words of SQLite about a file that is damaged."""
 _WITHOUT_USABLE: Final = 2
 """The version of the tables before products had `usable`."""
 
@@ -133,7 +136,7 @@ class Database:
         return CatalogError(
             f"is a catalog of version {found}, and this lidarops works with {SCHEMA_VERSION}",
             file=self.place,
-            remedy="move it away: a new one is made from the archive, and products are made again"
+            remedy=_MOVE_AWAY
             if older
             else "use the newer lidarops that made it, or another catalog",
         )
@@ -144,6 +147,8 @@ class Database:
             remedy = "make space on the disk, then run again: what is done stays done"
         elif "readonly" in cause or "read-only" in cause:
             remedy = "make the folder writable, or choose another with --out or LIDAROPS_CATALOG"
+        elif self._sqlite and any(word in cause for word in _BROKEN):
+            remedy = _MOVE_AWAY
         else:
             remedy = "check that the folder is writable and the file is a lidarops catalog"
         return CatalogError(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)

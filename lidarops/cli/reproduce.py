@@ -23,6 +23,15 @@ def reproduce(
         Path | None,
         typer.Option("--ancillary", help="Folder of soundings and overlap functions."),
     ] = None,
+    catalog: Annotated[
+        str | None,
+        typer.Option(
+            "--catalog",
+            help="SQLAlchemy URL of a catalog that knows where raw files were moved to;"
+            " looked for if not told.",
+            metavar="URL",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make a product again from its own provenance; exit code 0 where every byte is the same.
@@ -34,6 +43,6 @@ def reproduce(
     from lidarops.reproduce import explain
     from lidarops.reproduce import reproduce as make_again
 
-    result = make_again(product, archive=archive, ancillary=ancillary)
+    result = make_again(product, archive=archive, ancillary=ancillary, catalog=catalog)
     typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain(result))
     leave(failed=not result.identical)

@@ -297,6 +297,21 @@ def _rows(store: Store) -> list[tuple[object, ...]]:
         ]
 
 
+@pytest.mark.parametrize("damage", ["no database", "a page overwritten"])
+def test_a_damaged_catalog_says_that_a_new_one_can_be_made(damage: str, campaign: Campaign) -> None:
+    file = Path(campaign.output) / "catalog.sqlite"
+    with Store(campaign.catalog_url, campaign.name):
+        pass
+    content = file.read_bytes()
+    broken = b"?" * 8192 if damage == "no database" else content[:100] + b"?" * 8192
+    file.write_bytes(broken + content[len(broken) :])
+    with (
+        pytest.raises(CatalogError, match="move it away: a new one is made from the archive"),
+        Store(campaign.catalog_url, campaign.name) as damaged,
+    ):
+        damaged.granules()
+
+
 def _deadly(read: headers.Headers, due: headers.Due) -> GranuleRow:
     """Take down any process but the first."""
     if multiprocessing.parent_process() is not None and due.file.path == "coast/h13":

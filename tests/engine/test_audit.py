@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,46 @@ def test_a_selection_without_any_scene_is_told_from_one_whose_products_are_fresh
         fresh = said(*words)
         assert "is fresh" in fresh
         assert none not in fresh
+
+
+def test_a_product_is_made_again_from_raw_files_that_were_moved(
+    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made(product: Path, *words: str) -> tuple[int, str]:
+        done = CliRunner().invoke(app, ["reproduce", str(product), *words])
+        return done.exit_code, done.output
+
+    monkeypatch.delenv("LIDAROPS_CATALOG", raising=False)
+    product = sorted((archive.folder / "out/products").rglob("poor/signal/**/*.nc"))[-1]
+    raw = archive.folder / "raw" / "poor"
+    (raw / "h10").rename(raw / "h-moved")
+    code, said = made(product)
+    assert code == 1
+    assert "input poor/h10: missing" in said
+    assert "--catalog" in said
+    # Another file takes the name of one that is an input.
+    (raw / "h11").rename(raw / "h-too")
+    (raw / "h00").rename(raw / "h11")
+    before = product.stat().st_mtime_ns
+    CliRunner().invoke(app, ["reprocess", str(archive.file)])
+    assert product.stat().st_mtime_ns == before
+    code, said = made(product)
+    assert code == 0, said
+    # Not one is left under its name.
+    (raw / "h12").rename(raw / "h-last")
+    (raw / "h11").rename(raw / "h-first")
+    CliRunner().invoke(app, ["catalog", str(archive.file)])
+    assert made(product)[0] == 0
+    elsewhere = Path(shutil.copy(product, tmp_path.parent / f"{tmp_path.name}.nc"))
+    catalog = f"sqlite:///{archive.folder}/out/catalog.sqlite"
+    for place in (str(archive.folder / "raw"), f"file://{archive.folder}/raw"):
+        assert made(elsewhere, "--archive", place)[0] == 1
+        assert made(elsewhere, "--archive", place, "--catalog", catalog)[0] == 0
+    (raw / "h-last").unlink()
+    code, said = made(product)
+    assert code == 1
+    assert "input poor/h12: missing" in said
+    assert "h10" not in said
+    nothing = made(product, "--catalog", f"sqlite:///{archive.folder}/none.sqlite")
+    assert nothing[0] == 1
+    assert "there is no catalog yet" in nothing[1]

@@ -14,7 +14,7 @@ from lidarops import engine
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
-from lidarops.engine import Ended, Stop, alone, carry_out, local_client
+from lidarops.engine import Ended, Stop, alone, carry_out, local_client, make_jobs, process_all
 from lidarops.errors import SceneError
 from lidarops.pipeline import Options, Selection, bring_up_to_date, prepare, reprocess
 from lidarops.processing import Job, failed
@@ -41,6 +41,16 @@ def test_workers_make_the_bytes_that_one_process_makes(archive: Archive, client:
     together = reprocess(campaign, client=client)
     assert made(alone) == made(together)
     assert archive.contents("alone/products") == archive.contents("out/products")
+
+
+def test_a_file_that_vanishes_after_the_scan_is_refused_as_such(archive: Archive) -> None:
+    campaign = archive.write()
+    jobs = make_jobs(campaign, prepare(campaign, instruments=["poor"]))
+    (archive.folder / "raw/poor/h10").unlink()
+    refused = [granule for outcome in process_all(jobs) for granule in outcome.refused]
+    (granule,) = refused
+    assert granule.path == "poor/h10"
+    assert granule.reason == "vanished after it was catalogued (run lidarops catalog again)"
 
 
 def test_a_scene_that_kills_its_worker_is_refused_by_name(archive: Archive) -> None:
