@@ -19,8 +19,9 @@ PILOT: Final = 0.01
 """Weight of smoothness of the pilot solution over that of the solution."""
 _MOST_ROWS: Final = 256
 _LARGEST_DEVIATION: Final = 3.0
-_LEAST_SCALE: Final = 0.25
-"""A profile of little optical depth may have structure all the same."""
+_LEAST_SCALE: Final = 0.7
+"""A thin haze may have a sharp layer all the same. With 1, errors would be too large where profiles
+differ by noise alone, and those of thin hazes more than those of thick ones."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -186,7 +187,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     profile that half of the block reach too, with the variance V of its optical depth and the
     weighted mean R of the squares of all that reach it,
 
-    .. math:: \max\left(\tfrac14, \frac{\tau^2 + V}{R + V}\right),
+    .. math:: \max\left(0.7, \frac{\tau^2 + V}{R + V}\right),
 
     which is 1 where noise hides the optical depth.
 

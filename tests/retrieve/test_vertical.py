@@ -9,6 +9,7 @@ import pytest
 from angle_scenes import clear, clear_depth, cloud, estimates, kano_hamilton, simulate
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import erf
 from test_banded import dense
 
 from lidarops.errors import RetrievalInputError
@@ -228,6 +229,26 @@ def test_standard_errors_are_as_honest_of_thick_hazes_as_of_thin_ones(correlatio
     assert 0.7 < rms(deviation[thick]) / rms(deviation[thin]) < 1.4
     assert rms(deviation) < 1.0
     assert np.nanmax(np.abs(deviation)) < 5.0
+
+
+def test_sharp_layers_in_thin_hazes_are_nearly_as_honest_beside_thick_ones():
+    """Hazes that are smooth and thick do not make smoothing look harmless where air is thin."""
+    thin, extinction = 8, 1e-4
+    deviations = []
+    for seed in range(8):
+        scene = clear(3000.0)
+        amount = np.where(np.arange(32) < thin, 0.3, 5.0)[:, np.newaxis]
+        haze = 0.05e-3 * 1200.0 * -np.expm1(-scene.altitude / 1200.0)
+        air = 0.0131e-3 * 8000.0 * -np.expm1(-scene.altitude / 8000.0)
+        sharp = extinction * 100.0 * np.sqrt(0.5 * np.pi)
+        sharp = sharp * (erf((scene.altitude - 2500.0) / (100.0 * np.sqrt(2.0))) + 1.0)
+        scene = dataclasses.replace(scene, truth=air + amount * haze + (amount < 1.0) * sharp)
+        result = solve(scene, estimates(scene, 32, np.random.default_rng(seed), 0.3))
+        score = (result.extinction - truth_of(scene, result)[1]) / result.extinction_standard_error
+        deviations.append(np.where(result.prior_dominated, np.nan, score)[:thin])
+    deviation = np.concatenate(deviations)
+    assert rms(deviation) < 1.0
+    assert np.mean(np.abs(deviation[np.isfinite(deviation)]) > 4.0) < 0.01
 
 
 @pytest.mark.parametrize("correlation", [0.5, 0.8, 0.95])
