@@ -270,6 +270,23 @@ def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
     assert weaker.all()
 
 
+@pytest.mark.parametrize("name", FIELDS)
+def test_rays_that_profiles_lack_cost_no_more_than_what_they_saw(name):
+    net, field = three_by_two(), FIELDS[name]
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field), 0.02, 50, seed=2)
+    lost = np.random.default_rng(2).random((50, net.rays, 1)) < 0.25
+    found = [
+        solve(one, r, net, variance=variance, full_overlap_range=100.0)
+        for one in (power, np.where(lost, np.nan, power))
+    ]
+    kept = [np.isfinite(one.extinction) & ~one.flags.flagged for one in found]
+    # Of a vertex that two rays see, at best (3 / 4)^2 are without a flag.
+    assert kept[1].sum() > 0.4 * kept[0].sum()
+    score = (found[1].extinction - at_vertices(net, field)) / found[1].extinction_standard_error
+    assert np.all(np.abs(score[kept[1]]) < 4.0)
+
+
 def test_average_signals_before_not_solutions_afterwards():
     net = triangle()
     r = grid(net)
