@@ -303,6 +303,38 @@ def test_vertices_that_only_lost_rays_saw_are_missing():
     np.testing.assert_allclose(np.exp(result.logarithm[0, seen]), 2e-3, rtol=0.02)
 
 
+@pytest.mark.parametrize("deviation", [np.inf, 0.1])
+@pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
+def test_a_ray_of_singular_covariance_is_left_out(deviation, bad):
+    _, layout, data, problem = case(3)
+    clean = problem.afresh(deviation)
+    without = data.take(np.arange(3))
+    without.usable[1, : layout.first_crossing[1]] = 0
+    data.covariance[1, : layout.offset[1]] = bad
+    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    found, expected = (_prior._Problem(one, *where).afresh(deviation) for one in (data, without))
+    assert np.all(found.status == _network.SOLVED)
+    np.testing.assert_array_equal(found.degrees_of_freedom, expected.degrees_of_freedom)
+    assert np.array_equal(np.isfinite(found.logarithm), np.isfinite(expected.logarithm))
+    np.testing.assert_allclose(found.logarithm, expected.logarithm, rtol=1e-4)
+    np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-2)
+    for one in ("logarithm", "variance", "chi_square", "prior_chi_square"):
+        mine, others = getattr(found, one)[[0, 2]], getattr(clean, one)[[0, 2]]
+        np.testing.assert_array_equal(mine, others)
+
+
+def test_a_profile_of_singular_covariances_is_not_determined():
+    _, layout, data, _ = case(3)
+    data.covariance[1] = 0.0
+    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    for deviation in (np.inf, 0.1):
+        found = _prior._Problem(data, *where).afresh(deviation)
+        assert found.status.tolist() == [
+            _network.SOLVED, _network.UNDETERMINED, _network.SOLVED
+        ]  # fmt: skip
+        assert np.isnan(found.logarithm[1]).all()
+
+
 def test_prior_with_an_only_vertex_is_finite():
     precision, norm = _prior._free_level(_prior._gradient(np.zeros((1, 3))), 0.1)
     assert np.isfinite(precision).all()
