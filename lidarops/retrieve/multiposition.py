@@ -99,8 +99,8 @@ class VertexFlags:
     """A ray of the vertex is too noisy there, and was left out; the others stand."""
     bridged: Booleans
     """A ray of the vertex has gates that lie far off their neighbours: these took the place of
-    single ones. Several together, which may be air, were left as they are, and what they change
-    is part of the standard error. The value stands."""
+    single ones. Several together, which may be air, were left as they are, and what they and the
+    gates between two edges change is part of the standard error. The value stands."""
     outlying: Booleans
     """A ray of the vertex has so many such gates before it that it was left out."""
     pole: Booleans
