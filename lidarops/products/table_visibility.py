@@ -222,9 +222,8 @@ VISIBILITY: Final = Layout(
             " their noise allows, or a beam that ends before the point at bins that lie off their"
             " neighbours; outlier a beam with bins that lie more than 6 standard errors off their"
             " neighbours: these took the place of single ones, while several together, which may be"
-            " the edge of a layer, were left, and what they change is part of the standard error"
-            " unless so many lie side by side that nothing tells what is between them."
-            " The value stands.",
+            " the edges of a layer, were left, and what they and the bins between two edges change"
+            " is part of the standard error. The value stands.",
         ),
         _per_time(
             "optical_depth",

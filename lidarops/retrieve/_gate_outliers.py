@@ -7,9 +7,9 @@ same polynomial takes its place, and its derivatives go to the gates that made i
 variances stay those of the gates that were used. Edges of layers and clouds are air: they leave
 several gates off, or something beside the one that is taken out, and such a ray stays as it is.
 So do rays of wider gates than 10 m, where a layer may fill a single one. As wild gates may lie
-together too, what bridging them would change is added to the covariance of such a ray, unless so
-many lie side by side that nothing tells what is between them. Where more gates lie off than could
-be wild, noise is not what is stated, and the ray is not believed.
+together too, what bridging them would change is added to the covariance of such a ray, straight
+lines across long runs of them too (`lidarops.retrieve._gate_runs`). Where more gates lie off than
+could be wild, noise is not what is stated, and the ray is not believed.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments

@@ -263,22 +263,27 @@ def _invert_system(factor: Array, size: int, out: Array) -> None:
 
 
 @_compiled
-def _look(
-    usable: Codes, first_crossing: Indices, vertex: Indices, counts: Indices, seen: Codes
+def _look(usable: Codes, first_crossing: Indices, counts: Indices) -> None:
+    """Fill the crossings of each ray; 0 where there is one only."""
+    for ray in range(counts.size):
+        count = _count(usable, first_crossing[ray], first_crossing[ray + 1])
+        counts[ray] = count if count >= 2 else 0
+
+
+@_compiled
+def _tally(
+    first_crossing: Indices, vertex: Indices, counts: Indices, seen: Codes
 ) -> tuple[int, int, int]:
-    """Fill the crossings of each ray and the vertices seen; return rays, crossings, vertices."""
+    """Fill the vertices seen; return rays, crossings, vertices."""
     used = observations = vertices = 0
     for v in range(seen.size):
         seen[v] = 0
     for ray in range(counts.size):
-        first = first_crossing[ray]
-        count = _count(usable, first, first_crossing[ray + 1])
-        counts[ray] = count if count >= 2 else 0
-        if count < 2:
+        if counts[ray] == 0:
             continue
         used += 1
-        observations += count
-        for c in range(first, first + count):
+        observations += counts[ray]
+        for c in range(first_crossing[ray], first_crossing[ray] + counts[ray]):
             vertices += 1 - seen[vertex[c]]
             seen[vertex[c]] = 1
     return used, observations, vertices
@@ -294,7 +299,10 @@ def _assemble(
     matrix: Array,
     side: Array,
 ) -> tuple[float, float, float]:
-    """Fill the normal equations of all rays; return square, log determinants and mean level."""
+    """Fill the normal equations of all rays; return square, log determinants and mean level.
+
+    A ray of singular covariance is left out: its count gets zero.
+    """
     values, integrals, covariance = data
     first_crossing, offset, vertex = geometry
     scratch, inverses, weights, columns, information = work
@@ -315,6 +323,11 @@ def _assemble(
             covariance[offset[ray] : offset[ray + 1]], quantities, counts[ray],
             constants[ray], (scratch, inverses[ray], weights), columns[ray],
         )  # fmt: skip
+        for c in range(counts[ray]):
+            logarithm += 0.0 * columns[ray, c, 0]
+        if not (math.isfinite(logarithm) and 0.0 < information[ray] < math.inf):
+            counts[ray] = 0
+            continue
         square += _enter(
             columns[ray], inverses[ray], information[ray], vertex[first:last], matrix, side
         )
@@ -408,7 +421,8 @@ def solve_profiles(
     matrix, side, target = np.empty((vertices, vertices)), np.empty(vertices), np.empty(vertices)
     counts, seen = np.zeros(rays, dtype=np.intp), np.zeros(vertices, dtype=np.uint8)
     for n in range(values.shape[0]):
-        used, observations, count = _look(usable[n], geometry[0], geometry[2], counts, seen)
+        _look(usable[n], geometry[0], counts)
+        used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
         fine, moved, square, determinants = used > 0, math.inf, 0.0, 0.0
         data = (values[n], integrals[n], covariance[n])
         for _ in range(passes):
@@ -420,8 +434,9 @@ def solve_profiles(
                 for w in range(vertices):
                     inverse[v, w] = matrix[v, w]
             _add_prior(matrix, side, level, precision, flat)
-            # The covariance of a ray that is singular leaves what was there before it.
-            fine = fine and math.isfinite(square + determinants) and factorise(matrix, vertices)
+            used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
+            fine = used > 0 and math.isfinite(square + determinants)
+            fine = fine and factorise(matrix, vertices)
             if not fine:
                 break
             substitute(matrix, vertices, side)

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve import _gate_outliers
+from lidarops.retrieve import _gate_outliers, _gate_runs
 from lidarops.retrieve.geometry import Crossings, Network
 
 Array = npt.NDArray[np.float64]
@@ -452,11 +452,12 @@ def _screen(
     if number == _gate_outliers.LEFT:
         for g in range(first, last):
             other[0][g], other[1][g] = logs[g], noise[g]
+        _gate_runs.draw_lines(other[0], other[1], grid, other[2], (first, last))
         reached = _gate_outliers.bridge(
             other[0], other[1], exponent, grid, (first, last, end), other[2], nodes, shares
         )
-        # So many side by side are no wild ones.
-        return end, number if reached == end else 1
+        # Where nothing good is left, nothing is told.
+        return (end, number) if reached == end else (low, 1)
     if number > 0:
         end = _gate_outliers.bridge(
             logs, noise, exponent, grid, (first, last, end), codes, nodes, shares

@@ -40,9 +40,7 @@ _CONTRADICTION: Final = 3.5
 _HARMLESS: Final = 0.5
 """Of the standard error that is reported."""
 _ENOUGH: Final = 8
-"""Profiles of a block whose mean is asked."""
-_SEEN_BY: Final = 0.9
-"""Share of the profiles that see what their mean is taken to see."""
+"""Profiles that must see a ray for their mean to be asked."""
 _TOLD_BY_MEAN: Final = 0.3
 _APART: Final = 2.5
 """Standard errors, of both, between the mean of solutions and the solution of the mean."""
@@ -195,31 +193,58 @@ def _mean_problem(
     data: Condensed, layout: Layout, vertex: Indices, exponent: Array, position: Array
 ) -> _Problem | None:
     """Return the mean of profiles as a problem; None where too few see the same."""
-    pooled = _pooled(data)
+    pooled = _pooled(data, layout)
     return None if pooled is None else _Problem(pooled, layout, vertex, exponent, position)
 
 
-def _pooled(data: Condensed) -> Condensed | None:
-    """Return the mean of profiles as one; None where too few see the same.
+def _pooled(data: Condensed, layout: Layout) -> Condensed | None:
+    """Return the mean of profiles as one; None where too few see any ray.
 
-    Of values and integrals relative to each ray's first value: the energy of a laser changes from
-    profile to profile.
+    Ray by ray, up to the crossing with which most values go into it, as hardly a profile may see
+    all rays. Of values and integrals relative to each ray's first value: the energy of a laser
+    changes from profile to profile.
     """
-    seen = data.usable.mean(axis=0) >= _SEEN_BY
-    whole = data.usable[:, seen].all(axis=1)
-    number = int(whole.sum())
-    if number < _ENOUGH:
+    usable = np.zeros((1, data.usable.shape[1]), dtype=np.uint8)
+    log_value, integral = np.full(usable.shape, np.nan), np.zeros(usable.shape)
+    covariance = np.zeros((1, data.covariance.shape[1]))
+    slope = np.full((*usable.shape, 4), np.nan)
+    for ray in range(layout.first_crossing.size - 1):
+        mine = slice(layout.first_crossing[ray], layout.first_crossing[ray + 1])
+        packed = slice(layout.offset[ray], layout.offset[ray + 1])
+        reach = np.logical_and.accumulate(data.usable[:, mine] == 1, axis=1).sum(axis=1)
+        depth = _depth(reach)
+        if depth == 0:
+            continue
+        used = np.flatnonzero(reach >= depth)
+        number = used.size
+        usable[0, mine][:depth] = 1
+        log_value[0, mine] = data.log_value[used, mine].sum(axis=0) / number
+        integral[0, mine] = data.integral[used, mine].sum(axis=0) / number
+        covariance[0, packed] = data.covariance[used, packed].sum(axis=0) / number / number
+        slope[0, mine] = data.slope[used, mine].sum(axis=0) / number
+        slope[0, mine, 1::2] /= number
+    if not usable.any():
         return None
-
-    def mean(values: Array) -> Array:
-        return np.asarray(values[whole].sum(axis=0, keepdims=True) / number)
-
-    slope = mean(data.slope)
-    slope[..., 1::2] /= number
     return Condensed(
-        mean(data.log_value), mean(data.integral), seen[np.newaxis].astype(np.uint8),
-        mean(data.covariance) / number, slope, data.status[:1], data.bridged[:1],
-    )  # fmt: skip
+        log_value, integral, usable, covariance, slope, data.status[:1], data.bridged[:1]
+    )
+
+
+def _depth(reach: Indices) -> int:
+    """Return how many crossings of a ray the mean of profiles takes; 0 where too few see two.
+
+    Parameters
+    ----------
+    reach : (profile,) intp
+        Crossings of the ray that each profile sees.
+    """
+    best, most = 0, 0
+    for depth in range(2, int(reach.max(initial=0)) + 1):
+        number = int(np.sum(reach >= depth))
+        # Of the first crossing, all values are zero.
+        if number >= _ENOUGH and (depth - 1) * number > most:
+            best, most = depth, (depth - 1) * number
+    return best
 
 
 def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solution:
@@ -229,6 +254,9 @@ def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solu
     with np.errstate(invalid="ignore"):
         mean = None if np.all(alone.variance < _WELL_TOLD**2) else pool()
     whole = None if mean is None else mean.afresh(np.inf)
+    if whole is not None and whole.status[0] == _network.UNDETERMINED:
+        # A mean that tells nothing speaks against no prior.
+        mean = whole = None
     settled = whole is not None and bool(whole.status[0] == _network.SOLVED)
     for strength in _STRENGTHS:
         least = _least(mean, strength) if mean is not None and settled else 0.0

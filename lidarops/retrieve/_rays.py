@@ -24,6 +24,9 @@ _OF_MEDIAN: Final = np.pi / 2.0
 """Variance of a median over that of a mean."""
 _BELOW: Final = 4.0
 """Standard errors by which a mean signal is then less than zero."""
+_LOUDER: Final = 10.0
+"""Times the median variance, from which on a profile is not counted for one of its block; up
+to that many times more where its signal is stronger, whose noise is then larger too."""
 _SMOOTHED: Final = 31
 """Gates over which an estimated noise is averaged."""
 
@@ -47,7 +50,8 @@ class Rays:
     """(block,) relative standard error of a gate of a single profile, root mean square over the
     gates about the vertices that are used."""
     weak: Booleans
-    """(block, crossing) True where the signal is too weak to be used."""
+    """(profile, crossing) True where the signal of the block, or of a profile that is far louder
+    than most of it, is too weak to be used."""
     leading: tuple[int, ...]
 
 
@@ -91,10 +95,12 @@ def prepare(
     with np.errstate(invalid="ignore"):
         heard = np.where(weak | (means.usable == 0), np.nan, loudness)
     means.usable[weak] = 0
-    data.usable[(means.usable == 0)[block]] = 0
+    alone = _loud(signal, rows, row, single[block], layout)
+    data.usable[(means.usable == 0)[block] | alone] = 0
     return Rays(
-        layout, powers, data, means, block, averaged, np.sqrt(_row_means(heard)), weak, leading
-    )
+        layout, powers, data, means, block, averaged, np.sqrt(_row_means(heard)),
+        weak[block] | alone, leading,
+    )  # fmt: skip
 
 
 def _row_means(values: Array) -> Array:
@@ -263,6 +269,7 @@ def _means(
 
     Medians, because a single wild gate must not spoil a block. The energy of a laser changes from
     profile to profile, so that one with a gap on a ray would put a step there: it is left out.
+    A few loud profiles do a median no harm, and are not counted in what is its variance.
     """
     shape = (len(members), *signal.shape[1:])
     mean, spread, single = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
@@ -278,10 +285,53 @@ def _means(
             if used.size == 0:
                 continue
             mean[b, ray] = np.median(signal[used, ray], axis=0)
-            single[b, ray] = rows[row[used], ray].sum(axis=0) / used.size
+            single[b, ray, low:high] = _usual(
+                rows[row[used], ray, low:high], signal[used, ray, low:high], mean[b, ray, low:high]
+            )
             spread[b, ray] = _OF_MEDIAN * single[b, ray] / used.size
             averaged[b] = min(averaged[b], used.size) if averaged[b] else used.size
     return mean, spread, single, averaged
+
+
+def _usual(variances: Array, signal: Array, median: Array) -> Array:
+    """Return (bin,) means of variances, but of those that are far louder than most.
+
+    Parameters
+    ----------
+    variances, signal : (profile, bin) float64
+    median : (bin,) float64
+        Of the signal.
+    """
+    width = min(_SMOOTHED, median.size)
+    known = np.isfinite(variances)
+    usual = np.median(np.where(known, variances, np.inf), axis=0)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        stronger = (_moving_sum(signal, width) / _moving_sum(median, width)) ** 2
+        allowed = _LOUDER * np.fmin(np.fmax(stronger, 1.0), _LOUDER)
+        quiet = variances <= allowed * usual
+        # Of a few counts, the median of the variances may be zero.
+        quiet = known & (quiet | (usual == 0.0))
+        return np.asarray(np.where(quiet, variances, 0.0).sum(axis=0) / quiet.sum(axis=0))
+
+
+def _loud(signal: Array, rows: Array, row: Indices, single: Array, layout: Layout) -> Booleans:
+    """Return (profile, crossing) where one far louder than its block is too weak by itself.
+
+    By its own level, as the energy of a laser may be what raises its noise.
+    """
+    out = np.zeros((signal.shape[0], layout.crossings.ray.size), dtype=np.bool_)
+    if rows.shape[0] == 1:
+        return out
+    gates = layout.weights.shape[1]
+    for c in range(out.shape[1]):
+        ray, gate = layout.crossings.ray[c], slice(layout.window[c], layout.window[c] + gates)
+        with np.errstate(invalid="ignore", over="ignore"):
+            spread = rows[row, ray, gate].sum(axis=1) / gates
+            usual = single[:, ray, gate].sum(axis=1) / gates
+            level = np.maximum(signal[:, ray, gate].sum(axis=1) / gates, 0.0)
+            louder = (usual > 0.0) & ~(spread <= _LOUDER * usual)
+            out[:, c] = louder & ~(spread <= LOUDEST_GATE**2 * level**2)
+    return out
 
 
 def _faded(means: Condensed, below: Booleans, layout: Layout) -> Booleans:

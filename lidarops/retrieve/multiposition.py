@@ -99,8 +99,8 @@ class VertexFlags:
     """A ray of the vertex is too noisy there, and was left out; the others stand."""
     bridged: Booleans
     """A ray of the vertex has gates that lie far off their neighbours: these took the place of
-    single ones. Several together, which may be air, were left as they are, and what they change
-    is part of the standard error. The value stands."""
+    single ones. Several together, which may be air, were left as they are, and what they and the
+    gates between two edges change is part of the standard error. The value stands."""
     outlying: Booleans
     """A ray of the vertex has so many such gates before it that it was left out."""
     pole: Booleans
@@ -356,7 +356,7 @@ def _judged(
         uncertain=uncertain,
         signal_not_positive=_lost(rays, NOT_POSITIVE),
         signal_missing=_lost(rays, MISSING),
-        weak_signal=_by_vertex(rays, rays.weak[rays.block]),
+        weak_signal=_by_vertex(rays, rays.weak),
         bridged=_by_vertex(rays, rays.data.bridged[:, rays.layout.crossings.ray] == 1),
         outlying=_lost(rays, OUTLYING),
         pole=estimate.pole,
@@ -398,7 +398,7 @@ def _improbable(chi_square: Array, freedom: Array) -> Booleans:
 def _lost(rays: _rays.Rays, reason: int) -> Booleans:
     """Return where a ray of a vertex has lost it for a reason."""
     status = rays.data.status[:, rays.layout.crossings.ray]
-    beyond = (rays.data.usable == 0) & ~rays.weak[rays.block]
+    beyond = (rays.data.usable == 0) & ~rays.weak
     return _by_vertex(rays, (status == reason) & beyond)
 
 

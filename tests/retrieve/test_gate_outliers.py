@@ -7,7 +7,7 @@ import pytest
 from oracle_multiposition import FIELDS, fan, grid, noisy, signals, triangle
 from scipy.interpolate import BarycentricInterpolator
 
-from lidarops.retrieve import _gate_outliers, _point_weights
+from lidarops.retrieve import _gate_outliers, _gate_runs, _point_weights
 from lidarops.retrieve.multiposition import solve
 
 GATES = 7
@@ -206,6 +206,69 @@ def test_a_crowd_of_spikes_is_told_and_left():
     assert found.bridged[4, 0]
     assert found.bridged.sum() == 1
     np.testing.assert_array_equal(found.integral, plain.integral)
+
+
+def run(net, r, power, variance, after, gates, size=40.0):
+    """Move gates side by side on the first ray of all profiles, so many behind where beams meet."""
+    at = gate_at(r, net.on_ray(0)[1][0]) + after
+    for k in range(gates):
+        power = hit(power, variance, slice(None), 0, at + k, size)
+    return power
+
+
+@pytest.mark.parametrize(("after", "gates"), [(-3, 6), (-6, 12), (9, 12), (5, 20), (0, 30)])
+def test_a_run_of_wild_gates_is_part_of_the_standard_error(after, gates):
+    """Only its edges show: those in the middle lie on one curve."""
+    net, r, power, variance = scene(relative=0.02)
+    damaged = run(net, r, power, variance, after, gates)
+    told, layout = condensed(net, r, damaged, variance)
+    plain, _ = condensed(net, r, damaged, variance, screened=False)
+    clean, _ = condensed(net, r, power, variance)
+    np.testing.assert_array_equal(told.integral, plain.integral)
+    np.testing.assert_array_equal(told.log_value, plain.log_value)
+    assert told.bridged[:, 0].all()
+    added = (told.covariance - plain.covariance)[:, : layout.offset[1]].reshape(-1, 3, 3)
+    moved = plain.log_value[:, 1] - clean.log_value[:, 1]
+    stated = np.sqrt(added[:, 0, 0] + added[:, 1, 1] - 2.0 * added[:, 0, 1])
+    assert np.all(np.abs(moved) < 1.5 * stated + 1e-9)
+    found = solved(net, r, damaged, variance)
+    score = (found.extinction - 2e-3) / found.extinction_standard_error
+    kept = ~found.flags.flagged & np.isfinite(found.extinction)
+    assert np.all(np.abs(score[kept]) < 3.0)
+    assert np.isfinite(found.extinction[:, found.near_vertex]).mean() > 0.9
+
+
+def test_a_line_goes_through_the_good_gates_on_either_side():
+    grid_, noise = 5.0 * np.arange(20.0), np.full(20, 0.09)
+    logs, codes = 1.0 - 0.02 * grid_, np.zeros(20, dtype=np.uint8)
+    expected, wild = logs.copy(), slice(6, 15)
+    logs[wild] += 3.0
+    codes[[6, 14]] = _gate_outliers.BRIDGED
+    _gate_runs.draw_lines(logs, noise, grid_, codes, (0, 20))
+    np.testing.assert_allclose(logs, expected, atol=1e-12)
+    assert np.all(codes[wild] == _gate_outliers.LOST)
+    assert np.all(codes[[5, 15]] == _gate_outliers.GOOD)
+    # Of two means of 3 gates: in the middle, a half of each.
+    assert noise[10] == pytest.approx(0.09 / 6.0)
+
+
+def test_what_no_line_can_be_drawn_across_stays_as_it_is():
+    logs, noise = np.arange(9.0), np.ones(9)
+    for marked, drawn in (([2, 3], False), (np.arange(9), False), (np.arange(1, 9), True)):
+        codes = np.zeros(9, dtype=np.uint8)
+        codes[marked] = _gate_outliers.BRIDGED
+        told = logs.copy()
+        _gate_runs.draw_lines(told, noise.copy(), np.arange(9.0), codes, (0, 9))
+        # Beyond the last good gate, the signal stays as there.
+        np.testing.assert_array_equal(told, np.zeros(9) if drawn else logs)
+
+
+def test_edges_far_apart_are_no_run():
+    codes = np.zeros(60, dtype=np.uint8)
+    codes[[10, 50]] = _gate_outliers.BRIDGED
+    before = codes.copy()
+    _gate_runs.draw_lines(np.arange(60.0), np.ones(60), np.arange(60.0), codes, (0, 60))
+    np.testing.assert_array_equal(codes, before)
 
 
 @pytest.mark.parametrize("step", [0.3, 1.1, 4.0])

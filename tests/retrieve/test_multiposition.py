@@ -270,6 +270,23 @@ def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
     assert weaker.all()
 
 
+@pytest.mark.parametrize("name", FIELDS)
+def test_rays_that_profiles_lack_cost_no_more_than_what_they_saw(name):
+    net, field = three_by_two(), FIELDS[name]
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field), 0.02, 50, seed=2)
+    lost = np.random.default_rng(2).random((50, net.rays, 1)) < 0.25
+    found = [
+        solve(one, r, net, variance=variance, full_overlap_range=100.0)
+        for one in (power, np.where(lost, np.nan, power))
+    ]
+    kept = [np.isfinite(one.extinction) & ~one.flags.flagged for one in found]
+    # Of a vertex that two rays see, at best (3 / 4)^2 are without a flag.
+    assert kept[1].sum() > 0.4 * kept[0].sum()
+    score = (found[1].extinction - at_vertices(net, field)) / found[1].extinction_standard_error
+    assert np.all(np.abs(score[kept[1]]) < 4.0)
+
+
 def test_average_signals_before_not_solutions_afterwards():
     net = triangle()
     r = grid(net)
@@ -391,6 +408,11 @@ def test_vertices_without_full_overlap_are_not_measured():
     assert np.isfinite(far.extinction[~far.flags.not_measured & far.near_vertex]).any()
 
 
+def apart(one, other):
+    """Return by how many of its standard errors the one differs from the other."""
+    return np.abs(one.extinction - other.extinction) / one.extinction_standard_error
+
+
 def test_weak_signals_are_left_out_and_told():
     net = triangle()
     r = grid(net)
@@ -401,6 +423,43 @@ def test_weak_signals_are_left_out_and_told():
     usable = ~result.flags.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - 4e-3) / result.extinction_standard_error)[usable]
     assert score.size == 0 or np.mean(np.abs(score) < 3) > 0.97
+
+
+@pytest.mark.parametrize("factor", [30.0, 1e2, 1e4, 1e8, np.inf, np.nan])
+def test_one_loud_profile_costs_the_others_nothing(factor):
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.05, 50, seed=4)
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[3] *= factor
+    heard = power.copy()
+    if np.isfinite(factor):
+        rng = np.random.default_rng(0)
+        heard[3] += np.sqrt(told[3] - variance) * rng.standard_normal(heard[3].shape)
+    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    found = solve(heard, r, net, variance=told, full_overlap_range=100.0)
+    others, kept = np.arange(50) != 3, np.isfinite(clean.extinction)
+    np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])
+    assert np.all(apart(found, clean)[others][kept[others]] < 0.05)
+    ratio = found.extinction_standard_error / clean.extinction_standard_error
+    np.testing.assert_allclose(ratio[others][kept[others]], 1.0, rtol=0.02)
+    mine = np.isfinite(found.extinction[3]) & ~found.flags.flagged[3]
+    if factor > 50.0 or np.isnan(factor):
+        assert not mine.any()
+        assert found.flags.weak_signal[3, net.near_vertex].all()
+    score = (found.extinction - 2e-3) / found.extinction_standard_error
+    assert np.all(np.abs(score[3][mine]) < 4.0)
+
+
+def test_a_profile_of_more_energy_is_not_loud():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.05, 50, seed=4)
+    scale = np.where(np.arange(50) == 3, 20.0, 1.0)[:, np.newaxis, np.newaxis]
+    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    found = solve(scale * power, r, net, variance=scale**2 * variance, full_overlap_range=100.0)
+    assert not found.flags.weak_signal.any()
+    np.testing.assert_allclose(found.extinction, clean.extinction, rtol=1e-9)
 
 
 def test_visibility_follows_from_extinction():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -301,6 +303,38 @@ def test_vertices_that_only_lost_rays_saw_are_missing():
     np.testing.assert_allclose(np.exp(result.logarithm[0, seen]), 2e-3, rtol=0.02)
 
 
+@pytest.mark.parametrize("deviation", [np.inf, 0.1])
+@pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
+def test_a_ray_of_singular_covariance_is_left_out(deviation, bad):
+    _, layout, data, problem = case(3)
+    clean = problem.afresh(deviation)
+    without = data.take(np.arange(3))
+    without.usable[1, : layout.first_crossing[1]] = 0
+    data.covariance[1, : layout.offset[1]] = bad
+    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    found, expected = (_prior._Problem(one, *where).afresh(deviation) for one in (data, without))
+    assert np.all(found.status == _network.SOLVED)
+    np.testing.assert_array_equal(found.degrees_of_freedom, expected.degrees_of_freedom)
+    assert np.array_equal(np.isfinite(found.logarithm), np.isfinite(expected.logarithm))
+    np.testing.assert_allclose(found.logarithm, expected.logarithm, rtol=1e-4)
+    np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-2)
+    for one in ("logarithm", "variance", "chi_square", "prior_chi_square"):
+        mine, others = getattr(found, one)[[0, 2]], getattr(clean, one)[[0, 2]]
+        np.testing.assert_array_equal(mine, others)
+
+
+def test_a_profile_of_singular_covariances_is_not_determined():
+    _, layout, data, _ = case(3)
+    data.covariance[1] = 0.0
+    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    for deviation in (np.inf, 0.1):
+        found = _prior._Problem(data, *where).afresh(deviation)
+        assert found.status.tolist() == [
+            _network.SOLVED, _network.UNDETERMINED, _network.SOLVED
+        ]  # fmt: skip
+        assert np.isnan(found.logarithm[1]).all()
+
+
 def test_prior_with_an_only_vertex_is_finite():
     precision, norm = _prior._free_level(_prior._gradient(np.zeros((1, 3))), 0.1)
     assert np.isfinite(precision).all()
@@ -326,20 +360,123 @@ def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told)
     assert _prior._unlikely(mean, sharp, 1.0) == told
 
 
-def test_a_field_that_the_mean_tells_to_vary_is_not_told_to_be_even():
-    net = three_by_two()
-    r = grid(net)
-    uneven = 0.2 * np.sin(7.0 * np.arange(net.vertices))
+def uneven(net):
+    """Return air that is another at every vertex."""
+    size = 0.2 * np.sin(7.0 * np.arange(net.vertices))
 
     def field(x, y, z):
         apart = [(x - v[0]) ** 2 + (z - v[2]) ** 2 for v in net.vertex]
-        bumps = [u * np.exp(-a / (2.0 * 40.0**2)) for u, a in zip(uneven, apart, strict=True)]
+        bumps = [u * np.exp(-a / (2.0 * 40.0**2)) for u, a in zip(size, apart, strict=True)]
         return 2e-3 * np.exp(np.sum(bumps, axis=0))
 
-    power, variance = noisy(net, r, signals(net, r, field), 0.05, 50, additive=0.0)
-    layout, data = condensed(net, power, variance)
-    where = (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    return field
+
+
+def fifty(field, relative, lost=0.0):
+    """Return profiles, some without some of their rays, and what a problem asks besides."""
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field(net)), relative, 50, additive=0.0)
+    gone = np.random.default_rng(2).random((50, net.rays, 1)) < lost
+    layout, data = condensed(net, np.where(gone, np.nan, power), variance)
+    return data, (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+
+
+def test_a_field_that_the_mean_tells_to_vary_is_not_told_to_be_even():
+    data, where = fifty(uneven, 0.05)
     least = _prior._least(_prior._mean_problem(data, *where), 1.0)
     assert 0.03 < least < 0.4
     problem = _prior._Problem(data, *where)
     assert _prior._likeliest(problem, 1.0, least).deviation[0] >= least
+
+
+class Unsettled(_prior._Problem):
+    """A mean whose solution without prior, or any, still moves in the last pass."""
+
+    always = False
+
+    def afresh(self, deviation, strength=1.0):
+        found = super().afresh(deviation, strength)
+        if not (self.always or np.isinf(deviation)):
+            return found
+        return replace(found, status=np.full_like(found.status, _network.UNSETTLED))
+
+
+def test_a_prior_under_which_the_mean_does_not_settle_is_rejected():
+    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
+    mean = Unsettled(_prior._pooled(data, where[0]), *where)
+    result = _prior._Problem(data, *where).afresh(0.1)
+    assert not _prior._unlikely(mean, result, 1.0)
+    mean.always = True
+    assert _prior._unlikely(mean, result, 1.0)
+    told = _prior._solve_block(_prior._Problem(data, *where), lambda: mean)
+    assert np.all(np.isinf(told.deviation))
+
+
+def test_a_mean_that_is_not_determined_speaks_against_no_prior():
+    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
+    mean = _prior._Problem(_prior._pooled(data, where[0]), *where)
+    mean.data.log_value[:] = np.nan
+    assert mean.afresh(np.inf).status[0] == _network.UNDETERMINED
+    told = _prior._solve_block(_prior._Problem(data, *where), lambda: mean)
+    unasked = _prior._solve_block(_prior._Problem(data, *where), lambda: None)
+    assert np.isfinite(told.deviation[0])
+    np.testing.assert_array_equal(told.logarithm, unasked.logarithm)
+
+
+def test_a_mean_that_does_not_settle_tells_no_least_deviation(monkeypatch):
+    data, where = fifty(lambda _: homogeneous(2e-3), 0.1)
+    pooled = _prior._pooled(fifty(uneven, 0.1)[0], where[0])
+    for other in ("_unlikely", "_apart"):
+        monkeypatch.setattr(_prior, other, lambda *_: False)
+    asked = [
+        _prior._solve_block(_prior._Problem(data, *where), lambda mean=mean: mean).deviation[0]
+        for mean in (Unsettled(pooled, *where), _prior._Problem(pooled, *where))
+    ]
+    assert asked[0] < asked[1] < np.inf
+
+
+# Profiles that lack rays --------------------------------------------------------------------
+
+
+def test_the_mean_of_profiles_is_made_ray_by_ray():
+    data, (layout, *rest) = fifty(lambda _: homogeneous(), 0.05, lost=0.25)
+    assert data.usable.all(axis=1).sum() < 20
+    mean = _prior._pooled(data, layout)
+    assert mean.usable.all()
+    for ray in range(6):
+        mine = slice(layout.first_crossing[ray], layout.first_crossing[ray + 1])
+        packed = slice(layout.offset[ray], layout.offset[ray + 1])
+        seen = data.usable[:, mine].all(axis=1)
+        np.testing.assert_allclose(mean.log_value[0, mine], data.log_value[seen, mine].mean(axis=0))
+        np.testing.assert_allclose(mean.integral[0, mine], data.integral[seen, mine].mean(axis=0))
+        expected = data.covariance[seen, packed].mean(axis=0) / seen.sum()
+        np.testing.assert_allclose(mean.covariance[0, packed], expected)
+    whole = _prior._Problem(mean, layout, *rest).afresh(np.inf)
+    assert whole.status[0] == _network.SOLVED
+
+
+def test_a_mean_of_what_nobody_sees_is_none():
+    data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
+    data.usable[7:] = 0
+    assert _prior._pooled(data, layout) is None
+    # A value at a ray's first vertex alone is none.
+    data, _ = fifty(lambda _: homogeneous(), 0.05)
+    data.usable[:] = 0
+    data.usable[:, layout.first_crossing[:-1]] = 1
+    assert _prior._pooled(data, layout) is None
+
+
+@pytest.mark.parametrize(
+    ("reach", "depth"),
+    [
+        ([3] * 50, 3),
+        ([3] * 45 + [2] * 5, 3),
+        ([3] * 9 + [2] * 41, 2),
+        ([3] * 7, 0),
+        ([1] * 50, 0),
+        ([], 0),
+    ],
+)
+def test_a_mean_takes_as_much_of_a_ray_as_most_values_see(reach, depth):
+    assert _prior._depth(np.array(reach, dtype=np.intp)) == depth
