@@ -95,7 +95,8 @@ def prepare(
     with np.errstate(invalid="ignore"):
         heard = np.where(weak | (means.usable == 0), np.nan, loudness)
     means.usable[weak] = 0
-    alone = _loud(signal, rows, row, single[block], layout)
+    # What is missing has another reason.
+    alone = _loud(signal, rows, row, single[block], layout) & (data.usable == 1)
     data.usable[(means.usable == 0)[block] | alone] = 0
     return Rays(
         layout, powers, data, means, block, averaged, np.sqrt(_row_means(heard)),
