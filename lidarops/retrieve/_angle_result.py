@@ -78,7 +78,7 @@ class MultiAngleResult:
     optical_depth: Array
     """From the lidar to the altitude."""
     optical_depth_standard_error: Array
-    """Random error, without `optical_depth_gradient_error`."""
+    """Of noise and smoothing, without `optical_depth_gradient_error`."""
     optical_depth_gradient_error: Array
     """Systematic: the largest error that the declared horizontal gradient of backscatter makes."""
     extinction: Array
