@@ -19,6 +19,7 @@ from datetime import UTC, datetime
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from lidarops import worker
 from lidarops.campaign import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
@@ -269,9 +270,11 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
 
     started = {"distributed.worker.multiprocessing-method": start_method()}
     with (
+        worker.quiet(),
         dask.config.set({**_DASK, **started}),
         LocalCluster(
-            n_workers=workers,
+            # A signal while they start would leave a cluster that nobody can close.
+            n_workers=0,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
@@ -279,17 +282,27 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
             # Without a dashboard dask still answers by HTTP, on a port of all interfaces.
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
             memory_limit=memory or "auto",
+            preload=worker.__name__,
         ) as cluster,
         Client(cluster) as client,
     ):
-        # Ctrl-C goes to all processes of a terminal, and the workers are to end their scenes.
-        client.run(_ignore_interrupts)
+        cluster.scale(workers)
+        _await_workers(client, workers)
         yield client
 
 
-def _ignore_interrupts() -> None:
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _await_workers(client: Client, workers: int) -> None:
+    """Wait for workers that are starting; fewer are better than none."""
+    try:
+        client.wait_for_workers(workers, timeout=PATIENCE)
+    except TimeoutError as error:
+        there = len(client.nthreads())
+        if not there:
+            raise SceneError(
+                f"no worker has started within {PATIENCE:.0f} s",
+                remedy="give more memory to each, or ask for fewer",
+            ) from error
+        _LOG.warning("%d of %d workers have started within %.0f s", there, workers, PATIENCE)
 
 
 def carry_out(

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from distributed import Client
+from distributed import Client, Nanny
+from distributed.core import Status
+from distributed.deploy.spec import SpecCluster
 from poison import Poison
 from small_archive import Archive, made
 
@@ -43,6 +49,24 @@ def test_workers_make_the_bytes_that_one_process_makes(archive: Archive, client:
     assert archive.contents("alone/products") == archive.contents("out/products")
 
 
+def test_a_signal_while_workers_start_leaves_no_cluster_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Python would close it at its end, in tracebacks, after its processes were gone."""
+    start = Nanny.instantiate
+
+    async def interrupted(nanny: Nanny) -> Any:
+        os.kill(os.getpid(), signal.SIGINT)
+        return await start(nanny)
+
+    monkeypatch.setattr(Nanny, "instantiate", interrupted)
+    with Stop() as stop:
+        with stop.idle(), local_client(1):
+            raise AssertionError
+        assert stop.signal == signal.SIGINT
+    assert not [each for each in SpecCluster._instances if each.status is not Status.closed]
+
+
 def test_a_file_that_vanishes_after_the_scan_is_refused_as_such(archive: Archive) -> None:
     campaign = archive.write()
     jobs = make_jobs(campaign, prepare(campaign, instruments=["poor"]))
@@ -53,7 +77,11 @@ def test_a_file_that_vanishes_after_the_scan_is_refused_as_such(archive: Archive
     assert granule.reason == "vanished after it was catalogued (run lidarops catalog again)"
 
 
-def test_a_scene_that_kills_its_worker_is_refused_by_name(archive: Archive) -> None:
+def test_a_scene_that_kills_its_worker_is_refused_by_name(
+    archive: Archive, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # dask hands its records to nobody else.
+    monkeypatch.setattr(logging.getLogger("distributed"), "handlers", [caplog.handler])
     campaign = archive.write()
     scene = "rich_20260302T000000"
     # A cluster of its own, as dask may lose workers that it restarts while they start.
@@ -62,6 +90,10 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(archive: Archive) -> N
         result = bring_up_to_date(campaign, client=client)
     assert set(result.failures) == {scene}
     assert "died 3 times" in result.failures[scene]
+    assert "its worker died" in caplog.text
+    # Only that of `lidarops`: the scene was tried again, and had not failed yet.
+    assert "marked as failed" not in caplog.text
+    assert logging.getLogger("distributed.scheduler").level < logging.CRITICAL
     others = {outcome.scene for outcome in result.record.scenes if not outcome.error}
     assert others == {"rich_20260301T000000", "poor_20260301T000000", "poor_20260302T000000"}
     assert bring_up_to_date(campaign).record is None
