@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
@@ -83,7 +83,7 @@ class _Told:
             entities = document["entity"]
             about = entities["lidarops:product"]
             software = document["agent"]["lidarops:software"]
-            return cls(
+            told = cls(
                 file=file,
                 about=about,
                 settings=json.loads(about["lidarops:settings"]),
@@ -95,6 +95,22 @@ class _Told:
             )
         except (KeyError, ValueError, TypeError) as error:
             raise _untold(file, repr(error)) from error
+        for record in told.inputs:
+            # Copies are put under that name, which whoever made the product may have chosen.
+            if record.role in _RAW and not _inside(record.path):
+                raise ProductError(
+                    f"names a raw file outside its archive: {record.path}",
+                    file=file,
+                    field="provenance",
+                    remedy="lidarops writes no such product: do not trust it",
+                )
+        return told
+
+
+def _inside(path: str) -> bool:
+    """Return whether a path stays in the folder that it is relative to."""
+    pure = PurePosixPath(path)
+    return not (pure.is_absolute() or ".." in pure.parts)
 
 
 def _untold(file: Path, problem: str) -> ProductError:
@@ -271,7 +287,7 @@ def _moved(told: _Told, lost: Sequence[InputRecord], catalog: str | None) -> dic
             raise
         return {}
     now = {record.path: found.get(record.sha256, record.path) for record in lost}
-    return {old: new for old, new in now.items() if old != new}
+    return {old: new for old, new in now.items() if old != new and _inside(new)}
 
 
 def _nearest_catalog(file: Path) -> str:

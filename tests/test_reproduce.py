@@ -22,6 +22,7 @@ from lidarops.cli import app
 from lidarops.engine import make_jobs, process_all
 from lidarops.errors import ProductError
 from lidarops.pipeline import prepare
+from lidarops.products.provenance import read_provenance
 from lidarops.products.write import write
 from lidarops.records import ProductKind
 from lidarops.reproduce import Reproduction, explain, reproduce
@@ -251,3 +252,19 @@ def test_the_command_tells_by_its_exit_code(campaign: Campaign, moved: Campaign)
     told = json.loads(bad.output)
     assert not told["identical"]
     assert told["differences"][0]["name"] == f"coast/{gone.name}"
+
+
+@pytest.mark.parametrize("escape", ["{outside}", "../outside"])
+def test_a_product_that_names_raw_files_elsewhere_is_refused(
+    escape: str, campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    outside = tmp_path / "outside"
+    outside.write_bytes(b"of somebody else")
+    product = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    told = read_provenance(product)
+    raw = next(each for each in told["entity"].values() if "/h" in each.get("lidarops:path", ""))
+    raw["lidarops:path"] = escape.format(outside=outside)
+    monkeypatch.setattr("lidarops.reproduce.read_provenance", lambda _: told)
+    with pytest.raises(ProductError, match="outside its archive"):
+        reproduce(product, archive=campaign.archive, catalog=campaign.catalog_url)
+    assert outside.read_bytes() == b"of somebody else"
