@@ -20,7 +20,7 @@ from lidarops.bench import stand_ins
 from lidarops.bench.pipeline import Size, simulated
 from lidarops.bench.stand_ins import StandIns
 from lidarops.bench.story import facts
-from lidarops.bench.terms import RESULT, Effort, Finding, Kind
+from lidarops.bench.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
 from lidarops.bench.timing import Machine, machine
 from lidarops.campaign import load
 from lidarops.catalog.store import Store
@@ -31,7 +31,6 @@ from lidarops.reports.charts import Chart, Panel, Series
 from lidarops.staleness import Judge
 
 _NOTHING: Final = "-"
-_FILE: Final = "campaign.yaml"
 _MICRO: Final = 1e6
 _OF_SCENE: Final = 480
 _BINS: Final = 200
@@ -146,8 +145,8 @@ def measure(
             measured.append(_measured(size.files, _OF_FILES, (small, large), read=True))
         progress(1)
     with _folders() as (small, large):
-        stand_ins.enter(StandIns(instruments=1, days=1), small / _FILE)
-        stand_ins.enter(standing, large / _FILE)
+        stand_ins.enter(StandIns(instruments=1, days=1), small / CAMPAIGN_FILE)
+        stand_ins.enter(standing, large / CAMPAIGN_FILE)
         measured.append(_measured(standing.files, _OF_ROWS, (small, large), read=False))
     progress(1)
     return Archives(date, machine(), tuple(measured))
@@ -166,7 +165,7 @@ def _folders() -> Iterator[tuple[Path, Path]]:
 def _measured(
     files: int, ways: Sequence[Pass], folders: tuple[Path, Path], *, read: bool
 ) -> Measured:
-    small, large = (folder / _FILE for folder in folders)
+    small, large = (folder / CAMPAIGN_FILE for folder in folders)
     return Measured(files, read, {each: _alone(each, small, large) for each in ways})
 
 

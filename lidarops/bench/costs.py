@@ -25,7 +25,7 @@ from scipy.optimize import nnls
 
 from lidarops import costs, dependence, pipeline
 from lidarops.bench.story import facts
-from lidarops.bench.terms import RESULT, Effort, Finding, Kind
+from lidarops.bench.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
 from lidarops.bench.timing import Machine, machine
 from lidarops.campaign import Campaign, load
 from lidarops.costs import Costs, Term
@@ -43,7 +43,6 @@ _ROUNDS: Final = 3
 _TRUST: Final = 0.05
 """Of the costs that come with lidarops: a relative departure of 1 from one of them weighs as much
 as a misfit of this share in one scene. It decides only what the scenes do not tell."""
-_FILE: Final = "campaign.yaml"
 _PHOTON: Final = "photon_532o"
 _ANALOG: Final = "analog_532o"
 _GLUED: Final = "glued_532o"
@@ -250,7 +249,7 @@ def first_times(path: str) -> None:
 
 def _child(code: str, campaign: Campaign, *words: str) -> str:
     """Run Python in a process of its own, and return what it writes."""
-    path = str(campaign.folder / _FILE)
+    path = str(campaign.folder / CAMPAIGN_FILE)
     done = subprocess.run(  # noqa: S603 - this very Python and a file of our own
         [sys.executable, "-c", f"import sys; {code}", path, *words],
         check=False,
@@ -289,7 +288,7 @@ def _of_children() -> float:
 
 
 def _simulated(folder: Path) -> Campaign:
-    path = folder / _FILE
+    path = folder / CAMPAIGN_FILE
     path.write_text(yaml.safe_dump(_settings()), encoding="utf-8")
     campaign = load(path)
     written = carry_out(plan(campaign))

@@ -19,7 +19,7 @@ from scipy import stats
 from lidarops import pipeline
 from lidarops.bench import orchestration
 from lidarops.bench.story import facts
-from lidarops.bench.terms import RESULT, Effort, Finding, Kind
+from lidarops.bench.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
 from lidarops.bench.timing import Machine, machine
 from lidarops.campaign import Campaign, load
 from lidarops.errors import CampaignError
@@ -34,7 +34,6 @@ _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _INTERVAL: Final = 60
 """s, of a file."""
 _NOTHING: Final = "-"
-_FILE: Final = "campaign.yaml"
 _MILLI: Final = 1e3
 _SHORTEST: Final = 1e-4
 """s; the clock of a fast machine with little work may not have moved."""
@@ -222,7 +221,7 @@ def _ways(progress: Callable[[int], object]) -> tuple[orchestration.Way, ...]:
             place = Path(folder) / str(size.scenes)
             place.mkdir()
             simulated(size, place)
-            files.append(place / _FILE)
+            files.append(place / CAMPAIGN_FILE)
         found = orchestration.measure(files)
     progress(1)
     return found
@@ -242,7 +241,7 @@ def simulated(size: Size, folder: Path) -> Campaign:
     Campaign
         With products of all profiles.
     """
-    path = folder / _FILE
+    path = folder / CAMPAIGN_FILE
     path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
     campaign = load(path)
     written = carry_out(plan(campaign))

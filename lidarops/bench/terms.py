@@ -11,6 +11,8 @@ from lidarops.reports import benchmark
 
 RESULT: Final = "result.json"
 """Name of the figures beside the page."""
+CAMPAIGN_FILE: Final = "campaign.yaml"
+"""Name of the file of a campaign that a benchmark simulates, in a folder of its own."""
 
 
 class Kind(StrEnum):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import sqlite3
 import time
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import quick
 from small_archive import DAY, Archive, made
 
 from lidarops import engine
@@ -47,27 +45,11 @@ def _poor(days: range) -> set[str]:
 EVERYTHING = _all(range(1, 5)) | _poor(range(1, 5))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _quick() -> Iterator[None]:
-    """Leave the physics out: other tests show that products are what their plans say."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine, "attempt", quick.attempt)
-        yield
+pytestmark = pytest.mark.usefixtures("quickly")
 
 
-@pytest.fixture(scope="module")
-def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small archive, processed."""
-    made_here = Archive(tmp_path_factory.mktemp("processed"))
-    assert made(reprocess(made_here.write())) == EVERYTHING
-    return made_here.folder
-
-
-@pytest.fixture
-def archive(processed: Path, tmp_path: Path) -> Archive:
-    """A copy of it, with the same modification times."""
-    shutil.copytree(processed, tmp_path / "archive")
-    return Archive(tmp_path / "archive")
+def test_a_run_that_is_forced_makes_everything(archive: Archive) -> None:
+    assert made(reprocess(archive.write(), options=Options(force=True))) == EVERYTHING
 
 
 def test_a_run_with_nothing_to_do_writes_nothing(archive: Archive) -> None:

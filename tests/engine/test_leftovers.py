@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sqlite3
-from collections.abc import Iterator
 from datetime import UTC, datetime
-from pathlib import Path
 
 import pytest
-import quick
-from small_archive import DAY, Archive, made
+from small_archive import DAY, Archive
 from typer.testing import CliRunner
 
-from lidarops import engine, pipeline
+from lidarops import pipeline
 from lidarops.catalog.ledger import Run, RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
@@ -26,26 +22,7 @@ from lidarops.records import ProductKind
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _quick() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine, "attempt", quick.attempt)
-        yield
-
-
-@pytest.fixture(scope="module")
-def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small archive, processed."""
-    made_here = Archive(tmp_path_factory.mktemp("processed"))
-    assert made(reprocess(made_here.write()))
-    return made_here.folder
-
-
-@pytest.fixture
-def archive(processed: Path, tmp_path: Path) -> Archive:
-    """A copy of it, with the same modification times."""
-    shutil.copytree(processed, tmp_path / "archive")
-    return Archive(tmp_path / "archive")
+pytestmark = pytest.mark.usefixtures("quickly")
 
 
 # Told ----------------------------------------------------------------------------------------
