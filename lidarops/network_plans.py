@@ -28,6 +28,7 @@ from lidarops.plan_rules import (
     ranged_by,
     reaching,
     wavelength,
+    within,
 )
 from lidarops.product_settings import NetworkVisibilitySettings, VisibilitySettings
 from lidarops.records import ChannelLayout, DetectionMode, Granule, LeftOut, Plan, Scene, Step
@@ -454,8 +455,9 @@ def _gate_of(case: MemberCase, farthest: float) -> Step | LeftOut:
         return counts.without(StepName.RANGE_GATE, ALL_STEPS)
     width, (start, stop) = channel.bin_width, case.tail
     low, high = (share * (start + width) for share in BEFORE_TAIL)
-    wanted = ((0.0, farthest + BEYOND * width), (low - width, high), (start, stop))
-    kept = _merged([reaching(near, far, counts) for near, far in wanted], channel.bins)
+    near = reaching(0.0, farthest + BEYOND * width, counts)
+    far = (within(low - width, high, counts), within(start, stop, counts))
+    kept = _merged([near, *far], channel.bins)
     number = float(sum(past - first for first, past in kept))
     if len(kept) == 1 and number == channel.bins:
         reason = "beams and background reach over all bins"

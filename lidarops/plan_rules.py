@@ -334,6 +334,17 @@ def reaching(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
     return max(first, 0), math.ceil((farthest - offset) / width) + beside(farthest)
 
 
+def within(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m alone, as `reaching` does with more of them.
+
+    For bins of which a mean is all that is needed: the noise of those at the ends is that of fewer.
+    """
+    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+    # Two for rounding.
+    first = math.floor((nearest - offset) / width) - 2
+    return max(first, 0), max(math.ceil((farthest - offset) / width) + 2, 0)
+
+
 def ranged_by(channel: str) -> str:
     """Return the channel whose ranges a channel has: a joined one those of its photons."""
     return parts_of(channel)[1] if channel.startswith(GLUED) else channel

@@ -6,6 +6,7 @@ A scene is the unit of work: it becomes its product files or a stated failure.
 from __future__ import annotations
 
 import hashlib
+import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -236,7 +237,7 @@ def _known_digest(granule: Granule, root: Path) -> str | None:
     """Return the digest of a file that has not changed since it was taken."""
     if granule.sha256 is None:
         return None
-    about = (root / granule.path).stat()
+    about = os.stat(f"{root}/{granule.path}")  # noqa: PTH116 - a Path takes twice as long
     same = (about.st_size, about.st_mtime_ns) == (granule.size, granule.mtime_ns)
     return granule.sha256 if same else None
 

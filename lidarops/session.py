@@ -18,7 +18,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.dependence import Wanted
 from lidarops.products.provenance import code_version
-from lidarops.records import Granule, ProductRecord, RunRecord, SceneOutcome
+from lidarops.records import Granule, ProductRecord, RunRecord, Scene, SceneOutcome
 from lidarops.staleness import Judge, Judgement
 
 MOST_INPUTS: Final = 100_000
@@ -110,6 +110,7 @@ class Session:
             key=self._judge.key(judged),
             final=final,
             products=tuple(new),
+            digests=_unknown_digests(judged.scene, outcome),
         )
         self._store.record(entry, self.id, self._lock.token)
         self._settle(judged, outcome, new)
@@ -218,6 +219,16 @@ class Session:
         for granule in outcome.refused:
             facts = {"scene": outcome.scene, "granule": granule.path}
             _LOG.warning("refused %s: %s", granule.path, granule.reason, extra=facts)
+
+
+def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:
+    """Return the digests of the files of a scene that the catalog holds otherwise, or not."""
+    known = {granule.path: granule.sha256 for granule in (*scene.granules, *scene.dark)}
+    return {
+        used.path: used.sha256
+        for used in outcome.inputs
+        if used.path in known and used.sha256 != known[used.path]
+    }
 
 
 def _truth(campaign: Campaign) -> str:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from lidarops import processes
+
 _NOISY: Final = ("distributed.scheduler", "distributed.nanny", "distributed.worker.state_machine")
 """Loggers that show, some in tracebacks, what lidarops tells in its own words: workers that died,
 and scenes that were abandoned. What a worker's memory comes to is told by another."""
@@ -34,6 +36,7 @@ def _hush() -> None:
 def dask_setup(_worker: object) -> None:
     """Prepare a worker; dask calls a function of this name."""
     _hush()
+    processes.keep_memory()
     # Ctrl-C goes to all processes of a terminal, and the workers are to end their scenes.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -106,6 +106,8 @@ class Entry:
     final: bool
     """Whether the same inputs cannot but fail again."""
     products: tuple[NewProduct, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
+    """Of raw files, by path: those that the catalog does not know yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +235,7 @@ class Ledger(Granules):
             self._hold(connection, token)
             self._enter_products(connection, entry, run)
             self._enter_scene(connection, entry, run)
-            self._enter_digests(connection, {used.path: used.sha256 for used in outcome.inputs})
+            self._enter_digests(connection, entry.digests)
             self._refuse(connection, outcome.refused)
             connection.execute(
                 sa.update(RUN)

@@ -105,7 +105,8 @@ def open_archive(
     columns.sort()
     columns.keep(stretches or {})
     chunks = _chunks(columns, profiles_per_chunk)
-    token = tokenize(stamps, columns.kept)
+    # dask itself would look at each number of a list.
+    token = tokenize(repr(stamps), columns.kept)
 
     def signal(channel: int, dataset: Dataset) -> da.Array:
         offsets = columns.fact(channel, "offset").astype(np.int64)
@@ -198,7 +199,7 @@ def _files(source: Source, root: str | os.PathLike[str] | None) -> list[str]:
     if isinstance(source, str | os.PathLike):
         files = _expand(base, Path(source))
     else:
-        files = [str(base / (item.path if isinstance(item, Granule) else item)) for item in source]
+        files = [_placed(base, item) for item in source]
     if not files:
         raise RawFormatError(
             "no files are found",
@@ -210,6 +211,13 @@ def _files(source: Source, root: str | os.PathLike[str] | None) -> list[str]:
         raise RawFormatError(f"is given {times} times", file=path)
     # The first file, with which the layout of the others is compared, is always the same.
     return sorted(files)
+
+
+def _placed(base: Path, item: str | os.PathLike[str] | Granule) -> str:
+    if not isinstance(item, Granule):
+        return str(base / item)
+    # What Path would make of it, at a quarter of the cost: a granule's path is in order.
+    return item.path if base == Path() else os.path.join(base, item.path)  # noqa: PTH118
 
 
 def _expand(base: Path, source: Path) -> list[str]:

@@ -49,8 +49,9 @@ _ICE_POINT = 273.15
 _NUMBER = re.compile(r"[+-]?(?:\d{1,9}(?:[.,]\d{0,9})?|[.,]\d{1,9})", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 _WAVELENGTH = re.compile(r"(\d{1,5})[.,]([A-Za-z0-9])", re.ASCII)
-_DATE = r"(\d{1,2})/(\d{1,2})/(\d{4}) {1,8}(\d{1,2}):(\d{2}):(\d{2})"
-_DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
+_DATE = r"\d{1,2}/\d{1,2}/\d{4} {1,8}\d{1,2}:\d{2}:\d{2}"
+_DATES = re.compile(rf"(?<!\S)({_DATE}) {{1,8}}({_DATE})(?!\S)", re.ASCII)
+_NOT_DIGITS = re.compile(r"[/: ]+")
 
 
 class DatasetKind(IntEnum):
@@ -290,7 +291,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
             "holds no start and stop date: this is not a Licel file", field="header line 2"
         )
     start, stop = _moments(dates)
-    place = _parse_site(second[dates.end() :])
+    place = _parse_site(second[dates.end() :].rstrip())
     lasers, number, timestamp, notes = _parse_lasers(third)
     block_start = ends[2] + 2
     block_end = _line_ends(buffer, block_start, number)[-1] + 2
@@ -303,7 +304,8 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         )
     data_start = block_end + 2
     block = buffer[block_start:block_end]
-    datasets, ending = _fit(block, data_start, size)
+    fit = _fit if len(block) <= _CACHED_BLOCK else _fit.__wrapped__
+    datasets, about_datasets = fit(block, data_start, size)
     return Header(
         name=first.strip(),
         site=second[: dates.start()].strip(),
@@ -322,7 +324,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         datasets=datasets,
         data_start=data_start,
         size=size,
-        notes=place.notes + notes + _dataset_notes(datasets) + ending,
+        notes=place.notes + notes + about_datasets,
         path=file,
         source=buffer[:data_start],
     )
@@ -365,15 +367,14 @@ def _bounded(value: float, low: float, high: float, name: str) -> None:
 
 
 def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
-    numbers = [int(group) for group in dates.groups()]
-    start, stop = _moment(numbers[:6], "start"), _moment(numbers[6:], "stop")
+    start, stop = _moment(dates[1], "start"), _moment(dates[2], "stop")
     if stop < start:
         raise RawFormatError(f"{stop:%Y-%m-%d %H:%M:%S} lies before the start", field="stop")
     return start, stop
 
 
-def _moment(numbers: list[int], name: str) -> datetime:
-    day, month, year, hour, minute, second = numbers
+def _moment(text: str, name: str) -> datetime:
+    day, month, year, hour, minute, second = map(int, _NOT_DIGITS.split(text))
     _bounded(year, *_YEARS, name)
     try:
         return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
@@ -381,6 +382,8 @@ def _moment(numbers: list[int], name: str) -> datetime:
         raise RawFormatError(f"is no date and time: {error}", field=name) from None
 
 
+# Where a lidar stands and looks, and its lasers, are the same in many files.
+@lru_cache(maxsize=1024)
 def _parse_site(text: str) -> _Site:
     tokens, custom = _split_custom(text)
     if len(tokens) < 4:
@@ -440,6 +443,7 @@ def _parse_weather(
     return None, None, (f"{celsius} degC, {hectopascal} hPa are not believed",)
 
 
+@lru_cache(maxsize=1024)
 def _parse_lasers(text: str) -> tuple[tuple[Laser, ...], int, str | None, tuple[str, ...]]:
     tokens = text.split()
     if len(tokens) < 5:
@@ -457,17 +461,20 @@ def _parse_lasers(text: str) -> tuple[tuple[Laser, ...], int, str | None, tuple[
     return lasers, number, timestamp, notes
 
 
+# The dataset lines of an archive repeat from file to file: parsing them once is what makes
+# a header scan fast.
+@lru_cache(maxsize=128)
 def _fit(block: bytes, data_start: int, size: int) -> tuple[tuple[Dataset, ...], tuple[str, ...]]:
+    """Return the datasets of dataset lines, and notes on them."""
     # By the specification inactive datasets are not stored; some software stores them.
-    parse = _parse_block if len(block) <= _CACHED_BLOCK else _parse_block.__wrapped__
     expected = 0
     for stored, note in ((False, ()), (True, ("inactive datasets are stored",))):
-        datasets: tuple[Dataset, ...] = parse(block, data_start, stored)
+        datasets = _parse_block(block, data_start, stored=stored)
         promised = _promised_size(datasets, data_start)
         if size == promised:
-            return datasets, note
+            return datasets, (*_dataset_notes(datasets), *note)
         if promised - 2 <= size < promised and promised > data_start:
-            return datasets, (*note, "the last CRLF is missing")
+            return datasets, (*_dataset_notes(datasets), *note, "the last CRLF is missing")
         expected = expected or promised
         if all(dataset.active for dataset in datasets):
             break
@@ -483,10 +490,7 @@ def _promised_size(datasets: Iterable[Dataset], data_start: int) -> int:
     return data_start + sum(4 * d.bins + 2 for d in datasets if d.offset is not None)
 
 
-# The dataset lines of an archive repeat from file to file: parsing them once is what makes
-# a header scan fast.
-@lru_cache(maxsize=128)
-def _parse_block(block: bytes, data_start: int, stored: bool) -> tuple[Dataset, ...]:  # noqa: FBT001
+def _parse_block(block: bytes, data_start: int, *, stored: bool) -> tuple[Dataset, ...]:
     datasets: list[Dataset] = []
     offset, start = data_start, 0
     while start < len(block):

@@ -325,6 +325,10 @@ class _Solver:
     def changes(self, found: MultiPositionResult, change: Array) -> Iterator[Array]:
         """Yield, for each group of rays, by how much extinction moves with the signals."""
         for group in self.groups:
+            if not change[:, group].any():
+                # The same signals give the same values.
+                yield found.extinction - found.extinction
+                continue
             power = self.signals.power.copy()
             power[:, group] += change[:, group]
             yield self.solve(power).extinction - found.extinction

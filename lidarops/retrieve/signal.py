@@ -400,13 +400,15 @@ def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kern
     """Return the smoothing window of each bin; `ends` are bins that never hold a value."""
     size = grid.size
     index = np.arange(size)
-    spacing = float(np.min(np.abs(np.diff(grid)))) if size > 1 else 1.0
+    steps = np.abs(np.diff(grid))
+    spacing = float(np.min(steps)) if size > 1 else 1.0
     with np.errstate(over="ignore", invalid="ignore"):
         reach = np.nan_to_num(np.abs(grid) * (window / spacing))
     half = np.clip(reach, MIN_NOISE_BINS, max(size, MIN_NOISE_BINS)).astype(np.intp)
+    begin, end = _stretch(steps > MIN_NOISE_BINS * spacing)
     # Symmetric up to the ends, so that a steep signal is not smoothed to one side.
-    half = np.minimum(half, np.maximum(np.minimum(index, size - 1 - index), MIN_NOISE_BINS))
-    first, past = np.maximum(index - half, 0), np.minimum(index + half + 1, size)
+    half = np.minimum(half, np.maximum(np.minimum(index - begin, end - 1 - index), MIN_NOISE_BINS))
+    first, past = np.maximum(index - half, begin), np.minimum(index + half + 1, end)
     bins = np.minimum(past, size - ends[1]) - np.maximum(first, ends[0])
     past[past == size] = -(-size // kernels.BLOCK) * kernels.BLOCK
     return kernels.Windows(
@@ -414,6 +416,16 @@ def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kern
         frozen(past.astype(np.uint32)),
         frozen(np.maximum(bins, 0).astype(np.float64)),
     )
+
+
+def _stretch(gaps: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Return, for each bin, the first bin of its stretch without a gap and the one past its last.
+
+    Light on the two sides of a gap, where bins were left on disk, has nothing in common.
+    """
+    edges = np.concatenate([[0], np.flatnonzero(gaps) + 1, [gaps.size + 1]])
+    lengths = np.diff(edges)
+    return np.repeat(edges[:-1], lengths), np.repeat(edges[1:], lengths)
 
 
 def _noise(grid: Array) -> kernels.Noise:

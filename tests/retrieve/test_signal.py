@@ -331,6 +331,26 @@ def test_windows_never_leave_the_profile() -> None:
         assert average[-1] == np.mean(values[-17:])
 
 
+def test_windows_do_not_reach_over_bins_that_were_left_on_disk() -> None:
+    distance = (np.arange(4000) + 0.5) * 7.5
+    counts = np.random.default_rng(9).poisson(1e5 * np.exp(-distance / 900.0) + 20.0, (3, 4000))
+    counts, shots = counts.astype(np.int32), np.full(3, 600)
+    settings = {"bin_width": 7.5, "dead_time": 3e-9}
+    parts = [slice(0, 700), slice(2400, 2900), slice(3500, 4000)]
+    kept = np.r_[tuple(parts)]
+    found = signal.photon(counts[:, kept], shots, distance[kept], **settings)
+    whole = signal.photon(counts, shots, distance, **settings)
+    np.testing.assert_array_equal(found.power, whole.power[:, kept])
+    place = 0
+    for part in parts:
+        here = slice(place, place + part.stop - part.start)
+        alone = signal.photon(counts[:, part], shots, distance[part], **settings)
+        np.testing.assert_allclose(found.variance[:, here], alone.variance, rtol=1e-12)
+        place = here.stop
+    # Light falls by nine decades over the gap: a window over it would take that for noise.
+    np.testing.assert_allclose(found.variance, whole.variance[:, kept], rtol=0.2)
+
+
 def test_every_layout_of_the_input_gives_the_same_bits() -> None:
     rng = np.random.default_rng(4)
     counts = rng.poisson(300, (6, 400)).astype(np.int32)
