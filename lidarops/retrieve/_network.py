@@ -444,8 +444,12 @@ def solve_profiles(
         for v in range(vertices):
             determinants += 2.0 * math.log(matrix[v, v]) if fine else math.nan
         free = (observations - used - count, observations - used - (count if flat else 1))
+        rough = _square_at(inverse, target, side, square) if flat and fine else math.nan
         summary[n, 0] = _least_square(inverse, target, seen, square, fine)
         summary[n, 2] = summary[n, 0] if flat or not fine else square - _dot(side, target)
+        if flat and fine and math.isnan(summary[n, 0]):
+            # Rays that leave some vertices open, or whose constants have run away, may disagree.
+            summary[n, 2], free = rough, (free[0], observations - used - 1)
         summary[n, 1], summary[n, 3] = free
         summary[n, 4] = summary[n, 2] + determinants + norm
         status[n] = UNDETERMINED if not fine else (SOLVED if moved < _SETTLED else UNSETTLED)
@@ -459,6 +463,18 @@ def _dot(left: Array, right: Array) -> float:
     total = 0.0
     for v in range(left.size):
         total += left[v] * right[v]
+    return total
+
+
+@_compiled
+def _square_at(matrix: Array, side: Array, solution: Array, square: float) -> float:
+    """Return chi-square of the rays alone at a solution, which need not be their least."""
+    total = square
+    for v in range(side.size):
+        here = 0.0
+        for w in range(side.size):
+            here += matrix[v, w] * solution[w]
+        total += solution[v] * (here - 2.0 * side[v])
     return total
 
 

@@ -225,6 +225,17 @@ def test_solution_is_the_least_squares_one(deviation):
     assert result.degrees_of_freedom[0] == layout.crossings.ray.size - net.rays - net.vertices
 
 
+def test_rays_that_contradict_tell_so_when_their_constants_run_away():
+    """With nothing told beforehand, the constant of a ray that is off goes where it counts for
+    nothing, and the equations of the rays become singular."""
+    _, layout, data, problem = case(2)
+    data.log_value[0, layout.first_crossing[0] + 1] -= 3.0
+    found = problem.solve(np.inf, 60)
+    assert np.isnan(found.chi_square[0])
+    assert found.prior_chi_square[0] > 50.0 * found.prior_degrees_of_freedom[0]
+    assert found.prior_chi_square[1] == found.chi_square[1]
+
+
 def test_likelihood_is_that_of_the_dense_linear_model():
     net, layout, data, problem = case(1)
     problem.solve(0.05, 60)
