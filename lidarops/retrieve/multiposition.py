@@ -29,7 +29,7 @@ import numpy.typing as npt
 from scipy import special
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve import _closed, _inputs, _network, _prior, _rays
+from lidarops.retrieve import _block_errors, _closed, _inputs, _network, _prior, _rays
 from lidarops.retrieve import geometry as rays_geometry
 from lidarops.retrieve import visibility as sight
 from lidarops.retrieve._point_weights import MISSING, NOT_POSITIVE, OUTLYING
@@ -132,7 +132,8 @@ class MultiPositionResult:
     """(..., vertex) m-1; NaN at vertices that are near ones on no ray, and where there is none."""
     extinction_standard_error: Array
     """m-1, by noise and by what a field may deviate from the prior: twice the prior's standard
-    deviation is counted."""
+    deviation is counted, and a bend over the network where the mean of the block's rays allows it.
+    Of a block in thin air, no less than is typical of it, and what noise moves all by."""
     visibility: sight.VisibilityResult
     """(..., vertex) m, at the wavelength of the lidars."""
     flags: VertexFlags
@@ -293,6 +294,8 @@ def _solve_network(
         extinction[:, layout.measured] = np.exp(fit.logarithm)
         variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
         believed[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.believed
+    if prior is Prior.BLOCK:
+        variance = _block_errors.at_least_typical(extinction, variance, rays.block)
     none = np.zeros(shape, dtype=np.bool_)
     # Doubt in the prior, which is stated, is no noise that makes a value lie anywhere.
     shaky = _closed.shaky(extinction, believed, rays.block)

@@ -218,9 +218,13 @@ def test_solution_is_the_least_squares_one(deviation):
             doubt = covariance @ precision @ covariance
             stated = np.diag(covariance + 3.0 * doubt)
             np.testing.assert_allclose(stated, result.variance[n], rtol=0.02)
+            # What fields move the solution by that the prior rules out.
+            moved = problem.bends @ precision @ covariance
+            np.testing.assert_allclose(np.sum(moved**2, axis=0), result.missed[n], rtol=0.02)
             assert 2 * best.cost == pytest.approx(result.prior_chi_square[n], rel=1e-5)
         else:
             np.testing.assert_array_equal(result.variance[n], result.believed[n])
+            np.testing.assert_array_equal(result.missed[n], 0.0)
             assert 2 * best.cost == pytest.approx(result.chi_square[n], rel=0.02)
     assert result.degrees_of_freedom[0] == layout.crossings.ray.size - net.rays - net.vertices
 
@@ -368,7 +372,7 @@ def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told)
     sharp = problem.afresh(_prior.DEVIATIONS[0])
     # Profiles fit by themselves, the steep ones hardly worse.
     assert np.median(sharp.prior_chi_square / sharp.prior_degrees_of_freedom) < 2.0
-    assert _prior._unlikely(mean, sharp, 1.0) == told
+    assert _prior._unlikely(_prior._told(mean, sharp, 1.0)) == told
 
 
 def uneven(net):
@@ -417,9 +421,9 @@ def test_a_prior_under_which_the_mean_does_not_settle_is_rejected():
     data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
     mean = Unsettled(_prior._pooled(data, where[0]), *where)
     result = _prior._Problem(data, *where).afresh(0.1)
-    assert not _prior._unlikely(mean, result, 1.0)
+    assert not _prior._unlikely(_prior._told(mean, result, 1.0))
     mean.always = True
-    assert _prior._unlikely(mean, result, 1.0)
+    assert _prior._unlikely(_prior._told(mean, result, 1.0))
     told = _prior._solve_block(_prior._Problem(data, *where), lambda: mean)
     assert np.all(np.isinf(told.deviation))
 
