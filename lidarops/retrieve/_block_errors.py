@@ -9,6 +9,7 @@ what the mean of the rays leaves open without any prior. Nothing here changes a 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -45,12 +46,19 @@ def bends(position: Array) -> Array:
     (field, vertex) float64
         Of ln extinction; no field where vertices are so few that a gradient describes any.
     """
-    if position.shape[0] == 0:
+    return _bends(np.ascontiguousarray(position, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=32)
+def _bends(position: bytes) -> Array:
+    # Blocks of profiles share a network, and a decomposition costs more than a profile.
+    where = np.frombuffer(position, dtype=np.float64).reshape(-1, 3)
+    if where.shape[0] == 0:
         return np.zeros((0, 0))
-    centred = position - position.mean(axis=0)
+    centred = where - where.mean(axis=0)
     size = float(np.sqrt(np.mean(np.sum(centred * centred, axis=1))))
     if size == 0.0:
-        return np.zeros((0, position.shape[0]))
+        return np.zeros((0, where.shape[0]))
     centred /= size
     first, second = np.triu_indices(3)
     weight = np.where(first == second, 1.0, np.sqrt(2.0))
@@ -131,10 +139,18 @@ def at_least_typical(extinction: Array, variance: Array, block: Indices) -> Arra
     for number in np.unique(block):
         mine = np.flatnonzero(block == number)
         known = np.isfinite(variance[mine])
-        for vertex in np.flatnonzero(known.any(axis=0)):
+        whole = known.all(axis=0)
+        columns = np.flatnonzero(whole)
+        out[np.ix_(mine, columns)] = _lifted(
+            extinction[np.ix_(mine, columns)], variance[np.ix_(mine, columns)]
+        )
+        for vertex in np.flatnonzero(known.any(axis=0) & ~whole):
             rows = mine[known[:, vertex]]
-            usual = float(np.median(variance[rows, vertex]))
-            middle = float(np.median(extinction[rows, vertex]))
-            if usual > (_NOT_LINEAR * middle) ** 2:
-                out[rows, vertex] = np.maximum(variance[rows, vertex], usual)
+            out[rows, vertex] = _lifted(extinction[rows, vertex], variance[rows, vertex])
     return out
+
+
+def _lifted(extinction: Array, variance: Array) -> Array:
+    usual, middle = np.median(variance, axis=0), np.median(extinction, axis=0)
+    lifted = np.maximum(variance, usual)
+    return np.asarray(np.where(usual > (_NOT_LINEAR * middle) ** 2, lifted, variance))
