@@ -39,7 +39,7 @@ _THINNEST: Final = 1e-3
 _SETTLED: Final = 1e-3
 _TINIEST_PIVOT: Final = 1e-13
 _NEARLY_NONE: Final = 1e-2
-_DOUBT: Final = 2.0
+DOUBT: Final = 2.0
 """Times the standard deviation of the prior, by which a field may deviate, for what is stated."""
 _LARGEST_VARIANCE: Final = 4.0
 """Of ln extinction; beyond, it is not determined."""
@@ -382,6 +382,7 @@ def solve_profiles(
     covariance: Array,
     geometry: tuple[Indices, Indices, Indices],
     precision: Array,
+    doubts: Array,
     norm: float,
     flat: bool,
     passes: int,
@@ -389,6 +390,7 @@ def solve_profiles(
     logarithms: Array,
     variances: Array,
     believed: Array,
+    missed: Array,
     summary: Array,
     status: Codes,
 ) -> None:
@@ -402,6 +404,8 @@ def solve_profiles(
         Where crossings and where covariances of a ray start; the vertex of each crossing.
     precision : (vertex, vertex) float64
         Prior precision of ln extinction, which leaves a common level free.
+    doubts : (field, vertex) float64
+        Fields of ln extinction that the prior rules out, each of the size that it may have.
     norm : float
         -ln of its determinant.
     flat : bool
@@ -409,9 +413,10 @@ def solve_profiles(
     passes : int
     constants : (profile, ray) float64
         In: where to start; out: where the passes ended.
-    logarithms, variances, believed : (profile, vertex) float64
+    logarithms, variances, believed, missed : (profile, vertex) float64
         Get ln(extinction / m-1), its variance where fields deviate by more than the prior has it
-        (`_DOUBT`), and where they do not; NaN where undetermined, or unseen.
+        (`DOUBT`), and where they do not, and what `doubts` add to it; NaN where undetermined, or
+        unseen.
     summary : (profile, COLUMNS) float64
     status : (profile,) uint8
     """
@@ -444,14 +449,19 @@ def solve_profiles(
         for v in range(vertices):
             determinants += 2.0 * math.log(matrix[v, v]) if fine else math.nan
         free = (observations - used - count, observations - used - (count if flat else 1))
+        rough = _square_at(inverse, target, side, square) if flat and fine else math.nan
         summary[n, 0] = _least_square(inverse, target, seen, square, fine)
         summary[n, 2] = summary[n, 0] if flat or not fine else square - _dot(side, target)
+        if flat and fine and math.isnan(summary[n, 0]):
+            # Rays that leave some vertices open, or whose constants have run away, may disagree.
+            summary[n, 2], free = rough, (free[0], observations - used - 1)
         summary[n, 1], summary[n, 3] = free
         summary[n, 4] = summary[n, 2] + determinants + norm
         status[n] = UNDETERMINED if not fine else (SOLVED if moved < _SETTLED else UNSETTLED)
         _hand_over(
-            matrix, side, precision, seen, fine, inverse, logarithms[n], variances[n], believed[n]
-        )
+            matrix, side, precision, doubts, seen, fine, (inverse, target), logarithms[n],
+            variances[n], believed[n], missed[n],
+        )  # fmt: skip
 
 
 @_compiled
@@ -459,6 +469,18 @@ def _dot(left: Array, right: Array) -> float:
     total = 0.0
     for v in range(left.size):
         total += left[v] * right[v]
+    return total
+
+
+@_compiled
+def _square_at(matrix: Array, side: Array, solution: Array, square: float) -> float:
+    """Return chi-square of the rays alone at a solution, which need not be their least."""
+    total = square
+    for v in range(side.size):
+        here = 0.0
+        for w in range(side.size):
+            here += matrix[v, w] * solution[w]
+        total += solution[v] * (here - 2.0 * side[v])
     return total
 
 
@@ -479,28 +501,38 @@ def _hand_over(
     factor: Array,
     solution: Array,
     precision: Array,
+    doubts: Array,
     seen: Codes,
     fine: bool,
-    inverse: Array,
+    work: tuple[Array, Array],
     logarithms: Array,
     variances: Array,
     believed: Array,
+    missed: Array,
 ) -> None:
     """Fill the solution and its variances where vertices are seen, NaN elsewhere.
 
     The inverse C of all information is the covariance of a field of which the prior P is true;
-    C + (d^2 - 1) C P C that of one which deviates by d times as much.
+    C + (d^2 - 1) C P C that of one which deviates by d times as much. A field f that the prior
+    rules out moves the solution by C P f.
     """
+    inverse, pull = work
     if fine:
         _invert_system(factor, solution.size, inverse)
     for v in range(solution.size):
         good = fine and seen[v] == 1 and inverse[v, v] < _LARGEST_VARIANCE
         logarithms[v] = solution[v] if good else math.nan
-        variances[v], believed[v] = math.nan, math.nan
+        variances[v], believed[v], missed[v] = math.nan, math.nan, math.nan
         if good:
             believed[v] = inverse[v, v]
             told = 0.0
             for i in range(solution.size):
+                pull[i] = 0.0
                 for k in range(solution.size):
-                    told += inverse[v, i] * precision[i, k] * inverse[k, v]
-            variances[v] = inverse[v, v] + (_DOUBT * _DOUBT - 1.0) * max(told, 0.0)
+                    pull[i] += precision[i, k] * inverse[k, v]
+                told += inverse[v, i] * pull[i]
+            missed[v] = 0.0
+            for field in range(doubts.shape[0]):
+                reach = _dot(doubts[field], pull)
+                missed[v] += reach * reach
+            variances[v] = inverse[v, v] + (DOUBT * DOUBT - 1.0) * max(told, 0.0)

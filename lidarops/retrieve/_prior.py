@@ -11,7 +11,7 @@ one that deviates by twice as much (`lidarops.retrieve._network`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Final
 
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from lidarops.retrieve import _network
+from lidarops.retrieve import _block_errors, _network
 from lidarops.retrieve._point_weights import Condensed, Layout
 
 Array = npt.NDArray[np.float64]
@@ -62,6 +62,8 @@ class Solution:
     """(profile, vertex), with doubt in the prior."""
     believed: Array
     """(profile, vertex) variance where the prior is true."""
+    missed: Array
+    """(profile, vertex) variance by fields that the prior rules out, where nothing else does."""
     chi_square: Array
     """(profile,) of the rays alone, whatever the prior."""
     degrees_of_freedom: Array
@@ -85,6 +87,7 @@ class _Problem:
         self.data = data
         self.vertices = position.shape[0]
         self.gradient = _gradient(position)
+        self.bends = _block_errors.bends(position)
         self.geometry = (layout.first_crossing, layout.offset, vertex)
         self.constants = np.zeros((data.log_value.shape[0], exponent.size))
         self.likelihood = 0.0
@@ -103,7 +106,7 @@ class _Problem:
         """Solve all profiles; move the constants."""
         shape = (self.constants.shape[0], self.vertices)
         logarithm, variance = np.full(shape, np.nan), np.full(shape, np.nan)
-        believed = np.full(shape, np.nan)
+        believed, missed = np.full(shape, np.nan), np.full(shape, np.nan)
         summary, status = (
             np.full((shape[0], _network.COLUMNS), np.nan),
             np.zeros(shape[0], dtype=np.uint8),
@@ -117,16 +120,16 @@ class _Problem:
         data = self.data
         _network.solve_profiles(
             data.log_value, data.integral, data.usable, data.covariance, self.geometry,
-            precision, norm, flat, passes, self.constants, logarithm, variance, believed, summary,
-            status,
+            precision, self.bends, norm, flat, passes, self.constants, logarithm, variance,
+            believed, missed, summary, status,
         )  # fmt: skip
         fine = status != _network.UNDETERMINED
         # A profile that one prior leaves undetermined must not make it likelier than others.
         terms = np.where(fine, summary[:, _network.LIKELIHOOD], _UNDETERMINED_COST)
         self.likelihood = float(np.sum(terms))
         return Solution(
-            logarithm, variance, believed, summary[:, 0], summary[:, 1], summary[:, 2],
-            summary[:, 3], np.full(shape[0], strength * deviation), status,
+            logarithm, variance, believed, missed, summary[:, 0], summary[:, 1],
+            summary[:, 2], summary[:, 3], np.full(shape[0], strength * deviation), status,
         )  # fmt: skip
 
 
@@ -174,8 +177,9 @@ def solve_blocks(
 
     n = block.size
     out = Solution(
-        nothing(*shape), nothing(*shape), nothing(*shape), nothing(n), nothing(n), nothing(n),
-        nothing(n), nothing(n), np.full(n, _network.UNDETERMINED, dtype=np.uint8),
+        nothing(*shape), nothing(*shape), nothing(*shape), nothing(*shape), nothing(n),
+        nothing(n), nothing(n), nothing(n), nothing(n),
+        np.full(n, _network.UNDETERMINED, dtype=np.uint8),
     )  # fmt: skip
     for b in np.unique(block):
         mine = np.flatnonzero(block == b)
@@ -253,34 +257,66 @@ def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solu
     # What profiles tell well by themselves, their mean need not tell.
     with np.errstate(invalid="ignore"):
         mean = None if np.all(alone.variance < _WELL_TOLD**2) else pool()
-    whole = None if mean is None else mean.afresh(np.inf)
-    if whole is not None and whole.status[0] == _network.UNDETERMINED:
+    if mean is None:
+        return _strongest(problem, alone)[0]
+    whole = mean.afresh(np.inf)
+    if whole.status[0] == _network.UNDETERMINED:
         # A mean that tells nothing speaks against no prior.
-        mean = whole = None
-    settled = whole is not None and bool(whole.status[0] == _network.SOLVED)
+        result, strength = _strongest(problem, alone)
+        told = _told(mean, result, strength)
+        return _widened(result, strength, told, whole)
+    settled = bool(whole.status[0] == _network.SOLVED)
     for strength in _STRENGTHS:
-        least = _least(mean, strength) if mean is not None and settled else 0.0
+        least = _least(mean, strength) if settled else 0.0
         result = _likeliest(problem, strength, least)
-        if _contradicted(result, alone) or (whole and _apart(result, whole)):
+        if _contradicted(result, alone) or _apart(result, whole):
             continue
-        if mean is None or not _unlikely(mean, result, strength):
-            return result
-    return alone
+        told = _told(mean, result, strength)
+        if not _unlikely(told):
+            return _widened(result, strength, told, whole)
+    return _widened(alone, 1.0, whole, whole)
 
 
-def _unlikely(mean: _Problem, result: Solution, strength: float) -> bool:
+def _strongest(problem: _Problem, alone: Solution) -> tuple[Solution, float]:
+    """Solve with the strongest prior that no profile contradicts; return its strength, too."""
+    for strength in _STRENGTHS:
+        result = _likeliest(problem, strength, 0.0)
+        if not _contradicted(result, alone):
+            return result, strength
+    return alone, 1.0
+
+
+def _told(mean: _Problem, result: Solution, strength: float) -> Solution:
+    """Solve the mean of profiles with the prior that each of them was solved with."""
+    return mean.afresh(float(result.deviation[0]) / strength, strength)
+
+
+def _unlikely(told: Solution) -> bool:
     """Return whether the mean of profiles does not fit the prior that each of them fits.
 
     Noise hides in each profile what a prior has wrong; in their mean there is less of it. Asked
     in values along rays, where `_apart` asks in extinction, of which thin air tells nothing.
     """
-    told = mean.afresh(float(result.deviation[0]) / strength, strength)
     if told.status[0] != _network.SOLVED:
         return True
     square, freedom = float(told.prior_chi_square[0]), float(told.prior_degrees_of_freedom[0])
     if freedom <= 0:
         return False
     return bool(special.gammaincc(freedom / 2.0, max(square, 0.0) / 2.0) < _UNLIKELY)
+
+
+def _widened(result: Solution, strength: float, told: Solution, free: Solution) -> Solution:
+    """Return solutions with the errors that the mean of profiles knows of, told and free."""
+    noise = _block_errors.of_noise(result.logarithm, result.variance, told.logarithm[0])
+    field = _block_errors.of_field(
+        result.missed, told.logarithm[0], free.logarithm[0], free.variance[0]
+    )
+    # Where nothing speaks against a prior, the weakest that is tried may be the true one.
+    times = max(_STRENGTHS[-1] / strength, _network.DOUBT)
+    more = (times**2 - 1.0) / (_network.DOUBT**2 - 1.0)
+    factor = np.where(np.isfinite(free.variance[0]), 1.0, more)
+    prior = (factor - 1.0) * (result.variance - result.believed)
+    return replace(result, variance=result.variance + (noise + field + prior))
 
 
 def _likeliest(problem: _Problem, strength: float, least: float) -> Solution:

@@ -79,7 +79,7 @@ def prepare(
     members = [np.flatnonzero(block == b) for b in range(count)]
     relative = variance is None
     if variance is None:
-        rows, row = _estimated(signal, members), block
+        rows, row = _estimated(signal, members, block)
     else:
         rows, row = _variances(variance, signal.shape, turn=turn)
     mean, mean_rows, single, averaged = _means(signal, rows, row, members, layout)
@@ -96,7 +96,8 @@ def prepare(
         heard = np.where(weak | (means.usable == 0), np.nan, loudness)
     means.usable[weak] = 0
     # What is missing has another reason.
-    alone = _loud(signal, rows, row, single[block], layout) & (data.usable == 1)
+    alone = _loud(signal, rows, row, single[block], layout, relative=relative)
+    alone &= data.usable == 1
     data.usable[(means.usable == 0)[block] | alone] = 0
     return Rays(
         layout, powers, data, means, block, averaged, np.sqrt(_row_means(heard)),
@@ -233,24 +234,56 @@ def _variances(
     return np.ascontiguousarray(rows), row
 
 
-def _estimated(signal: Array, members: list[Indices]) -> Array:
-    """Return (block, ray, bin) relative variances, from second differences along range."""
+def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[Array, Indices]:
+    """Return relative variances, from second differences along range, and which go with a profile.
+
+    One row for each block, and one for each profile that is far louder than its block: it would
+    spoil the errors of all others, and state too little itself.
+
+    Returns
+    -------
+    rows : (row, ray, bin) float64
+    row : (profile,) intp
+    """
     out = np.full((len(members), *signal.shape[1:]), np.nan)
     if signal.shape[-1] < 3:
-        return out
+        return out, block
     with np.errstate(invalid="ignore", divide="ignore"):
         logs = np.log(np.where(signal > 0, signal, np.nan))
     squares = (logs[..., :-2] - 2.0 * logs[..., 1:-1] + logs[..., 2:]) ** 2 / 6.0
-    width = min(_SMOOTHED, squares.shape[-1])
+    row, own = block.copy(), []
     for b, mine in enumerate(members):
-        known = np.isfinite(squares[mine])
-        total = np.where(known, squares[mine], 0.0).sum(axis=0)
-        number = known.sum(axis=0).astype(np.float64)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            smooth = _moving_sum(total, width) / _moving_sum(number, width)
-        out[b, :, 1:-1] = smooth
-        out[b, :, 0], out[b, :, -1] = smooth[:, 0], smooth[:, -1]
-    return out
+        here = squares[mine]
+        known = np.isfinite(here)
+        loud = _louder(here, known)
+        most = known & ~loud[..., np.newaxis] if loud.any() else known
+        out[b] = _smoothed(here, most)
+        for n in np.flatnonzero(loud.any(axis=1)):
+            alone = _smoothed(here[n : n + 1], known[n : n + 1])
+            own.append(np.where(loud[n, :, np.newaxis], alone, out[b]))
+            row[mine[n]] = len(members) + len(own) - 1
+    return np.concatenate([out, np.array(own)]) if own else out, row
+
+
+def _louder(squares: Array, known: Booleans) -> Booleans:
+    """Return (profile, ray) where noise is far above that of most profiles.
+
+    By medians along range, which no single wild gate moves.
+    """
+    # Every third shares no gate with the next one. What is unknown is none of the smallest.
+    size = np.median(np.where(known[..., ::3], squares[..., ::3], np.inf), axis=2)
+    usual = np.median(size, axis=0)
+    return np.asarray(np.isfinite(size) & (size > _LOUDER * usual) & (usual > 0.0))
+
+
+def _smoothed(squares: Array, known: Booleans) -> Array:
+    """Return (ray, bin) means over profiles and neighbouring gates; two more bins than squares."""
+    width = min(_SMOOTHED, squares.shape[-1])
+    total = np.where(known, squares, 0.0).sum(axis=0)
+    number = known.sum(axis=0).astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        smooth = _moving_sum(total, width) / _moving_sum(number, width)
+    return np.asarray(np.concatenate([smooth[:, :1], smooth, smooth[:, -1:]], axis=1))
 
 
 def _moving_sum(values: Array, width: int) -> Array:
@@ -315,7 +348,9 @@ def _usual(variances: Array, signal: Array, median: Array) -> Array:
         return np.asarray(np.where(quiet, variances, 0.0).sum(axis=0) / quiet.sum(axis=0))
 
 
-def _loud(signal: Array, rows: Array, row: Indices, single: Array, layout: Layout) -> Booleans:
+def _loud(
+    signal: Array, rows: Array, row: Indices, single: Array, layout: Layout, *, relative: bool
+) -> Booleans:
     """Return (profile, crossing) where one far louder than its block is too weak by itself.
 
     By its own level, as the energy of a laser may be what raises its noise.
@@ -331,7 +366,8 @@ def _loud(signal: Array, rows: Array, row: Indices, single: Array, layout: Layou
             usual = single[:, ray, gate].sum(axis=1) / gates
             level = np.maximum(signal[:, ray, gate].sum(axis=1) / gates, 0.0)
             louder = (usual > 0.0) & ~(spread <= _LOUDER * usual)
-            out[:, c] = louder & ~(spread <= LOUDEST_GATE**2 * level**2)
+            scale = 1.0 if relative else level**2
+            out[:, c] = louder & ~(spread <= LOUDEST_GATE**2 * scale)
     return out
 
 

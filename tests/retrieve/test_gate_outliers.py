@@ -332,6 +332,31 @@ def test_spikes_are_seen_where_signals_tell_the_noise():
     assert np.nanmax(apart(found, clean)[7]) < 1.0
 
 
+@pytest.mark.parametrize(("wild", "left"), [((0, 1, -2, -1), True), ((0, 1), False)])
+def test_a_ray_nothing_good_is_left_of_is_not_believed(wild, left):
+    """Between wild gates at either end of a short ray, all may be wild; nothing lies beyond."""
+    net = fan([-30.0, 0.0, 40.0], [(60,), (90,), (120,)])
+    r = np.arange(20.0, 140.0, 4.0)
+    field = ALL["homogeneous"]
+    power, variance = noisy(net, r, signals(net, r, field), 2e-3, 50, 3, 0.0)
+    ends = net.on_ray(0)[1][[0, -1]]
+    used = np.arange(gate_at(r, ends[0]) - 3, gate_at(r, ends[1]) + 4)
+    power[:, 0, used[-1] + 1 :] = np.nan
+    nearest = np.array([r[used[0]] - 1.0, 20.0, 20.0])
+    damaged = hit(power, variance, 4, 0, used[list(wild)], 60.0)
+    data, layout = condensed(net, r, damaged, variance, nearest=nearest)
+    mine = slice(layout.first_crossing[0], layout.first_crossing[1])
+    others = np.arange(50) != 4
+    assert (data.usable[others, mine] == 1).all()
+    assert not data.bridged[others].any()
+    assert data.bridged[4, 0]
+    assert (data.status[4, 0] == _point_weights.OUTLYING) == left
+    assert (data.usable[4, mine] == 0).all() == left
+    found = solved(net, r, damaged, variance, full_overlap_range=nearest)
+    assert found.flags.outlying[4, net.on_ray(0)[0]].all() == left
+    assert not found.flags.outlying[others].any()
+
+
 # Honesty ------------------------------------------------------------------------------------
 
 

@@ -19,7 +19,7 @@ from oracle_multiposition import (
     without_noise,
 )
 
-from lidarops.retrieve import geometry
+from lidarops.retrieve import _rays, geometry
 from lidarops.retrieve.multiposition import solve
 
 # Flags --------------------------------------------------------------------------------------
@@ -173,3 +173,52 @@ def test_a_vertex_reached_against_strong_attenuation_is_flagged(method, relative
     assert result.flags.ill_conditioned[:, other].mean() > 0.6
     assert result.flags.flagged[:, other].all()
     assert not result.flags.flagged[:, start].any()
+
+
+@pytest.mark.parametrize("factor", [8.0, 20.0])
+def test_one_loud_profile_costs_the_others_nothing_where_signals_tell_the_noise(factor):
+    """Its noise was taken for that of its whole block, and for a part of its own only."""
+    net = triangle()
+    r = grid(net)
+    clean = signals(net, r, homogeneous(2e-3))
+    calm, _ = noisy(net, r, clean, 0.01, 50, 4, 0.0)
+    power = calm.copy()
+    power[7] += (factor - 1.0) * (calm[7] - clean)
+    settings = {"full_overlap_range": 100.0, "prior": "none"}
+    quiet, found = solve(calm, r, net, **settings), solve(power, r, net, **settings)
+    others = np.arange(50) != 7
+    near = found.near_vertex
+    np.testing.assert_allclose(
+        found.extinction_standard_error[others][:, near],
+        quiet.extinction_standard_error[others][:, near], rtol=0.05,
+    )  # fmt: skip
+    own = found.extinction_standard_error[7, near] / found.extinction[7, near]
+    usual = quiet.extinction_standard_error[7, near] / quiet.extinction[7, near]
+    told = np.isfinite(own)
+    assert np.all(found.flags.flagged[7, near] | (own > 0.5 * factor * usual))
+    assert not (
+        told
+        & ~found.flags.flagged[7, near]
+        & (
+            np.abs(found.extinction[7, near] - 2e-3)
+            > 4.0 * found.extinction_standard_error[7, near]
+        )
+    ).any()
+
+
+def test_noise_of_calm_profiles_is_pooled_as_ever():
+    power, _ = noisy(
+        triangle(),
+        grid(triangle()),
+        signals(triangle(), grid(triangle()), homogeneous(2e-3)),
+        0.02,
+        12,
+        5,
+        0.0,
+    )
+    block = np.repeat([0, 1], 6)
+    members = [np.flatnonzero(block == b) for b in range(2)]
+    rows, row = _rays._estimated(power, members, block)
+    np.testing.assert_array_equal(row, block)
+    assert rows.shape == (2, *power.shape[1:])
+    np.testing.assert_allclose(np.sqrt(np.median(rows, axis=2)), 0.02, rtol=0.1)

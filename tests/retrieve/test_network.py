@@ -218,11 +218,26 @@ def test_solution_is_the_least_squares_one(deviation):
             doubt = covariance @ precision @ covariance
             stated = np.diag(covariance + 3.0 * doubt)
             np.testing.assert_allclose(stated, result.variance[n], rtol=0.02)
+            # What fields move the solution by that the prior rules out.
+            moved = problem.bends @ precision @ covariance
+            np.testing.assert_allclose(np.sum(moved**2, axis=0), result.missed[n], rtol=0.02)
             assert 2 * best.cost == pytest.approx(result.prior_chi_square[n], rel=1e-5)
         else:
             np.testing.assert_array_equal(result.variance[n], result.believed[n])
+            np.testing.assert_array_equal(result.missed[n], 0.0)
             assert 2 * best.cost == pytest.approx(result.chi_square[n], rel=0.02)
     assert result.degrees_of_freedom[0] == layout.crossings.ray.size - net.rays - net.vertices
+
+
+def test_rays_that_contradict_tell_so_when_their_constants_run_away():
+    """With nothing told beforehand, the constant of a ray that is off goes where it counts for
+    nothing, and the equations of the rays become singular."""
+    _, layout, data, problem = case(2)
+    data.log_value[0, layout.first_crossing[0] + 1] -= 3.0
+    found = problem.solve(np.inf, 60)
+    assert np.isnan(found.chi_square[0])
+    assert found.prior_chi_square[0] > 50.0 * found.prior_degrees_of_freedom[0]
+    assert found.prior_chi_square[1] == found.chi_square[1]
 
 
 def test_likelihood_is_that_of_the_dense_linear_model():
@@ -357,7 +372,7 @@ def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told)
     sharp = problem.afresh(_prior.DEVIATIONS[0])
     # Profiles fit by themselves, the steep ones hardly worse.
     assert np.median(sharp.prior_chi_square / sharp.prior_degrees_of_freedom) < 2.0
-    assert _prior._unlikely(mean, sharp, 1.0) == told
+    assert _prior._unlikely(_prior._told(mean, sharp, 1.0)) == told
 
 
 def uneven(net):
@@ -406,9 +421,9 @@ def test_a_prior_under_which_the_mean_does_not_settle_is_rejected():
     data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
     mean = Unsettled(_prior._pooled(data, where[0]), *where)
     result = _prior._Problem(data, *where).afresh(0.1)
-    assert not _prior._unlikely(mean, result, 1.0)
+    assert not _prior._unlikely(_prior._told(mean, result, 1.0))
     mean.always = True
-    assert _prior._unlikely(mean, result, 1.0)
+    assert _prior._unlikely(_prior._told(mean, result, 1.0))
     told = _prior._solve_block(_prior._Problem(data, *where), lambda: mean)
     assert np.all(np.isinf(told.deviation))
 
