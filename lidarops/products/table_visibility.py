@@ -218,8 +218,9 @@ VISIBILITY: Final = Layout(
             quality(_SERIES, FLAGS),
             comment="In this kind of product poorly_determined means a standard error above a third"
             " of extinction, of the value or as the median of its block, before the doubt in the"
-            " prior is added; low_leverage a beam that"
-            " is too weak to be used beside the others; poor_fit beams that disagree by more than"
+            " prior is added;"
+            " low_leverage a beam that is too weak, or of a variance of zero, to be used beside"
+            " the others; poor_fit beams that disagree by more than"
             " their noise allows, or a beam that ends before the point at bins that lie off their"
             " neighbours; outlier a beam with bins that lie more than 6 standard errors off their"
             " neighbours: these took the place of single ones, while several together, which may be"

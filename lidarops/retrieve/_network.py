@@ -393,6 +393,7 @@ def solve_profiles(
     missed: Array,
     summary: Array,
     status: Codes,
+    left_out: Codes,
 ) -> None:
     """Solve profiles for the logarithms of extinction at all vertices.
 
@@ -419,6 +420,9 @@ def solve_profiles(
         unseen.
     summary : (profile, COLUMNS) float64
     status : (profile,) uint8
+    left_out : (profile, ray) uint8
+        Gets 1 where two crossings or more of a ray are usable, and their covariance is singular
+        or not finite.
     """
     rays, vertices = constants.shape[1], logarithms.shape[1]
     work = _workspace(geometry[0], rays)
@@ -446,6 +450,10 @@ def solve_profiles(
                 break
             substitute(matrix, vertices, side)
             moved = _move(geometry, counts, work[3], work[4], side, constants[n])
+        for ray in range(rays):
+            first = geometry[0][ray]
+            usual = _count(usable[n], first, geometry[0][ray + 1])
+            left_out[n, ray] = counts[ray] == 0 and usual >= 2
         for v in range(vertices):
             determinants += 2.0 * math.log(matrix[v, v]) if fine else math.nan
         free = (observations - used - count, observations - used - (count if flat else 1))

@@ -81,7 +81,8 @@ class Condensed:
     integral: Array
     """(profile, crossing) m, 2 m times the integral from here to the next crossing of the ray."""
     usable: Codes
-    """(profile, crossing) 1 where all gates up to the crossing's are positive."""
+    """(profile, crossing) 1 where all gates up to the crossing's are positive, and their variances
+    known."""
     covariance: Array
     """(profile, packed) for each ray, of its log values and then its integrals."""
     slope: Array
@@ -414,10 +415,11 @@ def _look_beyond(
         codes[g] = _gate_outliers.LOST
         if not abs(row[g]) < 1e300 or row[g] <= 0.0:
             continue
-        codes[g] = _gate_outliers.GOOD
         logs[g] = exponent * (math.log(row[g]) + log_factor[g])
         spread = variance[g]
         noise[g] = exponent * exponent * (spread if relative else spread / row[g] ** 2)
+        if noise[g] < math.inf:
+            codes[g] = _gate_outliers.GOOD
 
 
 @_compiled
@@ -543,6 +545,9 @@ def _condense(
             for g in range(low, stop):
                 spread = spread_row[g]
                 noise[g] = m * m * (spread if relative else spread / power[n, ray, g] ** 2)
+                if not noise[g] < math.inf:
+                    stop, reason = g, MISSING
+                    break
                 codes[g] = _gate_outliers.GOOD
             start = max(limits[ray, 0], low - _gate_outliers.MARGIN)
             end = min(limits[ray, 1], stop + _gate_outliers.MARGIN)

@@ -24,6 +24,7 @@ from lidarops.retrieve._point_weights import Condensed, Layout
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
+Booleans = npt.NDArray[np.bool_]
 Codes = npt.NDArray[np.uint8]
 
 GRADIENT: Final = 0.15
@@ -41,6 +42,8 @@ _HARMLESS: Final = 0.5
 """Of the standard error that is reported."""
 _ENOUGH: Final = 8
 """Profiles that must see a ray for their mean to be asked."""
+_LOUDER: Final = 10.0
+"""Times the median variance of a block's profiles, from which on one is left out of their mean."""
 _TOLD_BY_MEAN: Final = 0.3
 _APART: Final = 2.5
 """Standard errors, of both, between the mean of solutions and the solution of the mean."""
@@ -76,6 +79,8 @@ class Solution:
     """(profile,) of the prior; inf without one."""
     status: Codes
     """(profile,) of `lidarops.retrieve._network`."""
+    left_out: Codes
+    """(profile, ray) 1 where a ray was, because its covariance is singular or none."""
 
 
 class _Problem:
@@ -111,6 +116,7 @@ class _Problem:
             np.full((shape[0], _network.COLUMNS), np.nan),
             np.zeros(shape[0], dtype=np.uint8),
         )
+        left_out = np.zeros(self.constants.shape, dtype=np.uint8)
         flat = not np.isfinite(deviation)
         precision, norm = (
             (np.zeros_like(self.gradient), 0.0)
@@ -121,7 +127,7 @@ class _Problem:
         _network.solve_profiles(
             data.log_value, data.integral, data.usable, data.covariance, self.geometry,
             precision, self.bends, norm, flat, passes, self.constants, logarithm, variance,
-            believed, missed, summary, status,
+            believed, missed, summary, status, left_out,
         )  # fmt: skip
         fine = status != _network.UNDETERMINED
         # A profile that one prior leaves undetermined must not make it likelier than others.
@@ -130,6 +136,7 @@ class _Problem:
         return Solution(
             logarithm, variance, believed, missed, summary[:, 0], summary[:, 1],
             summary[:, 2], summary[:, 3], np.full(shape[0], strength * deviation), status,
+            left_out,
         )  # fmt: skip
 
 
@@ -180,6 +187,7 @@ def solve_blocks(
         nothing(*shape), nothing(*shape), nothing(*shape), nothing(*shape), nothing(n),
         nothing(n), nothing(n), nothing(n), nothing(n),
         np.full(n, _network.UNDETERMINED, dtype=np.uint8),
+        np.zeros((n, exponent.size), dtype=np.uint8),
     )  # fmt: skip
     for b in np.unique(block):
         mine = np.flatnonzero(block == b)
@@ -220,7 +228,10 @@ def _pooled(data: Condensed, layout: Layout) -> Condensed | None:
         if depth == 0:
             continue
         used = np.flatnonzero(reach >= depth)
+        used = used[_quiet(data.covariance[used, packed], mine.stop - mine.start, depth)]
         number = used.size
+        if number < _ENOUGH:
+            continue
         usable[0, mine][:depth] = 1
         log_value[0, mine] = data.log_value[used, mine].sum(axis=0) / number
         integral[0, mine] = data.integral[used, mine].sum(axis=0) / number
@@ -232,6 +243,27 @@ def _pooled(data: Condensed, layout: Layout) -> Condensed | None:
     return Condensed(
         log_value, integral, usable, covariance, slope, data.status[:1], data.bridged[:1]
     )
+
+
+def _quiet(covariance: Array, crossings: int, depth: int) -> Booleans:
+    """Return (profile,) where a ray is not far louder than in most profiles.
+
+    A single gate of huge or unknown variance in one profile would take a ray from the mean of
+    all, which then speaks against no prior.
+
+    Parameters
+    ----------
+    covariance : (profile, packed) float64
+        Of a ray: of its log values and then its integrals, both up to a depth.
+    crossings, depth : int
+        Of the ray, and those in the mean.
+    """
+    quantities = 2 * crossings - 1
+    mine = np.r_[:depth, crossings : crossings + depth - 1]
+    variances = covariance[:, mine * (quantities + 1)]
+    known = np.isfinite(variances)
+    usual = np.median(np.where(known, variances, np.inf), axis=0)
+    return np.asarray((known & (variances <= _LOUDER * usual)).all(axis=1))
 
 
 def _depth(reach: Indices) -> int:

@@ -420,7 +420,7 @@ def average(
         noise = rows[row]
     mean = np.full((count, *signal.shape[1:]), np.nan)
     spread = None if noise is None else mean.copy()
-    known = np.isfinite(signal)
+    known = np.isfinite(signal) if noise is None else np.isfinite(signal) & np.isfinite(noise)
     for g in range(count):
         mine = np.flatnonzero(group == g)
         present = known[mine].any(axis=0)

@@ -96,9 +96,10 @@ class VertexFlags:
     signal_not_positive: Booleans
     """A ray of the vertex has a gate before it that is zero or negative."""
     signal_missing: Booleans
-    """A ray of the vertex has a gate before it that is not finite."""
+    """A ray of the vertex has a gate before it of which power or variance is not finite."""
     weak_signal: Booleans
-    """A ray of the vertex is too noisy there, and was left out; the others stand."""
+    """A ray of the vertex is too noisy there, or of a variance that cannot be (zero), and was left
+    out; the others stand."""
     bridged: Booleans
     """A ray of the vertex has gates that lie far off their neighbours: these took the place of
     single ones. Several together, which may be air, were left as they are, and what they and the
@@ -159,7 +160,8 @@ def average(
     """Average the signals of groups of profiles, as should be done before they are solved.
 
     A lidar's energy changes from profile to profile: a ray with a gap would put a step into the
-    mean, and is left out of it. Where no profile of a group has a gate, the mean has none.
+    mean, and is left out of it, as is one with a gate of unknown variance. Where no profile of a
+    group has a gate, the mean has none.
 
     Parameters
     ----------
@@ -346,6 +348,7 @@ def _judged(
     none = np.zeros(shape[0], dtype=np.bool_)
     chi_square, freedom = np.full(shape[0], np.nan), np.full(shape[0], np.nan)
     deviation, unsettled, poor = np.full(shape[0], np.nan), none, none
+    weak = rays.weak
     if fit is not None:
         freedom, deviation = fit.degrees_of_freedom, fit.deviation
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -353,6 +356,8 @@ def _judged(
         poor = _improbable(fit.chi_square, freedom)
         poor |= _improbable(fit.prior_chi_square, fit.prior_degrees_of_freedom)
         unsettled = fit.status == _network.UNSETTLED
+        dropped = fit.left_out[:, rays.layout.crossings.ray] == 1
+        weak = weak | (dropped & (rays.data.usable == 1))
     flags = VertexFlags(
         ill_conditioned=estimate.weak_attenuation & finite,
         far_start=np.broadcast_to(estimate.far_start, shape),
@@ -361,7 +366,7 @@ def _judged(
         uncertain=uncertain,
         signal_not_positive=_lost(rays, NOT_POSITIVE),
         signal_missing=_lost(rays, MISSING),
-        weak_signal=_by_vertex(rays, rays.weak),
+        weak_signal=_by_vertex(rays, weak),
         bridged=_by_vertex(rays, rays.data.bridged[:, rays.layout.crossings.ray] == 1),
         outlying=_lost(rays, OUTLYING),
         pole=estimate.pole,

@@ -315,6 +315,16 @@ def test_averages_leave_out_rays_with_gaps():
     assert np.isnan(mean[:, 1, 6:]).all()
     np.testing.assert_allclose(variance[:, 0, 0], [0.15, 0.15], rtol=1e-14)
     assert multiposition.average(power, labels)[1] is None
+    # A gate of unknown variance is a gap: one profile must not take it from the mean of all.
+    noise = np.full(power.shape, 0.3)
+    noise[[2, 0], [0, 1], [5, 2]] = np.nan, np.inf
+    noise[:, 1, 5] = np.nan
+    mean, variance = multiposition.average(power, labels, variance=noise)
+    np.testing.assert_allclose(mean[0, 0], power[4, 0], rtol=1e-14)
+    np.testing.assert_allclose(variance[0, 0], 0.3, rtol=1e-14)
+    np.testing.assert_allclose(mean[1, 1, :6], power[3, 1, :6], rtol=1e-14)
+    np.testing.assert_allclose(variance[:, 1, :5], [[0.1] * 5, [0.3] * 5], rtol=1e-14)
+    assert np.isnan(variance[:, 1, 5]).all()
     with pytest.raises(RetrievalInputError):
         multiposition.average(power[0], labels)
     with pytest.raises(RetrievalInputError):
@@ -447,9 +457,72 @@ def test_one_loud_profile_costs_the_others_nothing(factor):
     if factor > 50.0 or np.isnan(factor):
         assert not mine.any()
         told = found.flags.weak_signal | found.flags.signal_not_positive | found.flags.outlying
+        told |= found.flags.signal_missing
         assert told[3, net.near_vertex].all()
     score = (found.extinction - 2e-3) / found.extinction_standard_error
     assert np.all(np.abs(score[3][mine]) < 4.0)
+
+
+def between(net, r):
+    """Return the gate of each ray in the middle of its last two vertices."""
+    last = [net.on_ray(ray)[1][-2:] for ray in range(net.rays)]
+    return np.searchsorted(r, np.mean(last, axis=1))
+
+
+@pytest.mark.parametrize("factor", [np.nan, np.inf, 1e12])
+def test_a_gate_of_unknown_variance_leaves_the_other_profiles_as_they_are(factor):
+    """One gate, between vertices, took its rays from the mean: the prior then went untested."""
+    net = three_by_two()
+    r = grid(net)
+    clean = signals(net, r, lambda _, __, z: 1.5e-3 * np.exp(-(z - 500.0) / 250.0))
+    power, variance = noisy(net, r, clean, 0.05, 60)
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[7, np.arange(net.rays), between(net, r)] *= factor
+    settings = {"full_overlap_range": 100.0}
+    found = solve(power, r, net, variance=told, **settings)
+    whole = solve(power, r, net, variance=variance, **settings)
+    others = np.arange(60) != 7
+    np.testing.assert_array_equal(found.prior_deviation, whole.prior_deviation)
+    np.testing.assert_array_equal(found.flags.flagged[others], whole.flags.flagged[others])
+    kept = ~whole.flags.flagged & np.isfinite(whole.extinction)
+    assert np.all(apart(found, whole)[others][kept[others]] < 0.05)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_gate_of_unknown_variance_costs_what_one_without_signal_does(bad):
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.01, 50, seed=4)
+    ray = int(np.argmax(np.bincount(net.crossings.ray)))
+    gate = between(net, r)[ray]
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[7, ray, gate] = bad
+    lost = power.copy()
+    lost[7, ray, gate] = np.nan
+    found = solve(power, r, net, variance=told, full_overlap_range=100.0)
+    other = solve(lost, r, net, variance=variance, full_overlap_range=100.0)
+    for one in ("extinction", "extinction_standard_error", "degrees_of_freedom"):
+        np.testing.assert_allclose(getattr(found, one)[7], getattr(other, one)[7], rtol=1e-9)
+    vertices = net.on_ray(ray)[0]
+    assert found.flags.signal_missing[7, vertices[-1]]
+    assert not found.flags.signal_missing[7, vertices[0]]
+    assert np.delete(found.flags.signal_missing, 7, axis=0).sum() == 0
+
+
+def test_a_ray_without_noise_is_left_out_and_told():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[3, 0] = 0.0
+    found = solve(power, r, net, variance=told, full_overlap_range=100.0)
+    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    mine = np.zeros_like(found.flags.weak_signal)
+    mine[3, net.on_ray(0)[0]] = True
+    np.testing.assert_array_equal(found.flags.weak_signal, mine)
+    assert found.degrees_of_freedom[3] < clean.degrees_of_freedom[3]
+    wider = found.extinction_standard_error[3] > 1.5 * clean.extinction_standard_error[3]
+    assert wider[net.near_vertex].any()
 
 
 def test_a_profile_of_more_energy_is_not_loud():

@@ -471,6 +471,28 @@ def test_the_mean_of_profiles_is_made_ray_by_ray():
     assert whole.status[0] == _network.SOLVED
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e12, 20.0])
+def test_a_mean_leaves_out_a_ray_that_is_far_louder_than_most(bad):
+    data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
+    quiet = data.take(np.arange(50))
+    quiet.usable[7, : layout.first_crossing[1]] = 0
+    expected = _prior._pooled(quiet, layout)
+    # The variance of the ray's first integral alone.
+    count = layout.first_crossing[1]
+    data.covariance[7, 2 * count * count] *= bad
+    found = _prior._pooled(data, layout)
+    for one in ("log_value", "integral", "covariance", "usable", "slope"):
+        np.testing.assert_array_equal(getattr(found, one), getattr(expected, one))
+
+
+def test_a_mean_of_which_hardly_a_profile_is_known_lacks_the_ray():
+    data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
+    data.covariance[7:, : layout.offset[1]] = np.nan
+    found = _prior._pooled(data, layout)
+    assert not found.usable[0, : layout.first_crossing[1]].any()
+    assert found.usable[0, layout.first_crossing[1] :].all()
+
+
 def test_a_mean_of_what_nobody_sees_is_none():
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     data.usable[7:] = 0
