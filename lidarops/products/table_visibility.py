@@ -218,7 +218,7 @@ VISIBILITY: Final = Layout(
             quality(_SERIES, FLAGS),
             comment="In this kind of product poorly_determined means a standard error above a third"
             " of extinction, of the value or as the median of its block, before the doubt in the"
-            " prior is added;"
+            " prior is added, or beams too few to tell a field that is not as the prior has it;"
             " low_leverage a beam that is too weak, or of a variance of zero, to be used beside"
             " the others; poor_fit beams that disagree by more than"
             " their noise allows, or a beam that ends before the point at bins that lie off their"

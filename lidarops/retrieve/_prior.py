@@ -5,7 +5,8 @@ So a gradient over the network is held to tens of percent beforehand: that much 
 no likelihood tells it. What else a vertex deviates by, the rays that cross there see: its size is
 the one that makes all profiles of a block likeliest, and no less than their mean wants. Nothing
 is said of the level of a profile. As a single field is no sample of many, errors are stated for
-one that deviates by twice as much (`lidarops.retrieve._network`).
+one that deviates by twice as much (`lidarops.retrieve._network`). Where rays are too few to
+test the prior, the widest one that is tried is taken.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ _ENOUGH: Final = 8
 _LOUDER: Final = 10.0
 """Times the median variance of a block's profiles, from which on one is left out of their mean."""
 _TOLD_BY_MEAN: Final = 0.3
+_UNTOLD: Final = 1.0
+"""Standard error of ln extinction in the mean, from which on equations do not tell a vertex."""
 _APART: Final = 2.5
 """Standard errors, of both, between the mean of solutions and the solution of the mean."""
 _UNLIKELY: Final = 1e-2
@@ -81,6 +84,8 @@ class Solution:
     """(profile,) of `lidarops.retrieve._network`."""
     left_out: Codes
     """(profile, ray) 1 where a ray was, because its covariance is singular or none."""
+    doubtful: Booleans
+    """(profile,) True where rays tell that the field is not as the prior has it, and not how."""
 
 
 class _Problem:
@@ -136,7 +141,7 @@ class _Problem:
         return Solution(
             logarithm, variance, believed, missed, summary[:, 0], summary[:, 1],
             summary[:, 2], summary[:, 3], np.full(shape[0], strength * deviation), status,
-            left_out,
+            left_out, np.zeros(shape[0], dtype=np.bool_),
         )  # fmt: skip
 
 
@@ -187,7 +192,7 @@ def solve_blocks(
         nothing(*shape), nothing(*shape), nothing(*shape), nothing(*shape), nothing(n),
         nothing(n), nothing(n), nothing(n), nothing(n),
         np.full(n, _network.UNDETERMINED, dtype=np.uint8),
-        np.zeros((n, exponent.size), dtype=np.uint8),
+        np.zeros((n, exponent.size), dtype=np.uint8), np.zeros(n, dtype=np.bool_),
     )  # fmt: skip
     for b in np.unique(block):
         mine = np.flatnonzero(block == b)
@@ -289,16 +294,30 @@ def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solu
     # What profiles tell well by themselves, their mean need not tell.
     with np.errstate(invalid="ignore"):
         mean = None if np.all(alone.variance < _WELL_TOLD**2) else pool()
-    if mean is None:
-        return _strongest(problem, alone)[0]
-    whole = mean.afresh(np.inf)
+    whole = None if mean is None else mean.afresh(np.inf)
+    tested = _tests(problem, alone, whole)
+    strengths = _STRENGTHS if tested else _STRENGTHS[-1:]
+    if mean is None or whole is None:
+        return _strongest(problem, alone, strengths)[0]
+    result = _with_mean(problem, alone, mean, whole, strengths)
+    doubtful = not tested and _unlikely(mean.afresh(DEVIATIONS[0]))
+    return replace(result, doubtful=np.full_like(result.doubtful, doubtful))
+
+
+def _with_mean(
+    problem: _Problem,
+    alone: Solution,
+    mean: _Problem,
+    whole: Solution,
+    strengths: tuple[float, ...],
+) -> Solution:
+    """Solve a block with the strongest prior that neither profiles nor their mean contradict."""
     if whole.status[0] == _network.UNDETERMINED:
         # A mean that tells nothing speaks against no prior.
-        result, strength = _strongest(problem, alone)
-        told = _told(mean, result, strength)
-        return _widened(result, strength, told, whole)
+        result, strength = _strongest(problem, alone, strengths)
+        return _widened(result, strength, _told(mean, result, strength), whole)
     settled = bool(whole.status[0] == _network.SOLVED)
-    for strength in _STRENGTHS:
+    for strength in strengths:
         least = _least(mean, strength) if settled else 0.0
         result = _likeliest(problem, strength, least)
         if _contradicted(result, alone) or _apart(result, whole):
@@ -309,9 +328,28 @@ def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solu
     return _widened(alone, 1.0, whole, whole)
 
 
-def _strongest(problem: _Problem, alone: Solution) -> tuple[Solution, float]:
+def _tests(problem: _Problem, alone: Solution, whole: Solution | None) -> bool:
+    """Return whether the rays tell enough to test a prior.
+
+    Where they are fewer equations than unknowns, or as many that do not tell all vertices, the
+    prior decides what is left, and none of its tests asks for that: a steep field passes for
+    large deviations about a slight gradient.
+    """
+    known = alone.status != _network.UNDETERMINED
+    freedom = float(np.median(alone.degrees_of_freedom[known])) if known.any() else 0.0
+    if whole is None:
+        return freedom >= 0
+    freedom = max(freedom, float(whole.degrees_of_freedom[0]))
+    seen = np.unique(problem.geometry[2][(problem.data.usable == 1).any(axis=0)])
+    told = bool(np.all(whole.variance[0, seen] < _UNTOLD**2))
+    return freedom > 0 or (freedom == 0 and told)
+
+
+def _strongest(
+    problem: _Problem, alone: Solution, strengths: tuple[float, ...]
+) -> tuple[Solution, float]:
     """Solve with the strongest prior that no profile contradicts; return its strength, too."""
-    for strength in _STRENGTHS:
+    for strength in strengths:
         result = _likeliest(problem, strength, 0.0)
         if not _contradicted(result, alone):
             return result, strength

@@ -18,6 +18,11 @@ no test tells it there: what the prior allows, and what the rest of the block te
 plumes that drift within a block (`lidarops bench stability`). What is left stands in single
 vertices at the edge of a plume that one weak ray joins to the others. More profiles in a block
 and more rays tell more.
+
+Scale heights are 300 m and more there. In steeper fields the far vertices may fade, and leave
+fewer equations than unknowns: errors are then stated with a prior that holds ln extinction over
+the vertices to 0.6, and values are flagged where the rays exclude the usual one. A field that is
+steeper still, of which so few rays tell nothing, is missed.
 """
 
 from __future__ import annotations
@@ -84,7 +89,8 @@ class VertexFlags:
 
     ill_conditioned: Booleans
     """Attenuation around the cycle, what takes its place, or the value itself is less than 3
-    standard errors: of the profile, or typically of its block."""
+    standard errors: of the profile, or typically of its block. Or the rays are too few to tell
+    the field, and tell that it is not as the prior has it."""
     far_start: Booleans
     """The start of the cycle is the far vertex of its ray."""
     not_positive: Booleans
@@ -135,7 +141,7 @@ class MultiPositionResult:
     """(..., vertex) m-1; NaN at vertices that are near ones on no ray, and where there is none."""
     extinction_standard_error: Array
     """m-1, by noise and by what a field may deviate from the prior: twice the prior's standard
-    deviation is counted, and a bend over the network where the mean of the block's rays allows it.
+    deviation is counted, eight times as much where rays are too few to test the prior, and a bend over the network where the mean of the block's rays allows it.
     Of a block in thin air, no less than is typical of it, and what noise moves all by."""
     visibility: sight.VisibilityResult
     """(..., vertex) m, at the wavelength of the lidars."""
@@ -302,7 +308,7 @@ def _solve_network(
         variance = _block_errors.at_least_typical(extinction, variance, rays.block)
     none = np.zeros(shape, dtype=np.bool_)
     # Doubt in the prior, which is stated, is no noise that makes a value lie anywhere.
-    shaky = _closed.shaky(extinction, believed, rays.block)
+    shaky = _closed.shaky(extinction, believed, rays.block) | fit.doubtful[:, np.newaxis]
     estimate = _closed.Estimate(
         extinction, variance, shaky, none, np.zeros(shape[1], dtype=np.bool_),
         np.full(shape[0], np.nan),

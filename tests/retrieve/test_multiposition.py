@@ -208,7 +208,10 @@ def test_values_stay_within_3_errors_while_a_plume_moves(relative):
     usable = ~result.flags.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
     assert np.mean(np.abs(score) < 3) >= 0.98
-    assert usable[:, 0].mean() > 0.9
+    assert usable[50:, 0].mean() > 0.9
+    # Two rays reach behind the plume of the first block: they tell of it, but not how large.
+    assert np.all(result.degrees_of_freedom[:50] < 0)
+    assert result.flags.flagged[:50].all()
 
 
 def test_long_chains_are_not_biased():
@@ -268,6 +271,43 @@ def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
     assert np.mean((np.abs(score) > 4.0) & kept) < 0.02
     weaker = (result.prior_deviation > 0.015) | np.isinf(result.prior_deviation)
     assert weaker.all()
+
+
+def scores_where_far_vertices_fade(scale, relative, net):
+    """Return the result and errors over stated ones where the field falls off with height."""
+    r = grid(net)
+
+    def field(_, __, z):
+        return 1.5e-3 * np.exp(-(z - 500.0) / scale)
+
+    power, variance = noisy(net, r, signals(net, r, field), relative, 40, 0, relative / 3.0)
+    result = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    score = (result.extinction - at_vertices(net, field)) / result.extinction_standard_error
+    return result, score
+
+
+@pytest.mark.parametrize(
+    ("scale", "relative", "net"),
+    [(200.0, 0.06, triangle()), (175.0, 0.03, three_by_two()), (150.0, 0.03, three_by_two()),
+     (100.0, 0.03, three_by_two())],
+)  # fmt: skip
+def test_a_prior_that_nothing_tests_is_not_reported_as_a_measurement(scale, relative, net):
+    """All values were without a flag, half of them off by more than 4 errors."""
+    result, score = scores_where_far_vertices_fade(scale, relative, net)
+    assert np.median(result.degrees_of_freedom) < 0
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    assert np.mean((np.abs(score) > 4.0)[:, net.near_vertex] & kept[:, net.near_vertex]) < 0.01
+
+
+def test_a_field_that_too_few_rays_see_is_told_with_wide_errors():
+    net = three_by_two()
+    result, score = scores_where_far_vertices_fade(500.0, 0.1, net)
+    assert np.median(result.degrees_of_freedom) < 0
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    assert kept.sum() > 40
+    assert np.all(np.abs(score[kept]) < 4.0)
+    stated = result.extinction_standard_error / result.extinction
+    assert np.median(stated[kept]) > 0.15
 
 
 @pytest.mark.parametrize("name", FIELDS)
