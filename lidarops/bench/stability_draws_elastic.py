@@ -13,7 +13,7 @@ from lidarops.bench.stability_draws import VISIBLE, Failure, Judged, Mask
 from lidarops.bench.stability_terms import Array
 from lidarops.flags import Quality
 from lidarops.product_settings import ReferenceSettings
-from lidarops.retrieve import elastic, known_shape, layers, reference
+from lidarops.retrieve import elastic, known_shape, layers, lone_bins, reference
 from lidarops.retrieve.molecular import MolecularProfile
 
 Random = np.random.Generator
@@ -51,6 +51,8 @@ class Sky:
     """m, scale of an overlap that is not told."""
     gaps: float = 0.0
     """Share of the bins that are missing."""
+    wild: float = 0.0
+    """Share of the bins that lie off, each on its own."""
 
 
 def _sky(rng: Random) -> Sky:
@@ -102,6 +104,10 @@ def _holed(sky: Sky, rng: Random) -> Sky:
     return replace(sky, gaps=rng.uniform(0.0, 0.2))
 
 
+def _wild(sky: Sky, rng: Random) -> Sky:
+    return replace(sky, wild=rng.uniform(0.0, 0.02))
+
+
 def _bent_ratio(sky: Sky, rng: Random) -> Sky:
     return replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0])))
 
@@ -123,6 +129,7 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Sky, Random], Sky]], ...]] = (
     (Failure("cloud in the far range"), _clouded),
     (Failure("overlap error", unseen=_NEAR), _partly_seen),
     (Failure("more haze than is declared", unseen=_ALIKE), _hazier),
+    (Failure("outliers"), _wild),
 )
 
 
@@ -158,6 +165,10 @@ class _Found:
 
 def _process(counts: Array, noise: Array, base: elastic_cases.Sky) -> _Found:
     r = base.range
+    with np.errstate(invalid="ignore"):
+        rough = np.nanmedian(counts[:, -r.size // 10 :], axis=1)
+    bridged = lone_bins.bridge(counts, r, noise, background=rough)
+    counts, noise = np.asarray(bridged.power, dtype=np.float64), bridged.variance
     found = known_shape.solve(counts, r, base.shape, variance=noise)
     power = np.where(base.inverted, counts - found.background[:, np.newaxis], np.nan)
     clouds = layers.screen(power, r, noise, molecular_attenuated=base.shape)
@@ -276,11 +287,22 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
         if sky.gaps:
             counts = np.where(rng.random(counts.shape) < sky.gaps, np.nan, counts)
         noise = np.broadcast_to(_smoothed(counts), counts.shape)
+        if sky.wild:
+            counts = counts + np.sqrt(noise) * _deviations(rng, counts.shape, sky.wild)
         found = _process(counts, noise, base)
         hidden = None
         if not failure.satisfied:
             hidden = visible(mean / _SHOTS, noise[0], base, found) < VISIBLE
+        if sky.wild:
+            # The misfit of signals without noise knows nothing of single bins.
+            hidden = np.zeros(profiles, dtype=np.bool_)
         yield _judged(failure, sky, found, base, hidden), profiles
+
+
+def _deviations(rng: Random, shape: tuple[int, ...], share: float) -> Array:
+    """Return by how many standard deviations of the noise bins lie off: 3 to 1000, most by none."""
+    size = np.exp(rng.uniform(np.log(3.0), np.log(1e3), shape)) * rng.choice([-1.0, 1.0], shape)
+    return np.where(rng.random(shape) < share, size, 0.0)
 
 
 def _judged(

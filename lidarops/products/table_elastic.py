@@ -39,6 +39,7 @@ FLAGS: Final = (
     | Quality.SATURATED
     | Quality.PILE_UP
     | Quality.INCOMPLETE_OVERLAP
+    | Quality.OUTLIER
     | Quality.BACKGROUND_UNCERTAIN
     | Quality.NO_GLUING
     | Quality.CLOUD
@@ -95,7 +96,8 @@ ELASTIC: Final = Layout(
     " more than 4 standard errors where such haze scattered up to 3.5 percent of what air does at"
     " 7 km, and 12 percent where it scattered 0.35 to 35 percent: declare more where air is hazy at"
     " all heights. No elastic signal tells the lidar ratio either; its declared error has to cover"
-    " it.",
+    " it. Values flagged outlier come from the ranges next to theirs: the signal there lies off on"
+    " its own, by more than noise.",
     sampled="range",
     unused_steps=frozenset({"homogeneous", "signal", "background"}),
     coordinates=coordinates((RANGE,), altitude("range")),

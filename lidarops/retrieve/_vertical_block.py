@@ -263,7 +263,9 @@ def _precision(block: _Block, information: Array, share: Array) -> Array:
 
 def _ratio(reduced: Array, whole: Array) -> Array:
     """Return reduced over whole information, 1 where there is none."""
-    return np.where(whole > 0.0, reduced / np.where(whole > 0.0, whole, 1.0), 1.0)
+    # The bisquare gives undoubted estimates a little more than their whole information; a noise
+    # that is shared by more than all of itself would have a negative variance.
+    return np.minimum(np.where(whole > 0.0, reduced / np.where(whole > 0.0, whole, 1.0), 1.0), 1.0)
 
 
 def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calibration:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve import _fernald, _inputs
+from lidarops.retrieve import _fernald, _inputs, lone_bins
 from lidarops.retrieve._frozen import frozen
 
 Array = npt.NDArray[np.float64]
@@ -96,6 +96,8 @@ class ElasticResult:
     """Withheld: the denominator of the solution is too small, or not certain to be positive."""
     calibrated: Mask
     """Whether the reference window holds a positive signal, with the leading axes of the power."""
+    outlying: Mask
+    """The bin lies off on its own: the value is that of its neighbours (`lone_bins.bridge`)."""
 
     @property
     def backscatter_standard_error(self) -> Array:
@@ -166,6 +168,7 @@ class _Problem:
     window: Mask
     air: tuple[Array, Array, Array]
     """Backscatter and extinction of the air, lidar ratio."""
+    outlying: Mask
     scattering_ratio: Array
     errors: tuple[Array, Array]
     """Of the lidar ratio, of the air."""
@@ -200,8 +203,8 @@ def solve(
     times the scattering ratio there. Integrals are trapezoids, so that signals of either sign
     count alike: a bin is off by less than 1e-4 where scattering changes over 100 m or more and
     bins are 7.5 m apart. Errors are of first order, those by noise widened where the reference is
-    noisy (`SKEWED`); noise is taken as independent from bin to
-    bin, and carried through integrals and window as they correlate it.
+    noisy (`SKEWED`); noise is taken as independent from bin to bin, and carried through integrals
+    and window as they correlate it. A lone bin that its variance does not explain is bridged.
 
     Parameters
     ----------
@@ -477,6 +480,7 @@ def _result(problem: _Problem, out: Array, scalars: Array, state: _fernald.Codes
         valid=profiles(state == _fernald.VALID),
         unstable=profiles(state == _fernald.UNSTABLE),
         calibrated=np.any(state != _fernald.MISSING, axis=-1).reshape(problem.leading),
+        outlying=profiles(problem.outlying),
     )
 
 
@@ -502,13 +506,18 @@ def _prepare(
     _require(
         ratio > 0.0, ratio, "reference_scattering_ratio", "give 1 where air is free of particles"
     )
+    noise, outlying = None, np.zeros((1, grid.size), dtype=np.bool_)
+    if variance is not None:
+        noise = _inputs.variance_rows(variance, grid, leading)
+        rows, noise, outlying = lone_bins.bridge_rows(rows, noise, grid)
     return _Problem(
         grid,
         leading,
         rows,
-        None if variance is None else _inputs.variance_rows(variance, grid, leading),
+        noise,
         _window(reference, grid, leading),
         (backscatter, extinction, lidar_ratio),
+        outlying,
         ratio,
         (
             _errors(errors[0], "lidar_ratio_standard_error", grid, leading),

@@ -14,6 +14,7 @@ from lidarops.retrieve import background as _background
 from lidarops.retrieve import elastic as _elastic
 from lidarops.retrieve import known_shape as _known_shape
 from lidarops.retrieve import layers as _layers
+from lidarops.retrieve import lone_bins as _lone_bins
 from lidarops.retrieve import reference as _reference
 from lidarops.retrieve.molecular import (
     HIGHEST,
@@ -47,6 +48,7 @@ _CARRIED: Final = int(
 _WITHHELD: Final = int(
     Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
 )
+_OUTLIER: Final = np.int32(Quality.OUTLIER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +210,19 @@ class _Prepared:
         partial = np.where(np.isnan(self.overlap), int(Quality.INCOMPLETE_OVERLAP), 0)
         self.quality = quality | partial.astype(np.int32)
         self.raw, self.noise = averages["power"].to_numpy(), averages["variance"].to_numpy()
+        self._bridge_lone_bins()
         self.variance = self.noise / self.overlap**2
+
+    def _bridge_lone_bins(self) -> None:
+        """Replace bins that lie off on their own before backgrounds and windows rest on them."""
+        rough = _background.tail_mean(self.raw, self.distance, variance=self.noise).background
+        used = np.where((self.quality & _WITHHELD) != 0, np.nan, self.raw)
+        bridged = _lone_bins.bridge(
+            used, self.distance, self.noise, background=np.nan_to_num(rough, nan=0.0)
+        )
+        self.raw = np.where(bridged.found, bridged.power, self.raw)
+        self.noise = np.where(bridged.found, bridged.variance, self.noise)
+        self.quality = self.quality | np.where(bridged.found, _OUTLIER, np.int32(0))
 
     def without(self, background: Array) -> Array:
         """Return the signal without background, as with full overlap."""
@@ -318,6 +332,7 @@ def _judged(
     bits = np.zeros(found.valid.shape, dtype=np.int32)
     bits[~window.chosen] |= np.int32(Quality.NO_REFERENCE)
     bits[clear.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
+    bits[found.outlying] |= np.int32(Quality.OUTLIER)
     lost = window.chosen[:, np.newaxis] & ~found.valid & ((quality & _WITHHELD) == 0)
     bits[lost] |= np.int32(Quality.UNSTABLE_INVERSION)
     return bits

@@ -237,7 +237,9 @@ def _judged(found: MultiAngleResult, carried: Flags, samples: npt.NDArray[np.int
     bits = carried & np.int32(CARE)
     for name, bit in _QUALITY_OF_FLAG.items():
         bits |= np.where(raised[name], np.int32(bit), np.int32(0))
-    bits |= found.quality & np.int32(Quality.INPUT_MISSING)
+    # What is missing at single altitudes has its reasons below, as the signals carry them.
+    gone = (found.quality & np.int32(Quality.INPUT_MISSING)).all(axis=-1, keepdims=True)
+    bits |= np.where(gone, np.int32(Quality.INPUT_MISSING), np.int32(0))
     untested = np.isfinite(found.optical_depth) & ~np.isfinite(found.reduced_chi_square)
     untested &= ~raised["interpolated"]
     bits |= np.where(untested, np.int32(Quality.NO_RESIDUAL), np.int32(0))

@@ -180,7 +180,7 @@ def solve(
         )
         profiles.put(members, part)
         steps += [StepRecord(int(label), *step) for step in done]
-    given = np.asarray(np.isfinite(rows).any(axis=(1, 2)))
+    given = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
     return profiles.result(leading, _quality(profiles, given), tuple(steps))
 
 
@@ -326,10 +326,20 @@ def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], gates: int) -
 
 
 def _quality(profiles: Profiles, given: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
-    """Return the bits that every product knows: missing, lost in noise, outlying."""
+    """Return the bits that every product knows; each missing optical depth has a rejecting one.
+
+    Parameters
+    ----------
+    profiles : Profiles
+    given : (profile, altitude) bool
+        Whether any angle has a signal and its variance.
+    """
     quality = np.zeros(profiles.optical_depth.shape, dtype=np.int32)
-    quality[~given] |= np.int32(Quality.INPUT_MISSING)
+    quality[~given.any(axis=1)] |= np.int32(Quality.INPUT_MISSING)
     lost = profiles.flags["extrapolated"] & ~profiles.flags["no_data"]
     quality[lost] |= np.int32(Quality.LOW_SIGNAL)
     quality[profiles.flags["outlier"]] |= np.int32(Quality.OUTLIER)
+    silent = np.isnan(profiles.optical_depth) & (quality & int(Quality.rejecting()) == 0)
+    quality[silent & ~given] |= np.int32(Quality.INPUT_MISSING)
+    quality[silent & given] |= np.int32(Quality.NO_LEVERAGE)
     return quality

@@ -337,3 +337,20 @@ def test_haze_in_the_shape_of_the_background_is_told_apart_where_it_is_hidden():
     assert np.any(np.abs(error[hidden]) > 4.0 * random[hidden])
     assert told[~hidden].mean() > 0.5
     assert told[hidden].mean() < 0.1
+
+
+def test_single_wild_bins_cost_few_elastic_values():
+    """Without bridging, the tests of background and window reject two of three."""
+
+    def wild(cluster):
+        for judged, scenes in stability_draws_elastic.judged(cluster, 60):
+            if judged.failure.name == "outliers":
+                yield judged, scenes
+
+    (rate,) = (
+        one
+        for one in collect(wild, 8, lambda _: None).rates("elastic", None)
+        if one.failure == "outliers"
+    )
+    assert rate.judged.value < rate.target
+    assert rate.kept.value > 0.5

@@ -610,3 +610,33 @@ def test_one_sample_is_no_spread():
     setup = noisy_setup(COARSE_POWER, COARSE)
     with pytest.raises(RetrievalInputError, match="samples"):
         monte_carlo(COARSE_POWER, COARSE, **setup, samples=1, seed=0)
+
+
+# Wild bins ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("window", [True, False], ids=["in the window", "elsewhere"])
+@pytest.mark.parametrize("size", [30.0, 1000.0, -1000.0])
+def test_a_bin_that_lies_off_leaves_the_errors_honest(window, size):
+    rng = np.random.default_rng(31)
+    deviation = np.sqrt(1e-4 * FINE_POWER.max() * FINE_POWER / 100.0 + FINE_POWER[-1] ** 2 / 100.0)
+    power = FINE_POWER + deviation * rng.normal(size=(200, FINE.size))
+    given = {
+        **air(FINE), "lidar_ratio": 50.0, "reference": CLEAN, "variance": deviation**2,
+        "reference_relative_error": 0.01,
+    }  # fmt: skip
+    clean = solve(power, FINE, **given)
+    assert not clean.outlying.any()
+    bins = np.flatnonzero(within(FINE, CLEAN) if window else (FINE > KM) & (FINE < 7.5 * KM))
+    at = rng.choice(bins, 200)
+    wild = power.copy()
+    wild[np.arange(200), at] += size * deviation[at]
+    found = solve(wild, FINE, **given)
+    assert found.outlying[np.arange(200), at].all()
+    assert found.outlying.sum() == 200
+    assert np.array_equal(found.valid, clean.valid)
+    off = (found.backscatter - particles(FINE)) / found.backscatter_standard_error
+    assert np.mean(np.abs(off[found.valid]) > 4.0) < 1e-3
+    # Without a variance, nobody knows what noise explains.
+    blind = solve(wild, FINE, **{**given, "variance": None})
+    assert not blind.outlying.any()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -147,6 +148,36 @@ def test_model_weights_reach_the_error_of_the_true_ones():
     np.testing.assert_allclose(
         model.background_standard_error, true.background_standard_error, rtol=0.02
     )
+
+
+def of_few_bins(bins, profiles, variance):
+    """Return fits of a shape, 1 where it is largest, with noise of 1 over bins to 30 km."""
+    range_ = np.linspace(4500.0, 30000.0, bins)
+    shape = np.exp(-range_ / 8000.0) / range_**2
+    shape /= shape[0]
+    power = 5.0 + 50.0 * shape + np.random.default_rng(11).normal(size=(profiles, bins))
+    return solve(power, range_, shape, variance=variance, start=0.0)
+
+
+@pytest.mark.parametrize("bins", [8, 12, 20])
+def test_errors_of_short_windows_hold_where_the_noise_is_estimated(bins):
+    known = of_few_bins(bins, 100_000, 1.0)
+    found = of_few_bins(bins, 100_000, None)
+    freedom = bins - 2
+    student = stats.t.isf(stats.norm.sf(4.0), freedom) / 4.0
+    usual = student * np.sqrt(stats.chi2.median(freedom) / freedom)
+    for name, truth in (("background", 5.0), ("amplitude", 50.0)):
+        error = getattr(found, f"{name}_standard_error")
+        assert np.mean(np.abs(getattr(found, name) - truth) > 4.0 * error) < 2e-4
+        ratio = np.median(error / getattr(known, f"{name}_standard_error"))
+        assert ratio == pytest.approx(usual, rel=0.02)
+    both = found.background_standard_error * found.amplitude_standard_error
+    assert np.ptp(found.covariance / both) < 1e-9
+
+
+@pytest.mark.parametrize("bins", [16, 40, 100])
+def test_noise_that_is_estimated_raises_no_more_false_alarms(bins):
+    assert of_few_bins(bins, 60_000, None).poor_fit.sum() <= 16
 
 
 # Windows ------------------------------------------------------------------------------------

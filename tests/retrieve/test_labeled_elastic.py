@@ -500,6 +500,9 @@ def test_every_bit_of_the_product_occurs():
     seen |= np.bitwise_or.reduce(
         solved(counted(far, exposure=300 * EXPOSURE))["quality_flag"].to_numpy(), axis=None
     )
+    wild = counted(light(distance))
+    wild["power"][:, 300] *= 2.0
+    seen |= np.bitwise_or.reduce(solved(wild)["quality_flag"].to_numpy(), axis=None)
     assert Quality(int(seen)) == FLAGS
 
 
@@ -533,3 +536,28 @@ def test_bins_that_end_where_a_window_would_end_are_no_error(fraction):
 def test_a_wavelength_without_air_is_refused_by_name():
     with pytest.raises(RetrievalInputError, match="wavelength"):
         solved(counted(truth()), wavelength=5.32e-4)
+
+
+def test_a_bin_that_lies_off_is_bridged_and_said_so():
+    """In the far range, which tells the background, in the window, and below it."""
+    data = counted(light(distance), draws=8, seed=9)
+    clean = solved(data)
+    places = [300, 1000, 1500]
+    deviation = np.sqrt(data["variance"].to_numpy())
+    power = data["power"].to_numpy().copy()
+    for at in places:
+        power[:, at] += 1000.0 * deviation[:, at]
+    wild = solved(data.assign(power=(data["power"].dims, power)))
+    flagged = (wild["quality_flag"].to_numpy() & BITS[Quality.OUTLIER]) != 0
+    assert flagged[:, places].all()
+    assert flagged.sum() == 8 * len(places)
+    assert not ((clean["quality_flag"].to_numpy() & BITS[Quality.OUTLIER]) != 0).any()
+    for name in ("background", "reference_bottom"):
+        error = clean["background_standard_error"].to_numpy()
+        moved = np.abs(wild[name].to_numpy() - clean[name].to_numpy())
+        assert np.all(moved <= (2.0 * error if name == "background" else 0.0))
+    both = np.isfinite(clean["backscatter"].to_numpy())
+    assert np.array_equal(np.isfinite(wild["backscatter"].to_numpy()), both)
+    off = wild["backscatter"] - particles(STATION + distance)
+    far = np.abs(off / wild["backscatter_standard_error"]).to_numpy()[both] > 4.0
+    assert far.mean() < 1e-3

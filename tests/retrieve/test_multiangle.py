@@ -199,6 +199,7 @@ def test_one_path_tells_nothing(small, method):
         assert np.all(np.isnan(result.optical_depth))
         assert np.all(np.isnan(result.reach))
         assert result.flags.no_data.all()
+        assert np.all(result.quality == Quality.NO_LEVERAGE)
 
 
 def test_tiny_leverage_is_told_with_an_honest_error():
@@ -242,6 +243,27 @@ def test_broken_profiles_stay_alone(small, method):
     if method in {"auto", "joint"}:
         assert rms(result.optical_depth[whole] - tau) < 0.004
         assert result.flags.interpolated[1, 50]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("variance_of", [np.nan, np.inf])
+def test_samples_without_a_variance_are_as_good_as_missing(small, method, variance_of):
+    signal, variance, height, _ = small
+    unknown = np.array(variance)
+    unknown[3] = variance_of
+    unknown[5, :, 20:30] = variance_of
+    one_left = np.where(np.arange(ANGLES.size)[:, np.newaxis] > 0, np.nan, signal[6, :, 40:50])
+    signal = signal.copy()
+    signal[6, :, 40:50] = one_left
+    result = solve(signal, ANGLES, height, variance=unknown, method=method)
+    assert np.isnan(result.optical_depth[3]).all()
+    assert np.all(result.quality[3] & Quality.INPUT_MISSING)
+    withheld = np.isnan(result.optical_depth)
+    assert np.all(result.quality[withheld] & int(Quality.rejecting()))
+    assert not np.any(result.quality[~withheld] & (Quality.INPUT_MISSING | Quality.NO_LEVERAGE))
+    if method == "kano_hamilton":
+        assert np.all(result.quality[5, 20:30] == Quality.INPUT_MISSING)
+        assert np.all(result.quality[6, 40:50] == Quality.NO_LEVERAGE)
 
 
 def test_holes_are_bridged_or_left(small):

@@ -22,6 +22,7 @@ def errors_with_gaps(atmosphere, angles, correlation, missing, **noise):
         )
         signal[rng.random(signal.shape) < missing] = np.nan
         one = solve(signal, angles, atmosphere[0], variance=variance)
+        assert np.array_equal(np.isnan(one.extinction), np.isnan(one.extinction_standard_error))
         found.append(
             (
                 one.optical_depth - tau,
@@ -49,6 +50,29 @@ def test_stated_errors_of_clear_air_hold_with_gaps():
     )
     assert 0.9 < rms(depth / stated) < 1.1
     assert rms(extinction / of_extinction) < 1.1
+
+
+@pytest.mark.parametrize("hole", [(1, 60, 61), (3, 30, 60)], ids=["one sample", "half a ray"])
+def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
+    """Undoubted estimates must not share more of their noise than all of it."""
+    rng, atmosphere = np.random.default_rng(1), clear(120)
+    deviations = []
+    for correlation in (0.97, 0.99):
+        for _ in range(8):
+            signal, variance, _ = signals(
+                rng, 16, ANGLES, atmosphere, ratio=3000.0, inhomogeneity=0.03,
+                correlation=correlation,
+            )  # fmt: skip
+            ray, first, past = hole
+            signal[:, [1, ray], first:past] = np.nan
+            one = solve(signal, ANGLES, atmosphere[0], variance=variance)
+            valued = np.isfinite(one.extinction)
+            assert np.all(one.extinction_standard_error[valued] > 0.0)
+            assert np.all(one.optical_depth_standard_error[np.isfinite(one.optical_depth)] > 0.0)
+            deviations.append(
+                ((one.extinction - atmosphere[1]) / one.extinction_standard_error)[valued]
+            )
+    assert np.mean(np.abs(np.concatenate(deviations)) > 4.0) < 5e-4
 
 
 def noise_with_gaps(rng, correlation, rays=8, heights=60):
