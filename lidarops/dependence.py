@@ -100,7 +100,9 @@ def of_kinds(plan: Plan, kinds: Collection[ProductKind]) -> Plan:
     """
     if not kinds:
         return plan
-    mine = part(plan, [product for product in wanted(plan) if product[0] in kinds])
+    products = [product for product in wanted(plan) if product[0] in kinds]
+    # What the members of a network share would stay without its product.
+    mine = part(plan, products) if products else replace(plan, steps=(), left_out=())
     told = {*kinds, StepName.READ}
     left_out = tuple(left for left in plan.left_out if left.name in told or left in mine.left_out)
     return replace(mine, left_out=left_out)

@@ -109,6 +109,15 @@ def test_lidars_that_serve_a_network_alone_are_no_trouble(net: Net) -> None:
     assert "used by network valley" in shown
 
 
+def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
+    for kind, some in (("visibility", True), ("signal", False)):
+        line = ["plan", str(net.file), "--json", "--product", kind, "--instrument", "valley"]
+        (scene,) = json.loads(CliRunner().invoke(app, line).stdout)["scenes"]
+        assert bool(scene["steps"]) is some
+        assert (scene["estimated_cpu_seconds"]["everything"] > 0) is some
+        assert (len(scene["stale"]), scene["fresh"]) == (int(some), 0)
+
+
 def test_a_lidar_without_its_network_is_told(net: Net) -> None:
     net.lose("east", "north")
     barren = bring_up_to_date(net.write()).barren
