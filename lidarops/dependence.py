@@ -89,6 +89,25 @@ def part(plan: Plan, products: Collection[Wanted]) -> Plan:
     return replace(plan, steps=steps, left_out=left_out)
 
 
+def of_kinds(plan: Plan, kinds: Collection[ProductKind]) -> Plan:
+    """Return what a plan tells of some kinds of products: what they need, and what is left out.
+
+    Parameters
+    ----------
+    plan : Plan
+    kinds : collection of ProductKind
+        All where empty.
+    """
+    if not kinds:
+        return plan
+    products = [product for product in wanted(plan) if product[0] in kinds]
+    # What the members of a network share would stay without its product.
+    mine = part(plan, products) if products else replace(plan, steps=(), left_out=())
+    told = {*kinds, StepName.READ}
+    left_out = tuple(left for left in plan.left_out if left.name in told or left in mine.left_out)
+    return replace(mine, left_out=left_out)
+
+
 def _part_of_network(plan: Plan, kinds: set[str]) -> Plan:
     # All members and channels meet in each product.
     return replace(

@@ -23,14 +23,15 @@ from lidarops.catalog.scan import ScanSummary, scan
 from lidarops.catalog.store import Store
 from lidarops.engine import Ended, Stop, alone, carry_out, local_client, size
 from lidarops.errors import CatalogError, SceneError
+from lidarops.leftovers import Orphan
 from lidarops.processes import load_ahead, one_ahead
-from lidarops.processing import Job, failed, nothing_to_do
+from lidarops.processing import Job, failed
 from lidarops.records import Granule, RunRecord
 from lidarops.reports import page, record
 from lidarops.runs import Options, Result
 from lidarops.scenes import Cut, cut, select
 from lidarops.session import Session
-from lidarops.staleness import DaysJudged, Judge, Judgement, Orphan, Selection, Signature
+from lidarops.staleness import DaysJudged, Judge, Judgement, Selection, Signature
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -285,7 +286,7 @@ class _Work:
             failures=self._store.failures(),
             # Nothing would ever make these again, so that they would be told for ever.
             empty=tuple(self._store.empty(without={each.path for each in found.orphans})),
-            barren={each.scene.id: nothing_to_do(each.plan) for each in found.barren},
+            barren={each.scene.id: each.barren for each in found.barren},
             set_aside={each.path: each.reason for each in found.set_aside},
             untold=sum(sum(verdicts[day][1:]) for day in clean[AGAIN:]),
             signal=caught,
@@ -472,7 +473,8 @@ def _verdicts(
 def remove_orphans(campaign: Campaign, found: Result, *, wait: float = 0.0) -> int:
     """Remove products that nothing asks for any more, files and ledger rows.
 
-    Products that another run has made again since are left.
+    Products that another run has made again since are left, and those that the campaign still asks
+    for where other files of their scene no longer allow them.
 
     Parameters
     ----------
@@ -493,11 +495,17 @@ def remove_orphans(campaign: Campaign, found: Result, *, wait: float = 0.0) -> i
         If the archive holds no file at all, as where it is not mounted, or another run holds the
         catalog.
     """
-    if not found.orphans:
+    # A file that was removed by hand leaves nothing to keep.
+    unasked = [
+        each
+        for each in found.orphans
+        if not (each.asked and (campaign.products_root / each.path).exists())
+    ]
+    if not unasked:
         return 0
     if not found.summary.files:
         raise CatalogError(
-            f"holds no raw file, so that {len(found.orphans)} products would be removed",
+            f"holds no raw file, so that {len(unasked)} products would be removed",
             file=campaign.archive,
             field="archive",
             remedy="see that it is mounted; where it is to be empty, remove the products by hand",
@@ -507,7 +515,7 @@ def remove_orphans(campaign: Campaign, found: Result, *, wait: float = 0.0) -> i
         lock.acquire()
         with store.all_made() as made:
             runs = {each.path: each.run for each in made}
-        still = [each.path for each in found.orphans if runs.get(each.path) == each.run]
+        still = [each.path for each in unasked if runs.get(each.path) == each.run]
         for name in still:
             path = campaign.products_root / name
             removed += path.exists()

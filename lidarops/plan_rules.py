@@ -113,6 +113,8 @@ class ChannelCase(Case):
     """Set where the channel's ``multiangle`` product is wanted."""
     glued: tuple[str, ...]
     """Channels that this one is joined into."""
+    networks: tuple[str, ...]
+    """Networks that use the channel."""
     all_steps: bool
     """Whether nothing is left out because it would give nothing."""
 

@@ -37,7 +37,15 @@ from lidarops.product_settings import (
     MultiAngleSettings,
     SignalSettings,
 )
-from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Plan, Scene, Step
+from lidarops.records import (
+    ChannelLayout,
+    DetectionMode,
+    LeftOut,
+    Plan,
+    ProductKind,
+    Scene,
+    Step,
+)
 from lidarops.retrieve.labeled import LEVEL
 
 MIN_SECTION_BINS = 8
@@ -60,6 +68,8 @@ class _Asked:
     scene: Scene
     instrument: Instrument
     facts: InstrumentFacts
+    networks: Mapping[str, str]
+    """Those that the instrument is part of -> the channel that they want."""
 
 
 def plan(scene: Scene, campaign: Campaign) -> Plan:
@@ -82,12 +92,39 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
     # A scene never straddles an edge of a validity period, so its first granule speaks for all.
     facts = instrument.facts_at(scene.granules[0].start or scene.start)
     steps: list[Step] = []
-    asked = _Asked(scene, instrument, facts)
+    networks = {
+        name: network.visibility.channel
+        for name, network in campaign.networks.items()
+        if scene.instrument in network.instruments
+    }
+    asked = _Asked(scene, instrument, facts, networks)
     left_out = [left for left in applied((ABSENT, STRANGE), asked) if isinstance(left, LeftOut)]
     for channel in (*scene.layout, *glued_channels(scene, instrument)):
         for decision in _channel(channel, asked, all_steps=campaign.all_steps):
             (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
-    return Plan(scene.id, tuple(steps), tuple(left_out))
+    return _without_idle(Plan(scene.id, tuple(steps), tuple(left_out)))
+
+
+def _without_idle(told: Plan) -> Plan:
+    """Leave out the channels of which every product is left out, as nothing reads them."""
+    kinds = tuple(ProductKind)
+    giving = {step.channel for step in told.steps if step.name in kinds}
+    for name in [name for name in giving if name.startswith(GLUED)]:
+        giving.update(parts_of(name))
+    idle = {step.channel for step in told.steps} - giving
+    reason = "nothing that this channel is asked for can be made"
+    return replace(
+        told,
+        steps=tuple(step for step in told.steps if step.channel in giving),
+        left_out=(
+            *(left for left in told.left_out if left.channel not in idle or left.name in kinds),
+            *(
+                LeftOut(step.name, step.channel, reason, rule=step.rule)
+                for step in told.steps
+                if step.channel in idle and step.name == StepName.READ
+            ),
+        ),
+    )
 
 
 def glued_channels(scene: Scene, instrument: Instrument) -> tuple[ChannelLayout, ...]:
@@ -179,6 +216,11 @@ def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decis
         elastic=_wanted(products.elastic, channel),
         multiangle=_wanted(products.multiangle, channel),
         glued=tuple(name for name in made if channel.name in parts_of(name)),
+        networks=tuple(
+            name
+            for name, wanted in asked.networks.items()
+            if channel.name in (parts_of(wanted) if wanted.startswith(GLUED) else (wanted,))
+        ),
         all_steps=all_steps,
     )
     reading = list(CHANNEL.decisions(case))
@@ -192,7 +234,11 @@ def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decis
 def _read(case: ChannelCase) -> Decisions:
     asked = list(_asked(case))
     if not asked:
-        yield case.without(StepName.READ, "no product of the campaign asks for this channel")
+        reason = "no product of the campaign asks for this channel"
+        if case.networks:
+            word = "networks" if len(case.networks) > 1 else "network"
+            reason = f"used by {word} {' and '.join(case.networks)} alone"
+        yield case.without(StepName.READ, reason)
         return
     name = case.channel.name
     known = channel_facts(case.facts, parts_of(name)[1]) if name.startswith(GLUED) else case.known

@@ -254,7 +254,10 @@ class ProductRecord:
 
 
 JUDGE_THEMSELVES: Final = (ProductKind.ELASTIC, ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
-"""Products whose retrieval rejects its own values."""
+"""Products of which a scene is a trouble where all values are rejected.
+
+Not homogeneous ones: sections are tried in any air, and fog or the dark leaves none of them.
+"""
 
 
 @dataclass(frozen=True, slots=True)

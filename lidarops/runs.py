@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
+from lidarops.leftovers import Orphan
 from lidarops.records import RunRecord, SceneOutcome
-from lidarops.staleness import Orphan
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -63,6 +63,12 @@ class Result:
     """More of both, on days in which nothing changed."""
     signal: int = 0
     """The signal that stopped the run."""
+
+    @property
+    def left_nothing(self) -> tuple[str, ...]:
+        """Scenes whose retrievals left nothing to use: of the archive, and of this run's part."""
+        scenes = () if self.record is None else self.record.scenes
+        return tuple(dict.fromkeys((*self.empty, *(each.scene for each in scenes if each.empty))))
 
     @property
     def troubled(self) -> bool:

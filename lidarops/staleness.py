@@ -17,13 +17,14 @@ from math import ceil
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from lidarops import dependence
+from lidarops import dependence, leftovers
 from lidarops.campaign import Campaign, as_settings
 from lidarops.catalog.ledger import Dependence, Made, Tried
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.dependence import Wanted
+from lidarops.leftovers import Orphan
 from lidarops.plans import plan
 from lidarops.products.provenance import code_version
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
@@ -104,6 +105,8 @@ class Judgement:
     scene: Scene
     plan: Plan
     """All that the campaign asks for."""
+    asked: Plan
+    """What of it the selection asks for."""
     day: int
     key: str
     """Changes with anything that may change the outcome."""
@@ -113,25 +116,12 @@ class Judgement:
     """Why the scene is not tried again, though products of it are missing."""
     suspect: bool = False
     """Whether an earlier try took its process down."""
-
-    @property
-    def barren(self) -> bool:
-        """Whether the scene can give no product at all."""
-        return not dependence.wanted(self.plan)
+    barren: str = ""
+    """Why the scene can give no product, and serves none of a network; empty where it does."""
 
     def needed(self) -> Plan:
         """Return the part of the plan that the stale products need."""
         return dependence.part(self.plan, [(each.kind, each.channel) for each in self.stale])
-
-
-@dataclass(frozen=True, slots=True)
-class Orphan:
-    """A product that nothing asks for any more."""
-
-    path: str
-    reason: str
-    run: str
-    """The one that made it."""
 
 
 class Signature(NamedTuple):
@@ -280,9 +270,15 @@ class Judge:
         made = {each.key: each for each in self._store.made(first, last) if each.day in wanted}
         touched: dict[str, int] = {}
         everything = [self._scene(scene, made, tried, touched) for scene in found.scenes]
+        planned = [(each.scene, each.plan) for each in everything]
+        barren = leftovers.barren(planned, self._campaign)
+        everything = [
+            replace(each, barren=barren[each.scene.id]) if each.scene.id in barren else each
+            for each in everything
+        ]
         chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
-        orphans = _orphans(everything, made)
-        orphaned = {made[key].day for key in orphans}
+        orphans = leftovers.orphans(planned, made.values(), self._campaign, self._other_files)
+        orphaned = {known.day for known, _ in orphans}
         digests, self._digests = self._digests, {}
         counts = _counts(everything, found.set_aside)
         gone = {each.scene.id for each in everything if self._healed(each, tried)}
@@ -291,9 +287,7 @@ class Judge:
         return DaysJudged(
             judgements=tuple(each for each in everything if each.scene.id in chosen),
             orphans=tuple(
-                Orphan(made[key].path, why, made[key].run)
-                for key, why in orphans.items()
-                if self._selection.product(made[key], self._campaign)
+                each for known, each in orphans if self._selection.product(known, self._campaign)
             ),
             set_aside=found.set_aside,
             told={day: counts[day] for day in days if day not in orphaned}
@@ -335,18 +329,18 @@ class Judge:
         judged = self.judgement(scene, whole)
         last = tried.get(scene.id)
         stale = []
-        for kind, channel in dependence.wanted(whole):
-            if self._selection.kinds and kind not in self._selection.kinds:
-                continue
+        asked = dependence.of_kinds(whole, self._selection.kinds)
+        for kind, channel in dependence.wanted(asked):
             known = made.get((scene.id, kind.value, channel))
             reason = self._reason(scene, whole, (kind, channel), known, touched)
             if reason:
                 stale.append(Stale(kind, channel, reason, known))
         judged = replace(
             judged,
+            asked=asked,
             key=self.key(judged),
             stale=tuple(stale),
-            fresh=len(dependence.wanted(whole)) - len(stale),
+            fresh=len(dependence.wanted(asked)) - len(stale),
             suspect=last is not None and last.crashes > 0,
         )
         if last is None or self._force or not stale:
@@ -358,7 +352,7 @@ class Judge:
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
         """Return a judgement that asks for every product of a scene."""
         stale = tuple(Stale(*each, "asked for") for each in dependence.wanted(whole))
-        return Judgement(scene, whole, day_of(scene.start), "", stale, 0)
+        return Judgement(scene, whole, whole, day_of(scene.start), "", stale, 0)
 
     def key(self, judged: Judgement) -> str:
         """Return what changes with anything that may change the outcome of a scene.
@@ -492,6 +486,12 @@ class Judge:
                 known = None
         return known or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
 
+    def _other_files(self, made: Made, scene: Scene) -> bool:
+        before = self._store.inputs_of(made.path)
+        return {used.sha256 for used in before if used.role is Role.SIGNAL} != {
+            self._content(granule) for granule in scene.granules
+        }
+
     def _profile(self, name: str) -> str:
         if name not in self._profiles:
             try:
@@ -525,31 +525,13 @@ def _channels(whole: Plan) -> list[str]:
     return sorted({channel for _, channel in dependence.wanted(whole)})
 
 
-def _orphans(
-    judgements: Sequence[Judgement], made: Mapping[tuple[str, str, str], Made]
-) -> dict[tuple[str, str, str], str]:
-    scenes = {each.scene.id for each in judgements}
-    asked = {
-        (each.scene.id, kind.value, channel)
-        for each in judgements
-        for kind, channel in dependence.wanted(each.plan)
-    }
-    return {
-        key: "the campaign does not ask for it any more"
-        if key[0] in scenes
-        else "no raw file of its scene is left"
-        for key in made
-        if key not in asked
-    }
-
-
 def _counts(
     judgements: Sequence[Judgement], set_aside: Sequence[Granule]
 ) -> dict[int, tuple[int, int]]:
     barren: dict[int, int] = defaultdict(int)
     aside: dict[int, int] = defaultdict(int)
     for each in judgements:
-        barren[each.day] += each.barren
+        barren[each.day] += bool(each.barren)
     for granule in set_aside:
         aside[day_of(_moment(granule))] += 1
     return defaultdict(

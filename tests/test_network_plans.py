@@ -207,6 +207,17 @@ class TestPlans:
         joint = [s.name for s in found.steps if not s.instrument]
         assert joint == ["average", "prior", "visibility"]
 
+    def test_members_are_not_read_for_themselves(self):
+        told = campaign()
+        alone = next(s for s in cut(told, granules()).scenes if s.instrument == "west-lidar")
+        found = plan(alone, told)
+        assert found.steps == ()
+        left_out = {left.channel: left.reason for left in found.left_out}
+        assert left_out["photon_532o"] == "used by network valley alone"
+        assert left_out["analog_532o"] == "no product of the campaign asks for this channel"
+        joined = plan(alone, campaign({"channel": "glued_532o"}))
+        assert {left.reason for left in joined.left_out} == {"used by network valley alone"}
+
     def test_it_is_plain_data(self):
         found = planned(campaign({"exponents": {"east-lidar": 1.2}}))
         assert found.as_dict()["steps"][0]["instrument"] == "west-lidar"

@@ -9,6 +9,7 @@ from dataclasses import replace
 import factories
 import pytest
 
+from lidarops import dependence
 from lidarops.plans import plan
 from lidarops.records import Plan, Role, Scene
 from lidarops.scenes import cut
@@ -48,6 +49,41 @@ def test_a_channel_that_nobody_wants_is_not_read() -> None:
     result = plan(_scene(), factories.campaign())
     assert not _steps(result, "analog_532o")
     assert "no product" in _left_out(result, "analog_532o")["read"]
+
+
+def test_a_channel_of_which_every_product_is_left_out_is_not_read() -> None:
+    wanted = {
+        "homogeneous": {"channels": ["analog_532o"], "sections": [[14_000, 16_000]]},
+        "signal": {"channels": ["photon_532o"]},
+    }
+    result = plan(_scene(), factories.campaign(products=wanted))
+    assert {step.channel for step in result.steps} == {"photon_532o"}
+    left_out = _left_out(result, "analog_532o")
+    assert set(left_out) == {"signal", "homogeneous", "elastic", "multiangle", "read"}
+    assert left_out["read"] == "nothing that this channel is asked for can be made"
+    assert "14000-16000 m" in left_out["homogeneous"]
+
+
+@pytest.mark.parametrize(
+    "products",
+    [
+        {"signal": {"channels": ["glued_532o"]}},
+        {"elastic": {"channels": ["glued_532o"]}, "signal": {"channels": ["photon_532o"]}},
+        {
+            "homogeneous": {"channels": ["analog_532o"], "sections": [[14_000, 16_000]]},
+            "signal": {"channels": "all"},
+        },
+    ],
+)
+def test_steps_of_a_plan_are_those_that_its_products_need(products: dict[str, object]) -> None:
+    result = plan(_scene(), factories.campaign(products=products))
+    needed = dependence.part(result, dependence.wanted(result))
+    assert [(s.channel, s.name, s.settings) for s in result.steps] == [
+        (s.channel, s.name, s.settings) for s in needed.steps
+    ]
+    read = {step.channel for step in result.steps if step.name == "read"}
+    idle = {left.channel for left in result.left_out if left.name == "read"}
+    assert not read & idle
 
 
 @pytest.mark.parametrize("with_dark", [True, False])

@@ -51,6 +51,9 @@ if TYPE_CHECKING:
 _LEAST_MEMORY = 2**20
 """Bytes; what is less was given without its unit."""
 
+_EMPTY = "its retrievals left nothing to use"
+_NONE = "nothing to do: no scene of the archive is asked for"
+
 AllStepsOption = Annotated[
     bool,
     typer.Option(
@@ -137,7 +140,7 @@ def show_plan(
 
     Example: lidarops plan catalogs/demo.yaml
     """
-    from lidarops import costs
+    from lidarops import asked, costs
     from lidarops.pipeline import assess
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
@@ -146,11 +149,13 @@ def show_plan(
     machine = costs.load()
     making, everything = costs.Tally(machine), costs.Tally(machine)
     scenes = []
+    none = True
     for each in found:
+        none = False
         scene, whole = each.scene, settings.all_steps
         times = {
             "to_be_made": making.add(scene, each.needed(), whole=whole),
-            "everything": everything.add(scene, each.plan, whole=whole),
+            "everything": everything.add(scene, each.asked, whole=whole),
         }
         if as_json:
             scenes.append({**_plain(each), "estimated_cpu_seconds": times})
@@ -158,8 +163,9 @@ def show_plan(
         title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
         if not stale:
             took = f"about {times['everything']:.2g} s of CPU time"
-            show(_plan_table(f"{title}, {took}", each.plan))
+            show(_plan_table(f"{title}, {took}", each.asked))
         show(_stale_table(f"{title}, about {times['to_be_made']:.2g} s of CPU time", each))
+    none = none and asked.none(settings, wanted)
     # What is fresh too was not looked at.
     told = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
     if as_json:
@@ -167,8 +173,12 @@ def show_plan(
             name.partition(",")[0].replace(" ", "_"): each.parts for name, each in told.items()
         }
         estimate = {**total, "costs": machine.words, "calibrated": not machine.note}
-        typer.echo(json.dumps({"scenes": scenes, "estimated_cpu_seconds": estimate}, indent=2))
+        found_none = {"no_scene_asked_for": none}
+        document = {"scenes": scenes, **found_none, "estimated_cpu_seconds": estimate}
+        typer.echo(json.dumps(document, indent=2))
         return
+    if none:
+        typer.echo(_NONE)
     show(_time_table(told))
     typer.echo(f"estimated CPU time: {machine.words}")
 
@@ -252,9 +262,12 @@ def reprocess(
     page = None
     if result.record is not None:
         page = pipeline.report_run(settings, result.record, workers=options.workers).page
+    none = result.record is None and asked.none(settings, wanted)
     if as_json:
-        typer.echo(json.dumps(_run_summary(settings, result, page), indent=2))
-    elif result.record is None and asked.none(settings, wanted):
+        summary = _run_summary(settings, result, page)
+        told = {"no_scene_asked_for": none, "removed": removed or 0}
+        typer.echo(json.dumps({**summary, **told}, indent=2))
+    elif none:
         _tell_none(settings, result)
     else:
         _tell(settings, result, page, removed)
@@ -359,7 +372,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
         {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
         for each in judged.stale
     ]
-    return {**judged.plan.as_dict(), "stale": stale, "fresh": judged.fresh, "held": judged.held}
+    return {**judged.asked.as_dict(), "stale": stale, "fresh": judged.fresh, "held": judged.held}
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
@@ -374,13 +387,14 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             **result.failures,
             **{scene.scene: scene.error for scene in scenes if scene.error},
         },
-        "empty_scenes": list(result.empty),
+        "empty_scenes": list(result.left_nothing),
         "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
         "products": [product.path for scene in scenes for product in scene.products],
         "files_set_aside": dict(result.set_aside),
         "barren_scenes": dict(result.barren),
         "more_of_both": result.untold,
-        "orphans": {orphan.path: orphan.reason for orphan in result.orphans},
+        "orphans": {each.path: each.reason for each in result.orphans if not each.asked},
+        "kept_products": {each.path: each.reason for each in result.orphans if each.asked},
     }
 
 
@@ -409,6 +423,8 @@ def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | 
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
     show(_orphans_table(result, removed))
+    show(_kept_table(result))
+    show(_empty_table(result))
     show(_failures_table(result))
     if page is None:
         typer.echo("nothing to do: every product that is asked for is fresh or cannot be made")
@@ -433,24 +449,47 @@ def _tell_none(campaign: Campaign, result: Result) -> None:
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
     show(_failures_table(result))
-    typer.echo("nothing to do: no scene of the archive is asked for")
+    typer.echo(_NONE)
 
 
 def _orphans_table(result: Result, removed: int | None) -> Table:
     fate = "kept; --remove-orphans removes them" if removed is None else f"{removed} removed"
     table = make_table(f"Products that nothing asks for ({fate})", "file", "because")
     for orphan in result.orphans:
-        add_row(table, orphan.path, orphan.reason)
+        if not orphan.asked:
+            add_row(table, orphan.path, orphan.reason)
     return table
 
 
+def _kept_table(result: Result) -> Table:
+    title = "Products that are asked for, and could not be made again (kept)"
+    table = make_table(title, "file", "because")
+    for orphan in result.orphans:
+        if orphan.asked:
+            add_row(table, orphan.path, orphan.reason)
+    return table
+
+
+def _empty_table(result: Result) -> Table:
+    table = make_table("Without a value to use", "scene", "problem")
+    told = _of_this_run(result)
+    for scene in result.left_nothing:
+        if scene in told:
+            add_row(table, scene, _EMPTY)
+    return table
+
+
+def _of_this_run(result: Result) -> set[str]:
+    return {scene.scene for scene in (() if result.record is None else result.record.scenes)}
+
+
 def _failures_table(result: Result) -> Table:
-    told = {scene.scene for scene in (() if result.record is None else result.record.scenes)}
+    told = _of_this_run(result)
     table = make_table("Of earlier runs, and nothing has changed since", "scene", "problem")
     for scene, error in result.failures.items():
         if scene not in told:
             add_row(table, scene, error)
     for scene in result.empty:
         if scene not in told:
-            add_row(table, scene, "its retrievals left nothing to use")
+            add_row(table, scene, _EMPTY)
     return table

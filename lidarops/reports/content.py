@@ -135,13 +135,19 @@ def verdict(record: RunRecord) -> str:
     if not record.scenes:
         tail = f" {counted(refused, 'granule')} refused." if refused else ""
         return f"There was no scene to process.{tail}"
-    empty = sum(p.usable == 0 for scene in record.scenes for p in scene.products)
-    tail = f" {counted(empty, 'product')} without a value to use." if empty else ""
-    if not failed and not refused:
-        return f"Every scene was processed and no granule was refused.{tail}"
+    empty = [scene.scene for scene in record.scenes if scene.empty]
+    rest = sum(p.usable == 0 for scene in record.scenes if not scene.empty for p in scene.products)
+    tail = f" {counted(rest, 'product')} without a value to use." if rest else ""
     parts = [f"{counted(failed, 'scene')} failed"] if failed else []
     parts += [f"{counted(refused, 'granule')} refused"] if refused else []
-    return f"{' and '.join(parts)}.{tail}"
+    if empty:
+        number = counted(len(empty), "scene")
+        parts.append(f"the retrievals of {number} left nothing to use: {listed(empty)}")
+    if not parts:
+        return f"Every scene was processed and no granule was refused.{tail}"
+    *first, last = parts
+    told = f"{', '.join(first)} and {last}" if first else last
+    return f"{told[0].upper()}{told[1:]}.{tail}"
 
 
 def instruments(record: RunRecord) -> list[InstrumentRow]:
@@ -286,6 +292,8 @@ def outcome_word(scene: SceneOutcome) -> str:
     """Return in a word what became of a scene."""
     if scene.error:
         return "failed"
+    if scene.empty:
+        return "nothing to use"
     return "done" if scene.products else "no product"
 
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import quick
 from small_archive import DAY, Archive, made
+from typer.testing import CliRunner
 
 from lidarops import engine
 from lidarops.catalog.ledger import RunStatus
@@ -20,6 +24,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.scan import scan
 from lidarops.catalog.store import Store
+from lidarops.cli import app
 from lidarops.pipeline import (
     Options,
     Selection,
@@ -28,6 +33,7 @@ from lidarops.pipeline import (
     remove_orphans,
     reprocess,
 )
+from lidarops.processing import Job
 from lidarops.records import ProductKind, SceneOutcome
 from lidarops.staleness import DaysJudged, Judge
 
@@ -227,6 +233,54 @@ def test_a_selection_makes_its_part_and_leaves_the_rest_stale(archive: Archive) 
     assert reprocess(campaign) is None
 
 
+def _planned(archive: Archive, *options: str) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["plan", str(archive.file), "--json", *options])
+    assert result.exit_code == 0
+    return dict(json.loads(result.stdout))
+
+
+def test_the_plan_of_a_selection_is_of_its_products(archive: Archive) -> None:
+    archive.write()
+    whole = _planned(archive)["estimated_cpu_seconds"]["everything"]
+    told = _planned(archive, "--product", "homogeneous")
+    for scene in told["scenes"]:
+        rich = scene["scene"].startswith("rich")
+        assert (scene["fresh"], len(scene["stale"])) == (int(rich), 0)
+        names = {step["name"] for step in scene["steps"]}
+        assert ("homogeneous" in names) == bool(names) == rich
+        assert not names & {"signal", "background", "elastic", "reference"}
+        assert {left["name"] for left in scene["left_out"]} >= {"homogeneous"} - names
+    some = told["estimated_cpu_seconds"]["everything"]
+    assert 0 < some["scenes"] < whole["scenes"]
+    assert some["start"] < whole["start"], "elastic code is not loaded"
+    nothing = _planned(archive, "--product", "visibility")
+    assert {scene["fresh"] for scene in nothing["scenes"]} == {0}
+    assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
+
+
+def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(
+    archive: Archive, tmp_path: Path
+) -> None:
+    archive.write()
+    for kinds in ([], ["--product", "signal"], ["--product", "homogeneous"]):
+        told = _planned(archive, "--out", str(tmp_path / "new"), *kinds)
+        assert {scene["fresh"] for scene in told["scenes"]} == {0}
+        times = told["estimated_cpu_seconds"]
+        assert times["to_be_made"] == times["everything"]
+        assert times["everything"]["all"] > 0
+
+
+def test_a_selection_without_a_scene_is_told_to_people_and_programs(archive: Archive) -> None:
+    archive.write()
+    said = "no scene of the archive is asked for"
+    for command in ("plan", "reprocess"):
+        for options, none in ((["--since", "2030-01-01"], True), (["--station", "coast"], False)):
+            line = [command, str(archive.file), *options]
+            assert (said in CliRunner().invoke(app, line).stdout) is none
+            told = json.loads(CliRunner().invoke(app, [*line, "--json"]).stdout)
+            assert told["no_scene_asked_for"] is none
+
+
 def test_force_makes_what_is_fresh(archive: Archive) -> None:
     before = archive.contents("out/products")
     selection = Selection(stations=("coast",), instruments=("poor",))
@@ -268,6 +322,29 @@ def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
     assert again.record is None
     assert set(again.empty) == scenes - {rows[poorest]["scene"]}
     assert again.troubled
+
+
+def test_the_run_in_which_a_scene_comes_to_nothing_says_so(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nothing(job: Job) -> tuple[SceneOutcome, bool]:
+        outcome, final = quick.attempt(job)
+        return replace(
+            outcome, products=tuple(replace(each, usable=0) for each in outcome.products)
+        ), final
+
+    monkeypatch.setattr(engine, "attempt", nothing)
+    archive.write()
+    command = ["reprocess", str(archive.file), "--instrument", "rich", "--force"]
+    command += ["--until", "2026-03-02"]
+    shown = CliRunner().invoke(app, [*command, "--product", "homogeneous"])
+    assert (shown.exit_code, "left nothing to use" in shown.stdout) == (0, False)
+    shown = CliRunner().invoke(app, command)
+    assert shown.exit_code == 1
+    assert shown.stdout.count("left nothing to use") == 1
+    assert "earlier runs" not in shown.stdout
+    told = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
+    assert told["empty_scenes"] == ["rich_20260301T000000"]
 
 
 def test_products_that_nothing_asks_for_are_not_told_as_empty(archive: Archive) -> None:

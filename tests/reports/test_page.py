@@ -263,6 +263,21 @@ class TestDegenerateRuns:
         found = built(run_record(tmp_path, [outcome("s", products=(empty,))]), tmp_path / "report")
         assert "x.nc" in found.text
 
+    def test_a_scene_that_left_nothing_to_use_is_named_as_a_trouble(self, tmp_path):
+        bad = ProductRecord("x.nc", ProductKind.ELASTIC, "c", "", 0, 9, {}, 0, 0)
+        good = replace(bad, path="y.nc", usable=5)
+        idle = replace(bad, path="z.nc", kind=ProductKind.HOMOGENEOUS)
+        scenes = [outcome("cloudy", products=(bad,)), outcome("clear", products=(good, idle))]
+        run = run_record(tmp_path, scenes)
+        said = "The retrievals of 1 scene left nothing to use: cloudy. 1 product without a value"
+        assert said in built(run, tmp_path / "report").text
+        assert content.outcome_word(scenes[0]) == "nothing to use"
+        assert content.outcome_word(scenes[1]) == "done"
+        refused = replace(run, refused=(fab.granule("raw/0", "cause"),))
+        assert content.verdict(refused).startswith("1 granule refused and the retrievals of 1")
+        only_idle = replace(run, scenes=scenes[1:])
+        assert content.verdict(only_idle).startswith("Every scene was processed")
+
     def test_unknown_bits_are_shown(self, tmp_path):
         odd = ProductRecord("x.nc", ProductKind.SIGNAL, "c", "", 0, 10, {"cosmic": 4}, 6)
         found = built(run_record(tmp_path, [outcome("s", products=(odd,))]), tmp_path / "report")
