@@ -141,7 +141,8 @@ class MultiPositionResult:
     """(..., vertex) m-1; NaN at vertices that are near ones on no ray, and where there is none."""
     extinction_standard_error: Array
     """m-1, by noise and by what a field may deviate from the prior: twice the prior's standard
-    deviation is counted, eight times as much where rays are too few to test the prior, and a bend over the network where the mean of the block's rays allows it.
+    deviation is counted, eight times as much where rays are too few to test the prior, and a bend
+    over the network where the mean of the block's rays allows it.
     Of a block in thin air, no less than is typical of it, and what noise moves all by."""
     visibility: sight.VisibilityResult
     """(..., vertex) m, at the wavelength of the lidars."""
