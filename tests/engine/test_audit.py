@@ -113,7 +113,14 @@ def test_what_asks_the_ledger_makes_none(command: str, archive: Archive) -> None
         (["--memory-limit", "foo"], 2, "2GiB"),
         (["--memory-limit", "2"], 2, "2GiB"),
         (["--log-level", "luck"], 2, "warning"),
-        (["--catalog", "luck"], 1, "postgresql"),
+        (["--catalog", "luck"], 2, "postgresql"),
+        (["--catalog", "luck://host/name"], 2, "postgresql"),
+        (["--archive", "luck"], 2, "luck"),
+        (["--archive", "luck://bucket"], 2, "luck"),
+        (["--cluster", "luck"], 2, "kubernetes"),
+        (["--scheduler", "luck"], 2, "tls://head:8786"),
+        (["--cluster", "slurm", "--memory-limit", "2GiB"], 2, "memory_limit"),
+        (["--scheduler", "tcp://head:8786", "--memory-limit", "2GiB"], 2, "memory_limit"),
     ],
 )
 def test_wrong_use_names_the_choices(
@@ -122,6 +129,19 @@ def test_wrong_use_names_the_choices(
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), *words])
     assert result.exit_code == code
     assert said in result.output
+
+
+@pytest.mark.parametrize("command", ["catalog", "plan", "verify"])
+def test_an_archive_that_is_away_is_wrong_use_only_where_it_is_given(
+    archive: Archive, command: str
+) -> None:
+    def code(*words: str) -> int:
+        return CliRunner().invoke(app, [command, str(archive.file), *words]).exit_code
+
+    (archive.folder / "raw").rename(archive.folder / "away")
+    assert code() == 1
+    assert code("--archive", str(archive.folder / "raw")) == 2
+    assert code("--archive", str(archive.folder / "away")) == 0
 
 
 def test_a_size_of_memory_is_read_before_the_archive(tmp_path: Path) -> None:
