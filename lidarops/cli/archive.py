@@ -127,6 +127,7 @@ def show_plan(
     stale: Annotated[
         bool, typer.Option("--stale", help="Only what is to be made, and why.")
     ] = False,
+    wait: WaitOption = 0.0,
     all_steps: AllStepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -141,7 +142,7 @@ def show_plan(
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
-    found = assess(settings, selection=wanted, everything=not stale)
+    found = assess(settings, selection=wanted, everything=not stale, wait=wait)
     machine = costs.load()
     making, everything = costs.Tally(machine), costs.Tally(machine)
     scenes = []
