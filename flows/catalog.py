@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Annotated
 
 import typer
 from prefect import flow, get_run_logger
@@ -13,6 +14,7 @@ from prefect.artifacts import create_table_artifact
 
 from flows import usage
 from flows.reprocess import Seconds, Workers
+from lidarops import asked
 from lidarops.campaign import load
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
@@ -27,6 +29,7 @@ def catalog(
     out: str | None = None,
     wait: Seconds = 0.0,
     workers: Workers = 1,
+    catalog: str | None = None,
 ) -> ScanSummary:
     """Scan the archive of a campaign and publish what it refuses as an artifact.
 
@@ -40,12 +43,14 @@ def catalog(
         s to wait for another run on the same archive.
     workers : int, optional
         Processes, where thousands of files are new.
+    catalog : str, optional
+        As on the command line: SQLAlchemy URL of catalog and ledger.
 
     Returns
     -------
     ScanSummary
     """
-    settings = load(campaign, archive=archive, output=out)
+    settings = load(campaign, archive=archive, output=out, catalog=catalog)
     summary = update_catalog(settings, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.granules(status=Status.REFUSED)
@@ -58,11 +63,23 @@ def catalog(
     return summary
 
 
-def main(campaign: str, archive: str | None = None, out: str | None = None) -> None:
+def main(
+    campaign: str,
+    archive: str | None = None,
+    out: str | None = None,
+    url: Annotated[
+        str | None, typer.Option("--catalog", help="SQLAlchemy URL of catalog and ledger")
+    ] = None,
+    wait: Annotated[float, typer.Option(min=0, help="s to wait for another run")] = 0.0,
+) -> None:
     """Bring the catalog of a campaign up to date as a Prefect flow."""
+    # Within the flow all of this would be told after the start of a server, in tracebacks.
     with usage.told():
-        load(campaign, archive=archive, output=out)
-    summary = catalog(campaign, archive, out)
+        catalog.validate_parameters({"campaign": campaign, "wait": wait})
+        settings = load(campaign, archive=archive, output=out, catalog=url)
+        asked.refuse_nowhere(settings, archive=archive)
+    with usage.told():
+        summary = catalog(campaign, archive, out, wait, catalog=url)
     raise typer.Exit(1 if summary.refused else 0)
 
 

@@ -229,7 +229,9 @@ def reprocess(
     Both come as the data of a state of its own name, `flows.WITH_FAILURES`, where something is
     refused or failed; who calls the flow gets the data.
     """
-    chosen = _cluster(workers, scheduler, cluster, memory_limit)
+    chosen = clusters.choose(
+        workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
+    )
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
     selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
@@ -268,21 +270,6 @@ def _selection(
         since=since,
         until=until,
     )
-
-
-def _cluster(
-    workers: int | None, scheduler: str | None, cluster: str | None, memory: str | None
-) -> clusters.Cluster:
-    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
-    if memory is None:
-        return chosen
-    if not isinstance(chosen, clusters.Local):
-        raise clusters.ClusterError(
-            "is for workers of this machine",
-            field="memory_limit",
-            remedy="give the memory in the cluster's file",
-        )
-    return chosen.model_copy(update={"memory": memory})
 
 
 def _tell_troubles(campaign: Campaign, result: Result) -> str:
@@ -376,12 +363,10 @@ def main(
         settings = load(campaign, archive=archive, output=out, catalog=catalog)
         of_selection = ("instruments", "stations", "products", "since", "until")
         asked.refuse_unknown(settings, _selection(*(valid[name] for name in of_selection)))
-        _cluster(workers, scheduler, cluster, memory_limit)
-    try:
+        clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit)
+        asked.refuse_nowhere(settings, archive=archive)
+    with usage.told():
         result, built = reprocess(**given)
-    except LidarOpsError as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(1) from error
     if result.record is None:
         typer.echo("nothing to do")
     else:

@@ -1,4 +1,4 @@
-"""How the flows tell wrong use where they are called from a command line."""
+"""How the flows tell what is wrong where they are called from a command line."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from contextlib import contextmanager
 import typer
 from prefect.exceptions import ParameterTypeError
 
-from lidarops.clusters import ClusterError
-from lidarops.errors import CampaignError
+from lidarops.errors import LidarOpsError
 
 _WRONG_USE = 2
+_REFUSED = 1
 
 
 @contextmanager
 def told() -> Iterator[None]:
-    """Show wrong use as a sentence and exit with 2; looked for before a server is started."""
+    """Show an error as a sentence; exit with 2 where it is wrong use, and with 1 else."""
     try:
         yield
-    except (CampaignError, ClusterError, ParameterTypeError) as error:
+    except (LidarOpsError, ParameterTypeError) as error:
         typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(_WRONG_USE) from error
+        wrong_use = not isinstance(error, LidarOpsError) or error.wrong_use
+        raise typer.Exit(_WRONG_USE if wrong_use else _REFUSED) from error

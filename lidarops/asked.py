@@ -1,10 +1,12 @@
-"""What is asked for of a campaign: whether there is such a thing at all."""
+"""What is asked for: whether there is such a thing at all, told before anything is started."""
 
 from __future__ import annotations
 
 from lidarops.campaign import Campaign
+from lidarops.catalog.database import refuse_wrong_url
+from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import CampaignError
+from lidarops.errors import CampaignError, CatalogError
 from lidarops.scenes import cut
 from lidarops.staleness import Selection
 
@@ -35,6 +37,29 @@ def refuse_unknown(campaign: Campaign, selection: Selection) -> None:
             field="since, until",
             remedy="since must be earlier than until",
         )
+
+
+def refuse_nowhere(campaign: Campaign, *, archive: str | None) -> None:
+    """Refuse an archive that is not there and a catalog that has no URL of a database.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        As loaded.
+    archive : str, optional
+        What was given beside the campaign file: it is wrong use where that is not there, while
+        the archive of a file may be away for a while.
+
+    Raises
+    ------
+    CatalogError
+    """
+    refuse_wrong_url(campaign.catalog_url)
+    try:
+        Source.of(campaign.archive).refuse_absent()
+    except CatalogError as error:
+        error.wrong_use = error.wrong_use or bool(archive)
+        raise
 
 
 def none(campaign: Campaign, selection: Selection) -> bool:

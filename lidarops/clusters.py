@@ -108,7 +108,11 @@ _KINDS = ("local", "slurm", "kubernetes")
 
 
 def choose(
-    *, workers: int | None = None, scheduler: str | None = None, cluster: str | None = None
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    cluster: str | None = None,
+    memory: str | None = None,
 ) -> Cluster:
     """Make the cluster of what stands on a command line.
 
@@ -121,6 +125,8 @@ def choose(
     cluster : str, optional
         ``slurm`` or ``kubernetes`` with the defaults of `Slurm` or `Kubernetes`, or the path of a
         YAML file that describes one.
+    memory : str, optional
+        Most memory of a worker of this machine, such as ``2GiB``; of others it is told elsewhere.
 
     Returns
     -------
@@ -129,14 +135,29 @@ def choose(
     Raises
     ------
     ClusterError
-        If the choice contradicts itself or is described wrongly.
+        If the choice contradicts itself or is described wrongly: wrong use.
     """
+    chosen = _chosen(workers, scheduler, cluster)
+    if memory is None:
+        return chosen
+    if not isinstance(chosen, Local):
+        raise ClusterError(
+            "is for workers of this machine",
+            field="memory_limit",
+            remedy="give the memory in the cluster's file, or where its workers are started",
+            wrong_use=True,
+        )
+    return chosen.model_copy(update={"memory": memory})
+
+
+def _chosen(workers: int | None, scheduler: str | None, cluster: str | None) -> Cluster:
     if scheduler is not None:
         if cluster is not None or workers is not None:
             raise ClusterError(
                 "a running scheduler has its own workers",
                 field="--scheduler",
                 remedy="give --scheduler alone, or --cluster and --workers",
+                wrong_use=True,
             )
         return _validated({"kind": "scheduler", "address": scheduler}, None)
     settings: dict[str, Any] = {"kind": "local"} if cluster is None else _described(cluster)
@@ -155,9 +176,15 @@ def _described(cluster: str) -> dict[str, Any]:
             f"cannot be read: {error}",
             file=cluster,
             remedy="give slurm, kubernetes, or the path of a YAML file",
+            wrong_use=True,
         ) from error
     if not isinstance(raw, dict):
-        raise ClusterError("is not a mapping", file=cluster, remedy="see deploy/slurm/cluster.yaml")
+        raise ClusterError(
+            "is not a mapping",
+            file=cluster,
+            remedy="see deploy/slurm/cluster.yaml",
+            wrong_use=True,
+        )
     return raw
 
 
@@ -169,7 +196,15 @@ def _validated(settings: dict[str, Any], file: str | None) -> Cluster:
             f"{'.'.join(str(part) for part in each['loc'][1:]) or 'kind'}: {each['msg']}"
             for each in error.errors(include_url=False)
         ]
-        raise ClusterError("; ".join(told), file=file) from error
+        addressed = any("address" in each["loc"] for each in error.errors())
+        raise ClusterError(
+            "; ".join(told),
+            file=file,
+            remedy="give the address of a scheduler, such as tls://head:8786"
+            if addressed
+            else "see lidarops/clusters.py for every key and its bounds",
+            wrong_use=True,
+        ) from error
 
 
 @contextmanager

@@ -22,7 +22,12 @@ class LidarOpsError(Exception):
         The field, key, variable or argument in which it was found.
     remedy : str, optional
         What the user can do about it.
+    wrong_use : bool, optional
+        Whether it is what was asked for that cannot be meant, so that to ask again will not help;
+        that of the class where not given.
     """
+
+    wrong_use: bool = False
 
     def __init__(
         self,
@@ -31,11 +36,14 @@ class LidarOpsError(Exception):
         file: str | Path | None = None,
         field: str | None = None,
         remedy: str | None = None,
+        wrong_use: bool | None = None,
     ) -> None:
         self.problem = problem
         self.file = None if file is None else str(file)
         self.field = field
         self.remedy = remedy
+        if wrong_use is not None:
+            self.wrong_use = wrong_use
         super().__init__(str(self))
 
     def __str__(self) -> str:
@@ -45,7 +53,8 @@ class LidarOpsError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only arguments are lost by the default, and errors cross process borders.
-        return _rebuild, (type(self), self.problem, self.file, self.field, self.remedy)
+        told = (self.problem, self.file, self.field, self.remedy, self.wrong_use)
+        return _rebuild, (type(self), *told)
 
 
 def _rebuild(
@@ -54,8 +63,9 @@ def _rebuild(
     file: str | None,
     field: str | None,
     remedy: str | None,
+    wrong_use: bool,  # noqa: FBT001 - pickle gives what it was given by position
 ) -> LidarOpsError:
-    return kind(problem, file=file, field=field, remedy=remedy)
+    return kind(problem, file=file, field=field, remedy=remedy, wrong_use=wrong_use)
 
 
 class RawFormatError(LidarOpsError, ValueError):
@@ -64,6 +74,8 @@ class RawFormatError(LidarOpsError, ValueError):
 
 class CampaignError(LidarOpsError, ValueError):
     """A campaign file that is missing, unreadable or inconsistent, or not what it is asked for."""
+
+    wrong_use = True
 
 
 class AncillaryError(LidarOpsError, ValueError):
@@ -80,6 +92,8 @@ class SceneError(LidarOpsError):
 
 class RetrievalInputError(LidarOpsError, ValueError):
     """Arguments of a retrieval whose shapes, units or values cannot be right."""
+
+    wrong_use = True
 
 
 class ProductError(LidarOpsError):

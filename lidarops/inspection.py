@@ -93,7 +93,11 @@ def _raw(file: Path) -> dict[str, Any]:
     told: dict[str, Any] = _plain(header)
     channels = told.pop("datasets")
     for told_of, dataset in zip(channels, header.datasets, strict=True):
-        told_of |= {"name": dataset.name, "bin_width": dataset.bin_width}
+        told_of |= {
+            "name": dataset.name,
+            "bin_width": dataset.bin_width,
+            "wavelength": _plain(dataset.wavelength),
+        }
     told |= {"zenith_angle": header.zenith_angle}
     return {"type": "raw", "file": str(file), **told, "channels": channels}
 

@@ -129,6 +129,7 @@ def assess(
     selection: Selection | None = None,
     force: bool = False,
     everything: bool = False,
+    wait: float = 0.0,
 ) -> Iterator[Judgement]:
     """Tell for every scene that may have something to be done what that is, and why.
 
@@ -143,6 +144,8 @@ def assess(
         Whether all of it counts as stale.
     everything : bool
         Whether to tell of scenes too for which nothing is to be done.
+    wait : float
+        s to wait for another run on the same catalog.
 
     Yields
     ------
@@ -150,7 +153,7 @@ def assess(
     """
     selection = selection or Selection()
     refuse_unknown(campaign, selection)
-    update_catalog(campaign)
+    update_catalog(campaign, wait=wait)
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection, force=force)
         days = _dirty(judge, store, selection, force=force or everything)

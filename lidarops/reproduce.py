@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from lidarops.products.provenance import (
 )
 from lidarops.raw import licel
 from lidarops.records import Granule, InputRecord, LeftOut, Plan, Role, Scene, Status, Step
+from lidarops.stores import RemoteStore, is_url
 
 _RAW: Final = (Role.SIGNAL, Role.DARK)
 """Roles of files of the archive; those of the others lie beside the campaign file."""
@@ -197,14 +199,18 @@ def reproduce(
     ProductError
         If the file is no product, does not tell enough, or its inputs are nowhere to be found.
     CatalogError
-        If the catalog that is given cannot be used.
+        If the folder, store or catalog that is given is not there or cannot be used.
     """
+    local = None if is_url(str(archive)) else archive
+    for field, given in (("--archive", local), ("--ancillary", ancillary)):
+        if given is not None and not Path(given).is_dir():
+            raise CatalogError("is no folder", file=given, field=field, wrong_use=True)
     told = _Told.of(Path(product))
     raw = [record for record in told.inputs if record.role in _RAW]
     beside = [record for record in told.inputs if record.role not in _RAW]
     with _staged(told, raw, archive, catalog) as (root, wrong):
         folder = _beside(told, beside, ancillary) if beside else root
-        changed = [*wrong, *_changed(folder, beside)]
+        changed = [*wrong, *_changed(folder, beside, str(folder))]
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))
         software = tuple(_software(told))
@@ -224,34 +230,34 @@ def _staged(
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
         staged = Path(name)
         there = {record.path: record.path for record in records}
-        if "://" in str(archive):
-            root, bring = staged, _from_store(str(archive), staged)
+        if is_url(str(archive)):
+            store = RemoteStore(str(archive))
+            root, place, bring = staged, store.url, _from_store(store, staged)
             bring(there)
         else:
-            root = _raw_folder(told, records, archive, catalog)
-            bring = _from_folder(root, staged)
-        changed = list(_changed(root, records))
+            root = _raw_folder(told, records, catalog) if archive is None else Path(archive)
+            place, bring = str(root), _from_folder(root, staged)
+        changed = list(_changed(root, records, place))
         wrong = {each.name for each in changed}
         lost = [record for record in records if record.path in wrong]
         moved = _moved(told, lost, catalog)
         if moved:
             bring({**there, **moved} if root is not staged else moved)
             root = staged
-            wrong = {each.name for each in _changed(root, lost)}
+            wrong = {each.name for each in _changed(root, lost, place)}
         yield root, [each for each in changed if each.name in wrong]
 
 
-def _from_store(archive: str, staged: Path) -> Callable[[Mapping[str, str]], None]:
+def _from_store(store: RemoteStore, staged: Path) -> Callable[[Mapping[str, str]], None]:
     """Return what copies files, old name -> name, from behind a URL."""
-    import fsspec  # noqa: PLC0415 - most archives are local
-
-    store, prefix = fsspec.core.url_to_fs(archive)
 
     def bring(names: Mapping[str, str]) -> None:
-        for old, now in names.items():
-            source = f"{prefix.rstrip('/')}/{now}"
-            if store.exists(source):
-                store.get_file(source, str(_cleared(staged / old)))
+        with tempfile.TemporaryDirectory(prefix="lidarops-") as fetched:
+            store.fetch(sorted(set(names.values())), Path(fetched))
+            for old, now in names.items():
+                if (Path(fetched) / now).is_file():
+                    # Two names may have become one.
+                    shutil.copyfile(Path(fetched) / now, _cleared(staged / old))
 
     return bring
 
@@ -297,11 +303,7 @@ def _nearest_catalog(file: Path) -> str:
     return ""
 
 
-def _raw_folder(
-    told: _Told, records: Sequence[InputRecord], given: str | Path | None, catalog: str | None
-) -> Path:
-    if given is not None:
-        return Path(given)
+def _raw_folder(told: _Told, records: Sequence[InputRecord], catalog: str | None) -> Path:
     found = _folder_with(told.file, [record.path for record in records])
     if found is None:
         found = _folder_with(told.file, list(_moved(told, records, catalog).values()))
@@ -343,13 +345,13 @@ def _folders_in(parent: Path) -> list[Path]:
         return []
 
 
-def _changed(folder: Path, records: Iterable[InputRecord]) -> Iterator[Difference]:
+def _changed(folder: Path, records: Iterable[InputRecord], place: str) -> Iterator[Difference]:
     for record in records:
         try:
             with (folder / record.path).open("rb") as stream:
                 digest = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as error:
-            problem = f"missing from {folder}: {error.strerror}"
+            problem = f"missing from {place}: {error.strerror}"
             yield Difference("input", record.path, problem)
         else:
             if digest != record.sha256:

@@ -96,6 +96,8 @@ class RemoteStore:
                 f"the URL cannot be opened: {without_keys(str(error))}",
                 file=self.url,
                 remedy="use a URL that fsspec knows and install its driver: lidarops[s3] for s3://",
+                # What is known lacks its driver only.
+                wrong_use=isinstance(error, ValueError),
             ) from error
         self._prefix = prefix.rstrip("/")
 

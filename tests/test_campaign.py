@@ -11,7 +11,7 @@ import yaml
 from pydantic import ValidationError
 
 from lidarops.campaign import Campaign, ElasticSettings, load
-from lidarops.errors import CampaignError
+from lidarops.errors import CampaignError, CatalogError
 
 MINIMAL = """\
 name: small
@@ -207,6 +207,14 @@ def test_the_folder_is_that_of_the_campaign_file(
     assert load("campaign.yaml").folder == tmp_path.resolve()
     assert load(tmp_path / "campaign.yaml", output="/elsewhere").folder == tmp_path.resolve()
     assert load("campaign.yaml").model_copy().folder == tmp_path.resolve()
+
+
+@pytest.mark.parametrize("wrong_use", [False, True])
+def test_an_error_tells_the_same_in_other_processes(*, wrong_use: bool) -> None:
+    error = CatalogError("is away", file="a", field="b", remedy="wait", wrong_use=wrong_use)
+    told = pickle.loads(pickle.dumps(error))
+    assert (str(told), told.wrong_use) == ("a: b: is away (wait)", wrong_use)
+    assert pickle.loads(pickle.dumps(CampaignError("is no campaign"))).wrong_use
 
 
 def test_the_folder_goes_with_a_campaign_to_other_processes(tmp_path: Path) -> None:

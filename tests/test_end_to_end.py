@@ -179,7 +179,7 @@ def test_the_command_line_reprocesses_and_tells(
     [
         (["catalog", "nowhere.yaml"], 2, "nowhere.yaml"),
         (["reprocess", "CAMPAIGN", "--workers", "0"], 2, "workers"),
-        (["reprocess", "CAMPAIGN", "--archive", "/nowhere"], 1, "/nowhere"),
+        (["reprocess", "CAMPAIGN", "--archive", "/nowhere"], 2, "/nowhere"),
         (["inspect", "/nowhere"], 1, "/nowhere"),
         (["report", "/nowhere"], 1, "/nowhere"),
         (["bench", "luck", "file"], 2, "throughput"),

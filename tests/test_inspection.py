@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import LidarOpsError
-from lidarops.inspection import describe
+from lidarops.inspection import describe, tables
 from lidarops.products.build import build
 from lidarops.products.write import write
 from lidarops.records import ProductKind
@@ -54,6 +54,11 @@ def test_raw_files_tell_all_their_channels(demo_archive: Path):
     assert {"analog_532o", "photon_532o"} <= {each["name"] for each in told["channels"]}
     widths = {each["name"]: (each["bins"], each["bin_width"]) for each in told["channels"]}
     assert set(widths.values()) == {(4000, 7.5)}, widths
+    green = {each["wavelength"] for each in told["channels"] if "532" in each["name"]}
+    assert list(green) == [pytest.approx(532e-9)]
+    _, channels = tables(path)
+    for column in channels.columns:
+        assert any(str(cell) for cell in column.cells), column.header
     table = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"})
     assert all(word in table.output for word in ("Channels", "photon_532o", "zenith angle"))
 

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from lidarops.campaign import Campaign, load
 from lidarops.cli import app
 from lidarops.engine import make_jobs, process_all
-from lidarops.errors import ProductError
+from lidarops.errors import CatalogError, ProductError
 from lidarops.pipeline import prepare
 from lidarops.products.provenance import read_provenance
 from lidarops.products.write import write
@@ -239,6 +239,36 @@ def test_inputs_that_are_nowhere_are_asked_for(campaign: Campaign, tmp_path: Pat
 def test_raw_files_may_lie_behind_a_url(campaign: Campaign):
     product = of_kind(campaign, ProductKind.MULTIANGLE)
     assert reproduce(product, archive=f"file://{campaign.archive}").identical
+
+
+def test_a_store_that_cannot_be_reached_lacks_nothing(campaign: Campaign) -> None:
+    """Of no file it is known that it is missing, so none is named."""
+    pytest.importorskip("aiohttp")
+    product = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    with pytest.raises(CatalogError, match=r"^http://127\.0\.0\.1:1/: cannot be read") as caught:
+        reproduce(product, archive="http://127.0.0.1:1/")
+    assert not caught.value.wrong_use
+
+
+def test_what_a_store_lacks_is_told_with_its_url(campaign: Campaign, moved: Campaign) -> None:
+    (gone, *_) = sorted(Path(moved.archive).glob("coast/h*"))
+    gone.unlink()
+    product = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    result = reproduce(product, archive=f"file://{moved.archive}")
+    (lost,) = result.differences
+    assert lost.name == f"coast/{gone.name}"
+    assert lost.problem.startswith(f"missing from file://{moved.archive}: ")
+
+
+@pytest.mark.parametrize(
+    "words", [["--archive", "s3x://foo"], ["--archive", "nowhere"], ["--ancillary", "nowhere"]]
+)
+def test_a_place_that_is_none_is_wrong_use(words: list[str], campaign: Campaign) -> None:
+    product = of_kind(campaign, ProductKind.ELASTIC)
+    refused = CliRunner().invoke(app, ["reproduce", str(product), *words])
+    assert refused.exit_code == 2
+    assert refused.output.startswith(f"error: {words[1]}: ")
+    assert len(refused.output.splitlines()) == 1
 
 
 def test_the_command_tells_by_its_exit_code(campaign: Campaign, moved: Campaign):

@@ -26,6 +26,8 @@ from lidarops.bench.timing import machine
 from lidarops.errors import CampaignError
 from lidarops.reports import benchmark
 
+STABILITY: Final = "stability"
+"""The benchmark that is no `Kind`: it has no cases to choose from."""
 _REPEATS: Final = 7
 
 _Names = TypeVar("_Names", bound=StrEnum)
@@ -74,7 +76,7 @@ def run(
     RawFormatError
         Where "reader" gets no file, or one that cannot be read.
     """
-    kind = _member(Kind, what, "benchmark")
+    kind = _member(Kind, what, "benchmark", STABILITY)
     usual = Case.ALL if kind is Kind.ACCURACY else Case.HOMOGENEOUS
     chosen = _member(Case, case or (Case.READER if files else usual), "case")
     _check(kind, chosen, files, data)
@@ -132,9 +134,9 @@ def write(finding: Finding, folder: Path) -> Path:
     return benchmark.build(finding.report, folder)
 
 
-def _member(names: type[_Names], value: str, what: str) -> _Names:
+def _member(names: type[_Names], value: str, what: str, *others: str) -> _Names:
     try:
         return names(value)
     except ValueError:
-        choices = " or ".join(names)
+        choices = " or ".join((*names, *others))
         raise CampaignError(f"no {what} {value!r}", remedy=f"choose: {choices}") from None

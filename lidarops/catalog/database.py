@@ -17,6 +17,7 @@ from lidarops.errors import CatalogError
 BATCH = 1000
 """Rows a statement, where a list of them is asked for."""
 _MOVE_AWAY: Final = "move it away: a new one is made from the archive, and products are made again"
+_URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
 _BROKEN: Final = ("malformed", "not a database")
 """Words of SQLite about a file that is damaged."""
 _WITHOUT_USABLE: Final = 2
@@ -196,20 +197,36 @@ def _add_usable(connection: sa.Connection) -> None:
         connection.execute(sa.text(f"ALTER TABLE {PRODUCT.name} ADD COLUMN {column}"))
 
 
+def refuse_wrong_url(url: str) -> None:
+    """Refuse what is no URL of a database; connects to none.
+
+    Raises
+    ------
+    CatalogError
+        Also where the driver is not installed.
+    """
+    _engine(_parsed(url)).dispose()
+
+
 def _parsed(url: str) -> sa.URL:
     try:
         return sa.make_url(url)
     except sa.exc.ArgumentError as error:
         raise CatalogError(
-            "is no URL of a database",
-            file=url,
-            remedy="give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME",
+            "is no URL of a database", file=url, remedy=_URLS, wrong_use=True
         ) from error
 
 
 def _engine(url: sa.URL) -> sa.Engine:
     try:
         return sa.create_engine(url)
+    except sa.exc.NoSuchModuleError as error:
+        raise CatalogError(
+            f"there is no such kind of database: {error}",
+            file=url.render_as_string(hide_password=True),
+            remedy=_URLS,
+            wrong_use=True,
+        ) from error
     except (ImportError, sa.exc.SQLAlchemyError) as error:
         raise CatalogError(
             f"cannot be opened: {error}",

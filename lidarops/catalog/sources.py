@@ -55,13 +55,22 @@ class Source:
 
     def files(self) -> Iterator[RawFile]:
         """List files in the order of their paths, whatever the file system's own."""
+        self.refuse_absent()
+        yield from self._walk(str(self._root), "")
+
+    def refuse_absent(self) -> None:
+        """Refuse a folder that is not there.
+
+        Raises
+        ------
+        CatalogError
+        """
         if not self._root.is_dir():
             raise CatalogError(
                 "the archive is not a folder",
                 file=self._root,
                 remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
             )
-        yield from self._walk(str(self._root), "")
 
     def _walk(self, folder: str, prefix: str) -> Iterator[RawFile]:
         try:
@@ -109,6 +118,9 @@ class RemoteSource(Source):
         """List files in the order of their paths."""
         for stored in self._store.files():
             yield RawFile(stored.path, stored.size, stored.stamp)
+
+    def refuse_absent(self) -> None:
+        """Refuse nothing: to ask a store may take as long as to list it."""
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""

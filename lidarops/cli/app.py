@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
-from lidarops.errors import CampaignError, LidarOpsError, RetrievalInputError
+from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -82,8 +82,7 @@ def plainly(command: Callable[_P, _R]) -> Callable[_P, _R]:
             return command(*args, **kwargs)
         except LidarOpsError as error:
             typer.secho(f"error: {error}", fg="red", err=True)
-            wrong_use = isinstance(error, CampaignError | RetrievalInputError)
-            raise typer.Exit(WRONG_USE if wrong_use else REFUSED) from error
+            raise typer.Exit(WRONG_USE if error.wrong_use else REFUSED) from error
 
     return wrapped
 

@@ -94,11 +94,10 @@ def catalog(
     """
     from dataclasses import asdict
 
-    from lidarops.campaign import load
     from lidarops.catalog.store import Store
     from lidarops.pipeline import update_catalog
 
-    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    settings = _loaded(campaign, archive, out, catalog)
     with progress_bar("catalog", None) as advance:
         summary = update_catalog(settings, progress=advance, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
@@ -131,6 +130,7 @@ def show_plan(
     stale: Annotated[
         bool, typer.Option("--stale", help="Only what is to be made, and why.")
     ] = False,
+    wait: WaitOption = 0.0,
     all_steps: AllStepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -145,7 +145,7 @@ def show_plan(
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
-    found = assess(settings, selection=wanted, everything=not stale)
+    found = assess(settings, selection=wanted, everything=not stale, wait=wait)
     machine = costs.load()
     making, everything = costs.Tally(machine), costs.Tally(machine)
     scenes = []
@@ -243,7 +243,7 @@ def reprocess(
     set_up(log_level, as_json=log_json, file=log_file)
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
-    there = _cluster(workers, scheduler, tls, cluster)
+    there = _cluster(workers, scheduler, tls, cluster, memory_limit)
     with growing_bar("reprocess", "granules") as bar:
         options = pipeline.Options(
             force=force,
@@ -277,11 +277,18 @@ def reprocess(
 
 
 def _loaded(
-    campaign: Path, archive: str | None, out: Path | None, catalog: str | None, *, all_steps: bool
+    campaign: Path,
+    archive: str | None,
+    out: Path | None,
+    catalog: str | None,
+    *,
+    all_steps: bool = False,
 ) -> Campaign:
+    from lidarops.asked import refuse_nowhere
     from lidarops.campaign import load
 
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    refuse_nowhere(settings, archive=archive)
     return settings.model_copy(update={"all_steps": all_steps or settings.all_steps})
 
 
@@ -290,6 +297,7 @@ def _cluster(
     scheduler: str | None,
     tls: tuple[Path, Path, Path] | None,
     cluster: str | None,
+    memory: str | None,
 ) -> Callable[[], AbstractContextManager[Client]] | None:
     """Return what reaches the cluster that is asked for; None for this machine."""
     if tls and scheduler is None:
@@ -298,7 +306,7 @@ def _cluster(
         return None
     from lidarops import clusters
 
-    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster)
+    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster, memory=memory)
     if tls and isinstance(chosen, clusters.Scheduler):
         ca, certificate, key = tls
         files = clusters.Tls(ca=ca, certificate=certificate, key=key)

@@ -83,11 +83,14 @@ def verify(
 
     Example: lidarops verify catalogs/demo.yaml
     """
+    from lidarops.asked import refuse_nowhere
     from lidarops.campaign import load
     from lidarops.catalog.store import Store
     from lidarops.catalog.verify import verify as audit
 
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    if archive and not products_only:
+        refuse_nowhere(settings, archive=archive)
     looked = 0
 
     with (

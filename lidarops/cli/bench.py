@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,8 +23,6 @@ from lidarops.errors import CampaignError
 
 if TYPE_CHECKING:
     from lidarops.bench.terms import Effort, Finding
-
-_STABILITY: Final = "stability"
 
 
 @app.command()
@@ -72,7 +70,7 @@ def bench(
     today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as advance:
         effort = Effort(quick=quick, repeats=repeats, date=today, progress=advance)
-        if what == _STABILITY:
+        if what == cases.STABILITY:
             _refuse({"case": case, "files": files, "data": data, "repeats": repeats})
             finding = _stability(effort)
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -37,6 +38,18 @@ def test_everything_is_made(tmp_path: Path):
     files = [made["index"], made["stac"], *(each["path"] for each in made["views"])]
     files += [each["path"] for each in made["means"]]
     assert all((tmp_path / file).is_file() for file in files)
+
+
+def test_the_line_of_the_readme_makes_what_it_says(repository: Path, tmp_path: Path):
+    for day in range(2):
+        add_day(tmp_path, day)
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^    lidarops aggregate demo (.*?) +# .*daily means, index", text, re.M)
+    code, output = run(tmp_path, *line.split(), "--json")
+    made = json.loads(output)
+    assert code == 0
+    assert made["index"]
+    assert [each["periods"] for each in made["means"]] == [2]
 
 
 def test_a_damaged_product_is_named_and_the_exit_code_is_1(tmp_path: Path):

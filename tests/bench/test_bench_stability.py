@@ -271,6 +271,12 @@ def test_command_fails_where_a_case_does(found, monkeypatch):
     assert "FAILED" in made.stdout
 
 
+def test_command_names_every_benchmark_where_one_is_unknown():
+    refused = CliRunner().invoke(app, ["bench", "luck"], env={"COLUMNS": "300"})
+    assert refused.exit_code == 2
+    assert "accuracy or throughput or stability" in refused.output
+
+
 @pytest.mark.parametrize("option", [["--case", "homogeneous"], ["--repeats", "3"], ["file"]])
 def test_command_refuses_what_stability_does_not_take(option):
     made = CliRunner().invoke(app, ["bench", "stability", *option])

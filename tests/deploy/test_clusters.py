@@ -57,11 +57,28 @@ def test_a_wrong_description_is_told_with_file_and_field(
     assert told in str(caught.value)
 
 
-def test_contradictions_and_absent_files_are_told() -> None:
-    with pytest.raises(clusters.ClusterError, match="has its own workers"):
-        clusters.choose(scheduler="tcp://head:8786", workers=2)
-    with pytest.raises(clusters.ClusterError, match="cannot be read"):
-        clusters.choose(cluster="no-such.yaml")
+@pytest.mark.parametrize(
+    ("choice", "told"),
+    [
+        ({"scheduler": "tcp://head:8786", "workers": 2}, "has its own workers"),
+        ({"cluster": "no-such.yaml"}, "cannot be read"),
+        ({"scheduler": "nowhere"}, "such as tls://head:8786"),
+        ({"scheduler": "tls://head:8786", "memory": "2GiB"}, "memory_limit: .*of this machine"),
+        ({"cluster": "slurm", "memory": "2GiB"}, "memory_limit: .*of this machine"),
+    ],
+)
+def test_a_choice_that_cannot_be_meant_is_wrong_use(choice: dict[str, Any], told: str) -> None:
+    with pytest.raises(clusters.ClusterError, match=told) as caught:
+        clusters.choose(**choice)
+    assert caught.value.wrong_use
+
+
+def test_a_limit_of_memory_is_of_workers_here(tmp_path: Path) -> None:
+    assert clusters.choose(memory="2GiB") == clusters.Local(memory="2GiB")
+    described = tmp_path / "cluster.yaml"
+    described.write_text("{kind: local, workers: 3, memory: 1GiB}")
+    chosen = clusters.choose(cluster=str(described), memory="2GiB")
+    assert chosen == clusters.Local(workers=3, memory="2GiB")
 
 
 def where() -> tuple[int, str | None]:
@@ -83,10 +100,12 @@ def test_local_workers_are_processes_of_one_thread_on_loopback() -> None:
 def test_a_scheduler_that_is_absent_is_told() -> None:
     address = f"tcp://127.0.0.1:{servers.free_port()}"
     with (
-        pytest.raises(clusters.ClusterError, match="no scheduler cluster"),
+        pytest.raises(clusters.ClusterError, match="no scheduler cluster") as caught,
         clusters.client(clusters.Scheduler(address=address, wait=1.0)),
     ):
         raise AssertionError("the client was given")
+    # It may come back.
+    assert not caught.value.wrong_use
 
 
 FILES = {

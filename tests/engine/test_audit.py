@@ -7,9 +7,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from small_archive import Archive
+from click.testing import Result
+from small_archive import DAY, Archive
 from typer.testing import CliRunner
 
+from lidarops.catalog import lock as lock_module
+from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.catalog.verify import verify
 from lidarops.cli import app
@@ -113,7 +116,14 @@ def test_what_asks_the_ledger_makes_none(command: str, archive: Archive) -> None
         (["--memory-limit", "foo"], 2, "2GiB"),
         (["--memory-limit", "2"], 2, "2GiB"),
         (["--log-level", "luck"], 2, "warning"),
-        (["--catalog", "luck"], 1, "postgresql"),
+        (["--catalog", "luck"], 2, "postgresql"),
+        (["--catalog", "luck://host/name"], 2, "postgresql"),
+        (["--archive", "luck"], 2, "luck"),
+        (["--archive", "luck://bucket"], 2, "luck"),
+        (["--cluster", "luck"], 2, "kubernetes"),
+        (["--scheduler", "luck"], 2, "tls://head:8786"),
+        (["--cluster", "slurm", "--memory-limit", "2GiB"], 2, "memory_limit"),
+        (["--scheduler", "tcp://head:8786", "--memory-limit", "2GiB"], 2, "memory_limit"),
     ],
 )
 def test_wrong_use_names_the_choices(
@@ -122,6 +132,38 @@ def test_wrong_use_names_the_choices(
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), *words])
     assert result.exit_code == code
     assert said in result.output
+
+
+@pytest.mark.parametrize("command", ["catalog", "plan", "verify"])
+def test_an_archive_that_is_away_is_wrong_use_only_where_it_is_given(
+    archive: Archive, command: str
+) -> None:
+    def code(*words: str) -> int:
+        return CliRunner().invoke(app, [command, str(archive.file), *words]).exit_code
+
+    (archive.folder / "raw").rename(archive.folder / "away")
+    assert code() == 1
+    assert code("--archive", str(archive.folder / "raw")) == 2
+    assert code("--archive", str(archive.folder / "away")) == 0
+
+
+def test_a_plan_waits_for_another_run_as_long_as_asked(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def planned(*words: str) -> Result:
+        return CliRunner().invoke(app, ["plan", str(archive.file), "--stale", *words])
+
+    campaign = archive.write()
+    archive.raw("poor/h13", DAY + 603, seed=1)
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as held:
+        held.acquire()
+        refused = planned()
+        assert refused.exit_code == 1
+        assert "--wait" in refused.output
+        monkeypatch.setattr(lock_module.time, "sleep", lambda _: held.release())
+        waited = planned("--wait", "30")
+    assert waited.exit_code == 0, waited.output
+    assert "poor_20260302T000000" in waited.output
 
 
 def test_a_size_of_memory_is_read_before_the_archive(tmp_path: Path) -> None:

@@ -33,9 +33,12 @@ from flows.maintenance import reap_runs
 from flows.reprocess import process_task, reprocess
 from lidarops.campaign import load
 from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.scan import ScanSummary
+from lidarops.catalog.store import Store
 from lidarops.clusters import Local
 from lidarops.errors import LidarOpsError, ProductError, SceneError
-from lidarops.pipeline import Result, Selection, bring_up_to_date
+from lidarops.pipeline import Result, Selection, bring_up_to_date, update_catalog
 
 
 @pytest.fixture(scope="session")
@@ -124,6 +127,78 @@ def test_wrong_options_of_the_flow_are_wrong_use(
     result = called(flows.reprocess.main, str(campaign_file), *words)
     assert result.exit_code == 2
     assert said in result.output
+
+
+@pytest.mark.parametrize("command", [flows.catalog.main, flows.reprocess.main])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--catalog", "luck"], "postgresql"),
+        (["--archive", "luck"], "not a folder"),
+        (["--archive", "luck://bucket"], "cannot be opened"),
+        (["--wait", "1e9"], "wait"),
+    ],
+)
+def test_places_that_are_none_are_wrong_use_of_every_flow(
+    command: Callable[..., None], words: list[str], said: str, campaign_file: Path
+) -> None:
+    """And told before any server is started."""
+    result = called(command, str(campaign_file), *words)
+    assert result.exit_code == 2
+    assert result.output.startswith("error: ")
+    assert said in result.output
+
+
+@pytest.mark.parametrize("command", [flows.catalog.main, flows.reprocess.main])
+def test_an_archive_that_is_away_is_told_before_any_server_is_started(
+    command: Callable[..., None], campaign_file: Path
+) -> None:
+    (campaign_file.parent / "raw").rename(campaign_file.parent / "away")
+    result = called(command, str(campaign_file))
+    assert result.exit_code == 1
+    assert result.output.startswith("error: ")
+    assert "not a folder" in result.output
+
+
+def test_the_scheduled_look_at_a_catalog_waits_for_a_run_and_not_for_the_next_look(
+    repository: Path,
+) -> None:
+    described = yaml.safe_load((repository / "deploy" / "prefect.yaml").read_text())
+    deployments = {each["name"]: each for each in described["deployments"]}
+    for each in deployments.values():
+        assert each.get("parameters", {"wait": 1})["wait"] > 0
+    looks = deployments["demo-catalog"]
+    assert looks["schedules"][0]["cron"] == "10 * * * *"
+    assert 1800 < looks["parameters"]["wait"] < 3600
+    catalog.validate_parameters(looks["parameters"])
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_the_flow_of_the_catalog_waits_for_a_run_as_long_as_asked(
+    campaign_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = f"sqlite:///{campaign_file.parent}/other.sqlite"
+    words = [str(campaign_file), "--catalog", url]
+    with Store(url, "test") as store, Lock(store) as held:
+        held.acquire()
+        refused = called(flows.catalog.main, *words)
+        assert refused.exit_code == 1
+        assert isinstance(refused.exception, SystemExit)
+        assert "error: " in refused.output
+        assert "held by" in refused.output
+        assert store.granules() == []
+
+        def released(*arguments: Any, wait: float, **options: Any) -> ScanSummary:
+            assert wait == 60
+            held.release()
+            return update_catalog(*arguments, wait=wait, **options)
+
+        monkeypatch.setattr(flows.catalog, "update_catalog", released)
+        waited = called(flows.catalog.main, *words, "--wait", "60")
+        # A file of the archive is refused.
+        assert waited.exit_code == 1
+        assert "error: " not in waited.output
+        assert len(store.granules()) == 4
 
 
 @pytest.mark.usefixtures("prefect_server")

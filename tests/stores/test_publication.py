@@ -125,8 +125,9 @@ def test_keys_in_the_url_are_not_told(campaign_file: Path) -> None:
     done = CliRunner().invoke(app, ["publish", str(campaign_file), f"memory://key:sec/ret@{place}"])
     assert done.exit_code == 0, done.output
     assert done.output.startswith(f"memory://{place}: 2 sent")
-    for url in (f"http://key:sec/ret@{place}", f"luck://key:sec/ret@{place}"):
+    for scheme, code in (("http", 1), ("luck", 2)):
+        url = f"{scheme}://key:sec/ret@{place}"
         refused = CliRunner().invoke(app, ["publish", str(campaign_file), url])
-        assert refused.exit_code == 1
+        assert refused.exit_code == code
         assert "://bucket" in refused.output
         assert "ret" not in refused.output
