@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from oracle_multiposition import FIELDS, fan, grid, noisy, signals, triangle
+from oracle_multiposition import FIELDS, fan, grid, noisy, signals, three_by_two, triangle
 from scipy.interpolate import BarycentricInterpolator
 
 from lidarops.retrieve import _gate_outliers, _gate_runs, _point_weights
@@ -253,22 +253,147 @@ def test_a_line_goes_through_the_good_gates_on_either_side():
 
 
 def test_what_no_line_can_be_drawn_across_stays_as_it_is():
-    logs, noise = np.arange(9.0), np.ones(9)
-    for marked, drawn in (([2, 3], False), (np.arange(9), False), (np.arange(1, 9), True)):
-        codes = np.zeros(9, dtype=np.uint8)
+    logs, noise = np.arange(30.0), np.ones(30)
+    for marked, expected in (
+        ([2, 3], logs),
+        (np.arange(30), logs),
+        # Beyond the last good gates, the signal stays as there.
+        (np.arange(20, 30), np.where(logs < 20.0, logs, 18.0)),
+    ):
+        codes = np.zeros(30, dtype=np.uint8)
         codes[marked] = _gate_outliers.BRIDGED
         told = logs.copy()
-        _gate_runs.draw_lines(told, noise.copy(), np.arange(9.0), codes, (0, 9))
-        # Beyond the last good gate, the signal stays as there.
-        np.testing.assert_array_equal(told, np.zeros(9) if drawn else logs)
+        _gate_runs.draw_lines(told, noise.copy(), np.arange(30.0), codes, (0, 30))
+        np.testing.assert_array_equal(told, expected)
+
+
+def test_of_rays_with_many_gates_off_nothing_is_told():
+    """Those on one curve may be the wild ones."""
+    marked = np.arange(0, 30, 2)
+    logs = np.zeros(30)
+    out, codes = lined(logs, marked)
+    np.testing.assert_array_equal(out, logs)
+    assert np.all(codes == _gate_outliers.BRIDGED)
+
+
+def lined(logs, marked, noise=1e-4):
+    """Return logarithms across whose runs lines are drawn, and what became of the gates."""
+    codes = np.zeros(logs.size, dtype=np.uint8)
+    codes[marked] = _gate_outliers.BRIDGED
+    out = logs.copy()
+    spread = np.full(logs.size, noise)
+    _gate_runs.draw_lines(out, spread, 5.0 * np.arange(logs.size), codes, (0, logs.size))
+    return out, codes
+
+
+@pytest.mark.parametrize("slope", [-0.08, 0.0, 0.08])
+@pytest.mark.parametrize("rise", [-0.3, 0.3])
+@pytest.mark.parametrize("marked", [[40, 59], [39, 40, 59, 60], [40], [59]])
+def test_a_run_jumps_and_jumps_back(slope, rise, marked):
+    """Also where the slope of air hides the jump, and where but one of its edges is marked."""
+    air = slope * np.arange(100.0)
+    logs = air.copy()
+    logs[40:60] += rise
+    out, codes = lined(logs, marked)
+    np.testing.assert_allclose(out, air, atol=1e-12)
+    assert np.all(codes[40:60] == _gate_outliers.LOST)
+    assert np.count_nonzero(codes) <= 24
+
+
+@pytest.mark.parametrize("apart", [5, 10, 25, 32])
+def test_single_gates_make_no_run(apart):
+    """However many they are: a line would take the air between them away."""
+    logs = np.exp(-(((np.arange(200.0) - 100.0) / 22.0) ** 2))
+    marked = np.arange(4, 196, apart)
+    logs[marked] += 0.3
+    out, codes = lined(logs, marked)
+    np.testing.assert_array_equal(out, logs)
+    assert np.all(codes[marked] == _gate_outliers.BRIDGED)
+    assert np.count_nonzero(codes) == marked.size
+
+
+@pytest.mark.parametrize("gates", [6, 12, 30])
+@pytest.mark.parametrize("slope", [-0.08, 0.08])
+@pytest.mark.parametrize("end", ["first", "last"])
+@pytest.mark.parametrize("more", [0, 1])
+def test_of_a_run_at_the_end_of_a_ray_the_jump_is_taken_out(gates, slope, end, more):
+    """Also where two gates are marked at its only edge."""
+    air = slope * np.arange(100.0)
+    logs = air.copy()
+    logs[:gates] += 0.4
+    marked = [gates - 1, gates][: 1 + more]
+    if end == "last":
+        logs, air, marked = logs[::-1], air[::-1], [99 - g for g in marked]
+    out, codes = lined(logs, marked)
+    good = codes == _gate_outliers.GOOD
+    np.testing.assert_allclose(np.ptp((out - air)[good]), 0.0, atol=1e-12)
+    assert np.count_nonzero(~good) == 1 + more
+
+
+def test_a_jump_far_from_the_ends_is_air():
+    logs = np.where(np.arange(100) < 50, 0.0, 0.4)
+    out, _ = lined(logs, [50])
+    np.testing.assert_array_equal(out, logs)
+
+
+def test_behind_a_run_another_begins():
+    air = np.zeros(120)
+    logs = air.copy()
+    logs[20:40] += 0.5
+    logs[55:75] += 0.5
+    out, codes = lined(logs, [20, 39, 55, 74])
+    np.testing.assert_allclose(out, air, atol=1e-12)
+    assert not codes[40:55].any()
 
 
 def test_edges_far_apart_are_no_run():
-    codes = np.zeros(60, dtype=np.uint8)
-    codes[[10, 50]] = _gate_outliers.BRIDGED
-    before = codes.copy()
-    _gate_runs.draw_lines(np.arange(60.0), np.ones(60), np.arange(60.0), codes, (0, 60))
-    np.testing.assert_array_equal(codes, before)
+    logs = np.zeros(200)
+    logs[80:120] += 0.5
+    out, codes = lined(logs, [80, 119])
+    np.testing.assert_array_equal(out, logs)
+    assert np.count_nonzero(codes) == 2
+
+
+def layer(x, y, z):
+    """Stand 1.5 per km, with a layer of 60 m of three times the air about it."""
+    return 1.5e-3 + 3e-3 * np.exp(-((z - 600.0) ** 2) / (2 * 60.0**2)) + 0.0 * x
+
+
+@pytest.mark.parametrize("step", [5.0, 2.0])
+@pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 4.0), (layer, 6.0)])
+def test_single_wild_gates_in_curved_air_cost_little(field, most, step):
+    """Lines from one to the next would take the plume away, and state errors for it."""
+    net = three_by_two()
+    r = grid(net, step)
+    power, variance = noisy(net, r, signals(net, r, field), 0.01, 60, 3, 0.003)
+    clean = solved(net, r, power, variance)
+    rng = np.random.default_rng(5)
+    wild = np.zeros(power.shape, dtype=bool)
+    for ray in wild.reshape(-1, r.size):
+        ray[rng.integers(5, 25) : -4 : 25] = True
+    found = solved(net, r, power + wild * 30.0 * np.sqrt(variance), variance)
+    near = found.near_vertex
+    dearer = (found.extinction_standard_error / clean.extinction_standard_error)[:, near]
+    assert np.nanmedian(dearer) < most
+
+
+@pytest.mark.parametrize("share", [0.02, 0.04])
+@pytest.mark.parametrize("step", [5.0, 2.0])
+@pytest.mark.parametrize("field", [ALL["plume"], layer])
+def test_wild_gates_in_curved_air_leave_values_within_their_errors(field, step, share):
+    net = three_by_two()
+    r = grid(net, step)
+    power, variance = noisy(net, r, signals(net, r, field), 0.01, 150, 3, 0.003)
+    rng = np.random.default_rng(50)
+    wild = 30.0 * (rng.random(power.shape) < share)
+    found = solved(
+        net, r, power + wild * np.sqrt(variance), variance, blocks=np.arange(150) // 50
+    )  # fmt: skip
+    near = found.near_vertex
+    kept = (~found.flags.flagged & np.isfinite(found.extinction))[:, near]
+    score = (found.extinction - field(*net.vertex.T)) / found.extinction_standard_error
+    assert kept.mean() > 0.95
+    assert np.mean(np.abs(score[:, near][kept]) > 4.0) <= 7e-3
 
 
 @pytest.mark.parametrize("step", [0.3, 1.1, 4.0])
