@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
+Booleans = npt.NDArray[np.bool_]
 
 BEND: Final = 0.15
 """Standard deviation of ln extinction over the vertices by which a field may bend beyond any
@@ -123,34 +124,47 @@ def of_field(missed: Array, told: Array, free: Array, variance: Array) -> Array:
     return np.asarray(np.minimum(missed, np.where(np.isfinite(allowed), allowed, np.inf)))
 
 
-def at_least_typical(extinction: Array, variance: Array, block: Indices) -> Array:
+def at_least_typical(extinction: Array, variance: Array, block: Indices, seen: Booleans) -> Array:
     """Return variances that are no less than the median of their block, in m-2.
 
     The error of an attenuation does not depend on the extinction that noise makes of it; what a
-    profile that came out high states is too little. Where errors are small, they are left alone.
+    profile that came out high states is too little. It is compared with those that see all that
+    it sees: what others lack makes their errors larger. Where errors are small, they are left
+    alone.
 
     Parameters
     ----------
     extinction, variance : (profile, vertex) float64
         m-1 and m-2; NaN where there is none.
     block : (profile,) intp
+    seen : (profile, crossing) bool
     """
     out = variance.copy()
     for number in np.unique(block):
         mine = np.flatnonzero(block == number)
-        known = np.isfinite(variance[mine])
-        whole = known.all(axis=0)
-        columns = np.flatnonzero(whole)
-        out[np.ix_(mine, columns)] = _lifted(
-            extinction[np.ix_(mine, columns)], variance[np.ix_(mine, columns)]
-        )
-        for vertex in np.flatnonzero(known.any(axis=0) & ~whole):
-            rows = mine[known[:, vertex]]
-            out[rows, vertex] = _lifted(extinction[rows, vertex], variance[rows, vertex])
+        patterns, kind = np.unique(seen[mine], axis=0, return_inverse=True)
+        for k, pattern in enumerate(patterns):
+            alike = mine[kind.reshape(-1) == k]
+            peers = mine[(seen[mine] >= pattern).all(axis=1)]
+            out[alike] = _lifted(extinction, variance, alike, peers)
     return out
 
 
-def _lifted(extinction: Array, variance: Array) -> Array:
-    usual, middle = np.median(variance, axis=0), np.median(extinction, axis=0)
-    lifted = np.maximum(variance, usual)
-    return np.asarray(np.where(usual > (_NOT_LINEAR * middle) ** 2, lifted, variance))
+def _lifted(extinction: Array, variance: Array, rows: Indices, peers: Indices) -> Array:
+    """Return variances of rows, no less than the medians of their peers where these are large."""
+    usual, middle = _median(variance[peers]), _median(extinction[peers])
+    own = variance[rows]
+    with np.errstate(invalid="ignore"):
+        large = usual > (_NOT_LINEAR * middle) ** 2
+    return np.asarray(np.where(large & np.isfinite(own), np.fmax(own, usual), own))
+
+
+def _median(values: Array) -> Array:
+    """Return (vertex,) medians of what is finite; NaN where nothing is."""
+    known = np.isfinite(values)
+    if known.all():
+        return np.asarray(np.median(values, axis=0))
+    out = np.full(values.shape[1], np.nan)
+    for column in np.flatnonzero(known.any(axis=0)):
+        out[column] = np.median(values[known[:, column], column])
+    return out

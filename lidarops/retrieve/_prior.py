@@ -46,6 +46,8 @@ _ENOUGH: Final = 8
 _LOUDER: Final = 10.0
 """Times the median variance of a block's profiles, from which on one is left out of their mean."""
 _TOLD_BY_MEAN: Final = 0.3
+_TELLING: Final = 0.75
+"""Share of the profiles, beyond which at least one has to test the prior."""
 _UNTOLD: Final = 1.0
 """Standard error of ln extinction in the mean, from which on equations do not tell a vertex."""
 _APART: Final = 2.5
@@ -336,7 +338,11 @@ def _tests(problem: _Problem, alone: Solution, whole: Solution | None) -> bool:
     large deviations about a slight gradient.
     """
     known = alone.status != _network.UNDETERMINED
-    freedom = float(np.median(alone.degrees_of_freedom[known])) if known.any() else 0.0
+    freedom = 0.0
+    if known.any():
+        # Of some profiles: they see the field of those that lost a ray.
+        told_by = alone.degrees_of_freedom[known]
+        freedom = float(np.quantile(told_by, _TELLING, method="higher"))
     if whole is None:
         return freedom >= 0
     freedom = max(freedom, float(whole.degrees_of_freedom[0]))

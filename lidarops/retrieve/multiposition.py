@@ -306,7 +306,8 @@ def _solve_network(
         variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
         believed[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.believed
     if prior is Prior.BLOCK:
-        variance = _block_errors.at_least_typical(extinction, variance, rays.block)
+        seen = rays.data.usable == 1
+        variance = _block_errors.at_least_typical(extinction, variance, rays.block, seen)
     none = np.zeros(shape, dtype=np.bool_)
     # Doubt in the prior, which is stated, is no noise that makes a value lie anywhere.
     shaky = _closed.shaky(extinction, believed, rays.block) | fit.doubtful[:, np.newaxis]

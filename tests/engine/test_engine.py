@@ -174,11 +174,12 @@ def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
 def test_workers_that_are_gone_for_good_are_not_waited_for(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine, "PATIENCE", 1.0)
-    monkeypatch.setattr(engine, "RECOUNT", 0.5)
     campaign = archive.write()
     jobs = engine.make_jobs(campaign, prepare(campaign))
     with local_client(1) as client:
+        # Not before, as the first worker may well take longer to start.
+        monkeypatch.setattr(engine, "PATIENCE", 1.0)
+        monkeypatch.setattr(engine, "RECOUNT", 0.5)
         client.retire_workers()
         with pytest.raises(SceneError, match="workers on this machine are gone"):
             list(carry_out(jobs, client=client))

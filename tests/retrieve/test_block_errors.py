@@ -65,11 +65,25 @@ def test_a_profile_that_came_out_high_states_no_less_than_its_block():
     extinction = np.array([[1.0, 1.0], [1.1, 1.1], [4.0, 4.0], [np.nan, 1.0], [9.0, 9.0]]) * 1e-4
     relative = np.array([[0.4, 0.04], [0.5, 0.05], [0.1, 0.01], [np.nan, 0.04], [0.1, 0.1]])
     variance, block = (relative * extinction) ** 2, np.array([0, 0, 0, 0, 1])
-    found = _block_errors.at_least_typical(extinction, variance, block)
+    alike = np.ones((5, 3), dtype=bool)
+    found = _block_errors.at_least_typical(extinction, variance, block, alike)
     np.testing.assert_allclose(np.sqrt(found[:3, 0]), [4e-5, 5.5e-5, 4e-5])
     # Small errors, and other blocks, are left alone.
     np.testing.assert_array_equal(found[:, 1], variance[:, 1])
     np.testing.assert_array_equal(found[3:], variance[3:])
+
+
+def test_a_profile_is_compared_with_those_that_see_what_it_sees():
+    extinction = np.full((6, 1), 1e-4)
+    variance = (np.array([[0.2], [0.3], [0.8], [0.9], [0.1], [0.7]]) * 1e-4) ** 2
+    # All rays, all, one lost (4 times).
+    seen = np.array([[1, 1, 1]] * 2 + [[1, 1, 0]] * 3 + [[0, 1, 1]], dtype=bool)
+    block = np.zeros(6, dtype=np.intp)
+    found = _block_errors.at_least_typical(extinction, variance, block, seen)
+    typical = np.sqrt((0.2**2 + 0.3**2) / 2.0)
+    # The last but one came out high, and is told by those that see as much, and more.
+    wanted = [typical, 0.3, 0.8, 0.9, 0.3, 0.7]
+    np.testing.assert_allclose(np.sqrt(found[:, 0]), np.array(wanted) * 1e-4)
 
 
 # Networks -------------------------------------------------------------------------------------
@@ -111,7 +125,7 @@ def test_errors_are_told_without_touching_a_value_or_a_clear_case(monkeypatch):
     error, stated = both()
     monkeypatch.setattr(_block_errors, "of_noise", lambda *_: 0.0)
     monkeypatch.setattr(_block_errors, "of_field", lambda *_: 0.0)
-    monkeypatch.setattr(_block_errors, "at_least_typical", lambda _, variance, __: variance)
+    monkeypatch.setattr(_block_errors, "at_least_typical", lambda _, variance, *__: variance)
     plain_error, plain = both()
     np.testing.assert_array_equal(error, plain_error)
     known = np.isfinite(plain)
