@@ -140,7 +140,7 @@ VISIBILITY: Final = Layout(
     " it there: extinction_standard_error counts with twice the gradient that is typical, and"
     " with a bend where the mean of a block's profiles allows it. In simulated random networks"
     " 0.01(1) percent of the values that no flag rejects were off by more than 4 standard errors,"
-    " 0.05(3) in plumes that drift within a block. More profiles in a block and more beams tell"
+    " 0.005(3) in plumes that drift within a block. More profiles in a block and more beams tell"
     " more. All profiles share what the prior allows, so"
     " that a mean over time does not make it smaller.",
     sampled="vertex",

@@ -13,8 +13,8 @@ and 34 percent.
 
 A gradient over the whole network looks like attenuation where air is thin or noise is high, and
 no test tells it there: what the prior allows, and what the rest of the block tells of it
-(`lidarops.retrieve._block_errors`), is then most of the standard error. In 1600 random networks
-0.01(1) percent of the values without a flag are off by more than 4 standard errors, 0.05(3) in
+(`lidarops.retrieve._block_errors`), is then most of the standard error. In 800 random networks
+0.01(1) percent of the values without a flag are off by more than 4 standard errors, 0.005(3) in
 plumes that drift within a block (`lidarops bench stability`). What is left stands in single
 vertices at the edge of a plume that one weak ray joins to the others. More profiles in a block
 and more rays tell more.
