@@ -22,6 +22,7 @@ from scipy import special
 
 from lidarops.retrieve import _block_errors, _network
 from lidarops.retrieve._point_weights import Condensed, Layout
+from lidarops.retrieve._rays import LOUDER
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -43,8 +44,6 @@ _HARMLESS: Final = 0.5
 """Of the standard error that is reported."""
 _ENOUGH: Final = 8
 """Profiles that must see a ray for their mean to be asked."""
-_LOUDER: Final = 10.0
-"""Times the median variance of a block's profiles, from which on one is left out of their mean."""
 _TOLD_BY_MEAN: Final = 0.3
 _TELLING: Final = 0.75
 """Share of the profiles, beyond which at least one has to test the prior."""
@@ -270,7 +269,7 @@ def _quiet(covariance: Array, crossings: int, depth: int) -> Booleans:
     variances = covariance[:, mine * (quantities + 1)]
     known = np.isfinite(variances)
     usual = np.median(np.where(known, variances, np.inf), axis=0)
-    return np.asarray((known & (variances <= _LOUDER * usual)).all(axis=1))
+    return np.asarray((known & (variances <= LOUDER * usual)).all(axis=1))
 
 
 def _depth(reach: Indices) -> int:

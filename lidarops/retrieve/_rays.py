@@ -24,7 +24,7 @@ _OF_MEDIAN: Final = np.pi / 2.0
 """Variance of a median over that of a mean."""
 _BELOW: Final = 4.0
 """Standard errors by which a mean signal is then less than zero."""
-_LOUDER: Final = 10.0
+LOUDER: Final = 10.0
 """Times the median variance, from which on a profile is not counted for one of its block; up
 to that many times more where its signal is stronger, whose noise is then larger too."""
 _SMOOTHED: Final = 31
@@ -273,7 +273,7 @@ def _louder(squares: Array, known: Booleans) -> Booleans:
     # Every third shares no gate with the next one. What is unknown is none of the smallest.
     size = np.median(np.where(known[..., ::3], squares[..., ::3], np.inf), axis=2)
     usual = np.median(size, axis=0)
-    return np.asarray(np.isfinite(size) & (size > _LOUDER * usual) & (usual > 0.0))
+    return np.asarray(np.isfinite(size) & (size > LOUDER * usual) & (usual > 0.0))
 
 
 def _smoothed(squares: Array, known: Booleans) -> Array:
@@ -341,7 +341,7 @@ def _usual(variances: Array, signal: Array, median: Array) -> Array:
     usual = np.median(np.where(known, variances, np.inf), axis=0)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         stronger = (_moving_sum(signal, width) / _moving_sum(median, width)) ** 2
-        allowed = _LOUDER * np.fmin(np.fmax(stronger, 1.0), _LOUDER)
+        allowed = LOUDER * np.fmin(np.fmax(stronger, 1.0), LOUDER)
         quiet = variances <= allowed * usual
         # Of a few counts, the median of the variances may be zero.
         quiet = known & (quiet | (usual == 0.0))
@@ -365,7 +365,7 @@ def _loud(
             spread = rows[row, ray, gate].sum(axis=1) / gates
             usual = single[:, ray, gate].sum(axis=1) / gates
             level = np.maximum(signal[:, ray, gate].sum(axis=1) / gates, 0.0)
-            louder = (usual > 0.0) & ~(spread <= _LOUDER * usual)
+            louder = (usual > 0.0) & ~(spread <= LOUDER * usual)
             scale = 1.0 if relative else level**2
             out[:, c] = louder & ~(spread <= LOUDEST_GATE**2 * scale)
     return out

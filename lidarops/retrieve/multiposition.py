@@ -16,8 +16,7 @@ no test tells it there: what the prior allows, and what the rest of the block te
 (`lidarops.retrieve._block_errors`), is then most of the standard error. In 800 random networks
 0.01(1) percent of the values without a flag are off by more than 4 standard errors, 0.005(3) in
 plumes that drift within a block (`lidarops bench stability`). What is left stands in single
-vertices at the edge of a plume that one weak ray joins to the others. More profiles in a block
-and more rays tell more.
+vertices in dense plumes. More profiles in a block and more rays tell more.
 
 Scale heights are 300 m and more there. In steeper fields the far vertices may fade, and leave
 fewer equations than unknowns: errors are then stated with a prior that holds ln extinction over
