@@ -209,7 +209,7 @@ def _digest(
     """Take the digest of every file, and say whether it is still what the catalog says.
 
     A file of the size and modification time of the catalog's has the digest that it noted, where
-    it did. Returns the bytes that were read at the end.
+    it did, and its header need not be read. Returns the bytes that were read at the end.
     """
     scene = job.scene
     usable: dict[str, Granule] = {}
@@ -218,7 +218,8 @@ def _digest(
     read = 0
     for granule in (*scene.granules, *scene.dark):
         try:
-            known = None if job.campaign.all_steps else _known_digest(granule, root)
+            same = not job.campaign.all_steps and _is_unchanged(granule, root)
+            known = granule.sha256 if same else None
             if known is None:
                 read += granule.size
                 known = _read_digest(granule, root)
@@ -228,18 +229,15 @@ def _digest(
             reason = str(error).removeprefix(f"{granule.path}: ")
             refused.append(replace(granule, status=Status.REFUSED, reason=reason))
         else:
-            usable[granule.path] = granule
+            usable[granule.path] = granule if same else replace(granule, header_digest=None)
             inputs.append(InputRecord(granule.path, granule.role, known))
     return _without(scene, usable), tuple(inputs), tuple(refused), read
 
 
-def _known_digest(granule: Granule, root: Path) -> str | None:
-    """Return the digest of a file that has not changed since it was taken."""
-    if granule.sha256 is None:
-        return None
+def _is_unchanged(granule: Granule, root: Path) -> bool:
+    """Tell whether a file is the one whose header was read, by its size and time of change."""
     about = os.stat(f"{root}/{granule.path}")  # noqa: PTH116 - a Path takes twice as long
-    same = (about.st_size, about.st_mtime_ns) == (granule.size, granule.mtime_ns)
-    return granule.sha256 if same else None
+    return (about.st_size, about.st_mtime_ns) == (granule.size, granule.mtime_ns)
 
 
 def _read_digest(granule: Granule, root: Path) -> str:
@@ -254,11 +252,11 @@ def _read_digest(granule: Granule, root: Path) -> str:
 
 
 def _without(scene: Scene, usable: Mapping[str, Granule]) -> Scene:
-    """Return a scene of its usable granules alone."""
+    """Return a scene of its usable granules alone, as they were found."""
     return replace(
         scene,
-        granules=tuple(g for g in scene.granules if g.path in usable),
-        dark=tuple(g for g in scene.dark if g.path in usable),
+        granules=tuple(usable[g.path] for g in scene.granules if g.path in usable),
+        dark=tuple(usable[g.path] for g in scene.dark if g.path in usable),
         members=tuple(_without(member, usable) for member in scene.members),
     )
 

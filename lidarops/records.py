@@ -93,6 +93,9 @@ class Granule:
     layout: tuple[ChannelLayout, ...] = ()
     sha256: str | None = None
     """Of the whole file; None until the file has been read whole."""
+    header_digest: str | None = None
+    """Equal in files whose headers differ in what stands above alone, and in the lasers; None
+    where that is not known, or the file may have changed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,15 +11,19 @@ import mixed_campaign
 import numpy as np
 import pytest
 import rawfiles
+import sqlalchemy as sa
 import xarray as xr
 
 from lidarops import processing, steps
+from lidarops.catalog.schema import GRANULE
+from lidarops.catalog.store import Store
 from lidarops.engine import run
 from lidarops.flags import Quality
 from lidarops.pipeline import Options, prepare, reprocess
 from lidarops.plan_rules import gates
 from lidarops.plans import CHANNEL, GATE, PRODUCTS, plan
 from lidarops.processing import Job, process
+from lidarops.raw.licel import RawFile
 from lidarops.records import Plan, Role, RunRecord, Step
 from lidarops.refinement import GAP, WITHOUT, refine
 from lidarops.retrieve import _angle_block, _slant, labeled_scan
@@ -469,7 +473,7 @@ def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
     assert [product.sha256 for product in process(job).products] == usual
 
 
-def test_a_changed_time_has_a_file_read_again(tmp_path):
+def test_a_changed_time_has_a_file_read_again(tmp_path, monkeypatch):
     campaign = archive(tmp_path)
     one = reprocess(campaign).scenes[0]
     size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
@@ -478,6 +482,40 @@ def test_a_changed_time_has_a_file_read_again(tmp_path):
     found = process(Job(campaign, stale, plan(stale, campaign)))
     assert found.inputs == one.inputs
     assert found.bytes_read > size
+    seen: list[str] = []
+    read = RawFile.read_header
+    monkeypatch.setattr(
+        RawFile, "read_header", lambda file: seen.append(Path(file.path).name) or read(file)
+    )
+    process(Job(campaign, stale, plan(stale, campaign)))
+    assert set(seen) == {"h0", "h1", "h2", "h3"}
+
+
+def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
+    campaign = archive(tmp_path)
+    first = reprocess(campaign).scenes[0]
+    seen: list[str] = []
+    read = RawFile.read_header
+    monkeypatch.setattr(
+        RawFile, "read_header", lambda file: seen.append(Path(file.path).name) or read(file)
+    )
+
+    def again(**changes: Any) -> list[str]:
+        seen.clear()
+        asked = campaign.model_copy(update=changes)
+        (scene,) = reprocess(asked, options=Options(force=True)).scenes
+        if not changes:
+            assert [each.sha256 for each in scene.products] == [
+                each.sha256 for each in first.products
+            ]
+        return seen
+
+    # Once for the look, of which all files are a part, and once for the whole.
+    assert again() == ["h0", "h0"]
+    assert set(again(all_steps=True)) == {"h0", "h1", "h2", "h3"}
+    with Store(campaign.catalog_url, campaign.name) as store, store.transaction() as connection:
+        connection.execute(sa.update(GRANULE).values(header_digest=None))
+    assert set(again()) == {"h0", "h1", "h2", "h3"}
 
 
 def test_what_was_asked_for_is_told_first_where_there_is_nothing_to_do(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -20,8 +20,8 @@ _MOVE_AWAY: Final = "move it away: a new one is made from the archive, and produ
 _URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
 _BROKEN: Final = ("malformed", "not a database")
 """Words of SQLite about a file that is damaged."""
-_WITHOUT_USABLE: Final = 2
-"""The version of the tables before products had `usable`."""
+_ADDED: Final[Mapping[int, sa.Column[Any]]] = {2: PRODUCT.c.usable, 3: GRANULE.c.header_digest}
+"""Version of a catalog -> the column that the next version has more."""
 
 
 class Database:
@@ -121,8 +121,8 @@ class Database:
             connection.execute(self.insert_new(SCHEMA), {"version": SCHEMA_VERSION})
         newest = sa.select(sa.func.max(SCHEMA.c.version))
         found = connection.scalar(newest)
-        if found == _WITHOUT_USABLE:
-            _add_usable(connection)
+        while found in _ADDED:
+            _bring_up(connection, found)
             found = connection.scalar(newest)
         if found != SCHEMA_VERSION:
             raise self._other_version(found)
@@ -183,18 +183,17 @@ def _conflicting(table: sa.Table, *, in_sqlite: bool, replacing: bool) -> sa.Tex
     return sa.text(str(statement.compile(dialect=dialect))).bindparams(*typed)
 
 
-def _add_usable(connection: sa.Connection) -> None:
-    """Bring a catalog of version 2 up to date: of its products nothing was judged."""
+def _bring_up(connection: sa.Connection, found: int) -> None:
+    """Add to a catalog of version `found` the column that the next one has, with nothing in it."""
     # First, as SQLite begins no transaction with a change of a table, and only one of two
     # processes finds the old number.
     raised = connection.execute(
-        sa.update(SCHEMA)
-        .where(SCHEMA.c.version == _WITHOUT_USABLE)
-        .values(version=_WITHOUT_USABLE + 1)
+        sa.update(SCHEMA).where(SCHEMA.c.version == found).values(version=found + 1)
     )
     if raised.rowcount == 1:
-        column = sa.schema.CreateColumn(PRODUCT.c.usable).compile(dialect=connection.dialect)
-        connection.execute(sa.text(f"ALTER TABLE {PRODUCT.name} ADD COLUMN {column}"))
+        added = _ADDED[found]
+        column = sa.schema.CreateColumn(added).compile(dialect=connection.dialect)
+        connection.execute(sa.text(f"ALTER TABLE {added.table.name} ADD COLUMN {column}"))
 
 
 def refuse_wrong_url(url: str) -> None:

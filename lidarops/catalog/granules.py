@@ -196,6 +196,7 @@ _OF_GRANULE: Final = tuple(
     for name in (
         "path", "size", "mtime_ns", "instrument", "role", "status", "reason", "notes", "start",
         "stop", "zenith_angle", "azimuth", "latitude", "longitude", "altitude", "layout", "sha256",
+        "header_digest",
     )
 )  # fmt: skip
 _ROLES: Final = {role.value: role for role in Role}
@@ -212,7 +213,7 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
 def _granule_from(row: Any, layouts: Layouts) -> Granule:
     (
         path, size, mtime_ns, instrument, role, status, reason, notes, start, stop,
-        zenith_angle, azimuth, latitude, longitude, altitude, layout, sha256,
+        zenith_angle, azimuth, latitude, longitude, altitude, layout, sha256, header_digest,
     ) = row  # fmt: skip
     return Granule(
         path=path,
@@ -233,4 +234,5 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
         altitude=altitude,
         layout=layouts[layout],
         sha256=sha256,
+        header_digest=header_digest,
     )

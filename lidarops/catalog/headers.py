@@ -162,6 +162,7 @@ def _accepted(due: Due, header: licel.Header, place: _Place) -> Granule:
         longitude=longitude,
         altitude=header.altitude,
         layout=licel.layout(header),
+        header_digest=licel.header_digest(header),
     )
 
 

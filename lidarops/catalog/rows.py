@@ -109,6 +109,7 @@ def _values(granule: Granule, campaign: str, scan_key: str, layout: str) -> dict
         "altitude": granule.altitude,
         "layout": layout,
         "sha256": granule.sha256,
+        "header_digest": granule.header_digest,
         "day": None if granule.start is None else day_of(granule.start),
         "stamp_low": low,
         "stamp_high": high,

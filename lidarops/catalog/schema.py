@@ -6,9 +6,9 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 3
+SCHEMA_VERSION: Final = 4
 """Raised with every change of a table: a database of another version is refused by name, if it
-cannot be brought up to date as one of version 2 can."""
+cannot be brought up to date as one of version 2 or 3 can."""
 
 METADATA: Final = sa.MetaData()
 
@@ -49,6 +49,8 @@ GRANULE = sa.Table(
     sa.Column("altitude", sa.Float),
     sa.Column("layout", sa.ForeignKey("layout.hash")),
     sa.Column("sha256", _DIGEST),
+    # Null also where the file was catalogued before there was this column.
+    sa.Column("header_digest", sa.String(16)),
     # Days since 1970-01-01 of the start; null where that is not known.
     sa.Column("day", sa.Integer),
     # Two halves of a digest of the row, whose sums over a day tell whether anything in it changed.

@@ -1,6 +1,7 @@
 """Many raw files of one layout as one dask-backed Dataset.
 
-The data model is that of `lidarops.raw.model`. Headers are read once, when the archive is opened;
+The data model is that of `lidarops.raw.model`. Headers are read once, when the archive is opened,
+and of files that the catalog knows to be alike one is;
 a task of the graph reads the bytes of one channel in the files of one chunk.
 """
 
@@ -13,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from dask.base import tokenize
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.licel import Dataset, RawFile, channel_names, to_physical
+from lidarops.raw.licel import Dataset, RawFile, channel_names, header_digest, to_physical
 from lidarops.raw.model import Columns, Position, Stretches, build
 from lidarops.records import Granule
 
@@ -69,7 +71,9 @@ def open_archive(
     ----------
     source : str, path, or iterable of paths or Granule
         A folder (with its subfolders, hidden files left out), a file, a glob pattern, or files.
-        The order does not matter: profiles are sorted by start, then path.
+        The order does not matter: profiles are sorted by start, then path. Of granules with a
+        `header_digest`, start, stop, altitude and pointing are taken instead of the header's
+        where `header_position` is "ignore".
     channels : iterable of str, optional
         Channels to open, which all files must have alike; all signal channels, which must be
         the same in all files, where not given.
@@ -97,11 +101,7 @@ def open_archive(
         Naming the file where one cannot be read or is of another layout.
     """
     columns = Columns(channel_names(channels), header_position)
-    stamps = []
-    for path in _files(source, root):
-        with RawFile(path) as file:
-            columns.append(file.read_header())
-            stamps.append((path, file.size, file.mtime_ns))
+    stamps = _read_headers(columns, _files(source, root))
     columns.sort()
     columns.keep(stretches or {})
     chunks = _chunks(columns, profiles_per_chunk)
@@ -123,6 +123,33 @@ def open_archive(
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
 
     return build(columns, signal, scaled=mask_and_scale)
+
+
+def _read_headers(
+    columns: Columns, files: Mapping[str, Granule | None]
+) -> list[tuple[str, int, int]]:
+    """Fill `columns`; return path, size and time of change of each file.
+
+    Of granules that say which headers are alike one is read, as far as the place that a header
+    tells is not asked for: the catalog may have another for it.
+    """
+    stamps = []
+    variants: dict[tuple[str, int], int] = {}
+    for path, granule in files.items():
+        alike = None
+        if granule is not None and granule.header_digest and columns.order == "ignore":
+            alike = granule.header_digest, granule.size
+            if alike in variants:
+                columns.append_alike(granule, path, variants[alike])
+                stamps.append((path, granule.size, granule.mtime_ns))
+                continue
+        with RawFile(path) as file:
+            header = file.read_header()
+            columns.append(header)
+            stamps.append((path, file.size, file.mtime_ns))
+        if alike == (header_digest(header), header.size):
+            variants[alike] = columns.variant[-1]
+    return stamps
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,23 +221,26 @@ def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]
     ]
 
 
-def _files(source: Source, root: str | os.PathLike[str] | None) -> list[str]:
+def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Granule | None]:
     base = Path(root) if root is not None else Path()
+    files: list[tuple[str, Granule | None]]
     if isinstance(source, str | os.PathLike):
-        files = _expand(base, Path(source))
+        files = [(path, None) for path in _expand(base, Path(source))]
     else:
-        files = [_placed(base, item) for item in source]
+        files = [
+            (_placed(base, item), item if isinstance(item, Granule) else None) for item in source
+        ]
     if not files:
         raise RawFormatError(
             "no files are found",
             file=base / source if isinstance(source, str | os.PathLike) else None,
             remedy="give a folder, a glob pattern or paths that exist",
         )
-    path, times = Counter(files).most_common(1)[0]
+    path, times = Counter(path for path, _ in files).most_common(1)[0]
     if times > 1:
         raise RawFormatError(f"is given {times} times", file=path)
     # The first file, with which the layout of the others is compared, is always the same.
-    return sorted(files)
+    return dict(sorted(files, key=itemgetter(0)))
 
 
 def _placed(base: Path, item: str | os.PathLike[str] | Granule) -> str:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.licel import CONVENTION, Dataset, Header, check_layout, select_signals
+from lidarops.records import Granule
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]
 
@@ -112,17 +113,56 @@ class Columns:
             check_layout(header, chosen, self.datasets if self.variants else chosen)
             ordered = sorted(chosen, key=lambda d: self._rank(d.name))
             self.variants[header.datasets] = (len(self.variants), tuple(ordered))
-        latitude, longitude = (
-            (math.nan, math.nan) if self.order == "ignore" else header.position(self.order)
-        )
-        azimuth = math.nan if header.azimuth is None else header.azimuth
-        self.paths.append(header.path)
-        self.sizes.append(header.size)
-        self.times.append(((header.start - _EPOCH) // _SECOND, (header.stop - _EPOCH) // _SECOND))
-        self.places.append((latitude, longitude, header.altitude, header.zenith_angle, azimuth))
+        position = (math.nan, math.nan) if self.order == "ignore" else header.position(self.order)
+        pointing = (header.zenith_angle, _known(header.azimuth))
         self.sites.add(header.site)
         self.notes.update(header.notes)
-        self.variant.append(self.variants[header.datasets][0])
+        self._enter(
+            header.path,
+            header.size,
+            (header.start, header.stop),
+            (*position, header.altitude, *pointing),
+            self.variants[header.datasets][0],
+        )
+
+    def append_alike(self, granule: Granule, path: str, variant: int) -> None:
+        """Add a file whose header says of site and datasets what another file's says.
+
+        Parameters
+        ----------
+        granule : Granule
+            All that the header says besides; its position is not taken.
+        path : str
+            The file.
+        variant : int
+            Number of the other file's datasets.
+        """
+        if granule.start is None or granule.stop is None:
+            raise RawFormatError("has no start or stop in the catalog", file=path, field="start")
+        pointing = (_known(granule.zenith_angle), _known(granule.azimuth))
+        self.notes.update(granule.notes)
+        self._enter(
+            path,
+            granule.size,
+            (granule.start, granule.stop),
+            (math.nan, math.nan, _known(granule.altitude), *pointing),
+            variant,
+        )
+
+    def _enter(
+        self,
+        path: str,
+        size: int,
+        interval: tuple[datetime, datetime],
+        place: tuple[float, float, float, float, float],
+        variant: int,
+    ) -> None:
+        self.paths.append(path)
+        self.sizes.append(size)
+        start, stop = interval
+        self.times.append(((start - _EPOCH) // _SECOND, (stop - _EPOCH) // _SECOND))
+        self.places.append(place)
+        self.variant.append(variant)
 
     @property
     def datasets(self) -> tuple[Dataset, ...]:
@@ -181,6 +221,10 @@ class Columns:
         if not self.variants:
             return 0
         return next(i for i, dataset in enumerate(self.datasets) if dataset.name == name)
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def bins_of(stretches: Stretches) -> int:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import factories
 import pytest
 import sqlalchemy as sa
 
 from lidarops.catalog import lock as lock_module
 from lidarops.catalog.ledger import Run, RunStatus
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.rows import row_of
 from lidarops.catalog.schema import LOCK, PRODUCT, SCHEMA_VERSION
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
@@ -108,7 +111,14 @@ def test_a_catalog_of_another_version_is_told(url: str, tmp_path: Path) -> None:
         Store(url, "test")
 
 
-def test_a_catalog_of_version_2_is_brought_up_to_date(url: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("version", "added"),
+    [(2, ("product.usable", "granule.header_digest")), (3, ("granule.header_digest",))],
+)
+def test_a_catalog_of_an_older_version_is_brought_up_to_date(
+    url: str, tmp_path: Path, version: int, added: tuple[str, ...]
+) -> None:
+    granule = factories.granule(header_digest="one")
     run = Run(
         "one", datetime(2026, 3, 1, tzinfo=UTC), None, RunStatus.RUNNING, "me", "0.1", "abc"
     )  # fmt: skip
@@ -121,13 +131,18 @@ def test_a_catalog_of_version_2_is_brought_up_to_date(url: str, tmp_path: Path) 
                 for column in PRODUCT.columns
             }
             connection.execute(sa.insert(PRODUCT), {**row, "campaign": "test"})
-            before = connection.execute(sa.select(PRODUCT)).mappings().one()
+            before = dict(connection.execute(sa.select(PRODUCT)).mappings().one())
+        store.replace([row_of(granule, "test", "key")])
     with sqlite3.connect(tmp_path / "catalog.sqlite") as connection:
-        connection.execute("alter table product drop column usable")
-        connection.execute("update schema_version set version = 2")
+        for table, _, column in (each.partition(".") for each in added):
+            connection.execute(f"alter table {table} drop column {column}")
+        connection.execute("update schema_version set version = ?", (version,))
+    if "product.usable" in added:
+        before["usable"] = None
     for _ in range(2):
         with Store(url, "test") as store:
-            assert store.products() == [{**before, "usable": None}]
+            assert store.products() == [before]
+            assert store.granules() == [replace(granule, header_digest=None)]
             assert [each.id for each in store.runs()] == ["one"]
             assert store.empty() == []
             with store.transaction() as connection:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import dask
@@ -15,6 +16,7 @@ from licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
 
 import lidarops
 from lidarops.errors import RawFormatError
+from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
 from lidarops.raw.licel import RawFile
 from lidarops.records import Granule, Role, Status
@@ -201,6 +203,76 @@ def test_sources(tmp_path):
     ):
         xr.testing.assert_identical(opened.compute(**SYNCHRONOUS), expected.compute(**SYNCHRONOUS))
     assert open_archive(first).sizes["time"] == 1
+
+
+def catalogued(folder: Path, paths: list[Path]) -> list[Granule]:
+    """Granules of files, as a catalog would have them."""
+    found = []
+    for path in paths:
+        header = licel.read_header(path)
+        found.append(
+            Granule(
+                path=str(path.relative_to(folder)),
+                size=header.size,
+                mtime_ns=path.stat().st_mtime_ns,
+                instrument="i",
+                role=Role.SIGNAL,
+                status=Status.GOOD,
+                notes=header.notes,
+                start=header.start,
+                stop=header.stop,
+                zenith_angle=header.zenith_angle,
+                azimuth=header.azimuth,
+                altitude=header.altitude,
+                header_digest=licel.header_digest(header),
+            )
+        )
+    return found
+
+
+@pytest.fixture
+def headers_read(monkeypatch) -> list[str]:
+    """Paths of the files whose headers were read."""
+    seen: list[str] = []
+    read = RawFile.read_header
+    monkeypatch.setattr(RawFile, "read_header", lambda file: seen.append(file.path) or read(file))
+    return seen
+
+
+def test_of_files_that_are_known_to_be_alike_one_header_is_read(tmp_path, headers_read):
+    other_shots = (ANALOG.replace("000101", "000102"), PHOTON)
+    paths = [make(tmp_path, f"a{k}", k, line_2=f"{LINE_2[:-2]}{k:02d}") for k in (5, 1, 3)]
+    paths += [make(tmp_path, f"b{k}", k, datasets=other_shots) for k in (4, 2)]
+    paths.append(make(tmp_path, "c", 6, line_2=LINE_2.replace("LidarPi", "Elsewhere")))
+    paths.append(make(tmp_path, "d", 7, last=b""))
+    paths.append(make(tmp_path, "e", 8, line_1=" a longer name than the eighty bytes " + "x" * 50))
+    granules = catalogued(tmp_path, paths)
+    headers_read.clear()
+    known = open_archive(granules, root=tmp_path, header_position="ignore", mask_and_scale=False)
+    assert [Path(path).name for path in headers_read] == ["a1", "b2", "c", "d", "e"]
+    read = open_archive(paths, header_position="ignore", mask_and_scale=False)
+    assert known.zenith_angle.values[:3].tolist() == [1.0, 0.0, 3.0]
+    assert known.analog_532p_shots.values.tolist() == [101, 102, 101, 102, 101, 101, 101, 101]
+    xr.testing.assert_identical(known.compute(**SYNCHRONOUS), read.compute(**SYNCHRONOUS))
+    assert known.analog_532p.data.name == read.analog_532p.data.name
+
+
+def test_a_header_is_read_where_the_catalog_does_not_tell_what_is_asked(tmp_path, headers_read):
+    paths = [make(tmp_path, f"a{k}", k) for k in range(4)]
+    granules = catalogued(tmp_path, paths)
+    headers_read.clear()
+    # A place: the catalog may have the station's.
+    open_archive(granules, root=tmp_path)
+    assert len(headers_read) == 4
+    headers_read.clear()
+    unknown = [granules[0], replace(granules[1], header_digest=None), *granules[2:]]
+    open_archive(unknown, root=tmp_path, header_position="ignore")
+    assert [Path(path).name for path in headers_read] == ["a0", "a1"]
+    headers_read.clear()
+    # The first file is no longer what the catalog says: nothing is concluded from it.
+    make(tmp_path, "a0", 0, line_2=LINE_2.replace("LidarPi", "LidarPo"))
+    open_archive(granules, root=tmp_path, header_position="ignore")
+    assert [Path(path).name for path in headers_read] == ["a0", "a1"]
 
 
 def test_sources_that_cannot_be_opened(tmp_path):
