@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import multiprocessing
 import os
@@ -274,3 +275,18 @@ class TestLater:
         with Processes(number, 3) as pool:
             begun = [pool.later(product, item) for item in range(9)]
             assert [found() for found in begun] == [3 * item for item in range(9)]
+
+
+def test_what_was_there_is_not_swept_and_is_afterwards():
+    assert gc.get_freeze_count() == 0
+    with processes.unswept():
+        frozen = gc.get_freeze_count()
+        assert frozen > 1000
+        with processes.unswept():
+            assert gc.get_freeze_count() <= frozen
+        # The inner one has nothing to thaw.
+        assert gc.get_freeze_count() > 1000
+    assert gc.get_freeze_count() == 0
+    with pytest.raises(ValueError, match="inside"), processes.unswept():
+        raise ValueError("inside")
+    assert gc.get_freeze_count() == 0
