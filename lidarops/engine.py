@@ -26,7 +26,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
 from lidarops.plans import plan
-from lidarops.processes import keep_memory, start_method, unswept
+from lidarops.processes import keep_memory, start_method
 from lidarops.processing import Job, attempt, failed
 from lidarops.products.provenance import code_version
 from lidarops.records import RunRecord, SceneOutcome
@@ -341,13 +341,12 @@ def _serial(
     jobs: Iterable[Job], stop: Stop, taken: Callable[[Job], None] | None
 ) -> Iterator[Ended]:
     keep_memory()
-    with unswept():
-        for job in jobs:
-            if stop:
-                return
-            if taken:
-                taken(job)
-            yield Ended(job, *attempt(job))
+    for job in jobs:
+        if stop:
+            return
+        if taken:
+            taken(job)
+        yield Ended(job, *attempt(job))
 
 
 def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]:

@@ -24,7 +24,7 @@ from lidarops.catalog.store import Store
 from lidarops.engine import Ended, Stop, alone, carry_out, local_client, size
 from lidarops.errors import CatalogError, SceneError
 from lidarops.leftovers import Orphan
-from lidarops.processes import load_ahead, one_ahead
+from lidarops.processes import load_ahead, one_ahead, unswept
 from lidarops.processing import Job, failed
 from lidarops.records import Granule, RunRecord
 from lidarops.reports import page, record
@@ -115,6 +115,7 @@ def bring_up_to_date(
     with (
         Store(campaign.catalog_url, campaign.name) as store,
         Lock(store, wait=options.wait) as lock,
+        unswept(),
     ):
         while True:
             try:

@@ -237,11 +237,26 @@ def _settle(path: Path) -> Written:
     return Written(digest.hexdigest(), path.stat().st_size)
 
 
+class _DefinedAtOnce(netCDF4.Dataset):
+    """A file whose dimensions, variables and attributes are written together.
+
+    In the classic model netCDF4 would write all that it has of them anew after each one, which
+    takes as long as all the rest of a small product.
+    """
+
+    def _enddef(self) -> None:
+        """Stay where things are defined: netCDF4 calls this after each of them."""
+
+    def end_definitions(self) -> None:
+        """Write what is defined; from now on there may be data."""
+        super()._enddef()  # type: ignore[misc]  # not in its stubs
+
+
 def _store(dataset: xr.Dataset, path: Path, model: _Format, *, without: Container[str]) -> None:
     """Write all but the data of the variables named in `without`."""
     unlimited = dataset.encoding.get("unlimited_dims", ())
     # HDF5 may crash when it cannot write to a full disk; so it keeps the file until the end.
-    with netCDF4.Dataset(
+    with _DefinedAtOnce(
         path, "w", format=model, clobber=False, diskless=True, persist=True
     ) as file:
         file.setncatts(dataset.attrs)
@@ -251,6 +266,7 @@ def _store(dataset: xr.Dataset, path: Path, model: _Format, *, without: Containe
             str(name): _define(file, str(name), variable)
             for name, variable in dataset.variables.items()
         }
+        file.end_definitions()
         for name, target in targets.items():
             if name not in without:
                 target[...] = dataset.variables[name].values

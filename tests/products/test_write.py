@@ -188,6 +188,24 @@ def test_large_variables_may_have_any_name(name: str, tmp_path: Path):
     assert_stored(tmp_path / "any.nc", dataset)
 
 
+def test_what_is_defined_is_written_once(
+    product: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ends: list[str] = []
+    kept_from = writer._DefinedAtOnce._enddef
+    written = writer._DefinedAtOnce.end_definitions
+    monkeypatch.setattr(
+        writer._DefinedAtOnce, "_enddef", lambda file: ends.append("kept") or kept_from(file)
+    )
+    monkeypatch.setattr(
+        writer._DefinedAtOnce, "end_definitions", lambda file: ends.append("end") or written(file)
+    )
+    write(product, tmp_path / "product.nc")
+    # Otherwise netCDF4 has another way, and this one would be in vain.
+    assert ends.count("kept") > len(product.variables)
+    assert ends.count("end") == 1
+
+
 @pytest.mark.parametrize("kind", list(MAKERS))
 def test_xarray_decodes_times_flags_bounds_and_coordinates(kind: ProductKind, tmp_path: Path):
     data = MAKERS[kind](zenith=0.0)
