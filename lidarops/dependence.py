@@ -247,4 +247,7 @@ def digest(value: Any) -> str:
 
 def digest_of_inputs(files: Sequence[InputRecord]) -> str:
     """Return the sha256 of the contents of files and their roles, whatever their names."""
-    return digest(sorted([used.role.value, used.sha256] for used in files))
+    # The JSON that `digest` would make of them, which has nothing to escape, at a quarter of the
+    # cost: there are thousands of files, and this is asked of every product.
+    contents = sorted([f'["{used.role}","{used.sha256}"]' for used in files])
+    return hashlib.sha256(f"[{','.join(contents)}]".encode()).hexdigest()

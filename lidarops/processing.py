@@ -281,15 +281,12 @@ def _open(
     # What the campaign says of the pointing wins over the headers.
     facts = dependence.facts_of(job.campaign, scene)
     told = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
-    pointed = archive.assign_coords(
-        {
-            name: xr.full_like(archive["zenith_angle"], angle)
-            for name, angle in told.items()
-            if angle is not None
-        }
-    )
-    # Coordinates are compared at every step, and a lazy one would be computed each time.
-    return pointed.assign_coords({name: array.load() for name, array in pointed.coords.items()})
+    pointing = {
+        name: xr.full_like(archive["zenith_angle"], angle)
+        for name, angle in told.items()
+        if angle is not None
+    }
+    return archive.assign_coords(pointing) if pointing else archive
 
 
 def _bench(job: Job, scene: Scene, plan: Plan, root: Path) -> steps.Bench:
