@@ -85,7 +85,9 @@ def condition(
         full_overlap_range=full_overlap_range,
     )
     parts = source.mapped(_conditioned, ranged=3, plain=0, dtypes=_DTYPES)
-    result = xr.Dataset(dict(zip(_PARTS, parts, strict=True)))
+    # With the coordinates that they share, which need not be compared.
+    variables = {name: part.variable for name, part in zip(_PARTS, parts, strict=True)}
+    result = xr.Dataset(variables, coords=parts[0].coords)
     result["power"].attrs = {"units": source.unit}
     result["variance"].attrs = {"units": f"{source.unit}2"}
     result["range"].attrs = source.inputs[0]["range"].attrs
@@ -196,9 +198,10 @@ class _Source:
         grid = str(counts.dims[-1])
         if grid != "range":
             counts = counts.rename({grid: "range"})
-        counts = counts.assign_coords(
-            range=counts["range"].copy(data=counts["range"].to_numpy() + range_offset)
-        )
+        if range_offset:
+            counts = counts.assign_coords(
+                range=counts["range"].copy(data=counts["range"].to_numpy() + range_offset)
+            )
         self.settings: dict[str, Any] = {
             "range": counts["range"].to_numpy().astype(np.float64),
             "full_overlap_range": full_overlap_range,
