@@ -26,6 +26,8 @@ RELEASE_DATE: Final = date(2026, 11, 21)
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
 
+_quoted: Final = json.JSONEncoder().encode
+
 _PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
 _NOT_COMPUTING: Final = (
     "__main__.py",
@@ -68,16 +70,21 @@ def prov_json(provenance: Provenance) -> str:
         ASCII, keys sorted; equal for equal provenance, in whatever order the inputs come.
     """
     inputs = sorted(provenance.inputs, key=attrgetter("sha256", "path", "role"))
-    document = {
-        "prefix": {"lidarops": NAMESPACE, "sha256": "urn:sha256:"},
-        "entity": {
-            "lidarops:product": _product(provenance),
-            "lidarops:plan": _plan(provenance),
-            **{
-                f"sha256:{digest}": _input(list(records))
-                for digest, records in groupby(inputs, key=attrgetter("sha256"))
-            },
+    entities = {
+        "lidarops:product": _canonical(_product(provenance)),
+        "lidarops:plan": _canonical(_plan(provenance)),
+        **{
+            f"sha256:{digest}": _input(list(records))
+            for digest, records in groupby(inputs, key=attrgetter("sha256"))
         },
+    }
+    uses = {
+        f"_:use{number}": '{"prov:activity":"lidarops:processing",'
+        f'"prov:entity":"sha256:{record.sha256}","prov:role":"{record.role}"}}'
+        for number, record in enumerate(inputs, start=1)
+    }
+    others = {
+        "prefix": {"lidarops": NAMESPACE, "sha256": "urn:sha256:"},
         "activity": {"lidarops:processing": {"lidarops:scene": provenance.scene}},
         "agent": {"lidarops:software": _software(provenance)},
         "wasGeneratedBy": {
@@ -85,14 +92,6 @@ def prov_json(provenance: Provenance) -> str:
                 "prov:entity": "lidarops:product",
                 "prov:activity": "lidarops:processing",
             }
-        },
-        "used": {
-            f"_:use{number}": {
-                "prov:activity": "lidarops:processing",
-                "prov:entity": f"sha256:{record.sha256}",
-                "prov:role": record.role.value,
-            }
-            for number, record in enumerate(inputs, start=1)
         },
         "wasAssociatedWith": {
             "_:association": {
@@ -102,11 +101,20 @@ def prov_json(provenance: Provenance) -> str:
             }
         },
     }
-    return _canonical(document)
+    told = {key: _canonical(value) for key, value in others.items()}
+    return _object({**told, "entity": _object(entities), "used": _object(uses)})
 
 
 def _canonical(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def _object(members: Mapping[str, str]) -> str:
+    """Return a canonical JSON object of members that are JSON already.
+
+    Of thousands of inputs `json` would take longer than a product takes to be written.
+    """
+    return f"{{{','.join([f'{_quoted(key)}:{members[key]}' for key in sorted(members)])}}}"
 
 
 def _type(name: str) -> dict[str, str]:
@@ -144,13 +152,13 @@ def _rule(left: LeftOut) -> str:
     return f" [{left.rule}{number}]" if left.rule else ""
 
 
-def _input(records: list[InputRecord]) -> dict[str, Any]:
-    paths = [record.path for record in records]
-    return {
-        "prov:type": _type("lidarops:RawFile"),
-        "lidarops:path": paths[0] if len(paths) == 1 else paths,
-        "lidarops:sha256": records[0].sha256,
-    }
+def _input(records: list[InputRecord]) -> str:
+    paths = [_quoted(record.path) for record in records]
+    path = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
+    return (
+        f'{{"lidarops:path":{path},"lidarops:sha256":"{records[0].sha256}",'
+        '"prov:type":{"$":"lidarops:RawFile","type":"prov:QUALIFIED_NAME"}}'
+    )
 
 
 def _software(provenance: Provenance) -> dict[str, Any]:
@@ -178,12 +186,14 @@ def product_id(provenance: Provenance) -> str:
     content = {
         "kind": provenance.kind.value,
         "channel": provenance.channel,
-        "inputs": sorted([record.role.value, record.sha256] for record in provenance.inputs),
         "plan": provenance.plan.hash,
         "settings": dict(provenance.settings),
         "code_version": provenance.code_version,
     }
-    return str(uuid5(NAMESPACE_URL, NAMESPACE + _canonical(content)))
+    inputs = sorted([f'["{record.role}","{record.sha256}"]' for record in provenance.inputs])
+    told = {key: _canonical(value) for key, value in content.items()}
+    text = _object({**told, "inputs": f"[{','.join(inputs)}]"})
+    return str(uuid5(NAMESPACE_URL, NAMESPACE + text))
 
 
 def read_provenance(path: str | Path) -> dict[str, Any]:

@@ -112,6 +112,20 @@ def test_order_of_inputs_changes_nothing(inputs):
     assert product_id(shuffled) == product_id(provenance())
 
 
+CONTENTS = st.sampled_from([hashlib.sha256(bytes([k])).hexdigest() for k in range(3)])
+
+
+@given(st.lists(st.builds(InputRecord, st.text(min_size=1), st.sampled_from(Role), CONTENTS)))
+def test_documents_are_canonical_json_whatever_files_are_called(inputs):
+    text = prov_json(provenance(inputs=tuple(inputs)))
+    found = json.loads(text)
+    assert text == json.dumps(found, sort_keys=True, separators=(",", ":"))
+    assert len(found["used"]) == len(inputs)
+    for record in inputs:
+        paths = found["entity"][f"sha256:{record.sha256}"]["lidarops:path"]
+        assert record.path in ([paths] if isinstance(paths, str) else paths)
+
+
 def test_identifiers_differ_where_content_may():
     base = provenance()
     plan = replace(base.plan, left_out=(*base.plan.left_out, LeftOut("x", "y", "z")))
