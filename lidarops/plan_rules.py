@@ -156,9 +156,11 @@ def parts_of(glued: str) -> tuple[str, str]:
     return f"analog_{label}", f"photon_{label}"
 
 
-def joined_channels(scene: Scene, names: Iterable[str]) -> tuple[ChannelLayout, ...]:
+def joined_channels(
+    layout: Iterable[ChannelLayout], names: Iterable[str]
+) -> tuple[ChannelLayout, ...]:
     """Return those ``glued_`` channels of which the files hold both parts on one range grid."""
-    present = {channel.name: channel for channel in scene.layout}
+    present = {channel.name: channel for channel in layout}
     found = []
     for name in names:
         analog, photon = (present.get(part) for part in parts_of(name))

@@ -18,7 +18,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.dependence import Wanted
 from lidarops.products.provenance import code_version
-from lidarops.records import Granule, ProductRecord, RunRecord, Scene, SceneOutcome
+from lidarops.records import Granule, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
 from lidarops.staleness import Judge, Judgement
 
 MOST_INPUTS: Final = 100_000
@@ -137,7 +137,9 @@ class Session:
         """Add to the record of the run what was not tried."""
         self._outcomes.append(outcome)
 
-    def finish(self, status: RunStatus, set_aside: Sequence[Granule]) -> RunRecord:
+    def finish(
+        self, status: RunStatus, set_aside: Sequence[Granule], unmet: tuple[Unmet, ...] = ()
+    ) -> RunRecord:
         """Close the run in the ledger and return its record."""
         refused = (*self._store.refused(), *set_aside)
         self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
@@ -155,6 +157,7 @@ class Session:
             refused=refused,
             truth=_truth(self._campaign),
             costs=self._tally.costs.words,
+            unmet=unmet,
         )
 
     def _estimated(self, judged: Judgement) -> float:

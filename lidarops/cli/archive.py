@@ -384,6 +384,8 @@ def _plain(judged: Judgement) -> dict[str, Any]:
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
+    from dataclasses import asdict
+
     record = result.record
     scenes = () if record is None else record.scenes
     return {
@@ -401,6 +403,7 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "files_set_aside": dict(result.set_aside),
         "barren_scenes": dict(result.barren),
         "more_of_both": result.untold,
+        "not_in_files": [{**asdict(each), "nowhere": each.nowhere} for each in result.unmet],
         "orphans": {each.path: each.reason for each in result.orphans if not each.asked},
         "kept_products": {each.path: each.reason for each in result.orphans if each.asked},
     }
@@ -430,6 +433,7 @@ def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | 
     refused = _refused(campaign, result)
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
+    show(_unmet_table(result))
     show(_orphans_table(result, removed))
     show(_kept_table(result))
     show(_empty_table(result))
@@ -452,10 +456,22 @@ def _unused_table(result: Result, told: Collection[str]) -> Table:
     return table
 
 
+def _unmet_table(result: Result) -> Table:
+    from lidarops.reports.words import lacking
+
+    title = "Asked for, and not in the files"
+    table = make_table(title, "instrument", "channel", "asked for by", "because", "missing in")
+    for each in result.unmet:
+        told = (each.instrument, each.channel, each.asked, each.reason)
+        add_row(table, *told, lacking(each))
+    return table
+
+
 def _tell_none(campaign: Campaign, result: Result) -> None:
     refused = _refused(campaign, result)
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
+    show(_unmet_table(result))
     show(_failures_table(result))
     typer.echo(_NONE)
 

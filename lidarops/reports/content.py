@@ -143,6 +143,10 @@ def verdict(record: RunRecord) -> str:
     if empty:
         number = counted(len(empty), "scene")
         parts.append(f"the retrievals of {number} left nothing to use: {listed(empty)}")
+    nowhere = {(each.instrument, each.channel) for each in record.unmet if each.nowhere}
+    if nowhere:
+        named = listed({channel for _, channel in nowhere})
+        parts.append(f"{counted(len(nowhere), 'channel')} named that no file holds: {named}")
     if not parts:
         return f"Every scene was processed and no granule was refused.{tail}"
     *first, last = parts

@@ -19,7 +19,7 @@ from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import content, gallery
 from lidarops.reports.gallery import Compared, Gallery, Picture
 from lidarops.reports.record import FILE_NAME, write_atomically
-from lidarops.reports.words import duration, percent, size, visible
+from lidarops.reports.words import duration, lacking, percent, size, visible
 
 INDEX: Final = "index.html"
 """Name of the page inside a run's report folder."""
@@ -172,6 +172,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"percent": percent, "moment": content.moment, "url": quote}
+    environment.filters |= {"lacking": lacking}
     return environment
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Callable
 from datetime import UTC, datetime
 
 import pytest
@@ -16,7 +17,14 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.pipeline import Options, Selection, bring_up_to_date, remove_orphans, reprocess
+from lidarops.pipeline import (
+    Options,
+    Selection,
+    bring_up_to_date,
+    remove_orphans,
+    report_run,
+    reprocess,
+)
 from lidarops.records import ProductKind
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
@@ -33,7 +41,8 @@ def _told(archive: Archive) -> dict[str, object]:
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
     told = json.loads(result.stdout)
     reasons = ("failed_scenes", "empty_scenes", "refused_files", "files_set_aside", "barren_scenes")
-    assert result.exit_code == int(any(told[name] for name in reasons))
+    nowhere = any(each["nowhere"] for each in told["not_in_files"])
+    assert result.exit_code == int(nowhere or any(told[name] for name in reasons))
     return dict(told)
 
 
@@ -58,6 +67,61 @@ def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -
         told = _told(archive)["barren_scenes"]
         assert len(told) == 4
         assert all("photon_355o" in why for why in told.values())
+
+
+def _misspelt_product(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["channels"].append("photon_999o")
+
+
+def _misspelt_facts(archive: Archive) -> None:
+    facts = archive.told["instruments"]["rich"]["facts"][1]
+    facts["channels"] = {"photon_533o": facts["channels"]["photon_532o"]}
+
+
+@pytest.mark.parametrize(
+    ("misspell", "channel", "asked"),
+    [
+        (_misspelt_product, "photon_999o", "homogeneous"),
+        (_misspelt_facts, "photon_533o", "facts from 2026-03-03T00:00:00Z"),
+    ],
+)
+def test_a_channel_that_no_file_holds_is_named_by_every_run(
+    archive: Archive, misspell: Callable[[Archive], None], channel: str, asked: str
+) -> None:
+    assert _told(archive)["not_in_files"] == []
+    misspell(archive)
+    found = bring_up_to_date(archive.write(), options=Options(force=True))
+    assert found.record is not None
+    assert found.record.failed
+    page = report_run(archive.write(), found.record).page.read_text()
+    assert page.count(channel) >= 2
+    assert "Asked for, and not in the files" in page
+    for _ in range(2):
+        (told,) = _told(archive)["not_in_files"]
+        assert (told["channel"], told["asked"], told["nowhere"]) == (channel, asked, True)
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file)], env={"COLUMNS": "200"})
+    assert channel in shown.stdout
+    assert shown.exit_code == 1
+    # Asked for another lidar alone, or for a time that these facts do not reach.
+    other = CliRunner().invoke(app, ["reprocess", str(archive.file), "--instrument", "poor"])
+    assert other.exit_code == 0
+    early = ["reprocess", str(archive.file), "--until", "2026-03-02"]
+    assert CliRunner().invoke(app, early).exit_code == int(asked == "homogeneous")
+
+
+def test_a_channel_that_came_with_a_new_laser_is_told_and_no_trouble(archive: Archive) -> None:
+    for path in (archive.folder / "raw/rich").glob("h3*"):
+        path.write_bytes(path.read_bytes().replace(b"00532.o", b"00533.o"))
+    archive.told["instruments"]["rich"]["facts"][1]["channels"]["photon_533o"] = {"dead_time": 3e-9}
+    archive.write()
+    told = _told(archive)
+    assert any("photon_533o" in path for path in told["products"])
+    files = {(each["channel"], each["asked"][:5]): each for each in told["not_in_files"]}
+    assert files["photon_533o", "facts"]["files"] == 3
+    assert files["photon_533o", "facts"]["of"] == 6
+    assert files["photon_532o", "homog"]["files"] == 3
+    assert files["photon_532o", "homog"]["of"] == 12
+    assert not any(each["nowhere"] for each in files.values())
 
 
 def test_of_very_many_days_some_are_told_and_the_rest_counted(
