@@ -467,7 +467,8 @@ class _Work:
         for each in self._found.held:
             job = Job(self._campaign, each.scene, each.plan)
             self._session.add(failed(job, f"{each.held} (not tried again: nothing has changed)"))
-        return self._session.finish(status, self._found.set_aside, unmet)
+        barren = {each.scene.id: each.barren for each in self._found.barren}
+        return self._session.finish(status, self._found.set_aside, barren=barren, unmet=unmet)
 
 
 def _verdicts(

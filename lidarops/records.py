@@ -298,6 +298,9 @@ class SceneOutcome:
     """CPU time of the thread that processed it; 0 where it was not measured."""
     estimated_seconds: float = 0.0
     """CPU time that was reckoned with before; 0 where nothing was."""
+    left_out: tuple[LeftOut, ...] = ()
+    """What else was left out of what the scene was asked for: of products that it does not give at
+    all, and of channels that it does not read, while `plan` tells of those that were made."""
 
     @property
     def empty(self) -> bool:
@@ -349,12 +352,16 @@ class RunRecord:
     """Whence the costs were that times were estimated with; empty where nothing was estimated."""
     unmet: tuple[Unmet, ...] = ()
     """What is asked for, or told facts of, and not in the files; what no file holds first."""
+    barren: Mapping[str, str] = field(default_factory=dict)
+    """Scene -> why it can give no product, of the first of those that the run looked at."""
+    more_barren: int = 0
+    """How many more there were."""
 
     @property
     def failed(self) -> bool:
         """Whether anything was refused or failed, was asked for in vain, or left nothing to use."""
         return (
-            bool(self.refused)
+            bool(self.refused or self.barren)
             or any(each.nowhere for each in self.unmet)
             or any(scene.error or scene.refused or scene.empty for scene in self.scenes)
         )

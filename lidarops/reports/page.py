@@ -144,6 +144,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
             for scene in record.scenes[:ROWS]
         ],
         left_out=content.left_out(record),
+        barren=content.barren(record),
         steps=content.done(record),
         flags=content.flags(record),
         refused=content.refused(record),

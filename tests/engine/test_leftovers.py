@@ -11,11 +11,12 @@ import pytest
 from small_archive import DAY, Archive
 from typer.testing import CliRunner
 
-from lidarops import pipeline
+from lidarops import pipeline, session
 from lidarops.catalog.ledger import Run, RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
+from lidarops.dependence import part, wanted
 from lidarops.errors import CatalogError
 from lidarops.pipeline import (
     Options,
@@ -67,6 +68,47 @@ def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -
         told = _told(archive)["barren_scenes"]
         assert len(told) == 4
         assert all("photon_355o" in why for why in told.values())
+
+
+def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None:
+    """Of a kind that gives nothing no product can tell, and the plans of the others do not."""
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 1500]]
+    archive.told["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+    record = reprocess(archive.write())
+    assert record is not None
+    assert {scene.instrument for scene in record.scenes} == {"rich"}
+    for scene in record.scenes:
+        assert scene.plan is not None
+        assert scene.plan.hash == part(scene.plan, wanted(scene.plan)).hash
+        told = [left.reason for left in scene.left_out if left.rule == "section_level"]
+        assert len(told) == 1
+        assert "climbs by 750 m" in told[0]
+        every = (*scene.plan.left_out, *scene.left_out)
+        assert len(set(every)) == len(every)
+    # One for all, as there may be many scenes.
+    assert len({id(scene.left_out) for scene in record.scenes}) < len(record.scenes)
+    page = report_run(archive.write(), record).page
+    assert "climbs by 750 m" in page.read_text()
+    assert "climbs by 750 m" in (page.parent / "run.json").read_text()
+
+
+def test_a_report_names_scenes_that_can_give_nothing(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "MOST_BARREN", 3)
+    archive.told["instruments"]["poor"]["products"] = {
+        "homogeneous": {"channels": ["photon_532o"], "sections": [[50_000, 60_000]]}
+    }
+    record = reprocess(archive.write(), options=Options(force=True))
+    assert record is not None
+    assert list(record.barren) == [f"poor_2026030{day}T000000" for day in (1, 2, 3)]
+    assert record.more_barren == 1
+    assert record.failed
+    page = report_run(archive.write(), record).page.read_text()
+    assert "section 50000-60000 m does not lie inside the bins" in page
+    assert "poor_20260303T000000" in page
+    assert "1 more can give none" in page
+    assert "4 scenes can give no product" in page
 
 
 def _misspelt_product(archive: Archive) -> None:
