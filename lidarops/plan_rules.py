@@ -302,15 +302,44 @@ def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
 
 def gates(steps: Collection[Step]) -> dict[str, Stretches]:
     """Return the channels of which only some bins are needed, and which."""
-    whole = {step.channel for step in steps if step.name in WHOLE}
-    for step in steps:
-        if step.name == StepName.GLUE:
-            whole |= set(step.settings.values())
+    whole = _needing_all(steps)
     return {
         step.channel: _stretches(step.settings["bins"])
         for step in steps
-        if step.name == StepName.RANGE_GATE and step.channel not in whole
+        if step.name == StepName.RANGE_GATE and (step.instrument, step.channel) not in whole
     }
+
+
+def idle_gate(step: Step, steps: Collection[Step]) -> str:
+    """Return why a gate of a plan keeps no bin from being read; empty where it does, or is none.
+
+    It stands in the plan all the same: what a product tells of itself must not depend on which
+    others are made.
+
+    Parameters
+    ----------
+    step : Step
+    steps : collection of Step
+        All that are carried out together.
+    """
+    if step.name != StepName.RANGE_GATE:
+        return ""
+    needing = _needing_all(steps).get((step.instrument, step.channel), [])
+    if not needing:
+        return ""
+    return f"{' and '.join(needing)} need{'s' if len(needing) == 1 else ''} all bins"
+
+
+def _needing_all(steps: Collection[Step]) -> dict[tuple[str, str], list[str]]:
+    """Return instrument and channel -> what is made of it and needs all bins."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for step in steps:
+        if step.name in WHOLE:
+            found.setdefault((step.instrument, step.channel), []).append(step.name)
+        elif step.name == StepName.GLUE:
+            for part in step.settings.values():
+                found.setdefault((step.instrument, part), []).append(step.channel)
+    return found
 
 
 def _stretches(told: Any) -> Stretches:

@@ -345,12 +345,15 @@ def _refused_table(refused: list[Granule]) -> Table:
 
 
 def _plan_table(title: str, plan: Plan) -> Table:
+    from lidarops.plan_rules import idle_gate
     from lidarops.reports.words import decided_on
 
     table = make_table(title, "channel", "step", "does", "why", "rule", "number")
     for step in plan.steps:
         settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
-        does = (step.channel, step.name, settings or "yes", step.reason)
+        idle = idle_gate(step, plan.steps)
+        done = f"no effect: {idle}" if idle else settings or "yes"
+        does = (step.channel, step.name, done, step.reason)
         add_row(table, *does, step.rule, decided_on(step.number))
     for left in plan.left_out:
         told = (left.channel, left.name, "left out", left.reason)
@@ -376,11 +379,20 @@ def _stale_table(title: str, judged: Judgement) -> Table:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
+    from lidarops.plan_rules import idle_gate
+
     stale = [
         {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
         for each in judged.stale
     ]
-    return {**judged.asked.as_dict(), "stale": stale, "fresh": judged.fresh, "held": judged.held}
+    plan = judged.asked
+    idle = [idle_gate(step, plan.steps) for step in plan.steps]
+    steps = [
+        {**step.as_dict(), **({"no_effect": why} if why else {})}
+        for step, why in zip(plan.steps, idle, strict=True)
+    ]
+    told = {**plan.as_dict(), "steps": steps}
+    return {**told, "stale": stale, "fresh": judged.fresh, "held": judged.held}
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:

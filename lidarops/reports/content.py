@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.flags import Quality, Severity
+from lidarops.plan_rules import idle_gate
 from lidarops.records import LeftOut, ProductKind, RunRecord, SceneOutcome, Step
 from lidarops.reports.words import counted, decided_on, duration, percent
 
@@ -185,7 +186,14 @@ def left_out(record: RunRecord) -> list[DecisionRow]:
 
 def done(record: RunRecord) -> list[DecisionRow]:
     """Group what was done by step and reason, the most frequent of a step first."""
-    return _decisions(record, lambda scene: scene.plan.steps if scene.plan else ())
+    return _decisions(record, _done)
+
+
+def _done(scene: SceneOutcome) -> Iterator[Step]:
+    steps = scene.plan.steps if scene.plan else ()
+    for step in steps:
+        idle = idle_gate(step, steps)
+        yield replace(step, reason=f"{step.reason}; of no effect: {idle}") if idle else step
 
 
 def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:

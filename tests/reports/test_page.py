@@ -18,7 +18,7 @@ from PIL import Image
 
 from lidarops.errors import CatalogError
 from lidarops.flags import Quality
-from lidarops.records import LeftOut, ProductKind, ProductRecord, Step, Unmet
+from lidarops.records import LeftOut, Plan, ProductKind, ProductRecord, Step, Unmet
 from lidarops.reports import content, page, record
 from lidarops.reports.words import counted, duration, percent, size
 
@@ -384,6 +384,20 @@ class TestManyScenes:
         # What each product came from is told as before.
         hashes = [[scene.plan.hash for scene in run.scenes] for run in (many, more)]
         assert hashes[0] == hashes[1]
+
+    def test_a_gate_of_no_effect_is_told_as_such(self, tmp_path):
+        gate = Step("range_gate", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins")
+        signal = Step("signal", CHANNEL, {}, "asked for")
+        scenes = [
+            outcome(name, plan=Plan(name, steps, ()))
+            for name, steps in (("alone", (gate,)), ("both", (gate, signal)))
+        ]
+        told = {row.reason: row.scenes for row in content.done(run_record(tmp_path, scenes))}
+        assert told == {
+            "asked for": 1,
+            "sections need no farther bins": 1,
+            "sections need no farther bins; of no effect: signal needs all bins": 1,
+        }
 
     def test_long_tables_are_cut_and_say_so(self, many, tmp_path, monkeypatch):
         monkeypatch.setattr(page, "ROWS", 40)
