@@ -142,12 +142,35 @@ def edges(campaign: Campaign) -> list[datetime]:
     return sorted(found - {_FIRST, _LAST})
 
 
+def lacks_any(campaign: Campaign, layouts: Iterable[tuple[str, tuple[ChannelLayout, ...]]]) -> bool:
+    """Return whether some files may lack something that the campaign names, at whatever time.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    layouts : iterable of (str, tuple of ChannelLayout)
+        Instruments, and what files of theirs hold.
+    """
+    return any(
+        _lacked(Held(layout, owner, facts))
+        for name, layout in layouts
+        if (owner := campaign.instruments.get(name)) is not None
+        for facts in owner.facts or (InstrumentFacts(),)
+    )
+
+
 def names_any(campaign: Campaign) -> bool:
     """Return whether a campaign names channels, so that files may lack them."""
     return any(
         any(_asked(instrument).values()) or any(facts.channels for facts in instrument.facts)
         for instrument in campaign.instruments.values()
     )
+
+
+def _lacked(held: Held) -> list[LeftOut]:
+    """Return what files lack; not what they hold and cannot be used as it is told."""
+    found = (each for each in applied(RULES, held) if isinstance(each, LeftOut))
+    return [left for left in found if left.name != StepName.LAG]
 
 
 def unmet(
@@ -194,11 +217,11 @@ def unmet(
             until is None or facts.valid_from < until
         )
         told = {}
-        for left in applied(RULES, Held(each.layout, instrument, facts)):
-            if left.rule == STRANGE.name and left.name == StepName.READ and touched:
-                told[period, left.channel] = left.reason
-            elif left.rule == ABSENT.name and StepName(left.name) in asked:
+        for left in _lacked(Held(each.layout, instrument, facts)):
+            if left.rule == ABSENT.name and StepName(left.name) in asked:
                 told[left.name, left.channel] = left.reason
+            elif left.rule == STRANGE.name and touched:
+                told[period, left.channel] = left.reason
         for (word, channel), reason in told.items():
             lacking[each.instrument, word, channel].append((each.files, reason))
     found = [

@@ -177,6 +177,22 @@ class Granules(Database):
                 for day, role, count, low, high in connection.execute(query)
             ]
 
+    def layouts(self) -> list[tuple[str, tuple[ChannelLayout, ...]]]:
+        """Return every instrument with what some good signal granules of it hold."""
+        inner = sa.select(_C.instrument, _C.layout).distinct().where(*self._signals()).subquery()
+        query = (
+            sa.select(inner.c.instrument, LAYOUT.c.channels)
+            .join(LAYOUT, LAYOUT.c.hash == inner.c.layout)
+            .order_by(inner.c.instrument, inner.c.layout)
+        )
+        with self.transaction() as connection:
+            rows = connection.execute(query).all()
+        return [(instrument, _layout_from(channels)) for instrument, channels in rows]
+
+    def _signals(self) -> tuple[sa.ColumnElement[bool], ...]:
+        good, signal = Status.GOOD.value, Role.SIGNAL.value
+        return _C.campaign == self.campaign, _C.status == good, _C.role == signal
+
     def holdings(self, edges: Sequence[datetime]) -> list[Holding]:
         """Return which channels good signal granules hold.
 
@@ -195,11 +211,7 @@ class Granules(Database):
         stretch = sa.case(*reversed(later), else_=0) if later else sa.literal_column("0")
         inner = (
             sa.select(_C.instrument, stretch.label("stretch"), _C.layout)
-            .where(
-                _C.campaign == self.campaign,
-                _C.status == Status.GOOD.value,
-                _C.role == Role.SIGNAL.value,
-            )
+            .where(*self._signals())
             .subquery()
         )
         columns = tuple(inner.c)
