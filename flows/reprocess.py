@@ -285,6 +285,11 @@ def _tell_troubles(campaign: Campaign, result: Result) -> str:
         "files refused": _refused(campaign, result),
         "scenes can give no product": result.barren,
         "good files stand in no scene": result.set_aside,
+        "channels named and in no file": {
+            f"{each.channel} of {each.instrument}, for {each.asked}": each.reason
+            for each in result.unmet
+            if each.nowhere
+        },
     }
     logger = get_run_logger()
     for what, troubles in named.items():

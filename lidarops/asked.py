@@ -1,12 +1,14 @@
-"""What is asked for: whether there is such a thing at all, told before anything is started."""
+"""What is asked for: whether there is such a thing at all."""
 
 from __future__ import annotations
 
+from lidarops import presence
 from lidarops.campaign import Campaign
 from lidarops.catalog.database import refuse_wrong_url
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, CatalogError
+from lidarops.records import Unmet
 from lidarops.scenes import cut
 from lidarops.staleness import Selection
 
@@ -80,3 +82,41 @@ def none(campaign: Campaign, selection: Selection) -> bool:
             selection.scenes(cut(campaign, store.granules_of(day, day, dark_days=0)).scenes)
             for day in days
         )
+
+
+def unmet(campaign: Campaign, store: Store, selection: Selection) -> tuple[Unmet, ...]:
+    """Return what is asked for, or told facts of, and not in the files.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    store : Store
+        Its catalog.
+    selection : Selection
+        Only of instruments, and of members of networks, that are asked for.
+    """
+    # To count files takes longer than to find that none lacks anything, as is usual.
+    if not (presence.names_any(campaign) and presence.lacks_any(campaign, store.layouts())):
+        return ()
+    owners: dict[str, tuple[str, ...]] = {name: (name,) for name in campaign.instruments}
+    owners |= {name: tuple(each.instruments) for name, each in campaign.networks.items()}
+    chosen = {
+        member
+        for name, members in owners.items()
+        for member in members
+        if (not selection.instruments or name in selection.instruments)
+        and (not selection.stations or _station(campaign, name) in selection.stations)
+    }
+    return presence.unmet(
+        campaign,
+        store.holdings(presence.edges(campaign)),
+        instruments=chosen,
+        kinds=selection.kinds,
+        since=selection.since,
+        until=selection.until,
+    )
+
+
+def _station(campaign: Campaign, name: str) -> str:
+    owner = campaign.instruments.get(name)
+    return owner.station if owner else name

@@ -144,7 +144,7 @@ def rays_of(rays: Sequence[RayPlan], scene: Scene, campaign: Campaign) -> tuple[
 def channel_of(member: Scene, name: str) -> ChannelLayout:
     """Return a channel that a member's files hold, or that is joined of two of them."""
     if name.startswith(GLUED):
-        return joined_channels(member, [name])[0]
+        return joined_channels(member.layout, [name])[0]
     return next(channel for channel in member.layout if channel.name == name)
 
 
@@ -222,7 +222,7 @@ class MemberCase:
     def why_not(self) -> tuple[str, float | None]:
         """Return why a member cannot take part, nothing where it can, and the number."""
         name, facts = self.settings.channel, self.facts
-        joined = joined_channels(self.scene, [name]) if name.startswith(GLUED) else ()
+        joined = joined_channels(self.scene.layout, [name]) if name.startswith(GLUED) else ()
         held = [channel.name for channel in (*self.scene.layout, *joined)]
         if name not in held:
             return f"the files hold no {name}, only {', '.join(held)}", None

@@ -15,7 +15,7 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
-from lidarops.asked import refuse_unknown
+from lidarops import asked
 from lidarops.campaign import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
@@ -26,7 +26,7 @@ from lidarops.errors import CatalogError, SceneError
 from lidarops.leftovers import Orphan
 from lidarops.processes import load_ahead, one_ahead, unswept
 from lidarops.processing import Job, failed
-from lidarops.records import Granule, RunRecord
+from lidarops.records import Granule, RunRecord, Unmet
 from lidarops.reports import page, record
 from lidarops.runs import Options, Result
 from lidarops.scenes import Cut, cut, select
@@ -111,7 +111,7 @@ def bring_up_to_date(
     """Do what `reprocess` does, and tell all that is known at the end."""
     selection = selection or Selection()
     options = options or Options()
-    refuse_unknown(campaign, selection)
+    asked.refuse_unknown(campaign, selection)
     with (
         Store(campaign.catalog_url, campaign.name) as store,
         Lock(store, wait=options.wait) as lock,
@@ -153,7 +153,7 @@ def assess(
     Judgement
     """
     selection = selection or Selection()
-    refuse_unknown(campaign, selection)
+    asked.refuse_unknown(campaign, selection)
     update_catalog(campaign, wait=wait)
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection, force=force)
@@ -278,7 +278,8 @@ class _Work:
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
-        run = self._conclude(status)
+        unmet = asked.unmet(self._campaign, self._store, self._selection)
+        run = self._conclude(status, unmet)
         found = self._found
         self._look_again(clean[:AGAIN])
         return Result(
@@ -293,6 +294,7 @@ class _Work:
             barren={each.scene.id: each.barren for each in found.barren},
             set_aside={each.path: each.reason for each in found.set_aside},
             untold=sum(sum(verdicts[day][1:]) for day in clean[AGAIN:]),
+            unmet=unmet,
             signal=caught,
         )
 
@@ -459,13 +461,14 @@ class _Work:
         done = self._session.settled if self._session else set()
         return self._found.open[day] <= done
 
-    def _conclude(self, status: RunStatus) -> RunRecord | None:
+    def _conclude(self, status: RunStatus, unmet: tuple[Unmet, ...]) -> RunRecord | None:
         if self._session is None:
             return None
         for each in self._found.held:
             job = Job(self._campaign, each.scene, each.plan)
             self._session.add(failed(job, f"{each.held} (not tried again: nothing has changed)"))
-        return self._session.finish(status, self._found.set_aside)
+        barren = {each.scene.id: each.barren for each in self._found.barren}
+        return self._session.finish(status, self._found.set_aside, barren=barren, unmet=unmet)
 
 
 def _verdicts(

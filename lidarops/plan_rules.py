@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from enum import StrEnum
 from typing import Any, Final
 
@@ -16,7 +18,8 @@ from lidarops.product_settings import (
     SignalSettings,
 )
 from lidarops.raw.model import Stretches
-from lidarops.records import ChannelLayout, DetectionMode, LeftOut, Scene, Step
+from lidarops.records import ChannelLayout, DetectionMode, Granule, LeftOut, Scene, Step
+from lidarops.retrieve.dark import SESSION_GAP
 from lidarops.retrieve.signal import MIN_NOISE_BINS, NOISE_WINDOW
 
 GLUED = "glued_"
@@ -156,9 +159,11 @@ def parts_of(glued: str) -> tuple[str, str]:
     return f"analog_{label}", f"photon_{label}"
 
 
-def joined_channels(scene: Scene, names: Iterable[str]) -> tuple[ChannelLayout, ...]:
+def joined_channels(
+    layout: Iterable[ChannelLayout], names: Iterable[str]
+) -> tuple[ChannelLayout, ...]:
     """Return those ``glued_`` channels of which the files hold both parts on one range grid."""
-    present = {channel.name: channel for channel in scene.layout}
+    present = {channel.name: channel for channel in layout}
     found = []
     for name in names:
         analog, photon = (present.get(part) for part in parts_of(name))
@@ -209,14 +214,44 @@ def _dark(case: Case) -> Decisions:
     if not count:
         yield case.without(StepName.DARK, "no dark files within 24 h of the scene", number=0.0)
         return
-    told = f"{count} dark files within 24 h of the scene"
-    times = [granule.start for granule in case.scene.dark if granule.start]
+    times = sorted(granule.start for granule in case.scene.dark if granule.start)
     profiles = [granule.start for granule in case.scene.granules if granule.start]
-    if min(times) < max(profiles) and min(profiles) < max(times):
-        reason, method = f"{told}, before and after it: interpolated in time", "interpolated"
+    around = times[0] < max(profiles) and min(profiles) < times[-1]
+    sessions = _sessions(case.scene.dark)
+    # Within a single session there is nothing to interpolate between.
+    if around and sessions > 1:
+        told, method = "interpolated in time", "interpolated"
+    elif sessions > 1:
+        told, method = "the nearest of them in time", "nearest"
     else:
-        reason, method = f"{told}, on one side of it: the nearest", "nearest"
+        told, method = "one session, which serves all profiles", "nearest"
+    lie = _where(times, min(profiles), max(profiles))
+    files = "1 dark file" if count == 1 else f"{count} dark files"
+    reason = f"{files} within 24 h of the scene, {lie}: {told}"
     yield case.step(StepName.DARK, reason, number=float(count), files=count, method=method)
+
+
+def _sessions(dark: Iterable[Granule]) -> int:
+    """Return how many sessions dark files make, as the retrieval tells them apart."""
+    middles = sorted(
+        granule.start + ((granule.stop or granule.start) - granule.start) / 2
+        for granule in dark
+        if granule.start
+    )
+    gaps = ((later - time).total_seconds() for time, later in itertools.pairwise(middles))
+    return 1 + sum(gap > SESSION_GAP for gap in gaps)
+
+
+def _where(times: Sequence[datetime], first: datetime, last: datetime) -> str:
+    """Say how many times lie before, among and after the profiles of a scene."""
+    places = {
+        "before": sum(time < first for time in times),
+        "among": sum(first <= time <= last for time in times),
+        "after": sum(time > last for time in times),
+    }
+    told = [f"{number} {place}" for place, number in places.items() if number]
+    *firsts, rest = told
+    return f"{', '.join(firsts)} and {rest} its profiles" if firsts else f"{rest} its profiles"
 
 
 def _dead_time(case: Case) -> Decisions:
@@ -300,15 +335,44 @@ def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
 
 def gates(steps: Collection[Step]) -> dict[str, Stretches]:
     """Return the channels of which only some bins are needed, and which."""
-    whole = {step.channel for step in steps if step.name in WHOLE}
-    for step in steps:
-        if step.name == StepName.GLUE:
-            whole |= set(step.settings.values())
+    whole = _needing_all(steps)
     return {
         step.channel: _stretches(step.settings["bins"])
         for step in steps
-        if step.name == StepName.RANGE_GATE and step.channel not in whole
+        if step.name == StepName.RANGE_GATE and (step.instrument, step.channel) not in whole
     }
+
+
+def idle_gate(step: Step, steps: Collection[Step]) -> str:
+    """Return why a gate of a plan keeps no bin from being read; empty where it does, or is none.
+
+    It stands in the plan all the same: what a product tells of itself must not depend on which
+    others are made.
+
+    Parameters
+    ----------
+    step : Step
+    steps : collection of Step
+        All that are carried out together.
+    """
+    if step.name != StepName.RANGE_GATE:
+        return ""
+    needing = _needing_all(steps).get((step.instrument, step.channel), [])
+    if not needing:
+        return ""
+    return f"{' and '.join(needing)} need{'s' if len(needing) == 1 else ''} all bins"
+
+
+def _needing_all(steps: Collection[Step]) -> dict[tuple[str, str], list[str]]:
+    """Return instrument and channel -> what is made of it and needs all bins."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for step in steps:
+        if step.name in WHOLE:
+            found.setdefault((step.instrument, step.channel), []).append(step.name)
+        elif step.name == StepName.GLUE:
+            for part in step.settings.values():
+                found.setdefault((step.instrument, part), []).append(step.channel)
+    return found
 
 
 def _stretches(told: Any) -> Stretches:

@@ -6,11 +6,11 @@ Every rule gives its reason in words that a user can check against the campaign 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
-from lidarops import network_plans, scan_rules
+from lidarops import network_plans, presence, scan_rules
 from lidarops.campaign import Campaign, Instrument, InstrumentFacts, channel_facts
 from lidarops.plan_rules import (
     ALL_STEPS,
@@ -22,7 +22,6 @@ from lidarops.plan_rules import (
     StepName,
     applied,
     glue_rules,
-    joined_channels,
     no_scan,
     parts_of,
     range_offset,
@@ -31,6 +30,7 @@ from lidarops.plan_rules import (
     steady_zenith,
     wavelength,
 )
+from lidarops.presence import glued_channels
 from lidarops.product_settings import (
     ElasticSettings,
     HomogeneousSettings,
@@ -98,8 +98,9 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
         if scene.instrument in network.instruments
     }
     asked = _Asked(scene, instrument, facts, networks)
-    left_out = [left for left in applied((ABSENT, STRANGE), asked) if isinstance(left, LeftOut)]
-    for channel in (*scene.layout, *glued_channels(scene, instrument)):
+    held = presence.Held(scene.layout, instrument, facts)
+    left_out = [left for left in applied(presence.RULES, held) if isinstance(left, LeftOut)]
+    for channel in (*scene.layout, *glued_channels(scene.layout, instrument)):
         for decision in _channel(channel, asked, all_steps=campaign.all_steps):
             (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
     return _without_idle(Plan(scene.id, tuple(steps), tuple(left_out)))
@@ -127,83 +128,10 @@ def _without_idle(told: Plan) -> Plan:
     )
 
 
-def glued_channels(scene: Scene, instrument: Instrument) -> tuple[ChannelLayout, ...]:
-    """Return the channels that a scene gets by joining analog and photon counting ones.
-
-    Parameters
-    ----------
-    scene : Scene
-    instrument : Instrument
-        Whose products ask for channels named ``glued_`` and a label.
-
-    Returns
-    -------
-    tuple of ChannelLayout
-        Those of which the files hold both parts on one range grid; in photon counting units.
-    """
-    return joined_channels(scene, sorted(_asked_glued(instrument)))
-
-
-def _asked_glued(instrument: Instrument) -> set[str]:
-    products = instrument.products
-    asked = [
-        name
-        for wanted in (products.elastic, products.multiangle)
-        if wanted is not None
-        for name in wanted.channels
-    ]
-    if products.signal is not None and products.signal.channels != "all":
-        asked += products.signal.channels
-    return {name for name in asked if name.startswith(GLUED)}
-
-
-def _absent(asked: _Asked) -> Decisions:
-    """Name the channels that the campaign wants and the files lack."""
-    scene, instrument = asked.scene, asked.instrument
-    channels = {channel.name: channel for channel in scene.layout}
-    made = [channel.name for channel in glued_channels(scene, instrument)]
-    products = instrument.products
-    for kind, wanted in (
-        (StepName.SIGNAL, products.signal),
-        (StepName.HOMOGENEOUS, products.homogeneous),
-        (StepName.ELASTIC, products.elastic),
-        (StepName.MULTIANGLE, products.multiangle),
-    ):
-        names: Sequence[str] = [] if wanted is None or wanted.channels == "all" else wanted.channels
-        for name in names:
-            if kind is StepName.HOMOGENEOUS and name.startswith(GLUED):
-                yield LeftOut(kind.value, name, "each record is fitted with its own background")
-            elif name not in channels and name not in made:
-                yield LeftOut(kind.value, name, _why_absent(name, channels))
-
-
-def _strange_facts(asked: _Asked) -> Decisions:
-    """Name the channels of which the campaign tells facts, and which the files lack."""
-    scene, facts = asked.scene, asked.facts
-    present = [channel.name for channel in scene.layout]
-    for name, known in facts.channels.items():
-        if name not in present:
-            reason = f"facts of a channel that the files do not hold, only {', '.join(present)}"
-            yield LeftOut(StepName.READ.value, name, reason)
-        elif known.lag is not None and not name.startswith("analog_"):
-            yield LeftOut(StepName.LAG.value, name, "a lag is a fact of the analog channel")
-
-
-def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
-    if name.startswith(GLUED):
-        parts = parts_of(name)
-        if set(parts) <= set(channels):
-            widths = [f"{channels[part].bin_width:g} m" for part in parts]
-            return f"its parts have bins of {' and '.join(widths)}"
-        missing = [part for part in parts if part not in channels]
-        return f"the files hold no {' and no '.join(missing)} to join"
-    return f"the files hold no such channel, only {', '.join(channels)}"
-
-
 def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decisions:
     scene, instrument, facts = asked.scene, asked.instrument, asked.facts
     products = instrument.products
-    made = [glued.name for glued in glued_channels(scene, instrument)]
+    made = [glued.name for glued in glued_channels(scene.layout, instrument)]
     joined = channel.name in made
     case = ChannelCase(
         scene=scene,
@@ -560,9 +488,3 @@ PRODUCTS: Final = (
     *scan_rules.SCANS,
 )
 """Of the products of a channel, in the order in which they run."""
-ABSENT: Final = Rule(
-    "channel_present", StepName.READ, "Do the files hold what is asked for?", _absent
-)
-STRANGE: Final = Rule(
-    "facts_fit", StepName.READ, "Do the campaign's facts fit the files?", _strange_facts
-)

@@ -25,7 +25,7 @@ from lidarops.campaign import Campaign, InstrumentFacts, Station, as_settings
 from lidarops.errors import LidarOpsError, ProductError, SceneError
 from lidarops.flags import Quality
 from lidarops.plan_rules import StepName, gates
-from lidarops.plans import glued_channels
+from lidarops.presence import glued_channels
 from lidarops.products import build, provenance, write
 from lidarops.raw import licel
 from lidarops.raw.archive import counting, open_archive
@@ -366,7 +366,7 @@ def _network_product(
 
 def _layout(job: Job, scene: Scene, name: str) -> ChannelLayout:
     instrument = job.campaign.instruments[scene.instrument]
-    known = (*scene.layout, *glued_channels(scene, instrument))
+    known = (*scene.layout, *glued_channels(scene.layout, instrument))
     return next(channel for channel in known if channel.name == name)
 
 

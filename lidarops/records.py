@@ -99,6 +99,17 @@ class Granule:
 
 
 @dataclass(frozen=True, slots=True)
+class Holding:
+    """Good signal files of one instrument with the same channels, of a stretch of time."""
+
+    instrument: str
+    since: datetime
+    """Where the stretch begins, not its first file."""
+    layout: tuple[ChannelLayout, ...]
+    files: int
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """The granules that are processed together."""
 
@@ -287,12 +298,36 @@ class SceneOutcome:
     """CPU time of the thread that processed it; 0 where it was not measured."""
     estimated_seconds: float = 0.0
     """CPU time that was reckoned with before; 0 where nothing was."""
+    left_out: tuple[LeftOut, ...] = ()
+    """What else was left out of what the scene was asked for: of products that it does not give at
+    all, and of channels that it does not read, while `plan` tells of those that were made."""
 
     @property
     def empty(self) -> bool:
         """Whether every value of the retrievals that judge themselves is rejected."""
         retrieved = [product for product in self.products if product.kind in JUDGE_THEMSELVES]
         return bool(retrieved) and all(product.usable == 0 for product in retrieved)
+
+
+@dataclass(frozen=True, slots=True)
+class Unmet:
+    """What a campaign asks for, or tells facts of, and files of an instrument do not hold."""
+
+    instrument: str
+    channel: str
+    asked: str
+    """Kind of the product that asks for the channel, or the facts that name it, with their
+    period."""
+    reason: str
+    files: int
+    """Number of files that lack it."""
+    of: int
+    """Number of files that were to hold it: all of the instrument, or of the period of facts."""
+
+    @property
+    def nowhere(self) -> bool:
+        """Whether no file holds it, as after a slip of the pen."""
+        return self.files == self.of
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,10 +350,18 @@ class RunRecord:
     """Path of the truth file of a simulated campaign, empty for real data."""
     costs: str = ""
     """Whence the costs were that times were estimated with; empty where nothing was estimated."""
+    unmet: tuple[Unmet, ...] = ()
+    """What is asked for, or told facts of, and not in the files; what no file holds first."""
+    barren: Mapping[str, str] = field(default_factory=dict)
+    """Scene -> why it can give no product, of the first of those that the run looked at."""
+    more_barren: int = 0
+    """How many more there were."""
 
     @property
     def failed(self) -> bool:
-        """Whether anything was refused or failed, or a scene's retrievals left nothing to use."""
-        return bool(self.refused) or any(
-            scene.error or scene.refused or scene.empty for scene in self.scenes
+        """Whether anything was refused or failed, was asked for in vain, or left nothing to use."""
+        return (
+            bool(self.refused or self.barren)
+            or any(each.nowhere for each in self.unmet)
+            or any(scene.error or scene.refused or scene.empty for scene in self.scenes)
         )

@@ -6,7 +6,8 @@ from typing import Final
 
 from lidarops.network_plans import NETWORK
 from lidarops.plan_rules import CONDITIONING, GLUING, Rule
-from lidarops.plans import ABSENT, CHANNEL, GATE, PRODUCTS, STRANGE
+from lidarops.plans import CHANNEL, GATE, PRODUCTS
+from lidarops.presence import ABSENT, STRANGE
 from lidarops.refinement import REFINEMENTS
 
 RULES: Final[tuple[Rule, ...]] = tuple(

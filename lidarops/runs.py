@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
 from lidarops.leftovers import Orphan
-from lidarops.records import RunRecord, SceneOutcome
+from lidarops.records import RunRecord, SceneOutcome, Unmet
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -61,6 +61,8 @@ class Result:
     """Path of a good granule that stands in no scene -> why."""
     untold: int = 0
     """More of both, on days in which nothing changed."""
+    unmet: tuple[Unmet, ...] = ()
+    """What is asked for, or told facts of, and not in the files; what no file holds first."""
     signal: int = 0
     """The signal that stopped the run."""
 
@@ -80,6 +82,7 @@ class Result:
             or self.barren
             or self.set_aside
             or self.untold
+            or any(each.nowhere for each in self.unmet)
             or self.status is not RunStatus.FINISHED
             or (self.record is not None and self.record.failed)
         )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -18,11 +19,13 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.dependence import Wanted
 from lidarops.products.provenance import code_version
-from lidarops.records import Granule, ProductRecord, RunRecord, Scene, SceneOutcome
+from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
 from lidarops.staleness import Judge, Judgement
 
 MOST_INPUTS: Final = 100_000
 """Granules whose names the record of a run keeps; the ledger keeps all."""
+MOST_BARREN: Final = 1000
+"""Scenes without any product that the record of a run names; it counts the others."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,6 +58,7 @@ class Session:
         self._output = Path(campaign.output)
         self._kept: dict[str, str] = {}
         self._outcomes: list[SceneOutcome] = []
+        self._left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
         self._named = 0
         self.settled: set[str] = set()
         """Scenes of which another look would find every product fresh."""
@@ -115,7 +119,11 @@ class Session:
         self._store.record(entry, self.id, self._lock.token)
         self._settle(judged, outcome, new)
         # Once it is entered, as an estimate is no reason to lose a scene.
-        outcome = replace(outcome, estimated_seconds=self._estimated(judged))
+        outcome = replace(
+            outcome,
+            estimated_seconds=self._estimated(judged),
+            left_out=self._beyond(judged, outcome),
+        )
         self._settle_versions(judged, outcome)
         self._tell(outcome)
         self._named += outcome.granules
@@ -137,8 +145,25 @@ class Session:
         """Add to the record of the run what was not tried."""
         self._outcomes.append(outcome)
 
-    def finish(self, status: RunStatus, set_aside: Sequence[Granule]) -> RunRecord:
-        """Close the run in the ledger and return its record."""
+    def finish(
+        self,
+        status: RunStatus,
+        set_aside: Sequence[Granule],
+        *,
+        barren: Mapping[str, str] | None = None,
+        unmet: tuple[Unmet, ...] = (),
+    ) -> RunRecord:
+        """Close the run in the ledger and return its record.
+
+        Parameters
+        ----------
+        status : RunStatus
+        set_aside : sequence of Granule
+            Good ones that stand in no scene.
+        barren : mapping of str to str, optional
+            Scene -> why it can give no product.
+        unmet : tuple of Unmet
+        """
         refused = (*self._store.refused(), *set_aside)
         self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
         _LOG.info("run %s %s: %d scenes", self.id, status.value, len(self._outcomes))
@@ -155,6 +180,9 @@ class Session:
             refused=refused,
             truth=_truth(self._campaign),
             costs=self._tally.costs.words,
+            unmet=unmet,
+            barren=dict(islice((barren or {}).items(), MOST_BARREN)),
+            more_barren=max(len(barren or {}) - MOST_BARREN, 0),
         )
 
     def _estimated(self, judged: Judgement) -> float:
@@ -163,6 +191,13 @@ class Session:
         whole = self._campaign.all_steps
         own = self._tally.add(judged.scene, judged.needed(), whole=whole)
         return own + self._tally.loading - before
+
+    def _beyond(self, judged: Judgement, outcome: SceneOutcome) -> tuple[LeftOut, ...]:
+        """Return what was left out of what is asked for, and is in no plan of a product."""
+        told = set(() if outcome.plan is None else outcome.plan.left_out)
+        found = tuple(left for left in judged.asked.left_out if left not in told)
+        # Equal in nearly all scenes of an instrument, of which a run may have 100,000.
+        return self._left_out.setdefault(found, found)
 
     def _new_products(
         self, judged: Judgement, outcome: SceneOutcome

@@ -14,17 +14,17 @@ import rawfiles
 import sqlalchemy as sa
 import xarray as xr
 
-from lidarops import processing, steps
+from lidarops import dependence, processing, steps
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.engine import run
 from lidarops.flags import Quality
 from lidarops.pipeline import Options, prepare, reprocess
-from lidarops.plan_rules import gates
+from lidarops.plan_rules import gates, idle_gate
 from lidarops.plans import CHANNEL, GATE, PRODUCTS, plan
 from lidarops.processing import Job, process
 from lidarops.raw.licel import RawFile
-from lidarops.records import Plan, Role, RunRecord, Step
+from lidarops.records import Plan, ProductKind, Role, RunRecord, Step
 from lidarops.refinement import GAP, WITHOUT, refine
 from lidarops.retrieve import _angle_block, _slant, labeled_scan
 from lidarops.retrieve.molecular import MolecularProfile
@@ -302,6 +302,39 @@ def test_the_gate_holds_the_farthest_section_and_what_tells_its_noise():
     moved = told(channels={"photon_532o": {"range_offset": -75.0}})
     (gate,) = (s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_gate")
     assert gate.settings == {"bins": [[0, 1112]]}
+
+
+@pytest.mark.parametrize(
+    ("products", "why"),
+    [
+        (HOMOGENEOUS, ""),
+        ({**HOMOGENEOUS, "signal": {"channels": ["analog_532o"]}}, ""),
+        ({**HOMOGENEOUS, "signal": {}}, "signal needs all bins"),
+        ({**HOMOGENEOUS, **ELASTIC["products"]}, "elastic needs all bins"),
+        ({**HOMOGENEOUS, **GLUED["products"]}, "glued_532o needs all bins"),
+        ({**HOMOGENEOUS, **ELASTIC["products"], "signal": {}}, "signal and elastic need all bins"),
+    ],
+)
+def test_a_gate_that_keeps_no_bin_from_being_read_says_so(products, why):
+    # It climbs by 90 m along the section, which is level enough, and reaches clean air.
+    steep = factories.granule(0, zenith_angle=0.0)
+    wanted = {**products, "homogeneous": {**SECTIONS, "sections": [[750, 840]]}}
+    made = planned(steep, products=wanted)
+    (gate,) = (step for step in made.steps if step.name == "range_gate")
+    assert idle_gate(gate, made.steps) == why
+    assert ("photon_532o" in gates(made.steps)) == (not why)
+    assert not any(idle_gate(step, made.steps) for step in made.steps if step is not gate)
+    # The product of sections tells the same of itself, whatever else is made.
+    alone = dependence.part(made, [(ProductKind.HOMOGENEOUS, "photon_532o")])
+    assert gate in alone.steps
+    assert not idle_gate(gate, alone.steps)
+
+
+def test_a_gate_of_one_lidar_is_not_idle_for_what_another_needs():
+    gate = Step("range_gate", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
+    signal = Step("signal", "photon_532o", {}, "asked for", "west")
+    assert not idle_gate(gate, [gate, signal])
+    assert gates([gate, signal]) == {"photon_532o": ((0, 9),)}
 
 
 def test_the_gate_of_an_older_product_is_understood():

@@ -7,11 +7,13 @@ import math
 from dataclasses import replace
 
 import factories
+import numpy as np
 import pytest
 
 from lidarops import dependence
 from lidarops.plans import plan
 from lidarops.records import Plan, Role, Scene
+from lidarops.retrieve.dark import profile as dark_profile
 from lidarops.scenes import cut
 
 
@@ -289,15 +291,60 @@ class TestDark:
         self.reason = next(step.reason for step in result.steps if step.name == "dark")
         return _steps(result, "analog_532o")["dark"]
 
-    @pytest.mark.parametrize("minutes", [(0.0, 10.0), (200.0,), (130.0, 300.0)])
-    def test_on_one_side_the_nearest(self, minutes: tuple[float, ...]) -> None:
+    @pytest.mark.parametrize(
+        ("minutes", "where"),
+        [
+            ((0.0, 50.0), "2 dark files within 24 h of the scene, 2 before its profiles"),
+            ((130.0, 300.0), "2 dark files within 24 h of the scene, 2 after its profiles"),
+        ],
+    )
+    def test_on_one_side_the_nearest(self, minutes: tuple[float, ...], where: str) -> None:
         assert self._step(*minutes) == {"files": len(minutes), "method": "nearest"}
-        assert "one side" in self.reason
+        assert self.reason == f"{where}: the nearest of them in time"
 
-    @pytest.mark.parametrize("minutes", [(0.0, 300.0), (0.0, 90.0), (0.0, 10.0, 300.0)])
-    def test_around_it_interpolated(self, minutes: tuple[float, ...]) -> None:
+    @pytest.mark.parametrize(
+        ("minutes", "where"),
+        [
+            ((90.0,), "1 dark file within 24 h of the scene, 1 among its profiles"),
+            ((0.0,), "1 dark file within 24 h of the scene, 1 before its profiles"),
+            ((0.0, 10.0), "2 dark files within 24 h of the scene, 2 before its profiles"),
+            ((60.0, 90.0), "2 dark files within 24 h of the scene, 2 among its profiles"),
+            (
+                (100.0, 115.0, 125.0),
+                "3 dark files within 24 h of the scene, 2 among and 1 after its profiles",
+            ),
+        ],
+    )
+    def test_one_session_serves_all(self, minutes: tuple[float, ...], where: str) -> None:
+        assert self._step(*minutes) == {"files": len(minutes), "method": "nearest"}
+        assert self.reason == f"{where}: one session, which serves all profiles"
+
+    @pytest.mark.parametrize(
+        ("minutes", "where"),
+        [
+            ((0.0, 300.0), "1 before and 1 after"),
+            ((0.0, 90.0), "1 before and 1 among"),
+            ((70.0, 110.0), "2 among"),
+            ((0.0, 10.0, 90.0, 300.0), "2 before, 1 among and 1 after"),
+        ],
+    )
+    def test_around_it_interpolated(self, minutes: tuple[float, ...], where: str) -> None:
         assert self._step(*minutes) == {"files": len(minutes), "method": "interpolated"}
-        assert f"{len(minutes)} dark files" in self.reason
+        told = f"{len(minutes)} dark files within 24 h of the scene, {where} its profiles"
+        assert self.reason == f"{told}: interpolated in time"
+
+    @pytest.mark.parametrize("minutes", [(90.0,), (60.0, 90.0), (100.0, 115.0, 125.0)])
+    def test_of_one_session_either_method_gives_the_same(self, minutes: tuple[float, ...]) -> None:
+        """So that calling it the nearest changes no product."""
+        signals = np.random.default_rng(1).normal(size=(len(minutes), 8))
+        times = np.array(minutes) * 60
+        wanted = np.array([60.0, 90.0, 120.0]) * 60
+        nearest, interpolated = (
+            dark_profile(signals, times, wanted, method=method)
+            for method in ("nearest", "interpolated")
+        )
+        assert np.array_equal(nearest.dark, interpolated.dark)
+        assert np.array_equal(nearest.variance, interpolated.variance)
 
     def test_photon_counting_needs_none(self) -> None:
         dark = factories.granule(0, path="dark/d", role=Role.DARK)

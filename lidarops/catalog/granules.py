@@ -12,9 +12,9 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.database import BATCH, Database
-from lidarops.catalog.rows import GranuleRow
+from lidarops.catalog.rows import GranuleRow, naive
 from lidarops.catalog.schema import GRANULE, LAYOUT
-from lidarops.records import ChannelLayout, DetectionMode, Granule, Role, Status
+from lidarops.records import ChannelLayout, DetectionMode, Granule, Holding, Role, Status
 
 _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
@@ -175,6 +175,56 @@ class Granules(Database):
             return [
                 DaySum(day, Role(role), count, int(low), int(high))
                 for day, role, count, low, high in connection.execute(query)
+            ]
+
+    def layouts(self) -> list[tuple[str, tuple[ChannelLayout, ...]]]:
+        """Return every instrument with what some good signal granules of it hold."""
+        inner = sa.select(_C.instrument, _C.layout).distinct().where(*self._signals()).subquery()
+        query = (
+            sa.select(inner.c.instrument, LAYOUT.c.channels)
+            .join(LAYOUT, LAYOUT.c.hash == inner.c.layout)
+            .order_by(inner.c.instrument, inner.c.layout)
+        )
+        with self.transaction() as connection:
+            rows = connection.execute(query).all()
+        return [(instrument, _layout_from(channels)) for instrument, channels in rows]
+
+    def _signals(self) -> tuple[sa.ColumnElement[bool], ...]:
+        good, signal = Status.GOOD.value, Role.SIGNAL.value
+        return _C.campaign == self.campaign, _C.status == good, _C.role == signal
+
+    def holdings(self, edges: Sequence[datetime]) -> list[Holding]:
+        """Return which channels good signal granules hold.
+
+        Parameters
+        ----------
+        edges : sequence of datetime
+            Rising; where stretches end and begin.
+
+        Returns
+        -------
+        list of Holding
+            One for each instrument, stretch and layout of channels.
+        """
+        begins = [datetime.min.replace(tzinfo=UTC), *edges]
+        later = [(_C.start >= naive(edge), k) for k, edge in enumerate(edges, 1)]
+        stretch = sa.case(*reversed(later), else_=0) if later else sa.literal_column("0")
+        inner = (
+            sa.select(_C.instrument, stretch.label("stretch"), _C.layout)
+            .where(*self._signals())
+            .subquery()
+        )
+        columns = tuple(inner.c)
+        query = (
+            sa.select(*columns, sa.func.count(), LAYOUT.c.channels)
+            .join(LAYOUT, LAYOUT.c.hash == inner.c.layout)
+            .group_by(*columns, LAYOUT.c.channels)
+            .order_by(*columns)
+        )
+        with self.transaction() as connection:
+            return [
+                Holding(instrument, begins[place], _layout_from(channels), files)
+                for instrument, place, _, files, channels in connection.execute(query)
             ]
 
     def paths_by_digest(self, digests: Collection[str]) -> dict[str, str]:

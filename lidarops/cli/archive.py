@@ -345,12 +345,15 @@ def _refused_table(refused: list[Granule]) -> Table:
 
 
 def _plan_table(title: str, plan: Plan) -> Table:
+    from lidarops.plan_rules import idle_gate
     from lidarops.reports.words import decided_on
 
     table = make_table(title, "channel", "step", "does", "why", "rule", "number")
     for step in plan.steps:
         settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
-        does = (step.channel, step.name, settings or "yes", step.reason)
+        idle = idle_gate(step, plan.steps)
+        done = f"no effect: {idle}" if idle else settings or "yes"
+        does = (step.channel, step.name, done, step.reason)
         add_row(table, *does, step.rule, decided_on(step.number))
     for left in plan.left_out:
         told = (left.channel, left.name, "left out", left.reason)
@@ -376,14 +379,25 @@ def _stale_table(title: str, judged: Judgement) -> Table:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
+    from lidarops.plan_rules import idle_gate
+
     stale = [
         {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
         for each in judged.stale
     ]
-    return {**judged.asked.as_dict(), "stale": stale, "fresh": judged.fresh, "held": judged.held}
+    plan = judged.asked
+    idle = [idle_gate(step, plan.steps) for step in plan.steps]
+    steps = [
+        {**step.as_dict(), **({"no_effect": why} if why else {})}
+        for step, why in zip(plan.steps, idle, strict=True)
+    ]
+    told = {**plan.as_dict(), "steps": steps}
+    return {**told, "stale": stale, "fresh": judged.fresh, "held": judged.held}
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
+    from dataclasses import asdict
+
     record = result.record
     scenes = () if record is None else record.scenes
     return {
@@ -401,6 +415,7 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "files_set_aside": dict(result.set_aside),
         "barren_scenes": dict(result.barren),
         "more_of_both": result.untold,
+        "not_in_files": [{**asdict(each), "nowhere": each.nowhere} for each in result.unmet],
         "orphans": {each.path: each.reason for each in result.orphans if not each.asked},
         "kept_products": {each.path: each.reason for each in result.orphans if each.asked},
     }
@@ -430,6 +445,7 @@ def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | 
     refused = _refused(campaign, result)
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
+    show(_unmet_table(result))
     show(_orphans_table(result, removed))
     show(_kept_table(result))
     show(_empty_table(result))
@@ -452,10 +468,22 @@ def _unused_table(result: Result, told: Collection[str]) -> Table:
     return table
 
 
+def _unmet_table(result: Result) -> Table:
+    from lidarops.reports.words import lacking
+
+    title = "Asked for, and not in the files"
+    table = make_table(title, "instrument", "channel", "asked for by", "because", "missing in")
+    for each in result.unmet:
+        told = (each.instrument, each.channel, each.asked, each.reason)
+        add_row(table, *told, lacking(each))
+    return table
+
+
 def _tell_none(campaign: Campaign, result: Result) -> None:
     refused = _refused(campaign, result)
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
+    show(_unmet_table(result))
     show(_failures_table(result))
     typer.echo(_NONE)
 

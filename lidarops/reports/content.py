@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.flags import Quality, Severity
-from lidarops.records import LeftOut, Plan, ProductKind, RunRecord, SceneOutcome, Step
+from lidarops.plan_rules import idle_gate
+from lidarops.records import LeftOut, ProductKind, RunRecord, SceneOutcome, Step
 from lidarops.reports.words import counted, decided_on, duration, percent
 
 _NAMED: Final = 8
@@ -51,6 +52,14 @@ class RefusedRow:
     reason: str
     found: str
     files: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BarrenRow:
+    """Scenes that can give no product for the same reason."""
+
+    reason: str
+    scenes: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +152,12 @@ def verdict(record: RunRecord) -> str:
     if empty:
         number = counted(len(empty), "scene")
         parts.append(f"the retrievals of {number} left nothing to use: {listed(empty)}")
+    barren = len(record.barren) + record.more_barren
+    parts += [f"{counted(barren, 'scene')} can give no product"] if barren else []
+    nowhere = {(each.instrument, each.channel) for each in record.unmet if each.nowhere}
+    if nowhere:
+        named = listed({channel for _, channel in nowhere})
+        parts.append(f"{counted(len(nowhere), 'channel')} named that no file holds: {named}")
     if not parts:
         return f"Every scene was processed and no granule was refused.{tail}"
     *first, last = parts
@@ -166,24 +181,36 @@ def instruments(record: RunRecord) -> list[InstrumentRow]:
 
 def left_out(record: RunRecord) -> list[DecisionRow]:
     """Group what was not done by step and reason, the most frequent of a step first."""
-    return _decisions(record, lambda plan: ((left, left.reason) for left in plan.left_out))
+    return _decisions(record, _left_out)
 
 
 def done(record: RunRecord) -> list[DecisionRow]:
     """Group what was done by step and reason, the most frequent of a step first."""
-    return _decisions(record, lambda plan: ((step, step.reason) for step in plan.steps))
+    return _decisions(record, _done)
+
+
+def _done(scene: SceneOutcome) -> Iterator[Step]:
+    steps = scene.plan.steps if scene.plan else ()
+    for step in steps:
+        idle = idle_gate(step, steps)
+        yield replace(step, reason=f"{step.reason}; of no effect: {idle}") if idle else step
+
+
+def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:
+    yield from scene.plan.left_out if scene.plan else ()
+    yield from scene.left_out
 
 
 def _decisions(
-    record: RunRecord, of: Callable[[Plan], Iterable[tuple[Step | LeftOut, str]]]
+    record: RunRecord, of: Callable[[SceneOutcome], Iterable[Step | LeftOut]]
 ) -> list[DecisionRow]:
     scenes: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     channels: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     names: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     numbers: dict[tuple[str, str, str], set[float]] = defaultdict(set)
     for scene in record.scenes:
-        for item, reason in of(scene.plan) if scene.plan else ():
-            key = (item.name, reason, item.rule)
+        for item in of(scene):
+            key = (item.name, item.reason, item.rule)
             scenes[key].add(scene.scene)
             channels[key].add(item.channel)
             names[key].add(scene.instrument)
@@ -249,6 +276,17 @@ def refused(record: RunRecord) -> list[RefusedRow]:
         for (reason, found), paths in sorted(
             files.items(), key=lambda item: (-len(item[1]), item[0])
         )
+    ]
+
+
+def barren(record: RunRecord) -> list[BarrenRow]:
+    """Group scenes that can give no product by reason, the most frequent first."""
+    scenes: dict[str, list[str]] = defaultdict(list)
+    for scene, reason in record.barren.items():
+        scenes[reason].append(scene)
+    return [
+        BarrenRow(reason, tuple(sorted(found)))
+        for reason, found in sorted(scenes.items(), key=lambda item: (-len(item[1]), item[0]))
     ]
 
 

@@ -19,7 +19,7 @@ from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import content, gallery
 from lidarops.reports.gallery import Compared, Gallery, Picture
 from lidarops.reports.record import FILE_NAME, write_atomically
-from lidarops.reports.words import duration, percent, size, visible
+from lidarops.reports.words import duration, lacking, percent, size, visible
 
 INDEX: Final = "index.html"
 """Name of the page inside a run's report folder."""
@@ -144,6 +144,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
             for scene in record.scenes[:ROWS]
         ],
         left_out=content.left_out(record),
+        barren=content.barren(record),
         steps=content.done(record),
         flags=content.flags(record),
         refused=content.refused(record),
@@ -172,6 +173,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"percent": percent, "moment": content.moment, "url": quote}
+    environment.filters |= {"lacking": lacking}
     return environment
 
 

@@ -7,6 +7,7 @@ import unicodedata
 from typing import Final
 
 from lidarops.flags import Quality
+from lidarops.records import Unmet
 
 _REORDERING: Final = frozenset(
     "\N{LEFT-TO-RIGHT EMBEDDING}\N{RIGHT-TO-LEFT EMBEDDING}\N{POP DIRECTIONAL FORMATTING}"
@@ -56,6 +57,13 @@ def duration(seconds: float) -> str:
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun, which takes an s in the plural."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def lacking(unmet: Unmet) -> str:
+    """Return how many files lack what is asked for."""
+    if unmet.nowhere:
+        return "the only file" if unmet.of == 1 else f"all {unmet.of:,} files"
+    return f"{unmet.files:,} of {unmet.of:,} files"
 
 
 def visible(text: str) -> str:

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Callable
 from datetime import UTC, datetime
 
 import pytest
 from small_archive import DAY, Archive
 from typer.testing import CliRunner
 
-from lidarops import pipeline
+from lidarops import pipeline, session
 from lidarops.catalog.ledger import Run, RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
+from lidarops.dependence import part, wanted
 from lidarops.errors import CatalogError
-from lidarops.pipeline import Options, Selection, bring_up_to_date, remove_orphans, reprocess
+from lidarops.pipeline import (
+    Options,
+    Selection,
+    bring_up_to_date,
+    remove_orphans,
+    report_run,
+    reprocess,
+)
 from lidarops.records import ProductKind
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
@@ -33,7 +42,8 @@ def _told(archive: Archive) -> dict[str, object]:
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
     told = json.loads(result.stdout)
     reasons = ("failed_scenes", "empty_scenes", "refused_files", "files_set_aside", "barren_scenes")
-    assert result.exit_code == int(any(told[name] for name in reasons))
+    nowhere = any(each["nowhere"] for each in told["not_in_files"])
+    assert result.exit_code == int(nowhere or any(told[name] for name in reasons))
     return dict(told)
 
 
@@ -58,6 +68,102 @@ def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -
         told = _told(archive)["barren_scenes"]
         assert len(told) == 4
         assert all("photon_355o" in why for why in told.values())
+
+
+def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None:
+    """Of a kind that gives nothing no product can tell, and the plans of the others do not."""
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 1500]]
+    archive.told["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+    record = reprocess(archive.write())
+    assert record is not None
+    assert {scene.instrument for scene in record.scenes} == {"rich"}
+    for scene in record.scenes:
+        assert scene.plan is not None
+        assert scene.plan.hash == part(scene.plan, wanted(scene.plan)).hash
+        told = [left.reason for left in scene.left_out if left.rule == "section_level"]
+        assert len(told) == 1
+        assert "climbs by 750 m" in told[0]
+        every = (*scene.plan.left_out, *scene.left_out)
+        assert len(set(every)) == len(every)
+    # One for all, as there may be many scenes.
+    assert len({id(scene.left_out) for scene in record.scenes}) < len(record.scenes)
+    page = report_run(archive.write(), record).page
+    assert "climbs by 750 m" in page.read_text()
+    assert "climbs by 750 m" in (page.parent / "run.json").read_text()
+
+
+def test_a_report_names_scenes_that_can_give_nothing(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "MOST_BARREN", 3)
+    archive.told["instruments"]["poor"]["products"] = {
+        "homogeneous": {"channels": ["photon_532o"], "sections": [[50_000, 60_000]]}
+    }
+    record = reprocess(archive.write(), options=Options(force=True))
+    assert record is not None
+    assert list(record.barren) == [f"poor_2026030{day}T000000" for day in (1, 2, 3)]
+    assert record.more_barren == 1
+    assert record.failed
+    page = report_run(archive.write(), record).page.read_text()
+    assert "section 50000-60000 m does not lie inside the bins" in page
+    assert "poor_20260303T000000" in page
+    assert "1 more can give none" in page
+    assert "4 scenes can give no product" in page
+
+
+def _misspelt_product(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["channels"].append("photon_999o")
+
+
+def _misspelt_facts(archive: Archive) -> None:
+    facts = archive.told["instruments"]["rich"]["facts"][1]
+    facts["channels"] = {"photon_533o": facts["channels"]["photon_532o"]}
+
+
+@pytest.mark.parametrize(
+    ("misspell", "channel", "asked"),
+    [
+        (_misspelt_product, "photon_999o", "homogeneous"),
+        (_misspelt_facts, "photon_533o", "facts from 2026-03-03T00:00:00Z"),
+    ],
+)
+def test_a_channel_that_no_file_holds_is_named_by_every_run(
+    archive: Archive, misspell: Callable[[Archive], None], channel: str, asked: str
+) -> None:
+    assert _told(archive)["not_in_files"] == []
+    misspell(archive)
+    found = bring_up_to_date(archive.write(), options=Options(force=True))
+    assert found.record is not None
+    assert found.record.failed
+    page = report_run(archive.write(), found.record).page.read_text()
+    assert page.count(channel) >= 2
+    assert "Asked for, and not in the files" in page
+    for _ in range(2):
+        (told,) = _told(archive)["not_in_files"]
+        assert (told["channel"], told["asked"], told["nowhere"]) == (channel, asked, True)
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file)], env={"COLUMNS": "200"})
+    assert channel in shown.stdout
+    assert shown.exit_code == 1
+    # Asked for another lidar alone, or for a time that these facts do not reach.
+    other = CliRunner().invoke(app, ["reprocess", str(archive.file), "--instrument", "poor"])
+    assert other.exit_code == 0
+    early = ["reprocess", str(archive.file), "--until", "2026-03-02"]
+    assert CliRunner().invoke(app, early).exit_code == int(asked == "homogeneous")
+
+
+def test_a_channel_that_came_with_a_new_laser_is_told_and_no_trouble(archive: Archive) -> None:
+    for path in (archive.folder / "raw/rich").glob("h3*"):
+        path.write_bytes(path.read_bytes().replace(b"00532.o", b"00533.o"))
+    archive.told["instruments"]["rich"]["facts"][1]["channels"]["photon_533o"] = {"dead_time": 3e-9}
+    archive.write()
+    told = _told(archive)
+    assert any("photon_533o" in path for path in told["products"])
+    files = {(each["channel"], each["asked"][:5]): each for each in told["not_in_files"]}
+    assert files["photon_533o", "facts"]["files"] == 3
+    assert files["photon_533o", "facts"]["of"] == 6
+    assert files["photon_532o", "homog"]["files"] == 3
+    assert files["photon_532o", "homog"]["of"] == 12
+    assert not any(each["nowhere"] for each in files.values())
 
 
 def test_of_very_many_days_some_are_told_and_the_rest_counted(

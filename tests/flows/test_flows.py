@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -283,6 +284,23 @@ def test_the_log_of_a_troubled_night_is_bounded(
     refused = [record for record in caplog.records if "coast/h" in record.getMessage()]
     assert len(refused) == 20
     assert "and 11 more files refused" in caplog.text
+
+
+def test_a_night_tells_the_channels_that_no_file_holds(
+    campaign_file: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    told = yaml.safe_load(campaign_file.read_text())
+    told["instruments"]["lidar"]["products"]["homogeneous"]["channels"].append("photon_999o")
+    campaign_file.write_text(yaml.safe_dump(told))
+    (campaign_file.parent / "raw" / "coast" / "h9").unlink()
+    campaign = load(campaign_file)
+    result = bring_up_to_date(campaign)
+    assert result.troubled
+    monkeypatch.setattr(flows.reprocess, "get_run_logger", lambda: logging.getLogger("night"))
+    with caplog.at_level(logging.WARNING, "night"):
+        message = flows.reprocess._tell_troubles(campaign, result)
+    assert message == "1 channels named and in no file"
+    assert "photon_999o of lidar, for homogeneous: the files hold no such" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from PIL import Image
 
 from lidarops.errors import CatalogError
 from lidarops.flags import Quality
-from lidarops.records import LeftOut, ProductKind, ProductRecord, Step
+from lidarops.records import LeftOut, Plan, ProductKind, ProductRecord, Step, Unmet
 from lidarops.reports import content, page, record
 from lidarops.reports.words import counted, duration, percent, size
 
@@ -357,6 +357,48 @@ class TestManyScenes:
         # One figure for the instrument over all its scenes, and the flags.
         assert len(found.sources) == 2
 
+    def test_what_no_product_needed_is_told_with_the_rest(self, many, tmp_path):
+        """What a plan of products cannot tell: whole kinds and channels, and whole scenes."""
+        idle = LeftOut("homogeneous", "analog_532o", "it climbs by 3750 m", rule="section_level")
+        more = replace(
+            many,
+            scenes=tuple(replace(scene, left_out=(idle,)) for scene in many.scenes),
+            barren={f"idle_{k}": "nothing to do: it climbs" for k in range(7)},
+            more_barren=1200,
+            unmet=(
+                Unmet("vertical", "photon_533o", "facts", "the files hold no such", 150, 150),
+                Unmet("vertical", "photon_607o", "signal", "the files hold no such", 20, 150),
+            ),
+        )
+        found = built(more, tmp_path / "report")
+        told = "it climbs by 3750 m section_level analog_532o horizontal, vertical 300"
+        assert told in found.text
+        assert "7 scenes" in found.text
+        assert all(f"idle_{k}" in found.text for k in range(7))
+        assert "1,200 more can give none" in found.text
+        assert "photon_533o facts the files hold no such all 150 files" in found.text
+        assert "photon_607o signal the files hold no such 20 of 150 files" in found.text
+        verdict = content.verdict(more)
+        assert "1,207 scenes can give no product" in verdict
+        assert "1 channel named that no file holds: photon_533o" in verdict
+        # What each product came from is told as before.
+        hashes = [[scene.plan.hash for scene in run.scenes] for run in (many, more)]
+        assert hashes[0] == hashes[1]
+
+    def test_a_gate_of_no_effect_is_told_as_such(self, tmp_path):
+        gate = Step("range_gate", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins")
+        signal = Step("signal", CHANNEL, {}, "asked for")
+        scenes = [
+            outcome(name, plan=Plan(name, steps, ()))
+            for name, steps in (("alone", (gate,)), ("both", (gate, signal)))
+        ]
+        told = {row.reason: row.scenes for row in content.done(run_record(tmp_path, scenes))}
+        assert told == {
+            "asked for": 1,
+            "sections need no farther bins": 1,
+            "sections need no farther bins; of no effect: signal needs all bins": 1,
+        }
+
     def test_long_tables_are_cut_and_say_so(self, many, tmp_path, monkeypatch):
         monkeypatch.setattr(page, "ROWS", 40)
         found = built(many, tmp_path / "report")
@@ -414,6 +456,7 @@ def nasty_run(nasty: str, archive):
     return run_record(
         archive.root, [scene, failed], id=nasty, campaign=nasty, title=nasty, version=nasty,
         archive=nasty, truth=nasty, refused=(fab.granule(nasty, nasty, instrument=nasty),),
+        barren={nasty: nasty}, unmet=(Unmet(nasty, nasty, nasty, nasty, 3, 4),),
     )  # fmt: skip
 
 

@@ -28,6 +28,7 @@ from lidarops.records import (
     SceneOutcome,
     Status,
     Step,
+    Unmet,
 )
 from lidarops.reports.record import FILE_NAME, load, save
 
@@ -77,11 +78,12 @@ granules = st.builds(
     layout=some(layouts),
     sha256=st.none() | text,
 )
+left_out = st.builds(LeftOut, text, text, text, rule=text, number=st.none() | number)
 plans = st.builds(
     Plan,
     text,
     some(st.builds(Step, text, text, mapping, text)),
-    some(st.builds(LeftOut, text, text, text)),
+    some(left_out),
 )
 products = st.builds(
     ProductRecord,
@@ -107,6 +109,7 @@ outcomes = st.builds(
     inputs=some(st.builds(InputRecord, text, st.sampled_from(Role), text)),
     error=text,
     seconds=st.dictionaries(text, st.floats(allow_nan=False, allow_infinity=False), max_size=3),
+    left_out=some(left_out),
 )
 records = st.builds(
     RunRecord,
@@ -121,6 +124,9 @@ records = st.builds(
     scenes=some(outcomes),
     refused=some(granules),
     truth=text,
+    unmet=some(st.builds(Unmet, text, text, text, text, whole, whole)),
+    barren=st.dictionaries(text, text, max_size=2),
+    more_barren=whole,
 )
 
 
