@@ -40,6 +40,10 @@ _BY_NOISE: Final = 4.0
 """Variances by noise that are taken from a square: beyond, noise alone leaves 0.08 of one."""
 _BY_OWN_NOISE: Final = 9.0
 """The same of a single profile, which has more noise than its value: 0.005 of one."""
+_CHANCE: Final = 3.0
+"""Standard deviations by which a mean square of noise is larger by chance, at most."""
+_LOUDER: Final = 10.0
+"""Times the median variance, from which on a profile does not count."""
 _OF_MEDIAN: Final = np.pi / 2.0
 """Variance of a median over that of a mean."""
 _LEAST_PART: Final = 1e-3
@@ -260,14 +264,25 @@ def carry_errors(
 def variance(moved: Array) -> Array:
     """Return the squares of what solutions are moved by, less what noise makes of them.
 
-    The larger one of what a block shares and of what a profile shows by itself: a layer may rise
-    or sink, but a profile tells less.
+    The largest of what a block shares, of the mean square of its profiles, as a layer may rise or
+    sink, and of what a profile shows by itself, where noise hides more.
 
     Parameters
     ----------
-    moved : (..., 4) float64
-        Of `carry_errors`.
+    moved : (profile, vertex, 4) float64
+        Of `carry_errors`, of the profiles of one block.
+
+    Returns
+    -------
+    (profile, vertex) float64
     """
-    shared = moved[..., 0] ** 2 - _BY_NOISE * moved[..., 1]
-    own = moved[..., 2] ** 2 - _BY_OWN_NOISE * moved[..., 3]
-    return np.asarray(np.maximum(np.maximum(shared, own), 0.0))
+    # What overflows has a variance by noise that leaves nothing else to say.
+    with np.errstate(over="ignore", invalid="ignore"):
+        shared = moved[..., 0] ** 2 - _BY_NOISE * moved[..., 1]
+        own, noise = moved[..., 2] ** 2, moved[..., 3]
+        # A loud profile would hide what all others show, or pass for it.
+        quiet = (noise > 0.0) & (noise <= _LOUDER * np.median(noise, axis=0))
+        number = np.maximum(quiet.sum(axis=0), 1)
+        excess = np.where(quiet, own - (1.0 + _CHANCE * np.sqrt(2.0 / number)) * noise, 0.0)
+        largest = np.fmax(shared, own - _BY_OWN_NOISE * noise)
+        return np.asarray(np.fmax(np.fmax(largest, excess.sum(axis=0) / number), 0.0))

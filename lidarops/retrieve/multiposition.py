@@ -331,19 +331,19 @@ def _by_bends(rays: _rays.Rays, fit: _prior.Solution, vertex: Indices, position:
 
     What the profiles of a block share tells the bends; see `lidarops.retrieve._departures`.
     """
-    moved = np.zeros((*fit.logarithm.shape, 4))
+    out = np.zeros_like(fit.logarithm)
     geometry = (rays.layout.first_crossing, rays.layout.offset, vertex)
     for b in np.unique(rays.block):
         mine = np.flatnonzero(rays.block == b)
         precision, flat = _precision(position, float(fit.deviation[mine[0]]))
-        data, part = rays.data.take(mine), moved[mine]
+        data, moved = rays.data.take(mine), np.zeros((mine.size, position.shape[0], 4))
         _departures.carry_errors(
             data.log_value, data.integral, data.usable, data.covariance, geometry, precision, flat,
             fit.logarithm[mine], _departures.usual(data.departure, data.usable), data.departure,
-            part,
+            moved,
         )  # fmt: skip
-        moved[mine] = part
-    return _departures.variance(moved)
+        out[mine] = _departures.variance(moved)
+    return out
 
 
 def _precision(position: Array, deviation: float) -> tuple[Array, bool]:

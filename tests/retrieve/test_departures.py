@@ -191,10 +191,11 @@ def test_a_layer_that_a_line_cannot_follow_is_in_the_error(
     assert np.median(stated) < 1.5 * np.median(relative_errors) + 3.0 * relative
 
 
-def test_a_layer_that_rises_within_a_block_is_in_the_error():
+@pytest.mark.parametrize(("deep", "rise"), [(20.0, 40.0), (20.0, 100.0), (10.0, 100.0)])
+def test_a_layer_that_rises_within_a_block_is_in_the_error(deep, rise):
     net, r = three_by_two(), grid(three_by_two())
-    heights = np.linspace(400.0, 440.0, 50)
-    fields = [layer(20.0, height) for height in heights]
+    heights = 420.0 + rise * np.linspace(-0.5, 0.5, 50)
+    fields = [layer(deep, height) for height in heights]
     power = np.stack([signals(net, r, field) for field in fields])
     truth = np.stack([at_vertices(net, field) for field in fields])
     deviation = 0.003 * power
@@ -202,8 +203,34 @@ def test_a_layer_that_rises_within_a_block_is_in_the_error():
     found = multiposition.solve(power, r, net, variance=deviation**2, full_overlap_range=100.0)
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
     errors = (np.abs(found.extinction - truth) / found.extinction_standard_error)[kept]
-    assert kept.sum() > 50
+    assert kept.sum() > 30
     assert np.mean(errors > 4.0) < 0.02
+
+
+@pytest.mark.parametrize("profiles", [1, 2, 50])
+def test_noise_is_not_counted_as_a_bend_and_bends_are(profiles):
+    rng = np.random.default_rng(9)
+    noise = np.array([1e-4, 4e-4])
+    moved = np.zeros((profiles, 2000, 2, 4))
+    moved[..., 1], moved[..., 3] = noise / profiles, noise
+    moved[..., 0] = np.sqrt(noise / profiles) * rng.standard_normal((2000, 2))
+    moved[..., 2] = np.sqrt(noise) * rng.standard_normal(moved.shape[:-1])
+    quiet = moved.copy()
+    moved[:, 1:] += [1.0, 0.0, 1.0, 0.0]
+    found = np.stack([_departures.variance(moved[:, k]) for k in range(2000)], axis=1)
+    np.testing.assert_allclose(np.mean(found[:, 1:]), 1.0, rtol=0.05)
+    found = np.stack([_departures.variance(quiet[:, k]) for k in range(2000)], axis=1)
+    assert np.all(np.mean(found, axis=(0, 1)) < (0.15 if profiles < 3 else 0.02) * noise)
+
+
+def test_a_loud_profile_neither_hides_what_others_show_nor_passes_for_it():
+    moved = np.zeros((20, 1, 4))
+    moved[:, 0, 3], moved[::2, 0, 2] = 1e-4, 0.1
+    loud = moved.copy()
+    loud[1, 0] = [0.0, 0.0, 3.0, 100.0]
+    np.testing.assert_allclose(_departures.variance(loud)[2:], _departures.variance(moved)[2:], 0.1)
+    loud[:, 0, 2] = [0.0, 100.0] + 18 * [0.0]
+    assert not np.any(_departures.variance(loud)[2:])
 
 
 @pytest.mark.parametrize("field", [gradient, plume])
