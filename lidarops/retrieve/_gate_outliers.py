@@ -189,6 +189,14 @@ def plan(grid: Array, limits: Indices, nodes: Indices, shares: Array, air: Array
                 shares[ray, g, i] = 0.0
 
 
+def planned(grid: Array, limits: Indices) -> tuple[Indices, Array, Array]:
+    """Return what `plan` fills."""
+    shape = (*grid.shape, NODES)
+    out = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.full(grid.shape, np.nan)
+    plan(grid, limits, *out)
+    return out
+
+
 @_compiled
 def make_plain(
     logs: Array,

@@ -33,7 +33,7 @@ COLUMNS: Final = 5
 """Of a summary: chi-square and degrees of freedom of the rays alone, and of rays and prior; -2 ln
 of the marginal likelihood, but a constant."""
 
-_LONGEST_STEP: Final = 1.5
+LONGEST_STEP: Final = 1.5
 _THINNEST: Final = 1e-3
 """Optical depth of the thinnest ray that a start is made from."""
 _SETTLED: Final = 1e-3
@@ -238,7 +238,7 @@ def _enter(
 
 
 @_compiled
-def _add_prior(matrix: Array, side: Array, level: float, precision: Array, flat: bool) -> None:
+def add_prior(matrix: Array, side: Array, level: float, precision: Array, flat: bool) -> None:
     """Add the prior to the normal equations.
 
     In place of none, a tenfold of e about the level of the profile is put, so that what is
@@ -254,7 +254,7 @@ def _add_prior(matrix: Array, side: Array, level: float, precision: Array, flat:
 
 
 @_compiled
-def _invert_system(factor: Array, size: int, out: Array) -> None:
+def invert_system(factor: Array, size: int, out: Array) -> None:
     for v in range(size):
         for i in range(size):
             out[v, i] = 0.0
@@ -263,7 +263,7 @@ def _invert_system(factor: Array, size: int, out: Array) -> None:
 
 
 @_compiled
-def _look(usable: Codes, first_crossing: Indices, counts: Indices) -> None:
+def look(usable: Codes, first_crossing: Indices, counts: Indices) -> None:
     """Fill the crossings of each ray; 0 where there is one only."""
     for ray in range(counts.size):
         count = _count(usable, first_crossing[ray], first_crossing[ray + 1])
@@ -290,7 +290,7 @@ def _tally(
 
 
 @_compiled
-def _assemble(
+def assemble(
     data: tuple[Array, Array, Array],
     geometry: tuple[Indices, Indices, Indices],
     counts: Indices,
@@ -357,14 +357,14 @@ def _move(
         for c in range(counts[ray]):
             gap = columns[ray, c, 0] - solution[vertex[first_crossing[ray] + c]]
             step += columns[ray, c, 2] * gap
-        step = min(max(step / information[ray], -_LONGEST_STEP), _LONGEST_STEP)
+        step = min(max(step / information[ray], -LONGEST_STEP), LONGEST_STEP)
         constants[ray] += step
         moved = max(moved, abs(step) * columns[ray, 0, 1])
     return moved
 
 
 @_compiled
-def _workspace(first_crossing: Indices, rays: int) -> tuple[Array, Array, Array, Array, Array]:
+def workspace(first_crossing: Indices, rays: int) -> tuple[Array, Array, Array, Array, Array]:
     most = 1
     for ray in range(rays):
         most = max(most, first_crossing[ray + 1] - first_crossing[ray])
@@ -425,24 +425,24 @@ def solve_profiles(
         or not finite.
     """
     rays, vertices = constants.shape[1], logarithms.shape[1]
-    work = _workspace(geometry[0], rays)
+    work = workspace(geometry[0], rays)
     inverse = np.empty((vertices, vertices))
     matrix, side, target = np.empty((vertices, vertices)), np.empty(vertices), np.empty(vertices)
     counts, seen = np.zeros(rays, dtype=np.intp), np.zeros(vertices, dtype=np.uint8)
     for n in range(values.shape[0]):
-        _look(usable[n], geometry[0], counts)
+        look(usable[n], geometry[0], counts)
         used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
         fine, moved, square, determinants = used > 0, math.inf, 0.0, 0.0
         data = (values[n], integrals[n], covariance[n])
         for _ in range(passes):
-            square, determinants, level = _assemble(
+            square, determinants, level = assemble(
                 data, geometry, counts, constants[n], work, matrix, side
             )
             for v in range(vertices):
                 target[v] = side[v]
                 for w in range(vertices):
                     inverse[v, w] = matrix[v, w]
-            _add_prior(matrix, side, level, precision, flat)
+            add_prior(matrix, side, level, precision, flat)
             used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
             fine = used > 0 and math.isfinite(square + determinants)
             fine = fine and factorise(matrix, vertices)
@@ -526,7 +526,7 @@ def _hand_over(
     """
     inverse, pull = work
     if fine:
-        _invert_system(factor, solution.size, inverse)
+        invert_system(factor, solution.size, inverse)
     for v in range(solution.size):
         good = fine and seen[v] == 1 and inverse[v, v] < _LARGEST_VARIANCE
         logarithms[v] = solution[v] if good else math.nan

@@ -10,14 +10,14 @@ result for a profile does not depend on the others.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve import _gate_outliers, _gate_runs
+from lidarops.retrieve import _departures, _gate_outliers, _gate_runs
 from lidarops.retrieve.geometry import Crossings, Network
 
 Array = npt.NDArray[np.float64]
@@ -92,13 +92,15 @@ class Condensed:
     """(profile, ray) MISSING, NOT_POSITIVE or OUTLYING."""
     bridged: Codes
     """(profile, ray) 1 where a gate lay off its neighbours, which took its place."""
+    departure: Array = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    """(profile, crossing, 2) of `_departures.measure`; empty where profiles were pooled."""
 
     def take(self, profiles: Indices) -> Condensed:
         """Return some of the profiles."""
         return Condensed(
             self.log_value[profiles], self.integral[profiles], self.usable[profiles],
             self.covariance[profiles], self.slope[profiles], self.status[profiles],
-            self.bridged[profiles],
+            self.bridged[profiles], self.departure[profiles],
         )  # fmt: skip
 
 
@@ -142,15 +144,8 @@ def lay_out(
     return Layout(
         kept, net.vertices, measured, near, first, window, weights, cell, fraction,
         np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds,
-        _neighbours(range_, bounds), offset,
+        _gate_outliers.planned(range_, bounds), offset,
     )  # fmt: skip
-
-
-def _neighbours(range_: Array, limits: Indices) -> tuple[Indices, Array, Array]:
-    shape = (*range_.shape, _gate_outliers.NODES)
-    out = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.full(range_.shape, np.nan)
-    _gate_outliers.plan(range_, limits, *out)
-    return out
 
 
 def _bounds(usable: Booleans) -> tuple[int, int]:
@@ -222,12 +217,14 @@ def condense(
         np.full((profiles, total, 4), np.nan),
         np.zeros((profiles, power.shape[1]), dtype=np.uint8),
         np.zeros((profiles, power.shape[1]), dtype=np.uint8),
+        np.zeros((profiles, total, 2)),
     )
     _condense(
         power, variance, variance_row, relative, exponent, layout.log_factor, layout.range,
         layout.first_crossing, layout.window, layout.weights, layout.cell, layout.fraction,
-        layout.offset, screened, layout.limits, layout.neighbours, out.log_value, out.integral,
-        out.usable, out.covariance, out.slope, out.status, out.bridged,
+        layout.offset, screened, layout.limits, layout.neighbours, _departures.weights(layout),
+        out.log_value, out.integral, out.usable, out.covariance, out.slope, out.status, out.bridged,
+        out.departure,
     )  # fmt: skip
     return out
 
@@ -512,6 +509,7 @@ def _condense(
     screened: bool,
     limits: Indices,
     neighbours: tuple[Indices, Array, Array],
+    departing: Array,
     values: Array,
     integrals: Array,
     usable: Codes,
@@ -519,6 +517,7 @@ def _condense(
     slopes: Array,
     status: Codes,
     bridged: Codes,
+    departures: Array,
 ) -> None:
     bins, most = power.shape[2], 1
     for ray in range(exponent.size):
@@ -569,6 +568,8 @@ def _condense(
                 logs, noise, m, stop, (first, last), window, weights, values[n], usable[n],
                 gradients, bounds,
             )  # fmt: skip
+            plain = other if found == _gate_outliers.LEFT else (logs, noise, codes)
+            _departures.measure(plain, m, (first, first + good), window, departing, departures[n])
             _join_points(
                 logs, noise, m, range_[ray], codes, (first, count, good), cell, fraction,
                 values[n, first], integrals[n], slopes[n], gradients, bounds,

@@ -35,6 +35,8 @@ _FARTHEST: Final = 2 * _HALF
 _WIDENED: Final = 1.25
 """Variance of a bridged bin over the sum of those of the two that it comes from: sums of the three
 then have the variance that they have, which is 9/4 of that sum."""
+_ROUNDING: Final = 1e-12
+"""Of a signal: what lies off by less may lie off by rounding alone, where no noise is stated."""
 _HUGE: Final = 1e300
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -233,6 +235,7 @@ def _find(power: Any, variance: Array, range_: Array, work: Array, found: Mask) 
             if _is_usable(value, own):
                 square = range_[i] * range_[i]
                 q[there], noise[there] = value * square, own * square * square
+                noise[there] = max(noise[there], (_ROUNDING * q[there]) ** 2)
                 place[there], index[there], given[there] = range_[i], i, value
                 there += 1
         for j in range(_HALF, there - _HALF):

@@ -18,6 +18,9 @@ no test tells it there: what the prior allows, and what the rest of the block te
 plumes that drift within a block (`lidarops bench stability`). What is left stands in single
 vertices in dense plumes. More profiles in a block and more rays tell more.
 
+A layer so thin that signals bend within the gates of a fit puts an error into the values there, of
+which the block tells too (`lidarops.retrieve._departures`).
+
 Scale heights are 300 m and more there. In steeper fields the far vertices may fade, and leave
 fewer equations than unknowns: errors are then stated with a prior that holds ln extinction over
 the vertices to 0.6, and values are flagged where the rays exclude the usual one. A field that is
@@ -35,13 +38,15 @@ import numpy.typing as npt
 from scipy import special
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve import _block_errors, _closed, _inputs, _network, _prior, _rays
+from lidarops.retrieve import _block_errors, _closed, _departures, _inputs, _network, _prior, _rays
 from lidarops.retrieve import geometry as rays_geometry
 from lidarops.retrieve import visibility as sight
 from lidarops.retrieve._point_weights import MISSING, NOT_POSITIVE, OUTLYING
+from lidarops.retrieve._prior import _STRENGTHS, DEVIATIONS, _free_level, _gradient
 from lidarops.retrieve.geometry import Cycle, Network
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
 DEFAULT_GATES: Final = 7
@@ -139,9 +144,10 @@ class MultiPositionResult:
     extinction: Array
     """(..., vertex) m-1; NaN at vertices that are near ones on no ray, and where there is none."""
     extinction_standard_error: Array
-    """m-1, by noise and by what a field may deviate from the prior: twice the prior's standard
-    deviation is counted, eight times as much where rays are too few to test the prior, and a bend
-    over the network where the mean of the block's rays allows it.
+    """m-1, by noise, by what a line through a few gates has wrong where the signal bends, and by
+    what a field may deviate from the prior: twice the prior's standard deviation is counted, eight
+    times as much where rays are too few to test the prior, and a bend over the network where the
+    mean of the block's rays allows it.
     Of a block in thin air, no less than is typical of it, and what noise moves all by."""
     visibility: sight.VisibilityResult
     """(..., vertex) m, at the wavelength of the lidars."""
@@ -307,6 +313,9 @@ def _solve_network(
     if prior is Prior.BLOCK:
         seen = rays.data.usable == 1
         variance = _block_errors.at_least_typical(extinction, variance, rays.block, seen)
+    with np.errstate(over="ignore", under="ignore"):
+        bent = _by_bends(rays, fit, vertex, position)
+        variance[:, layout.measured] += extinction[:, layout.measured] ** 2 * bent
     none = np.zeros(shape, dtype=np.bool_)
     # Doubt in the prior, which is stated, is no noise that makes a value lie anywhere.
     shaky = _closed.shaky(extinction, believed, rays.block) | fit.doubtful[:, np.newaxis]
@@ -315,6 +324,39 @@ def _solve_network(
         np.full(shape[0], np.nan),
     )  # fmt: skip
     return estimate, fit
+
+
+def _by_bends(rays: _rays.Rays, fit: _prior.Solution, vertex: Indices, position: Array) -> Array:
+    """Return (profile, vertex) variances of ln extinction by what bends of signals put into values.
+
+    What the profiles of a block share tells the bends; see `lidarops.retrieve._departures`.
+    """
+    out = np.zeros_like(fit.logarithm)
+    geometry = (rays.layout.first_crossing, rays.layout.offset, vertex)
+    for b in np.unique(rays.block):
+        mine = np.flatnonzero(rays.block == b)
+        precision, flat = _precision(position, float(fit.deviation[mine[0]]))
+        data, moved = rays.data.take(mine), np.zeros((mine.size, position.shape[0], 4))
+        _departures.carry_errors(
+            data.log_value, data.integral, data.usable, data.covariance, geometry, precision, flat,
+            fit.logarithm[mine], _departures.usual(data.departure, data.usable), data.departure,
+            moved,
+        )  # fmt: skip
+        out[mine] = _departures.variance(moved)
+    return out
+
+
+def _precision(position: Array, deviation: float) -> tuple[Array, bool]:
+    """Return the precision of a prior of a deviation, and whether there was none."""
+    flat = not np.isfinite(deviation)
+    if flat:
+        return np.zeros((position.shape[0], position.shape[0])), flat
+    # The product of strength and deviation tells both: no two of those tried have it in common.
+    strength = min(
+        _STRENGTHS,
+        key=lambda s: float(np.min(np.abs(np.log(deviation / s / np.array(DEVIATIONS))))),
+    )
+    return _free_level(_gradient(position), deviation / strength, strength)[0], flat
 
 
 def _solve_closed(

@@ -130,6 +130,15 @@ def test_noise_larger_than_stated_is_no_lone_bin():
     assert bridge(power, RANGE, variance / 100.0).found.mean() < 1e-3
 
 
+@pytest.mark.parametrize("step", [3.75, 15.0])
+def test_rounding_makes_no_lone_bins_where_no_noise_is_stated(step):
+    """Times the square of its range, a signal of 1 / R^2 is the same in all bins but for that."""
+    place = step * np.arange(1, 1001)
+    power = 1e12 / place**2
+    power[500] *= 3.0
+    assert np.flatnonzero(bridge(power, place, 0.0).found).tolist() == [500]
+
+
 def test_profiles_without_data_stay_so():
     power, variance = noisy(AIR, 50.0, 3)
     power[0], power[1, 4:] = np.nan, np.inf
