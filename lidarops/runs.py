@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lidarops.campaign import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
+from lidarops.catalog.store import Store
 from lidarops.leftovers import Orphan
 from lidarops.records import RunRecord, SceneOutcome
+from lidarops.reports import page, record
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -71,8 +75,13 @@ class Result:
         return tuple(dict.fromkeys((*self.empty, *(each.scene for each in scenes if each.empty))))
 
     @property
+    def lost(self) -> Mapping[str, str]:
+        """Products that are asked for, and of whose scene no raw file is left -> why."""
+        return {each.path: each.reason for each in self.orphans if each.lost}
+
+    @property
     def troubled(self) -> bool:
-        """Whether anything was refused or failed, in this run or before and still so."""
+        """Whether anything was refused, failed or lost, in this run or before and still so."""
         return bool(
             self.summary.refused
             or self.failures
@@ -80,6 +89,20 @@ class Result:
             or self.barren
             or self.set_aside
             or self.untold
+            or self.lost
             or self.status is not RunStatus.FINISHED
             or (self.record is not None and self.record.failed)
         )
+
+
+def unreported(campaign: Campaign) -> Path | None:
+    """Return the report folder of the last run, where its record is there and its page is not.
+
+    So it is where the disk was full, or where the run was stopped while it drew.
+    """
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        for last in store.runs(limit=1):
+            folder = campaign.report_root / last.id
+            if (folder / record.FILE_NAME).exists() and not (folder / page.INDEX).exists():
+                return folder
+    return None

@@ -277,7 +277,21 @@ class Judge:
             for each in everything
         ]
         chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
-        orphans = leftovers.orphans(planned, made.values(), self._campaign, self._other_files)
+        here = {
+            name
+            for each in found.scenes
+            for granule in each.granules
+            for name in (granule.path, granule.sha256)
+        }
+        orphans = leftovers.orphans(
+            planned,
+            made.values(),
+            self._campaign,
+            self._other_files,
+            lambda product: any(
+                used.path in here or used.sha256 in here for used in self._signals(product)
+            ),
+        )
         orphaned = {known.day for known, _ in orphans}
         digests, self._digests = self._digests, {}
         counts = _counts(everything, found.set_aside)
@@ -487,10 +501,13 @@ class Judge:
         return known or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
 
     def _other_files(self, made: Made, scene: Scene) -> bool:
-        before = self._store.inputs_of(made.path)
-        return {used.sha256 for used in before if used.role is Role.SIGNAL} != {
+        return {used.sha256 for used in self._signals(made)} != {
             self._content(granule) for granule in scene.granules
         }
+
+    def _signals(self, made: Made) -> list[InputRecord]:
+        """Return the signal files that a product was made from."""
+        return [used for used in self._store.inputs_of(made.path) if used.role is Role.SIGNAL]
 
     def _profile(self, name: str) -> str:
         if name not in self._profiles:

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 from pydantic import ValidationError
+from typer.testing import CliRunner
 
 from lidarops.campaign import Campaign, ElasticSettings, load
+from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
 
 MINIMAL = """\
@@ -63,6 +65,14 @@ def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, expected: str) -
     with pytest.raises(CampaignError, match=expected) as caught:
         load(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_url_of_the_command_line_is_no_folder(tmp_path: Path) -> None:
+    path = _write(tmp_path, MINIMAL)
+    for command in (["runs", str(path)], ["publish", str(path), "memory://there"]):
+        told = CliRunner().invoke(app, [*command, "--out", "s3://bucket/out"])
+        assert told.exit_code == 2
+        assert "output: is a URL" in told.stderr
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.clusters import Local
-from lidarops.errors import LidarOpsError, ProductError, SceneError
+from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.pipeline import Result, Selection, bring_up_to_date, update_catalog
 
 
@@ -271,6 +271,26 @@ def test_a_troubled_night_ends_in_a_state_of_its_own_and_says_what_is_wrong(
     mended["instruments"]["lidar"]["facts"][0].pop("overlap_profile")
     campaign_file.write_text(yaml.safe_dump(mended))
     assert reprocess(str(campaign_file), return_state=True).name == "Completed"
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_a_night_without_the_raw_files_of_products_says_which_and_what_to_do(
+    campaign_file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reprocess(str(campaign_file))
+    raw = campaign_file.parent / "raw" / "coast"
+    for k in range(3):
+        (raw / f"h{k}").unlink()
+    (raw / "h9").write_bytes(rawfiles.content(2000, bins=1000))
+    caplog.clear()
+    state = reprocess(str(campaign_file), return_state=True)
+    assert state.name == WITH_FAILURES
+    assert state.message.startswith("1 products without a raw file")
+    assert "--remove-orphans" in state.message
+    assert "20260301T000000" in caplog.text
+    (raw / "h9").unlink()
+    with pytest.raises(CatalogError, match="nothing is forgotten"):
+        reprocess(str(campaign_file))
 
 
 @pytest.mark.usefixtures("prefect_server")
