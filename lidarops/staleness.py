@@ -28,7 +28,7 @@ from lidarops.leftovers import Orphan
 from lidarops.plans import plan
 from lidarops.products.provenance import code_version
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
-from lidarops.scenes import DARK_REACH, Cut, cut, instrument_and_start, select
+from lidarops.scenes import DARK_REACH, Cut, cut, instrument_and_start, select, stop_of
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
@@ -73,7 +73,7 @@ class Selection:
             (not self.kinds or made.kind in self.kinds)
             and (not self.instruments or instrument in self.instruments)
             and (not self.stations or (owner.station if owner else instrument) in self.stations)
-            and (self.since is None or start >= self.since)
+            and (self.since is None or stop_of(made.scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
 

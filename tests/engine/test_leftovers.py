@@ -145,6 +145,31 @@ def test_what_is_not_asked_for_is_not_orphaned(archive: Archive) -> None:
         assert len(bring_up_to_date(campaign, selection=selection).orphans) == number
 
 
+def _leave_over(archive: Archive) -> None:
+    """Leave products over, of scenes that are there and of those that are gone."""
+    del archive.told["instruments"]["rich"]["products"]["homogeneous"]
+    _without(archive, "poor")
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "number"),
+    [
+        (FIRST.replace(hour=12), None, 8 + 4),
+        (FIRST.replace(hour=12), FIRST.replace(hour=13), 2 + 1),
+        (FIRST.replace(day=2), FIRST.replace(day=2, hour=1), 2 + 1),
+        (FIRST.replace(day=4, hour=23), None, 2 + 1),
+        (FIRST.replace(day=5), None, 0),
+    ],
+)
+def test_what_is_left_over_is_told_of_the_scenes_that_are_asked_for(
+    archive: Archive, since: datetime, until: datetime | None, number: int
+) -> None:
+    _leave_over(archive)
+    campaign = archive.write()
+    found = bring_up_to_date(campaign, selection=Selection(since=since, until=until))
+    assert len(found.orphans) == number
+
+
 def test_a_product_that_another_run_made_again_is_not_removed(archive: Archive) -> None:
     kept = {path: path.read_bytes() for path in (archive.folder / "raw/poor").glob("h1*")}
     for path in kept:
