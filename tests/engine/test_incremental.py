@@ -251,9 +251,17 @@ def test_the_plan_of_a_selection_is_of_its_products(archive: Archive) -> None:
     some = told["estimated_cpu_seconds"]["everything"]
     assert 0 < some["scenes"] < whole["scenes"]
     assert some["start"] < whole["start"], "elastic code is not loaded"
-    nothing = _planned(archive, "--product", "visibility")
+    nothing = _planned(archive, "--product", "homogeneous", "--instrument", "poor")
     assert {scene["fresh"] for scene in nothing["scenes"]} == {0}
     assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
+
+
+def test_a_kind_that_nothing_is_asked_for_is_wrong_use(archive: Archive) -> None:
+    archive.write()
+    for command in ("plan", "reprocess"):
+        refused = CliRunner().invoke(app, [command, str(archive.file), "--product", "visibility"])
+        assert refused.exit_code == 2
+        assert "asked for: signal, homogeneous, elastic" in refused.stderr
 
 
 def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(
