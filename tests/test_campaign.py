@@ -118,6 +118,9 @@ def test_a_url_of_the_command_line_is_no_folder(tmp_path: Path) -> None:
         told = CliRunner().invoke(app, [*command, "--out", "s3://bucket/out"])
         assert told.exit_code == 2
         assert "output: is a URL" in told.stderr
+    told = CliRunner().invoke(app, ["bench", "luck", "--out", "s3://bucket/out"])
+    assert told.exit_code == 2
+    assert "is a URL" in " ".join(told.stderr.split())
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:

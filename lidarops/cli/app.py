@@ -104,6 +104,13 @@ def _main(
         raise typer.Exit
 
 
+def no_url(folder: str | None) -> str | None:
+    """Refuse a URL where a folder is asked for: as a path it would be a folder of that name."""
+    if folder is not None and "://" in folder:
+        raise typer.BadParameter(f"{folder!r} is a URL; give a folder")
+    return folder
+
+
 def utc(moment: datetime | None) -> datetime | None:
     """Read a time without a zone as UTC."""
     return None if moment is None else moment.replace(tzinfo=moment.tzinfo or UTC)
