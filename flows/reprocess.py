@@ -246,8 +246,8 @@ def reprocess(
         none = asked.none(settings, selection)
         what = "no scene of the archive is asked for" if none else "nothing to do"
         get_run_logger().info("campaign %s: %s", settings.name, what)
-        if folder := unreported(settings):
-            get_run_logger().warning("its last run has no page: lidarops report %s", folder)
+        if said := unreported(settings):
+            get_run_logger().warning("campaign %s: %s", settings.name, said)
     else:
         local = chosen.workers if isinstance(chosen, clusters.Local) else 1
         built = report_task(_opaque(settings), _opaque(result.record), local)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lidarops.campaign import Campaign
@@ -95,14 +94,17 @@ class Result:
         )
 
 
-def unreported(campaign: Campaign) -> Path | None:
-    """Return the report folder of the last run, where its record is there and its page is not.
+def unreported(campaign: Campaign) -> str:
+    """Say how to get the page of the last run, where its report was begun and is not there.
 
     So it is where the disk was full, or where the run was stopped while it drew.
     """
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
         for last in store.runs(limit=1):
             folder = campaign.report_root / last.id
-            if (folder / record.FILE_NAME).exists() and not (folder / page.INDEX).exists():
-                return folder
-    return None
+            if folder.is_dir() and not (folder / page.INDEX).exists():
+                told = "the page of the last run is missing"
+                if (folder / record.FILE_NAME).exists():
+                    return f"{told}: lidarops report {folder}"
+                return f"{told}, and its record: lidarops reprocess --force makes others"
+    return ""

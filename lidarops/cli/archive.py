@@ -264,9 +264,9 @@ def reprocess(
         _tell_none(settings, result)
     elif not as_json:
         _tell(settings, result, removing=remove_orphans)
-    last = runs.unreported(settings) if result.record is None else None
-    if last is not None and not as_json:
-        typer.echo(f"the page of the last run is missing: lidarops report {last}")
+    unreported = runs.unreported(settings) if result.record is None else ""
+    if unreported and not as_json:
+        typer.echo(unreported)
     page, removed = None, None
     try:
         if result.record is not None:
@@ -278,8 +278,7 @@ def reprocess(
         if as_json:
             summary = _run_summary(settings, result, page)
             told = {"no_scene_asked_for": none, "removed": removed or 0}
-            unreported = {"unreported": None if last is None else str(last)}
-            typer.echo(json.dumps({**summary, **told, **unreported}, indent=2))
+            typer.echo(json.dumps({**summary, **told, "unreported": unreported}, indent=2))
         elif page is not None:
             typer.echo(f"report:   {page}")
     if removed is not None and not as_json:

@@ -75,7 +75,9 @@ def save(record: RunRecord, folder: Path) -> Path:
         write_atomically(target, text.encode("ascii"))
     except OSError as error:
         raise CatalogError(
-            f"cannot be written: {error}", file=target, remedy="choose a folder you can write to"
+            f"cannot be written: {error}",
+            file=target,
+            remedy="make space or choose a folder you can write to, then reprocess with --force",
         ) from error
     return target
 

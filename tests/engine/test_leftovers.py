@@ -22,7 +22,7 @@ from lidarops.cli import app
 from lidarops.errors import CatalogError
 from lidarops.pipeline import Options, Selection, bring_up_to_date, remove_orphans, reprocess
 from lidarops.records import ProductKind
-from lidarops.reports import gallery
+from lidarops.reports import gallery, record
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -303,12 +303,30 @@ def test_a_page_that_cannot_be_built_hides_nothing_and_is_asked_for_by_the_next_
         assert "report:" not in failed.stdout
     shown = CliRunner().invoke(app, command)
     if as_json:
-        assert json.loads(shown.stdout)["unreported"] == str(folder)
+        assert json.loads(shown.stdout)["unreported"].endswith(f": lidarops report {folder}")
     else:
         assert f"lidarops report {folder}" in shown.stdout
     assert CliRunner().invoke(app, ["report", str(folder)]).exit_code == 0
     shown = CliRunner().invoke(app, command)
     assert str(folder) not in shown.stdout
+
+
+def test_a_run_whose_record_could_not_be_kept_says_how_to_get_another(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    archive.write()
+    command = ["reprocess", str(archive.file)]
+    with monkeypatch.context() as patch:
+        patch.setattr(record, "write_atomically", _full)
+        failed = CliRunner().invoke(app, command)
+    assert failed.exit_code == 1
+    assert "poor_20260301T000000" in failed.stdout
+    assert "--force" in failed.stderr
+    assert "--force" in CliRunner().invoke(app, command).stdout
+    assert CliRunner().invoke(app, [*command, "--force"]).exit_code == 0
+    shown = CliRunner().invoke(app, command)
+    assert (shown.exit_code, "--force" in shown.stdout) == (0, False)
 
 
 def test_what_cannot_be_removed_does_not_hide_what_was_made(archive: Archive) -> None:
