@@ -261,7 +261,7 @@ def reprocess(
         result = pipeline.bring_up_to_date(settings, selection=wanted, options=options)
     none = result.record is None and asked.none(settings, wanted)
     if none and not as_json:
-        _tell_none(settings, result)
+        _tell_none(settings, result, removing=remove_orphans)
     elif not as_json:
         _tell(settings, result, removing=remove_orphans)
     unreported = runs.unreported(settings) if result.record is None else ""
@@ -477,10 +477,13 @@ def _unused_table(result: Result, told: Collection[str]) -> Table:
     return table
 
 
-def _tell_none(campaign: Campaign, result: Result) -> None:
+def _tell_none(campaign: Campaign, result: Result, *, removing: bool) -> None:
     refused = _refused(campaign, result)
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
+    if not removing:
+        show(_orphans_table(result, None))
+    show(_kept_table(result))
     show(_failures_table(result))
     typer.echo(_NONE)
 

@@ -230,9 +230,13 @@ def test_products_without_a_raw_file_are_a_trouble_until_they_are_removed(
         assert set(found.lost) == {each.path for each in found.orphans}
         assert len(found.lost) == 8
     command = ["reprocess", str(archive.file)]
-    shown = CliRunner().invoke(app, command)
-    assert shown.exit_code == 1
-    assert "--remove-orphans" in shown.stdout
+    # Also where the scenes that are asked for are all gone.
+    for options in ([], ["--instrument", "poor"]):
+        shown = CliRunner().invoke(app, [*command, *options])
+        assert shown.exit_code == 1
+        assert "--remove-orphans" in shown.stdout
+        assert "no raw file" in shown.stdout
+    assert CliRunner().invoke(app, [*command, "--instrument", "rich"]).exit_code == 0
     assert CliRunner().invoke(app, [*command, "--remove-orphans"]).exit_code == 0
     assert CliRunner().invoke(app, command).exit_code == 0
     assert not bring_up_to_date(campaign).orphans
