@@ -49,6 +49,7 @@ from lidarops.product_settings import Instant
 from lidarops.publication import publish as publish_products
 from lidarops.records import ProductKind, RunRecord, SceneOutcome
 from lidarops.reports import page
+from lidarops.runs import unreported
 
 _T = TypeVar("_T")
 
@@ -235,6 +236,8 @@ def reprocess(
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
     selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
+    # First, as copy and report may fail.
+    message = _tell_troubles(settings, result) if result.troubled else ""
     # Also where nothing was due: an earlier copy may have failed.
     if publish is not None:
         publish_task(_opaque(settings), publish)
@@ -243,6 +246,8 @@ def reprocess(
         none = asked.none(settings, selection)
         what = "no scene of the archive is asked for" if none else "nothing to do"
         get_run_logger().info("campaign %s: %s", settings.name, what)
+        if said := unreported(settings):
+            get_run_logger().warning("campaign %s: %s", settings.name, said)
     else:
         local = chosen.workers if isinstance(chosen, clusters.Local) else 1
         built = report_task(_opaque(settings), _opaque(result.record), local)
@@ -250,7 +255,6 @@ def reprocess(
         get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
     if not result.troubled:
         return result, built
-    message = _tell_troubles(settings, result)
     # Prefect takes a state that is returned for the flow's own, and gives callers its data.
     ended: State[Any] = Completed(name=WITH_FAILURES, message=message, data=(result, built))
     return cast("tuple[Result, Path | None]", ended)
@@ -290,6 +294,7 @@ def _tell_troubles(campaign: Campaign, result: Result) -> str:
             for each in result.unmet
             if each.nowhere
         },
+        "products without a raw file (reprocess --remove-orphans removes them)": result.lost,
     }
     logger = get_run_logger()
     for what, troubles in named.items():

@@ -8,7 +8,7 @@ from lidarops.catalog.database import refuse_wrong_url
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, CatalogError
-from lidarops.records import Unmet
+from lidarops.records import ProductKind, Unmet
 from lidarops.scenes import cut
 from lidarops.staleness import Selection
 
@@ -19,7 +19,8 @@ def refuse_unknown(campaign: Campaign, selection: Selection) -> None:
     Raises
     ------
     CampaignError
-        If the campaign knows no such station or instrument, or the interval is empty.
+        If the campaign knows no such station or instrument, or the interval is empty, or nothing
+        of it is asked for such a kind of product.
     """
     known = {
         "instrument": (selection.instruments, (*campaign.instruments, *campaign.networks)),
@@ -32,6 +33,13 @@ def refuse_unknown(campaign: Campaign, selection: Selection) -> None:
                     f"the campaign has no {word} {name!r}",
                     remedy=f"known: {', '.join(sorted(set(there)))}",
                 )
+    kinds = _kinds(campaign)
+    for kind in selection.kinds:
+        if kind not in kinds:
+            raise CampaignError(
+                f"no instrument or network of the campaign is asked for product {kind.value!r}",
+                remedy=f"asked for: {', '.join(kinds) or 'none'}",
+            )
     since, until = selection.since, selection.until
     if since is not None and until is not None and since >= until:
         raise CampaignError(
@@ -39,6 +47,17 @@ def refuse_unknown(campaign: Campaign, selection: Selection) -> None:
             field="since, until",
             remedy="since must be earlier than until",
         )
+
+
+def _kinds(campaign: Campaign) -> list[ProductKind]:
+    """Return the kinds of product that a campaign asks for."""
+    wanted = [each.products for each in campaign.instruments.values()]
+    return [
+        kind
+        for kind in ProductKind
+        if any(getattr(each, kind.value, None) is not None for each in wanted)
+        or (kind is ProductKind.VISIBILITY and campaign.networks)
+    ]
 
 
 def refuse_nowhere(campaign: Campaign, *, archive: str | None) -> None:

@@ -7,7 +7,7 @@ Facts about an instrument carry validity periods, because an archive of ten year
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +24,9 @@ from pydantic import (
 )
 
 from lidarops.errors import CampaignError
+from lidarops.mistakes import duplicates, explain
 from lidarops.product_settings import (
+    IDENTIFIER,
     ElasticSettings,
     HomogeneousSettings,
     Identifier,
@@ -63,6 +65,7 @@ __all__ = [
 
 ARCHIVE_VARIABLE = "LIDAROPS_ARCHIVE"
 CATALOG_VARIABLE = "LIDAROPS_CATALOG"
+_IDENTIFIERS = "letters, digits and hyphens that begin with a letter or a digit"
 
 
 class Station(Model):
@@ -329,6 +332,8 @@ def load(
             file=path,
             remedy="look for a date such as 2024-02-30; quote what is no date",
         ) from error
+    if twice := duplicates(tree):
+        raise CampaignError(_listed("is not a valid campaign:", twice), file=path)
     if not isinstance(raw, dict):
         raise CampaignError(
             "is not a mapping", file=path, remedy="see catalogs/demo.yaml for an example"
@@ -336,7 +341,8 @@ def load(
     try:
         campaign = Campaign.model_validate(raw)
     except ValidationError as error:
-        raise CampaignError(_explain(error, tree), file=path) from error
+        told = explain(error, tree, Campaign, {IDENTIFIER: _IDENTIFIERS})
+        raise CampaignError(_listed("is not a valid campaign:", told), file=path) from error
     base = path.resolve().parent
     if "://" in str(output or campaign.output):
         raise CampaignError(
@@ -361,39 +367,14 @@ def load(
     return loaded
 
 
+def _listed(problem: str, told: Sequence[str]) -> str:
+    return "\n  ".join([problem, *told])
+
+
 def _located(location: str, base: Path) -> str:
     if "://" in location:
         return location
     return str((base / Path(location).expanduser()).resolve())
-
-
-def _explain(error: ValidationError, tree: yaml.Node | None) -> str:
-    lines = []
-    for problem in error.errors():
-        keys = [str(key) for key in problem["loc"]]
-        line = _line_of(tree, keys)
-        place = ".".join(keys) or "top level"
-        lines.append(f"{f'line {line}: ' if line else ''}{place}: {problem['msg']}")
-    return "\n  ".join(["is not a valid campaign:", *lines])
-
-
-def _line_of(node: yaml.Node | None, keys: list[str]) -> int | None:
-    line = None
-    for key in keys:
-        node = next((value for name, value in _children(node) if name == key), None)
-        if node is None:
-            break
-        line = node.start_mark.line + 1
-    return line
-
-
-def _children(node: yaml.Node | None) -> Iterator[tuple[str, yaml.Node]]:
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            yield str(key.value), value
-    elif isinstance(node, yaml.SequenceNode):
-        for index, value in enumerate(node.value):
-            yield str(index), value
 
 
 def channel_facts(facts: InstrumentFacts, channel: str) -> ChannelFacts:

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from lidarops import kubernetes
 from lidarops.engine import TRIMMING, local_client
 from lidarops.errors import LidarOpsError
+from lidarops.mistakes import duplicates
 
 if TYPE_CHECKING:
     from distributed import Client, Security
@@ -170,7 +171,9 @@ def _described(cluster: str) -> dict[str, Any]:
     if cluster in _KINDS:
         return {"kind": cluster}
     try:
-        raw = yaml.safe_load(Path(cluster).read_text(encoding="utf-8"))
+        text = Path(cluster).read_text(encoding="utf-8")
+        twice = duplicates(yaml.compose(text, Loader=yaml.SafeLoader))
+        raw = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ClusterError(
             f"cannot be read: {error}",
@@ -178,6 +181,8 @@ def _described(cluster: str) -> dict[str, Any]:
             remedy="give slurm, kubernetes, or the path of a YAML file",
             wrong_use=True,
         ) from error
+    if twice:
+        raise ClusterError("; ".join(twice), file=cluster, wrong_use=True)
     if not isinstance(raw, dict):
         raise ClusterError(
             "is not a mapping",

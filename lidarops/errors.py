@@ -7,6 +7,10 @@ shown to a user as it is.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
+
+NO_FILE: Final = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
+"""What opening raises of a name that is not one of a file: another one was meant."""
 
 
 class LidarOpsError(Exception):

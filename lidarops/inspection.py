@@ -15,12 +15,11 @@ import xarray as xr
 from rich.table import Table
 from rich.text import Text
 
-from lidarops.errors import LidarOpsError, ProductError, RawFormatError
+from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
 from lidarops.flags import Quality
-from lidarops.products.provenance import read_provenance
+from lidarops.products.provenance import NETCDF_MAGIC, read_provenance
 from lidarops.raw import licel
 
-_NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
 _LONG: Final = {"comment", "history", "references"}
 """Attributes that no table has room for; JSON has them."""
 _CHANNEL: Final = ("name", "wavelength", "bins", "bin_width", "shots", "adc_bits", "device")
@@ -49,8 +48,10 @@ def describe(file: Path) -> dict[str, Any]:
         with file.open("rb") as stream:
             magic = stream.read(4)
     except OSError as error:
-        raise LidarOpsError(f"cannot be read: {error.strerror}", file=file) from error
-    return _product(file) if magic in _NETCDF_MAGIC else _raw(file)
+        raise LidarOpsError(
+            f"cannot be read: {error.strerror}", file=file, wrong_use=isinstance(error, NO_FILE)
+        ) from error
+    return _product(file) if magic in NETCDF_MAGIC else _raw(file)
 
 
 def tables(file: Path) -> list[Table]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Final
 
 from lidarops import dependence
 from lidarops.campaign import Campaign
@@ -14,6 +15,8 @@ from lidarops.processing import nothing_to_do
 from lidarops.product_settings import Products
 from lidarops.records import Plan, ProductKind, Scene
 from lidarops.scenes import instrument_and_start
+
+NO_FILE: Final = "no raw file of its scene is left"
 
 Planned = tuple[Scene, Plan]
 """A scene, and all that the campaign asks for of it."""
@@ -29,6 +32,8 @@ class Orphan:
     """The one that made it."""
     asked: bool = False
     """Whether the campaign still asks for it, and other files of its scene no longer allow it."""
+    lost: bool = False
+    """Whether the campaign still asks for it, and no raw file of its scene is left."""
 
 
 def barren(planned: Iterable[Planned], campaign: Campaign) -> dict[str, str]:
@@ -71,6 +76,7 @@ def orphans(
     made: Iterable[Made],
     campaign: Campaign,
     other_files: Callable[[Made, Scene], bool],
+    some_left: Callable[[Made], bool],
 ) -> list[tuple[Made, Orphan]]:
     """Return the products that would not be made again, and why.
 
@@ -83,6 +89,8 @@ def orphans(
     campaign : Campaign
     other_files : callable
         Whether a product was made from other signal files than its scene has now.
+    some_left : callable
+        Whether a signal file that a product was made from is in one of the scenes.
 
     Returns
     -------
@@ -98,15 +106,16 @@ def orphans(
     for each in made:
         if each.key in asked:
             continue
-        reason, kept = "the campaign does not ask for it any more", False
+        reason, kept, lost = "the campaign does not ask for it any more", False, False
         if _asks(campaign, each):
             if each.scene in scenes:
                 scene, told = scenes[each.scene]
                 reason, kept = _why(told, each), other_files(each, scene)
             else:
                 absent = _absent(each, planned, campaign)
-                reason, kept = absent or "no raw file of its scene is left", bool(absent)
-        found.append((each, Orphan(each.path, reason, each.run, kept)))
+                kept, lost = bool(absent), not (absent or some_left(each))
+                reason = absent or (NO_FILE if lost else "its files are cut into other scenes now")
+        found.append((each, Orphan(each.path, reason, each.run, kept, lost)))
     return found
 
 

@@ -52,7 +52,8 @@ Patterns = Annotated[
 ]
 Inside = Annotated[str, AfterValidator(_clean_pattern)]
 """Path relative to the campaign file, and below it."""
-Identifier = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$", max_length=40)]
+IDENTIFIER = r"^[A-Za-z0-9][A-Za-z0-9-]*$"
+Identifier = Annotated[str, Field(pattern=IDENTIFIER, max_length=40)]
 Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 

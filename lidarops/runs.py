@@ -7,10 +7,13 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from lidarops.campaign import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
+from lidarops.catalog.store import Store
 from lidarops.leftovers import Orphan
 from lidarops.records import RunRecord, SceneOutcome, Unmet
+from lidarops.reports import page, record
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -73,8 +76,13 @@ class Result:
         return tuple(dict.fromkeys((*self.empty, *(each.scene for each in scenes if each.empty))))
 
     @property
+    def lost(self) -> Mapping[str, str]:
+        """Products that are asked for, and of whose scene no raw file is left -> why."""
+        return {each.path: each.reason for each in self.orphans if each.lost}
+
+    @property
     def troubled(self) -> bool:
-        """Whether anything was refused or failed, in this run or before and still so."""
+        """Whether anything was refused, failed or lost, in this run or before and still so."""
         return bool(
             self.summary.refused
             or self.failures
@@ -83,6 +91,23 @@ class Result:
             or self.set_aside
             or self.untold
             or any(each.nowhere for each in self.unmet)
+            or self.lost
             or self.status is not RunStatus.FINISHED
             or (self.record is not None and self.record.failed)
         )
+
+
+def unreported(campaign: Campaign) -> str:
+    """Say how to get the page of the last run, where its report was begun and is not there.
+
+    So it is where the disk was full, or where the run was stopped while it drew.
+    """
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        for last in store.runs(limit=1):
+            folder = campaign.report_root / last.id
+            if folder.is_dir() and not (folder / page.INDEX).exists():
+                told = "the page of the last run is missing"
+                if (folder / record.FILE_NAME).exists():
+                    return f"{told}: lidarops report {folder}"
+                return f"{told}, and its record: lidarops reprocess --force makes others"
+    return ""

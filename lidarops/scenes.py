@@ -130,6 +130,13 @@ def instrument_and_start(scene: str) -> tuple[str, datetime]:
     return instrument, datetime.strptime(rest.partition("-")[0], _STAMP).replace(tzinfo=UTC)
 
 
+def stop_of(scene: str, campaign: Campaign) -> datetime:
+    """Return when a scene, which may be gone, ends by its name, as the campaign cuts scenes now."""
+    key, start = instrument_and_start(scene)
+    members = campaign.networks[key].instruments if key in campaign.networks else [key]
+    return _window(campaign, [each for each in members if each in campaign.instruments], start)[1]
+
+
 def select(
     scenes: Sequence[Scene],
     *,
@@ -188,15 +195,14 @@ def _in_windows(
     opens = closes = datetime.min.replace(tzinfo=UTC)
     for granule in granules:
         if not opens <= _start(granule) < closes:
-            opens, closes = _window(campaign, instruments, granule)
+            opens, closes = _window(campaign, instruments, _start(granule))
         yield granule, (opens, closes)
 
 
 def _window(
-    campaign: Campaign, instruments: Sequence[str], granule: Granule
+    campaign: Campaign, instruments: Sequence[str], start: datetime
 ) -> tuple[datetime, datetime]:
-    """Return the window of a granule, in which no fact about the instruments changes."""
-    start = _start(granule)
+    """Return the window of a granule by its start; no fact about the instruments changes in it."""
     length = timedelta(days=1) if campaign.scenes.window == "day" else campaign.scenes.window
     midnight = start.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
     opens = midnight + (start - midnight) // length * length

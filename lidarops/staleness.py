@@ -28,7 +28,7 @@ from lidarops.leftovers import Orphan
 from lidarops.plans import plan
 from lidarops.products.provenance import code_version
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
-from lidarops.scenes import DARK_REACH, Cut, cut, instrument_and_start, select
+from lidarops.scenes import DARK_REACH, Cut, cut, instrument_and_start, select, stop_of
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
@@ -73,7 +73,7 @@ class Selection:
             (not self.kinds or made.kind in self.kinds)
             and (not self.instruments or instrument in self.instruments)
             and (not self.stations or (owner.station if owner else instrument) in self.stations)
-            and (self.since is None or start >= self.since)
+            and (self.since is None or stop_of(made.scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
 
@@ -277,7 +277,21 @@ class Judge:
             for each in everything
         ]
         chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
-        orphans = leftovers.orphans(planned, made.values(), self._campaign, self._other_files)
+        here = {
+            name
+            for each in found.scenes
+            for granule in each.granules
+            for name in (granule.path, granule.sha256)
+        }
+        orphans = leftovers.orphans(
+            planned,
+            made.values(),
+            self._campaign,
+            self._other_files,
+            lambda product: any(
+                used.path in here or used.sha256 in here for used in self._signals(product)
+            ),
+        )
         orphaned = {known.day for known, _ in orphans}
         digests, self._digests = self._digests, {}
         counts = _counts(everything, found.set_aside)
@@ -487,10 +501,13 @@ class Judge:
         return known or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
 
     def _other_files(self, made: Made, scene: Scene) -> bool:
-        before = self._store.inputs_of(made.path)
-        return {used.sha256 for used in before if used.role is Role.SIGNAL} != {
+        return {used.sha256 for used in self._signals(made)} != {
             self._content(granule) for granule in scene.granules
         }
+
+    def _signals(self, made: Made) -> list[InputRecord]:
+        """Return the signal files that a product was made from."""
+        return [used for used in self._store.inputs_of(made.path) if used.role is Role.SIGNAL]
 
     def _profile(self, name: str) -> str:
         if name not in self._profiles:

@@ -209,7 +209,10 @@ class RemoteStore:
         """
         if self._scheme in _READ_ONLY:
             raise ProductError(
-                "is read-only", file=self.url, remedy="publish to s3://, gs:// or a mounted folder"
+                "is read-only",
+                file=self.url,
+                remedy="publish to s3://, gs:// or a mounted folder",
+                wrong_use=True,
             )
         there = {stored.path: stored.size for stored in self._existing()}
         sent = _read_journal(journal)

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 from pydantic import ValidationError
+from typer.testing import CliRunner
 
 from lidarops.campaign import Campaign, ElasticSettings, load
+from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
 
 MINIMAL = """\
@@ -51,7 +53,12 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
         ("station: coast", "station: cost", "known: coast"),
         ('files: "h*"', 'files: "../h*"', "inside its folder"),
         ('files: "h*"', 'files: "/h*"', "inside its folder"),
-        ("archive: raw", "archve: raw", "line 3: archve"),
+        ("archive: raw", "archve: raw", "line 3: archve: .* known: archive, all_steps, "),
+        ("station: coast", "products: {elastik: {}}", r"elastik: .* known: elastic, homogeneous"),
+        ("lidar:", "my_lidar:", r"line 8: instruments\.my_lidar: .*letters, digits and hyphens"),
+        ("station: coast", "station: x y", r"line 9: .*letters, digits and hyphens.*not 'x y'"),
+        ("output: out", "output: out\ntitle: B", "title: stands twice, in lines 2 and 5"),
+        ('"h*"', '"h*"\n    files: x', r"instruments\.lidar\.files: stands twice, in lines 10 and"),
         ("output: out", "output: s3://bucket/out", "output: is a URL"),
         ("title: A small campaign", "title: [", "not valid YAML"),
         ("title: A small campaign", "title: 2024-02-30", "not YAML"),
@@ -63,6 +70,57 @@ def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, expected: str) -
     with pytest.raises(CampaignError, match=expected) as caught:
         load(path)
     assert str(path) in str(caught.value)
+
+
+SIMULATED = """
+simulation:
+  start: 2026-01-01
+  duration: 60
+  instruments:
+    lidar:
+      kind: horizontal
+      aquisition: {}
+"""
+
+
+def test_a_wrong_key_of_one_of_several_kinds_is_told_with_those_of_its_kind(tmp_path: Path) -> None:
+    path = _write(tmp_path, MINIMAL + SIMULATED)
+    with pytest.raises(CampaignError) as caught:
+        load(path)
+    (told,) = [line for line in str(caught.value).splitlines() if "aquisition" in line]
+    assert told.strip().startswith("line 18: ")
+    assert "known: acquisition, " in told
+    assert "aerosol_extinction" in told
+    assert "scan" not in told
+
+
+def test_keys_that_stand_twice_in_different_places_are_no_mistake(tmp_path: Path) -> None:
+    anchored = """
+networks: {}
+metadata: {license: x, comment: y}
+"""
+    path = _write(tmp_path, MINIMAL + anchored)
+    assert load(path).metadata.comment == "y"
+    merged = MINIMAL.replace('"h*"', '"h*"\n    <<: *a\n    <<: *b').replace(
+        "instruments:", "x: [&a {name: A}, &b {header_position: ignore}]\ninstruments:"
+    )
+    with pytest.raises(CampaignError) as caught:
+        load(_write(tmp_path, merged))
+    assert "stands twice" not in str(caught.value)
+    loop = MINIMAL + "metadata: &a {comment: x, program: *a}\n"
+    with pytest.raises(CampaignError, match="program"):
+        load(_write(tmp_path, loop))
+
+
+def test_a_url_of_the_command_line_is_no_folder(tmp_path: Path) -> None:
+    path = _write(tmp_path, MINIMAL)
+    for command in (["runs", str(path)], ["publish", str(path), "memory://there"]):
+        told = CliRunner().invoke(app, [*command, "--out", "s3://bucket/out"])
+        assert told.exit_code == 2
+        assert "output: is a URL" in told.stderr
+    told = CliRunner().invoke(app, ["bench", "luck", "--out", "s3://bucket/out"])
+    assert told.exit_code == 2
+    assert "is a URL" in " ".join(told.stderr.split())
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:

@@ -180,8 +180,19 @@ def test_the_command_line_reprocesses_and_tells(
         (["catalog", "nowhere.yaml"], 2, "nowhere.yaml"),
         (["reprocess", "CAMPAIGN", "--workers", "0"], 2, "workers"),
         (["reprocess", "CAMPAIGN", "--archive", "/nowhere"], 2, "/nowhere"),
-        (["inspect", "/nowhere"], 1, "/nowhere"),
-        (["report", "/nowhere"], 1, "/nowhere"),
+        (
+            ["reprocess", "CAMPAIGN", "--archive", "/", "--product", "multiangle"],
+            2,
+            "asked for: signal",
+        ),
+        (["inspect", "/nowhere"], 2, "/nowhere"),
+        (["inspect", "/"], 2, "directory"),
+        (["inspect", "/nowhere", "--provenance"], 2, "/nowhere"),
+        (["reproduce", "/nowhere"], 2, "/nowhere"),
+        (["reproduce", "CAMPAIGN"], 2, "a product of lidarops"),
+        (["report", "/nowhere"], 2, "/nowhere"),
+        (["report", "/"], 2, "run.json"),
+        (["site", "/nowhere"], 2, "/nowhere"),
         (["bench", "luck", "file"], 2, "throughput"),
     ],
 )
@@ -195,6 +206,20 @@ def test_wrong_use_is_told(
     result = CliRunner().invoke(app, words)
     assert result.exit_code == code
     assert said in result.output
+
+
+def test_the_examples_of_the_help_name_files_that_the_demo_makes(
+    demo_archive: Path, demo: tuple[Campaign, RunRecord]
+) -> None:
+    roots = {"demo/raw/": demo_archive, "demo/products/": demo[0].products_root}
+    named = 0
+    for command in app.registered_commands:
+        for word in (command.callback.__doc__ or "").split() if command.callback else ():
+            for prefix, root in roots.items():
+                if word.startswith(prefix):
+                    named += 1
+                    assert list(root.glob(word.removeprefix(prefix))), word
+    assert named >= 3
 
 
 def test_the_benchmark_reports_every_way_of_reading(demo_archive: Path) -> None:

@@ -271,6 +271,15 @@ def test_a_place_that_is_none_is_wrong_use(words: list[str], campaign: Campaign)
     assert len(refused.output.splitlines()) == 1
 
 
+def test_a_damaged_product_is_no_wrong_use(campaign: Campaign, tmp_path: Path) -> None:
+    whole = of_kind(campaign, ProductKind.SIGNAL).read_bytes()
+    (tmp_path / "cut.nc").write_bytes(whole[:20_000])
+    (tmp_path / "log.nc").write_bytes(b"no product")
+    for name, code in (("cut.nc", 1), ("log.nc", 2), ("nowhere.nc", 2), (".", 2)):
+        for command in (["reproduce"], ["inspect", "--provenance"]):
+            assert CliRunner().invoke(app, [*command, str(tmp_path / name)]).exit_code == code
+
+
 def test_the_command_tells_by_its_exit_code(campaign: Campaign, moved: Campaign):
     product = of_kind(campaign, ProductKind.HOMOGENEOUS)
     good = CliRunner().invoke(app, ["reproduce", str(product)])

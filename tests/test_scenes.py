@@ -11,7 +11,7 @@ import pytest
 
 from lidarops.errors import SceneError
 from lidarops.records import Role, Status
-from lidarops.scenes import cut, select
+from lidarops.scenes import cut, select, stop_of
 
 
 def test_one_scene_for_each_utc_day() -> None:
@@ -47,6 +47,20 @@ def test_a_scene_ends_where_the_facts_change() -> None:
         (noon, factories.DAY + timedelta(days=1)),
     ]
     assert [len(scene.granules) for scene in scenes] == [13, 11]
+
+
+def test_the_end_of_a_scene_is_known_by_its_name() -> None:
+    noon = factories.DAY + timedelta(hours=12, minutes=7)
+    campaign = factories.campaign(
+        facts=[{"valid_to": noon.isoformat()}, {"valid_from": noon.isoformat()}]
+    )
+    windows = (campaign.scenes.window, timedelta(hours=6), timedelta(minutes=30))
+    for window in windows:
+        scenes = campaign.scenes.model_copy(update={"window": window})
+        other = campaign.model_copy(update={"scenes": scenes})
+        found = cut(other, [factories.granule(20 * k) for k in range(72)]).scenes
+        assert [stop_of(scene.id, other) for scene in found] == [scene.stop for scene in found]
+    assert stop_of("gone_20260301T000000", campaign) == factories.DAY + timedelta(days=1)
 
 
 def test_any_order_of_files_gives_the_same_scenes() -> None:

@@ -153,7 +153,9 @@ def product_paths(root: Path) -> list[str]:
         If there is no such folder.
     """
     if not root.is_dir():
-        raise ProductError("is no folder", file=root, remedy="give the folder of products")
+        raise ProductError(
+            "is no folder", file=root, remedy="give the folder of products", wrong_use=True
+        )
     below = root / "products" if (root / "products").is_dir() else root
     found = (file.relative_to(root) for file in below.rglob("*.nc"))
     return sorted(path.as_posix() for path in found if _is_listed(path))

@@ -84,6 +84,7 @@ def make(root: Path, wanted: Wanted, *, progress: Progress = lambda _done: None)
     made = Made(root)
     products = _products(root, wanted.selection, made, progress)
     if not products:
+        _refuse_unknown(root, wanted.selection)
         raise ProductError("no product is found", file=root, remedy=_remedy(made))
     made.products = len(products)
     found = groups(products)
@@ -111,6 +112,21 @@ def _products(root: Path, wanted: Selection, made: Made, progress: Progress) -> 
                 products.append(found)
         progress(1)
     return products
+
+
+def _refuse_unknown(root: Path, wanted: Selection) -> None:
+    """Refuse what no product is of, and name what there is."""
+    there = _products(root, EVERYTHING, Made(root), lambda _done: None)
+    for name in ("channel", "station", "instrument"):
+        asked, known = getattr(wanted, name), sorted({getattr(each, name) for each in there})
+        if known and asked is not None and asked not in known:
+            raise ProductError(
+                f"no product is of {name} {asked!r}",
+                file=root,
+                field=name,
+                remedy=f"known: {', '.join(known)}",
+                wrong_use=True,
+            )
 
 
 def _remedy(made: Made) -> str:

@@ -16,8 +16,10 @@ from lidarops.catalog.headers import Due, Headers, read_row
 from lidarops.catalog.rows import GranuleRow
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
 from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError
 from lidarops.processes import Processes
 from lidarops.records import Role, Status
+from lidarops.stores import without_keys
 
 _BATCH = 2000
 _SCAN_VERSION = 1
@@ -95,7 +97,8 @@ def scan(
     Raises
     ------
     CatalogError
-        If the archive cannot be listed.
+        If the archive cannot be listed, or none of the files that the catalog knows is there and
+        no other is claimed: nothing is forgotten then.
     """
     work = _Scan(campaign, store, progress, before_write)
     remote = isinstance(work.source, RemoteSource)
@@ -147,6 +150,7 @@ class _Scan:
         before_write: Callable[[], object] | None,
     ) -> None:
         self.source = Source.of(campaign.archive)
+        self._archive = campaign.archive
         self._store = store
         self._progress = progress
         self._before_write = before_write
@@ -242,6 +246,8 @@ class _Scan:
 
     def finish(self) -> ScanSummary:
         """Write what is left, and sum up."""
+        if self._gone and not self._files:
+            raise self._emptied()
         self._flush()
         moved = self._moved()
         if moved:
@@ -260,6 +266,18 @@ class _Scan:
             vanished=len(self._gone) - len(moved),
             refused=self._store.count(status=Status.REFUSED),
             moved=len(moved),
+        )
+
+    def _emptied(self) -> CatalogError:
+        # The folder of a disk that is not mounted looks like this.
+        return CatalogError(
+            "holds no file that an instrument of the campaign claims, and the catalog knows"
+            f" {len(self._gone)}: nothing is forgotten",
+            file=without_keys(self._archive),
+            field="archive",
+            remedy="see that it is mounted, that it is the archive of this campaign, and that files"
+            " and dark_files match; where it was emptied on purpose, give another catalog, or"
+            f" move {self._store.place} away, if no other campaign is in it",
         )
 
     def _moved(self) -> dict[str, str]:

@@ -30,7 +30,8 @@ ArchiveOption = Annotated[
     typer.Option("--archive", help="Folder or URL of the raw files; wins over the campaign file."),
 ]
 OutOption = Annotated[
-    Path | None,
+    # No Path, which would make a folder of a URL.
+    str | None,
     typer.Option("--out", help="Folder of catalog, products and reports; wins over the file."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
@@ -73,6 +74,11 @@ WRONG_USE = 2
 REFUSED = 1
 
 
+def tell(error: LidarOpsError) -> None:
+    """Show an error on standard error."""
+    typer.secho(f"error: {error}", fg="red", err=True)
+
+
 def plainly(command: Callable[_P, _R]) -> Callable[_P, _R]:
     """Show an error of ours as a sentence, not as a traceback."""
 
@@ -81,7 +87,7 @@ def plainly(command: Callable[_P, _R]) -> Callable[_P, _R]:
         try:
             return command(*args, **kwargs)
         except LidarOpsError as error:
-            typer.secho(f"error: {error}", fg="red", err=True)
+            tell(error)
             raise typer.Exit(WRONG_USE if error.wrong_use else REFUSED) from error
 
     return wrapped
@@ -96,6 +102,13 @@ def _main(
 
         typer.echo(__version__)
         raise typer.Exit
+
+
+def no_url(folder: str | None) -> str | None:
+    """Refuse a URL where a folder is asked for: as a path it would be a folder of that name."""
+    if folder is not None and "://" in folder:
+        raise typer.BadParameter(f"{folder!r} is a URL; give a folder")
+    return folder
 
 
 def utc(moment: datetime | None) -> datetime | None:

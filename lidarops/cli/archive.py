@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -31,9 +32,11 @@ from lidarops.cli.app import (
     plainly,
     progress_bar,
     show,
+    tell,
     utc,
 )
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
+from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -45,7 +48,7 @@ if TYPE_CHECKING:
     from lidarops.campaign import Campaign
     from lidarops.costs import Tally
     from lidarops.pipeline import Result
-    from lidarops.records import Granule, Plan
+    from lidarops.records import Granule, Plan, RunRecord
     from lidarops.staleness import Judgement, Selection
 
 _LEAST_MEMORY = 2**20
@@ -238,7 +241,7 @@ def reprocess(
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
-    from lidarops import asked, pipeline
+    from lidarops import asked, pipeline, runs
 
     set_up(log_level, as_json=log_json, file=log_file)
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
@@ -256,30 +259,51 @@ def reprocess(
             expect=bar.grow,
         )
         result = pipeline.bring_up_to_date(settings, selection=wanted, options=options)
-    removed = None
-    if remove_orphans:
-        removed = pipeline.remove_orphans(settings, result, wait=wait)
-    page = None
-    if result.record is not None:
-        page = pipeline.report_run(settings, result.record, workers=options.workers).page
     none = result.record is None and asked.none(settings, wanted)
-    if as_json:
-        summary = _run_summary(settings, result, page)
-        told = {"no_scene_asked_for": none, "removed": removed or 0}
-        typer.echo(json.dumps({**summary, **told}, indent=2))
-    elif none:
-        _tell_none(settings, result)
-    else:
-        _tell(settings, result, page, removed)
+    if none and not as_json:
+        _tell_none(settings, result, removing=remove_orphans)
+    elif not as_json:
+        _tell(settings, result, removing=remove_orphans)
+    unreported = runs.unreported(settings) if result.record is None else ""
+    if unreported and not as_json:
+        typer.echo(unreported)
+    page, removed = None, None
+    try:
+        if result.record is not None:
+            page = _page(settings, result.record, options.workers)
+        if remove_orphans:
+            removed = pipeline.remove_orphans(settings, result, wait=wait)
+    finally:
+        # The run has ended, whatever becomes of its page and of what is left over.
+        if as_json:
+            summary = _run_summary(settings, result, page)
+            told = {"no_scene_asked_for": none, "removed": removed or 0}
+            typer.echo(json.dumps({**summary, **told, "unreported": unreported}, indent=2))
+        elif page is not None:
+            typer.echo(f"report:   {page}")
+    if removed is not None and not as_json:
+        show(_orphans_table(result, removed))
     if result.signal:
         raise typer.Exit(128 + result.signal)
-    leave(failed=result.troubled)
+    left = result if removed is None else replace(result, orphans=())
+    leave(failed=left.troubled or (result.record is not None and page is None))
+
+
+def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
+    """Build the page of a run; None where it cannot be, which is told."""
+    from lidarops.pipeline import report_run
+
+    try:
+        return report_run(campaign, run, workers=workers).page
+    except LidarOpsError as error:
+        tell(error)
+        return None
 
 
 def _loaded(
     campaign: Path,
     archive: str | None,
-    out: Path | None,
+    out: str | None,
     catalog: str | None,
     *,
     all_steps: bool = False,
@@ -432,7 +456,7 @@ def _refused(campaign: Campaign, result: Result) -> list[Granule]:
         return store.refused()
 
 
-def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | None) -> None:
+def _tell(campaign: Campaign, result: Result, *, removing: bool) -> None:
     table = make_table("Products", "scene", "kind", "channel", "values", "unflagged", "flags")
     for scene in () if result.record is None else result.record.scenes:
         for product in scene.products:
@@ -446,15 +470,16 @@ def _tell(campaign: Campaign, result: Result, page: Path | None, removed: int | 
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
     show(_unmet_table(result))
-    show(_orphans_table(result, removed))
+    if not removing:
+        show(_orphans_table(result, None))
     show(_kept_table(result))
     show(_empty_table(result))
     show(_failures_table(result))
-    if page is None:
-        typer.echo("nothing to do: every product that is asked for is fresh or cannot be made")
-    else:
+    if result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
-        typer.echo(f"products: {campaign.products_root}{ended}\nreport:   {page}")
+        typer.echo(f"products: {campaign.products_root}{ended}")
+        return
+    typer.echo("nothing to do: every product that is asked for is fresh or cannot be made")
 
 
 def _unused_table(result: Result, told: Collection[str]) -> Table:
@@ -479,11 +504,14 @@ def _unmet_table(result: Result) -> Table:
     return table
 
 
-def _tell_none(campaign: Campaign, result: Result) -> None:
+def _tell_none(campaign: Campaign, result: Result, *, removing: bool) -> None:
     refused = _refused(campaign, result)
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
     show(_unmet_table(result))
+    if not removing:
+        show(_orphans_table(result, None))
+    show(_kept_table(result))
     show(_failures_table(result))
     typer.echo(_NONE)
 

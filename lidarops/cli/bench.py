@@ -15,6 +15,7 @@ from lidarops.cli.app import (
     app,
     leave,
     make_table,
+    no_url,
     plainly,
     progress_bar,
     show,
@@ -47,7 +48,9 @@ def bench(
     repeats: Annotated[
         int | None, typer.Option(min=1, max=100, help="Counted repeats of each timing.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of page and JSON.")] = None,
+    out: Annotated[
+        str | None, typer.Option("--out", help="Folder of page and JSON.", callback=no_url)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure errors against the least possible ones, or speed against a floor of the same run.
@@ -75,7 +78,7 @@ def bench(
             finding = _stability(effort)
         else:
             finding = cases.run(what, case, files or [], effort, data=data)
-    page = None if out is None else cases.write(finding, out)
+    page = None if out is None else cases.write(finding, Path(out))
     if as_json:
         typer.echo(json.dumps(results.plain(finding.result), indent=1))
         leave(failed=_failed(finding))

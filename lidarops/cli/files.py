@@ -19,7 +19,7 @@ def report(
 ) -> None:
     """Build the HTML report and figures of a run again.
 
-    Example: lidarops report demo/report/20260301T000000-ab12cd --workers 2
+    Example: lidarops report demo/report/RUN --workers 2
     """
     from lidarops.reports import page, record
 
@@ -38,7 +38,7 @@ def inspect(
 ) -> None:
     """Show what a raw file or a product holds.
 
-    Example: lidarops inspect demo/raw/coast/h2630100.000000
+    Example: lidarops inspect demo/raw/coast/h2492106.010000
     """
     from lidarops import inspection
 

@@ -36,7 +36,7 @@ def reproduce(
 ) -> None:
     """Make a product again from its own provenance; exit code 0 where every byte is the same.
 
-    Example: lidarops reproduce demo/products/coast/coast-lidar/signal/2026/PRODUCT.nc
+    Example: lidarops reproduce demo/products/hill/hill-vertical/elastic/2024/*355o*0922*.nc
     """
     from dataclasses import asdict
 

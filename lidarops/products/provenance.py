@@ -18,13 +18,15 @@ from uuid import NAMESPACE_URL, uuid5
 
 import xarray as xr
 
-from lidarops.errors import ProductError
+from lidarops.errors import NO_FILE, ProductError
 from lidarops.records import InputRecord, LeftOut, Provenance
 
 RELEASE_DATE: Final = date(2026, 11, 21)
 """Of this version of lidarops; a product is dated no earlier."""
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
+NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
+"""First bytes of files of netCDF."""
 
 _quoted: Final = json.JSONEncoder().encode
 
@@ -40,6 +42,7 @@ _NOT_COMPUTING: Final = (
     "engine.py",
     "inspection.py",
     "kubernetes.py",
+    "mistakes.py",
     "pipeline.py",
     "products/read.py",
     "products/table_means.py",
@@ -216,17 +219,33 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
     try:
         with xr.open_dataset(path, engine="netcdf4", decode_times=False) as product:
             if "provenance" not in product:
-                raise ProductError("has no such variable", file=path, field="provenance")
+                raise ProductError(
+                    "has no such variable", file=path, field="provenance", wrong_use=True
+                )
             text = str(product["provenance"].item())
     except (OSError, ValueError) as error:
         raise ProductError(
-            f"cannot be read: {error}", file=path, remedy="give the path of a product of lidarops"
+            f"cannot be read: {error}",
+            file=path,
+            remedy="give the path of a product of lidarops",
+            wrong_use=not _is_netcdf(Path(path)),
         ) from error
     try:
         document: dict[str, Any] = json.loads(text)
     except ValueError as error:
         raise ProductError(f"is not JSON: {error}", file=path, field="provenance") from error
     return document
+
+
+def _is_netcdf(path: Path) -> bool:
+    """Return whether a file is NetCDF by its first bytes, or there and cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4) in NETCDF_MAGIC
+    except NO_FILE:
+        return False
+    except OSError:
+        return True
 
 
 @cache

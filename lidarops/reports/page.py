@@ -102,7 +102,7 @@ def build(
         raise CatalogError(
             f"the report cannot be written: {error}",
             file=folder,
-            remedy="choose a folder you can write to",
+            remedy=f"make space or choose a folder you can write to, then lidarops report {folder}",
         ) from error
     pictures = filled.pictures
     return Report(target, folder / pictures[0].file if pictures else None)

@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from lidarops.errors import CatalogError
+from lidarops.errors import NO_FILE, CatalogError
 from lidarops.records import RunRecord
 
 FILE_NAME: Final = "run.json"
@@ -75,7 +75,9 @@ def save(record: RunRecord, folder: Path) -> Path:
         write_atomically(target, text.encode("ascii"))
     except OSError as error:
         raise CatalogError(
-            f"cannot be written: {error}", file=target, remedy="choose a folder you can write to"
+            f"cannot be written: {error}",
+            file=target,
+            remedy="make space or choose a folder you can write to, then reprocess with --force",
         ) from error
     return target
 
@@ -104,7 +106,10 @@ def load(path: str | Path) -> RunRecord:
     try:
         document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
     except OSError as error:
-        raise CatalogError(f"cannot be read: {error}", file=path, remedy=_REMEDY) from error
+        missing = isinstance(error, NO_FILE)
+        raise CatalogError(
+            f"cannot be read: {error}", file=path, remedy=_REMEDY, wrong_use=missing
+        ) from error
     except (ValueError, RecursionError) as error:
         raise CatalogError(f"is not a JSON document: {error}", file=path, remedy=_REMEDY) from error
     if not isinstance(document, dict) or document.get("format") != _FORMAT:

@@ -35,6 +35,7 @@ def product_folder(output: Path) -> Path:
             "holds no folder `products`",
             file=output,
             remedy="give the output folder of a campaign that was reprocessed",
+            wrong_use=not output.is_dir(),
         )
     return folder
 

@@ -99,8 +99,11 @@ def test_a_person_is_told_of_grids(tmp_path: Path):
 
 @pytest.mark.parametrize(
     "wrong",
-    [["--kind", "x"], ["--means", "week"], ["--weights", "x"], ["--since", "x"]],
-)
+    [
+        ["--kind", "x"], ["--means", "week"], ["--weights", "x"], ["--since", "x"],
+        ["--channel", "x"], ["--station", "x"], ["--instrument", "x"],
+    ],
+)  # fmt: skip
 def test_wrong_use_exits_with_2(wrong: list[str], tmp_path: Path):
     add_day(tmp_path, 0)
     assert run(tmp_path, *wrong)[0] == 2
@@ -108,7 +111,16 @@ def test_wrong_use_exits_with_2(wrong: list[str], tmp_path: Path):
 
 def test_a_folder_without_products_is_refused(tmp_path: Path):
     assert run(tmp_path)[0] == 1
-    assert run(tmp_path / "nothing")[0] == 1
+    assert run(tmp_path / "nothing")[0] == 2
+
+
+def test_a_selection_without_products_names_what_there_is(tmp_path: Path):
+    add_day(tmp_path, 0)
+    code, output = run(tmp_path, "--station", "nope")
+    assert (code, "known: " in output) == (2, True)
+    # There is such a kind, and may be one tomorrow.
+    assert run(tmp_path, "--kind", "multiangle")[0] == 1
+    assert run(tmp_path, "--since", "2030-01-01")[0] == 1
 
 
 def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch):

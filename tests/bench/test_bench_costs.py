@@ -12,6 +12,7 @@ from lidarops import costs, pipeline
 from lidarops.bench import costs as calibration
 from lidarops.bench.costs import Observation, fitted
 from lidarops.bench.terms import Effort, Kind
+from lidarops.bench.timing import machine
 from lidarops.costs import DEFAULTS, Costs, Term
 from lidarops.errors import CampaignError
 from lidarops.records import RunRecord
@@ -46,6 +47,34 @@ def test_no_cost_is_negative_and_what_is_not_seen_stays():
     found = fitted(scenes)
     assert min(found.values()) >= 0
     assert found[Term.VISIBILITY] == pytest.approx(DEFAULTS[Term.VISIBILITY])
+
+
+@pytest.mark.parametrize(("whole", "cost"), [(102.4, 4.5), (90.0, 4.5), (110.0, 9.0)])
+def test_a_run_costs_no_less_than_one_with_nothing_to_do(
+    whole: float, cost: float, monkeypatch: pytest.MonkeyPatch
+):
+    """Whatever the noise of the one that does all, of which scenes and report are subtracted."""
+    idle = iter([4.4, 30.0, 4.5])
+
+    def of_run(_: object, *words: str) -> float:
+        return whole if "--force" in words else next(idle)
+
+    monkeypatch.setattr(calibration, "_of_run", of_run)
+    monkeypatch.setattr(calibration.pipeline, "assess", lambda *_, **__: [])
+    monkeypatch.setattr(costs.Tally, "total", 101.0)
+    assert calibration._beside(None, Costs(DEFAULTS)) == pytest.approx(cost)
+
+
+@pytest.mark.parametrize(("ratio", "doubted"), [(1.4, False), (1.6, True), (1 / 1.6, True)])
+def test_costs_that_miss_what_they_were_found_from_are_told(
+    ratio: float, doubted: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    scenes = tuple(Observation("", (), {}, 2.0, 2.0 * each) for each in (1.0, ratio))
+    found = calibration.Calibration("", machine(), DEFAULTS, scenes, "")
+    monkeypatch.setattr(calibration, "calibrate", lambda **_: found)
+    page = calibration.run(Kind.THROUGHPUT, effort=Effort()).report
+    assert ("calibrate again" in caplog.text) == doubted
+    assert ("calibrate again" in page.parts[0].text) == doubted
 
 
 def test_costs_have_no_accuracy():

@@ -95,6 +95,26 @@ def test_only_what_changed_is_opened(campaign: Campaign, store: Store, opened: l
     assert "coast/h2" not in {granule.path for granule in store.granules()}
 
 
+@pytest.mark.parametrize("others", [False, True], ids=["empty", "wrong"])
+def test_an_archive_without_any_of_its_files_is_refused_and_nothing_is_forgotten(
+    campaign: Campaign, store: Store, tmp_path: Path, *, others: bool
+) -> None:
+    root = _fill(campaign)
+    scan(campaign, store)
+    known = store.granules()
+    root.rename(tmp_path / "away")
+    root.mkdir()
+    if others:
+        rawfiles.write(root / "elsewhere" / "h0", rawfiles.content(0))
+    with pytest.raises(CatalogError, match="knows 6: nothing is forgotten") as caught:
+        scan(campaign, store)
+    assert not caught.value.wrong_use
+    assert store.granules() == known
+    with Store(campaign.catalog_url, "other") as shared:
+        other = campaign.model_copy(update={"name": "other"})
+        assert scan(other, shared) == ScanSummary(0, 0, 0, 0, 0, 0)
+
+
 def test_a_changed_fact_of_the_campaign_rescans(campaign: Campaign, store: Store) -> None:
     _fill(campaign)
     scan(campaign, store)

@@ -44,6 +44,7 @@ def test_choices_of_the_command_line(tmp_path: Path) -> None:
         ("{kind: local, memory: 2}", "memory"),
         ("{kind: scheduler, address: 'head'}", "address"),
         ("[slurm]", "is not a mapping"),
+        ("{kind: slurm, kind: local}", "kind: stands twice, in lines 1 and 1"),
         ("{kind: [", "cannot be read"),
     ],
 )

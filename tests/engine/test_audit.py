@@ -182,7 +182,8 @@ def test_a_selection_without_any_scene_is_told_from_one_whose_products_are_fresh
     none = "no scene of the archive is asked for"
     assert none in said("--since", "2026-04-01")
     assert none in said("--until", "2026-03-01", "--instrument", "poor")
-    for words in (["--since", "2026-03-02"], ["--station", "coast"], ["--product", "visibility"]):
+    kind = ["--product", "homogeneous"]
+    for words in (["--since", "2026-03-02"], kind, [*kind, "--instrument", "poor"]):
         fresh = said(*words)
         assert "is fresh" in fresh
         assert none not in fresh

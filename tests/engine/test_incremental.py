@@ -164,15 +164,13 @@ def test_touched_and_moved_files_make_nothing_stale(archive: Archive) -> None:
 
 
 def test_a_lost_catalog_row_is_judged_by_content(archive: Archive) -> None:
-    raw = archive.folder / "raw"
-    # As when a disk is not mounted for one run.
-    raw.rename(archive.folder / "away")
-    raw.mkdir()
+    rich = archive.folder / "raw" / "rich"
+    # As when one of two disks is not mounted for one run.
+    rich.rename(archive.folder / "away")
     result = bring_up_to_date(archive.write())
     assert result.record is None
-    assert len(result.orphans) == len(EVERYTHING)
-    raw.rmdir()
-    (archive.folder / "away").rename(raw)
+    assert len(result.orphans) == len(_all(range(1, 5)))
+    (archive.folder / "away").rename(rich)
     assert reprocess(archive.write()) is None
 
 
@@ -253,7 +251,7 @@ def test_the_plan_of_a_selection_is_of_its_products(archive: Archive) -> None:
     some = told["estimated_cpu_seconds"]["everything"]
     assert 0 < some["scenes"] < whole["scenes"]
     assert some["start"] < whole["start"], "elastic code is not loaded"
-    nothing = _planned(archive, "--product", "visibility")
+    nothing = _planned(archive, "--product", "homogeneous", "--instrument", "poor")
     assert {scene["fresh"] for scene in nothing["scenes"]} == {0}
     assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
 
@@ -269,6 +267,14 @@ def test_a_plan_tells_a_gate_of_no_effect(archive: Archive) -> None:
     assert _gates_told(_planned(archive, "--product", "homogeneous")) == [""] * 4
     shown = CliRunner().invoke(app, ["plan", str(archive.file)], env={"COLUMNS": "300"})
     assert shown.stdout.count("no effect: signal needs all bins") == 4
+
+
+def test_a_kind_that_nothing_is_asked_for_is_wrong_use(archive: Archive) -> None:
+    archive.write()
+    for command in ("plan", "reprocess"):
+        refused = CliRunner().invoke(app, [command, str(archive.file), "--product", "visibility"])
+        assert refused.exit_code == 2
+        assert "asked for: signal, homogeneous, elastic" in refused.stderr
 
 
 def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import sqlite3
 from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import NoReturn
 
 import pytest
 from small_archive import DAY, Archive
@@ -27,6 +30,7 @@ from lidarops.pipeline import (
     reprocess,
 )
 from lidarops.records import ProductKind
+from lidarops.reports import gallery, record
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
 
@@ -246,6 +250,31 @@ def test_what_is_not_asked_for_is_not_orphaned(archive: Archive) -> None:
         assert len(bring_up_to_date(campaign, selection=selection).orphans) == number
 
 
+def _leave_over(archive: Archive) -> None:
+    """Leave products over, of scenes that are there and of those that are gone."""
+    del archive.told["instruments"]["rich"]["products"]["homogeneous"]
+    _without(archive, "poor")
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "number"),
+    [
+        (FIRST.replace(hour=12), None, 8 + 4),
+        (FIRST.replace(hour=12), FIRST.replace(hour=13), 2 + 1),
+        (FIRST.replace(day=2), FIRST.replace(day=2, hour=1), 2 + 1),
+        (FIRST.replace(day=4, hour=23), None, 2 + 1),
+        (FIRST.replace(day=5), None, 0),
+    ],
+)
+def test_what_is_left_over_is_told_of_the_scenes_that_are_asked_for(
+    archive: Archive, since: datetime, until: datetime | None, number: int
+) -> None:
+    _leave_over(archive)
+    campaign = archive.write()
+    found = bring_up_to_date(campaign, selection=Selection(since=since, until=until))
+    assert len(found.orphans) == number
+
+
 def test_a_product_that_another_run_made_again_is_not_removed(archive: Archive) -> None:
     kept = {path: path.read_bytes() for path in (archive.folder / "raw/poor").glob("h1*")}
     for path in kept:
@@ -262,10 +291,77 @@ def test_a_product_that_another_run_made_again_is_not_removed(archive: Archive) 
     assert reprocess(campaign) is None
 
 
-def test_nothing_is_removed_for_an_archive_that_is_not_there(archive: Archive) -> None:
+def _vanish(archive: Archive, instrument: str, day: int) -> None:
+    for path in (archive.folder / "raw" / instrument).glob(f"h{day}*"):
+        path.unlink()
+
+
+def _empty(archive: Archive) -> None:
     _without(archive, "rich")
     _without(archive, "poor")
     (archive.folder / "raw/rich/d0").unlink()
+
+
+@pytest.mark.parametrize("command", ["catalog", "plan", "reprocess"])
+def test_an_archive_that_holds_nothing_any_more_fails_and_is_not_forgotten(
+    archive: Archive, command: str
+) -> None:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        known = store.granules()
+    _empty(archive)
+    before = archive.contents("out/products")
+    options = ["--remove-orphans"] if command == "reprocess" else []
+    result = CliRunner().invoke(app, [command, str(archive.file), *options])
+    assert result.exit_code == 1
+    for words in ("nothing is forgotten", "mounted", "on purpose", campaign.catalog_url):
+        assert words in result.stderr
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert store.granules() == known
+    assert archive.contents("out/products") == before
+    # As the message says.
+    other = ["--catalog", f"sqlite:///{archive.folder}/other.sqlite"]
+    assert CliRunner().invoke(app, [command, str(archive.file), *other]).exit_code == 0
+
+
+def test_products_without_a_raw_file_are_a_trouble_until_they_are_removed(
+    archive: Archive,
+) -> None:
+    _without(archive, "poor")
+    campaign = archive.write()
+    for _ in range(2):
+        found = bring_up_to_date(campaign)
+        assert found.troubled
+        assert set(found.lost) == {each.path for each in found.orphans}
+        assert len(found.lost) == 8
+    command = ["reprocess", str(archive.file)]
+    # Also where the scenes that are asked for are all gone.
+    for options in ([], ["--instrument", "poor"]):
+        shown = CliRunner().invoke(app, [*command, *options])
+        assert shown.exit_code == 1
+        assert "--remove-orphans" in shown.stdout
+        assert "no raw file" in shown.stdout
+    assert CliRunner().invoke(app, [*command, "--instrument", "rich"]).exit_code == 0
+    assert CliRunner().invoke(app, [*command, "--remove-orphans"]).exit_code == 0
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert not bring_up_to_date(campaign).orphans
+
+
+def test_products_of_scenes_that_are_cut_in_another_way_are_not_told_as_lost(
+    archive: Archive,
+) -> None:
+    archive.told["scenes"] = {"window": "6h"}
+    found = bring_up_to_date(archive.write())
+    assert {each.reason for each in found.orphans} == {"its files are cut into other scenes now"}
+    assert len(found.orphans) == 24
+    assert not found.troubled
+
+
+def test_nothing_is_removed_for_an_archive_that_is_not_there(archive: Archive) -> None:
+    _empty(archive)
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        # As a catalog was left by what forgot the files of such an archive.
+        connection.execute("delete from granule")
     campaign = archive.write()
     found = bring_up_to_date(campaign)
     before = archive.contents("out/products")
@@ -273,6 +369,92 @@ def test_nothing_is_removed_for_an_archive_that_is_not_there(archive: Archive) -
     with pytest.raises(CatalogError, match="no raw file"):
         remove_orphans(campaign, found)
     assert archive.contents("out/products") == before
+
+
+# The page ------------------------------------------------------------------------------------
+
+
+def _full(*_: object, **__: object) -> NoReturn:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _stopped(*_: object, **__: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("fails", "code"), [(_full, 1), (_stopped, 130)])
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_page_that_cannot_be_built_hides_nothing_and_is_asked_for_by_the_next_run(
+    archive: Archive,
+    monkeypatch: pytest.MonkeyPatch,
+    fails: Callable[..., NoReturn],
+    code: int,
+    *,
+    as_json: bool,
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    _vanish(archive, "poor", 1)
+    archive.write()
+    command = ["reprocess", str(archive.file), *(["--json"] if as_json else [])]
+    with monkeypatch.context() as patch:
+        patch.setattr(gallery, "fill", fails)
+        failed = CliRunner().invoke(app, command)
+    assert failed.exit_code == code
+    (folder,) = (archive.folder / "out/report").glob("*")
+    if fails is _full:
+        assert f"lidarops report {folder}" in failed.stderr
+    if as_json:
+        told = json.loads(failed.stdout)
+        assert (told["report"], len(told["products"]), len(told["orphans"])) == (None, 2, 2)
+    else:
+        assert "poor_20260301T000000" in failed.stdout
+        assert "poor_20260302T000000" in failed.stdout
+        assert "report:" not in failed.stdout
+    shown = CliRunner().invoke(app, command)
+    if as_json:
+        assert json.loads(shown.stdout)["unreported"].endswith(f": lidarops report {folder}")
+    else:
+        assert f"lidarops report {folder}" in shown.stdout
+    assert CliRunner().invoke(app, ["report", str(folder)]).exit_code == 0
+    shown = CliRunner().invoke(app, command)
+    assert str(folder) not in shown.stdout
+
+
+def test_a_run_whose_record_could_not_be_kept_says_how_to_get_another(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    archive.write()
+    command = ["reprocess", str(archive.file)]
+    with monkeypatch.context() as patch:
+        patch.setattr(record, "write_atomically", _full)
+        failed = CliRunner().invoke(app, command)
+    assert failed.exit_code == 1
+    assert "poor_20260301T000000" in failed.stdout
+    assert "--force" in failed.stderr
+    assert "--force" in CliRunner().invoke(app, command).stdout
+    assert CliRunner().invoke(app, [*command, "--force"]).exit_code == 0
+    shown = CliRunner().invoke(app, command)
+    assert (shown.exit_code, "--force" in shown.stdout) == (0, False)
+
+
+def test_what_cannot_be_removed_does_not_hide_what_was_made(archive: Archive) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    _vanish(archive, "poor", 1)
+    archive.write()
+
+    def held(*_: object, **__: object) -> NoReturn:
+        raise CatalogError("is held")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "remove_orphans", held)
+        failed = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
+    assert failed.exit_code == 1
+    assert "is held" in failed.stderr
+    assert "poor_20260301T000000" in failed.stdout
+    (page,) = (archive.folder / "out/report").glob("*/index.html")
+    assert "report:" in failed.stdout
+    assert page.exists()
 
 
 # Runs and scans ------------------------------------------------------------------------------

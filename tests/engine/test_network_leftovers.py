@@ -110,6 +110,8 @@ def test_lidars_that_serve_a_network_alone_are_no_trouble(net: Net) -> None:
 
 
 def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
+    net.told["instruments"]["west-lidar"]["products"] = {"signal": {}}
+    net.write()
     for kind, some in (("visibility", True), ("signal", False)):
         line = ["plan", str(net.file), "--json", "--product", kind, "--instrument", "valley"]
         (scene,) = json.loads(CliRunner().invoke(app, line).stdout)["scenes"]

@@ -38,7 +38,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.clusters import Local
-from lidarops.errors import LidarOpsError, ProductError, SceneError
+from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.pipeline import Result, Selection, bring_up_to_date, update_catalog
 
 
@@ -117,6 +117,7 @@ def test_a_missing_or_invalid_campaign_file_is_wrong_use(
         (["--memory-limit", "foo"], "memory_limit"),
         (["--memory-limit", "2GiB", "--cluster", "slurm"], "memory_limit"),
         (["--product", "luck"], "homogeneous"),
+        (["--product", "elastic"], "homogeneous"),
         (["--scheduler", "nowhere"], "address"),
         (["--station", "nope"], "coast"),
         (["--since", "2024-09-22", "--until", "2024-09-21"], "since"),
@@ -217,7 +218,6 @@ def test_the_flow_takes_the_options_of_the_command_line(campaign_file: Path) -> 
     asked = ["--station", "coast", "--instrument", "lidar", "--product", "homogeneous"]
     inside = ["--since", "2026-02-28", "--until", "2026-03-02"]
     assert products(*asked, *inside, "--wait", "1", "--memory-limit", "1GiB") == 1
-    assert products("--product", "elastic") == 0
     assert products("--since", "2026-03-05") == 0
 
 
@@ -272,6 +272,26 @@ def test_a_troubled_night_ends_in_a_state_of_its_own_and_says_what_is_wrong(
     mended["instruments"]["lidar"]["facts"][0].pop("overlap_profile")
     campaign_file.write_text(yaml.safe_dump(mended))
     assert reprocess(str(campaign_file), return_state=True).name == "Completed"
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_a_night_without_the_raw_files_of_products_says_which_and_what_to_do(
+    campaign_file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reprocess(str(campaign_file))
+    raw = campaign_file.parent / "raw" / "coast"
+    for k in range(3):
+        (raw / f"h{k}").unlink()
+    (raw / "h9").write_bytes(rawfiles.content(2000, bins=1000))
+    caplog.clear()
+    state = reprocess(str(campaign_file), return_state=True)
+    assert state.name == WITH_FAILURES
+    assert state.message.startswith("1 products without a raw file")
+    assert "--remove-orphans" in state.message
+    assert "20260301T000000" in caplog.text
+    (raw / "h9").unlink()
+    with pytest.raises(CatalogError, match="nothing is forgotten"):
+        reprocess(str(campaign_file))
 
 
 @pytest.mark.usefixtures("prefect_server")
