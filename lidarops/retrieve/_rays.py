@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve import _inputs, _point_weights
+from lidarops.retrieve import _inputs, _noise_groups, _point_weights
 from lidarops.retrieve._point_weights import Condensed, Layout
 from lidarops.retrieve.geometry import Network
 
@@ -43,7 +43,7 @@ class Rays:
     mean: Condensed
     """Of the median signals of the blocks."""
     block: Indices
-    """(profile,)."""
+    """(profile,) numbered anew where noise parts a block (`_noise_groups`)."""
     averaged: Indices
     """(block,) profiles in the means."""
     noise: Array
@@ -76,12 +76,16 @@ def prepare(
     powers = _exponents(exponent, network.rays)
     layout = _point_weights.lay_out(network, grid, shape, nearest, int(gates))
     block, count = _blocks(blocks, leading)
-    members = [np.flatnonzero(block == b) for b in range(count)]
     relative = variance is None
     if variance is None:
+        members = [np.flatnonzero(block == b) for b in range(count)]
         rows, row = _estimated(signal, members, block)
     else:
         rows, row = _variances(variance, signal.shape, turn=turn)
+        about = (layout.crossings.ray, layout.window, layout.weights.shape[1])
+        block = _noise_groups.part(signal, rows, row, block, about, LOUDEST_GATE)
+        count = int(block.max(initial=-1)) + 1
+        members = [np.flatnonzero(block == b) for b in range(count)]
     mean, mean_rows, single, averaged = _means(signal, rows, row, members, layout)
     data = _point_weights.condense(
         signal, rows, row, powers, layout, relative=relative, screened=True
