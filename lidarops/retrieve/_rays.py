@@ -131,7 +131,11 @@ def _grids(values: npt.ArrayLike, rays: int) -> tuple[Array, bool]:
     for row in array:
         known = np.isfinite(row)
         if not known.any() or not known[: int(known.sum())].all():
-            raise RetrievalInputError("is not finite before the last bin of a ray", field="range")
+            raise RetrievalInputError(
+                "is not finite before the last bin of a ray",
+                field="range",
+                remedy="give each ray's bins first, and NaN only behind the last of them",
+            )
         if _inputs.range_grid(row[known]).descending:
             raise RetrievalInputError("descends", field="range", remedy="turn it, and the power")
     return np.ascontiguousarray(array), False
@@ -196,7 +200,9 @@ def _exponents(exponent: npt.ArrayLike, rays: int) -> Array:
     return np.broadcast_to(array, (rays,)).copy()
 
 
-def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Indices, int]:
+def _blocks(
+    blocks: npt.ArrayLike | None, leading: tuple[int, ...], field: str = "blocks"
+) -> tuple[Indices, int]:
     count = int(np.prod(leading, dtype=np.int64))
     if blocks is None:
         return np.zeros(count, dtype=np.intp), min(count, 1)
@@ -204,7 +210,7 @@ def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Ind
     if labels.shape != leading or labels.dtype.kind not in "iuUS":
         raise RetrievalInputError(
             f"has the shape {labels.shape} of {labels.dtype}",
-            field="blocks",
+            field=field,
             remedy=f"give one whole number or name per profile, {leading}",
         )
     found, inverse = np.unique(labels.reshape(count), return_inverse=True)
@@ -417,7 +423,7 @@ def average(
         raise RetrievalInputError(
             f"has the shape {signal.shape}", field="power", remedy="give (profile, ray, range)"
         )
-    group, count = _blocks(groups, signal.shape[:1])
+    group, count = _blocks(groups, signal.shape[:1], "groups")
     noise = None
     if variance is not None:
         rows, row = _variances(variance, signal.shape, turn=False)
