@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -29,6 +30,9 @@ LOUDER: Final = 10.0
 to that many times more where its signal is stronger, whose noise is then larger too."""
 _SMOOTHED: Final = 31
 """Gates over which an estimated noise is averaged."""
+_WILD: Final = 30.0
+"""Times the median square of what is about it, from which on one is not of noise: of normal noise
+one in 5000, a third of a percent of the variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -289,11 +293,28 @@ def _louder(squares: Array, known: Booleans) -> Booleans:
 def _smoothed(squares: Array, known: Booleans) -> Array:
     """Return (ray, bin) means over profiles and neighbouring gates; two more bins than squares."""
     width = min(_SMOOTHED, squares.shape[-1])
+    known = known & (squares <= _WILD * _usual_square(squares, known))
     total = np.where(known, squares, 0.0).sum(axis=0)
     number = known.sum(axis=0).astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         smooth = _moving_sum(total, width) / _moving_sum(number, width)
     return np.asarray(np.concatenate([smooth[:, :1], smooth, smooth[:, -1:]], axis=1))
+
+
+def _usual_square(squares: Array, known: Booleans) -> Array:
+    """Return (ray, bin) medians of all profiles and of some tens of gates; inf where they are 0.
+
+    A single wild gate of one profile would be taken for noise of all.
+    """
+    out = np.full(squares.shape[1:], np.inf)
+    parts = max(squares.shape[-1] // _SMOOTHED, 1)
+    edges = np.linspace(0, squares.shape[-1], parts + 1).astype(int)
+    for low, high in pairwise(edges):
+        for ray in range(squares.shape[1]):
+            here = squares[:, ray, low:high][known[:, ray, low:high]]
+            usual = np.median(here) if here.size else 0.0
+            out[ray, low:high] = usual if usual > 0.0 else np.inf
+    return out
 
 
 def _moving_sum(values: Array, width: int) -> Array:

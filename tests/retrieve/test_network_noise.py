@@ -1,0 +1,75 @@
+"""Noise of the signals of a network: told by themselves, and loud profiles among others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from oracle_multiposition import (
+    grid,
+    homogeneous,
+    plume,
+    signals,
+    three_by_two,
+)
+
+from lidarops.retrieve import _rays
+from lidarops.retrieve.multiposition import solve
+
+FULL = {"full_overlap_range": 100.0}
+
+
+def estimated(power):
+    """Return (row, ray, bin) relative standard deviations of one block."""
+    rows, row = _rays._estimated(power, [np.arange(len(power))], np.zeros(len(power), np.intp))
+    return np.sqrt(rows), row
+
+
+def drawn(net, relative, profiles, field=plume, seed=2):
+    """Return power whose relative noise is the same at all gates, and the power without."""
+    clean = signals(net, grid(net), field)
+    rng = np.random.default_rng(seed)
+    return clean * (1.0 + relative * rng.standard_normal((profiles, *clean.shape))), clean
+
+
+# Told by the signals ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("profiles", [1, 50])
+def test_wild_gates_are_not_taken_for_noise(profiles):
+    power, _ = drawn(three_by_two(), 0.02, profiles, homogeneous())
+    wild = np.random.default_rng(4).random(power.shape) < 0.003
+    noise, _ = estimated(np.where(wild, 1e6, 1.0) * power)
+    assert wild.any()
+    assert np.median(noise) == pytest.approx(0.02, rel=0.05)
+    # Of one profile, 31 gates tell the noise.
+    assert noise.max() < 0.02 * (1.15 if profiles > 1 else 2.0)
+
+
+@pytest.mark.parametrize("relative", [3e-3, 0.02, 0.2])
+def test_noise_is_all_counted_that_is_normal(relative):
+    noise, _ = estimated(drawn(three_by_two(), relative, 50, homogeneous())[0])
+    assert np.sqrt(np.mean(noise**2)) == pytest.approx(relative, rel=0.05)
+
+
+def test_noise_of_mostly_equal_counts_is_what_the_others_have():
+    power = np.full((4, 1, 100), 7.0)
+    power[:, 0, ::10] = 8.0
+    noise, _ = estimated(power)
+    assert 0.02 < noise.min() < noise.max() < 0.1
+    assert np.all(estimated(np.full((4, 1, 100), 7.0))[0] == 0.0)
+
+
+def test_a_wild_gate_costs_the_other_profiles_nothing_where_signals_tell_the_noise():
+    """The errors of all others were five times as large."""
+    net = three_by_two()
+    power, _ = drawn(net, 0.01, 50)
+    heard = power.copy()
+    heard[7, 2, 60] *= 1e6
+    clean, found = (solve(one, grid(net), net, **FULL) for one in (power, heard))
+    others, near = np.arange(50) != 7, net.near_vertex
+    np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])
+    assert not found.flags.flagged[others][:, near].any()
+    np.testing.assert_allclose(
+        found.extinction_standard_error[others][:, near],
+        clean.extinction_standard_error[others][:, near], rtol=0.02,
+    )  # fmt: skip
