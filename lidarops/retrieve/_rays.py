@@ -30,9 +30,11 @@ LOUDER: Final = 10.0
 to that many times more where its signal is stronger, whose noise is then larger too."""
 _SMOOTHED: Final = 31
 """Gates over which an estimated noise is averaged."""
-_WILD: Final = 30.0
-"""Times the median square of what is about it, from which on one is not of noise: of normal noise
-one in 5000, a third of a percent of the variance."""
+_WILD: Final = 60.0
+"""Times the median square of what is about it, from which on a gate is not of noise: it lies off
+by 6 standard errors, as what is bridged does (`lidarops.retrieve._gate_outliers`)."""
+_SCREENED: Final = 0.045
+"""Relative standard error of a gate, up to which wild gates are surely looked for there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,8 +253,10 @@ def _variances(
 def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[Array, Indices]:
     """Return relative variances, from second differences along range, and which go with a profile.
 
+    Gates are taken for independent: where neighbours are correlated, errors are understated.
     One row for each block, and one for each profile that is far louder than its block: it would
-    spoil the errors of all others, and state too little itself.
+    spoil the errors of all others, and state too little itself. So would one with wild gates that
+    are not bridged.
 
     Returns
     -------
@@ -271,11 +275,22 @@ def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[A
         known = np.isfinite(here)
         loud = _louder(here, known)
         most = known & ~loud[..., np.newaxis] if loud.any() else known
-        out[b] = _smoothed(here, most)
-        for n in np.flatnonzero(loud.any(axis=1)):
-            alone = _smoothed(here[n : n + 1], known[n : n + 1])
-            own.append(np.where(loud[n, :, np.newaxis], alone, out[b]))
-            row[mine[n]] = len(members) + len(own) - 1
+        limit = _WILD * _usual_square(here, most)
+        plain = known & (here <= limit)
+        out[b] = _smoothed(here, plain & most)
+        for n in np.flatnonzero((loud | (most & ~plain).any(axis=2)).any(axis=1)):
+            alone, one = out[b].copy(), slice(n, n + 1)
+            if loud[n].any():
+                told = known[one] & (here[one] <= _WILD * _usual_square(here[one], known[one]))
+                plain[n, loud[n]] = told[0, loud[n]]
+                alone[loud[n]] = _smoothed(here[one], told)[loud[n]]
+            # Where nobody looks for wild gates they are noise, but of their profile alone.
+            wild = known[n] & ~plain[n]
+            more = _smoothed(np.where(wild, here[n], 0.0)[np.newaxis], known[one])
+            alone += np.where((alone > _SCREENED**2) & (more > 0.0), more, 0.0)
+            if loud[n].any() or not np.array_equal(alone, out[b], equal_nan=True):
+                own.append(alone)
+                row[mine[n]] = len(members) + len(own) - 1
     return np.concatenate([out, np.array(own)]) if own else out, row
 
 
@@ -293,7 +308,6 @@ def _louder(squares: Array, known: Booleans) -> Booleans:
 def _smoothed(squares: Array, known: Booleans) -> Array:
     """Return (ray, bin) means over profiles and neighbouring gates; two more bins than squares."""
     width = min(_SMOOTHED, squares.shape[-1])
-    known = known & (squares <= _WILD * _usual_square(squares, known))
     total = np.where(known, squares, 0.0).sum(axis=0)
     number = known.sum(axis=0).astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -304,7 +318,7 @@ def _smoothed(squares: Array, known: Booleans) -> Array:
 def _usual_square(squares: Array, known: Booleans) -> Array:
     """Return (ray, bin) medians of all profiles and of some tens of gates; inf where they are 0.
 
-    A single wild gate of one profile would be taken for noise of all.
+    By them a wild gate is told: one of one profile would be taken for noise of all.
     """
     out = np.full(squares.shape[1:], np.inf)
     parts = max(squares.shape[-1] // _SMOOTHED, 1)
