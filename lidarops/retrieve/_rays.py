@@ -33,6 +33,8 @@ _SMOOTHED: Final = 31
 _WILD: Final = 60.0
 """Times the median square of what is about it, from which on a gate is not of noise: it lies off
 by 6 standard errors, as what is bridged does (`lidarops.retrieve._gate_outliers`)."""
+_ASKED: Final = 16
+"""Profiles for a median of what is about a gate, at least, where there are as many."""
 _SCREENED: Final = 0.045
 """Relative standard error of a gate, up to which wild gates are surely looked for there."""
 
@@ -316,10 +318,13 @@ def _smoothed(squares: Array, known: Booleans) -> Array:
 
 
 def _usual_square(squares: Array, known: Booleans) -> Array:
-    """Return (ray, bin) medians of all profiles and of some tens of gates; inf where they are 0.
+    """Return (ray, bin) medians of profiles and of some tens of gates; inf where they are 0.
 
-    By them a wild gate is told: one of one profile would be taken for noise of all.
+    By them a wild gate is told: one of one profile would be taken for noise of all. Some hundred
+    squares tell a median well enough, so that not all profiles are asked.
     """
+    some = slice(None, None, max(len(squares) // _ASKED, 1))
+    squares, known = squares[some], known[some]
     out = np.full(squares.shape[1:], np.inf)
     parts = max(squares.shape[-1] // _SMOOTHED, 1)
     edges = np.linspace(0, squares.shape[-1], parts + 1).astype(int)
