@@ -301,7 +301,8 @@ def _louder(squares: Array, known: Booleans) -> Booleans:
 
     By medians along range, which no single wild gate moves.
     """
-    # Every third shares no gate with the next one. What is unknown is none of the smallest.
+    # Every third, which shares no gate with the next one, tells as much at a third of the cost.
+    # What is unknown is none of the smallest.
     size = np.median(np.where(known[..., ::3], squares[..., ::3], np.inf), axis=2)
     usual = np.median(size, axis=0)
     return np.asarray(np.isfinite(size) & (size > LOUDER * usual) & (usual > 0.0))

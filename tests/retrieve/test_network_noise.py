@@ -8,6 +8,7 @@ from oracle_multiposition import (
     at_vertices,
     grid,
     homogeneous,
+    noisy,
     plume,
     signals,
     three_by_two,
@@ -93,3 +94,58 @@ def test_wild_gates_are_told_where_noise_is_too_high_to_look_for_them():
     score = (found.extinction - 2e-3) / found.extinction_standard_error
     assert kept.sum() > 500
     assert np.all(np.abs(score[kept]) < 4.0)
+
+
+def test_a_loud_profile_states_its_own_error_where_signals_tell_the_noise():
+    net = three_by_two()
+    power, clean = drawn(net, 0.002, 400, homogeneous())
+    loud = np.arange(400) % 20 == 7
+    power[loud] += 11.0 * (power[loud] - clean)
+    found = solve(power, grid(net), net, prior="none", blocks=np.arange(400) // 20, **FULL)
+    near = net.near_vertex
+    assert found.flags.flagged[loud][:, near].mean() < 0.2
+    score = (found.extinction - 2e-3) / found.extinction_standard_error
+    for mine in (loud, ~loud):
+        kept = ~found.flags.flagged[mine] & near
+        assert np.sqrt(np.mean(score[mine][kept] ** 2)) == pytest.approx(1.0, abs=0.2)
+
+
+# Loud profiles and weak signals -------------------------------------------------------------
+
+
+def test_profiles_are_loud_by_more_than_their_signal_is_strong():
+    """Noise of counts grows with the signal: it is not what a detector out of order has."""
+    signal, variances = np.ones((50, 40)), np.ones((50, 40))
+    variances[3] = 90.0
+    np.testing.assert_allclose(_rays._usual(variances, signal, signal[0]), 1.0)
+    signal[3] = 4.0
+    np.testing.assert_allclose(_rays._usual(variances, signal, signal[0]), (49.0 + 90.0) / 50.0)
+    variances[3] = 110.0
+    np.testing.assert_allclose(_rays._usual(variances, signal, signal[0]), 1.0)
+
+
+def test_a_ray_of_which_nothing_is_known_is_missing_and_not_weak():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
+    told = np.broadcast_to(variance, power.shape).copy()
+    power[3, 0], told[3, 0] = np.nan, np.nan
+    found = solve(power, r, net, variance=told, **FULL)
+    assert not found.flags.weak_signal.any()
+    mine = np.zeros_like(found.flags.signal_missing)
+    mine[3, net.on_ray(0)[0]] = True
+    np.testing.assert_array_equal(found.flags.signal_missing, mine)
+
+
+def test_what_noise_alone_makes_negative_is_weak():
+    """A ray that is out of order is told from one of which little is left."""
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous(8e-3)), 0.01, 20, additive=0.05)
+    found = solve(power, r, net, variance=variance, **FULL)
+    assert (np.median(power, axis=0) <= 0.0).any()
+    assert found.flags.weak_signal.any(axis=0).any()
+    assert not found.flags.signal_not_positive.any()
+    power[:, 0] -= 10.0 * np.sqrt(variance[0])
+    found = solve(power, r, net, variance=variance, **FULL)
+    assert found.flags.signal_not_positive[:, net.on_ray(0)[0][1:]].all()
