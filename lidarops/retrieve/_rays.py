@@ -33,8 +33,16 @@ _SMOOTHED: Final = 31
 _WILD: Final = 60.0
 """Times the median square of what is about it, from which on a gate is not of noise: it lies off
 by 6 standard errors, as what is bridged does (`lidarops.retrieve._gate_outliers`)."""
-_ASKED: Final = 16
+_ASKED: Final = 8
 """Profiles for a median of what is about a gate, at least, where there are as many."""
+_SUMMED: Final = 4
+"""Gates of which sums tell whether neighbours are correlated."""
+_ASKED_SUMS: Final = 400
+"""Sums of a ray that are asked whether they are, about, where there are as many."""
+_SUMS: Final = 300
+"""Sums that are enough to tell so."""
+_CORRELATED: Final = 1.5
+"""Times the variance of independent gates, up to which sums may have more by chance."""
 _SCREENED: Final = 0.045
 """Relative standard error of a gate, up to which wild gates are surely looked for there."""
 
@@ -255,7 +263,8 @@ def _variances(
 def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[Array, Indices]:
     """Return relative variances, from second differences along range, and which go with a profile.
 
-    Gates are taken for independent: where neighbours are correlated, errors are understated.
+    Gates are taken for independent. Where neighbours are correlated, second differences tell too
+    little of them, and variances are those that sums have; of a few profiles nothing tells so.
     One row for each block, and one for each profile that is far louder than its block: it would
     spoil the errors of all others, and state too little itself. So would one with wild gates that
     are not bridged.
@@ -279,21 +288,61 @@ def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[A
         most = known & ~loud[..., np.newaxis] if loud.any() else known
         limit = _WILD * _usual_square(here, most)
         plain = known & (here <= limit)
+        times = _excess(logs[mine, :, 1:-1], plain)[:, np.newaxis]
         out[b] = _smoothed(here, plain & most)
-        for n in np.flatnonzero((loud | (most & ~plain).any(axis=2)).any(axis=1)):
-            alone, one = out[b].copy(), slice(n, n + 1)
-            if loud[n].any():
-                told = known[one] & (here[one] <= _WILD * _usual_square(here[one], known[one]))
-                plain[n, loud[n]] = told[0, loud[n]]
-                alone[loud[n]] = _smoothed(here[one], told)[loud[n]]
-            # Where nobody looks for wild gates they are noise, but of their profile alone.
-            wild = known[n] & ~plain[n]
-            more = _smoothed(np.where(wild, here[n], 0.0)[np.newaxis], known[one])
-            alone += np.where((alone > _SCREENED**2) & (more > 0.0), more, 0.0)
-            if loud[n].any() or not np.array_equal(alone, out[b], equal_nan=True):
-                own.append(alone)
-                row[mine[n]] = len(members) + len(own) - 1
+        for n in np.flatnonzero(loud.any(axis=1)):
+            told = known[n] & (here[n] <= _WILD * _usual_square(here[[n]], known[[n]]))
+            plain[n, loud[n]] = told[loud[n]]
+        hit = np.flatnonzero((loud | (known & ~plain).any(axis=2)).any(axis=1))
+        # Where nobody looks for wild gates they are noise, but of their profile alone.
+        wild = known[hit] & ~plain[hit]
+        alone = np.broadcast_to(out[b], (hit.size, *out[b].shape)).copy()
+        for k in np.flatnonzero(loud[hit].any(axis=1)):
+            which = loud[hit[k]]
+            alone[k, which] = _smoothed(here[hit[[k]]], plain[hit[[k]]])[which]
+        more = _moving_mean(np.where(wild, here[hit], 0.0), known[hit])
+        more = np.where((alone > _SCREENED**2) & (more > 0.0), more, 0.0)
+        for k in np.flatnonzero(loud[hit].any(axis=1) | more.any(axis=(1, 2))):
+            own.append((alone[k] + more[k]) * times)
+            row[mine[hit[k]]] = len(members) + len(own) - 1
+        out[b] *= times
     return np.concatenate([out, np.array(own)]) if own else out, row
+
+
+def _excess(logs: Array, plain: Booleans) -> Array:
+    """Return (ray,) the variance of sums of gates over that of second differences of gates.
+
+    Of what one profile differs by from the next: air that stays there would count as correlated
+    noise. 1 where chance makes as much, or too little is known.
+
+    Parameters
+    ----------
+    logs : (profile, ray, bin) float64
+    plain : (profile, ray, bin) bool
+        Whether a gate is known, and not wild.
+    """
+    out = np.ones(logs.shape[1])
+    size = logs.shape[-1] // (3 * _SUMMED)
+    # Of long rays a part is enough, too.
+    every = max((len(logs) - 1) * size // _ASKED_SUMS, 1)
+    pairs = np.arange(0, len(logs) - 1, every)
+    if pairs.size * size < _SUMS:
+        return out
+    used = slice(0, size * 3 * _SUMMED)
+    steps = logs[pairs + 1, :, used] - logs[pairs, :, used]
+    steps[~(plain[pairs, :, used] & plain[pairs + 1, :, used])] = np.nan
+    parts = steps.reshape(*steps.shape[:2], size, 3, _SUMMED)
+    sums = _second_squares(parts.sum(axis=4)) / _SUMMED
+    gates = _second_squares(parts[..., :3])
+    usual, whole = _ray_medians(gates, _SUMS), _ray_medians(sums, _SUMS)
+    told = (usual > 0.0) & (whole > _CORRELATED * usual)
+    out[told] = whole[told] / usual[told]
+    return out
+
+
+def _second_squares(values: Array) -> Array:
+    """Return squares of the second differences of three."""
+    return np.asarray((values[..., 0] - 2.0 * values[..., 1] + values[..., 2]) ** 2)
 
 
 def _louder(squares: Array, known: Booleans) -> Booleans:
@@ -310,12 +359,15 @@ def _louder(squares: Array, known: Booleans) -> Booleans:
 
 def _smoothed(squares: Array, known: Booleans) -> Array:
     """Return (ray, bin) means over profiles and neighbouring gates; two more bins than squares."""
-    width = min(_SMOOTHED, squares.shape[-1])
-    total = np.where(known, squares, 0.0).sum(axis=0)
-    number = known.sum(axis=0).astype(np.float64)
+    return _moving_mean(np.where(known, squares, 0.0).sum(axis=0), known.sum(axis=0))
+
+
+def _moving_mean(total: Array, number: Indices | Booleans) -> Array:
+    """Return means over neighbouring gates, of sums of so many squares; two more bins."""
+    width = min(_SMOOTHED, total.shape[-1])
     with np.errstate(invalid="ignore", divide="ignore"):
-        smooth = _moving_sum(total, width) / _moving_sum(number, width)
-    return np.asarray(np.concatenate([smooth[:, :1], smooth, smooth[:, -1:]], axis=1))
+        smooth = _moving_sum(total, width) / _moving_sum(number.astype(np.float64), width)
+    return np.concatenate([smooth[..., :1], smooth, smooth[..., -1:]], axis=-1)
 
 
 def _usual_square(squares: Array, known: Booleans) -> Array:
@@ -330,11 +382,26 @@ def _usual_square(squares: Array, known: Booleans) -> Array:
     parts = max(squares.shape[-1] // _SMOOTHED, 1)
     edges = np.linspace(0, squares.shape[-1], parts + 1).astype(int)
     for low, high in pairwise(edges):
-        for ray in range(squares.shape[1]):
-            here = squares[:, ray, low:high][known[:, ray, low:high]]
-            usual = np.median(here) if here.size else 0.0
-            out[ray, low:high] = usual if usual > 0.0 else np.inf
+        here = np.where(known[..., low:high], squares[..., low:high], np.nan)
+        usual = _ray_medians(here)
+        out[:, low:high] = np.where(usual > 0.0, usual, np.inf)[:, np.newaxis]
     return out
+
+
+def _ray_medians(values: Array, least: int = 1) -> Array:
+    """Return (ray,) medians of what is known; 0 where that is less than some number.
+
+    Parameters
+    ----------
+    values : (profile, ray, ...) float64
+    least : int
+    """
+    rows = np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
+    known = np.isfinite(rows)
+    if known.all() and rows.shape[1] >= least:
+        return np.asarray(np.median(rows, axis=1))
+    kept = [row[good] for row, good in zip(rows, known, strict=True)]
+    return np.array([np.median(row) if row.size >= least else 0.0 for row in kept])
 
 
 def _moving_sum(values: Array, width: int) -> Array:

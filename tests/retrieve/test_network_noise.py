@@ -110,6 +110,64 @@ def test_a_loud_profile_states_its_own_error_where_signals_tell_the_noise():
         assert np.sqrt(np.mean(score[mine][kept] ** 2)) == pytest.approx(1.0, abs=0.2)
 
 
+# Gates that are not independent -------------------------------------------------------------
+
+
+def correlated(shape, share, rng):
+    """Return normal noise of which neighbours have a correlation of share / (1 + share^2)."""
+    plain = rng.standard_normal((*shape[:-1], shape[-1] + 1))
+    return (plain[..., 1:] + share * plain[..., :-1]) / np.sqrt(1.0 + share**2)
+
+
+@pytest.mark.parametrize(("relative", "share"), [(0.003, 0.4), (0.02, 1.0)])
+def test_correlated_gates_state_what_their_sums_have(relative, share):
+    """A tenth of the values lay off by more than 4 errors, without a flag."""
+    net = three_by_two()
+    r = grid(net)
+    clean = signals(net, r, plume)
+    shape = (200, *clean.shape)
+    power = clean * (1.0 + relative * correlated(shape, share, np.random.default_rng(3)))
+    found = solve(power, r, net, blocks=np.arange(200) // 50, **FULL)
+    kept = np.isfinite(found.extinction) & ~found.flags.flagged
+    assert kept[:, net.near_vertex].mean() > 0.95
+    score = (found.extinction - at_vertices(net, plume)) / found.extinction_standard_error
+    assert np.mean(np.abs(score[kept]) > 4.0) < 0.002
+    # Sums of many have (1 + share)^2 / (1 + share^2) times the variance of independent ones.
+    noise, _ = estimated(power[:50])
+    sums = relative * (1.0 + share) / np.sqrt(1.0 + share**2)
+    assert np.median(noise) == pytest.approx(sums, rel=0.15)
+
+
+@pytest.mark.parametrize("profiles", [1, 2, 12, 50])
+def test_independent_gates_are_not_taken_for_correlated(profiles):
+    power, _ = drawn(three_by_two(), 0.05, profiles)
+    np.testing.assert_array_equal(_rays._excess(np.log(power), np.isfinite(power)), 1.0)
+
+
+def test_air_that_drifts_is_no_correlated_noise():
+    net = three_by_two()
+    r = grid(net)
+    fields = [lambda x, y, z, e=e: plume(x, y, z, e) for e in np.linspace(-200.0, 100.0, 50)]
+    clean = np.array([signals(net, r, f) for f in fields])
+    power = clean * (1.0 + 0.005 * np.random.default_rng(2).standard_normal(clean.shape))
+    np.testing.assert_array_equal(_rays._excess(np.log(power), np.isfinite(power)), 1.0)
+
+
+def test_wild_gates_are_no_correlated_noise():
+    power, _ = drawn(three_by_two(), 0.02, 50, homogeneous())
+    wild = np.random.default_rng(4).random(power.shape) < 0.015
+    noise, _ = estimated(np.where(wild, 3.0, 1.0) * power)
+    assert np.sqrt(np.mean(noise**2)) == pytest.approx(0.02, rel=0.1)
+
+
+def test_of_unknown_and_equal_counts_no_correlation_is_told():
+    logs = np.full((50, 2, 200), np.nan)
+    logs[:, 1] = 3.0
+    np.testing.assert_array_equal(_rays._excess(logs, np.isfinite(logs)), 1.0)
+    logs[1::2, 1, ::7] = 3.1
+    np.testing.assert_array_equal(_rays._excess(logs, np.isfinite(logs)), 1.0)
+
+
 # Loud profiles and weak signals -------------------------------------------------------------
 
 
