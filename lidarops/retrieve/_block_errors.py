@@ -27,7 +27,7 @@ _HARMLESS: Final = 0.5
 _NOT_LINEAR: Final = 0.1
 """Relative standard error, typical of a block, from which on that of a profile depends on where
 noise has put the value."""
-_FARTHEST: Final = 4.0
+_FARTHEST: Final = 8.0
 """Median standard errors from the median, beyond which a profile is taken for no further off, and
 that it states at most."""
 _FLAT: Final = 1e-9
