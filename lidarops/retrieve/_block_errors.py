@@ -27,6 +27,9 @@ _HARMLESS: Final = 0.5
 _NOT_LINEAR: Final = 0.1
 """Relative standard error, typical of a block, from which on that of a profile depends on where
 noise has put the value."""
+_FARTHEST: Final = 8.0
+"""Median standard errors from the median, beyond which a profile is taken for no further off, and
+that it states at most."""
 _FLAT: Final = 1e-9
 """Of a field's size: less is rounding."""
 
@@ -94,8 +97,13 @@ def of_noise(logarithm: Array, variance: Array, mean: Array) -> Array:
     """
     known = np.isfinite(logarithm) & np.isfinite(variance)
     number = np.maximum(known.sum(axis=0), 1)
-    gap = np.where(known, logarithm, 0.0).sum(axis=0) / number - mean
-    typical = np.where(known, variance, 0.0).sum(axis=0) / number
+    middle = _median(np.where(known, logarithm, np.nan))
+    farthest = _FARTHEST**2 * _median(np.where(known, variance, np.nan))
+    # Of a profile whose rays contradict each other, all others would state the error.
+    with np.errstate(invalid="ignore"):
+        typical = np.where(known, np.minimum(variance, farthest), 0.0).sum(axis=0) / number
+        apart = np.clip(logarithm - middle, -np.sqrt(farthest), np.sqrt(farthest))
+        gap = np.where(known, apart, 0.0).sum(axis=0) / number + middle - mean
     counts = known.any(axis=0) & (gap * gap > _HARMLESS**2 * typical)
     return np.asarray(np.where(counts, gap * gap, 0.0))
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve import _inputs, _point_weights
+from lidarops.retrieve import _inputs, _noise_groups, _point_weights
 from lidarops.retrieve._point_weights import Condensed, Layout
 from lidarops.retrieve.geometry import Network
 
@@ -29,6 +30,21 @@ LOUDER: Final = 10.0
 to that many times more where its signal is stronger, whose noise is then larger too."""
 _SMOOTHED: Final = 31
 """Gates over which an estimated noise is averaged."""
+_WILD: Final = 60.0
+"""Times the median square of what is about it, from which on a gate is not of noise: it lies off
+by 6 standard errors, as what is bridged does (`lidarops.retrieve._gate_outliers`)."""
+_ASKED: Final = 8
+"""Profiles for a median of what is about a gate, at least, where there are as many."""
+_SUMMED: Final = 4
+"""Gates of which sums tell whether neighbours are correlated."""
+_ASKED_SUMS: Final = 400
+"""Sums of a ray that are asked whether they are, about, where there are as many."""
+_SUMS: Final = 300
+"""Sums that are enough to tell so."""
+_CORRELATED: Final = 1.5
+"""Times the variance of independent gates, up to which sums may have more by chance."""
+_SCREENED: Final = 0.045
+"""Relative standard error of a gate, up to which wild gates are surely looked for there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +59,7 @@ class Rays:
     mean: Condensed
     """Of the median signals of the blocks."""
     block: Indices
-    """(profile,)."""
+    """(profile,) numbered anew where noise parts a block (`_noise_groups`)."""
     averaged: Indices
     """(block,) profiles in the means."""
     noise: Array
@@ -76,12 +92,16 @@ def prepare(
     powers = _exponents(exponent, network.rays)
     layout = _point_weights.lay_out(network, grid, shape, nearest, int(gates))
     block, count = _blocks(blocks, leading)
-    members = [np.flatnonzero(block == b) for b in range(count)]
     relative = variance is None
     if variance is None:
+        members = [np.flatnonzero(block == b) for b in range(count)]
         rows, row = _estimated(signal, members, block)
     else:
         rows, row = _variances(variance, signal.shape, turn=turn)
+        about = (layout.crossings.ray, layout.window, layout.weights.shape[1])
+        block = _noise_groups.part(signal, rows, row, block, about, LOUDEST_GATE)
+        count = int(block.max(initial=-1)) + 1
+        members = [np.flatnonzero(block == b) for b in range(count)]
     mean, mean_rows, single, averaged = _means(signal, rows, row, members, layout)
     data = _point_weights.condense(
         signal, rows, row, powers, layout, relative=relative, screened=True
@@ -127,7 +147,11 @@ def _grids(values: npt.ArrayLike, rays: int) -> tuple[Array, bool]:
     for row in array:
         known = np.isfinite(row)
         if not known.any() or not known[: int(known.sum())].all():
-            raise RetrievalInputError("is not finite before the last bin of a ray", field="range")
+            raise RetrievalInputError(
+                "is not finite before the last bin of a ray",
+                field="range",
+                remedy="give each ray's bins first, and NaN only behind the last of them",
+            )
         if _inputs.range_grid(row[known]).descending:
             raise RetrievalInputError("descends", field="range", remedy="turn it, and the power")
     return np.ascontiguousarray(array), False
@@ -192,7 +216,9 @@ def _exponents(exponent: npt.ArrayLike, rays: int) -> Array:
     return np.broadcast_to(array, (rays,)).copy()
 
 
-def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Indices, int]:
+def _blocks(
+    blocks: npt.ArrayLike | None, leading: tuple[int, ...], field: str = "blocks"
+) -> tuple[Indices, int]:
     count = int(np.prod(leading, dtype=np.int64))
     if blocks is None:
         return np.zeros(count, dtype=np.intp), min(count, 1)
@@ -200,7 +226,7 @@ def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> tuple[Ind
     if labels.shape != leading or labels.dtype.kind not in "iuUS":
         raise RetrievalInputError(
             f"has the shape {labels.shape} of {labels.dtype}",
-            field="blocks",
+            field=field,
             remedy=f"give one whole number or name per profile, {leading}",
         )
     found, inverse = np.unique(labels.reshape(count), return_inverse=True)
@@ -237,8 +263,11 @@ def _variances(
 def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[Array, Indices]:
     """Return relative variances, from second differences along range, and which go with a profile.
 
+    Gates are taken for independent. Where neighbours are correlated, second differences tell too
+    little of them, and variances are those that sums have; of a few profiles nothing tells so.
     One row for each block, and one for each profile that is far louder than its block: it would
-    spoil the errors of all others, and state too little itself.
+    spoil the errors of all others, and state too little itself. So would one with wild gates that
+    are not bridged.
 
     Returns
     -------
@@ -257,12 +286,63 @@ def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[A
         known = np.isfinite(here)
         loud = _louder(here, known)
         most = known & ~loud[..., np.newaxis] if loud.any() else known
-        out[b] = _smoothed(here, most)
+        limit = _WILD * _usual_square(here, most)
+        plain = known & (here <= limit)
+        times = _excess(logs[mine, :, 1:-1], plain)[:, np.newaxis]
+        out[b] = _smoothed(here, plain & most)
         for n in np.flatnonzero(loud.any(axis=1)):
-            alone = _smoothed(here[n : n + 1], known[n : n + 1])
-            own.append(np.where(loud[n, :, np.newaxis], alone, out[b]))
-            row[mine[n]] = len(members) + len(own) - 1
+            told = known[n] & (here[n] <= _WILD * _usual_square(here[[n]], known[[n]]))
+            plain[n, loud[n]] = told[loud[n]]
+        hit = np.flatnonzero((loud | (known & ~plain).any(axis=2)).any(axis=1))
+        # Where nobody looks for wild gates they are noise, but of their profile alone.
+        wild = known[hit] & ~plain[hit]
+        alone = np.broadcast_to(out[b], (hit.size, *out[b].shape)).copy()
+        for k in np.flatnonzero(loud[hit].any(axis=1)):
+            which = loud[hit[k]]
+            alone[k, which] = _smoothed(here[hit[[k]]], plain[hit[[k]]])[which]
+        more = _moving_mean(np.where(wild, here[hit], 0.0), known[hit])
+        more = np.where((alone > _SCREENED**2) & (more > 0.0), more, 0.0)
+        for k in np.flatnonzero(loud[hit].any(axis=1) | more.any(axis=(1, 2))):
+            own.append((alone[k] + more[k]) * times)
+            row[mine[hit[k]]] = len(members) + len(own) - 1
+        out[b] *= times
     return np.concatenate([out, np.array(own)]) if own else out, row
+
+
+def _excess(logs: Array, plain: Booleans) -> Array:
+    """Return (ray,) the variance of sums of gates over that of second differences of gates.
+
+    Of what one profile differs by from the next: air that stays there would count as correlated
+    noise. 1 where chance makes as much, or too little is known.
+
+    Parameters
+    ----------
+    logs : (profile, ray, bin) float64
+    plain : (profile, ray, bin) bool
+        Whether a gate is known, and not wild.
+    """
+    out = np.ones(logs.shape[1])
+    size = logs.shape[-1] // (3 * _SUMMED)
+    # Of long rays a part is enough, too.
+    every = max((len(logs) - 1) * size // _ASKED_SUMS, 1)
+    pairs = np.arange(0, len(logs) - 1, every)
+    if pairs.size * size < _SUMS:
+        return out
+    used = slice(0, size * 3 * _SUMMED)
+    steps = logs[pairs + 1, :, used] - logs[pairs, :, used]
+    steps[~(plain[pairs, :, used] & plain[pairs + 1, :, used])] = np.nan
+    parts = steps.reshape(*steps.shape[:2], size, 3, _SUMMED)
+    sums = _second_squares(parts.sum(axis=4)) / _SUMMED
+    gates = _second_squares(parts[..., :3])
+    usual, whole = _ray_medians(gates, _SUMS), _ray_medians(sums, _SUMS)
+    told = (usual > 0.0) & (whole > _CORRELATED * usual)
+    out[told] = whole[told] / usual[told]
+    return out
+
+
+def _second_squares(values: Array) -> Array:
+    """Return squares of the second differences of three."""
+    return np.asarray((values[..., 0] - 2.0 * values[..., 1] + values[..., 2]) ** 2)
 
 
 def _louder(squares: Array, known: Booleans) -> Booleans:
@@ -270,7 +350,8 @@ def _louder(squares: Array, known: Booleans) -> Booleans:
 
     By medians along range, which no single wild gate moves.
     """
-    # Every third shares no gate with the next one. What is unknown is none of the smallest.
+    # Every third, which shares no gate with the next one, tells as much at a third of the cost.
+    # What is unknown is none of the smallest.
     size = np.median(np.where(known[..., ::3], squares[..., ::3], np.inf), axis=2)
     usual = np.median(size, axis=0)
     return np.asarray(np.isfinite(size) & (size > LOUDER * usual) & (usual > 0.0))
@@ -278,12 +359,49 @@ def _louder(squares: Array, known: Booleans) -> Booleans:
 
 def _smoothed(squares: Array, known: Booleans) -> Array:
     """Return (ray, bin) means over profiles and neighbouring gates; two more bins than squares."""
-    width = min(_SMOOTHED, squares.shape[-1])
-    total = np.where(known, squares, 0.0).sum(axis=0)
-    number = known.sum(axis=0).astype(np.float64)
+    return _moving_mean(np.where(known, squares, 0.0).sum(axis=0), known.sum(axis=0))
+
+
+def _moving_mean(total: Array, number: Indices | Booleans) -> Array:
+    """Return means over neighbouring gates, of sums of so many squares; two more bins."""
+    width = min(_SMOOTHED, total.shape[-1])
     with np.errstate(invalid="ignore", divide="ignore"):
-        smooth = _moving_sum(total, width) / _moving_sum(number, width)
-    return np.asarray(np.concatenate([smooth[:, :1], smooth, smooth[:, -1:]], axis=1))
+        smooth = _moving_sum(total, width) / _moving_sum(number.astype(np.float64), width)
+    return np.concatenate([smooth[..., :1], smooth, smooth[..., -1:]], axis=-1)
+
+
+def _usual_square(squares: Array, known: Booleans) -> Array:
+    """Return (ray, bin) medians of profiles and of some tens of gates; inf where they are 0.
+
+    By them a wild gate is told: one of one profile would be taken for noise of all. Some hundred
+    squares tell a median well enough, so that not all profiles are asked.
+    """
+    some = slice(None, None, max(len(squares) // _ASKED, 1))
+    squares, known = squares[some], known[some]
+    out = np.full(squares.shape[1:], np.inf)
+    parts = max(squares.shape[-1] // _SMOOTHED, 1)
+    edges = np.linspace(0, squares.shape[-1], parts + 1).astype(int)
+    for low, high in pairwise(edges):
+        here = np.where(known[..., low:high], squares[..., low:high], np.nan)
+        usual = _ray_medians(here)
+        out[:, low:high] = np.where(usual > 0.0, usual, np.inf)[:, np.newaxis]
+    return out
+
+
+def _ray_medians(values: Array, least: int = 1) -> Array:
+    """Return (ray,) medians of what is known; 0 where that is less than some number.
+
+    Parameters
+    ----------
+    values : (profile, ray, ...) float64
+    least : int
+    """
+    rows = np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
+    known = np.isfinite(rows)
+    if known.all() and rows.shape[1] >= least:
+        return np.asarray(np.median(rows, axis=1))
+    kept = [row[good] for row, good in zip(rows, known, strict=True)]
+    return np.array([np.median(row) if row.size >= least else 0.0 for row in kept])
 
 
 def _moving_sum(values: Array, width: int) -> Array:
@@ -413,7 +531,7 @@ def average(
         raise RetrievalInputError(
             f"has the shape {signal.shape}", field="power", remedy="give (profile, ray, range)"
         )
-    group, count = _blocks(groups, signal.shape[:1])
+    group, count = _blocks(groups, signal.shape[:1], "groups")
     noise = None
     if variance is not None:
         rows, row = _variances(variance, signal.shape, turn=False)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from oracle_multiposition import grid, noisy, plume, signals, three_by_two
 
 from lidarops.bench import stability_draws_network as draws
 from lidarops.retrieve import _block_errors
+from lidarops.retrieve.multiposition import solve
 
 # Fields that a prior rules out ----------------------------------------------------------------
 
@@ -131,3 +133,34 @@ def test_errors_are_told_without_touching_a_value_or_a_clear_case(monkeypatch):
     known = np.isfinite(plain)
     assert np.all(stated[known] >= plain[known])
     assert np.median(stated[known] / plain[known]) < 1.1
+
+
+@pytest.mark.parametrize("off", [1.0, 30.0, -30.0, 1e3])
+def test_a_profile_that_is_far_off_moves_no_other(off):
+    """A twentieth of what it was off by stood in the errors of all."""
+    rng = np.random.default_rng(3)
+    logarithm = -7.0 + rng.normal(0.0, 0.02, (50, 1))
+    variance = np.full((50, 1), 0.02**2)
+    logarithm[7] += off
+    variance[7] *= 1e6
+    assert _block_errors.of_noise(logarithm, variance, np.array([-7.0]))[0] == 0.0
+    # Where many are off to one side, by little, all are told so.
+    logarithm[:20] += 0.1
+    told = _block_errors.of_noise(logarithm, variance, np.array([-7.0]))[0]
+    assert 0.02**2 < told < 0.06**2
+
+
+@pytest.mark.parametrize("factor", [1e4, 1e8])
+def test_rays_that_contradict_each_other_in_a_profile_cost_the_others_nothing(factor):
+    """The others stated up to 26 times their errors."""
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.003, 50, seed=4)
+    heard = power.copy()
+    heard[7, 0, 133:136] *= factor
+    settings = {"variance": variance, "full_overlap_range": 100.0}
+    clean, found = (solve(one, r, net, **settings) for one in (power, heard))
+    others, near = np.arange(50) != 7, net.near_vertex
+    ratio = found.extinction_standard_error / clean.extinction_standard_error
+    np.testing.assert_allclose(ratio[others][:, near], 1.0, rtol=0.05)
+    np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])

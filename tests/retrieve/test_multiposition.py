@@ -365,10 +365,11 @@ def test_averages_leave_out_rays_with_gaps():
     np.testing.assert_allclose(mean[1, 1, :6], power[3, 1, :6], rtol=1e-14)
     np.testing.assert_allclose(variance[:, 1, :5], [[0.1] * 5, [0.3] * 5], rtol=1e-14)
     assert np.isnan(variance[:, 1, 5]).all()
-    with pytest.raises(RetrievalInputError):
+    with pytest.raises(RetrievalInputError, match="power"):
         multiposition.average(power[0], labels)
-    with pytest.raises(RetrievalInputError):
+    with pytest.raises(RetrievalInputError, match="groups") as raised:
         multiposition.average(power, labels[:2])
+    assert raised.value.field == "groups"
 
 
 def test_unknown_noise_is_told_by_the_signal():

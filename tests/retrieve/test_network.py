@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -437,6 +438,58 @@ def test_a_mean_that_is_not_determined_speaks_against_no_prior():
     unasked = _prior._solve_block(_prior._Problem(data, *where), lambda: None)
     assert np.isfinite(told.deviation[0])
     np.testing.assert_array_equal(told.logarithm, unasked.logarithm)
+    # The field may deviate by as much as the weakest prior has it, and bend.
+    more = unasked.variance - unasked.believed
+    wide = unasked.believed + (4.0**2 - 1.0) / (2.0**2 - 1.0) * more + unasked.missed
+    np.testing.assert_allclose(told.variance, wide, rtol=1e-12)
+
+
+def test_what_the_mean_leaves_open_is_told_with_the_weakest_prior(monkeypatch):
+    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
+    result = _prior._Problem(data, *where).afresh(0.1)
+    mean = _prior._mean_problem(data, *where)
+    told, free = mean.afresh(0.1), mean.afresh(np.inf)
+    free.variance[0, 2] = np.nan
+    for other in ("of_noise", "of_field"):
+        monkeypatch.setattr(_prior._block_errors, other, lambda *_: 0.0)
+    factor = np.ones(result.variance.shape[1])
+    for strength, wanted in ((1.0, 5.0), (2.0, 1.0), (4.0, 1.0)):
+        factor[2] = wanted
+        found = _prior._widened(result, strength, told, free)
+        expected = result.believed + factor * (result.variance - result.believed)
+        np.testing.assert_allclose(found.variance, expected, rtol=1e-12)
+
+
+def asked(freedoms, whole=None):
+    """Return whether rays test a prior: of profiles, and of the freedom and errors of their mean.
+
+    The last of four vertices is seen by no ray."""
+    data = SimpleNamespace(usable=np.array([[1, 1, 1, 0]], dtype=np.uint8))
+    problem = SimpleNamespace(geometry=(None, None, np.arange(4)), data=data)
+    status = np.full(len(freedoms), _network.SOLVED)
+    alone = SimpleNamespace(status=status, degrees_of_freedom=np.array(freedoms, dtype=float))
+    if whole is None:
+        return _prior._tests(problem, alone, None)
+    freedom, errors = whole
+    variance = np.array([[*np.square(errors), np.nan]])
+    mean = SimpleNamespace(degrees_of_freedom=np.array([float(freedom)]), variance=variance)
+    return _prior._tests(problem, alone, mean)
+
+
+@pytest.mark.parametrize(
+    ("whole", "told"),
+    [((0, [0.1, 0.5, 0.9]), True), ((0, [0.1, 0.5, 1.1]), False), ((0, [0.1, np.nan, 0.1]), False),
+     ((1, [0.1, 0.5, 1.1]), True), ((-1, [0.1, 0.1, 0.1]), False)],
+)  # fmt: skip
+def test_as_many_equations_as_unknowns_test_a_prior_where_they_tell_all_vertices(whole, told):
+    assert asked([-1.0] * 10, whole) == told
+
+
+@pytest.mark.parametrize(("most", "told"), [(0.7, True), (0.8, False)])
+def test_a_quarter_of_the_profiles_is_enough_to_test_a_prior(most, told):
+    number = round(50 * most)
+    assert asked([-1.0] * number + [2.0] * (50 - number)) == told
+    assert asked([-1.0] * number + [2.0] * (50 - number), (-1, [0.1, 0.1, 0.1])) == told
 
 
 def test_a_mean_that_does_not_settle_tells_no_least_deviation(monkeypatch):
