@@ -81,6 +81,8 @@ class Solution:
     """(profile,) of that."""
     deviation: Array
     """(profile,) of the prior; inf without one."""
+    strength: Array
+    """(profile,) by which that, and the gradient, were multiplied."""
     status: Codes
     """(profile,) of `lidarops.retrieve._network`."""
     left_out: Codes
@@ -123,12 +125,7 @@ class _Problem:
             np.zeros(shape[0], dtype=np.uint8),
         )
         left_out = np.zeros(self.constants.shape, dtype=np.uint8)
-        flat = not np.isfinite(deviation)
-        precision, norm = (
-            (np.zeros_like(self.gradient), 0.0)
-            if flat
-            else _free_level(self.gradient, deviation, strength)
-        )
+        precision, norm, flat = _precision(self.gradient, deviation, strength)
         data = self.data
         _network.solve_profiles(
             data.log_value, data.integral, data.usable, data.covariance, self.geometry,
@@ -141,8 +138,8 @@ class _Problem:
         self.likelihood = float(np.sum(terms))
         return Solution(
             logarithm, variance, believed, missed, summary[:, 0], summary[:, 1],
-            summary[:, 2], summary[:, 3], np.full(shape[0], strength * deviation), status,
-            left_out, np.zeros(shape[0], dtype=np.bool_),
+            summary[:, 2], summary[:, 3], np.full(shape[0], strength * deviation),
+            np.full(shape[0], strength), status, left_out, np.zeros(shape[0], dtype=np.bool_),
         )  # fmt: skip
 
 
@@ -191,7 +188,7 @@ def solve_blocks(
     n = block.size
     out = Solution(
         nothing(*shape), nothing(*shape), nothing(*shape), nothing(*shape), nothing(n),
-        nothing(n), nothing(n), nothing(n), nothing(n),
+        nothing(n), nothing(n), nothing(n), nothing(n), nothing(n),
         np.full(n, _network.UNDETERMINED, dtype=np.uint8),
         np.zeros((n, exponent.size), dtype=np.uint8), np.zeros(n, dtype=np.bool_),
     )  # fmt: skip
@@ -473,6 +470,21 @@ def _gradient(position: Array) -> Array:
     size = float(np.trace(covariance))
     # One vertex has no gradient.
     return np.asarray(covariance * (len(position) / size if size > 0 else 0.0))
+
+
+def prior_of(position: Array, found: Solution, profile: int) -> tuple[Array, bool]:
+    """Return the precision of the prior that a profile was solved with, and whether it had none."""
+    strength = float(found.strength[profile])
+    deviation = float(found.deviation[profile]) / strength
+    precision, _, flat = _precision(_gradient(position), deviation, strength)
+    return precision, flat
+
+
+def _precision(gradient: Array, deviation: float, strength: float) -> tuple[Array, float, bool]:
+    """Return the precision of a prior, -ln of its determinant, and whether there is none."""
+    if not np.isfinite(deviation):
+        return np.zeros_like(gradient), 0.0, True
+    return *_free_level(gradient, deviation, strength), False
 
 
 def _free_level(gradient: Array, deviation: float, strength: float = 1.0) -> tuple[Array, float]:

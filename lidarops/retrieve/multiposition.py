@@ -42,7 +42,6 @@ from lidarops.retrieve import _block_errors, _closed, _departures, _inputs, _net
 from lidarops.retrieve import geometry as rays_geometry
 from lidarops.retrieve import visibility as sight
 from lidarops.retrieve._point_weights import MISSING, NOT_POSITIVE, OUTLYING
-from lidarops.retrieve._prior import _STRENGTHS, DEVIATIONS, _free_level, _gradient
 from lidarops.retrieve.geometry import Cycle, Network
 
 Array = npt.NDArray[np.float64]
@@ -230,7 +229,8 @@ def solve(
     method : {"network", "cycle", "multiplier", "unbiased", "slope", "klett"}
     variance : (..., ray, range) float, optional
         Noise variance in the square of the power's unit, broadcast against `power`; gates are
-        independent. Where not given, second differences along range tell it, block by block.
+        independent. Where not given, second differences along range tell it, block by block, and
+        sums of gates that these are correlated, where there are profiles enough.
     overlap : (ray, range) or (range,) float, optional
         Overlap function, by which power is divided; gates below 0.5 are not used.
     full_overlap_range : float or (ray,) float, optional
@@ -239,7 +239,8 @@ def solve(
         m of backscatter ~ extinction^(1/m) along a ray.
     blocks : (...) int or str, optional
         Labels of the profiles that are pooled, for the mean field and the multiplier; one block
-        where not given. A block's results depend on its own profiles only.
+        where not given. A block's results depend on its own profiles only. Where many of them are
+        far noisier than many others, it is parted into the quiet and the noisy ones.
     prior : {"block", "none"}
         For the network. "none" solves each profile for itself; vertices that are not
         determined are NaN.
@@ -335,7 +336,7 @@ def _by_bends(rays: _rays.Rays, fit: _prior.Solution, vertex: Indices, position:
     geometry = (rays.layout.first_crossing, rays.layout.offset, vertex)
     for b in np.unique(rays.block):
         mine = np.flatnonzero(rays.block == b)
-        precision, flat = _precision(position, float(fit.deviation[mine[0]]))
+        precision, flat = _prior.prior_of(position, fit, mine[0])
         data, moved = rays.data.take(mine), np.zeros((mine.size, position.shape[0], 4))
         _departures.carry_errors(
             data.log_value, data.integral, data.usable, data.covariance, geometry, precision, flat,
@@ -344,19 +345,6 @@ def _by_bends(rays: _rays.Rays, fit: _prior.Solution, vertex: Indices, position:
         )  # fmt: skip
         out[mine] = _departures.variance(moved)
     return out
-
-
-def _precision(position: Array, deviation: float) -> tuple[Array, bool]:
-    """Return the precision of a prior of a deviation, and whether there was none."""
-    flat = not np.isfinite(deviation)
-    if flat:
-        return np.zeros((position.shape[0], position.shape[0])), flat
-    # The product of strength and deviation tells both: no two of those tried have it in common.
-    strength = min(
-        _STRENGTHS,
-        key=lambda s: float(np.min(np.abs(np.log(deviation / s / np.array(DEVIATIONS))))),
-    )
-    return _free_level(_gradient(position), deviation / strength, strength)[0], flat
 
 
 def _solve_closed(

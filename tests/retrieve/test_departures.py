@@ -102,13 +102,29 @@ def test_the_noise_of_a_departure_is_what_is_stated():
 
 
 @pytest.mark.parametrize("strength", [1.0, 2.0, 4.0])
-def test_the_precision_of_a_prior_is_told_by_its_deviation(strength):
-    position = three_by_two().vertex
-    for deviation in _prior.DEVIATIONS:
-        expected, _ = _prior._free_level(_prior._gradient(position), deviation, strength)
-        found, flat = multiposition._precision(position, strength * deviation)
-        np.testing.assert_array_equal(found, expected)
-        assert not flat
+@pytest.mark.parametrize("deviation", [*_prior.DEVIATIONS, np.inf])
+def test_a_solution_tells_the_prior_that_it_was_found_with(deviation, strength):
+    net = three_by_two()
+    shape = (1, net.vertices)
+    layout = _point_weights.lay_out(
+        net, np.tile(grid(net), (net.rays, 1)), None, np.full(net.rays, 100), 7
+    )
+    power = signals(net, grid(net), gradient)[np.newaxis]
+    data = _point_weights.condense(
+        power, ((0.01 * power[0]) ** 2)[np.newaxis], np.zeros(1, dtype=np.intp), np.ones(net.rays),
+        layout, relative=False, screened=False,
+    )  # fmt: skip
+    vertex = layout.crossings.vertex.astype(np.intp)
+    problem = _prior._Problem(data, layout, vertex, np.ones(net.rays), net.vertex)
+    found = problem.solve(deviation, 4, strength)
+    precision, flat = _prior.prior_of(net.vertex, found, 0)
+    assert found.logarithm.shape == shape
+    assert flat == np.isinf(deviation)
+    if flat:
+        assert not precision.any()
+    else:
+        expected = _prior._free_level(_prior._gradient(net.vertex), deviation, strength)[0]
+        np.testing.assert_allclose(precision, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("deviation", [0.03, 0.3, np.inf])
@@ -135,12 +151,8 @@ def test_errors_of_values_move_solutions_as_if_these_were_solved_anew(build, dev
     numbers = np.cumsum(layout.measured) - 1
     given = layout, numbers[layout.crossings.vertex].astype(np.intp), np.ones(net.rays), net.vertex
     here, there = (_prior._Problem(d, *given).solve(deviation, 40) for d in (data, other))
-    flat = not np.isfinite(deviation)
-    precision = (
-        np.zeros((net.vertices, net.vertices))
-        if flat
-        else _prior._free_level(_prior._gradient(net.vertex), deviation)[0]
-    )
+    precision, flat = _prior.prior_of(net.vertex, here, 0)
+    assert flat == (not np.isfinite(deviation))
 
     def carried(shared, own):
         out = np.zeros((1, net.vertices, 4))
