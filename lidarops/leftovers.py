@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Final
+from enum import StrEnum
+from functools import cached_property
 
 from lidarops import dependence
 from lidarops.campaign import Campaign
@@ -13,10 +14,8 @@ from lidarops.catalog.ledger import Made
 from lidarops.plan_rules import GLUED, StepName
 from lidarops.processing import nothing_to_do
 from lidarops.product_settings import Products
-from lidarops.records import Plan, ProductKind, Scene
-from lidarops.scenes import instrument_and_start
-
-NO_FILE: Final = "no raw file of its scene is left"
+from lidarops.records import Granule, InputRecord, Plan, ProductKind, Scene
+from lidarops.scenes import Cut, instrument_and_start
 
 Planned = tuple[Scene, Plan]
 """A scene, and all that the campaign asks for of it."""
@@ -31,9 +30,58 @@ class Orphan:
     run: str
     """The one that made it."""
     asked: bool = False
-    """Whether the campaign still asks for it, and other files of its scene no longer allow it."""
+    """Whether the campaign still asks for it, and its files, or others of its scene, no longer
+    allow it."""
     lost: bool = False
     """Whether the campaign still asks for it, and no raw file of its scene is left."""
+
+
+class Fate(StrEnum):
+    """What became of the signal files that a product was made from, whose scene is gone."""
+
+    CUT_ANEW = "its files are cut into other scenes now"
+    UNUSED = "its raw files are refused, or stand in no scene"
+    GONE = "no raw file of its scene is left"
+
+
+class Fates:
+    """Tells what became of the signal files of products.
+
+    Parameters
+    ----------
+    found : Cut
+        The scenes of some days, and the good granules that stand in none.
+    refused : callable
+        Gives the granules that the catalog refuses; asked once, and only where it matters.
+    signals : callable
+        Of a product, the signal files that it was made from.
+    """
+
+    def __init__(
+        self,
+        found: Cut,
+        refused: Callable[[], Iterable[Granule]],
+        signals: Callable[[Made], Iterable[InputRecord]],
+    ) -> None:
+        self._found = found
+        self._refused = refused
+        self._signals = signals
+
+    def of(self, made: Made) -> Fate:
+        """Return what became of the files of a product, of those that are left where some are."""
+        signals = list(self._signals(made))
+        if any(used.path in self._in_scenes or used.sha256 in self._in_scenes for used in signals):
+            return Fate.CUT_ANEW
+        return Fate.UNUSED if any(used.path in self._idle for used in signals) else Fate.GONE
+
+    @cached_property
+    def _in_scenes(self) -> set[str | None]:
+        granules = (granule for scene in self._found.scenes for granule in scene.granules)
+        return {name for granule in granules for name in (granule.path, granule.sha256)}
+
+    @cached_property
+    def _idle(self) -> set[str]:
+        return {granule.path for granule in (*self._refused(), *self._found.set_aside)}
 
 
 def barren(planned: Iterable[Planned], campaign: Campaign) -> dict[str, str]:
@@ -76,7 +124,7 @@ def orphans(
     made: Iterable[Made],
     campaign: Campaign,
     other_files: Callable[[Made, Scene], bool],
-    some_left: Callable[[Made], bool],
+    fate: Callable[[Made], Fate],
 ) -> list[tuple[Made, Orphan]]:
     """Return the products that would not be made again, and why.
 
@@ -89,8 +137,8 @@ def orphans(
     campaign : Campaign
     other_files : callable
         Whether a product was made from other signal files than its scene has now.
-    some_left : callable
-        Whether a signal file that a product was made from is in one of the scenes.
+    fate : callable
+        What became of the signal files of a product whose scene is gone; `Fates.of`.
 
     Returns
     -------
@@ -113,8 +161,11 @@ def orphans(
                 reason, kept = _why(told, each), other_files(each, scene)
             else:
                 absent = _absent(each, planned, campaign)
-                kept, lost = bool(absent), not (absent or some_left(each))
-                reason = absent or (NO_FILE if lost else "its files are cut into other scenes now")
+                became = fate(each)
+                # What cannot be read now may have been the only good bytes.
+                kept = bool(absent) or became is Fate.UNUSED
+                lost = not absent and became is Fate.GONE
+                reason = absent or became.value
         found.append((each, Orphan(each.path, reason, each.run, kept, lost)))
     return found
 

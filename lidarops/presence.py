@@ -205,10 +205,13 @@ def unmet(
     asked = {StepName(kind.value) for kind in kinds} or set(StepName)
     all_files: dict[tuple[str, str], int] = defaultdict(int)
     lacking: dict[tuple[str, str, str], list[tuple[int, str]]] = defaultdict(list)
+    held: dict[tuple[str, str], int] = defaultdict(int)
     for each in holdings:
         instrument = campaign.instruments.get(each.instrument)
         if instrument is None or not (instruments is None or each.instrument in instruments):
             continue
+        for there in each.layout:
+            held[each.instrument, there.name] += each.files
         facts = instrument.facts_at(each.since)
         period = _period(facts)
         for word in {"", period}:
@@ -224,17 +227,12 @@ def unmet(
                 told[period, left.channel] = left.reason
         for (word, channel), reason in told.items():
             lacking[each.instrument, word, channel].append((each.files, reason))
-    found = [
-        Unmet(
-            instrument=name,
-            channel=channel,
-            asked=word,
-            reason=max(told)[1],
-            files=sum(files for files, _ in told),
-            of=all_files[name, word if word.startswith(FACTS) else ""],
-        )
-        for (name, word, channel), told in lacking.items()
-    ]
+    found = []
+    for (name, word, channel), without in lacking.items():
+        of_facts = word.startswith(FACTS)
+        files, whole = sum(count for count, _ in without), all_files[name, word if of_facts else ""]
+        holding = held[name, channel] if of_facts else whole - files
+        found.append(Unmet(name, channel, word, max(without)[1], files, whole, holding))
     return tuple(sorted(found, key=lambda each: (not each.nowhere, each.instrument)))
 
 

@@ -323,11 +323,13 @@ class Unmet:
     """Number of files that lack it."""
     of: int
     """Number of files that were to hold it: all of the instrument, or of the period of facts."""
+    held: int
+    """Number of files of the instrument, of whatever period, that hold it."""
 
     @property
     def nowhere(self) -> bool:
         """Whether no file holds it, as after a slip of the pen."""
-        return self.files == self.of
+        return self.held == 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -277,20 +277,9 @@ class Judge:
             for each in everything
         ]
         chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
-        here = {
-            name
-            for each in found.scenes
-            for granule in each.granules
-            for name in (granule.path, granule.sha256)
-        }
+        fates = leftovers.Fates(found, self._store.refused, self._signals)
         orphans = leftovers.orphans(
-            planned,
-            made.values(),
-            self._campaign,
-            self._other_files,
-            lambda product: any(
-                used.path in here or used.sha256 in here for used in self._signals(product)
-            ),
+            planned, made.values(), self._campaign, self._other_files, fates.of
         )
         orphaned = {known.day for known, _ in orphans}
         digests, self._digests = self._digests, {}

@@ -77,8 +77,13 @@ def test_facts_are_compared_with_the_files_of_their_period(tmp_path: Path) -> No
     assert _found(right, *files, folder=tmp_path) == []
     wrong = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_532o")}]
     (each,) = _found(wrong, *files, folder=tmp_path)
-    assert (each.asked, each.nowhere) == ("facts from 2026-03-02T00:00:00Z", True)
-    assert (each.files, each.of) == (2, 2)
+    assert (each.asked, each.files, each.of) == ("facts from 2026-03-02T00:00:00Z", 2, 2)
+    # It is told, and no trouble for ever: facts of two periods may share what they say.
+    assert each.held == 1
+    assert not each.nowhere
+    slip = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_606o")}]
+    (each,) = _found(slip, *files, folder=tmp_path)
+    assert each.nowhere
 
 
 def test_facts_of_a_time_without_files_are_no_slip(tmp_path: Path) -> None:

@@ -347,6 +347,28 @@ def test_products_without_a_raw_file_are_a_trouble_until_they_are_removed(
     assert not bring_up_to_date(campaign).orphans
 
 
+@pytest.mark.parametrize("how", ["truncated", "unreadable"])
+def test_products_whose_files_cannot_be_used_any_more_are_kept(archive: Archive, how: str) -> None:
+    campaign = archive.write()
+    before = archive.contents("out/products")
+    for path in (archive.folder / "raw/poor").glob("h2*"):
+        if how == "truncated":
+            path.write_bytes(path.read_bytes()[:-100])
+        else:
+            path.unlink()
+            path.symlink_to("nowhere")
+    for _ in range(2):
+        found = bring_up_to_date(campaign)
+        (orphan,) = {(each.reason, each.asked, each.lost) for each in found.orphans}
+        assert orphan == ("its raw files are refused, or stand in no scene", True, False)
+        assert len(found.orphans) == 2
+        assert found.troubled
+        assert not found.lost
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
+    assert shown.exit_code == 1
+    assert archive.contents("out/products") == before
+
+
 def test_products_of_scenes_that_are_cut_in_another_way_are_not_told_as_lost(
     archive: Archive,
 ) -> None:

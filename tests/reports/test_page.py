@@ -366,8 +366,8 @@ class TestManyScenes:
             barren={f"idle_{k}": "nothing to do: it climbs" for k in range(7)},
             more_barren=1200,
             unmet=(
-                Unmet("vertical", "photon_533o", "facts", "the files hold no such", 150, 150),
-                Unmet("vertical", "photon_607o", "signal", "the files hold no such", 20, 150),
+                Unmet("vertical", "photon_533o", "facts", "the files hold no such", 150, 150, 0),
+                Unmet("vertical", "photon_607o", "signal", "the files hold no such", 20, 150, 130),
             ),
         )
         found = built(more, tmp_path / "report")
@@ -456,7 +456,7 @@ def nasty_run(nasty: str, archive):
     return run_record(
         archive.root, [scene, failed], id=nasty, campaign=nasty, title=nasty, version=nasty,
         archive=nasty, truth=nasty, refused=(fab.granule(nasty, nasty, instrument=nasty),),
-        barren={nasty: nasty}, unmet=(Unmet(nasty, nasty, nasty, nasty, 3, 4),),
+        barren={nasty: nasty}, unmet=(Unmet(nasty, nasty, nasty, nasty, 3, 4, 1),),
     )  # fmt: skip
 
 

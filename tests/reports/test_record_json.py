@@ -124,7 +124,7 @@ records = st.builds(
     scenes=some(outcomes),
     refused=some(granules),
     truth=text,
-    unmet=some(st.builds(Unmet, text, text, text, text, whole, whole)),
+    unmet=some(st.builds(Unmet, text, text, text, text, whole, whole, whole)),
     barren=st.dictionaries(text, text, max_size=2),
     more_barren=whole,
 )
