@@ -35,12 +35,18 @@ _WILD: Final = 60.0
 by 6 standard errors, as what is bridged does (`lidarops.retrieve._gate_outliers`)."""
 _ASKED: Final = 8
 """Profiles for a median of what is about a gate, at least, where there are as many."""
+_APART: Final = 3
+"""Gates to the next second difference that shares none: a third of all, which tells as much."""
+_FEW: Final = 7
+"""Of them, at least, for what is usual of a profile and ray: fewer may mostly be wild."""
 _SUMMED: Final = 4
 """Gates of which sums tell whether neighbours are correlated."""
 _ASKED_SUMS: Final = 400
 """Sums of a ray that are asked whether they are, about, where there are as many."""
 _SUMS: Final = 300
 """Sums that are enough to tell so."""
+_MORE: Final = 4
+"""Times as many are asked where too few of them are known."""
 _CORRELATED: Final = 1.5
 """Times the variance of independent gates, up to which sums may have more by chance."""
 _SCREENED: Final = 0.045
@@ -284,14 +290,14 @@ def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[A
     for b, mine in enumerate(members):
         here = squares[mine]
         known = np.isfinite(here)
-        loud = _louder(here, known)
+        level = _levels(here, known)
+        loud = _louder(level)
         most = known & ~loud[..., np.newaxis] if loud.any() else known
-        limit = _WILD * _usual_square(here, most)
-        plain = known & (here <= limit)
-        times = _excess(logs[mine, :, 1:-1], plain)[:, np.newaxis]
+        plain = _plain(here, known, _usual_square(here, most, level))
+        times = _excess(logs[mine, :, 1:-1], plain, level)[:, np.newaxis]
         out[b] = _smoothed(here, plain & most)
         for n in np.flatnonzero(loud.any(axis=1)):
-            told = known[n] & (here[n] <= _WILD * _usual_square(here[[n]], known[[n]]))
+            told = known[n] & (here[n] <= _WILD * _usual_square(here[[n]], known[[n]], level[[n]]))
             plain[n, loud[n]] = told[loud[n]]
         hit = np.flatnonzero((loud | (known & ~plain).any(axis=2)).any(axis=1))
         # Where nobody looks for wild gates they are noise, but of their profile alone.
@@ -309,34 +315,48 @@ def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[A
     return np.concatenate([out, np.array(own)]) if own else out, row
 
 
-def _excess(logs: Array, plain: Booleans) -> Array:
+def _excess(logs: Array, plain: Booleans, level: Array) -> Array:
     """Return (ray,) the variance of sums of gates over that of second differences of gates.
 
     Of what one profile differs by from the next: air that stays there would count as correlated
-    noise. 1 where chance makes as much, or too little is known.
+    noise. In units of the noise of both: where that differs much from profile to profile, medians
+    of gates and of sums would differ by chance. 1 where chance makes as much, or too little is
+    known.
 
     Parameters
     ----------
     logs : (profile, ray, bin) float64
     plain : (profile, ray, bin) bool
         Whether a gate is known, and not wild.
+    level : (profile, ray) float64
+        What variances are proportional to; where it is not finite or 0, the median of the others.
     """
     out = np.ones(logs.shape[1])
     size = logs.shape[-1] // (3 * _SUMMED)
-    # Of long rays a part is enough, too.
-    every = max((len(logs) - 1) * size // _ASKED_SUMS, 1)
-    pairs = np.arange(0, len(logs) - 1, every)
-    if pairs.size * size < _SUMS:
+    total = (len(logs) - 1) * size
+    if total < _SUMS:
         return out
-    used = slice(0, size * 3 * _SUMMED)
-    steps = logs[pairs + 1, :, used] - logs[pairs, :, used]
-    steps[~(plain[pairs, :, used] & plain[pairs + 1, :, used])] = np.nan
-    parts = steps.reshape(*steps.shape[:2], size, 3, _SUMMED)
-    sums = _second_squares(parts.sum(axis=4)) / _SUMMED
-    gates = _second_squares(parts[..., :3])
-    usual, whole = _ray_medians(gates, _SUMS), _ray_medians(sums, _SUMS)
-    told = (usual > 0.0) & (whole > _CORRELATED * usual)
-    out[told] = whole[told] / usual[told]
+    level = np.where(np.isfinite(level) & (level > 0.0), level, np.nan)
+    others = _ray_medians(level)
+    level = np.where(np.isnan(level), np.where(others > 0.0, others, 1.0), level)
+    # Of long rays a part is enough, too, but for those of which too little of it is known.
+    every, rays = max(total // _ASKED_SUMS, 1), np.arange(out.size)
+    while rays.size:
+        pairs = np.arange(0, len(logs) - 1, every)
+        here, after = np.ix_(pairs, rays), np.ix_(pairs + 1, rays)
+        used = slice(0, size * 3 * _SUMMED)
+        steps = logs[..., used][after] - logs[..., used][here]
+        steps /= np.sqrt(level[here] + level[after])[..., np.newaxis]
+        steps[~(plain[..., used][here] & plain[..., used][after])] = np.nan
+        parts = steps.reshape(*steps.shape[:2], size, 3, _SUMMED)
+        sums = _second_squares(parts.sum(axis=4)) / _SUMMED
+        gates = _second_squares(parts[..., :3])
+        usual, whole = _ray_medians(gates, _SUMS), _ray_medians(sums, _SUMS)
+        told = (usual > 0.0) & (whole > _CORRELATED * usual)
+        out[rays[told]] = whole[told] / usual[told]
+        if every == 1:
+            break
+        every, rays = max(every // _MORE, 1), rays[whole == 0.0]
     return out
 
 
@@ -345,16 +365,37 @@ def _second_squares(values: Array) -> Array:
     return np.asarray((values[..., 0] - 2.0 * values[..., 1] + values[..., 2]) ** 2)
 
 
-def _louder(squares: Array, known: Booleans) -> Booleans:
-    """Return (profile, ray) where noise is far above that of most profiles.
-
-    By medians along range, which no single wild gate moves.
-    """
-    # Every third, which shares no gate with the next one, tells as much at a third of the cost.
+def _levels(squares: Array, known: Booleans) -> Array:
+    """Return (profile, ray) medians along range, which no single wild gate moves."""
     # What is unknown is none of the smallest.
-    size = np.median(np.where(known[..., ::3], squares[..., ::3], np.inf), axis=2)
-    usual = np.median(size, axis=0)
-    return np.asarray(np.isfinite(size) & (size > LOUDER * usual) & (usual > 0.0))
+    some = np.where(known[..., ::_APART], squares[..., ::_APART], np.inf)
+    return np.asarray(np.median(some, axis=2))
+
+
+def _louder(level: Array) -> Booleans:
+    """Return (profile, ray) where noise is far above that of most profiles."""
+    usual = np.median(level, axis=0)
+    return np.asarray(np.isfinite(level) & (level > LOUDER * usual) & (usual > 0.0))
+
+
+def _plain(squares: Array, known: Booleans, usual: Array) -> Booleans:
+    """Return (profile, ray, bin) what is known, and not wild by the (ray, bin) usual squares.
+
+    Where many profiles are noisier than the rest, none of them is louder than most: what is
+    usual in each of them is asked before its noise is called wild.
+    """
+    limit = _WILD * usual
+    out = known & (squares <= limit)
+    profile, ray = np.nonzero((known & ~out).any(axis=2))
+    if profile.size:
+        some = known[profile, ray, ::_APART]
+        ratio = np.where(some, squares[profile, ray, ::_APART] / usual[ray, ::_APART], np.inf)
+        number = some.sum(axis=1)
+        middle = np.maximum(number - 1, 0) // 2
+        times = np.sort(ratio, axis=1)[np.arange(number.size), middle]
+        times = np.where(number >= _FEW, np.maximum(times, 1.0), 1.0)[:, np.newaxis]
+        out[profile, ray] = known[profile, ray] & (squares[profile, ray] <= limit[ray] * times)
+    return out
 
 
 def _smoothed(squares: Array, known: Booleans) -> Array:
@@ -370,14 +411,20 @@ def _moving_mean(total: Array, number: Indices | Booleans) -> Array:
     return np.concatenate([smooth[..., :1], smooth, smooth[..., -1:]], axis=-1)
 
 
-def _usual_square(squares: Array, known: Booleans) -> Array:
+def _usual_square(squares: Array, known: Booleans, level: Array) -> Array:
     """Return (ray, bin) medians of profiles and of some tens of gates; inf where they are 0.
 
     By them a wild gate is told: one of one profile would be taken for noise of all. Some hundred
-    squares tell a median well enough, so that not all profiles are asked.
+    squares tell a median well enough, so that not all profiles are asked: by their (profile, ray)
+    level quiet and noisy ones alike, in whichever order they come.
     """
-    some = slice(None, None, max(len(squares) // _ASKED, 1))
-    squares, known = squares[some], known[some]
+    every = len(squares) // _ASKED
+    if every > 1:
+        # Levels of counts may be equal.
+        total = np.where(known, squares, 0.0).sum(axis=2)
+        some = np.lexsort((total, level), axis=0)[every // 2 :: every]
+        rays = np.arange(squares.shape[1])
+        squares, known = squares[some, rays], known[some, rays]
     out = np.full(squares.shape[1:], np.inf)
     parts = max(squares.shape[-1] // _SMOOTHED, 1)
     edges = np.linspace(0, squares.shape[-1], parts + 1).astype(int)

@@ -110,6 +110,84 @@ def test_a_loud_profile_states_its_own_error_where_signals_tell_the_noise():
         assert np.sqrt(np.mean(score[mine][kept] ** 2)) == pytest.approx(1.0, abs=0.2)
 
 
+def half_louder(ratio, first, profiles=16, seed=2):
+    """Return power of which every other profile has that many times the noise, and the noise."""
+    net = three_by_two()
+    clean = signals(net, grid(net), plume)
+    relative = np.where(np.arange(profiles) % 2 == first, 0.005, 0.005 * ratio)
+    rng = np.random.default_rng(seed)
+    noise = relative[:, np.newaxis, np.newaxis] * rng.standard_normal((profiles, *clean.shape))
+    return clean * (1.0 + noise), relative
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("ratio", [6.0, 15.0])
+def test_noise_of_half_the_profiles_is_not_wild(ratio, first):
+    """A sixth of it was told, and no value of the noisy profiles left, where a quiet one led."""
+    power, relative = half_louder(ratio, first)
+    power[:, :2, -60:] = np.nan
+    noise, row = estimated(power)
+    told = np.sqrt(np.nanmean(noise[row] ** 2))
+    assert told == pytest.approx(np.sqrt(np.mean(relative**2)), rel=0.1)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_noisy_profiles_are_kept_among_as_many_quiet_ones(first):
+    net = three_by_two()
+    power, relative = half_louder(15.0, first, 64)
+    found = solve(power, grid(net), net, blocks=np.arange(64) // 16, **FULL)
+    kept = np.isfinite(found.extinction) & ~found.flags.flagged
+    assert kept[:, net.near_vertex][relative > 0.01].mean() > 0.9
+    score = (found.extinction - at_vertices(net, plume)) / found.extinction_standard_error
+    assert np.all(np.abs(score[kept]) < 4.0)
+
+
+@pytest.mark.parametrize("profiles", [16, 50])
+@pytest.mark.parametrize("ratio", [1.0, 4.0, 15.0])
+def test_the_order_of_profiles_does_not_change_their_noise(ratio, profiles):
+    power, _ = half_louder(ratio, 0, profiles)
+    wild = np.random.default_rng(4).random(power.shape) < 0.003
+    power[wild] *= 3.0
+    power[5, 1, 40:] = np.nan
+    noise, row = estimated(power)
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(profiles)
+        other, mine = estimated(power[order])
+        np.testing.assert_allclose(other[mine], noise[row[order]], rtol=1e-9)
+
+
+def test_profiles_of_equal_levels_are_asked_in_any_order():
+    """Medians of counts are often equal: they alone do not tell which profiles are asked."""
+    rng = np.random.default_rng(6)
+    squares = rng.random((40, 2, 90)) * np.where(np.arange(40) % 5, 1.0, 50.0)[:, None, None]
+    known, level = rng.random(squares.shape) < 0.9, np.ones((40, 2))
+    usual = _rays._usual_square(squares, known, level)
+    for _ in range(3):
+        order = rng.permutation(40)
+        np.testing.assert_array_equal(
+            _rays._usual_square(squares[order], known[order], level), usual
+        )
+
+
+@pytest.mark.parametrize("hit", [4, 5])
+@pytest.mark.parametrize("ratio", [1.0, 15.0])
+def test_a_wild_gate_is_told_among_quiet_and_noisy_profiles(ratio, hit):
+    power, _ = half_louder(ratio, 0)
+    clean, _ = estimated(power)
+    power[hit, 2, 60] *= 1e6
+    noise, _ = estimated(power)
+    np.testing.assert_allclose(noise[0], clean[0], rtol=0.03)
+
+
+def test_few_gates_that_are_mostly_wild_are_no_noisy_profile():
+    power, _ = drawn(three_by_two(), 0.02, 20, homogeneous())
+    clean, _ = estimated(power)
+    power[4, :, 20:] = np.nan
+    power[4, :, :20:2] *= 30.0
+    noise, _ = estimated(power)
+    np.testing.assert_allclose(noise[0], clean[0], rtol=0.05)
+
+
 # Gates that are not independent -------------------------------------------------------------
 
 
@@ -117,6 +195,11 @@ def correlated(shape, share, rng):
     """Return normal noise of which neighbours have a correlation of share / (1 + share^2)."""
     plain = rng.standard_normal((*shape[:-1], shape[-1] + 1))
     return (plain[..., 1:] + share * plain[..., :-1]) / np.sqrt(1.0 + share**2)
+
+
+def excess(logs):
+    """Return (ray,) what sums of gates of the same noise in all profiles have more."""
+    return _rays._excess(logs, np.isfinite(logs), np.ones(logs.shape[:2]))
 
 
 @pytest.mark.parametrize(("relative", "share"), [(0.003, 0.4), (0.02, 1.0)])
@@ -138,10 +221,44 @@ def test_correlated_gates_state_what_their_sums_have(relative, share):
     assert np.median(noise) == pytest.approx(sums, rel=0.15)
 
 
+@pytest.mark.parametrize("lost", ["far third", "first profile", "both", "a twentieth"])
+@pytest.mark.parametrize("gates", [1200, 6000])
+def test_gates_are_correlated_also_where_some_are_unknown(gates, lost):
+    """Second differences alone were told, less than half of the noise."""
+    rng = np.random.default_rng(1)
+    logs = 0.02 * correlated((60, 3, gates), 1.0, rng)
+    whole = excess(logs)
+    part = logs.copy()
+    if lost in {"far third", "both"}:
+        part[:, 1, -gates // 3 :] = np.nan
+    if lost in {"first profile", "both"}:
+        part[0, 1] = np.nan
+    if lost == "a twentieth":
+        part[:, 1][rng.random((60, gates)) < 0.05] = np.nan
+    part[:, 2] = np.nan
+    found = excess(part)
+    # Correlations of neighbours are 1/2, those of neighbouring sums 1/14.
+    assert found[1] == pytest.approx(1.75 * (1.0 - 4.0 / 3.0 / 14.0) / (1.0 / 3.0), rel=0.25)
+    assert found[0] == whole[0]
+    assert found[2] == 1.0
+
+
 @pytest.mark.parametrize("profiles", [1, 2, 12, 50])
 def test_independent_gates_are_not_taken_for_correlated(profiles):
     power, _ = drawn(three_by_two(), 0.05, profiles)
-    np.testing.assert_array_equal(_rays._excess(np.log(power), np.isfinite(power)), 1.0)
+    np.testing.assert_array_equal(excess(np.log(power)), 1.0)
+
+
+def test_noise_that_differs_between_profiles_is_not_taken_for_correlated():
+    """By chance it was, of 2 to 6 rays in a hundred."""
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        level = np.where(rng.permutation(24) % 2, 1.0, 225.0)[:, np.newaxis] * np.ones(6)
+        logs = 0.005 * np.sqrt(level)[..., np.newaxis] * rng.standard_normal((24, 6, 240))
+        found = _rays._excess(logs, np.isfinite(logs), level)
+        np.testing.assert_array_equal(found, 1.0)
+        level[::5] = [np.inf, 0.0, np.nan, 1.0, 1.0, 1.0]
+        assert np.isfinite(_rays._excess(logs, np.isfinite(logs), level)).all()
 
 
 def test_air_that_drifts_is_no_correlated_noise():
@@ -150,7 +267,7 @@ def test_air_that_drifts_is_no_correlated_noise():
     fields = [lambda x, y, z, e=e: plume(x, y, z, e) for e in np.linspace(-200.0, 100.0, 50)]
     clean = np.array([signals(net, r, f) for f in fields])
     power = clean * (1.0 + 0.005 * np.random.default_rng(2).standard_normal(clean.shape))
-    np.testing.assert_array_equal(_rays._excess(np.log(power), np.isfinite(power)), 1.0)
+    np.testing.assert_array_equal(excess(np.log(power)), 1.0)
 
 
 def test_wild_gates_are_no_correlated_noise():
@@ -163,9 +280,9 @@ def test_wild_gates_are_no_correlated_noise():
 def test_of_unknown_and_equal_counts_no_correlation_is_told():
     logs = np.full((50, 2, 200), np.nan)
     logs[:, 1] = 3.0
-    np.testing.assert_array_equal(_rays._excess(logs, np.isfinite(logs)), 1.0)
+    np.testing.assert_array_equal(excess(logs), 1.0)
     logs[1::2, 1, ::7] = 3.1
-    np.testing.assert_array_equal(_rays._excess(logs, np.isfinite(logs)), 1.0)
+    np.testing.assert_array_equal(excess(logs), 1.0)
 
 
 # Loud profiles and weak signals -------------------------------------------------------------
