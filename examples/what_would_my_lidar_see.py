@@ -19,7 +19,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops import open_archive
-from lidarops.campaign import Campaign
+from lidarops.campaign.model import Campaign
 from lidarops.simulate.campaign import SimulatedCampaign, simulate
 
 Array = NDArray[np.float64]

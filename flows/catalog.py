@@ -14,12 +14,12 @@ from prefect.artifacts import create_table_artifact
 
 from flows import usage
 from flows.reprocess import Seconds, Workers
-from lidarops import asked
-from lidarops.campaign import load
+from lidarops.campaign.model import load
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
-from lidarops.pipeline import update_catalog
 from lidarops.records import Status
+from lidarops.run import selection
+from lidarops.run.archive import update_catalog
 
 
 @flow(name="lidarops-catalog")
@@ -77,7 +77,7 @@ def main(
     with usage.told():
         catalog.validate_parameters({"campaign": campaign, "wait": wait})
         settings = load(campaign, archive=archive, output=out, catalog=url)
-        asked.refuse_nowhere(settings, archive=archive)
+        selection.refuse_nowhere(settings, archive=archive)
     with usage.told():
         summary = catalog(campaign, archive, out, wait, catalog=url)
     raise typer.Exit(1 if summary.refused else 0)

@@ -39,17 +39,18 @@ from prefect.utilities.annotations import quote
 from pydantic import Field
 
 from flows import WITH_FAILURES, usage
-from lidarops import asked, clusters
-from lidarops.campaign import Campaign, load
+from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.product_settings import Instant
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
-from lidarops.pipeline import Options, Result, Selection, bring_up_to_date, report_run
-from lidarops.product_settings import Instant
-from lidarops.publication import publish as publish_products
 from lidarops.records import ProductKind, RunRecord, SceneOutcome
-from lidarops.reports import page
-from lidarops.runs import unreported
+from lidarops.reports import run_page
+from lidarops.run import clusters
+from lidarops.run import selection as asked
+from lidarops.run.archive import Options, Result, Selection, bring_up_to_date, report_run
+from lidarops.run.options import unreported
+from lidarops.run.publication import publish as publish_products
 
 _T = TypeVar("_T")
 
@@ -149,7 +150,7 @@ def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
     built = report_run(campaign, record, workers=workers)
     key = campaign.name.lower()
     create_table_artifact(
-        key=f"{key}-products", table=page.summary_rows(record), description=f"Run {record.id}"
+        key=f"{key}-products", table=run_page.summary_rows(record), description=f"Run {record.id}"
     )
     create_link_artifact(built.page.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
     if built.quicklook is not None:
@@ -209,7 +210,7 @@ def reprocess(
     since, until : datetime, optional
         Only scenes that touch this interval.
     scheduler, cluster : str, optional
-        As on the command line: `lidarops.clusters.choose`.
+        As on the command line: `lidarops.run.clusters.choose`.
     wait : float
         s to wait for another run on the same archive.
     publish : str, optional

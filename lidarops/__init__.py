@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from importlib.metadata import version as _version
-from typing import Any
+from typing import Any, Final
 
 __all__ = ["__version__", "find_products", "open_archive", "open_products"]
 
 __version__ = _version("lidarops")
 
+# Imported on first use: xarray and dask take a second, and `lidarops --help` must not wait.
+_MODULES: Final = {
+    "open_archive": "lidarops.raw.archive",
+    "open_products": "lidarops.aggregate.open_products",
+    "find_products": "lidarops.aggregate.index",
+}
+
 
 def __getattr__(name: str) -> Any:
-    # xarray and dask take a second to import: `lidarops --help` must not wait for them.
-    if name == "open_archive":
-        from lidarops.raw.archive import open_archive
-
-        return open_archive
-    if name == "open_products":
-        from lidarops.aggregate.opening import open_products
-
-        return open_products
-    if name == "find_products":
-        from lidarops.aggregate.index import find_products
-
-        return find_products
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

@@ -145,7 +145,7 @@ class Step:
     instrument: str = ""
     """Member of a network that the step is for; empty where the scene has no members."""
     rule: str = ""
-    """Name of the rule that decided, in `lidarops.rules`."""
+    """Name of the rule that decided, in `lidarops.plan.rule_table`."""
     number: float | None = None
     """That the rule decided on, where there is one."""
 
@@ -171,7 +171,7 @@ class LeftOut:
     instrument: str = ""
     """Member of a network; empty where the scene has no members."""
     rule: str = ""
-    """Name of the rule that decided, in `lidarops.rules`."""
+    """Name of the rule that decided, in `lidarops.plan.rule_table`."""
     number: float | None = None
     """That the rule decided on, where there is one."""
 

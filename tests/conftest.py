@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 
+pytest_plugins = ["support.report_fixtures", "support.s3_fixtures"]
+
 # Time is no property of a result, and a failure must come back when it is looked for.
 hypothesis.settings.register_profile("lidarops", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("lidarops")

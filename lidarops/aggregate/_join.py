@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from lidarops.products.table_means import PRODUCT, PRODUCT_INDEX
+from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 
 _OF_ONE: Final = (
     "date_", "history", "id", "lidarops_input_count", "lidarops_plan", "lidarops_scene",

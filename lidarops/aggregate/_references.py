@@ -21,9 +21,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, opened, plain, within
+from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
-from lidarops.products.rows import attributes
-from lidarops.products.table_means import PRODUCT, PRODUCT_INDEX
+from lidarops.netcdf.variables import attributes
 from lidarops.records import DetectionMode, ProductKind
 
 Refs = dict[str, Any]

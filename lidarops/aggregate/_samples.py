@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate._sums import Array, Sample
 from lidarops.aggregate.facts import Facts, opened, within
+from lidarops.aggregate.means_variables import (
+    INTERVALS,
+    Budget,
+    averaged,
+    budget,
+    systematic,
+)
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.rows import QUALITY_FLAG, Row
-from lidarops.products.table_means import INTERVALS, Budget, averaged, budget, systematic
+from lidarops.netcdf.variables import QUALITY_FLAG, Row
 from lidarops.records import ProductKind
 
 

@@ -14,11 +14,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from lidarops.aggregate.means_variables import PERIOD
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.rows import PROVENANCE
-from lidarops.products.table import LAYOUTS
-from lidarops.products.table_means import PERIOD
+from lidarops.netcdf.variables import PROVENANCE
+from lidarops.products.layouts import LAYOUTS
 from lidarops.records import ProductKind
 
 FOLDER: Final = "aggregates"

@@ -17,13 +17,13 @@ from uuid import UUID
 
 import pandas as pd
 
-from lidarops.aggregate._needs import need
+from lidarops.aggregate._optional_packages import need
 from lidarops.aggregate.facts import FOLDER, Facts, Selection
-from lidarops.aggregate.selecting import select
+from lidarops.aggregate.selection import select
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.records import ProductKind
-from lidarops.reports.record import write_atomically
+from lidarops.reports.run_record import write_atomically
 
 INDEX: Final = "products.parquet"
 FORMAT: Final = b"1"

@@ -24,10 +24,10 @@ from lidarops.aggregate.means_file import (
     prov_json,
     read_frame,
 )
+from lidarops.aggregate.means_variables import About, Period, Weights, systematic
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.table_means import About, Period, Weights, systematic
-from lidarops.products.write import write
+from lidarops.netcdf.write import write
 from lidarops.records import ProductKind
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}

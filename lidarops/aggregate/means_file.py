@@ -17,12 +17,18 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate.facts import Facts, coordinate_names, opened, within
+from lidarops.aggregate.means_variables import (
+    About,
+    Period,
+    Weights,
+    global_attributes,
+    layout,
+)
 from lidarops.errors import ProductError
-from lidarops.products import rows
-from lidarops.products.build import bitround
-from lidarops.products.provenance import NAMESPACE, code_version, package_versions
-from lidarops.products.rows import QUANTIZATION, Layout, Row, attributes
-from lidarops.products.table_means import About, Period, Weights, global_attributes, layout
+from lidarops.netcdf import variables as rows
+from lidarops.netcdf.build import bitround
+from lidarops.netcdf.provenance import NAMESPACE, code_version, package_versions
+from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
 from lidarops.records import DetectionMode, ProductKind
 
 _MOVING: Final = ("zenith_angle", "azimuth")
@@ -117,7 +123,7 @@ def encode(
     Returns
     -------
     xr.Dataset
-        Encoded, as `lidarops.products.write.write` takes it.
+        Encoded, as `lidarops.netcdf.write.write` takes it.
     """
     found = layout(frame.kind, about.period, about.weights)
     texts = {rows.PROVENANCE.name: _text(rows.PROVENANCE, provenance, frame.mode)}
@@ -279,8 +285,7 @@ def prov_json(lineage: Lineage) -> str:
 def means_version() -> str:
     """Return a digest of the sources that means come from: those of the products, and these."""
     digest = hashlib.sha256(code_version().encode())
-    here = Path(__file__).resolve().parent
-    for file in (*sorted(here.glob("*.py")), here.parent / "products" / "table_means.py"):
+    for file in sorted(Path(__file__).resolve().parent.glob("*.py")):
         digest.update(f"{file.name}\0".encode() + file.read_bytes().replace(b"\r\n", b"\n"))
     return digest.hexdigest()[:16]
 

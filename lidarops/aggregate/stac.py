@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from lidarops.aggregate._needs import need
+from lidarops.aggregate._optional_packages import need
 from lidarops.aggregate.facts import FOLDER, Facts
 from lidarops.errors import ProductError
-from lidarops.products.table import LAYOUTS
+from lidarops.products.layouts import LAYOUTS
 from lidarops.records import ProductKind
 
 _NETCDF: Final = "application/x-netcdf"

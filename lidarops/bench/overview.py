@@ -9,17 +9,17 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.bench import elastic_cases
-from lidarops.bench.accuracy import Accuracy, Measured, outcomes_of
-from lidarops.bench.elastic import Elastic
-from lidarops.bench.multiangle_scores import MultiAngle
-from lidarops.bench.multiposition_scores import MultiPosition
-from lidarops.bench.peers import peers
-from lidarops.bench.speed import ALL_STEPS
-from lidarops.reports.benchmark import Part, Table
-from lidarops.reports.charts import Chart, Panel, Series, pareto
-from lidarops.reports.words import percent
-from lidarops.retrieve.homogeneous import Method
+from lidarops.bench.accuracy import elastic_cases
+from lidarops.bench.accuracy.elastic import Elastic
+from lidarops.bench.accuracy.homogeneous import Accuracy, Measured, outcomes_of
+from lidarops.bench.accuracy.multiangle_scores import MultiAngle
+from lidarops.bench.accuracy.network_scores import MultiPosition
+from lidarops.bench.accuracy.peers import peers
+from lidarops.bench.throughput.retrievals import ALL_STEPS
+from lidarops.figures.charts import Chart, Panel, Series, pareto
+from lidarops.figures.wording import percent
+from lidarops.reports.benchmark_page import Part, Table
+from lidarops.retrieve.homogeneous.path_fit import Method
 
 HOMOGENEOUS: Final = "homogeneous path"
 ELASTIC: Final = "elastic inversion"

@@ -17,7 +17,7 @@ from lidarops.raw import licel
 from lidarops.records import Granule, Role, Status
 
 if TYPE_CHECKING:
-    from lidarops.campaign import Campaign
+    from lidarops.campaign.model import Campaign
 
 _UNREADABLE: Final = "cannot be read"
 """How the reason starts where a file is refused that may be readable another time."""

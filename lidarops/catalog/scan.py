@@ -10,16 +10,16 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 
-from lidarops.campaign import Campaign
+from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
 from lidarops.catalog.headers import Due, Headers, read_row
 from lidarops.catalog.rows import GranuleRow
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.processes import Processes
 from lidarops.records import Role, Status
-from lidarops.stores import without_keys
+from lidarops.system.processes import Processes
+from lidarops.system.stores import without_keys
 
 _BATCH = 2000
 _SCAN_VERSION = 1

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lidarops.errors import CatalogError
-from lidarops.stores import RemoteStore
+from lidarops.system.stores import RemoteStore
 
 
 class RawFile(NamedTuple):

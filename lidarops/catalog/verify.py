@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidarops.campaign import Campaign
+from lidarops.campaign.model import Campaign
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.records import Role

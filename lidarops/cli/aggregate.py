@@ -23,7 +23,7 @@ from lidarops.cli.app import (
 )
 
 if TYPE_CHECKING:
-    from lidarops.aggregate.making import Made
+    from lidarops.aggregate.aggregates import Made
 
 
 @app.command()
@@ -63,9 +63,9 @@ def aggregate(
 
     Example: lidarops aggregate demo --kind elastic --means month --weights inverse-variance
     """
-    from lidarops.aggregate.making import Wanted, make
-    from lidarops.aggregate.selecting import choice, select
-    from lidarops.products.table_means import Period, Weights
+    from lidarops.aggregate.aggregates import Wanted, make
+    from lidarops.aggregate.means_variables import Period, Weights
+    from lidarops.aggregate.selection import choice, select
 
     wanted = Wanted(
         select(kind, channel, station, instrument, utc(since), utc(until)),
@@ -85,7 +85,7 @@ def aggregate(
 def _root(out: Path) -> Path:
     if not out.is_file():
         return out
-    from lidarops.campaign import load
+    from lidarops.campaign.model import load
 
     return Path(load(out).output)
 

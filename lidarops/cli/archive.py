@@ -45,11 +45,11 @@ if TYPE_CHECKING:
     from distributed import Client
     from rich.table import Table
 
-    from lidarops.campaign import Campaign
-    from lidarops.costs import Tally
-    from lidarops.pipeline import Result
+    from lidarops.campaign.model import Campaign
+    from lidarops.plan.cost_estimate import Tally
     from lidarops.records import Granule, Plan, RunRecord
-    from lidarops.staleness import Judgement, Selection
+    from lidarops.run.archive import Result
+    from lidarops.run.staleness import Judgement, Selection
 
 _LEAST_MEMORY = 2**20
 """Bytes; what is less was given without its unit."""
@@ -98,7 +98,7 @@ def catalog(
     from dataclasses import asdict
 
     from lidarops.catalog.store import Store
-    from lidarops.pipeline import update_catalog
+    from lidarops.run.archive import update_catalog
 
     settings = _loaded(campaign, archive, out, catalog)
     with progress_bar("catalog", None) as advance:
@@ -143,14 +143,15 @@ def show_plan(
 
     Example: lidarops plan catalogs/demo.yaml
     """
-    from lidarops import asked, costs
-    from lidarops.pipeline import assess
+    from lidarops.plan import cost_estimate
+    from lidarops.run import selection as asked
+    from lidarops.run.archive import assess
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
     found = assess(settings, selection=wanted, everything=not stale, wait=wait)
-    machine = costs.load()
-    making, everything = costs.Tally(machine), costs.Tally(machine)
+    machine = cost_estimate.load()
+    making, everything = cost_estimate.Tally(machine), cost_estimate.Tally(machine)
     scenes = []
     none = True
     for each in found:
@@ -241,7 +242,9 @@ def reprocess(
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
-    from lidarops import asked, pipeline, runs
+    from lidarops.run import archive as pipeline
+    from lidarops.run import options as runs
+    from lidarops.run import selection as asked
 
     set_up(log_level, as_json=log_json, file=log_file)
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
@@ -291,7 +294,7 @@ def reprocess(
 
 def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
     """Build the page of a run; None where it cannot be, which is told."""
-    from lidarops.pipeline import report_run
+    from lidarops.run.archive import report_run
 
     try:
         return report_run(campaign, run, workers=workers).page
@@ -308,8 +311,8 @@ def _loaded(
     *,
     all_steps: bool = False,
 ) -> Campaign:
-    from lidarops.asked import refuse_nowhere
-    from lidarops.campaign import load
+    from lidarops.campaign.model import load
+    from lidarops.run.selection import refuse_nowhere
 
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
     refuse_nowhere(settings, archive=archive)
@@ -328,7 +331,7 @@ def _cluster(
         raise typer.BadParameter("--tls is for --scheduler; a cluster's file has its own")
     if scheduler is None and cluster is None:
         return None
-    from lidarops import clusters
+    from lidarops.run import clusters
 
     chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster, memory=memory)
     if tls and isinstance(chosen, clusters.Scheduler):
@@ -346,7 +349,7 @@ def _selection(
     until: datetime | None,
 ) -> Selection:
     from lidarops.records import ProductKind
-    from lidarops.staleness import Selection
+    from lidarops.run.staleness import Selection
 
     kinds = [kind.value for kind in ProductKind]
     for name in products or ():
@@ -369,8 +372,8 @@ def _refused_table(refused: list[Granule]) -> Table:
 
 
 def _plan_table(title: str, plan: Plan) -> Table:
-    from lidarops.plan_rules import idle_gate
-    from lidarops.reports.words import decided_on
+    from lidarops.figures.wording import decided_on
+    from lidarops.plan.signal_rules import idle_gate
 
     table = make_table(title, "channel", "step", "does", "why", "rule", "number")
     for step in plan.steps:
@@ -403,7 +406,7 @@ def _stale_table(title: str, judged: Judgement) -> Table:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
-    from lidarops.plan_rules import idle_gate
+    from lidarops.plan.signal_rules import idle_gate
 
     stale = [
         {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
@@ -494,7 +497,7 @@ def _unused_table(result: Result, told: Collection[str]) -> Table:
 
 
 def _unmet_table(result: Result) -> Table:
-    from lidarops.reports.words import lacking
+    from lidarops.figures.wording import lacking
 
     title = "Asked for, and not in the files"
     table = make_table(title, "instrument", "channel", "asked for by", "because", "missing in")

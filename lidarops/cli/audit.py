@@ -40,7 +40,7 @@ def runs(
 
     Example: lidarops runs catalogs/demo.yaml
     """
-    from lidarops.campaign import load
+    from lidarops.campaign.model import load
     from lidarops.catalog.store import Store
 
     settings = load(campaign, output=out, catalog=catalog)
@@ -83,10 +83,10 @@ def verify(
 
     Example: lidarops verify catalogs/demo.yaml
     """
-    from lidarops.asked import refuse_nowhere
-    from lidarops.campaign import load
+    from lidarops.campaign.model import load
     from lidarops.catalog.store import Store
     from lidarops.catalog.verify import verify as audit
+    from lidarops.run.selection import refuse_nowhere
 
     settings = load(campaign, archive=archive, output=out, catalog=catalog)
     if archive and not products_only:

@@ -23,7 +23,7 @@ from lidarops.cli.app import (
 from lidarops.errors import CampaignError
 
 if TYPE_CHECKING:
-    from lidarops.bench.terms import Effort, Finding
+    from lidarops.bench.harness.terms import Effort, Finding
 
 
 @app.command()
@@ -67,18 +67,19 @@ def bench(
 
     Example: lidarops bench stability --quick --out bench
     """
-    from lidarops.bench import cases, results
-    from lidarops.bench.terms import Effort
+    from lidarops.bench import registry
+    from lidarops.bench.harness import results
+    from lidarops.bench.harness.terms import Effort
 
     today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as advance:
         effort = Effort(quick=quick, repeats=repeats, date=today, progress=advance)
-        if what == cases.STABILITY:
+        if what == registry.STABILITY:
             _refuse({"case": case, "files": files, "data": data, "repeats": repeats})
             finding = _stability(effort)
         else:
-            finding = cases.run(what, case, files or [], effort, data=data)
-    page = None if out is None else cases.write(finding, Path(out))
+            finding = registry.run(what, case, files or [], effort, data=data)
+    page = None if out is None else registry.write(finding, Path(out))
     if as_json:
         typer.echo(json.dumps(results.plain(finding.result), indent=1))
         leave(failed=_failed(finding))
@@ -104,9 +105,9 @@ def _refuse(given: dict[str, object]) -> None:
 
 
 def _stability(effort: Effort) -> Finding:
-    from lidarops.bench import stability
+    from lidarops.bench.stability import study
 
-    return stability.run(effort)
+    return study.run(effort)
 
 
 def _failed(finding: Finding) -> bool:

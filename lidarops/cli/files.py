@@ -21,10 +21,10 @@ def report(
 
     Example: lidarops report demo/report/RUN --workers 2
     """
-    from lidarops.reports import page, record
+    from lidarops.reports import run_page, run_record
 
     folder = run if run.is_dir() else run.parent
-    typer.echo(str(page.build(record.load(run), folder, workers=workers).page))
+    typer.echo(str(run_page.build(run_record.load(run), folder, workers=workers).page))
 
 
 @app.command()
@@ -40,7 +40,7 @@ def inspect(
 
     Example: lidarops inspect demo/raw/coast/h2492106.010000
     """
-    from lidarops import inspection
+    from lidarops.reports import inspection
 
     if provenance:
         typer.echo(inspection.provenance(file))

@@ -24,9 +24,9 @@ def publish(
 
     Example: lidarops publish catalogs/demo.yaml s3://bucket/demo
     """
-    from lidarops.campaign import load
-    from lidarops.publication import publish as copy
-    from lidarops.stores import without_keys
+    from lidarops.campaign.model import load
+    from lidarops.run.publication import publish as copy
+    from lidarops.system.stores import without_keys
 
     settings = load(campaign, output=out, catalog=catalog)
     done = copy(settings, url)

@@ -40,8 +40,8 @@ def reproduce(
     """
     from dataclasses import asdict
 
-    from lidarops.reproduce import explain
-    from lidarops.reproduce import reproduce as make_again
+    from lidarops.run.reproduction import explain
+    from lidarops.run.reproduction import reproduce as make_again
 
     result = make_again(product, archive=archive, ancillary=ancillary, catalog=catalog)
     typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain(result))

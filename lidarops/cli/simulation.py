@@ -23,9 +23,9 @@ def simulate(
     """
     from contextlib import nullcontext
 
-    from lidarops.campaign import load
-    from lidarops.engine import local_client
-    from lidarops.products.write import write_plain
+    from lidarops.campaign.model import load
+    from lidarops.netcdf.write import write_plain
+    from lidarops.run.executor import local_client
     from lidarops.simulate.campaign import carry_out, plan
 
     settings = load(campaign, archive=archive, output=out)

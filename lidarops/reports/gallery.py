@@ -17,10 +17,8 @@ from typing import Any, Final, TypeVar
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
-from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
-from lidarops.reports import figures, network_figures, panels
-from lidarops.reports.networks import (
+from lidarops.figures import network_figures, panels, product_figures
+from lidarops.figures.network_data import (
     MAP_VARIABLES,
     VERTEX_VARIABLES,
     instruments_of,
@@ -28,11 +26,10 @@ from lidarops.reports.networks import (
     read_map,
     read_vertices,
 )
-from lidarops.reports.profiles import PROFILE_VARIABLES, clearest_profile
-from lidarops.reports.raster import COLUMNS, Raster, raster_variables, read_raster
-from lidarops.reports.reading import UNREADABLE, Readers, Reading, Unread, reason
-from lidarops.reports.record import write_atomically
-from lidarops.reports.scans import (
+from lidarops.figures.profile_data import PROFILE_VARIABLES, clearest_profile
+from lidarops.figures.raster import COLUMNS, Raster, raster_variables, read_raster
+from lidarops.figures.reading import UNREADABLE, Readers, Reading, Unread, reason
+from lidarops.figures.scan_data import (
     CYCLE_VARIABLES,
     EXTINCTION_VARIABLES,
     RESIDUAL_VARIABLES,
@@ -40,7 +37,7 @@ from lidarops.reports.scans import (
     read_extinction,
     read_residuals,
 )
-from lidarops.reports.series import (
+from lidarops.figures.series_data import (
     QUANTITIES,
     SECTION_VARIABLES,
     Comparison,
@@ -48,7 +45,10 @@ from lidarops.reports.series import (
     join,
     read_sections,
 )
-from lidarops.reports.words import counted
+from lidarops.figures.wording import counted
+from lidarops.flags import Quality
+from lidarops.records import ProductKind, ProductRecord, Role, RunRecord, SceneOutcome
+from lidarops.reports.run_record import write_atomically
 
 FIGURES: Final = 40
 """Most figures of products in a report."""
@@ -63,7 +63,7 @@ _KINDS: Final = (
     ProductKind.SIGNAL,
 )
 Found = TypeVar("Found")
-Drawing = Callable[[], figures.Rendered]
+Drawing = Callable[[], product_figures.Rendered]
 """Gives a figure when it is done."""
 
 
@@ -186,7 +186,7 @@ class _Sources:
 
     def draw(self, draw: Callable[..., Any], of: object, title: str) -> Drawing:
         """Begin a figure, in another process where there is one."""
-        return self.readers.later(figures.draw, figures.Sketch(draw, of, title))
+        return self.readers.later(product_figures.draw, product_figures.Sketch(draw, of, title))
 
     def _read(self, paths: list[str], readings: list[Reading[Found]]) -> Iterator[Found]:
         for path, found in zip(paths, self.readers.each(readings), strict=True):
@@ -347,13 +347,13 @@ def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_D
             f"homogeneous_{group.instrument}_{group.channel}",
             f"Extinction and background with their standard errors: {where};"
             f" {counted(scenes, 'scene')}.",
-            sources.draw(figures.draw_retrieval, few, group.label),
+            sources.draw(product_figures.draw_retrieval, few, group.label),
         )
         if compared:
             yield _Drawn(
                 f"truth_{group.instrument}_{group.channel}",
                 f"Unflagged values against the truth of the simulation: {where}.",
-                sources.draw(figures.draw_comparison, few, group.label),
+                sources.draw(product_figures.draw_comparison, few, group.label),
             )
 
 
@@ -402,7 +402,7 @@ def _signal(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"signal_{group.instrument}_{group.channel}",
             f"Range-corrected signal and background: {group.label};"
             f" {counted(len(rasters), 'scene')}.",
-            sources.draw(figures.draw_quicklook, rasters, group.label),
+            sources.draw(product_figures.draw_quicklook, rasters, group.label),
         )
 
 
@@ -415,7 +415,7 @@ def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"elastic_{group.instrument}_{group.channel}",
             f"Attenuated backscatter, clouds and background: {group.label};"
             f" {counted(len(rasters), 'scene')}.",
-            sources.draw(figures.draw_backscatter, rasters, group.label),
+            sources.draw(product_figures.draw_backscatter, rasters, group.label),
         )
     profile = sources.first(group, PROFILE_VARIABLES, clearest_profile)
     if profile is not None:
@@ -423,7 +423,7 @@ def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"profile_{group.instrument}_{group.channel}",
             f"The profile of a scene with most unflagged gates, and its error budget:"
             f" {group.label}.",
-            sources.draw(figures.error_budget, profile, group.label),
+            sources.draw(product_figures.error_budget, profile, group.label),
         )
 
 
@@ -433,7 +433,7 @@ def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
         yield _Drawn(
             f"multiangle_{group.instrument}_{group.channel}",
             f"Extinction over time and altitude: {group.label}; {counted(len(rasters), 'scene')}.",
-            sources.draw(figures.draw_extinction, rasters, group.label),
+            sources.draw(product_figures.draw_extinction, rasters, group.label),
         )
     clearest = functools.partial(clearest_cycle, instrument=group.instrument)
     profile = sources.first(group, CYCLE_VARIABLES, clearest, with_truth=True)
@@ -441,7 +441,7 @@ def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
         yield _Drawn(
             f"scan-profile_{group.instrument}_{group.channel}",
             f"The cycle of a scene with most unflagged values: {group.label}.",
-            sources.draw(figures.scan_profile, profile, group.label),
+            sources.draw(product_figures.scan_profile, profile, group.label),
         )
     residuals = sources.first(group, RESIDUAL_VARIABLES, read_residuals)
     if residuals is not None:
@@ -449,7 +449,7 @@ def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"scan-residuals_{group.instrument}_{group.channel}",
             f"What the fit over angles leaves of the signal, mean of the cycles of a scene:"
             f" {group.label}.",
-            sources.draw(figures.scan_residuals, residuals, group.label),
+            sources.draw(product_figures.scan_residuals, residuals, group.label),
         )
 
 
@@ -460,7 +460,7 @@ def _flags(record: RunRecord, sources: _Sources) -> _Drawn | None:
     return _Drawn(
         "flags",
         "Share of the values of every product that carry a quality bit, over all scenes.",
-        sources.draw(figures.flags_overview, shares, "Flagged values"),
+        sources.draw(product_figures.flags_overview, shares, "Flagged values"),
     )
 
 

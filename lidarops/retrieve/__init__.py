@@ -1,6 +1,6 @@
 """Numerics: arrays in, arrays out; numpy, scipy and numba only (but `labeled`)."""
 
-from lidarops.retrieve._compiled_code import keep_apart
+from lidarops.retrieve.common.compiled_code import keep_apart
 
 # Before any function is compiled.
 keep_apart()

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from lidarops.retrieve.molecular import (
+from lidarops.campaign.simulated_atmosphere import Gradient, Plume, Sounding, Turbulence
+from lidarops.campaign.simulation import Aerosol, AtmosphereSettings, DiurnalCourse
+from lidarops.retrieve.air.molecular import (
     HIGHEST,
     LOWEST,
     MolecularProfile,
@@ -21,8 +23,6 @@ from lidarops.retrieve.molecular import (
     rayleigh_cross_section,
     us_standard,
 )
-from lidarops.simulate.settings import Aerosol, AtmosphereSettings, DiurnalCourse
-from lidarops.simulate.settings_atmosphere import Gradient, Plume, Sounding, Turbulence
 
 Array = NDArray[np.float64]
 

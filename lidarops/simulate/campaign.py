@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Final
 
 import xarray as xr
 
-from lidarops.campaign import Campaign, Station
+from lidarops.campaign.model import Campaign, Station
+from lidarops.campaign.simulation import DamageKind, SimulationSettings
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator
-from lidarops.simulate.settings import DamageKind, SimulationSettings
 from lidarops.simulate.site import Order, Site, channel_name, dead_time
 from lidarops.simulate.truth import FileTruth, TruthTable
 

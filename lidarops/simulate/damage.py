@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarops.campaign.simulated_files import DamageKind
 from lidarops.raw.licel import Dataset, parse_header
 from lidarops.records import DetectionMode
-from lidarops.simulate.settings_files import DamageKind
 
 FOREIGN_NAME: Final = "log.txt"
 """What follows the prefix of the raw files in the name of a foreign file."""

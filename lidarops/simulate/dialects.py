@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final, Literal
 
+from lidarops.campaign.simulated_files import DialectName
 from lidarops.raw.licel import Dataset, Header, Laser, new_header
 from lidarops.raw.licel_header import parse_dataset
-from lidarops.simulate.settings_files import DialectName
 
 _LINE = 78
 

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarops.campaign.simulation import Pulse
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate import pulse as shapes
 from lidarops.simulate.atmosphere import Path
-from lidarops.simulate.settings import Pulse
 from lidarops.simulate.signal import bin_centres
 
 Array = NDArray[np.float64]

@@ -11,7 +11,14 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.campaign import InstrumentFacts, channel_facts
+from lidarops.campaign.model import InstrumentFacts, channel_facts
+from lidarops.campaign.simulation import (
+    Acquisition,
+    AnalogRecorder,
+    DamageKind,
+    Detector,
+    PhotonCounter,
+)
 from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSECOND
 from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset
 from lidarops.records import DetectionMode, Role
@@ -29,13 +36,6 @@ from lidarops.simulate.instrument import (
     digitise_fast,
     release,
     seen_from,
-)
-from lidarops.simulate.settings import (
-    Acquisition,
-    AnalogRecorder,
-    DamageKind,
-    Detector,
-    PhotonCounter,
 )
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.site import Order, Site, channel_name, dead_time, modes, random_stream

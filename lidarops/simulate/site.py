@@ -11,12 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.campaign import Instrument, InstrumentFacts, Station, channel_facts
-from lidarops.errors import CampaignError
-from lidarops.records import DetectionMode, Role
-from lidarops.simulate.damage import FOREIGN_NAME
-from lidarops.simulate.dialects import DIALECTS, Dialect, Place, tail
-from lidarops.simulate.settings import (
+from lidarops.campaign.model import Instrument, InstrumentFacts, Station, channel_facts
+from lidarops.campaign.simulation import (
     Acquisition,
     DamageKind,
     Detector,
@@ -24,6 +20,10 @@ from lidarops.simulate.settings import (
     SimulatedInstrument,
     SimulationSettings,
 )
+from lidarops.errors import CampaignError
+from lidarops.records import DetectionMode, Role
+from lidarops.simulate.damage import FOREIGN_NAME
+from lidarops.simulate.dialects import DIALECTS, Dialect, Place, tail
 
 EARTH_RADIUS: Final = 6_371_008.8
 """m, mean radius."""

@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from lidarops.campaign.simulated_files import DamageKind, Handling
 from lidarops.records import DetectionMode
-from lidarops.simulate.settings_files import DamageKind, Handling
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,9 @@ import xarray as xr
 
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError
-from lidarops.products.rows import QUALITY_FLAG
-from lidarops.reports.record import write_atomically
-from lidarops.site import drawing, holding, pages
-from lidarops.site.entries import Entry, Problem
+from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.reports.run_record import write_atomically
+from lidarops.site import pages, product_contents, product_gallery
 from lidarops.site.paths import (
     SITE,
     day_page,
@@ -30,6 +29,7 @@ from lidarops.site.paths import (
     product_paths,
     year_page,
 )
+from lidarops.site.product_entry import Entry, Problem
 
 MANIFEST: Final = "manifest.json"
 """What the site was made of; also what tells a site from any other folder."""
@@ -199,12 +199,12 @@ def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
 
 def _made(task: _Task, file: Path, sha256: str) -> Entry:
     with xr.open_dataset(file, engine="netcdf4", decode_timedelta=False) as opened:
-        judged, origin = holding.judge(opened), holding.origin(opened)
-        span = holding.span(opened)
-        kind = holding.attribute(opened, "lidarops_kind")
+        judged, origin = product_contents.judge(opened), product_contents.origin(opened)
+        span = product_contents.span(opened)
+        kind = product_contents.attribute(opened, "lidarops_kind")
         gallery, problem = _drawn(opened, kind)
         page = product_page(task.path)
-        station = holding.attribute(opened, "lidarops_station")
+        station = product_contents.attribute(opened, "lidarops_station")
         entry = Entry(
             path=task.path,
             sha256=sha256,
@@ -212,12 +212,12 @@ def _made(task: _Task, file: Path, sha256: str) -> Entry:
             page=page,
             thumbnail=page.removesuffix(".html") + ".svg",
             digests=(),
-            campaign=holding.attribute(opened, "lidarops_campaign"),
+            campaign=product_contents.attribute(opened, "lidarops_campaign"),
             station=station,
-            place=holding.attribute(opened, "platform", station),
-            instrument=holding.attribute(opened, "lidarops_instrument"),
+            place=product_contents.attribute(opened, "platform", station),
+            instrument=product_contents.attribute(opened, "lidarops_instrument"),
             kind=kind,
-            channel=holding.attribute(opened, "lidarops_channel"),
+            channel=product_contents.attribute(opened, "lidarops_channel"),
             start=span.start,
             stop=span.stop,
             values=judged.values,
@@ -236,17 +236,17 @@ def _made(task: _Task, file: Path, sha256: str) -> Entry:
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
 
 
-def _drawn(opened: xr.Dataset, kind: str) -> tuple[drawing.Gallery, str]:
+def _drawn(opened: xr.Dataset, kind: str) -> tuple[product_gallery.Gallery, str]:
     """Draw a product; where it is not what its kind says, as one of no known kind."""
     style = pages.style("thumb.css")
     try:
-        return drawing.draw(opened, kind, style), ""
+        return product_gallery.draw(opened, kind, style), ""
     except _UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        return drawing.draw(opened, "", style), problem
+        return product_gallery.draw(opened, "", style), problem
     except _UNREADABLE:
-        return drawing.nothing("it cannot be drawn", style), problem
+        return product_gallery.nothing("it cannot be drawn", style), problem
 
 
 def _unjudged(opened: xr.Dataset) -> str:
@@ -308,7 +308,11 @@ def _sweep(site: Path, expected: set[str]) -> None:
 def _version() -> str:
     """Return a digest of all that makes pages: with another one, none is kept."""
     package = Path(__file__).resolve().parents[1]
-    sources = [package / "flags.py", *(package / "reports").glob("*.py")]
+    sources = [
+        package / "flags.py",
+        *(package / "figures").glob("*.py"),
+        package / "reports/run_record.py",
+    ]
     sources += [path for path in (package / "site").rglob("*") if path.suffix in _SOURCES]
     digest = hashlib.sha256(__version__.encode())
     for source in sorted(sources):

@@ -15,11 +15,11 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops import __version__
-from lidarops.reports.words import counted, percent, size, visible
-from lidarops.site.drawing import Drawn
-from lidarops.site.entries import SIGNAL, UNKNOWN, Entry, Grade, Problem, mean_share
-from lidarops.site.holding import Judged, Origin, variables
+from lidarops.figures.wording import counted, percent, size, visible
 from lidarops.site.paths import day_page, href, slug, year_page
+from lidarops.site.product_contents import Judged, Origin, variables
+from lidarops.site.product_entry import SIGNAL, UNKNOWN, Entry, Grade, Problem, mean_share
+from lidarops.site.product_gallery import Drawn
 
 INDEX: Final = "index.html"
 ROWS: Final = 2000

@@ -19,7 +19,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
-from lidarops.reports.words import visible
+from lidarops.figures.wording import visible
 
 Floats = NDArray[np.float64]
 

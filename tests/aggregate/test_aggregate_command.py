@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from made_archive import add_day
+from support.aggregate_archive import add_day
 from typer.testing import CliRunner
 
-from lidarops.aggregate._needs import need
+from lidarops.aggregate._optional_packages import need
 from lidarops.cli import aggregate as _command  # noqa: F401  # registers the command
 from lidarops.cli import app
 from lidarops.errors import LidarOpsError

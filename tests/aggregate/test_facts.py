@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
-from made_archive import add_day, facts_of
+from support.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.facts import (
     Facts,
@@ -25,7 +25,7 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.write import write_plain
+from lidarops.netcdf.write import write_plain
 from lidarops.records import ProductKind
 
 

@@ -10,7 +10,7 @@ from uuid import UUID
 import numpy as np
 import pandas as pd
 import pytest
-from made_archive import add_day, facts_of
+from support.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.facts import Facts, Selection
 from lidarops.aggregate.index import INDEX, find, find_products, write_index

@@ -11,20 +11,27 @@ import numpy as np
 import pytest
 import xarray as xr
 from compliance_checker.runner import CheckSuite, ComplianceChecker
-from made_archive import add_day, facts_of
-from products.made_products import MAKERS
+from support.aggregate_archive import add_day, facts_of
+from support.made_products import MAKERS
 
 from lidarops.aggregate.facts import Refused, groups, read_facts
 from lidarops.aggregate.means import Averaged, write_means
-from lidarops.aggregate.opening import open_products
+from lidarops.aggregate.means_variables import (
+    BUDGETS,
+    Period,
+    Weights,
+    averaged,
+    layout,
+    systematic,
+)
+from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.products.rows import ErrorKind
-from lidarops.products.table import LAYOUTS
-from lidarops.products.table_means import BUDGETS, Period, Weights, averaged, layout, systematic
+from lidarops.netcdf.variables import ErrorKind
+from lidarops.products.layouts import LAYOUTS
 from lidarops.records import DetectionMode, ProductKind
-from lidarops.retrieve.labeled_visibility import Definition, of_extinction
-from lidarops.retrieve.visibility import WavelengthLaw
+from lidarops.retrieve.air.labeled import Definition, of_extinction
+from lidarops.retrieve.air.visibility import WavelengthLaw
 
 
 def findings(path: Path) -> list[set[str]]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from retrieve.angle_scenes import clear, estimates
+from support.angle_scenes import clear, estimates
 
 from lidarops.aggregate._sums import Sample, Sums
-from lidarops.products.table_means import budget
+from lidarops.aggregate.means_variables import budget
 from lidarops.records import ProductKind
-from lidarops.retrieve import vertical
+from lidarops.retrieve.multiangle.vertical import smooth_profile
 
 CYCLES = 48
 
@@ -23,7 +23,7 @@ def test_means_of_one_sky_stay_within_their_errors(name: str):
     sums, shares = None, []
     for days in range(1, 6):
         found = estimates(scene, CYCLES, rng, 0.6)
-        smooth = vertical.smooth(
+        smooth = smooth_profile.smooth(
             found.optical_depth,
             found.information,
             scene.altitude,

@@ -9,14 +9,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import factories
 import fsspec
 import pytest
-import rawfiles
 import sqlalchemy as sa
+from support import factories, raw_archives
 
-from lidarops import processes
-from lidarops.campaign import Campaign
+from lidarops.campaign.model import Campaign
 from lidarops.catalog import headers
 from lidarops.catalog import scan as scan_module
 from lidarops.catalog.rows import GranuleRow, row_of
@@ -25,6 +23,7 @@ from lidarops.catalog.schema import GRANULE, LAYOUT
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Role, Status
+from lidarops.system import processes
 
 
 @pytest.fixture
@@ -61,9 +60,9 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def _fill(campaign: Campaign, count: int = 5) -> Path:
     root = Path(campaign.archive)
     for k in range(count):
-        rawfiles.write(root / "coast" / f"h{k}", rawfiles.content(k))
-    rawfiles.write(root / "dark" / "d0", rawfiles.content(-30))
-    rawfiles.write(root / "coast" / "notes.txt", b"not claimed by any pattern")
+        raw_archives.write(root / "coast" / f"h{k}", raw_archives.content(k))
+    raw_archives.write(root / "dark" / "d0", raw_archives.content(-30))
+    raw_archives.write(root / "coast" / "notes.txt", b"not claimed by any pattern")
     return root
 
 
@@ -86,9 +85,9 @@ def test_only_what_changed_is_opened(campaign: Campaign, store: Store, opened: l
     opened.clear()
     assert scan(campaign, store) == ScanSummary(6, 0, 0, 6, 0, 0)
     assert opened == []
-    rawfiles.write(root / "coast" / "h1", rawfiles.content(1, seed=9))
+    raw_archives.write(root / "coast" / "h1", raw_archives.content(1, seed=9))
     os.utime(root / "coast" / "h1", ns=(1, 1))
-    rawfiles.write(root / "coast" / "h9", rawfiles.content(9))
+    raw_archives.write(root / "coast" / "h9", raw_archives.content(9))
     (root / "coast" / "h2").unlink()
     assert scan(campaign, store) == ScanSummary(6, 1, 1, 4, 1, 0)
     assert sorted(opened) == ["coast/h1", "coast/h9"]
@@ -105,7 +104,7 @@ def test_an_archive_without_any_of_its_files_is_refused_and_nothing_is_forgotten
     root.rename(tmp_path / "away")
     root.mkdir()
     if others:
-        rawfiles.write(root / "elsewhere" / "h0", rawfiles.content(0))
+        raw_archives.write(root / "elsewhere" / "h0", raw_archives.content(0))
     with pytest.raises(CatalogError, match="knows 6: nothing is forgotten") as caught:
         scan(campaign, store)
     assert not caught.value.wrong_use
@@ -126,7 +125,7 @@ def test_a_changed_fact_of_the_campaign_rescans(campaign: Campaign, store: Store
 
 def test_damaged_files_are_refused_with_a_reason(campaign: Campaign, store: Store) -> None:
     root = _fill(campaign)
-    good = rawfiles.content(7)
+    good = raw_archives.content(7)
     damaged = {
         "h-truncated": good[:-100],
         "h-empty": b"",
@@ -135,7 +134,7 @@ def test_damaged_files_are_refused_with_a_reason(campaign: Campaign, store: Stor
         "h-position": good.replace(b" 046.4", b" 146.4").replace(b"0046.4", b"0146.4"),
     }
     for name, data in damaged.items():
-        rawfiles.write(root / "coast" / name, data)
+        raw_archives.write(root / "coast" / name, data)
     summary = scan(campaign, store)
     assert summary.refused == len(damaged)
     refused = {granule.path: granule.reason for granule in store.granules(status=Status.REFUSED)}
@@ -165,7 +164,7 @@ def test_a_file_of_two_instruments_is_refused(campaign: Campaign, store: Store) 
 
 def test_swapped_coordinates_are_noted(campaign: Campaign, store: Store) -> None:
     root = Path(campaign.archive)
-    rawfiles.write(root / "coast" / "h0", rawfiles.content(0, position=(30.7, 46.4)))
+    raw_archives.write(root / "coast" / "h0", raw_archives.content(0, position=(30.7, 46.4)))
     scan(campaign, store)
     assert "swapped" in store.granules()[0].notes[-1]
     told = {
@@ -180,8 +179,8 @@ def test_swapped_coordinates_are_noted(campaign: Campaign, store: Store) -> None
 
 def test_an_archive_behind_a_url(campaign: Campaign, store: Store) -> None:
     memory = fsspec.filesystem("memory")
-    memory.pipe("/lidar-archive/coast/h0", rawfiles.content(0))
-    memory.pipe("/lidar-archive/coast/h1", rawfiles.content(1)[:-50])
+    memory.pipe("/lidar-archive/coast/h0", raw_archives.content(0))
+    memory.pipe("/lidar-archive/coast/h1", raw_archives.content(1)[:-50])
     remote = campaign.model_copy(update={"archive": "memory://lidar-archive"})
     try:
         assert scan(remote, store) == ScanSummary(2, 2, 0, 0, 0, 1)
@@ -197,7 +196,7 @@ def test_an_absent_archive_is_named(campaign: Campaign, store: Store) -> None:
 
 
 def test_a_broken_database_is_named(tmp_path: Path) -> None:
-    path = rawfiles.write(tmp_path / "catalog.sqlite", b"this is no database" * 100)
+    path = raw_archives.write(tmp_path / "catalog.sqlite", b"this is no database" * 100)
     with pytest.raises(CatalogError, match=r"catalog\.sqlite"):
         Store(f"sqlite:///{path}", "test")
     with pytest.raises(CatalogError, match="--out"):
@@ -230,7 +229,7 @@ def test_a_name_that_is_no_text_is_refused_and_the_rest_goes_on(
     odd = os.fsencode(root / "coast") + b"/h\xff"
     try:
         with open(odd, "wb") as file:  # noqa: PTH123 - a Path holds no bytes
-            file.write(rawfiles.content(9))
+            file.write(raw_archives.content(9))
     except OSError:
         pytest.skip("the file system takes no such name")
     assert scan(campaign, store) == ScanSummary(7, 7, 0, 0, 0, 1)
@@ -254,7 +253,7 @@ class TestManyFiles:
         (root / "coast" / "h3").write_bytes(b"nonsense")
         (root / "coast" / "h4").unlink()
         (root / "coast" / "h4").symlink_to("nowhere")
-        (root / os.fsdecode(b"coast/h\xff")).write_bytes(rawfiles.content(40))
+        (root / os.fsdecode(b"coast/h\xff")).write_bytes(raw_archives.content(40))
         url = f"sqlite:///{tmp_path}"
         with (
             Store(f"{url}/one.sqlite", campaign.name) as one,
@@ -272,7 +271,7 @@ class TestManyFiles:
             (root / moved).rename(root / "coast" / "hz")
             (root / "coast" / "h7").unlink()
             for k in range(8, 16):
-                rawfiles.write(root / "coast" / f"h{k}", rawfiles.content(k + 100))
+                raw_archives.write(root / "coast" / f"h{k}", raw_archives.content(k + 100))
             (root / "coast" / "h9").write_bytes(b"nonsense")
             second = scan(campaign, one)
             assert scan(campaign, two, workers=2) == second
@@ -304,7 +303,7 @@ class TestManyFiles:
         scan(campaign, store)
         monkeypatch.setattr(processes, "ProcessPoolExecutor", None)
         for k in range(20, 23):
-            rawfiles.write(root / "coast" / f"h{k}", rawfiles.content(k))
+            raw_archives.write(root / "coast" / f"h{k}", raw_archives.content(k))
         assert scan(campaign, store, workers=2).added == 3
 
 

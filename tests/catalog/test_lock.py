@@ -9,9 +9,9 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import factories
 import pytest
 import sqlalchemy as sa
+from support import factories
 
 from lidarops.catalog import lock as lock_module
 from lidarops.catalog.ledger import Run, RunStatus

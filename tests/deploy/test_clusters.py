@@ -16,10 +16,10 @@ from typing import Any, ClassVar
 
 import dask.config
 import pytest
-import servers
 import yaml
+from support import servers
 
-from lidarops import clusters, kubernetes
+from lidarops.run import clusters, kubernetes
 
 
 def test_choices_of_the_command_line(tmp_path: Path) -> None:

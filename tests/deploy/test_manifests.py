@@ -14,7 +14,7 @@ import jsonschema
 import pytest
 import yaml
 
-from lidarops import clusters
+from lidarops.run import clusters
 
 TEXT = {"type": "string"}
 COUNT = {"type": "integer", "minimum": 0}

@@ -9,12 +9,10 @@ import time
 from pathlib import Path
 from typing import Any, ClassVar
 
-import factories
 import httpx
 import pytest
-import rawfiles
-import servers
 import yaml
+from support import factories, raw_archives, servers
 
 pytestmark = [pytest.mark.deployment, pytest.mark.timeout(900)]
 
@@ -45,8 +43,8 @@ class Api:
 
 def campaign_file(folder: Path) -> Path:
     for minute in range(3):
-        content = rawfiles.content(minute, bins=1000)
-        rawfiles.write(folder / "raw" / "coast" / f"h{minute}", content)
+        content = raw_archives.content(minute, bins=1000)
+        raw_archives.write(folder / "raw" / "coast" / f"h{minute}", content)
     path = folder / "campaign.yaml"
     campaign = factories.campaign().model_dump(mode="json", exclude={"simulation"})
     path.write_text(yaml.safe_dump(campaign))

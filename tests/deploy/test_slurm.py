@@ -11,15 +11,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
-import rawfiles
-import servers
 import yaml
+from support import raw_archives, servers
 
-from lidarops import clusters
-from lidarops.campaign import load
-from lidarops.engine import make_jobs, process_all
-from lidarops.pipeline import prepare
+from lidarops.campaign.model import load
 from lidarops.records import SceneOutcome
+from lidarops.run import clusters
+from lidarops.run.archive import prepare
+from lidarops.run.executor import make_jobs, process_all
 
 PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "scancel", "squeue")
 pytestmark = [pytest.mark.deployment, pytest.mark.timeout(600)]
@@ -159,11 +158,11 @@ def digests(outcomes: Iterable[SceneOutcome]) -> dict[str, str]:
 
 
 def many_scenes(folder: Path) -> dict[str, object]:
-    import factories
+    from support import factories
 
     for minute in range(24):
-        rawfiles.write(
-            folder / "raw" / "coast" / f"h{minute:02d}", rawfiles.content(minute, bins=4000)
+        raw_archives.write(
+            folder / "raw" / "coast" / f"h{minute:02d}", raw_archives.content(minute, bins=4000)
         )
     campaign = factories.campaign().model_dump(mode="json", exclude={"simulation"})
     return {**campaign, "scenes": {"window": "1min"}}

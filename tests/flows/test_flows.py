@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
-import factories
 import jsonschema
 import pytest
-import rawfiles
 import typer
 import yaml
 from click.testing import Result as Called
@@ -24,6 +22,7 @@ from prefect.client.schemas.objects import State, StateType
 from prefect.exceptions import ParameterTypeError
 from prefect.states import Completed, Failed, Pending, Running
 from prefect.utilities.callables import parameter_schema
+from support import factories, raw_archives
 from typer.testing import CliRunner
 
 import flows.catalog
@@ -32,14 +31,14 @@ from flows import WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
 from flows.maintenance import reap_runs
 from flows.reprocess import process_task, reprocess
-from lidarops.campaign import load
+from lidarops.campaign.model import load
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
-from lidarops.clusters import Local
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
-from lidarops.pipeline import Result, Selection, bring_up_to_date, update_catalog
+from lidarops.run.archive import Result, Selection, bring_up_to_date, update_catalog
+from lidarops.run.clusters import Local
 
 
 @pytest.fixture(scope="session")
@@ -55,8 +54,8 @@ def prefect_server() -> Iterator[None]:
 def campaign_file(tmp_path: Path) -> Path:
     """A campaign of three good files and a broken one."""
     for k in range(3):
-        rawfiles.write(tmp_path / "raw" / "coast" / f"h{k}", rawfiles.content(k, bins=1000))
-    rawfiles.write(tmp_path / "raw" / "coast" / "h9", b"broken")
+        raw_archives.write(tmp_path / "raw" / "coast" / f"h{k}", raw_archives.content(k, bins=1000))
+    raw_archives.write(tmp_path / "raw" / "coast" / "h9", b"broken")
     campaign = factories.campaign().model_dump(mode="json", exclude={"simulation"})
     path = tmp_path / "campaign.yaml"
     path.write_text(yaml.safe_dump(campaign))
@@ -282,7 +281,7 @@ def test_a_night_without_the_raw_files_of_products_says_which_and_what_to_do(
     raw = campaign_file.parent / "raw" / "coast"
     for k in range(3):
         (raw / f"h{k}").unlink()
-    (raw / "h9").write_bytes(rawfiles.content(2000, bins=1000))
+    (raw / "h9").write_bytes(raw_archives.content(2000, bins=1000))
     caplog.clear()
     state = reprocess(str(campaign_file), return_state=True)
     assert state.name == WITH_FAILURES
@@ -299,7 +298,7 @@ def test_the_log_of_a_troubled_night_is_bounded(
     campaign_file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     for k in range(30):
-        rawfiles.write(campaign_file.parent / "raw" / "coast" / f"hb{k:02d}", b"broken")
+        raw_archives.write(campaign_file.parent / "raw" / "coast" / f"hb{k:02d}", b"broken")
     reprocess(str(campaign_file))
     refused = [record for record in caplog.records if "coast/h" in record.getMessage()]
     assert len(refused) == 20

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from golden.cdl import dump
-from products.made_products import MAKERS, PLACED, context
+from support.made_products import MAKERS, PLACED, context
 
-from lidarops.products.build import build
-from lidarops.products.write import write
+from lidarops.netcdf.write import write
+from lidarops.products.layouts import build_product
 
 FOLDER = Path(__file__).parent
 BEAMS: dict[str, dict[str, Any]] = {
@@ -39,7 +39,7 @@ def texts(folder: Path) -> Iterator[tuple[str, str]]:
     for kind in MAKERS:
         for beam, angles in ({"several_beams": {}} if kind in PLACED else BEAMS).items():
             path = folder / f"{kind}_{beam}.nc"
-            write(build(plain(MAKERS[kind](**angles)), context(kind)), path)
+            write(build_product(plain(MAKERS[kind](**angles)), context(kind)), path)
             yield f"{path.stem}.cdl", dump(path)
 
 

@@ -10,36 +10,35 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_products import MAKERS, context
+from support.made_products import MAKERS, context
 
 from lidarops.flags import Quality, Severity
-from lidarops.products.build import build
-from lidarops.products.rows import sum_up
-from lidarops.products.table import LAYOUTS
-from lidarops.products.write import write
+from lidarops.netcdf.variables import sum_up
+from lidarops.netcdf.write import write
+from lidarops.products.layouts import LAYOUTS, build_product
 from lidarops.records import ProductKind
-from lidarops.retrieve import labeled_multiangle
+from lidarops.retrieve.multiangle import labeled
 
 BITS = list(Quality)
 
 SCENES = {
-    Quality.INPUT_MISSING: "test_background::test_variance_that_is_not_finite_is_missing",
-    Quality.SATURATED: "test_labeled::test_bad_bins_are_left_out_and_their_bits_carried",
-    Quality.PILE_UP: "test_labeled::test_bad_bins_are_left_out_and_their_bits_carried",
-    Quality.INCOMPLETE_OVERLAP: "test_labeled::test_bad_bins_are_left_out_and_their_bits_carried",
-    Quality.TOO_FEW_BINS: "test_homogeneous::test_few_bins",
-    Quality.NO_SIGNAL: "test_homogeneous::test_constant_profile_has_no_signal",
-    Quality.LOW_SIGNAL: "test_background::test_lost_roots_are_flagged",
-    Quality.POORLY_DETERMINED: "test_homogeneous::test_single_weak_shot_of_counts_is_flagged",
-    Quality.NEGATIVE_AMPLITUDE: "test_homogeneous::test_inverted_profile_has_negative_amplitude",
-    Quality.AT_BOUND: "test_homogeneous::test_extinction_stays_within_given_bounds_and_says_so",
-    Quality.POOR_FIT: "test_homogeneous::test_wrong_noise_variance_is_flagged",
-    Quality.NOT_HOMOGENEOUS: "test_homogeneous::"
+    Quality.INPUT_MISSING: "test_cubic_and_tail::test_variance_that_is_not_finite_is_missing",
+    Quality.SATURATED: "test_labeled_homogeneous::test_bad_bins_are_left_out_and_their_bits_carried",
+    Quality.PILE_UP: "test_labeled_homogeneous::test_bad_bins_are_left_out_and_their_bits_carried",
+    Quality.INCOMPLETE_OVERLAP: "test_labeled_homogeneous::test_bad_bins_are_left_out_and_their_bits_carried",
+    Quality.TOO_FEW_BINS: "test_path_fit::test_few_bins",
+    Quality.NO_SIGNAL: "test_path_fit::test_constant_profile_has_no_signal",
+    Quality.LOW_SIGNAL: "test_cubic_and_tail::test_lost_roots_are_flagged",
+    Quality.POORLY_DETERMINED: "test_path_fit::test_single_weak_shot_of_counts_is_flagged",
+    Quality.NEGATIVE_AMPLITUDE: "test_path_fit::test_inverted_profile_has_negative_amplitude",
+    Quality.AT_BOUND: "test_path_fit::test_extinction_stays_within_given_bounds_and_says_so",
+    Quality.POOR_FIT: "test_path_fit::test_wrong_noise_variance_is_flagged",
+    Quality.NOT_HOMOGENEOUS: "test_path_fit::"
     "test_backscatter_that_varies_along_the_path_is_flagged",
-    Quality.OUTLIER: "test_homogeneous::test_cloud_and_outlier_are_flagged",
+    Quality.OUTLIER: "test_path_fit::test_cloud_and_outlier_are_flagged",
     Quality.BACKGROUND_UNCERTAIN: "test_labeled_elastic::"
     "test_aerosol_in_the_far_range_makes_the_background_uncertain",
-    Quality.NO_GLUING: "test_labeled_glue::test_no_gluing_where_no_range_is_linear_in_both",
+    Quality.NO_GLUING: "test_labeled_gluing::test_no_gluing_where_no_range_is_linear_in_both",
     Quality.CLOUD: "test_labeled_elastic::"
     "test_a_cloud_below_the_reference_is_flagged_with_all_that_rests_on_it",
     Quality.NO_REFERENCE: "test_labeled_elastic::test_behind_an_opaque_cloud_there_is_no_reference",
@@ -55,8 +54,7 @@ SCENES = {
     "test_an_angle_to_one_side_is_flagged_and_has_a_systematic_error",
     Quality.HIGH_CORRELATION: "test_labeled_multiangle::"
     "test_where_energy_jitters_single_altitudes_stand",
-    Quality.NOT_LEVEL: "../test_end_to_end::"
-    "test_the_campaign_knows_the_pointing_better_than_the_header",
+    Quality.NOT_LEVEL: "test_archives::test_the_campaign_knows_the_pointing_better_than_the_header",
 }
 """The test of a scene that raises the bit; the bit stands in it by name."""
 
@@ -65,18 +63,18 @@ BY_FIELD = {
         "prior_dominated",
         "test_mld::test_published_claim_is_not_reproduced_at_15_degrees",
     ),
-    Quality.INTERPOLATED: ("interpolated", "test_multiangle::test_broken_profiles_stay_alone"),
+    Quality.INTERPOLATED: ("interpolated", "test_optical_depth::test_broken_profiles_stay_alone"),
     Quality.LOW_LEVERAGE: (
         "low_leverage",
-        "test_multiangle::test_tiny_leverage_is_told_with_an_honest_error",
+        "test_optical_depth::test_tiny_leverage_is_told_with_an_honest_error",
     ),
     Quality.NO_RESIDUAL: (
         "no_residual",
-        "test_vertical::test_noise_known_from_few_residuals_widens_the_errors",
+        "test_smooth_profile::test_noise_known_from_few_residuals_widens_the_errors",
     ),
     Quality.UNDERSMOOTHED: (
         "undersmoothed",
-        "test_vertical::test_profile_with_more_structure_than_smoothing_is_for_is_flagged",
+        "test_smooth_profile::test_profile_with_more_structure_than_smoothing_is_for_is_flagged",
     ),
     Quality.HORIZONTAL_GRADIENT: ("gradient", "test_kano_hamilton"),
 }
@@ -88,7 +86,8 @@ GUARDS = {Quality.NO_REAL_SOLUTION}
 
 def source(repository: Path, scene: str) -> str:
     module, _, name = scene.partition("::")
-    text = (repository / "tests/retrieve" / f"{module}.py").read_text(encoding="utf-8")
+    (path,) = (repository / "tests").rglob(f"{module}.py")
+    text = path.read_text(encoding="utf-8")
     if not name:
         return text
     functions = [
@@ -121,7 +120,7 @@ def test_every_bit_is_documented_in_some_kind_and_raised_by_some_scene(
     elif bit in BY_FIELD:
         field, scene = BY_FIELD[bit]
         assert f".{field}" in source(repository, scene)
-        written = Path(str(labeled_multiangle.__file__)).read_text(encoding="utf-8")
+        written = Path(str(labeled.__file__)).read_text(encoding="utf-8")
         assert f'"{field}": Quality.{bit.name}' in written
     else:
         assert bit in GUARDS, "name a scene that raises it"
@@ -148,7 +147,7 @@ def test_any_bits_come_back_from_a_file_by_mask_and_meaning(
     shape = results["quality_flag"].shape
     results["quality_flag"] = (results["quality_flag"].dims, np.resize(values, shape))
     path = tmp_path / "flags.nc"
-    write(build(results, context(kind)), path)
+    write(build_product(results, context(kind)), path)
     with netCDF4.Dataset(path) as file:
         variable = file["quality_flag"]
         stored = variable[...].ravel()

@@ -12,7 +12,7 @@ import dask
 import numpy as np
 import pytest
 import xarray as xr
-from licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
+from support.licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
 
 import lidarops
 from lidarops.errors import RawFormatError

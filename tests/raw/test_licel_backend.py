@@ -9,7 +9,7 @@ import struct
 import numpy as np
 import pytest
 import xarray as xr
-from licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
+from support.licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel

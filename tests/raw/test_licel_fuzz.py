@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
-from licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
+from support.licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
+from support.licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from licel_strategies import naive_physical, naive_read
+from support.licel_strategies import naive_physical, naive_read
 
 from lidarops.raw import licel
 

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from licel_strategies import datasets, files, headers, naive_read, raw_file
+from support.licel_strategies import datasets, files, headers, naive_read, raw_file
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from licel_strategies import raw_file
+from support.licel_strategies import raw_file
 
-from lidarops.bench import throughput
+from lidarops.bench.throughput import readers
 from lidarops.errors import RawFormatError
 
 
@@ -13,7 +13,7 @@ def test_ways_and_rates(tmp_path):
     paths = [tmp_path / f"file{number}" for number in range(3)]
     for path in paths:
         path.write_bytes(raw_file())
-    results = throughput.reader(paths, repeats=2)
+    results = readers.reader(paths, repeats=2)
     assert [result.name for result in results] == [
         "read bytes (floor)",
         "numpy (floor)",
@@ -34,6 +34,6 @@ def test_ways_and_rates(tmp_path):
 
 def test_needs_files(tmp_path):
     with pytest.raises(RawFormatError, match="at least one file"):
-        throughput.reader([])
+        readers.reader([])
     with pytest.raises(RawFormatError, match="cannot be opened"):
-        throughput.reader([tmp_path / "absent"])
+        readers.reader([tmp_path / "absent"])

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_campaign import TREE
+from support.small_campaign import TREE
 
-from lidarops.campaign import Campaign
+from lidarops.campaign.model import Campaign
 
 Change = Callable[[dict[str, Any]], object]
 

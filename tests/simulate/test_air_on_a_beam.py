@@ -8,8 +8,8 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
+from lidarops.campaign.simulation import AtmosphereSettings
 from lidarops.simulate.atmosphere import Air, Beam
-from lidarops.simulate.settings import AtmosphereSettings
 
 START = datetime(2025, 6, 1, tzinfo=UTC)
 DISTANCE = (np.arange(1000) + 0.5) * 7.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarops.campaign import load
+from lidarops.campaign.model import load
 from lidarops.raw import licel
 from lidarops.simulate.campaign import simulate
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from lidarops.campaign import Campaign, load
+from lidarops.campaign.model import Campaign, load
 from lidarops.errors import CampaignError
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
-from lidarops.retrieve import geometry
+from lidarops.retrieve.network import geometry
 from lidarops.simulate.campaign import simulate
 
 

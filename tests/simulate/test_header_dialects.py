@@ -10,10 +10,10 @@ import pytest
 from lidarops.catalog.scan import scan
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
+from lidarops.plan.scenes import cut
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
 from lidarops.records import Status
-from lidarops.scenes import cut
 from lidarops.simulate.campaign import simulate
 
 DIALECTS = ["licel", "manaus", "saopaulo", "pilar", "golmud"]

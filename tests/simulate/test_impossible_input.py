@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from lidarops.campaign.simulation import AtmosphereSettings, SimulationSettings
 from lidarops.errors import CatalogError
-from lidarops.retrieve.molecular import us_standard
+from lidarops.retrieve.air.molecular import us_standard
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.analog import Digitiser, digitise_fast, slow_baseline
 from lidarops.simulate.atmosphere import Air
 from lidarops.simulate.campaign import simulate
 from lidarops.simulate.counting import count_fast, counter_moments
-from lidarops.simulate.settings import AtmosphereSettings, SimulationSettings
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.sun import solar_elevation
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from lidarops.campaign.simulation import DamageKind, Handling
 from lidarops.catalog.scan import scan
 from lidarops.catalog.store import Store
-from lidarops.engine import run
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality
-from lidarops.pipeline import prepare
+from lidarops.plan.scenes import cut
 from lidarops.raw import licel
 from lidarops.records import Role, Status
-from lidarops.scenes import cut
+from lidarops.run.archive import prepare
+from lidarops.run.executor import run
 from lidarops.simulate.campaign import simulate
-from lidarops.simulate.settings import DamageKind, Handling
 
 KINDS = list(DamageKind)
 ALL_DAMAGE = [{"kind": kind.value, "index": 2 * i} for i, kind in enumerate(KINDS)]

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import expon, norm, uniform
 
+from lidarops.campaign.simulation import Pulse
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate.atmosphere import Path
 from lidarops.simulate.campaign import simulate
 from lidarops.simulate.echo import echo
-from lidarops.simulate.settings import Pulse
 from lidarops.simulate.signal import backscatter_signal
 
 STEP = 7.5

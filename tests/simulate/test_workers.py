@@ -9,8 +9,8 @@ import yaml
 from typer.testing import CliRunner
 
 from lidarops.cli import app
-from lidarops.engine import local_client
 from lidarops.errors import CampaignError
+from lidarops.run.executor import local_client
 from lidarops.simulate import campaign as module
 from lidarops.simulate.campaign import plan, simulate
 from lidarops.simulate.files import Simulator

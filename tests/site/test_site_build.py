@@ -16,7 +16,7 @@ import netCDF4
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from site_archive import add, add_unknown, contents, small_archive
+from support.site_archive import add, add_unknown, contents, small_archive
 from typer.testing import CliRunner
 
 from lidarops.cli import app
@@ -24,7 +24,7 @@ from lidarops.errors import CatalogError, ProductError
 from lidarops.records import ProductKind
 from lidarops.site import paths
 from lidarops.site.build import build
-from lidarops.site.entries import Grade
+from lidarops.site.product_entry import Grade
 
 FIRST_PAGE = 300_000
 """Bytes that the first page may load."""

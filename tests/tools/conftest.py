@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from products.made_products import MAKERS, context
+from support.made_products import MAKERS, context
 
-from lidarops.products.build import build
-from lidarops.products.write import write
+from lidarops.netcdf.write import write
+from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 
 BEAMS = {
@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ProductKind, str
     def path(kind: ProductKind, beam: str) -> Path:
         file = folder / f"{kind}_{beam}.nc"
         if not file.exists():
-            write(build(MAKERS[kind](**BEAMS[beam]), context(kind)), file)
+            write(build_product(MAKERS[kind](**BEAMS[beam]), context(kind)), file)
         return file
 
     return path

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidarops.products.write import chunk_sizes
+from lidarops.netcdf.write import chunk_sizes
 from lidarops.records import ProductKind
 
 

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.products.write import write
+from lidarops.netcdf.write import write
 
 
 @pytest.fixture

@@ -1,0 +1,265 @@
+"""One virtual dataset over all products of a kind, channel and grid.
+
+A view is a JSON file of kerchunk references: no values are copied but the small ones along time.
+It is derived and can be thrown away at any time; the products are the truth. `open_view` refuses
+a view whose products have changed since.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from lidarops.aggregate._join import join, shared_attributes
+from lidarops.aggregate._optional_packages import need
+from lidarops.aggregate._references import (
+    TEMPLATE,
+    Part,
+    Refs,
+    Source,
+    Template,
+    parts,
+    references,
+    source,
+    template,
+)
+from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates, within
+from lidarops.aggregate.usable import CARE, masked, with_usable
+from lidarops.errors import ProductError
+from lidarops.records import DetectionMode
+from lidarops.reports.run_record import write_atomically
+
+FORMAT: Final = 1
+_BRACES: Final = ("{", "}")
+_CODECS: Final = {"shuffle", "zlib"}
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A view that was written."""
+
+    path: str
+    """Relative to the folder of the products' root, with forward slashes."""
+    products: int
+    profiles: int
+    parts: int
+    """Zarr groups in it: 1 where the chunks of all products fit one regular grid."""
+    refused: tuple[Refused, ...] = ()
+    """Products that could not be read, and are not in it."""
+
+
+def write_view(root: Path, products: Sequence[Facts]) -> View:
+    """Write the view of one group of products.
+
+    Parameters
+    ----------
+    root : path
+        The folder that the products' paths are relative to; the view goes to its folder
+        ``aggregates/views``.
+    products : sequence of Facts
+        Of one group (`lidarops.aggregate.facts.groups`).
+
+    Returns
+    -------
+    View
+
+    Raises
+    ------
+    ProductError
+        If the products are not of one group, hold a time twice, or none of them can be read.
+    """
+    group = _group(products)
+    alike, sources, refused = _sources(root, products)
+    _refuse_duplicates(sources)
+    found = parts(sources, alike)
+    target = root / FOLDER / "views" / f"{group.name}.json"
+    content = _document(found, alike, DetectionMode(products[0].mode))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(target, json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
+    profiles = sum(each.facts.profiles for each in sources)
+    path = target.relative_to(root).as_posix()
+    return View(path, len(sources), profiles, len(found), refused)
+
+
+def _sources(
+    root: Path, products: Sequence[Facts]
+) -> tuple[Template, list[Source], tuple[Refused, ...]]:
+    alike: Template | None = None
+    sources, refused = [], []
+    for product in products:
+        try:
+            alike = alike or template(root, product)
+            sources.append(source(root, product, alike))
+        except ProductError as error:
+            refused.append(Refused(product.path, error.problem))
+    if alike is None or not sources:
+        raise ProductError(f"cannot be read: {refused[0].reason}", file=refused[0].path)
+    return alike, sources, tuple(refused)
+
+
+def _group(products: Sequence[Facts]) -> Group:
+    found = {product.group for product in products}
+    if len(found) != 1:
+        names = ", ".join(sorted(group.name for group in found)) or "none"
+        raise ProductError(f"a view is of one group of products, not of {names}")
+    for product in products:
+        if any(brace in product.path for brace in _BRACES):
+            raise ProductError(
+                "has braces in its path, which references cannot hold", file=product.path
+            )
+    return found.pop()
+
+
+def _refuse_duplicates(sources: Sequence[Source]) -> None:
+    times = np.concatenate([each.inline["time"] for each in sources])
+    owners = [each.facts.path for each in sources for _ in range(each.facts.profiles)]
+    refuse_duplicates(times, owners)
+
+
+def _document(found: Sequence[Part], alike: Template, mode: DetectionMode) -> dict[str, Any]:
+    shared = shared_attributes([each.attributes for part in found for each in part.sources])
+    names = [""] if len(found) == 1 else [f"part{number}" for number in range(len(found))]
+    refs: Refs = {}
+    for name, part in zip(names, found, strict=True):
+        inner = references(part, alike, mode, shared)
+        refs |= {f"{name}/{key}".removeprefix("/"): value for key, value in inner.items()}
+    refs.setdefault(".zgroup", json.dumps({"zarr_format": 2}))
+    return {
+        "version": 1,
+        "templates": {TEMPLATE: "../.."},
+        "refs": refs,
+        "lidarops": {
+            "format": FORMAT,
+            "parts": names,
+            "products": [
+                {
+                    "path": each.facts.path,
+                    "size": each.facts.size,
+                    "sha256": each.facts.sha256,
+                    "id": each.facts.id,
+                    "seal": each.seal,
+                }
+                for part in found
+                for each in part.sources
+            ],
+        },
+    }
+
+
+def open_view(path: str | os.PathLike[str], *, usable: int = CARE) -> xr.Dataset:
+    """Open a view as one lazy dataset, in order of time.
+
+    Parameters
+    ----------
+    path : path or str
+        From `write_view`, in its place below the products' root.
+    usable : int
+        Worst values that are wanted: 0 good, 1 with care, 2 all. Others are NaN; flags stay.
+
+    Returns
+    -------
+    xarray.Dataset
+        Decoded, on dask arrays, one chunk a product or smaller. ``product`` (product) is the
+        id of each product, ``product_index`` (time) tells which one holds a profile; what belongs
+        to a product as a whole has the dimension ``product``.
+
+    Raises
+    ------
+    ProductError
+        If the file is no view, or a product is missing or has changed since it was written.
+    LidarOpsError
+        If zarr is not installed.
+    """
+    view = Path(path)
+    document = _read(view)
+    root = view.resolve().parents[2]
+    refs: dict[str, Refs] = {name: {} for name in document["lidarops"]["parts"]}
+    for key, content in document["refs"].items():
+        part, _, inner = key.partition("/")
+        if part in refs:
+            refs[part][inner] = content
+        elif "" in refs:
+            refs[""][key] = content
+    pieces = [_part(root, each) for each in refs.values()]
+    return masked(with_usable(join(pieces)), usable)
+
+
+def _part(root: Path, refs: Refs) -> xr.Dataset:
+    zarr, fsspec = need("zarr"), need("fsspec")
+    # Zarr reads asynchronously; fsspec wraps the local files itself.
+    system = fsspec.filesystem(
+        "reference",
+        fo={"version": 1, "templates": {TEMPLATE: root.as_posix()}, "refs": refs},
+        remote_protocol="file",
+        asynchronous=True,
+    )
+    store = zarr.storage.FsspecStore(system, read_only=True)
+    found = xr.open_zarr(store, consolidated=False, zarr_format=2, chunks={}, decode_coords=True)
+    found = found.assign_coords(product=found["product"].astype(str, keep_attrs=True))
+    named: xr.Dataset = found.set_coords(["product", "product_index"])
+    return named
+
+
+def _read(view: Path) -> dict[str, Any]:
+    try:
+        document: Any = json.loads(view.read_bytes())
+    except (OSError, ValueError) as error:
+        raise ProductError(f"cannot be read as a view: {error}", file=view) from error
+    found = document.get("lidarops") if isinstance(document, dict) else None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise ProductError(
+            "is no view of this version of lidarops",
+            file=view,
+            remedy="write it again: lidarops aggregate",
+        )
+    try:
+        for key, content in document["refs"].items():
+            if key.endswith(".zarray"):
+                _refuse_strange_array(json.loads(content), view, key)
+        _check_products(view.resolve().parents[2], document, view)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ProductError(f"is a damaged view: {error!r}", file=view) from error
+    return dict(document)
+
+
+def _refuse_strange_array(array: dict[str, Any], view: Path, key: str) -> None:
+    """Refuse codecs that views do not have, some of which would run what they decode."""
+    codecs = {codec["id"] for codec in array["filters"]}
+    if array["compressor"] is not None or not codecs <= _CODECS or "O" in array["dtype"]:
+        raise ProductError("is stored as no view of lidarops is", file=view, field=key)
+
+
+def _check_products(root: Path, document: dict[str, Any], view: Path) -> None:
+    """Refuse a view whose references may lie in files that are not what they were."""
+    known = set()
+    prefix = f"{{{{{TEMPLATE}}}}}/"
+    for product in document["lidarops"]["products"]:
+        known.add(prefix + product["path"])
+        file = within(root, product["path"])
+        if not _is_unchanged(file, product):
+            raise ProductError(
+                "is missing or has changed since the view was written",
+                file=file,
+                remedy="write the view again: lidarops aggregate",
+            )
+    for key, place in document["refs"].items():
+        if isinstance(place, list) and place[0] not in known:
+            raise ProductError("refers to a file that is no product of it", file=view, field=key)
+
+
+def _is_unchanged(file: Path, product: dict[str, Any]) -> bool:
+    try:
+        with file.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            stream.seek(product["seal"])
+            found = stream.read(len(product["id"]))
+    except OSError:
+        return False
+    return bool(size == product["size"] and found == product["id"].encode())

@@ -1,0 +1,537 @@
+"""Vertical profiles whose truth is known, and who finds their background and their particles.
+
+The simulated set is made as the signals of the EARLINET elastic intercomparison are
+(boeckmann2004): 532 nm, no aerosol above 6 km, 1005 bins of 15 m, Poisson noise of a mean of
+1000 shots over a constant background. The files of the intercomparison are read where given.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import CampaignError, RawFormatError
+from lidarops.flags import Quality
+from lidarops.raw import licel
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.elastic import inversion, layers, reference_window
+from lidarops.retrieve.homogeneous import path_fit
+
+Array = npt.NDArray[np.float64]
+
+WAVELENGTH: Final = 532e-9
+LIDAR_RATIO: Final = 39.0
+SHOTS: Final = 1000.0
+BRIGHTEST: Final = 1.9093e7
+"""Counts in the brightest bin, as in the intercomparison."""
+RANGE: Final = 15.0 * (np.arange(1005, dtype=np.float64) + 0.5)
+LEVELS: Final = tuple(10.0**power for power in range(9))
+"""Counts in a bin and a shot."""
+CLEAN_FROM: Final = 6000.0
+OVERLAP: Final = 400.0
+"""m, from where on the inversion uses the signal."""
+COMPARED: Final = (500.0, 6000.0)
+GIVEN: Final = (7000.0, 8000.0)
+CANDIDATES: Final = reference_window.candidate_windows(4000.0, 12000.0, 1000.0, 250.0)
+
+_SEED: Final = 20040101
+_FULL_SCALE: Final = 2.0**31 - 1.0
+_CHANNEL: Final = "analog_532o"
+_RAMP: Final = 15.0
+"""Bins of incomplete overlap, from which the signal rises to the brightest bin."""
+_FIRST_TRUE_BIN: Final = 60
+"""Of the published files; the nearest bins hold a ramp."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """One set of air, particles and noise-free signal."""
+
+    range: Array
+    """m."""
+    molecular_backscatter: Array
+    """m-1 sr-1."""
+    molecular_extinction: Array
+    """m-1."""
+    shape: Array
+    """Of the signal from air alone, m-3 sr-1."""
+    signal: Array
+    """Counts a shot, free of noise and background."""
+    backscatter: Array
+    """m-1 sr-1, of the particles: the truth."""
+
+    @property
+    def compared(self) -> npt.NDArray[np.bool_]:
+        """Bins whose backscatter is judged."""
+        return (self.range >= COMPARED[0]) & (self.range <= COMPARED[1])
+
+    @property
+    def inverted(self) -> npt.NDArray[np.bool_]:
+        """Bins that the inversion is given."""
+        return self.range > OVERLAP
+
+    def counts(self, level: float, draws: int, *seed: int) -> Array:
+        """Return noisy profiles, mean counts of `SHOTS` shots; the same seed, the same noise.
+
+        Parameters
+        ----------
+        level : float
+            Background in counts a shot.
+        draws : int
+        *seed : int
+
+        Returns
+        -------
+        (draw, range) float
+        """
+        rng = np.random.default_rng([_SEED, *seed])
+        mean = np.broadcast_to(SHOTS * (self.signal + level), (draws, self.range.size))
+        return np.asarray(rng.poisson(mean) / SHOTS)
+
+
+def _sky(air: MolecularProfile, signal: Array, backscatter: Array) -> Sky:
+    molecular = air.backscatter(RANGE, WAVELENGTH)
+    extinction = air.extinction(RANGE, WAVELENGTH)
+    return Sky(
+        range=RANGE,
+        molecular_backscatter=molecular,
+        molecular_extinction=extinction,
+        shape=known_shape.molecular_shape(molecular, extinction, RANGE),
+        signal=signal / signal.max() * BRIGHTEST,
+        backscatter=backscatter,
+    )
+
+
+def particles(height: npt.ArrayLike) -> Array:
+    """Return the backscatter of the particles of the simulated set, m-1 sr-1.
+
+    As turbid as the intercomparison (optical depth 1.4): a mixed layer with a soft top at
+    1.75 km and a tenuous layer from 3.9 to 5.7 km, nothing from 6 km on.
+    """
+    z = np.asarray(height, dtype=np.float64)
+    mixed = 2e-5 / (1.0 + np.exp((z - 1750.0) / 120.0))
+    phase = np.clip((z - 4800.0) / 900.0, -1.0, 1.0)
+    aloft = 4e-7 * np.cos(0.5 * np.pi * phase) ** 2
+    return np.asarray(np.where(z < CLEAN_FROM, mixed + aloft, 0.0))
+
+
+@cache
+def simulated() -> Sky:
+    """Return the simulated set.
+
+    The optical depth is integrated by Gauss quadrature of 8 nodes from bin to bin, not by the
+    trapezoids of the inversion, whose error is thus part of what is measured.
+    """
+    air = MolecularProfile.us_standard()
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    edges = np.concatenate([[0.0], RANGE])
+    half = 0.5 * np.diff(edges)[:, np.newaxis]
+    z = edges[:-1, np.newaxis] + half * (1.0 + nodes)
+    extinction = LIDAR_RATIO * particles(z) + air.extinction(z, WAVELENGTH)
+    depth = np.cumsum(np.sum(extinction * weights * half, axis=-1))
+    molecular = air.backscatter(RANGE, WAVELENGTH)
+    signal = (particles(RANGE) + molecular) * np.exp(-2.0 * depth) / RANGE**2
+    signal *= np.minimum((np.arange(RANGE.size) + 1.0) / _RAMP, 1.0) ** 3
+    return _sky(air, signal, particles(RANGE))
+
+
+# Background -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Backgrounds in counts, one a profile."""
+
+    background: Array
+    standard_error: Array
+    rejected: npt.NDArray[np.bool_]
+    """A quality bit that says not to use the value."""
+
+
+Way = Callable[[Array, Sky], Found]
+"""From counts (profile, range) and the set they stem from to backgrounds."""
+
+KNOWN_SHAPE: Final = "known_shape"
+TOLD: Final = "known_shape, told 6 km"
+TAIL_MEAN: Final = "tail_mean"
+HOMOGENEOUS: Final = "homogeneous"
+
+
+def ways() -> dict[str, Way]:
+    """Return the ways to find the background by name.
+
+    `homogeneous` and `cubic` solve for a path along which nothing changes, which a vertical one
+    is not; they are given the range from 6 km on, to show by how much they miss.
+    """
+    return {
+        KNOWN_SHAPE: _known_shape,
+        TOLD: _told,
+        TAIL_MEAN: _tail_mean,
+        HOMOGENEOUS: _homogeneous,
+        "cubic": _cubic,
+    }
+
+
+def _known_shape(counts: Array, sky: Sky) -> Found:
+    found = known_shape.solve(counts, sky.range, sky.shape, exposure=SHOTS)
+    return _found(found.background, found.background_standard_error, found.quality)
+
+
+def _told(counts: Array, sky: Sky) -> Found:
+    found = known_shape.solve(counts, sky.range, sky.shape, exposure=SHOTS, start=CLEAN_FROM)
+    return _found(found.background, found.background_standard_error, found.quality)
+
+
+def _tail_mean(counts: Array, sky: Sky) -> Found:
+    found = cubic_and_tail.tail_mean(counts, sky.range)
+    return _found(found.background, found.background_standard_error, found.quality)
+
+
+def _homogeneous(counts: Array, sky: Sky) -> Found:
+    far = sky.range >= CLEAN_FROM
+    variance = path_fit.mean_profile_variance(counts[:, far], SHOTS)
+    found = path_fit.solve(counts[:, far], sky.range[far], variance=variance)
+    return _found(found.background, found.background_standard_error, found.quality)
+
+
+def _cubic(counts: Array, sky: Sky) -> Found:
+    far = sky.range >= CLEAN_FROM
+    found = cubic_and_tail.cubic(
+        counts[:, far], sky.range[far], statistics=cubic_and_tail.Statistics.POISSON, shots=SHOTS
+    )
+    return _found(found.background, found.background_standard_error, found.quality)
+
+
+def _found(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> Found:
+    return Found(value, error, (quality & Quality.rejecting()) != 0)
+
+
+def least_error(sky: Sky, level: float) -> float:
+    r"""Return the Cramér-Rao bound of the background's standard error from 6 km on, in counts.
+
+    .. math:: \left[ (J^T V^{-1} J)^{-1} \right]_{00}^{1/2}, \quad J = [1, \varphi], \quad
+        V = \mathrm{diag}(s + b) / N
+
+    with the shape :math:`\varphi` of air and N shots (kay1993).
+    """
+    far = sky.range >= CLEAN_FROM
+    shape = sky.shape[far] / sky.shape[far][0]
+    slopes = np.stack([np.ones_like(shape), shape], axis=1)
+    fisher = slopes.T @ (slopes * (SHOTS / (sky.signal[far] + level))[:, np.newaxis])
+    return float(np.sqrt(np.linalg.inv(fisher)[0, 0]))
+
+
+# Inversion ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Inverted:
+    """Particles of each profile."""
+
+    backscatter: Array
+    """m-1 sr-1, (profile, range); NaN where withheld."""
+    standard_error: Array
+    """m-1 sr-1."""
+    calibrated: npt.NDArray[np.bool_]
+    """Profiles with a reference window."""
+
+
+def variance(counts: Array) -> Array:
+    """Return the variance of mean counts, as one who knows no truth has it."""
+    # A bin without a count has one at most.
+    return np.maximum(counts, 1.0 / SHOTS) / SHOTS
+
+
+def cleared(counts: Array, sky: Sky, found: Found) -> Array:
+    """Return counts without background; NaN where the inversion is not to use them."""
+    return np.where(sky.inverted, counts - found.background[:, np.newaxis], np.nan)
+
+
+def screened(power: Array, noise: Array, sky: Sky) -> layers.Layers:
+    """Return the clouds, none of which are there."""
+    return layers.screen(power, sky.range, noise, molecular_attenuated=sky.shape)
+
+
+def chosen_window(
+    power: Array, noise: Array, sky: Sky, exclude: npt.NDArray[np.bool_] | None = None
+) -> reference_window.ReferenceWindow:
+    """Return the reference windows out of `CANDIDATES`."""
+    return reference_window.choose(
+        power,
+        sky.range,
+        noise,
+        molecular_attenuated=sky.shape,
+        candidates=CANDIDATES,
+        exclude=exclude,
+    )
+
+
+def particles_of(
+    power: Array,
+    sky: Sky,
+    edges: tuple[npt.ArrayLike, npt.ArrayLike],
+    *,
+    noise: Array | None = None,
+    background_error: npt.ArrayLike = 0.0,
+    reference_error: npt.ArrayLike = 0.0,
+) -> inversion.ElasticResult:
+    """Invert with the true lidar ratio and air."""
+    return inversion.solve(
+        power,
+        sky.range,
+        molecular_backscatter=sky.molecular_backscatter,
+        molecular_extinction=sky.molecular_extinction,
+        lidar_ratio=LIDAR_RATIO,
+        reference=edges,
+        variance=noise,
+        background_standard_error=background_error,
+        reference_relative_error=reference_error,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """From counts to particles."""
+
+    way: str
+    """To find the background."""
+    choose: bool = False
+    """The reference window, instead of `GIVEN`."""
+    carried: float = 0.0
+    """What the particles that the noise hides in a chosen window may add to it: standard errors
+    of the window, stated as error of the reference (`lidarops.retrieve.elastic.reference_window.choose`)."""
+
+
+def chains() -> dict[str, Chain]:
+    """Return the chains by name."""
+    return {
+        "window given": Chain(KNOWN_SHAPE),
+        "window chosen": Chain(KNOWN_SHAPE, choose=True),
+        "chosen, error carried": Chain(KNOWN_SHAPE, choose=True, carried=1.5),
+        "tail_mean, given": Chain(TAIL_MEAN),
+    }
+
+
+def invert(counts: Array, sky: Sky, found: Found, chain: Chain) -> Inverted:
+    """Return the particles.
+
+    Parameters
+    ----------
+    counts : (profile, range) float
+    sky : Sky
+    found : Found
+        The background, as the chain finds it.
+    chain : Chain
+    """
+    power, noise = cleared(counts, sky, found), variance(counts)
+    edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN
+    calibrated = np.ones(len(counts), dtype=np.bool_)
+    hidden: npt.ArrayLike = 0.0
+    if chain.choose:
+        window = chosen_window(power, noise, sky, screened(power, noise, sky).mask)
+        edges, calibrated = window.edges, window.chosen
+        hidden = np.nan_to_num(chain.carried * window.scale_standard_error / window.scale)
+    solved = particles_of(
+        power,
+        sky,
+        edges,
+        noise=noise,
+        background_error=found.standard_error,
+        reference_error=hidden,
+    )
+    return Inverted(
+        solved.backscatter, solved.backscatter_standard_error, calibrated & solved.calibrated
+    )
+
+
+# Peers ----------------------------------------------------------------------------------------
+
+
+def lstsq_backgrounds(counts: Array, sky: Sky) -> Array:
+    """Return backgrounds by `numpy.linalg.lstsq`, one weighted fit from 6 km on a profile."""
+    far = sky.range >= CLEAN_FROM
+    shape = sky.shape[far] / sky.shape[far][0]
+    slopes = np.stack([np.ones_like(shape), shape], axis=1)
+    found = np.empty(len(counts))
+    for row, profile in enumerate(counts[:, far]):
+        weight = np.sqrt(SHOTS / np.maximum(profile, 1.0 / SHOTS))
+        solution = np.linalg.lstsq(slopes * weight[:, np.newaxis], profile * weight, rcond=None)
+        found[row] = solution[0][0]
+    return found
+
+
+def klett_python(power: Array, sky: Sky) -> Array:
+    """Return the backscatter of particles by loops over profiles and bins, without errors.
+
+    fernald1984, backward and forward from the middle of `GIVEN`, by trapezoids.
+    """
+    distance = sky.range.tolist()
+    air, loss = sky.molecular_backscatter.tolist(), sky.molecular_extinction.tolist()
+    inside = [k for k, r in enumerate(distance) if GIVEN[0] <= r <= GIVEN[1]]
+    found = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
+    return np.asarray(found)
+
+
+def _klett(
+    power: list[float],
+    distance: list[float],
+    air: list[float],
+    loss: list[float],
+    inside: list[int],
+) -> list[float]:
+    start, size = inside[len(inside) // 2], len(power)
+    excess = [a - LIDAR_RATIO * b for a, b in zip(loss, air, strict=True)]
+    corrected, integral = [0.0] * size, [0.0] * size
+    for step in (1, -1):
+        depth = total = 0.0
+        last = start
+        corrected[start] = power[start] * distance[start] ** 2
+        for k in range(start + step, size if step > 0 else -1, step):
+            width = distance[k] - distance[last]
+            depth += 0.5 * width * (excess[k] + excess[last])
+            corrected[k] = power[k] * distance[k] ** 2 * math.exp(2.0 * depth)
+            total += 0.5 * width * LIDAR_RATIO * (corrected[k] + corrected[last])
+            integral[k] = total
+            last = k
+    ratio = sum(corrected[k] / air[k] for k in inside) / len(inside)
+    return [q / (ratio - 2.0 * i) - b for q, i, b in zip(corrected, integral, air, strict=True)]
+
+
+def klett_numpy(power: Array, sky: Sky) -> Array:
+    """Return the same as `klett_python` by cumulative sums, profile by profile."""
+    inside = np.flatnonzero((sky.range >= GIVEN[0]) & (sky.range <= GIVEN[1]))
+    start = inside[inside.size // 2]
+    excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter
+    found = np.empty(power.shape)
+    for row, profile in enumerate(power):
+        depth = _cumulated(excess, sky.range)
+        corrected = profile * sky.range**2 * np.exp(2.0 * (depth - depth[start]))
+        integral = _cumulated(LIDAR_RATIO * corrected, sky.range)
+        ratio = np.mean(corrected[inside] / sky.molecular_backscatter[inside])
+        total = corrected / (ratio - 2.0 * (integral - integral[start]))
+        found[row] = total - sky.molecular_backscatter
+    return found
+
+
+def _cumulated(values: Array, distance: Array) -> Array:
+    slices = 0.5 * (values[1:] + values[:-1]) * np.diff(distance)
+    return np.concatenate([[0.0], np.cumsum(slices)])
+
+
+# Published files ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """One file of the intercomparison."""
+
+    level: float
+    """Nominal background in counts a shot."""
+    counts: Array
+    """(1, range), counts a shot."""
+    background: float
+    """Truth: with the shape of the noise-free file fitted to this one, as its scale is known
+    to 1e-5 only."""
+    background_error: float
+    """Standard error of that truth, counts."""
+
+
+def published(folder: Path) -> tuple[Sky, list[Published]]:
+    """Read the files of the EARLINET elastic intercomparison at 532 nm.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds ``noise_free.licel``, ``molecular_profile_hPa.csv`` (hPa, K, m) and
+        ``background_1e*.licel``.
+
+    Returns
+    -------
+    Sky
+        The backscatter is that of the noise-free signal with the reference window `GIVEN`.
+    list of Published
+        By rising background.
+
+    Raises
+    ------
+    CampaignError
+        Where the folder holds no such files.
+    RawFormatError
+        Where one cannot be read, or holds another number of bins.
+    """
+    folder = Path(folder)
+    files = {_level(file): file for file in folder.glob("background_1e*.licel")}
+    if not files:
+        raise CampaignError(
+            "holds no files background_1e*.licel",
+            file=folder,
+            field="data",
+            remedy="give the folder of the intercomparison, or leave it out",
+        )
+    sky = _published_sky(folder)
+    return sky, [_published(files[level], level, sky) for level in sorted(files)]
+
+
+def _level(file: Path) -> float:
+    found = re.fullmatch(r"background_1e(\d+)\.licel", file.name)
+    if found is None:
+        raise CampaignError(
+            "names no background", file=file, remedy="name it background_1eN.licel, N in decades"
+        )
+    return float(f"1e{found[1]}")
+
+
+def _published_sky(folder: Path) -> Sky:
+    table = folder / "molecular_profile_hPa.csv"
+    try:
+        columns = np.loadtxt(table, delimiter=",", unpack=True, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise CampaignError(f"cannot be read: {error}", file=table, field="data") from error
+    if len(columns) != 3:
+        raise CampaignError(
+            f"has {len(columns)} columns", file=table, remedy="give pressure, temperature, height"
+        )
+    pressure, temperature, height = columns
+    air = MolecularProfile.from_profile(height, pressure, temperature, pressure_unit="hPa")
+    clean = _raw_counts(folder / "noise_free.licel")
+    sky = _sky(air, clean, np.full(RANGE.size, np.nan))
+    power = np.where(sky.inverted, sky.signal, np.nan)
+    return replace(sky, backscatter=particles_of(power, sky, GIVEN).backscatter)
+
+
+def _published(file: Path, level: float, sky: Sky) -> Published:
+    counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
+    truth = known_shape.solve(
+        counts,
+        sky.range,
+        sky.signal,
+        variance=(sky.signal + level) / SHOTS,
+        start=sky.range[_FIRST_TRUE_BIN],
+    )
+    return Published(
+        level,
+        counts[np.newaxis],
+        float(truth.background),
+        float(truth.background_standard_error),
+    )
+
+
+def _raw_counts(file: Path) -> Array:
+    counts = licel.read_counts(file, [_CHANNEL])[1][_CHANNEL].astype(np.float64)
+    if counts.size != RANGE.size or not counts.max() > 0:
+        raise RawFormatError(
+            f"holds {counts.size} bins with a maximum of {counts.max():g}",
+            file=file,
+            field=_CHANNEL,
+            remedy=f"give a file of the intercomparison, of {RANGE.size} bins",
+        )
+    return counts

@@ -1,0 +1,413 @@
+"""How accurate the solvers of a homogeneous path are, against the least possible error.
+
+The scores of the elastic retrieval are here too; `lidarops.bench.accuracy.elastic` measures it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.bench.accuracy.homogeneous_cases import (
+    QUANTITIES,
+    Array,
+    Estimates,
+    Scenario,
+    Way,
+    background_bias,
+    difficulty,
+    least_errors,
+    methods,
+    scenarios,
+)
+from lidarops.bench.accuracy.peers import peers
+from lidarops.bench.harness.timing import Machine, machine
+from lidarops.retrieve.background.cubic_and_tail import cubic
+from lidarops.retrieve.homogeneous.path_fit import Method
+
+PROFILES: Final = 10_000
+QUICK_PROFILES: Final = 4_000
+_SLOW: Final = "scipy"
+"""Ways whose names begin so are too slow for every profile."""
+_SLOW_SHARE: Final = 20
+_WARM: Final = 64
+_TWO_SIDED: Final = 1.959963984540054
+"""Standard deviations that hold 95 percent of a normal distribution."""
+
+_PAPER_LENGTHS: Final = ((2500.0, (1e3, 2e3, 4e3, 6e3, 8e3)), (10500.0, (1e3, 2e3, 2.5e3)))
+_PAPER_STEP: Final = 15.0
+_PAPER_SIGNAL: Final = 17.0
+_PAPER_EXTINCTION: Final = 3e-5
+_AVERAGED: Final = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A figure from random profiles, with its Monte Carlo standard error."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors of one unknown over the profiles that were not rejected."""
+
+    rmse: Measured
+    """Over the Cramér-Rao bound."""
+    bias: Measured
+    """Over the Cramér-Rao bound."""
+    coverage: Measured
+    """Share of profiles whose truth is within 1.96 stated standard errors."""
+    rmse_of_all: float
+    """As `rmse`, over every profile with a value, rejected or not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one way to solve did with one scenario."""
+
+    way: str
+    profiles: int
+    flagged: float
+    """Share of profiles with any quality bit."""
+    rejected: float
+    """Share of profiles with a quality bit that says not to use the value."""
+    nanoseconds: float
+    """CPU time a profile, of one run."""
+    scores: Mapping[str, Score]
+    """By unknown; without those that the way was given, or rejected throughout."""
+    distances: Mapping[str, float]
+    """Largest difference from the direct method over the Cramér-Rao bound, by unknown, over the
+    profiles that neither rejects; without those that the way was given."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One scenario with what all ways did with it."""
+
+    scenario: Scenario
+    difficulty: float
+    """Least standard error of extinction over extinction + 1 / mean range."""
+    least_errors: Mapping[str, float]
+    outcomes: tuple[Outcome, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """Mean error of the background on the signals of bobrovsky2024, tables 1 and 2."""
+
+    start: float
+    """m."""
+    length: float
+    """m."""
+    averaged: int
+    """Profiles averaged before they are solved."""
+    lag_1: Measured
+    """Of the cubic with a lag of one bin, without correction for the noise, in noise units."""
+    compressed: Measured
+    """Of `solve`, in noise units; every profile, flagged or not."""
+    scatter: float
+    """Standard deviation of the latter."""
+    expected: float
+    """Second-order bias of least squares."""
+    flagged: float
+    """Share of profiles that `solve` flags."""
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """The accuracy benchmark."""
+
+    date: str
+    machine: Machine
+    cases: tuple[Case, ...]
+    offsets: tuple[Offset, ...]
+
+
+def measure(
+    *,
+    quick: bool = False,
+    date: str = "",
+    profiles: int | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> Accuracy:
+    """Solve simulated profiles by every method of `solve` and by iterative peers.
+
+    Parameters
+    ----------
+    quick : bool
+        8 scenarios, fewer profiles.
+    date : str
+        When it is run, as it is to be stated.
+    profiles : int, optional
+        Of each scenario; the peers of scipy get a twentieth of them, at least 16.
+    progress : callable
+        Is given 1 after each scenario.
+    """
+    count = profiles or (QUICK_PROFILES if quick else PROFILES)
+    ways = {**methods(), **peers()}
+    cases = []
+    for seed, scenario in enumerate(scenarios(quick=quick)):
+        cases.append(_case(scenario, ways, scenario.powers(count, seed)))
+        progress(1)
+    return Accuracy(date, machine(), tuple(cases), tuple(offsets(count)))
+
+
+def offsets(count: int) -> list[Offset]:
+    """Return the errors of background on the signals of the published tables.
+
+    The tables do not state the signal: 17 times the noise at 2.5 km, bins of 15 m and an
+    extinction of 0.03 km-1 reproduce how the published background falls with the length.
+    """
+    fade = np.exp(-2 * _PAPER_EXTINCTION * (10500.0 - 2500.0)) * (2500.0 / 10500.0) ** 2
+    signals = {2500.0: _PAPER_SIGNAL, 10500.0: float(_PAPER_SIGNAL * fade)}
+    paths = [
+        Scenario(
+            start,
+            length,
+            _PAPER_EXTINCTION,
+            signals[start],
+            bins=round(length / _PAPER_STEP) + 1,
+        )
+        for start, lengths in _PAPER_LENGTHS
+        for length in lengths
+    ]
+    return [
+        _offset(path, averaged, count, seed)
+        for averaged in (1, _AVERAGED)
+        for seed, path in enumerate(paths)
+    ]
+
+
+def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
+    # The mean of white noise is white noise: powers in units of its standard deviation.
+    scale = float(np.sqrt(averaged))
+    louder = Scenario(
+        path.start,
+        path.length,
+        path.extinction,
+        path.signal * scale,
+        background=path.background * scale,
+        bins=path.bins,
+    )
+    power = louder.powers(count, seed)
+    # A variance of 0 is taken for no noise, which leaves its bias in, as published.
+    published = cubic(power, louder.range, lag=1, variance=0.0).background
+    found = methods()[Method.COMPRESSED](power, louder)
+    ours = found.values["background"]
+    return Offset(
+        start=path.start,
+        length=path.length,
+        averaged=averaged,
+        lag_1=mean((published - louder.background) / scale),
+        compressed=mean((ours - louder.background) / scale),
+        scatter=float(np.nanstd(ours)) / scale,
+        expected=background_bias(louder) / scale,
+        flagged=float(found.flagged.mean()),
+    )
+
+
+def _case(scenario: Scenario, ways: Mapping[str, Way], power: Any) -> Case:
+    least = least_errors(scenario)
+    converged = ways[Method.DIRECT](power, scenario)
+    outcomes = [
+        _outcome(name, way, scenario, power, least, converged) for name, way in ways.items()
+    ]
+    return Case(scenario, difficulty(scenario), least, tuple(outcomes))
+
+
+def _outcome(
+    name: str,
+    way: Way,
+    scenario: Scenario,
+    power: Any,
+    least: Mapping[str, float],
+    converged: Estimates,
+) -> Outcome:
+    if name.startswith(_SLOW):
+        power = power[: max(len(power) // _SLOW_SHARE, 16)]
+    way(power[:_WARM], scenario)
+    begin = time.process_time()
+    found = way(power, scenario)
+    spent = time.process_time() - begin
+    scores = {
+        quantity: score
+        for quantity in QUANTITIES
+        if (score := _score(found, quantity, scenario.truth[quantity], least[quantity]))
+    }
+    return Outcome(
+        way=name,
+        profiles=len(power),
+        flagged=float(found.flagged.mean()),
+        rejected=float(found.rejected.mean()),
+        nanoseconds=1e9 * spent / len(power),
+        scores=scores,
+        distances={
+            quantity: _distance(found, converged, quantity) / least[quantity] for quantity in scores
+        },
+    )
+
+
+def _score(found: Estimates, quantity: str, truth: float, least: float) -> Score | None:
+    error = (found.values[quantity] - truth) / least
+    stated = found.standard_errors[quantity] / least
+    finite = np.isfinite(error)
+    kept = finite & ~found.rejected
+    if kept.sum() < 2 or not np.any(stated[kept] > 0):
+        return None
+    squares = error[kept] ** 2
+    rmse = float(np.sqrt(squares.mean()))
+    inside = np.abs(error[kept]) <= _TWO_SIDED * stated[kept]
+    return Score(
+        rmse=Measured(rmse, mean(squares).error / (2 * rmse)),
+        bias=mean(error[kept]),
+        coverage=share(inside),
+        rmse_of_all=float(np.sqrt(np.mean(error[finite] ** 2))),
+    )
+
+
+def _distance(found: Estimates, converged: Estimates, quantity: str) -> float:
+    count = len(found.rejected)
+    kept = ~found.rejected & ~converged.rejected[:count]
+    between = np.abs(found.values[quantity] - converged.values[quantity][:count])[kept]
+    return float(np.nanmax(between, initial=0.0))
+
+
+def mean(values: Array) -> Measured:
+    """Return the mean of the finite values with its Monte Carlo error."""
+    finite = values[np.isfinite(values)]
+    return Measured(float(finite.mean()), float(finite.std() / np.sqrt(finite.size)))
+
+
+def share(inside: npt.NDArray[np.bool_]) -> Measured:
+    """Return how many of independent profiles are inside, with its Monte Carlo error."""
+    # Where all or none are inside, half a profile keeps the error from being zero.
+    likely = (inside.sum() + 0.5) / (inside.size + 1)
+    return Measured(float(inside.mean()), float(np.sqrt(likely * (1 - likely) / inside.size)))
+
+
+def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[Case, Outcome]]:
+    """Return what one way did, scenario by scenario."""
+    return [
+        (case, outcome)
+        for case in accuracy.cases
+        for outcome in case.outcomes
+        if outcome.way == way
+    ]
+
+
+# Elastic retrieval ---------------------------------------------------------------------------
+
+
+SIGMAS: Final = (1.0, _TWO_SIDED)
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundScore:
+    """Errors of one way, in counts, over the profiles that it did not reject."""
+
+    profiles: int
+    bias: Measured
+    scatter: Measured
+    rmse: Measured
+    stated: float
+    """Median of the stated standard errors."""
+    deviation: Measured
+    """Mean error over its own stated standard error."""
+    spread: Measured
+    """Root mean square of the same; 1 where errors are as stated."""
+    coverage: tuple[Measured, Measured]
+    """Share of profiles whose truth is within 1 and 1.96 stated standard errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class InversionScore:
+    """Errors of backscatter from 0.5 to 6 km, relative to its mean there."""
+
+    profiles: int
+    """With any value in these bins."""
+    solved: float
+    """Share of these bins, of all profiles, that have a value; the others are withheld."""
+    bias: Measured
+    """Mean error of a profile."""
+    scatter: float
+    """Standard deviation of the same."""
+    rmse: Measured
+    """Root mean square error of a bin."""
+    stated: float
+    """Root mean square of the stated standard errors of a bin."""
+    coverage: tuple[Measured, Measured]
+    """Share of bins whose truth is within 1 and 1.96 stated standard errors."""
+
+
+def background_score(
+    error: Array, stated: Array, rejected: npt.NDArray[np.bool_]
+) -> BackgroundScore | None:
+    """Return the errors of backgrounds; None where less than two are usable.
+
+    Parameters
+    ----------
+    error, stated : (profile,) float
+        Counts.
+    rejected : (profile,) bool
+    """
+    kept = ~rejected & np.isfinite(error) & (stated > 0)
+    if kept.sum() < 2:
+        return None
+    error, stated = error[kept], stated[kept]
+    deviation = error / stated
+    inside = [share(np.abs(deviation) <= sigmas) for sigmas in SIGMAS]
+    return BackgroundScore(
+        profiles=int(kept.sum()),
+        bias=mean(error),
+        scatter=_root(mean((error - error.mean()) ** 2)),
+        rmse=_root(mean(error**2)),
+        stated=float(np.median(stated)),
+        deviation=mean(deviation),
+        spread=_root(mean(deviation**2)),
+        coverage=(inside[0], inside[1]),
+    )
+
+
+def inversion_score(error: Array, stated: Array, scale: float) -> InversionScore | None:
+    """Return the errors of backscatter; None where less than two of many profiles have a value.
+
+    Parameters
+    ----------
+    error, stated : (profile, compared bin) float
+        m-1 sr-1; NaN where withheld.
+    scale : float
+        Mean of the truth, m-1 sr-1.
+    """
+    valid = np.isfinite(error) & np.isfinite(stated)
+    kept = np.any(valid, axis=1)
+    if kept.sum() < min(2, kept.size) or not np.any(kept):
+        return None
+    error, stated, valid = error[kept], stated[kept], valid[kept]
+    bins = valid.sum(axis=1)
+
+    def over_bins(values: npt.NDArray[np.generic]) -> Array:
+        return np.asarray(np.where(valid, values, 0.0).sum(axis=1) / bins)
+
+    biases = over_bins(error) / scale
+    inside = [mean(over_bins(np.abs(error) <= sigmas * stated)) for sigmas in SIGMAS]
+    return InversionScore(
+        profiles=int(kept.sum()),
+        solved=float(bins.sum() / (kept.size * error.shape[1])),
+        bias=mean(biases),
+        scatter=float(biases.std()),
+        rmse=_root(mean(over_bins((error / scale) ** 2))),
+        stated=float(np.sqrt(over_bins((stated / scale) ** 2).mean())),
+        coverage=(inside[0], inside[1]),
+    )
+
+
+def _root(square: Measured) -> Measured:
+    value = float(np.sqrt(square.value))
+    return Measured(value, square.error / (2.0 * value) if value > 0 else 0.0)

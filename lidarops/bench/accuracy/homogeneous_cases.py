@@ -1,0 +1,240 @@
+"""Homogeneous paths whose truth is known: signals, bounds of accuracy, and who solves them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.flags import Quality
+from lidarops.retrieve.homogeneous import path_fit
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, Method
+
+Array = npt.NDArray[np.float64]
+
+BINS: Final = 225
+BACKGROUND: Final = 370.0
+"""In standard deviations of the noise, as every power here."""
+QUANTITIES: Final = ("extinction", "background", "log_amplitude")
+"""B is the signal extrapolated to the range zero, by up to an optical depth of 100 here: it is
+its logarithm that has a distribution near normal, with the relative error of B as its own."""
+SOLVED: Final = ("extinction", "background", "amplitude")
+"""The unknowns as the solvers return them."""
+WRONG_PRIOR: Final = 0.8
+"""Prior extinction of what needs one, as a share of the truth."""
+
+_STARTS: Final = (2500.0, 10500.0)
+_LENGTHS: Final = (1700.0, 8000.0)
+_EXTINCTIONS: Final = (1e-5, 1e-4, 1e-3, 5e-3)
+_AMPLITUDES: Final = (15.0, 1e2, 1e3, 1e4, 1e5)
+_SOLVABLE: Final = 0.1
+_QUICK: Final = 8
+_SEED: Final = 20240915
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One homogeneous path seen through white noise of unit variance."""
+
+    start: float
+    """m."""
+    length: float
+    """m."""
+    extinction: float
+    """m-1."""
+    signal: float
+    """Above the background, at the start."""
+    background: float = BACKGROUND
+    bins: int = BINS
+
+    @property
+    def range(self) -> Array:
+        """Ranges in m, uniform from the start to the start plus the length."""
+        return np.linspace(self.start, self.start + self.length, self.bins)
+
+    @property
+    def amplitude(self) -> float:
+        """B of ``P = P* + B R^-2 exp(-2 extinction R)``, in m2."""
+        return float(self.signal * self.start**2 * np.exp(2 * self.extinction * self.start))
+
+    @property
+    def truth(self) -> Mapping[str, float]:
+        """Of the three unknowns, by name."""
+        found = (self.extinction, self.background, float(np.log(self.amplitude)))
+        return dict(zip(QUANTITIES, found, strict=True))
+
+    @property
+    def mean(self) -> Array:
+        """Noise-free power."""
+        depth = 2 * self.extinction * (self.range - self.start)
+        return np.asarray(
+            self.background + self.signal * (self.start / self.range) ** 2 * np.exp(-depth)
+        )
+
+    @property
+    def label(self) -> str:
+        """What tells it from the others, in km and km-1."""
+        return (
+            f"{self.start / 1e3:g} + {self.length / 1e3:g} km, "
+            f"{1e3 * self.extinction:g} km-1, signal {self.signal:g}"
+        )
+
+    def powers(self, count: int, seed: int = 0, dtype: npt.DTypeLike = np.float64) -> Any:
+        """Return `count` noisy profiles; the same seed gives the same noise."""
+        noise = np.random.default_rng([_SEED, seed]).standard_normal((count, self.bins))
+        return (self.mean + noise).astype(dtype)
+
+
+def least_errors(scenario: Scenario) -> dict[str, float]:
+    r"""Return the Cramér-Rao bound of the standard error of each unknown.
+
+    The inverse Fisher matrix of ``(P*, B, extinction)`` with Gaussian noise of unit variance,
+
+    .. math:: F = J^T J, \quad J = [1, \; \phi, \; -2 R B \phi],
+        \quad \phi = R^{-2} e^{-2 \sigma R}
+
+    (kay1993). It is inverted in ``b = B phi`` at the mean range, where it is well conditioned,
+    and carried over to log B by the exact derivatives.
+    """
+    height, covariance = _information(scenario)[1:]
+    middle = float(scenario.range.mean())
+    gradient = np.array([0.0, 1.0 / height, 2 * middle])
+    return {
+        "extinction": float(np.sqrt(covariance[2, 2])),
+        "background": float(np.sqrt(covariance[0, 0])),
+        "log_amplitude": float(np.sqrt(gradient @ covariance @ gradient)),
+    }
+
+
+def background_bias(scenario: Scenario) -> float:
+    r"""Return the bias of the background that every least-squares solution has.
+
+    To second order, with the inverse Fisher matrix C and the second derivatives H of the model
+    (box1971),
+
+    .. math:: -\tfrac12 \, C \sum_i J_i \, \mathrm{tr}(C H_i)
+    """
+    slopes, height, covariance = _information(scenario)
+    away = scenario.range - scenario.range.mean()
+    shape = slopes[:, 1]
+    curvature = (
+        2 * covariance[1, 2] * (-2 * away * shape) + covariance[2, 2] * 4 * height * away**2 * shape
+    )
+    return float(-0.5 * (covariance @ (slopes.T @ curvature))[0])
+
+
+def _information(scenario: Scenario) -> tuple[Array, float, Array]:
+    """Return derivatives by (P*, b, extinction), b at the mean range, and their covariance."""
+    distance = scenario.range
+    middle = float(distance.mean())
+    shape = (middle / distance) ** 2 * np.exp(-2 * scenario.extinction * (distance - middle))
+    height = scenario.amplitude * middle**-2 * np.exp(-2 * scenario.extinction * middle)
+    slopes = np.stack(
+        [np.ones_like(distance), shape, -2 * height * (distance - middle) * shape], axis=1
+    )
+    scale = np.sqrt(np.sum(slopes**2, axis=0))
+    covariance = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
+    return slopes, float(height), covariance
+
+
+def difficulty(scenario: Scenario) -> float:
+    """Return the least standard error of extinction over extinction + 1 / mean range."""
+    scale = scenario.extinction + 1.0 / float(scenario.range.mean())
+    return least_errors(scenario)["extinction"] / scale
+
+
+def scenarios(*, quick: bool = False) -> list[Scenario]:
+    """Return the paths of the benchmark: all whose `difficulty` is 0.1 or less, or 8 of them."""
+    grid = product(_STARTS, _LENGTHS, _EXTINCTIONS, _AMPLITUDES)
+    solvable = [s for values in grid if difficulty(s := Scenario(*values)) <= _SOLVABLE]
+    if not quick:
+        return solvable
+    picked = np.linspace(0, len(solvable) - 1, _QUICK).round().astype(int)
+    return [solvable[k] for k in picked]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimates:
+    """What a way to solve found, one value a profile."""
+
+    values: Mapping[str, Array]
+    standard_errors: Mapping[str, Array]
+    flagged: npt.NDArray[np.bool_]
+    """Any quality bit."""
+    rejected: npt.NDArray[np.bool_]
+    """A quality bit that says not to use the value."""
+
+
+Way = Callable[[Any, Scenario], Estimates]
+"""From powers (profile, range) and the scenario they stem from to estimates."""
+
+
+def arguments(method: Method, scenario: Scenario) -> dict[str, float]:
+    """Return what a method of `solve` needs besides the power.
+
+    What is known is known exactly, the prior of "linearized" is 20 percent low.
+    """
+    match method:
+        case Method.LINEARIZED:
+            return {"extinction": WRONG_PRIOR * scenario.extinction}
+        case Method.KNOWN_EXTINCTION:
+            return {"extinction": scenario.extinction}
+        case Method.KNOWN_BACKGROUND:
+            return {"background": scenario.background}
+        case _:
+            return {}
+
+
+def methods() -> dict[str, Way]:
+    """Return every method of `lidarops.retrieve.homogeneous.path_fit.solve` under its own name."""
+    return {str(method): _way(method) for method in Method if method is not Method.AUTO}
+
+
+def _way(method: Method) -> Way:
+    def solve(power: Any, scenario: Scenario) -> Estimates:
+        found = path_fit.solve(
+            power,
+            scenario.range,
+            variance=1.0,
+            method=method.value,
+            **arguments(method, scenario),  # type: ignore[arg-type]
+        )
+        return estimates(found)
+
+    return solve
+
+
+def estimates(found: HomogeneousResult) -> Estimates:
+    """Return a result of `solve` as the benchmark compares it."""
+    return estimated(
+        {name: getattr(found, name) for name in SOLVED},
+        {name: getattr(found, f"{name}_standard_error") for name in SOLVED},
+        flagged=found.quality != 0,
+        rejected=(found.quality & Quality.rejecting()) != 0,
+    )
+
+
+def estimated(
+    values: Mapping[str, Array],
+    standard_errors: Mapping[str, Array],
+    *,
+    flagged: Any,
+    rejected: Any,
+) -> Estimates:
+    """Return estimates of `SOLVED` with the logarithm of the amplitude; NaN where it has none."""
+    amplitude = values["amplitude"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        logarithm = np.log(amplitude)
+        relative = standard_errors["amplitude"] / amplitude
+    linear = QUANTITIES[:2]
+    return Estimates(
+        values={name: values[name] for name in linear} | {"log_amplitude": logarithm},
+        standard_errors={name: standard_errors[name] for name in linear}
+        | {"log_amplitude": relative},
+        flagged=flagged,
+        rejected=rejected,
+    )

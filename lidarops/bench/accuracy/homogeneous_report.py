@@ -1,0 +1,543 @@
+"""What the benchmarks found, as tables and charts; `lidarops.bench.accuracy.elastic` tells the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from lidarops.bench.accuracy.homogeneous import (
+    Accuracy,
+    Case,
+    Measured,
+    Offset,
+    Outcome,
+    outcomes_of,
+)
+from lidarops.bench.accuracy.homogeneous_cases import QUANTITIES
+from lidarops.bench.harness.timing import Machine
+from lidarops.bench.throughput import readers
+from lidarops.bench.throughput.retrievals import (
+    READ,
+    Cost,
+    ElasticThroughput,
+    Setting,
+    Speed,
+    Throughput,
+    settings,
+)
+from lidarops.figures.charts import Chart, Ladder, Panel, Series, pareto
+from lidarops.figures.wording import counted, percent
+from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.retrieve.homogeneous.path_fit import Method
+
+_HELPED: Final = frozenset({Method.LINEARIZED, Method.KNOWN_BACKGROUND, Method.KNOWN_EXTINCTION})
+"""Methods that are told more than the profile."""
+_PUBLISHED: Final = {1e3: 10.6, 4e3: 6.5, 6e3: 1.5, 8e3: 1.2}
+"""bobrovsky2024, table 1, less an assumed truth of 37.00, over an assumed noise of 0.1."""
+_GAIN: Final = 0.98
+"""A smaller gain in RMSE is Monte Carlo noise."""
+_UNSOLVED: Final = "-"
+
+
+def accuracy_report(found: Accuracy, data: str = "") -> Report:
+    """Return the page of the accuracy benchmark."""
+    return Report(
+        title="Homogeneous path: error against the Cramér-Rao bound",
+        facts=facts(found.date, found.machine),
+        parts=(_overview(found), _by_difficulty(found), _offsets(found.offsets)),
+        data=data,
+    )
+
+
+def throughput_report(found: Throughput, data: str = "") -> Report:
+    """Return the page of the throughput benchmark."""
+    return Report(
+        title="Homogeneous path: time per profile",
+        facts=facts(found.date, found.machine),
+        parts=(_times(found), _threads(found)),
+        data=data,
+    )
+
+
+def reader_report(
+    found: Sequence[readers.Throughput], date: str, machine: Machine, data: str = ""
+) -> Report:
+    """Return the page of the reader's benchmark."""
+    table = Table(
+        title="Throughput, one core, CPU time",
+        columns=("what", "files/s", "MB/s", "times floor"),
+        rows=tuple(
+            (
+                way.name,
+                f"{way.files_per_second:,.0f}",
+                f"{way.megabytes_per_second:,.0f}",
+                f"{way.times_floor:.2f}",
+            )
+            for way in found
+        ),
+    )
+    text = "Raw files to arrays, from the page cache, against floors measured in the same run."
+    return Report(
+        title="Reader: files per second",
+        facts=facts(date, machine),
+        parts=(Part("Throughput", text, tables=(table,)),),
+        data=data,
+    )
+
+
+def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:
+    """Return where, when and with what a benchmark ran."""
+    packages = ", ".join(f"{name} {version}" for name, version in machine.packages.items())
+    known = (("Date", date), ("Processor", machine.processor), ("Python", machine.python))
+    return tuple(fact for fact in (*known, ("Packages", packages)) if fact[1])
+
+
+def _ways(found: Accuracy) -> list[str]:
+    return [outcome.way for outcome in found.cases[0].outcomes]
+
+
+# Accuracy ------------------------------------------------------------------------------------
+
+
+def _overview(found: Accuracy) -> Part:
+    count = len(found.cases)
+    profiles = found.cases[0].outcomes[0].profiles
+    return Part(
+        title="Error against time",
+        text=f"{count} paths of 225 bins through white noise, from 2.5 or 10.5 km over 1.7 or "
+        f"8 km, extinction 0.01 to 5 per km, signal 15 to 100 000 times the noise, background "
+        f"370; {profiles:,} profiles each, fewer for scipy. The bound is the inverse Fisher "
+        "matrix of background, amplitude and extinction. Of the amplitude, which is the signal "
+        "extrapolated to the range zero, it is the logarithm that is compared. Profiles that a "
+        "method rejects do not count for its error. The iterative peers start from the true "
+        "background and amplitude and 0.8 of the true extinction.",
+        charts=(_work_precision(found), _convergence(found)),
+        tables=(_costs(found), *(_summary(found, quantity) for quantity in QUANTITIES)),
+        details=tuple(_table(found, way) for way in _ways(found)),
+    )
+
+
+def _work_precision(found: Accuracy) -> Chart:
+    return Chart(
+        name="work-precision",
+        title="Error against CPU time per profile",
+        caption="Median over the paths of RMSE over the Cramér-Rao bound, with bars from the "
+        "least to the largest; CPU time of one run. Hollow: told more than the profile, or "
+        "rejects every profile of some paths; these do not count for the Pareto front.",
+        panels=tuple(_work_panel(found, quantity) for quantity in QUANTITIES),
+    )
+
+
+def _work_panel(found: Accuracy, quantity: str) -> Panel:
+    series = []
+    points = []
+    for way in _ways(found):
+        pairs = outcomes_of(found, way)
+        errors = [o.scores[quantity].rmse.value for _, o in pairs if quantity in o.scores]
+        cost = float(np.median([o.nanoseconds for _, o in pairs]))
+        complete = way not in _HELPED and len(errors) == len(pairs)
+        if complete:
+            points.append((cost, float(np.median(errors))))
+        series.append(_point(way, cost, errors, hollow=not complete))
+    return Panel(
+        title=_spelled(quantity),
+        x_label="CPU time per profile (ns)",
+        y_label="RMSE over bound" if quantity == QUANTITIES[0] else "",
+        series=tuple(series),
+        level=1.0,
+        front=pareto(points, _GAIN),
+    )
+
+
+def _convergence(found: Accuracy) -> Chart:
+    return Chart(
+        name="convergence",
+        title="Distance from converged least squares against CPU time per profile",
+        caption="Largest distance from the solution of the direct method, in units of the "
+        "Cramér-Rao bound: median over the paths, with bars from the least to the largest. "
+        "Hollow as above.",
+        panels=tuple(_convergence_panel(found, quantity) for quantity in QUANTITIES),
+    )
+
+
+def _convergence_panel(found: Accuracy, quantity: str) -> Panel:
+    series = []
+    points = []
+    for way in _ways(found):
+        pairs = outcomes_of(found, way)
+        distances = [o.distances[quantity] for _, o in pairs if o.distances.get(quantity)]
+        cost = float(np.median([o.nanoseconds for _, o in pairs]))
+        complete = way not in _HELPED and len(distances) == len(pairs)
+        if complete:
+            points.append((cost, float(np.median(distances))))
+        series.append(_point(way, cost, distances, hollow=not complete))
+    return Panel(
+        title=_spelled(quantity),
+        x_label="CPU time per profile (ns)",
+        y_label="distance over bound" if quantity == QUANTITIES[0] else "",
+        series=tuple(series),
+        front=pareto(points),
+    )
+
+
+def _point(way: str, cost: float, errors: Sequence[float], *, hollow: bool) -> Series:
+    if not errors:
+        return Series(way, (), (), hollow=hollow)
+    middle = float(np.median(errors))
+    return Series(way, (cost,), (middle,), (min(errors),), (max(errors),), hollow=hollow)
+
+
+def _costs(found: Accuracy) -> Table:
+    rows = []
+    for way in _ways(found):
+        outcomes = [outcome for _, outcome in outcomes_of(found, way)]
+        rows.append(
+            (
+                way,
+                f"{outcomes[0].profiles:,}",
+                percent(float(np.mean([outcome.flagged for outcome in outcomes]))),
+                percent(float(np.mean([outcome.rejected for outcome in outcomes]))),
+                f"{np.median([outcome.nanoseconds for outcome in outcomes]):,.0f}",
+            )
+        )
+    return Table(
+        title="All paths together",
+        columns=("way", "profiles", "flagged", "rejected", "ns each"),
+        rows=tuple(rows),
+    )
+
+
+def _summary(found: Accuracy, quantity: str) -> Table:
+    rows = []
+    for way in _ways(found):
+        pairs = outcomes_of(found, way)
+        scores = [outcome.scores[quantity] for _, outcome in pairs if quantity in outcome.scores]
+        if scores:
+            coverage = sorted((score.coverage for score in scores), key=lambda m: m.value)
+            rows.append(
+                (
+                    way,
+                    f"{len(scores)} of {len(pairs)}",
+                    f"{np.median([score.rmse.value for score in scores]):.3f}",
+                    _value(max((score.rmse for score in scores), key=lambda m: m.value)),
+                    _value(max((score.bias for score in scores), key=lambda m: abs(m.value))),
+                    _value(coverage[0]),
+                    _value(coverage[-1]),
+                )
+            )
+    return Table(
+        title=f"{_spelled(quantity).capitalize()}, all paths together",
+        columns=("way", "solved", "RMSE", "worst", "bias", "95 %", "to"),
+        rows=tuple(rows),
+        note="Paths solved; RMSE over the bound, median and worst path; bias over the bound, "
+        "worst path; least and largest coverage of the 95 percent interval. In brackets the "
+        "Monte Carlo standard error in the last digits; the worst of many paths exceeds the "
+        "typical one by two or three of these.",
+    )
+
+
+def _table(found: Accuracy, way: str) -> Table:
+    pairs = outcomes_of(found, way)
+    columns = [
+        f"{_spelled(q)}: {what}" for q in QUANTITIES for what in ("RMSE", "bias", "coverage")
+    ]
+    return Table(
+        title=f"{way}, path by path",
+        columns=("path", "difficulty", *columns, "flagged", "rejected", "ns per profile"),
+        rows=tuple(_row(case, outcome) for case, outcome in pairs),
+        note=f"{pairs[0][1].profiles:,} profiles a path. RMSE and bias over the bound. "
+        "Difficulty: least standard error of extinction over extinction + 1 / mean range.",
+    )
+
+
+def _row(case: Case, outcome: Outcome) -> tuple[str, ...]:
+    cells: list[str] = []
+    for quantity in QUANTITIES:
+        score = outcome.scores.get(quantity)
+        figures = (score.rmse, score.bias, score.coverage) if score else (None,) * 3
+        cells += [_value(figure) if figure else _UNSOLVED for figure in figures]
+    shares = (percent(outcome.flagged), percent(outcome.rejected))
+    time = f"{outcome.nanoseconds:,.0f}"
+    return (case.scenario.label, f"{case.difficulty:.2g}", *cells, *shares, time)
+
+
+def _spelled(quantity: str) -> str:
+    return quantity.replace("_", " ")
+
+
+def _value(figure: Measured) -> str:
+    return f"{figure.value:.3f}({1e3 * figure.error:.0f})"
+
+
+def _by_difficulty(found: Accuracy) -> Part:
+    ways = [way for way in ("compressed", "fast", "direct", "cubic") if way in _ways(found)]
+    return Part(
+        title="Error against difficulty",
+        text="The same errors, path by path, against how well the best possible estimate could "
+        "know the extinction.",
+        charts=(
+            Chart(
+                name="difficulty",
+                title="Error against difficulty",
+                caption="RMSE over the Cramér-Rao bound against the least standard error of "
+                "extinction over extinction + 1 / mean range, with Monte Carlo errors.",
+                panels=tuple(_difficulty_panel(found, ways, q) for q in QUANTITIES),
+            ),
+        ),
+    )
+
+
+def _difficulty_panel(found: Accuracy, ways: Sequence[str], quantity: str) -> Panel:
+    return Panel(
+        title=_spelled(quantity),
+        x_label="difficulty",
+        y_label="RMSE over bound" if quantity == QUANTITIES[0] else "",
+        series=tuple(_difficulties(found, way, quantity) for way in ways),
+        level=1.0,
+    )
+
+
+def _difficulties(found: Accuracy, way: str, quantity: str) -> Series:
+    points = [
+        (case.difficulty, outcome.scores[quantity].rmse)
+        for case, outcome in outcomes_of(found, way)
+        if quantity in outcome.scores
+    ]
+    return Series(
+        label=way,
+        x=tuple(x for x, _ in points),
+        y=tuple(y.value for _, y in points),
+        low=tuple(y.value - y.error for _, y in points),
+        high=tuple(y.value + y.error for _, y in points),
+        hollow=way in (Method.FAST, Method.DIRECT),
+    )
+
+
+def _offsets(offsets: Sequence[Offset]) -> Part:
+    return Part(
+        title="Background of the published cubic",
+        text="Tables 1 and 2 of bobrovsky2024 give a background that falls with the length of "
+        "the section. The noise does that: with a lag of one bin and no correction for the "
+        "noise, the cubic takes what is left of the signal for background, by as much however "
+        "many profiles are averaged. The signal is not in the tables; 17 times the noise at 2.5 "
+        "km, 15 m bins and 0.03 per km are assumed. What is left of ours is the bias that "
+        "every least-squares solution has to second order in the noise; averaging removes it.",
+        charts=(_offset_chart(offsets),),
+        tables=(_offset_table(offsets),),
+    )
+
+
+def _offset_chart(offsets: Sequence[Offset]) -> Chart:
+    return Chart(
+        name="offsets",
+        title="Mean error of the background, sections from 2.5 km",
+        caption="Bars: 3 standard errors of the mean of all profiles, flagged or not. Published: "
+        "table 1 less an assumed truth of 37.00, over an assumed noise of 0.10; its entry at 4 "
+        "km is not reproduced.",
+        panels=tuple(
+            _offset_panel([o for o in offsets if o.averaged == averaged and o.start < 5e3])
+            for averaged in sorted({o.averaged for o in offsets})
+        ),
+    )
+
+
+def _offset_panel(offsets: Sequence[Offset]) -> Panel:
+    averaged = offsets[0].averaged
+    lengths = tuple(o.length / 1e3 for o in offsets)
+    return Panel(
+        title="single profiles" if averaged == 1 else f"means of {averaged} profiles",
+        x_label="length of the section (km)",
+        y_label="mean error of background (noise of a profile)",
+        series=(
+            _errors("cubic, lag 1, as published", lengths, [o.lag_1 for o in offsets]),
+            _errors("compressed", lengths, [o.compressed for o in offsets]),
+            Series(
+                "published tables",
+                tuple(length / 1e3 for length in _PUBLISHED),
+                tuple(_PUBLISHED.values()),
+                hollow=True,
+            ),
+        ),
+        x_log=False,
+        y_log=False,
+        level=0.0,
+    )
+
+
+def _errors(label: str, lengths: tuple[float, ...], errors: Sequence[Measured]) -> Series:
+    return Series(
+        label,
+        lengths,
+        tuple(m.value for m in errors),
+        tuple(m.value - 3 * m.error for m in errors),
+        tuple(m.value + 3 * m.error for m in errors),
+        joined=True,
+    )
+
+
+def _offset_table(offsets: Sequence[Offset]) -> Table:
+    return Table(
+        title="Mean error of the background, in units of the noise of one profile",
+        columns=(
+            "section",
+            "mean of",
+            "lag 1",
+            "ours",
+            "scatter",
+            "expected",
+            "flagged",
+        ),
+        rows=tuple(
+            (
+                f"{o.start / 1e3:g} + {o.length / 1e3:g} km",
+                f"{o.averaged}",
+                _value(o.lag_1),
+                _value(o.compressed),
+                f"{o.scatter:.3f}",
+                f"{o.expected:.3f}" if abs(o.expected) < o.scatter else _UNSOLVED,
+                percent(o.flagged),
+            )
+            for o in offsets
+        ),
+        note="Mean error and, in brackets, its standard error in the last digits: of the cubic "
+        "with a lag of one bin, and of the compressed method with its scatter. Expected: "
+        "second-order bias of least squares, left out where it exceeds the scatter and means "
+        "nothing.",
+    )
+
+
+# Throughput ----------------------------------------------------------------------------------
+
+
+def _times(found: Throughput) -> Part:
+    by_setting = {setting: _speeds(found, setting) for setting in settings()}
+    names = list(dict.fromkeys(speed.way for speed in found.speeds))
+    return Part(
+        title="CPU time per profile",
+        text=f"Path {found.path.label}, {found.path.bins} bins; all outputs and flags, one "
+        "thread, least CPU time of interleaved repeats. The read is a vectorised maximum of the "
+        "same array in the same run. JAX and numba are timed once compiled.",
+        charts=(_ladder(names, by_setting),),
+        tables=tuple(_speed_table(setting, speeds) for setting, speeds in by_setting.items()),
+    )
+
+
+def _speeds(found: Throughput, setting: Setting) -> dict[str, Speed]:
+    return {speed.way: speed for speed in found.speeds if speed.setting == setting}
+
+
+def _ladder(names: Sequence[str], found: Mapping[Setting, Mapping[str, Speed]]) -> Ladder:
+    return Ladder(
+        name="time",
+        title="CPU time per profile of 225 bins",
+        caption="All methods with a given variance; the read is the floor.",
+        x_label="CPU time per profile (ns)",
+        rows=tuple(names),
+        series=tuple(
+            (
+                f"{setting.dtype}, {'gaps' if setting.missing else 'dense'}",
+                tuple(speeds[name].nanoseconds if name in speeds else None for name in names),
+            )
+            for setting, speeds in found.items()
+            if setting.known_variance
+        ),
+    )
+
+
+def _speed_table(setting: Setting, speeds: Mapping[str, Speed]) -> Table:
+    best = speeds.get(Method.COMPRESSED)
+    return Table(
+        title=setting.label,
+        columns=("way", "profiles", "ns each", "reads", "ratio"),
+        rows=tuple(
+            (
+                speed.way,
+                f"{speed.profiles:,}",
+                f"{speed.nanoseconds:,.1f}",
+                f"{speed.reads:,.2f}",
+                f"{speed.nanoseconds / best.nanoseconds:,.2f}" if best else _UNSOLVED,
+            )
+            for speed in speeds.values()
+        ),
+        note=f"Reads: multiples of {READ}. Ratio: to the compressed method. Profiles: of one call.",
+    )
+
+
+def _threads(found: Throughput) -> Part:
+    return Part(
+        title="Two threads",
+        text="Time on the wall of one thread over that of two with half of the profiles each. It "
+        "says something only of a machine with two idle cores.",
+        tables=(
+            Table(
+                title="Gain of two threads",
+                columns=("way", "data", "gain"),
+                rows=tuple((t.way, t.dtype, f"{t.gain:.2f}") for t in found.threads),
+            ),
+        ),
+    )
+
+
+# Elastic retrieval ---------------------------------------------------------------------------
+
+
+def elastic_throughput_report(found: ElasticThroughput, data: str = "") -> Report:
+    """Return the page of the throughput benchmark."""
+    return Report(
+        title="Elastic inversion: time per profile",
+        facts=facts(found.date, found.machine),
+        parts=(cost_part(found.costs, found.bins),),
+        data=data,
+    )
+
+
+def cost_part(costs: tuple[Cost, ...], bins: int) -> Part:
+    """Return the chapter of the CPU time of the steps of the elastic retrieval."""
+    batches = sorted({cost.batch for cost in costs})
+    return Part(
+        title="CPU time per profile",
+        text=f"Profiles of {bins} bins, float64, one thread, least CPU time of interleaved "
+        "repeats. Ours with all errors and flags; all steps: background, clouds, reference "
+        "window and inversion with its error budget. The peers give values without errors: a "
+        "weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy and in "
+        "plain Python. The read is a vectorised maximum of the same array in the same run.",
+        charts=(_cost_ladder(costs, batches, bins),),
+        tables=tuple(_cost_table(costs, batch) for batch in batches),
+    )
+
+
+def _cost_ladder(costs: tuple[Cost, ...], batches: list[int], bins: int) -> Ladder:
+    steps = list(dict.fromkeys(cost.step for cost in costs))
+    spent = {(cost.batch, cost.step): cost.nanoseconds / 1e3 for cost in costs}
+    return Ladder(
+        name="elastic-time",
+        title=f"CPU time per profile of {bins} bins",
+        caption="By the number of profiles that a call is given.",
+        x_label="CPU time per profile (µs)",
+        rows=tuple(steps),
+        series=tuple(
+            (counted(batch, "profile"), tuple(spent.get((batch, step)) for step in steps))
+            for batch in batches
+        ),
+    )
+
+
+def _cost_table(costs: tuple[Cost, ...], batch: int) -> Table:
+    return Table(
+        title=f"Calls of {counted(batch, 'profile')}",
+        columns=("step", "whose", "profiles", "µs each", "reads"),
+        rows=tuple(
+            (
+                cost.step,
+                "ours" if cost.ours else "peer" if cost.step != READ else "floor",
+                f"{cost.profiles:,}",
+                f"{cost.nanoseconds / 1e3:,.2f}",
+                f"{cost.reads:,.1f}",
+            )
+            for cost in costs
+            if cost.batch == batch
+        ),
+        note=f"Reads: multiples of {READ}. Profiles: of one call, fewer where it is slow.",
+    )

@@ -1,0 +1,493 @@
+"""Simulated scans of one atmosphere at several angles, and ways to find its optical depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import lsq_linear
+
+from lidarops.retrieve.multiangle.optical_depth import (
+    MultiAngleResult,
+    Regularisation,
+    solve,
+)
+
+Array = npt.NDArray[np.float64]
+
+NOISELESS: Final = 1e7
+"""Signal over noise that leaves the scatter of the air alone."""
+LAYERS: Final = (5e-3, 10e-3, 15e-3, 20e-3, 15e-3, 10e-3, 8e-3, 5e-3)
+"""m-1, of layers of 50 m from the base of a cloud upwards."""
+CLOUD_SCATTER: Final = 0.147
+"""Standard deviation of ln(1 + U(-0.25, 0.25))."""
+_CLOUD_STEP: Final = 10.0
+_LAYER: Final = 50.0
+_OUTLIERS: Final = (0.3, 1.0)
+"""Of the logarithm."""
+_STRENGTHS: Final = np.logspace(-6.0, 4.0, 25)
+_SEEN: Final = 3.0
+_FEWEST: Final = 3
+
+TWO_ANGLE: Final = "two_angle"
+KANO_HAMILTON: Final = "kano_hamilton"
+JOINT: Final = "joint"
+MLD: Final = "mld"
+MLD_PRIOR: Final = "mld_prior"
+LSTSQ: Final = "numpy lstsq"
+TIKHONOV: Final = "Tikhonov, L-curve"
+BOUNDED: Final = "scipy lsq_linear"
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """An atmosphere that is the same along the horizontal but for scatter, and a scan of it."""
+
+    label: str
+    zenith_angle: Array
+    """(angle,) degree."""
+    altitude: Array
+    """(altitude,) m above the lidar, or the base of a cloud."""
+    extinction: Array
+    """(altitude,) or (profile, altitude) m-1, mean of the layer that ends at the altitude."""
+    backscatter: Array
+    """As `extinction`, in any unit."""
+    ratio: float
+    """Signal over noise at the zenith in 1 km, or at the top of a cloud."""
+    inhomogeneity: float
+    """Standard deviation of the logarithm of backscatter along the horizontal."""
+    correlation: float = 0.0
+    """Of the same, at neighbouring altitudes."""
+    outliers: float = 0.0
+    """Share of the samples that are brighter by 0.3 to 1 in the logarithm."""
+    gradient: float = 0.0
+    """m-1, of ln backscatter along the scan."""
+    variation: float = 0.0
+    """Of ln extinction along the paths over that of ln backscatter."""
+
+    @property
+    def path(self) -> Array:
+        """(angle,) slant over vertical paths."""
+        return np.asarray(1.0 / np.cos(np.radians(self.zenith_angle)))
+
+    @property
+    def optical_depth(self) -> Array:
+        """As `extinction`."""
+        return np.cumsum(self._layers(), axis=-1)
+
+    def draw(self, profiles: int, *seed: int) -> Scan:
+        """Simulate scans; the same numbers give the same scans.
+
+        Parameters
+        ----------
+        profiles : int
+        *seed : int
+        """
+        rng = np.random.default_rng(seed)
+        shape = (profiles, self.path.size, self.altitude.size)
+        air = self.inhomogeneity * correlated(rng, shape, self.correlation)
+        return self.seen(air, rng)
+
+    def seen(self, air: Array, rng: np.random.Generator) -> Scan:
+        """Simulate what is seen of air with a given scatter.
+
+        Parameters
+        ----------
+        air : (profile, angle, altitude) float
+            Added to the logarithm of backscatter.
+        rng : numpy.random.Generator
+        """
+        x = self.path[:, np.newaxis]
+        depth = np.atleast_2d(self.optical_depth)[:, np.newaxis, :]
+        mean = np.log(np.atleast_2d(self.backscatter))[:, np.newaxis, :] - 2.0 * x * depth
+        logarithm = mean + air
+        if self.gradient:
+            away = self.altitude * np.tan(np.radians(self.zenith_angle))[:, np.newaxis]
+            logarithm = logarithm + self.gradient * away
+        if self.variation:
+            layers = np.atleast_2d(self._layers())[:, np.newaxis, :]
+            logarithm = logarithm - 2.0 * x * self.variation * np.cumsum(layers * air, axis=-1)
+        if self.outliers:
+            hit = rng.random(air.shape) < self.outliers
+            logarithm = logarithm + hit * rng.uniform(*_OUTLIERS, air.shape)
+        noise = self._noise(mean) * (x * self.altitude) ** 2
+        signal = np.exp(logarithm) + noise * rng.normal(size=air.shape)
+        return Scan(self, signal, np.broadcast_to(noise**2, air.shape))
+
+    def _layers(self) -> Array:
+        return np.asarray(self.extinction * np.diff(self.altitude, prepend=0.0))
+
+    def _noise(self, mean: Array) -> Array:
+        """Return the noise of the signal over the square of its range."""
+        at = min(int(np.searchsorted(self.altitude, 1000.0)), self.altitude.size - 1)
+        brightness = np.exp(mean[:, :1, at : at + 1])
+        return np.asarray(brightness / self.ratio / self.altitude[at] ** 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """Simulated scans of one scene."""
+
+    scene: Scene
+    signal: Array
+    """(profile, angle, altitude), corrected for range."""
+    variance: Array
+    """As `signal`, of the noise."""
+
+    def first(self, profiles: int) -> Scan:
+        """Return the first of the profiles."""
+        return replace(self, signal=self.signal[:profiles], variance=self.variance[:profiles])
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a way finds, (profile, altitude); NaN where it has no value."""
+
+    optical_depth: Array
+    standard_error: Array | None = None
+    """None where the way states none."""
+    extinction: Array | None = None
+    """m-1, as the way publishes it; None where it gives optical depth alone."""
+    extinction_standard_error: Array | None = None
+    data_share: Array | None = None
+    freedom: Array | None = None
+    """(profile,)"""
+
+
+Way = Callable[[Scan], Found]
+
+
+def correlated(rng: np.random.Generator, shape: tuple[int, ...], correlation: float) -> Array:
+    """Return unit normal numbers, correlated along the last axis."""
+    out = rng.normal(size=shape)
+    rest = np.sqrt(1.0 - correlation**2)
+    for k in range(1, shape[-1] if correlation else 0):
+        out[..., k] = correlation * out[..., k - 1] + rest * out[..., k]
+    return out
+
+
+# Scenes ---------------------------------------------------------------------------------------
+
+
+def clear_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array]:
+    """Return extinction (m-1) and backscatter (m-1 sr-1) of air, haze and a layer aloft.
+
+    Parameters
+    ----------
+    height : (altitude,) float
+        m.
+    aerosol : (profile, 1) float
+        1 for a haze of 0.07 km-1 at the ground.
+    layer : (profile, 1) float
+        m, height of the middle of the layer.
+    """
+    air = 0.0116e-3 * np.exp(-height / 8000.0)
+    aloft = 0.05e-3 * np.exp(-0.5 * ((height - layer) / 150.0) ** 2)
+    haze = aerosol * (0.07e-3 * np.exp(-height / 1200.0) + aloft)
+    return air + haze, air / 8.4 + haze / 50.0
+
+
+def clear(ratio: float, *, outliers: float = 0.0, gates: int = 201) -> Scene:
+    """Return 12 rays to 75 degrees, evenly spaced in slant path, up to 6.15 km.
+
+    Parameters
+    ----------
+    ratio : float
+        Signal over noise at the zenith in 1 km.
+    outliers : float
+    gates : int
+        Altitudes, 30 m apart.
+    """
+    height = 150.0 + 30.0 * np.arange(gates, dtype=np.float64)
+    extinction, backscatter = clear_air(height, np.ones(1), np.full(1, 3000.0))
+    path = np.linspace(1.0, 1.0 / np.cos(np.radians(75.0)), 12)
+    label = f"clear air, SNR {ratio:g}"
+    angles = np.degrees(np.arccos(1.0 / path))
+    return Scene(label, angles, height, extinction, backscatter, ratio, 0.03, outliers=outliers)
+
+
+def cloud(correlation: float = 0.0, *, largest: float = 30.0) -> Scene:
+    """Return 6 rays up to an angle, of a cloud with an optical depth of 4.4 in 40 altitudes."""
+    extinction = np.repeat(LAYERS, round(_LAYER / _CLOUD_STEP))
+    height = _CLOUD_STEP * np.arange(1, extinction.size + 1, dtype=np.float64)
+    label = f"cloud, {largest:g}°, correlation {correlation:g}"
+    angles = np.linspace(0.0, largest, 6)
+    flat = np.ones(height.size)
+    scatter = CLOUD_SCATTER
+    return Scene(label, angles, height, extinction, flat, NOISELESS, scatter, correlation)
+
+
+def scenes() -> tuple[Scene, ...]:
+    """Return the scenes in which all ways are compared."""
+    return (clear(3000.0), clear(300.0), cloud(), cloud(0.8))
+
+
+def published(largest: float, rays: int, scatter: float) -> Scene:
+    """Return the cloud as the published experiment sees it: in the middle of its 8 layers.
+
+    Parameters
+    ----------
+    largest : float
+        degree; angles are evenly spaced from 0.
+    rays : int
+    scatter : float
+        Standard deviation of the logarithm of backscatter.
+    """
+    height = _LAYER * (0.5 + np.arange(len(LAYERS), dtype=np.float64))
+    layers = np.array(LAYERS)
+    depth = _LAYER * (np.cumsum(layers) - 0.5 * layers)
+    extinction = np.diff(depth, prepend=0.0) / np.diff(height, prepend=0.0)
+    label = f"{largest:g}°, {rays} rays"
+    angles = np.linspace(0.0, largest, rays)
+    return Scene(label, angles, height, extinction, np.ones(height.size), NOISELESS, scatter)
+
+
+def uniform_scatter(share: float, profiles: int, scene: Scene, *seed: int) -> Scan:
+    """Return scans with an error of backscatter uniform in a range, as published.
+
+    Parameters
+    ----------
+    share : float
+        0.25 for errors from -25 to 25 %.
+    profiles : int
+    scene : Scene
+    *seed : int
+    """
+    rng = np.random.default_rng(seed)
+    shape = (profiles, scene.path.size, scene.altitude.size)
+    return scene.seen(np.log1p(rng.uniform(-share, share, shape)), rng)
+
+
+def uniform_deviation(share: float) -> float:
+    """Return the standard deviation of ln(1 + U(-share, share))."""
+    low, high = 1.0 - share, 1.0 + share
+    first, second = (u * np.log(u) - u for u in (low, high))
+    mean = (second - first) / (2.0 * share)
+    squares = (u * (np.log(u) ** 2 - 2.0 * np.log(u) + 2.0) for u in (high, low))
+    return float(np.sqrt((next(squares) - next(squares)) / (2.0 * share) - mean**2))
+
+
+def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
+    """Return a scene of which nothing is as assumed, with another truth for each profile.
+
+    3 to 20 rays to 15-75 degrees, clear air or a cloud, scatter up to 40 % with a correlation of
+    0-0.95, SNR 10 to 1e5; half with up to 10 % outliers, three in five with a gradient of up to
+    10 % per km, one in seven with extinction that varies along the paths.
+
+    Parameters
+    ----------
+    seed : int
+    profiles : int
+    calm : bool
+        Whether the scatter is drawn by its logarithm, from 0.5 %, not by its amount: little
+        scatter makes stated errors small.
+    """
+    rng = np.random.default_rng((7, seed))
+    angles = np.linspace(0.0, rng.uniform(15.0, 75.0), int(rng.integers(3, 21)))
+    amount = np.exp(rng.normal(0.0, 0.7, (profiles, 1)))
+    if rng.random() < 0.5:
+        height = 150.0 + 60.0 * np.arange(100, dtype=np.float64)
+        layer = rng.uniform(1500.0, 4500.0, (profiles, 1))
+        extinction, backscatter = clear_air(height, amount, layer)
+    else:
+        one = cloud()
+        height, extinction = one.altitude, 0.5 * amount * one.extinction
+        backscatter = np.ones(extinction.shape)
+    return Scene(
+        label=f"random {seed}",
+        zenith_angle=angles,
+        altitude=height,
+        extinction=extinction,
+        backscatter=backscatter,
+        ratio=10.0 ** rng.uniform(1.0, 5.0),
+        inhomogeneity=float(
+            np.exp(rng.uniform(np.log(0.005), np.log(0.4))) if calm else rng.uniform(0.0, 0.4)
+        ),
+        correlation=rng.uniform(0.0, 0.95),
+        outliers=rng.uniform(0.0, 0.1) * (rng.random() < 0.5),
+        gradient=rng.uniform(-1e-4, 1e-4) * (rng.random() < 0.6),
+        variation=rng.uniform(0.3, 1.0) * (rng.random() < 0.15),
+    )
+
+
+# Our ways -------------------------------------------------------------------------------------
+
+
+def ways() -> Mapping[str, Way]:
+    """Return what is compared of ours, by name."""
+    return {
+        TWO_ANGLE: partial(_ours, method=TWO_ANGLE),
+        KANO_HAMILTON: partial(_ours, method=KANO_HAMILTON),
+        "mld 0, discrepancy": partial(_mld, regularisation=Regularisation(0, "discrepancy")),
+        "mld 0, Cp": partial(_mld, regularisation=Regularisation(0, "cp")),
+        "mld 0, GCV": partial(_mld, regularisation=Regularisation(0, "gcv")),
+        "mld 0, sum over angles": partial(_mld, regularisation=Regularisation(average="angles")),
+        "mld 1, discrepancy": partial(_mld, regularisation=Regularisation(1, "discrepancy")),
+        "mld 1, GCV": partial(_mld, regularisation=Regularisation(1, "gcv")),
+        MLD_PRIOR: partial(_ours, method=MLD_PRIOR),
+        JOINT: partial(_ours, method=JOINT),
+    }
+
+
+def retrieve(scan: Scan, method: str, *, robust: bool = True) -> MultiAngleResult:
+    """Solve all profiles of a scan as one block."""
+    scene = scan.scene
+    return solve(
+        scan.signal,
+        scene.zenith_angle,
+        scene.altitude,
+        variance=scan.variance,
+        method=method,
+        robust=robust,
+    )
+
+
+def with_prior(scan: Scan, prior: Array) -> Found:
+    """Solve with a given prior of the optical depth."""
+    return as_found(
+        solve(
+            scan.signal,
+            scan.scene.zenith_angle,
+            scan.scene.altitude,
+            variance=scan.variance,
+            method=MLD_PRIOR,
+            prior_optical_depth=prior,
+        )
+    )
+
+
+def as_found(result: MultiAngleResult) -> Found:
+    """Return what is compared of a result."""
+    return Found(
+        optical_depth=result.optical_depth,
+        standard_error=result.optical_depth_standard_error,
+        extinction=result.extinction,
+        extinction_standard_error=result.extinction_standard_error,
+        data_share=result.data_share,
+        freedom=result.effective_degrees_of_freedom,
+    )
+
+
+def _ours(scan: Scan, *, method: str) -> Found:
+    return as_found(retrieve(scan, method))
+
+
+def _mld(scan: Scan, *, regularisation: Regularisation) -> Found:
+    return as_found(
+        solve(
+            scan.signal,
+            scan.scene.zenith_angle,
+            scan.scene.altitude,
+            variance=scan.variance,
+            method=MLD,
+            regularisation=regularisation,
+        )
+    )
+
+
+# Peers ----------------------------------------------------------------------------------------
+
+
+def peers() -> Mapping[str, Way]:
+    """Return what one would write with numpy and scipy, altitude by altitude.
+
+    They are told the true scatter, and take samples of more than 3 times their noise.
+    """
+    return {
+        LSTSQ: lstsq,
+        TIKHONOV: tikhonov,
+        BOUNDED: bounded,
+    }
+
+
+_Line = tuple[Array, Array, Array]
+"""Slant path, logarithm and weight (the reciprocal standard error) of each ray."""
+
+
+def lstsq(scan: Scan) -> Found:
+    """Fit straight lines by `numpy.linalg.lstsq`."""
+
+    def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
+        design = np.stack([root, -2.0 * x * root], axis=1)
+        solution = np.linalg.lstsq(design, y * root, rcond=None)[0]
+        return float(solution[1]), float(np.sqrt(np.linalg.inv(design.T @ design)[1, 1]))
+
+    return _each(scan, fit, stated=True)
+
+
+def bounded(scan: Scan) -> Found:
+    """Fit straight lines with an optical depth that is not negative."""
+
+    def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
+        design = np.stack([root, -2.0 * x * root], axis=1)
+        least = ([-np.inf, 0.0], [np.inf, np.inf])
+        return float(lsq_linear(design, y * root, bounds=least).x[1]), np.nan
+
+    return _each(scan, fit, stated=False)
+
+
+def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> Found:
+    """Differentiate along the slant path, with the strength at the corner of the L-curve.
+
+    Parameters
+    ----------
+    scan : Scan
+    strengths : (strength,) float
+        Ascending; one strength is taken as it is.
+    """
+
+    def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
+        order = np.argsort(x)
+        x, y, root = x[order], y[order], root[order]
+        width = np.diff(x) / (x[-1] - x[0])
+        matrix = np.where(np.arange(width.size) < np.arange(x.size)[:, np.newaxis], width, 0.0)
+        square = root**2 / np.sum(root**2)
+        matrix = root[:, np.newaxis] * (matrix - square @ matrix) / np.sqrt(width)
+        left, values, right = np.linalg.svd(matrix, full_matrices=False)
+        data = left.T @ (root * (y - square @ y))
+        kept = values**2 / (values**2 + strengths[:, np.newaxis])
+        size = np.sqrt(np.sum((kept * data / values) ** 2, axis=1))
+        misfit = np.sqrt(np.sum(((1.0 - kept) * data) ** 2, axis=1))
+        slope = right.T @ (kept[_corner(misfit, size)] * data / values)
+        return float(-0.5 * np.sum(np.sqrt(width) * slope) / (x[-1] - x[0])), np.nan
+
+    return _each(scan, fit, stated=False)
+
+
+def _corner(misfit: Array, size: Array) -> int:
+    """Return where the L-curve bends most."""
+    if misfit.size == 1:
+        return 0
+    tiny = np.finfo(np.float64).tiny
+    x, y = np.log(np.maximum(misfit, tiny)), np.log(np.maximum(size, tiny))
+    dx, dy = np.gradient(x), np.gradient(y)
+    speed = np.maximum(np.hypot(dx, dy), tiny)
+    bend = (dx * np.gradient(dy) - dy * np.gradient(dx)) / speed**3
+    return int(np.argmax(np.where(np.isfinite(bend), bend, -np.inf)))
+
+
+def _each(
+    scan: Scan, fit: Callable[[Array, Array, Array], tuple[float, float]], *, stated: bool
+) -> Found:
+    profiles, _, gates = scan.signal.shape
+    depth, error = np.full((profiles, gates), np.nan), np.full((profiles, gates), np.nan)
+    for t in range(profiles):
+        for k in range(gates):
+            line = _line(scan, t, k)
+            if line[0].size >= _FEWEST:
+                depth[t, k], error[t, k] = fit(*line)
+    return Found(depth, error if stated else None)
+
+
+def _line(scan: Scan, t: int, k: int) -> _Line:
+    signal, variance = scan.signal[t, :, k], scan.variance[t, :, k]
+    seen = signal > _SEEN * np.sqrt(variance)
+    signal, variance = signal[seen], variance[seen]
+    scatter = variance / signal**2 + scan.scene.inhomogeneity**2
+    # Where nothing scatters, all rays count alike.
+    root = 1.0 / np.sqrt(scatter) if np.all(scatter > 0.0) else np.ones(signal.size)
+    return scan.scene.path[seen], np.log(signal), root

@@ -1,0 +1,600 @@
+"""How right the optical depths and extinctions of scans are, method by method."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import product
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.bench.accuracy import multiangle_cases as cases
+from lidarops.bench.accuracy.homogeneous import SIGMAS, Measured
+from lidarops.bench.accuracy.multiangle_cases import Array, Found, Scan, Scene, Way
+from lidarops.bench.harness.timing import Machine, machine
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleFlags, MultiAngleResult
+
+Mask = npt.NDArray[np.bool_]
+
+PUBLISHED_ANGLES: Final = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
+"""degree, the largest zenith angle."""
+PUBLISHED_SHARES: Final = (0.2, 0.25, 0.3)
+PUBLISHED_RAYS: Final = (6, 4)
+CENTRAL: Final = (6, 0.25)
+"""Rays and share of what is shown at all angles."""
+TWO_ANGLE_ALONE: Final = "two_angle, 10 %"
+NOTHING: Final = "answer 0"
+PRIORS: Final = (0.0, 0.5, 1.0, 1.5)
+CORRELATIONS: Final = (0.0, 0.5, 0.9, 0.99, 1.0)
+OUTLIERS: Final = (0.0, 0.05, 0.1)
+ANY: Final = "any air"
+CALM: Final = "calm air"
+LOW: Final = 2000.0
+"""m, up to which outliers are judged altitude by altitude."""
+FALSE: Final = 4.0
+"""Stated standard errors beyond which a value is false."""
+_NEEDLESS: Final = 2.5
+_CLOSE: Final = 0.5
+_SCENE_PROFILES: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How much is simulated."""
+
+    blocks: int
+    """Of each scene, at least 2; they share the truth and nothing else."""
+    profiles: int
+    """Of a block."""
+    slow: int
+    """Profiles of a block that the peers get."""
+    published: int
+    """Profiles of a block of the published experiment, which has 5 blocks or as many as others."""
+    random: int
+    """Random scenes, and a quarter of that of calm ones."""
+
+
+QUICK: Final = Size(blocks=6, profiles=24, slow=1, published=100, random=150)
+FULL: Final = Size(blocks=16, profiles=64, slow=2, published=250, random=3000)
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors of one way in one scene, at the altitudes that kano_hamilton reaches."""
+
+    way: str
+    profiles: int
+    nanoseconds: float
+    """CPU time a profile."""
+    solved: float
+    """Share of these values that the way has."""
+    rmse: Measured
+    """Of optical depth."""
+    bias: Measured
+    """Mean error of optical depth."""
+    top_bias: Measured | None
+    """Mean error at the highest of the altitudes that all profiles reach; None where the way has
+    no value there."""
+    coverage: tuple[Measured, Measured] | None
+    """Share of optical depths within 1 and 1.96 stated standard errors; None where the way
+    states none."""
+    extinction_rmse: Measured
+    """m-1, of differences of optical depths, published or not."""
+    extinction_coverage: tuple[Measured, Measured] | None
+    """Of published values."""
+    data_share: float | None
+    """Median."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneScore:
+    """What the ways did with one scene."""
+
+    label: str
+    profiles: int
+    altitudes: int
+    scores: tuple[Score, ...]
+    """Without ways that have no value."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedScore:
+    """One way in the published experiment, over the middles of 8 layers of a cloud."""
+
+    way: str
+    largest_angle: float
+    """degree."""
+    rays: int
+    share: float
+    """Largest error of backscatter over backscatter."""
+    profiles: int
+    rmse: Measured
+    top_bias: Measured
+    """Mean error at the highest altitude."""
+    extinction_rmse: Measured
+    """m-1."""
+    negative: float
+    """Share of optical depths below zero."""
+    monotone: float
+    """Share of profiles that nowhere decrease."""
+    close: Measured
+    """Share of profiles with a root mean square error below 0.5."""
+    data_share: float | None
+    """Median of the values."""
+    freedom: float | None
+    """Median degrees of freedom of an altitude."""
+
+
+@dataclass(frozen=True, slots=True)
+class PriorScore:
+    """The published method with a prior that is a multiple of the truth."""
+
+    factor: float
+    alone: float
+    """Root mean square error of the prior."""
+    rmse: Measured
+    data_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class CorrelationScore:
+    """One way where the scatter of neighbouring layers goes together."""
+
+    way: str
+    correlation: float
+    rmse: Measured
+    close: Measured
+
+
+@dataclass(frozen=True, slots=True)
+class OutlierScore:
+    """One way with samples that are too bright, in clear air."""
+
+    way: str
+    outliers: float
+    low_rmse: Measured
+    """Of optical depth, below 2 km."""
+    rmse: Measured
+    coverage: tuple[Measured, Measured]
+    flagged: float
+    """Share of values with the flag of outliers."""
+    ran: float
+    """Share of blocks for which the robust passes ran."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlagShare:
+    """Values with one flag."""
+
+    flag: str
+    values: float
+    """Share of all values."""
+    false: Measured | None
+    """Share of these that are false; None where there are none."""
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyScore:
+    """Values that are off by more than 4 stated errors, in random scenes."""
+
+    air: str
+    """How the scatter was drawn."""
+    way: str
+    quantity: str
+    scenes: int
+    profiles: int
+    values: int
+    random_only: Measured
+    """Share of values off by more than 4 random standard errors."""
+    false: Measured
+    """Share of values off by more than 4 of random error and gradient bound together."""
+    false_ok: Measured
+    """The same of the values without a flag that doubts the uncertainty."""
+    false_ok_profiles: Measured
+    """Share of profiles with such a value."""
+    within: Measured
+    """Share of unflagged values within 1.96 of random error and gradient bound together."""
+    flagged: float
+    """Share of values with such a flag."""
+    needless: float
+    """Share of values with such a flag that are within 2.5 of these errors."""
+    flags: tuple[FlagShare, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MultiAngle:
+    """The accuracy benchmark of scans."""
+
+    date: str
+    machine: Machine
+    scenes: tuple[SceneScore, ...]
+    published: tuple[PublishedScore, ...]
+    priors: tuple[PriorScore, ...]
+    correlations: tuple[CorrelationScore, ...]
+    outliers: tuple[OutlierScore, ...]
+    safety: tuple[SafetyScore, ...]
+
+
+def measure(
+    *,
+    quick: bool = False,
+    date: str = "",
+    size: Size | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> MultiAngle:
+    """Find optical depth and extinction of simulated scans by every method and by peers.
+
+    Parameters
+    ----------
+    quick : bool
+        Fewer profiles.
+    date : str
+        When it is run, as it is to be stated.
+    size : Size, optional
+        How much is simulated.
+    progress : callable
+        Is given 1 after each of 8 parts.
+    """
+    size = size or (QUICK if quick else FULL)
+    compared = []
+    for number, scene in enumerate(cases.scenes()):
+        compared.append(_compare(scene, size, number))
+        progress(1)
+    published = tuple(_published(size))
+    progress(1)
+    priors, correlations = tuple(_priors(size)), tuple(_correlations(size))
+    progress(1)
+    outliers = tuple(score for share in OUTLIERS for score in _outliers(share, size))
+    progress(1)
+    safety = tuple(_safety(size))
+    progress(1)
+    return MultiAngle(
+        date, machine(), tuple(compared), published, priors, correlations, outliers, safety
+    )
+
+
+# Statistics of blocks -------------------------------------------------------------------------
+
+Marks = dict[str, float]
+"""Means over one block, by name; NaN where there is nothing to average."""
+
+
+def _mean(values: Mask | Array) -> float:
+    finite = np.asarray(values, dtype=np.float64)[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def over_blocks(means: Sequence[float]) -> Measured:
+    """Return the mean of independent blocks with its Monte Carlo error."""
+    finite = np.array(means)[np.isfinite(means)]
+    error = float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else 0.0
+    return Measured(float(finite.mean()), error)
+
+
+def root(square: Measured) -> Measured:
+    """Return the square root of a mean of squares."""
+    value = float(np.sqrt(square.value))
+    return Measured(value, square.error / (2.0 * value) if value > 0 else 0.0)
+
+
+def ratio(part: Array, whole: Array) -> Measured:
+    """Return a share with the Monte Carlo error of independent clusters.
+
+    Parameters
+    ----------
+    part, whole : (cluster,) float
+        Counts.
+    """
+    total = float(whole.sum())
+    if total == 0.0:
+        return Measured(0.0, 0.0)
+    value = float(part.sum()) / total
+    error = float(np.sqrt(np.sum((part - value * whole) ** 2))) / total
+    # Where none is found, one more keeps the error from being zero.
+    return Measured(value, max(error, 1.0 / total))
+
+
+def _any(marks: Sequence[Marks], name: str) -> bool:
+    return any(np.isfinite(one[name]) for one in marks)
+
+
+def _coverage(marks: Sequence[Marks], name: str) -> tuple[Measured, Measured] | None:
+    if not _any(marks, f"{name}0"):
+        return None
+    low, high = (over_blocks([one[f"{name}{k}"] for one in marks]) for k in range(2))
+    return low, high
+
+
+def _inside(error: Array, stated: Array | None, sigmas: float) -> float:
+    if stated is None:
+        return float("nan")
+    known = np.isfinite(error) & np.isfinite(stated)
+    return _mean((np.abs(error) <= sigmas * stated)[known])
+
+
+def _differences(depth: Array, altitude: Array) -> Array:
+    return np.asarray(np.diff(depth, axis=1, prepend=0.0) / np.diff(altitude, prepend=0.0))
+
+
+# All ways in four scenes ----------------------------------------------------------------------
+
+
+def _compare(scene: Scene, size: Size, number: int) -> SceneScore:
+    scans = [scene.draw(size.profiles, number, block) for block in range(size.blocks)]
+    within = [
+        np.isfinite(cases.retrieve(scan, cases.KANO_HAMILTON).optical_depth) for scan in scans
+    ]
+    ours = [_score(name, way, scans, within) for name, way in cases.ways().items()]
+    few = [scan.first(size.slow) for scan in scans]
+    others = [_score(name, way, few, within) for name, way in cases.peers().items()]
+    profiles = size.blocks * size.profiles
+    scores = tuple(score for score in (*ours, *others) if score is not None)
+    return SceneScore(scene.label, profiles, scene.altitude.size, scores)
+
+
+def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -> Score | None:
+    way(scans[0].first(1))
+    marks, times, shares = [], [], []
+    for scan, reached in zip(scans, within, strict=True):
+        begin = time.process_time()
+        found = way(scan)
+        times.append((time.process_time() - begin) / len(scan.signal))
+        mask = reached[: len(scan.signal)]
+        marks.append(_marks(found, scan.scene, mask))
+        if found.data_share is not None:
+            shares.append(found.data_share[mask])
+    if not _any(marks, "extinction_square"):
+        return None
+    share = float(np.nanmedian(np.concatenate(shares))) if shares else None
+    return Score(
+        way=name,
+        profiles=sum(len(scan.signal) for scan in scans),
+        nanoseconds=1e9 * float(np.median(times)),
+        solved=over_blocks([one["solved"] for one in marks]).value,
+        rmse=root(over_blocks([one["square"] for one in marks])),
+        bias=over_blocks([one["error"] for one in marks]),
+        top_bias=over_blocks([one["top"] for one in marks]) if _any(marks, "top") else None,
+        coverage=_coverage(marks, "within"),
+        extinction_rmse=root(over_blocks([one["extinction_square"] for one in marks])),
+        extinction_coverage=_coverage(marks, "extinction_within"),
+        data_share=share,
+    )
+
+
+def _marks(found: Found, scene: Scene, mask: Mask) -> Marks:
+    """Return means over the altitudes of one block that count."""
+    error = np.where(mask, found.optical_depth - scene.optical_depth, np.nan)
+    slope = _differences(found.optical_depth, scene.altitude) - scene.extinction
+    top = max(int(mask.all(axis=0).sum()) - 1, 0)
+    published = found.extinction
+    wrong = np.full(mask.shape, np.nan)
+    if published is not None:
+        wrong = np.where(mask, published - scene.extinction, np.nan)
+    marks = {
+        "solved": _mean(np.isfinite(error)[mask]),
+        "square": _mean(error**2),
+        "error": _mean(error),
+        "top": _mean(error[:, top]),
+        "extinction_square": _mean(np.where(mask, slope, np.nan) ** 2),
+    }
+    for k, sigmas in enumerate(SIGMAS):
+        marks[f"within{k}"] = _inside(error, found.standard_error, sigmas)
+        marks[f"extinction_within{k}"] = _inside(wrong, found.extinction_standard_error, sigmas)
+    return marks
+
+
+# The published experiment ---------------------------------------------------------------------
+
+
+def _published(size: Size) -> Iterator[PublishedScore]:
+    every = set(product((15.0, 30.0), PUBLISHED_RAYS, PUBLISHED_SHARES))
+    every |= {(angle, *CENTRAL) for angle in PUBLISHED_ANGLES}
+    for number, (angle, rays, share) in enumerate(sorted(every)):
+        scene = cases.published(angle, rays, cases.uniform_deviation(share))
+        scans = [
+            cases.uniform_scatter(share, size.published, scene, number, block, 1)
+            for block in range(_published_blocks(size))
+        ]
+        gaussian = cases.published(angle, rays, 0.1)
+        loud = [
+            gaussian.draw(size.published, number, block, 2)
+            for block in range(_published_blocks(size))
+        ]
+        yield _published_score(NOTHING, _nothing, scans, share)
+        yield _published_score(TWO_ANGLE_ALONE, cases.ways()[cases.TWO_ANGLE], loud, share)
+        for name, way in cases.ways().items():
+            yield _published_score(name, way, scans, share)
+
+
+def _published_blocks(size: Size) -> int:
+    return min(5, size.blocks)
+
+
+def _nothing(scan: Scan) -> Found:
+    return Found(np.zeros((len(scan.signal), scan.scene.altitude.size)))
+
+
+def _published_score(name: str, way: Way, scans: Sequence[Scan], share: float) -> PublishedScore:
+    scene = scans[0].scene
+    found = [way(scan) for scan in scans]
+    depth = np.concatenate([one.optical_depth for one in found])
+    marks = [_marks(one, scene, np.ones(one.optical_depth.shape, np.bool_)) for one in found]
+    return PublishedScore(
+        way=name,
+        largest_angle=float(scene.zenith_angle.max()),
+        rays=scene.zenith_angle.size,
+        share=share,
+        profiles=len(depth),
+        rmse=root(over_blocks([one["square"] for one in marks])),
+        top_bias=over_blocks([one["top"] for one in marks]),
+        extinction_rmse=root(over_blocks([one["extinction_square"] for one in marks])),
+        negative=float(np.mean(depth < 0.0)),
+        monotone=float(np.mean(np.all(np.diff(depth, axis=1, prepend=0.0) >= 0.0, axis=1))),
+        close=over_blocks([_close(one.optical_depth, scene) for one in found]),
+        data_share=_median([one.data_share for one in found]),
+        freedom=_median([one.freedom for one in found], over=scene.altitude.size),
+    )
+
+
+def _median(arrays: Sequence[Array | None], over: int = 1) -> float | None:
+    known = [one.ravel() for one in arrays if one is not None]
+    return float(np.nanmedian(np.concatenate(known))) / over if known else None
+
+
+def _close(depth: Array, scene: Scene) -> float:
+    rms = np.sqrt(np.mean((depth - scene.optical_depth) ** 2, axis=1))
+    return float(np.mean(rms < _CLOSE))
+
+
+def _priors(size: Size) -> Iterator[PriorScore]:
+    share = CENTRAL[1]
+    scene = cases.published(15.0, CENTRAL[0], cases.uniform_deviation(share))
+    truth = scene.optical_depth
+    blocks = range(_published_blocks(size))
+    scans = [cases.uniform_scatter(share, size.published, scene, block, 3) for block in blocks]
+    for factor in PRIORS:
+        found = [cases.with_prior(scan, factor * truth) for scan in scans]
+        errors = [_mean((one.optical_depth - truth) ** 2) for one in found]
+        data = _median([one.data_share for one in found]) or 0.0
+        alone = abs(factor - 1.0) * float(np.sqrt(np.mean(truth**2)))
+        yield PriorScore(factor, alone, root(over_blocks(errors)), data)
+
+
+def _correlations(size: Size) -> Iterator[CorrelationScore]:
+    alone = cases.published(15.0, CENTRAL[0], cases.uniform_deviation(CENTRAL[1]))
+    for number, correlation in enumerate(CORRELATIONS):
+        scans = []
+        for block in range(_published_blocks(size)):
+            rng = np.random.default_rng((number, block, 4))
+            shape = (size.published, alone.path.size, alone.altitude.size)
+            air = alone.inhomogeneity * cases.correlated(rng, shape, correlation)
+            scans.append(alone.seen(air, rng))
+        for name in (cases.KANO_HAMILTON, "mld 0, discrepancy", cases.MLD_PRIOR, cases.JOINT):
+            found = [cases.ways()[name](scan).optical_depth for scan in scans]
+            squares = [_mean((one - alone.optical_depth) ** 2) for one in found]
+            close = over_blocks([_close(one, alone) for one in found])
+            yield CorrelationScore(name, correlation, root(over_blocks(squares)), close)
+
+
+# Outliers -------------------------------------------------------------------------------------
+
+
+def _outliers(share: float, size: Size) -> Iterator[OutlierScore]:
+    scene = cases.clear(3000.0, outliers=share)
+    scans = [scene.draw(size.profiles, round(100 * share), k, 5) for k in range(size.blocks)]
+    low = scene.altitude < LOW
+    for method, robust in product((cases.KANO_HAMILTON, cases.JOINT), (False, True)):
+        results = [cases.retrieve(scan, method, robust=robust) for scan in scans]
+        errors = [one.optical_depth - scene.optical_depth for one in results]
+        stated = [one.optical_depth_standard_error for one in results]
+        pairs = list(zip(errors, stated, strict=True))
+        inside = [over_blocks([_inside(e, s, n) for e, s in pairs]) for n in SIGMAS]
+        yield OutlierScore(
+            way=f"{method}, {'robust' if robust else 'plain'}",
+            outliers=share,
+            low_rmse=root(over_blocks([_mean(error[:, low] ** 2) for error in errors])),
+            rmse=root(over_blocks([_mean(error**2) for error in errors])),
+            coverage=(inside[0], inside[1]),
+            flagged=over_blocks([_mean(one.flags.outlier) for one in results]).value,
+            ran=float(np.mean([_ran(one) for one in results])),
+        )
+
+
+def _ran(result: MultiAngleResult) -> bool:
+    return any(step.ran and step.step == "robust_passes" for step in result.steps)
+
+
+# Random scenes --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """Counts of one quantity of one random scene."""
+
+    counts: Mapping[str, float]
+    by_flag: Mapping[str, tuple[float, float]]
+    """Values with the flag, and false ones of these."""
+
+
+def _safety(size: Size) -> Iterator[SafetyScore]:
+    judged: dict[tuple[str, str, str], list[_Judged]] = {}
+    for calm, count in ((False, size.random), (True, -(-size.random // 4))):
+        for seed in range(count):
+            scene = cases.random_scene(seed, _SCENE_PROFILES, calm=calm)
+            scan = scene.draw(_SCENE_PROFILES, seed, 6)
+            for method in (cases.KANO_HAMILTON, cases.JOINT):
+                result = cases.retrieve(scan, method)
+                for quantity, one in _judge(result, scene).items():
+                    kind = (CALM if calm else ANY, method, quantity)
+                    judged.setdefault(kind, []).append(one)
+    yield from (_safety_score(kind, scenes) for kind, scenes in judged.items())
+
+
+def _judge(result: MultiAngleResult, scene: Scene) -> dict[str, _Judged]:
+    return {
+        "optical depth": _counts(
+            result.optical_depth - scene.optical_depth,
+            result.optical_depth_standard_error,
+            result.optical_depth_gradient_error,
+            result.flags,
+        ),
+        "extinction": _counts(
+            result.extinction - scene.extinction,
+            result.extinction_standard_error,
+            result.extinction_gradient_error,
+            result.flags,
+        ),
+    }
+
+
+def _counts(error: Array, random: Array, bound: Array, flags: MultiAngleFlags) -> _Judged:
+    size, doubted, stated = np.abs(error), flags.doubtful(), np.hypot(random, bound)
+    valued = np.isfinite(error)
+    # A value without a stated error is false whatever it is.
+    false = valued & ~(size <= FALSE * stated)
+    plain = valued & ~doubted
+    masks = {
+        "values": valued,
+        "random_only": valued & ~(size <= FALSE * random),
+        "false": false,
+        "unflagged": plain,
+        "false_ok": false & plain,
+        "within": plain & (size <= SIGMAS[1] * stated),
+        "needless": valued & doubted & (size <= _NEEDLESS * stated),
+    }
+    counts = {name: float(mask.sum()) for name, mask in masks.items()}
+    counts["profiles"] = float(valued.any(axis=1).sum())
+    counts["false_ok_profiles"] = float((false & plain).any(axis=1).sum())
+    by_flag = {}
+    for one in fields(flags):
+        raised = valued & getattr(flags, one.name)
+        by_flag[one.name] = (float(raised.sum()), float((raised & false).sum()))
+    return _Judged(counts, by_flag)
+
+
+def _safety_score(kind: tuple[str, str, str], scenes: Sequence[_Judged]) -> SafetyScore:
+    counts = {name: np.array([one.counts[name] for one in scenes]) for name in scenes[0].counts}
+    values = counts["values"]
+    return SafetyScore(
+        *kind,
+        scenes=len(scenes),
+        profiles=int(counts["profiles"].sum()),
+        values=int(values.sum()),
+        random_only=ratio(counts["random_only"], values),
+        false=ratio(counts["false"], values),
+        false_ok=ratio(counts["false_ok"], counts["unflagged"]),
+        false_ok_profiles=ratio(counts["false_ok_profiles"], counts["profiles"]),
+        within=ratio(counts["within"], counts["unflagged"]),
+        flagged=ratio(values - counts["unflagged"], values).value,
+        needless=ratio(counts["needless"], values).value,
+        flags=tuple(_flag_share(name, scenes, values) for name in scenes[0].by_flag),
+    )
+
+
+def _flag_share(name: str, scenes: Sequence[_Judged], values: Array) -> FlagShare:
+    raised, false = np.array([one.by_flag[name] for one in scenes]).T
+    share = ratio(false, raised) if raised.sum() else None
+    return FlagShare(name, ratio(raised, values).value, share)

@@ -1,0 +1,437 @@
+"""Networks of lidars that look into known air, and ways to find its extinction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from lidarops.retrieve.network import geometry
+from lidarops.retrieve.network.cycles import systematic_error
+from lidarops.retrieve.network.extinction_field import (
+    DEFAULT_GATES,
+    Method,
+    MultiPositionResult,
+    Prior,
+    solve,
+)
+
+Array = npt.NDArray[np.float64]
+
+STEP: Final = 5.0
+"""m, of the range gates."""
+FULL_OVERLAP: Final = 100.0
+"""m."""
+NOISES: Final = (0.02, 0.05, 0.1)
+"""Relative standard deviation of a gate."""
+PEER_NOISE: Final = NOISES[1]
+"""Of the profiles that peers solve too."""
+ADDITIVE: Final = 0.01
+"""Standard deviation that every gate has besides, over the power at the ray's first vertex."""
+BLOCK: Final = 50
+"""Profiles that share a mean field and a multiplier."""
+
+_FIRST_GATE: Final = 100.3
+_BEYOND: Final = 60.0
+"""m that a signal goes on after the last vertex."""
+_LEAST_SLOPE: Final = 1e-6
+"""m-1, from which a fit begins at least."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+
+
+# Networks -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Lidars on a line, which look up into one vertical plane."""
+
+    name: str
+    east: tuple[float, ...]
+    """m, of each lidar."""
+    elevations: tuple[tuple[float, ...], ...]
+    """degree, of the rays of each lidar, from the east over the zenith."""
+    farthest: float = np.inf
+    """m, to which signals are used."""
+
+    def network(self) -> geometry.Network:
+        """Return rays and vertices."""
+        pairs = [(x, a) for x, fan in zip(self.east, self.elevations, strict=True) for a in fan]
+        angle = np.radians([a for _, a in pairs])
+        return geometry.network_of_lines(
+            [[x, 0.0, 0.0] for x, _ in pairs],
+            np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1),
+            tolerance=1e-3,
+            farthest=self.farthest,
+        )
+
+
+TRIANGLE: Final = Place("triangle", (300.0, -500.0, 0.0), ((120.0,), (60.0,), (90.0,)))
+"""That of the paper (drabenko2021): lidars 1, 2 and 3."""
+THREE_BY_TWO: Final = Place(
+    "3 x 2 rays",
+    (-500.0, 0.0, 400.0),
+    ((50.0, 68.0), (78.0, 103.0), (112.0, 130.0)),
+    farthest=1000.0,
+)
+PLACES: Final = (TRIANGLE, THREE_BY_TWO)
+
+
+# Air ------------------------------------------------------------------------------------------
+
+Extinction = Callable[[Array, Array], Array]
+"""From east and up in m to extinction in m-1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Air:
+    """A field of extinction, which may move from profile to profile."""
+
+    name: str
+    at: Callable[[int], Extinction]
+    """Of a profile of the block."""
+    moving: bool = False
+
+    def fields(self) -> list[Extinction]:
+        """Return the fields of a block's profiles; one where nothing moves."""
+        return [self.at(profile) for profile in range(BLOCK if self.moving else 1)]
+
+
+def _homogeneous(extinction: float) -> Extinction:
+    return lambda _, up: np.full_like(up, extinction)
+
+
+def _gradient(_: Array, up: Array) -> Array:
+    return np.asarray(2e-3 * np.exp(-(up - 600.0) / 1010.0))
+
+
+def _plume(east: float) -> Extinction:
+    def plume(x: Array, up: Array) -> Array:
+        apart = ((x - east) ** 2 + (up - 650.0) ** 2) / (2.0 * 110.0**2)
+        return np.asarray(1.5e-3 + 2e-3 * np.exp(-apart))
+
+    return plume
+
+
+THIN: Final = "homogeneous, 0.2 per km"
+AIRS: Final = (
+    Air("homogeneous", lambda _: _homogeneous(2e-3)),
+    Air("gradient", lambda _: _gradient),
+    Air("plume", lambda _: _plume(-40.0)),
+    Air("drifting plume", lambda profile: _plume(-200.0 + 300.0 * profile / BLOCK), moving=True),
+    Air(THIN, lambda _: _homogeneous(2e-4)),
+)
+"""2 per km at 600 m with a scale height of 1 km; 1.5 per km with 3.5 per km in the plume, which
+drifts by 300 m in a block."""
+SIGHTS_AIR: Final = AIRS[3]
+"""Of the errors of visibility."""
+
+
+# Signals --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signals:
+    """What the lidars of a network see of the air, without noise."""
+
+    network: geometry.Network
+    range: Array
+    """m."""
+    power: Array
+    """(field, ray, range), unit constants."""
+    extinction: Array
+    """(field, vertex) m-1, the truth."""
+
+    def draw(
+        self, noise: float, profiles: int, *seed: int, additive: float = ADDITIVE
+    ) -> tuple[Array, Array]:
+        """Return (profile, ray, range) power and its variance; the same for the same seed."""
+        rows = np.arange(profiles) % len(self.power)
+        deviation = np.hypot(noise * self.power, additive * self._first[..., np.newaxis])[rows]
+        random = np.random.default_rng(seed)
+        power = self.power[rows] + deviation * random.standard_normal(deviation.shape)
+        return power, deviation**2
+
+    def truth(self, profiles: int) -> Array:
+        """Return (profile, vertex) extinction, m-1."""
+        return self.extinction[np.arange(profiles) % len(self.extinction)]
+
+    @property
+    def _first(self) -> Array:
+        """(field, ray) power at the first vertex of each ray."""
+        out = np.empty(self.power.shape[:2])
+        for ray in range(self.network.rays):
+            near = self.network.on_ray(ray)[1][0]
+            out[:, ray] = [np.interp(near, self.range, each[ray]) for each in self.power]
+        return out
+
+
+def signals(net: geometry.Network, air: Air, first_gate: float = _FIRST_GATE) -> Signals:
+    """Return signals; optical depth by Gauss quadrature of 4 nodes from gate to gate."""
+    gates = np.arange(first_gate, float(net.crossings.range.max()) + _BEYOND, STEP)
+    fields = air.fields()
+    return Signals(
+        net,
+        gates,
+        np.stack([_power(net, gates, each) for each in fields]),
+        np.stack([each(net.vertex[:, 0], net.vertex[:, 2]) for each in fields]),
+    )
+
+
+def _power(net: geometry.Network, gates: Array, extinction: Extinction) -> Array:
+    edges = np.concatenate([np.linspace(0.0, gates[0], 40, endpoint=False), gates])
+    half = 0.5 * np.diff(edges)
+    nodes = edges[:-1] + half * (1.0 + _NODES[:, np.newaxis])
+    out = np.empty((net.rays, gates.size))
+    for ray in range(net.rays):
+        along = extinction(*_points(net, ray, nodes))
+        depth = np.cumsum(np.sum(along * _WEIGHTS[:, np.newaxis], axis=0) * half)
+        here = extinction(*_points(net, ray, gates))
+        out[ray] = here * np.exp(-2.0 * depth[-gates.size :]) / gates**2
+    return out
+
+
+def _points(net: geometry.Network, ray: int, distance: Array) -> tuple[Array, Array]:
+    origin, direction = net.origin[ray], net.direction[ray]
+    return origin[0] + direction[0] * distance, origin[2] + direction[2] * distance
+
+
+# Ways -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One way to find extinction at the vertices."""
+
+    name: str
+    method: Method
+    multiplier: float | None = None
+    prior: Prior = Prior.BLOCK
+
+    def __call__(
+        self, power: Array, variance: Array, seen: Signals, *, full_overlap: float = FULL_OVERLAP
+    ) -> MultiPositionResult:
+        """Solve profiles (profile, ray, range), block by block."""
+        return solve(
+            power,
+            seen.range,
+            seen.network,
+            method=self.method.value,
+            variance=variance,
+            full_overlap_range=full_overlap,
+            blocks=np.arange(len(power)) // BLOCK,
+            prior=self.prior.value,
+            multiplier=self.multiplier,
+        )
+
+
+EXACT: Final = Way("cycle, exact", Method.CYCLE)
+BEST: Final = Way("multiplier, best", Method.MULTIPLIER)
+PAPER_MULTIPLIER: Final = 0.8
+PAPER: Final = Way("multiplier 0.8", Method.MULTIPLIER, PAPER_MULTIPLIER)
+UNBIASED: Final = Way("unbiased 0.25", Method.UNBIASED, 0.25)
+SLOPE: Final = Way("slope", Method.SLOPE)
+KLETT: Final = Way("Klett, far end", Method.KLETT)
+FREE: Final = Way("network, no prior", Method.NETWORK, prior=Prior.NONE)
+NETWORK: Final = Way("network", Method.NETWORK)
+
+
+def ways(place: Place) -> tuple[Way, ...]:
+    """Return the ways that a network allows: cycles want one cycle of rays."""
+    any_network = (SLOPE, KLETT, FREE, NETWORK)
+    if place is not TRIANGLE:
+        return any_network
+    others = (
+        Way("multiplier 0.95", Method.MULTIPLIER, 0.95),
+        PAPER,
+        Way("multiplier 0", Method.MULTIPLIER, 0.0),
+    )
+    return (EXACT, BEST, *others, UNBIASED, *any_network)
+
+
+# The paper's second figure --------------------------------------------------------------------
+
+FIGURE_FIRST_LIDARS: Final = (200.0, 300.0, 400.0)
+"""m, distance of lidars 1 and 3."""
+FIGURE_ELEVATIONS: Final = tuple(float(angle) for angle in range(15, 80, 5))
+"""degree, of the second ray."""
+_FIGURE_FIRST_GATE: Final = 30.3
+
+
+@dataclass(frozen=True, slots=True)
+class FigurePoint:
+    """Systematic error (true - estimate) / true of visibility, of a homogeneous 2 per km."""
+
+    first_lidar: float
+    """m."""
+    elevation: float
+    """degree."""
+    printed: float
+    """With plain lengths in place of signed ones, the only reading that fits the figure's axis."""
+    signed: float | None
+    """At vertex 1 with signs; None beyond the pole."""
+    near: float | None
+    """At a vertex from which the cycle leads away from the lidars."""
+    simulated: float | None
+    """The same, of signals without noise; None where no lidar sees the vertex."""
+
+
+def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
+    """Return one point of figure 2 of drabenko2021, without signs and with the right ones."""
+    place = Place("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
+    net = place.network()
+    lengths = np.array([np.ptp(net.on_ray(ray)[1]) for ray in range(3)])
+    walk = geometry.cycle(net)
+    seen = signals(net, AIRS[0], _FIGURE_FIRST_GATE)
+    truth = float(seen.extinction[0, walk.vertex[0]])
+    depths = truth * lengths * [1.0, 1.0, -1.0]
+    away = _leads_away(net)
+
+    def error(optical_depth: Array) -> float | None:
+        return _finite(float(systematic_error(optical_depth, PAPER_MULTIPLIER)))
+
+    power = seen.power
+    solved = PAPER(power, 1e-12 * power**2, seen, full_overlap=_FIGURE_FIRST_GATE)
+    return FigurePoint(
+        first_lidar,
+        elevation,
+        printed=float(systematic_error(depths, PAPER_MULTIPLIER)),
+        signed=error(depths if away else -depths),
+        near=error(truth * (walk.end_range - walk.start_range)),
+        simulated=_finite(1.0 - truth / float(solved.extinction[0, walk.vertex[0]])),
+    )
+
+
+def _leads_away(net: geometry.Network) -> bool:
+    """Return whether ray 1 meets ray 3 before ray 2."""
+    vertices, _ = net.on_ray(0)
+    return bool(vertices[0] in net.on_ray(2)[0])
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+# Peers ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Random cycles, well conditioned: (cycle, row) arrays for `lidarops.retrieve.network.cycles`."""
+
+    start: Array
+    end: Array
+    integral: Array
+    variance: Array
+    """(cycle, row, 3), relative."""
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """All that a solution has to read."""
+        return self.start, self.end, self.integral, self.variance
+
+    def first(self, count: int) -> Rows:
+        """Return the first cycles."""
+        return Rows(*(array[:count] for array in self.arrays))
+
+    def last(self, count: int) -> Rows:
+        """Return the last cycles."""
+        return Rows(*(array[-count:] for array in self.arrays))
+
+
+def random_rows(cycles: int, rays: int) -> Rows:
+    """Return cycles whose rays all lead away from their lidars."""
+    random = np.random.default_rng((cycles, rays))
+    start = random.uniform(1.0, 2.0, (cycles, rays))
+    return Rows(
+        start,
+        start * random.uniform(0.6, 0.9, start.shape),
+        random.uniform(0.1, 0.3, start.shape),
+        np.full((*start.shape, 3), 1e-4),
+    )
+
+
+def solve_by_lu(rows: Rows) -> Array:
+    """Return (cycle,) reciprocal extinction at the first vertex by `numpy.linalg.solve` at once."""
+    return np.asarray(np.linalg.solve(_matrices(rows), rows.integral[..., np.newaxis])[:, 0, 0])
+
+
+def solve_by_lu_one_by_one(rows: Rows) -> Array:
+    """Return the same by one call of `numpy.linalg.solve` for each cycle."""
+    pairs = zip(_matrices(rows), rows.integral, strict=True)
+    return np.array([np.linalg.solve(matrix, side)[0] for matrix, side in pairs])
+
+
+def _matrices(rows: Rows) -> Array:
+    cycles, k = rows.start.shape
+    matrix = np.zeros((cycles, k, k))
+    here = np.arange(k)
+    matrix[:, here, here] = rows.start
+    matrix[:, here, (here + 1) % k] -= rows.end
+    return matrix
+
+
+def network_by_scipy(power: Array, variance: Array, seen: Signals) -> Array:
+    """Return (profile, vertex) extinction by `scipy.optimize.least_squares`, without errors.
+
+    Of each profile, the logarithms of extinction at the vertices and of one constant per ray are
+    fitted to point values, weighted as if these were independent.
+    """
+    return np.stack(
+        [_fit_network(*_condensed(p, v, seen), seen) for p, v in zip(power, variance, strict=True)]
+    )
+
+
+def _condensed(power: Array, variance: Array, seen: Signals) -> tuple[Array, Array, Array]:
+    """Return values, their relative errors, and integrals from the ray's first vertex on."""
+    values, errors, integrals = [], [], []
+    # A gate that is not positive has no logarithm: it is taken for half its noise.
+    power = np.maximum(power, 0.5 * np.sqrt(variance))
+    for ray in range(seen.network.rays):
+        logarithm = np.log(power[ray] * seen.range**2)
+        where, points = seen.network.on_ray(ray)[1], []
+        for r in where:
+            middle = int(np.argmin(np.abs(seen.range - r)))
+            gates = slice(middle - DEFAULT_GATES // 2, middle + DEFAULT_GATES // 2 + 1)
+            fit = np.polynomial.Polynomial.fit(seen.range[gates] - r, logarithm[gates], 1)
+            points.append(float(fit(0.0)))
+            noise = np.sqrt(variance[ray, gates]) / power[ray, gates]
+            errors.append(float(noise.mean() / np.sqrt(DEFAULT_GATES)))
+        values += points
+        total = 0.0
+        for k, r in enumerate(where):
+            if k:
+                inside = (seen.range > where[k - 1]) & (seen.range < r)
+                x = np.concatenate([[where[k - 1]], seen.range[inside], [r]])
+                y = np.concatenate([[points[k - 1]], logarithm[inside], [points[k]]])
+                total += _log_trapezoid(x, y)
+            integrals.append(total)
+    return np.array(values), np.array(errors), np.array(integrals)
+
+
+def _log_trapezoid(x: Array, logarithm: Array) -> float:
+    rise = np.diff(logarithm)
+    level = np.abs(rise) < 1e-6
+    mean = np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
+    return float(np.sum(np.diff(x) * np.exp(logarithm[:-1]) * mean))
+
+
+def _fit_network(values: Array, errors: Array, integrals: Array, seen: Signals) -> Array:
+    net = seen.network
+    ray, vertex = net.crossings.ray, net.crossings.vertex
+    first = np.searchsorted(ray, np.arange(net.rays))
+    last = np.searchsorted(ray, np.arange(net.rays), side="right") - 1
+    drop = np.exp(values[first]) - np.exp(values[last])
+    slope = max(float(np.median(drop / (2.0 * integrals[last]))), _LEAST_SLOPE)
+    begin = np.concatenate([np.full(net.vertices, np.log(slope)), values[first] - np.log(slope)])
+
+    def residuals(unknown: Array) -> Array:
+        extinction, constant = unknown[vertex], np.exp(unknown[net.vertices + ray])
+        left = np.maximum(constant - 2.0 * integrals, 1e-9 * constant)
+        return np.asarray((np.log(left) + extinction - values) / errors)
+
+    return np.asarray(np.exp(least_squares(residuals, begin, x_scale="jac").x[: net.vertices]))

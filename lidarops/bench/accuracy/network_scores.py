@@ -1,0 +1,272 @@
+"""What the benchmark of networks of lidars finds, and how errors are scored."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.bench.accuracy.homogeneous import SIGMAS, Measured
+from lidarops.bench.accuracy.network_cases import BLOCK, Array, FigurePoint
+from lidarops.bench.harness.timing import Machine
+from lidarops.retrieve.network.extinction_field import MultiPositionResult
+
+Booleans = npt.NDArray[np.bool_]
+
+CLIPPED: Final = 3.0
+"""Largest relative error that counts, as a quotient of noise has no variance."""
+WITHIN: Final = (*SIGMAS, 3.0)
+"""Standard errors."""
+READ: Final = "read (np.max)"
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors of one way at the near vertices, relative to the truth. None where nothing is left.
+
+    Monte Carlo errors are those of the scatter from block to block, as profiles of a block share
+    their mean field.
+    """
+
+    solved: float
+    """Share of values that are not withheld."""
+    flagged: Measured
+    """Share of values with any flag."""
+    bias: Measured | None
+    """Mean error of extinction."""
+    rmse: Measured | None
+    """Root mean square error of extinction."""
+    unflagged_rmse: Measured | None
+    within: tuple[Measured, Measured, Measured] | None
+    """Share of unflagged values within 1, 1.96 and 3 stated standard errors."""
+    visibility_bias: tuple[Measured | None, ...]
+    """Of visibility at each near vertex, the nearest first."""
+    visibility_rmse: tuple[Measured | None, ...]
+    chi_square: float | None
+    """Mean reduced chi-square of networks."""
+    microseconds: float
+    """CPU time of a profile, least of the chunks."""
+    reads: float
+    """The same as a multiple of the read of the same array in the same run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One network in one air with one noise."""
+
+    place: str
+    air: str
+    noise: float
+    profiles: int
+    scores: Mapping[str, Score]
+    """By way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """Errors of unflagged visibility by one definition, from extinction of the network."""
+
+    noise: float
+    contrast: float
+    constant: float
+    """Visibility times extinction."""
+    visibility: float
+    """Mean of the truth, m."""
+    bias: Measured
+    """m."""
+    rmse: Measured
+    """m."""
+    within_error: Measured
+    """Share of truths within one linear standard error."""
+    within_interval: Measured
+    """Share of truths from the lower to the upper visibility."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Our network without prior beside `scipy.optimize.least_squares`, on the same profiles."""
+
+    place: str
+    air: str
+    profiles: int
+    ours: float
+    """Root mean square error of extinction at the near vertices, relative, clipped."""
+    peer: float
+    apart: float
+    """Root mean square difference over our stated standard errors."""
+    ours_microseconds: float
+    peer_microseconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """CPU time of one way to solve cycles, or profiles of a network."""
+
+    way: str
+    rays: int
+    size: int
+    """Cycles or profiles of a call."""
+    nanoseconds: float
+    """Of each, least of the repeats."""
+    reads: float
+    """The same as a multiple of the read of the same arrays in the same run."""
+    ours: bool
+
+
+@dataclass(frozen=True, slots=True)
+class MultiPosition:
+    """The accuracy benchmark of networks of lidars."""
+
+    date: str
+    machine: Machine
+    cases: tuple[Case, ...]
+    figure: tuple[FigurePoint, ...]
+    """Figure 2 of drabenko2021."""
+    sights: tuple[Sight, ...]
+    comparisons: tuple[Comparison, ...]
+    cycles: tuple[Rate, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MultiPositionThroughput:
+    """The throughput benchmark of networks of lidars."""
+
+    date: str
+    machine: Machine
+    cycles: tuple[Rate, ...]
+    profiles: tuple[Rate, ...]
+    gain: float
+    """Time on the wall of one thread over that of two with half of the cycles each."""
+
+
+# Scores ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """(profile, near vertex) errors of one way; NaN where withheld."""
+
+    extinction: Array
+    """Relative, clipped."""
+    visibility: Array
+    """Relative, clipped."""
+    deviation: Array
+    """Of extinction over stated standard errors."""
+    flagged: Booleans
+    chi_square: Array
+    """(profile,)."""
+
+
+def errors_of(result: MultiPositionResult, truth: Array, near: Booleans) -> Errors:
+    """Return the errors of a result.
+
+    Parameters
+    ----------
+    result : MultiPositionResult
+    truth : (profile, vertex) float
+        Extinction, m-1.
+    near : (vertex,) bool
+    """
+    found, truth = result.extinction[:, near], truth[:, near]
+    stated = result.extinction_standard_error[:, near]
+    return Errors(
+        np.clip(found / truth - 1.0, -CLIPPED, CLIPPED),
+        np.clip(truth / found - 1.0, -CLIPPED, CLIPPED),
+        (found - truth) / stated,
+        result.flags.flagged[:, near],
+        result.reduced_chi_square,
+    )
+
+
+def joined(parts: Sequence[Errors]) -> Errors:
+    """Return the errors of all profiles."""
+    return Errors(
+        np.concatenate([part.extinction for part in parts]),
+        np.concatenate([part.visibility for part in parts]),
+        np.concatenate([part.deviation for part in parts]),
+        np.concatenate([part.flagged for part in parts]),
+        np.concatenate([part.chi_square for part in parts]),
+    )
+
+
+def mean_by_block(values: npt.NDArray[np.generic], kept: Booleans) -> Measured | None:
+    """Return the mean of kept values, with the error that their blocks scatter by.
+
+    Parameters
+    ----------
+    values : (profile, ...) float or bool
+    kept : (profile, ...) bool
+
+    Returns
+    -------
+    Measured or None
+        None where nothing is kept. The mean is a ratio of sums over blocks, and so is its error.
+    """
+    blocks = -(-len(values) // BLOCK)
+    edges = np.arange(blocks) * BLOCK
+    totals = np.add.reduceat(_rows(np.where(kept, values, 0.0)), edges)
+    counts = np.add.reduceat(_rows(kept.astype(np.float64)), edges)
+    count = counts.sum()
+    if count == 0:
+        return None
+    mean = totals.sum() / count
+    scatter = np.sum((totals - mean * counts) ** 2) * blocks / max(blocks - 1, 1)
+    return Measured(float(mean), float(np.sqrt(scatter) / count))
+
+
+def _rows(values: npt.NDArray[np.float64]) -> Array:
+    return np.asarray(values.reshape(len(values), -1).sum(axis=1))
+
+
+def share_by_block(inside: Booleans, kept: Booleans) -> Measured | None:
+    """Return the share of kept values that are inside; the error is never 0."""
+    found = mean_by_block(inside, kept)
+    if found is None:
+        return None
+    profiles = int(np.count_nonzero(_rows(kept.astype(np.float64))))
+    # Where all or none are inside, half a profile keeps the error from being zero.
+    likely = (found.value * profiles + 0.5) / (profiles + 1)
+    return Measured(found.value, max(found.error, math.sqrt(likely * (1 - likely) / profiles)))
+
+
+def root_by_block(errors: Array, kept: Booleans) -> Measured | None:
+    """Return the root mean square of kept errors, with the error that their blocks scatter by."""
+    square = mean_by_block(errors**2, kept)
+    if square is None:
+        return None
+    value = math.sqrt(square.value)
+    return Measured(value, square.error / (2.0 * value) if value > 0 else 0.0)
+
+
+def score(errors: Errors, microseconds: float, reads: float) -> Score:
+    """Return the score of one way in one case."""
+    solved = np.isfinite(errors.extinction) & np.isfinite(errors.deviation)
+    trusted = solved & ~errors.flagged
+    every = np.ones_like(solved)
+    flagged = share_by_block(errors.flagged, every)
+    first, second, third = (
+        share_by_block(np.abs(errors.deviation) <= sigmas, trusted) for sigmas in WITHIN
+    )
+    columns = range(solved.shape[1])
+    fitted = errors.chi_square[np.isfinite(errors.chi_square)]
+    return Score(
+        solved=float(solved.mean()),
+        flagged=flagged if flagged is not None else Measured(0.0, 0.0),
+        bias=mean_by_block(errors.extinction, solved),
+        rmse=root_by_block(errors.extinction, solved),
+        unflagged_rmse=root_by_block(errors.extinction, trusted),
+        within=None if first is None or second is None or third is None else (first, second, third),
+        visibility_bias=tuple(
+            mean_by_block(errors.visibility[:, c], solved[:, c]) for c in columns
+        ),
+        visibility_rmse=tuple(
+            root_by_block(errors.visibility[:, c], solved[:, c]) for c in columns
+        ),
+        chi_square=float(fitted.mean()) if fitted.size else None,
+        microseconds=microseconds,
+        reads=reads,
+    )

@@ -1,0 +1,121 @@
+"""The work-precision study of all retrievals, on one page."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from lidarops.bench import overview
+from lidarops.bench.accuracy import (
+    elastic,
+    homogeneous_report,
+    multiangle_report,
+    network,
+    network_report,
+)
+from lidarops.bench.accuracy import (
+    homogeneous as accuracy,
+)
+from lidarops.bench.accuracy.elastic import Elastic
+from lidarops.bench.accuracy.multiangle_scores import MultiAngle
+from lidarops.bench.accuracy.multiangle_scores import measure as measure_scans
+from lidarops.bench.accuracy.network_scores import MultiPosition
+from lidarops.bench.harness.terms import RESULT, Effort, Finding
+from lidarops.bench.harness.timing import Machine, least_times, machine
+from lidarops.bench.overview import Baseline, Work
+from lidarops.reports.benchmark_page import Part, Report
+
+_PROFILES: Final = 500
+_BINS: Final = 4096
+_CHANNELS: Final = 12
+_ROUNDS: Final = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Everything:
+    """The accuracy of all retrievals."""
+
+    date: str
+    machine: Machine
+    baselines: tuple[Baseline, ...]
+    works: tuple[Work, ...]
+    homogeneous: accuracy.Accuracy
+    elastic: Elastic
+    multiangle: MultiAngle
+    multiposition: MultiPosition
+
+
+def run(effort: Effort, *, data: Path | None = None) -> Finding:
+    """Measure error against run time of every retrieval.
+
+    Parameters
+    ----------
+    effort : Effort
+    data : Path, optional
+        Folder of published signals, for the elastic retrieval.
+
+    Raises
+    ------
+    CampaignError
+        Where the folder holds no such files.
+    RawFormatError
+        Where a published file cannot be read.
+    """
+    quick, date, progress = effort.quick, effort.date, effort.progress
+    paths = accuracy.measure(quick=quick, date=date, progress=progress)
+    vertical = elastic.measure(quick=quick, date=date, data=data, progress=progress)
+    scans = measure_scans(quick=quick, date=date, progress=progress)
+    networks = network.measure(quick=quick, date=date, repeats=effort.repeats, progress=progress)
+    found = Everything(
+        date=date,
+        machine=machine(),
+        baselines=tuple(_baselines()),
+        works=overview.works(paths, vertical, scans, networks),
+        homogeneous=paths,
+        elastic=vertical,
+        multiangle=scans,
+        multiposition=networks,
+    )
+    return Finding(found, _report(found))
+
+
+def _baselines() -> Iterator[Baseline]:
+    profiles = np.random.default_rng(0).random((_PROFILES, _BINS), np.float32)
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        file = Path(folder) / "counts"
+        file.write_bytes(np.zeros((_CHANNELS, _BINS), np.int32).tobytes())
+        times = least_times({"memory": lambda: np.max(profiles), "file": file.read_bytes}, _ROUNDS)
+    yield Baseline(
+        f"read a profile of {_BINS} float32 in memory (np.max)", 1e9 * times["memory"] / _PROFILES
+    )
+    yield Baseline(
+        f"read a file of {_CHANNELS} channels of {_BINS} bins from the page cache",
+        1e9 * times["file"],
+    )
+
+
+def _report(found: Everything) -> Report:
+    chapters = (
+        ("Homogeneous path", "homogeneous", homogeneous_report.accuracy_report(found.homogeneous)),
+        ("Elastic inversion", "elastic", elastic.accuracy_report(found.elastic)),
+        ("Scans", "multiangle", multiangle_report.accuracy_report(found.multiangle)),
+        ("Networks", "multiposition", network_report.accuracy_report(found.multiposition)),
+    )
+    told = [_apart(part, title, name) for title, name, report in chapters for part in report.parts]
+    return Report(
+        title="All retrievals: error against run time",
+        facts=homogeneous_report.facts(found.date, found.machine),
+        parts=(overview.overview(found.works, found.baselines), *told),
+        data=RESULT,
+    )
+
+
+def _apart(part: Part, title: str, name: str) -> Part:
+    """Name a chapter and its files after their retrieval, so that no two are alike."""
+    charts = tuple(replace(chart, name=f"{name}-{chart.name}") for chart in part.charts)
+    return replace(part, title=f"{title}: {part.title}", charts=charts)

@@ -1,0 +1,138 @@
+"""Random scans, and scans of air that is not level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from lidarops.bench.accuracy import multiangle_cases
+from lidarops.bench.accuracy.multiangle_cases import Scan, Scene
+from lidarops.bench.stability.random_scenes import Failure, Judged
+from lidarops.bench.stability.stiff_cases import Array
+from lidarops.bench.stability.stiff_scans import BITS
+from lidarops.retrieve.multiangle import optical_depth
+
+Random = np.random.Generator
+
+_LARGEST_GRADIENT: Final = 5e-5
+"""m-1, that the retrieval allows for by default."""
+
+
+def _level(scene: Scene, _: Random) -> Scene:
+    return replace(scene, outliers=0.0, gradient=0.0, variation=0.0)
+
+
+def _outliers(scene: Scene, rng: Random) -> Scene:
+    return replace(_level(scene, rng), outliers=rng.uniform(0.01, 0.1))
+
+
+def _gradient(scene: Scene, rng: Random, *, times: float = 1.0) -> Scene:
+    slope = times * rng.uniform(0.2, 1.0) * _LARGEST_GRADIENT * rng.choice([-1.0, 1.0])
+    return replace(_level(scene, rng), gradient=float(slope))
+
+
+def _two_sided(scene: Scene, rng: Random) -> Scene:
+    largest = scene.zenith_angle[-1]
+    angles = np.linspace(-largest, largest, scene.zenith_angle.size)
+    return replace(_gradient(scene, rng, times=2.0), zenith_angle=angles)
+
+
+def _variation(scene: Scene, rng: Random) -> Scene:
+    return replace(_level(scene, rng), variation=rng.uniform(0.3, 1.0))
+
+
+def _as_drawn(scene: Scene, _: Random) -> Scene:
+    return scene
+
+
+def _with_gaps(scan: Scan, rng: Random) -> Scan:
+    signal = scan.signal.copy()
+    signal[rng.random(signal.shape) < rng.uniform(0.0, 0.4)] = np.nan
+    first = rng.integers(0, signal.shape[-1])
+    signal[..., first : first + rng.integers(0, 10)] = np.nan
+    return replace(scan, signal=signal)
+
+
+def _with_overlap(scan: Scan, rng: Random) -> Scan:
+    distance = scan.scene.path[:, np.newaxis] * scan.scene.altitude
+    seen = 1.0 - rng.uniform(0.0, 0.2) * np.exp(-distance / rng.uniform(50.0, 1000.0))
+    return replace(scan, signal=scan.signal * seen)
+
+
+def _with_background(scan: Scan, rng: Random) -> Scan:
+    """Leave a part of the noise of one bin in the background of each ray."""
+    left = rng.normal(0.0, rng.uniform(0.0, 0.3), (*scan.signal.shape[:2], 1))
+    return replace(scan, signal=scan.signal + left * np.sqrt(scan.variance))
+
+
+def _plain(scan: Scan, _: Random) -> Scan:
+    return scan
+
+
+_Change = Callable[[Scene, Random], Scene]
+_Damage = Callable[[Scan, Random], Scan]
+
+_ONE_SIDE: Final = (
+    "a scan to one side cannot tell a gradient from optical depth: the declared largest gradient"
+    " has to cover it"
+)
+FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
+    (Failure("none", satisfied=True), _level, _plain),
+    (Failure("gaps", satisfied=True), _level, _with_gaps),
+    (Failure("outliers"), _outliers, _plain),
+    (Failure("gradient within what is declared, one side", unseen=_ONE_SIDE), _gradient, _plain),
+    (
+        Failure("gradient up to twice what is declared, one side", unseen=_ONE_SIDE),
+        partial(_gradient, times=2.0),
+        _plain,
+    ),
+    (Failure("gradient up to twice what is declared, two sides"), _two_sided, _plain),
+    (Failure("extinction that varies along the paths"), _variation, _plain),
+    (
+        Failure("overlap error", unseen="it is the same at equal ranges, which nothing compares"),
+        _level,
+        _with_overlap,
+    ),
+    (Failure("background left in the rays"), _level, _with_background),
+    (Failure("everything at once"), _as_drawn, _plain),
+)
+
+
+def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+    """Solve random scans of one geometry, class by class."""
+    for number, (failure, change, damage) in enumerate(FAILURES):
+        rng = np.random.default_rng((72, cluster, number))
+        scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
+        scan = damage(scene.draw(profiles, cluster, number, 72), rng)
+        found = optical_depth.solve(
+            scan.signal, scene.zenith_angle, scene.altitude, variance=scan.variance,
+            method="joint",
+        )  # fmt: skip
+        yield from _judged(failure, scene, found, profiles)
+
+
+def _judged(
+    failure: Failure, scene: Scene, found: optical_depth.MultiAngleResult, profiles: int
+) -> Iterator[tuple[Judged, int]]:
+    bits = np.asarray(found.quality).copy()
+    for name, bit in BITS.items():
+        bits |= np.where(getattr(found.flags, name), np.int32(bit), np.int32(0))
+    truth: dict[str, Array] = {
+        "optical depth": scene.optical_depth,
+        "extinction": np.asarray(scene.extinction),
+    }
+    for quantity, true in truth.items():
+        name = quantity.replace(" ", "_")
+        error: Any = getattr(found, name) - true
+        yield (
+            Judged(
+                failure, quantity, error, getattr(found, f"{name}_standard_error"),
+                getattr(found, f"{name}_gradient_error"), bits, doubted=found.flags.doubtful(),
+                solvable=np.isfinite(error),
+            ),
+            profiles,
+        )  # fmt: skip

@@ -1,0 +1,228 @@
+"""What an array looks like in memory must not matter: one answer for every layout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from lidarops.bench.stability import stiff_elastic, stiff_networks, stiff_scans
+from lidarops.bench.stability.stiff_cases import Answer, Case, Near, Refused, Retrieval
+from lidarops.bench.stability.stiff_homogeneous import CLEAR
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.elastic import inversion
+from lidarops.retrieve.homogeneous import labeled, path_fit
+from lidarops.retrieve.multiangle import optical_depth
+from lidarops.retrieve.network import extinction_field
+from lidarops.retrieve.signal import counts_to_signal
+
+Layout = Callable[[Any], Any]
+Solver = Callable[..., Mapping[str, Any]]
+
+
+def _read_only(array: Any) -> Any:
+    copy = np.array(array)
+    copy.flags.writeable = False
+    return copy
+
+
+def _strided(array: Any) -> Any:
+    """Return a view of every second value of a longer array, its first axis turned."""
+    wide = np.zeros((*array.shape[:-1], 2 * array.shape[-1]), dtype=array.dtype)
+    wide[..., ::2] = array
+    turned = np.ascontiguousarray(wide[::-1])[::-1] if array.ndim > 1 else wide
+    return turned[..., ::2]
+
+
+LAYOUTS: Final[dict[str, Layout]] = {
+    "big-endian": lambda array: array.astype(array.dtype.newbyteorder(">")),
+    "read-only": _read_only,
+    "with strides": _strided,
+    "in Fortran's order": np.asfortranarray,
+    "masked, nothing of it": np.ma.masked_array,
+    "as a list": lambda array: array.tolist(),
+}
+REFUSED: Final[dict[str, Layout]] = {
+    "objects": lambda array: array.astype(object),
+    "complex numbers": lambda array: array.astype(complex),
+    "strings": lambda array: array.astype(str),
+    "booleans": lambda array: array.astype(bool),
+}
+
+
+def _homogeneous(array: Any, layout: Layout) -> Mapping[str, Any]:
+    found = path_fit.solve(layout(array), layout(CLEAR.range), variance=1.0)
+    return {n: getattr(found, n) for n in ("background", "extinction", "quality", "reduced_chi2")}
+
+
+def _signal(array: Any, layout: Layout) -> Mapping[str, Any]:
+    distance = 7.5 * np.arange(1, array.shape[-1] + 1, dtype=np.float64)
+    found = counts_to_signal.photon(
+        layout(array), layout(np.full(array.shape[0], 600)), layout(distance), bin_width=7.5,
+        dead_time=4e-9,
+    )  # fmt: skip
+    return {n: getattr(found, n) for n in ("power", "variance", "quality")}
+
+
+def _elastic(array: Any, layout: Layout) -> Mapping[str, Any]:
+    given = stiff_elastic.arguments(array.shape[0])
+    changed = {n: layout(np.asarray(given[n])) for n in ("range", "molecular_backscatter")}
+    found = inversion.solve(**given | changed | {"power": layout(array)})
+    return {n: getattr(found, n) for n in ("backscatter", "backscatter_standard_error", "valid")}
+
+
+def _scans(array: Any, layout: Layout) -> Mapping[str, Any]:
+    given = stiff_scans.arguments(profiles=array.shape[0])
+    changed = {n: layout(np.asarray(given[n])) for n in ("zenith_angle", "altitude")}
+    found = optical_depth.solve(**given | changed | {"signal": layout(array)})
+    return {n: getattr(found, n) for n in ("optical_depth", "extinction", "quality")}
+
+
+def _network(array: Any, layout: Layout) -> Mapping[str, Any]:
+    given = stiff_networks.arguments()
+    changed = {"power": layout(array), "range": layout(given["range"])}
+    found = extinction_field.solve(**given | changed)
+    return {n: getattr(found, n) for n in ("extinction", "extinction_standard_error")}
+
+
+def _labeled(array: Any, chunk: int) -> Mapping[str, Any]:
+    power = xr.DataArray(
+        array,
+        dims=("time", "range"),
+        coords={"range": ("range", CLEAR.range, {"units": "m"})},
+        attrs={"units": "mV"},
+    )
+    sections = [(2500.0, 6000.0), (6000.0, 10000.0)]
+    if chunk:
+        power = power.chunk({"time": chunk, "range": 50})
+    found = labeled.homogeneous(power, sections=sections, variance=1.0).compute()
+    return {str(name): found[name].to_numpy() for name in found.data_vars}
+
+
+def _plain(array: Any) -> Any:
+    return array
+
+
+def _alike(solver: Solver, array: Callable[[], Any], *ways: Any) -> Answer:
+    """Return whether two ways give the same bits."""
+    one, other = (solver(array(), way) for way in ways)
+    same = [np.array_equal(one[n], other[n], equal_nan=one[n].dtype.kind == "f") for n in one]
+    return Answer({"same bits": float(all(same))})
+
+
+def _unlike(solver: Solver, name: str, error: str, array: Callable[[], Any]) -> Answer:
+    """Return the largest change by single precision, in standard errors."""
+    one = solver(array(), _plain)
+    other = solver(array().astype(np.float32), _plain)
+    stated = np.asarray(one[error]) if error in one else np.abs(np.asarray(one[name])) * 1e-3
+    change = np.abs(np.asarray(one[name]) - np.asarray(other[name])) / stated
+    return Answer({"change": np.nanmax(change)})
+
+
+def _counts() -> Any:
+    rng = np.random.default_rng(61)
+    return rng.poisson(600.0, (4, 300)).astype(np.int32)
+
+
+_SOLVED: Final[dict[Retrieval, tuple[Solver, Callable[[], Any], str]]] = {
+    Retrieval.HOMOGENEOUS: (_homogeneous, lambda: CLEAR.noisy(20), "power"),
+    Retrieval.SIGNAL: (_signal, _counts, "counts"),
+    Retrieval.ELASTIC: (_elastic, lambda: stiff_elastic.arguments(5)["power"], "power"),
+    Retrieval.MULTIANGLE: (_scans, lambda: stiff_scans.arguments()["signal"], "signal"),
+    Retrieval.MULTIPOSITION: (_network, lambda: stiff_networks.arguments()["power"], "power"),
+}
+_FLOAT32: Final = {
+    Retrieval.HOMOGENEOUS: "extinction",
+    Retrieval.ELASTIC: "backscatter",
+    Retrieval.MULTIANGLE: "optical_depth",
+    Retrieval.MULTIPOSITION: "extinction",
+}
+
+
+def _laid_out(retrieval: Retrieval, name: str, layout: Layout) -> Case:
+    solver, array, _ = _SOLVED[retrieval]
+    return Case(
+        f"{retrieval.value}: arrays {name}",
+        retrieval,
+        dict,
+        partial(_alike, solver, array, layout, _plain),
+        (Near("same bits", 1.0, 0.0),),
+    )
+
+
+def _refused(retrieval: Retrieval, name: str, layout: Layout) -> Case:
+    solver, array, field = _SOLVED[retrieval]
+
+    def signals_alone(values: Any) -> Any:
+        return layout(values) if np.ndim(values) > 1 else values
+
+    return Case(
+        f"{retrieval.value}: signals as {name}",
+        retrieval,
+        dict,
+        partial(_alike, solver, array, signals_alone, _plain),
+        (Refused(RetrievalInputError, field),),
+    )
+
+
+def _single(retrieval: Retrieval, quantity: str) -> Case:
+    solver, array, _ = _SOLVED[retrieval]
+    return Case(
+        f"{retrieval.value}: float32",
+        retrieval,
+        dict,
+        partial(_unlike, solver, quantity, f"{quantity}_standard_error", array),
+        (Near("change", 0.0, 1.0, relative=False),),
+    )
+
+
+def _whole_numbers() -> Answer:
+    """Compare integers with the same numbers as floats."""
+    power = np.rint(100.0 * CLEAR.noisy(20))
+    one = _homogeneous(power.astype(np.int64), _plain)
+    other = _homogeneous(power, _plain)
+    return Answer({"same bits": float(all(np.array_equal(one[n], other[n]) for n in one))})
+
+
+def _blocks() -> Answer:
+    """Compare profiles one by one with all at once, some of them all NaN."""
+    power = CLEAR.noisy(60)
+    power[10:30] = np.nan
+    found = path_fit.solve(power, CLEAR.range, variance=1.0)
+    clean = path_fit.solve(CLEAR.noisy(60), CLEAR.range, variance=1.0)
+    kept = np.delete(np.arange(60), np.arange(10, 30))
+    same = np.array_equal(found.extinction[kept], clean.extinction[kept])
+    lost = np.isnan(found.extinction[10:30]).all()
+    missing = (found.quality[10:30] & int(Quality.INPUT_MISSING) != 0).all()
+    return Answer({"same bits": float(same and lost and missing)})
+
+
+def _turned() -> Answer:
+    power = CLEAR.noisy(20)
+    one = path_fit.solve(power[:, ::-1], CLEAR.range[::-1], variance=1.0)
+    other = path_fit.solve(power, CLEAR.range, variance=1.0)
+    return Answer({"same bits": float(np.array_equal(one.extinction, other.extinction))})
+
+
+def cases() -> tuple[Case, ...]:
+    """Return all of them."""
+    same = (Near("same bits", 1.0, 0.0),)
+    chunks = tuple(
+        Case(f"dask, chunks of {counted} by 50 bins", Retrieval.HOMOGENEOUS, dict,
+             partial(_alike, _labeled, lambda: CLEAR.noisy(20), size, 0), same)
+        for size, counted in ((1, "one profile"), (7, "7 profiles"))
+    )  # fmt: skip
+    return (
+        *(_laid_out(r, name, way) for r in _SOLVED for name, way in LAYOUTS.items()
+          if not (r is Retrieval.SIGNAL and name == "as a list")),
+        *(_refused(r, name, way) for r in _SOLVED for name, way in REFUSED.items()),
+        *(_single(r, quantity) for r, quantity in _FLOAT32.items()),
+        *chunks,
+        Case("whole numbers", Retrieval.HOMOGENEOUS, dict, _whole_numbers, same),
+        Case("blocks of all NaN", Retrieval.HOMOGENEOUS, dict, _blocks, same),
+        Case("descending ranges", Retrieval.HOMOGENEOUS, dict, _turned, same),
+    )  # fmt: skip

@@ -1,0 +1,351 @@
+"""Stiff and extreme cases of the way from raw counts to a signal without background."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from lidarops.bench.stability.stiff_cases import (
+    Answer,
+    Array,
+    Between,
+    Case,
+    Honest,
+    Missing,
+    Near,
+    Raised,
+    Refused,
+    Retrieval,
+    Stands,
+)
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.signal import averaging, counts_to_signal, gluing, lag
+from lidarops.simulate import counting
+
+_case = partial(Case, retrieval=Retrieval.SIGNAL)
+RANGE: Final = 7.5 * (np.arange(2000, dtype=np.float64) + 0.5)
+SHOTS: Final = 600
+BIN_TIME: Final = 50e-9
+"""s."""
+DEAD_TIME: Final = 4e-9
+"""s."""
+_BITS: Final = 12
+_TOP: Final = SHOTS * (2**_BITS - 1)
+_FOLDED: Final = Quality.PILE_UP | Quality.SATURATED
+
+
+def analog(counts: Any, **more: Any) -> Answer:
+    """Turn counts into mV, 500 mV at full scale."""
+    arguments: dict[str, Any] = {
+        "shots": np.full(np.shape(counts)[:-1], SHOTS),
+        "range": RANGE[: np.shape(counts)[-1]],
+        "adc_bits": _BITS,
+        "input_range": np.full(np.shape(counts)[:-1], 0.5),
+    }
+    return _told(counts_to_signal.analog(counts, **arguments | more))
+
+
+def photon(counts: Any, **more: Any) -> Answer:
+    """Turn counts into MHz."""
+    arguments: dict[str, Any] = {
+        "shots": np.full(np.shape(counts)[:-1], SHOTS),
+        "range": RANGE[: np.shape(counts)[-1]],
+        "bin_width": 7.5,
+        "dead_time": DEAD_TIME,
+    }
+    return _told(counts_to_signal.photon(counts, **arguments | more))
+
+
+def _told(found: counts_to_signal.Signal) -> Answer:
+    error = np.sqrt(np.asarray(found.variance, dtype=np.float64))
+    values = {"power": found.power, "power_standard_error": error, "variance": found.variance}
+    return Answer(values, np.asarray(found.quality))
+
+
+def _quarter(answer: Answer, bins: slice) -> Answer:
+    """Return a part of the bins."""
+    values = {name: answer.value(name)[..., bins] for name in answer.values}
+    return Answer(values, answer.quality[..., bins])
+
+
+def _at(bins: slice, counts: Any, **more: Any) -> Answer:
+    return _quarter(analog(counts, **more), bins)
+
+
+def _steady(steps: float, noise: float, profiles: int = 4) -> dict[str, Any]:
+    """Return sums of shots that a digitiser rounds one by one."""
+    rng = np.random.default_rng(11)
+    shape = (SHOTS, profiles, 200)
+    sums = np.rint(steps + noise * rng.standard_normal(shape)).sum(axis=0)
+    return {"counts": sums.astype(np.int32)}
+
+
+def _level(steps: float) -> float:
+    return steps * 500.0 / 2**_BITS
+
+
+def _single_extreme(value: int) -> dict[str, Any]:
+    counts = _steady(100.0, 2.0)["counts"]
+    counts[:, 50] = value
+    return {"counts": counts}
+
+
+def _rate_counts(rate: float, *, paralyzable: bool = False, profiles: int = 4) -> dict[str, Any]:
+    mean, variance = counting.counter_moments(
+        np.full(RANGE.size, rate), bin_time=BIN_TIME, dead_time=DEAD_TIME, paralyzable=paralyzable
+    )
+    rng = np.random.default_rng(12)
+    noise = rng.standard_normal((profiles, RANGE.size)) * np.sqrt(SHOTS * variance)
+    counts = np.maximum(np.rint(SHOTS * mean + noise), 0.0)
+    return {"counts": counts.astype(np.int32)}
+
+
+def _empty(shots: int = SHOTS) -> dict[str, Any]:
+    counts = np.zeros((3, RANGE.size), dtype=np.int32)
+    return {"counts": counts, "shots": np.full(3, shots)}
+
+
+def _analog_cases() -> tuple[Case, ...]:
+    whole = slice(None)
+    noisy = partial(_steady, 100.3, 2.0)
+    return (
+        _case("analog, noise of 2 steps", build=noisy, solve=analog,
+              expected=(Stands(), Honest("power", _level(100.3), errors=5.0))),
+        *(
+            _case(f"B d analog, noise of {noise:g} steps at {steps:g}: rounding stays",
+                  build=partial(_steady, steps, noise), solve=analog,
+                  expected=(Honest("power", _level(steps), valued=1.0),))
+            for steps, noise in ((100.3, 0.0), (100.3, 0.05), (100.45, 0.05), (100.4, 0.1),
+                                 (100.25, 0.2), (100.25, 0.3), (100.25, 0.4))
+        ),
+        _case("B e analog without shots", build=lambda: _empty(0), solve=analog,
+              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+        _case("analog of zeros alone", build=_empty, solve=analog,
+              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+        _case("B f one bin at the largest integer", build=partial(_single_extreme, 2**31 - 1),
+              solve=partial(_at, slice(50, 51)),
+              expected=(Raised(Quality.INPUT_MISSING | Quality.SATURATED), Missing("power"))),
+        _case("B f its neighbours", build=partial(_single_extreme, 2**31 - 1),
+              solve=partial(_at, slice(51, 200)),
+              expected=(Stands(), Honest("power", _level(100.0), errors=5.0))),
+        _case("one bin at full scale", build=partial(_single_extreme, _TOP),
+              solve=partial(_at, slice(50, 51)),
+              expected=(Raised(Quality.SATURATED), Missing("power"))),
+        _case("one bin above full scale", build=partial(_single_extreme, _TOP + 5),
+              solve=partial(_at, slice(50, 51)),
+              expected=(Raised(Quality.SATURATED), Missing("power"))),
+        _case("profile above full scale",
+              build=lambda: {"counts": np.full((2, 200), 2 * _TOP, np.int32)}, solve=analog,
+              expected=(Raised(Quality.SATURATED), Missing("power"))),
+        _case("some shots clipped: 2 steps below full scale, noise of 5",
+              build=lambda: {"counts": np.minimum(_steady(4093.0, 5.0)["counts"], _TOP)},
+              solve=analog, expected=(Raised(Quality.SATURATED),)),
+        _case("analog without an input range",
+              build=lambda: noisy() | {"input_range": np.full(4, np.nan)}, solve=analog,
+              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+        _case("analog, one bin", build=lambda: {"counts": np.full((2, 1), 9000, np.int32)},
+              solve=analog, expected=(Near("power", _level(15.0), 1e-12),)),
+        _case("dark signal missing in one bin", solve=partial(_at, slice(3, 4)),
+              build=lambda: noisy() | {"dark": np.where(np.arange(200) == 3, np.nan, 1.0)},
+              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+        _case("counts as floats with fractions", build=lambda: {"counts": np.full((2, 200), 0.5)},
+              solve=analog, expected=(Refused(RetrievalInputError, "counts"),)),
+        _case("counts that are true or false",
+              build=lambda: {"counts": np.ones((2, 200), dtype=np.bool_)},
+              solve=analog, expected=(Refused(RetrievalInputError, "counts"),)),
+        _case("counts of 64 bits beyond 32",
+              build=lambda: {"counts": np.full((2, 200), 2**40)}, solve=analog,
+              expected=(Refused(RetrievalInputError, "counts"),)),
+        _case("negative noise variance", build=lambda: noisy() | {"noise_variance": -1.0},
+              solve=analog, expected=(Refused(RetrievalInputError, "noise_variance"),)),
+        _case("a variance of the dark signal of 1e300", solve=partial(_at, whole),
+              build=lambda: noisy() | {"dark": np.zeros(200), "noise_variance": 1.0,
+                                       "dark_variance": np.full(200, 1e300)},
+              expected=(Between("power_standard_error", 1e149, np.inf),)),
+    )  # fmt: skip
+
+
+def _photon_cases() -> tuple[Case, ...]:
+    return (
+        *(
+            _case(f"photon counting, {rate:g} MHz", build=partial(_rate_counts, rate),
+                  solve=photon, expected=(Stands(), Honest("power", rate, errors=5.5)))
+            for rate in (1.0, 20.0, 100.0)
+        ),
+        _case("200 MHz: the counter is nearly half paralysed",
+              build=partial(_rate_counts, 200.0), solve=photon,
+              expected=(Raised(_FOLDED), Honest("power", 200.0, errors=5.5))),
+        _case("600 MHz: above half of the time dead", build=partial(_rate_counts, 600.0),
+              solve=photon, expected=(Raised(Quality.SATURATED), Missing("power"))),
+        _case("B c 600 MHz, paralyzable, folded back",
+              build=partial(_rate_counts, 600.0, paralyzable=True), solve=photon,
+              expected=(Raised(_FOLDED),)),
+        _case("unknown dead time, 100 MHz", solve=photon,
+              build=lambda: _rate_counts(100.0) | {"dead_time": None},
+              expected=(Raised(_FOLDED),)),
+        _case("B e photon counting without shots", build=lambda: _empty(0), solve=photon,
+              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+        _case("photon counting of zeros alone", build=_empty, solve=photon,
+              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+        _case("one count in a profile: no bin is known without error", solve=photon,
+              build=lambda: {"counts": np.eye(1, RANGE.size, 700, dtype=np.int32)},
+              expected=(Between("power_standard_error", 1e-6, 1.0),)),
+        _case("the largest integer in all bins", solve=photon,
+              build=lambda: {"counts": np.full((1, 200), 2**31 - 1, np.int32)},
+              expected=(Raised(Quality.INPUT_MISSING | Quality.SATURATED), Missing("power"))),
+        _case("photon counts that are true or false", solve=photon,
+              build=lambda: {"counts": np.ones((2, 200), dtype=np.bool_)},
+              expected=(Refused(RetrievalInputError, "counts"),)),
+        _case("negative dead time", build=lambda: _rate_counts(1.0) | {"dead_time": -1e-9},
+              solve=photon, expected=(Refused(RetrievalInputError, "dead_time"),)),
+        _case("bin width of zero", build=lambda: _rate_counts(1.0) | {"bin_width": 0.0},
+              solve=photon, expected=(Refused(RetrievalInputError, "bin_width"),)),
+    )  # fmt: skip
+
+
+# Background, averages, gluing, lag ------------------------------------------------------------
+
+
+def tail(**arguments: Any) -> Answer:
+    """Take the mean of the far bins."""
+    found = cubic_and_tail.tail_mean(**arguments)
+    values = {
+        "background": found.background,
+        "background_standard_error": found.background_standard_error,
+    }
+    return Answer(values, np.asarray(found.quality))
+
+
+def shaped(**arguments: Any) -> Answer:
+    """Fit background and amplitude of a known shape."""
+    found = known_shape.solve(**arguments)
+    names = ("background", "amplitude")
+    values = {name: getattr(found, name) for name in names}
+    values |= {f"{name}_standard_error": getattr(found, f"{name}_standard_error") for name in names}
+    bits = np.asarray(found.quality)
+    singular = np.where(found.singular, np.int32(Quality.POORLY_DETERMINED), np.int32(0))
+    return Answer(values, bits | singular)
+
+
+_FAR: Final = 7.5 * (np.arange(400, 2000, dtype=np.float64) + 0.5)
+
+
+def _molecules(distance: Array = _FAR) -> Array:
+    air = np.exp(-distance / 8000.0)
+    return np.asarray(known_shape.molecular_shape(1.4e-6 * air, 1.2e-5 * air, distance))
+
+
+def _shaped(level: float, scale: float = 1.0, *, noise: float = 1.0, **more: Any) -> dict[str, Any]:
+    shape = _molecules()
+    model = level + 100.0 * shape / shape[0]
+    draws = np.random.default_rng(13).standard_normal((50, shape.size))
+    return {"power": scale * (model + noise * draws), "range": _FAR, "shape": shape,
+            "variance": (scale * noise) ** 2, **more}  # fmt: skip
+
+
+def _mean(profiles: Array, variance: Any = 1.0, **more: Any) -> Answer:
+    found = averaging.mean(profiles, np.broadcast_to(variance, profiles.shape), **more)
+    return Answer({"mean": found.values, "mean_standard_error": found.standard_error})
+
+
+def _glue(**arguments: Any) -> Answer:
+    found = gluing.glue(**arguments)
+    lost = np.where(found.no_window | found.poor_fit, np.int32(Quality.NO_GLUING), np.int32(0))
+    values = {"slope": found.slope, "slope_standard_error": found.slope_standard_error}
+    return Answer(values | {"power": found.power}, np.asarray(lost))
+
+
+def _channels(strength: float, gain: float = 0.5, profiles: int = 30) -> dict[str, Any]:
+    distance = RANGE[40:]
+    rate = strength * (distance[0] / distance) ** 2
+    rng = np.random.default_rng(14)
+    counted = rate / (SHOTS * BIN_TIME * 1e6)
+    shape = (profiles, rate.size)
+    return {
+        "analog": gain * rate + 0.02 * rng.standard_normal(shape),
+        "photon_counting": rate + np.sqrt(counted) * rng.standard_normal(shape),
+        "range": distance,
+        "analog_variance": np.full(shape, 4e-4),
+        "photon_variance": np.broadcast_to(counted, shape),
+        "block": np.zeros(profiles, dtype=np.int64),
+    }
+
+
+def _lag(shift: int | None) -> Answer:
+    rng = np.random.default_rng(15)
+    common = rng.standard_normal((40, 1200))
+    other = rng.standard_normal((40, 1200)) if shift is None else np.roll(common, shift, axis=-1)
+    found = lag.estimate(other + 0.5 * rng.standard_normal(common.shape), common)
+    unfound = np.where(found.found, np.int32(0), np.int32(Quality.NO_GLUING))
+    values = {"lag": found.lag, "lag_standard_error": found.standard_error}
+    return Answer(values, np.atleast_1d(unfound).astype(np.int32))
+
+
+def _rest() -> tuple[Case, ...]:
+    gapped = np.full((6, 50), np.nan)
+    one_left = np.where(np.arange(6)[:, np.newaxis] == 2, 3.0, gapped)
+    return (
+        _case("mean of the tail, all NaN",
+              build=lambda: {"power": np.full((2, 300), np.nan), "range": RANGE[:300]},
+              solve=tail, expected=(Raised(Quality.INPUT_MISSING), Missing("background"))),
+        _case("mean of the tail, one bin",
+              build=lambda: {"power": [[5.0]], "range": [200.0], "variance": 1.0}, solve=tail,
+              expected=(Raised(Quality.TOO_FEW_BINS), Near("background", 5.0, 0.0))),
+        _case("mean of the tail of a background of 1e30", solve=tail,
+              build=lambda: {"power": np.full((2, 300), 1e30), "range": RANGE[:300]},
+              expected=(Near("background", 1e30, 1e-15),)),
+        _case("mean of the tail of 1e300 with a variance of 1e300", solve=tail,
+              build=lambda: {"power": np.full((2, 300), 1e300), "range": RANGE[:300],
+                             "variance": 1e300},
+              expected=(Near("background", 1e300, 1e-14),)),
+        *(
+            _case(f"known shape, background {level:g} times the noise",
+                  build=partial(_shaped, level), solve=shaped,
+                  expected=(Honest("background", level, valued=0.9),))
+            for level in (0.0, 1.0, 1e5, 1e8)
+        ),
+        *(
+            _case(f"known shape, signals times {scale:g}", build=partial(_shaped, 10.0, scale),
+                  solve=shaped, expected=(Honest("background", 10.0 * scale, valued=0.9),))
+            for scale in (1e-30, 1e30, 1e-150, 1e150)
+        ),
+        _case("known shape without noise", solve=shaped,
+              build=lambda: _shaped(10.0, noise=0.0, variance=1e-12),
+              expected=(Near("background", 10.0, 1e-9),)),
+        _case("known shape, all NaN", build=lambda: _shaped(10.0, np.nan, variance=1.0),
+              solve=shaped, expected=(Raised(Quality.INPUT_MISSING), Missing("background"))),
+        _case("known shape, constant profile, no variance", solve=shaped,
+              build=lambda: _shaped(1.0) | {"power": np.full(_FAR.size, 7.0), "variance": None},
+              expected=(Raised(Quality.NO_SIGNAL),)),
+        _case("known shape in 10 far bins", solve=shaped,
+              build=lambda: {"power": _shaped(1.0)["power"][:, -10:], "range": _FAR[-10:],
+                             "shape": _molecules()[-10:], "variance": 1.0},
+              expected=(Honest("background", 1.0),)),
+        _case("mean of profiles, all NaN", build=lambda: {"profiles": gapped}, solve=_mean,
+              expected=(Missing("mean"),)),
+        _case("mean of profiles of which one is there", build=lambda: {"profiles": one_left},
+              solve=_mean, expected=(Near("mean", 3.0, 0.0),
+                                     Near("mean_standard_error", 1.0, 1e-15))),
+        _case("mean of 1e6 profiles", solve=_mean,
+              build=lambda: {"profiles": np.full((1_000_000, 1), 0.1), "variance": 1.0},
+              expected=(Near("mean", 0.1, 1e-10), Near("mean_standard_error", 1e-3, 1e-12))),
+        _case("gluing, 30 MHz at 300 m", build=partial(_channels, 30.0), solve=_glue,
+              expected=(Honest("slope", 2.0, valued=0.9),)),
+        _case("gluing, nothing is bright enough", build=partial(_channels, 0.05), solve=_glue,
+              expected=(Raised(Quality.NO_GLUING), Missing("power"))),
+        _case("gluing of an inverted analog channel", build=partial(_channels, 30.0, -0.5),
+              solve=_glue, expected=(Raised(Quality.NO_GLUING),)),
+        _case("lag of 9 bins", build=lambda: {"shift": 9}, solve=_lag,
+              expected=(Stands(), Near("lag", 9.0, 0.2, relative=False))),
+        _case("lag of channels with independent noise", build=lambda: {"shift": None}, solve=_lag,
+              expected=(Raised(Quality.NO_GLUING),)),
+    )  # fmt: skip
+
+
+def cases() -> tuple[Case, ...]:
+    """Return all of them."""
+    return (*_analog_cases(), *_photon_cases(), *_rest())

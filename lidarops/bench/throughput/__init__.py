@@ -1,0 +1,1 @@
+"""Speed of readers, retrievals, campaigns and archives."""

@@ -1,0 +1,426 @@
+"""What a campaign costs from raw files to report, stage by stage, and how that grows."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from scipy import stats
+
+from lidarops.bench.accuracy.homogeneous_report import facts
+from lidarops.bench.harness.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.timing import Machine, machine
+from lidarops.bench.throughput import orchestration
+from lidarops.campaign.model import Campaign, load
+from lidarops.errors import CampaignError
+from lidarops.figures.charts import Chart, Panel, Series
+from lidarops.figures.wording import percent
+from lidarops.netcdf.write import write_plain
+from lidarops.records import RunRecord
+from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.run import archive
+from lidarops.simulate.campaign import carry_out, plan
+
+_DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
+_INTERVAL: Final = 60
+"""s, of a file."""
+_NOTHING: Final = "-"
+_MILLI: Final = 1e3
+_SHORTEST: Final = 1e-4
+"""s; the clock of a fast machine with little work may not have moved."""
+
+
+class Stage(StrEnum):
+    """Where the time of a campaign goes."""
+
+    SCAN = "scan"
+    READ = "read"
+    RETRIEVE = "retrieve"
+    WRITE = "write"
+    ORCHESTRATION = "orchestration"
+    REPORT = "report"
+    UNCHANGED = "all unchanged"
+
+
+_ABOUT: Final[Mapping[Stage, str]] = {
+    Stage.SCAN: "headers of all files into the catalog",
+    Stage.READ: "digest and header of every file of a scene",
+    Stage.RETRIEVE: "counts to results, with reading the channels",
+    Stage.WRITE: "products as NetCDF",
+    Stage.ORCHESTRATION: "scenes, plans, what is stale, ledger",
+    Stage.REPORT: "page and figures",
+    Stage.UNCHANGED: "a second run, which finds nothing to do",
+}
+_OF_SCENE: Final = {"digest": Stage.READ, "retrieve": Stage.RETRIEVE, "write": Stage.WRITE}
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Of a simulated campaign."""
+
+    scenes: int = 2
+    profiles: int = 30
+    """Files of a scene; 1440 is a multiple of it."""
+    bins: int = 1000
+    angles: int = 0
+    """Directions of a scan; 0 is a horizontal lidar."""
+    retrieved: bool = True
+    """Whether paths are solved, or only their signals kept."""
+
+    @property
+    def files(self) -> int:
+        """Number of raw files."""
+        return self.scenes * self.profiles
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """CPU time of a campaign."""
+
+    size: Size
+    seconds: Mapping[Stage, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """How the CPU time grows with one property of a campaign."""
+
+    along: str
+    costs: tuple[Cost, ...]
+    slopes: Mapping[Stage, tuple[float, float]]
+    """Log-log slope and half of its 95 percent interval, of the time beyond that of a run with
+    nothing to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """The throughput benchmark of the pipeline."""
+
+    date: str
+    machine: Machine
+    growths: tuple[Growth, ...]
+    workers: Mapping[int, float]
+    """Seconds on the wall of a run, by number of worker processes."""
+    ways: tuple[orchestration.Way, ...] = ()
+    """Whole commands, on campaigns of `OF_WAYS`."""
+
+
+_ALONG: Final[Mapping[str, tuple[Size, ...]]] = {
+    "scenes": tuple(Size(scenes=n) for n in (2, 4, 8, 16)),
+    "profiles": tuple(Size(profiles=n) for n in (15, 30, 60, 120)),
+    "bins": tuple(Size(bins=n) for n in (500, 1000, 2000, 4000)),
+    "angles": tuple(Size(angles=n, profiles=120, bins=2000) for n in (5, 9, 17)),
+}
+_QUICK: Final[Mapping[str, tuple[Size, ...]]] = {
+    name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
+}
+_OF_WORKERS: Final = Size(scenes=16, profiles=60)
+OF_WAYS: Final = (Size(scenes=16), Size(scenes=128))
+
+
+def run(kind: Kind, *, effort: Effort) -> Finding:
+    """Run the benchmark of the pipeline.
+
+    Raises
+    ------
+    CampaignError
+        Where its accuracy is asked for.
+    """
+    if kind is not Kind.THROUGHPUT:
+        raise CampaignError("the pipeline has no accuracy benchmark", remedy="choose throughput")
+    found = measure(quick=effort.quick, date=effort.date, progress=effort.progress)
+    return Finding(found, report(found, RESULT))
+
+
+def measure(
+    *,
+    quick: bool = False,
+    date: str = "",
+    along: Mapping[str, Sequence[Size]] | None = None,
+    workers: Sequence[int] | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> Pipeline:
+    """Simulate campaigns of several sizes in a temporary folder, and reprocess them.
+
+    Parameters
+    ----------
+    quick : bool
+        Fewer and smaller campaigns, one worker.
+    date : str
+        When it is run, as it is to be stated.
+    along : mapping of str to sequence of Size, optional
+        What is varied, and how; at least 2 sizes each.
+    workers : sequence of int, optional
+        Numbers of processes to compare.
+    progress : callable
+        Is given 1 after each campaign.
+    """
+    growths = []
+    # The first campaign of a process pays for what is compiled and imported.
+    _cost(Size(scenes=1, profiles=15), progress)
+    for name, sizes in (along or (_QUICK if quick else _ALONG)).items():
+        costs = tuple(_cost(size, progress) for size in sizes)
+        growths.append(Growth(name, costs, dict(_slopes(name, costs))))
+    counts = workers if workers is not None else (() if quick else (1, 2))
+    times = {count: _wall(count, progress) for count in counts}
+    ways = _ways(progress) if workers is None and not quick else ()
+    return Pipeline(date, machine(), tuple(growths), times, ways)
+
+
+def _cost(size: Size, progress: Callable[[int], object]) -> Cost:
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        campaign = simulated(size, Path(folder))
+        seconds = {Stage.SCAN: _timed(lambda: archive.update_catalog(campaign))}
+        begin, started = time.process_time(), time.perf_counter()
+        record = archive.reprocess(campaign)
+        whole, lasted = time.process_time() - begin, time.perf_counter() - started
+        if record is None:
+            raise CampaignError("the simulated campaign gives nothing to do", field="simulation")
+        seconds |= _parts(record, whole, lasted)
+        seconds[Stage.REPORT] = _timed(lambda: archive.report_run(campaign, record))
+        seconds[Stage.UNCHANGED] = _timed(lambda: archive.reprocess(campaign))
+    progress(1)
+    return Cost(size, seconds)
+
+
+def _parts(record: RunRecord, whole: float, lasted: float) -> dict[Stage, float]:
+    """Share the CPU time of a run among its stages as its time on the wall is shared."""
+    laps = dict.fromkeys(_OF_SCENE.values(), 0.0)
+    for outcome in record.scenes:
+        for name, lap in outcome.seconds.items():
+            if name in _OF_SCENE:
+                laps[_OF_SCENE[name]] += lap
+    laps[Stage.ORCHESTRATION] = lasted - sum(laps.values())
+    return {stage: max(whole * lap / lasted, _SHORTEST) for stage, lap in laps.items()}
+
+
+def _wall(workers: int, progress: Callable[[int], object]) -> float:
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        campaign = simulated(_OF_WORKERS, Path(folder))
+        archive.update_catalog(campaign)
+        begin = time.perf_counter()
+        archive.reprocess(campaign, options=archive.Options(workers=workers))
+        seconds = time.perf_counter() - begin
+    progress(1)
+    return seconds
+
+
+def _ways(progress: Callable[[int], object]) -> tuple[orchestration.Way, ...]:
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        files = []
+        for size in OF_WAYS:
+            place = Path(folder) / str(size.scenes)
+            place.mkdir()
+            simulated(size, place)
+            files.append(place / CAMPAIGN_FILE)
+        found = orchestration.measure(files)
+    progress(1)
+    return found
+
+
+def _timed(call: Callable[[], object]) -> float:
+    begin = time.process_time()
+    call()
+    return max(time.process_time() - begin, _SHORTEST)
+
+
+def simulated(size: Size, folder: Path) -> Campaign:
+    """Write the raw files of a campaign of this size.
+
+    Returns
+    -------
+    Campaign
+        With products of all profiles.
+    """
+    path = folder / CAMPAIGN_FILE
+    path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
+    campaign = load(path)
+    written = carry_out(plan(campaign))
+    write_plain(written.truth, campaign.truth_path)
+    return campaign
+
+
+def _settings(size: Size) -> dict[str, Any]:
+    scans = size.angles > 0
+    channel = "photon_532o"
+    products: dict[str, Any] = {"signal": {}}
+    if scans:
+        products["multiangle"] = {"channels": [channel], "highest": 6000, "step": 60}
+    elif size.retrieved:
+        products["homogeneous"] = {
+            "channels": [channel],
+            "sections": [[750, 0.9 * 7.5 * size.bins]],
+        }
+    known = {"full_overlap_range": 300, "channels": {channel: {"dead_time": 3e-9}}}
+    return {
+        "name": "measured",
+        "title": "Campaign of a benchmark",
+        "archive": "raw",
+        "output": "out",
+        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
+        "instruments": {
+            "lidar": {
+                "station": "here",
+                "files": "here/h*",
+                "facts": [known if scans else known | {"zenith_angle": 90}],
+                "products": products,
+            }
+        },
+        "scenes": {"window": f"{size.profiles}min"},
+        "simulation": {
+            "seed": 7,
+            "start": _DAY,
+            "duration": size.files * _INTERVAL,
+            "instruments": {"lidar": _scanning(size) if scans else _level(size)},
+        },
+    }
+
+
+def _level(size: Size) -> dict[str, Any]:
+    return {
+        "kind": "horizontal",
+        "aerosol_extinction": {"minimum": 5e-5, "maximum": 2e-4, "hour_of_maximum": 18},
+        "aerosol": {"lidar_ratio": 50},
+    } | _recorded(size)
+
+
+def _scanning(size: Size) -> dict[str, Any]:
+    angles = np.degrees(np.arccos(1.0 / np.linspace(1.0, 4.0, size.angles)))
+    return {
+        "kind": "lidar",
+        "atmosphere": {
+            "boundary_layer": {
+                "extinction": 1.5e-4,
+                "height": {"minimum": 600, "maximum": 1500, "hour_of_maximum": 14},
+                "aerosol": {"lidar_ratio": 50, "angstrom_exponent": 1.2},
+            }
+        },
+        "scan": {"zenith_angles": [round(float(angle), 1) for angle in angles], "azimuth": 90},
+    } | _recorded(size)
+
+
+def _recorded(size: Size) -> dict[str, Any]:
+    return {
+        "acquisition": {
+            "interval": _INTERVAL,
+            "shots": 1000,
+            "repetition_rate": 20,
+            "bins": size.bins,
+        },
+        "detectors": [
+            {
+                "wavelength": 532,
+                "signal_rate": 5.0,
+                "background": {"night": 0.05, "day": 0.5},
+                "photon": {},
+            }
+        ],
+    }
+
+
+def _slopes(along: str, costs: Sequence[Cost]) -> Iterator[tuple[Stage, tuple[float, float]]]:
+    sizes = [getattr(cost.size, along) for cost in costs]
+    for stage in Stage:
+        seconds = [cost.seconds[stage] for cost in costs]
+        fit = stats.linregress(np.log(sizes), np.log(seconds))
+        half = stats.t.ppf(0.975, len(sizes) - 2) * fit.stderr if len(sizes) > 2 else math.inf
+        yield stage, (float(fit.slope), float(half) if math.isfinite(half) else 0.0)
+
+
+# Page -----------------------------------------------------------------------------------------
+
+
+def report(found: Pipeline, data: str = "") -> Report:
+    """Return the page of the benchmark."""
+    return Report(
+        title="Pipeline: cost of a campaign",
+        facts=facts(found.date, found.machine),
+        parts=tuple(_parts_of_page(found)),
+        data=data,
+    )
+
+
+def _parts_of_page(found: Pipeline) -> Iterator[Part]:
+    yield _stages(found)
+    if found.workers:
+        yield _workers(found)
+    if found.ways:
+        yield orchestration.part(found.ways, [size.scenes for size in OF_WAYS])
+
+
+def _stages(found: Pipeline) -> Part:
+    return Part(
+        title="Cost of each stage, and how it grows",
+        text="Simulated campaigns of one lidar, from raw files on disk to products and report, "
+        "in one process. CPU time; that of a run is shared among its stages as its time on the "
+        "wall is. Slope: of the logarithm of time over that of the size, with "
+        "its 95 % interval; 1 is linear.",
+        charts=(
+            Chart(
+                name="growth",
+                title="CPU time of a campaign",
+                caption="One line a stage; a slope of 1 means a constant cost each.",
+                panels=tuple(_panel(growth) for growth in found.growths),
+            ),
+        ),
+        tables=tuple(_table(growth) for growth in found.growths),
+    )
+
+
+def _panel(growth: Growth) -> Panel:
+    sizes = tuple(float(getattr(cost.size, growth.along)) for cost in growth.costs)
+    return Panel(
+        title=growth.along,
+        x_label=f"number of {growth.along}",
+        y_label="CPU time (s)",
+        series=tuple(
+            Series(stage, sizes, tuple(cost.seconds[stage] for cost in growth.costs), joined=True)
+            for stage in Stage
+        ),
+    )
+
+
+def _table(growth: Growth) -> Table:
+    largest = growth.costs[-1]
+    total = sum(largest.seconds[stage] for stage in Stage if stage is not Stage.UNCHANGED)
+    rows = []
+    for stage in Stage:
+        slope, half = growth.slopes[stage]
+        seconds = largest.seconds[stage]
+        share = _NOTHING if stage is Stage.UNCHANGED else percent(seconds / total)
+        each = f"{_MILLI * seconds / largest.size.files:.3g}"
+        told = f"{slope:.2f} ± {half:.2f}"
+        rows.append((stage.value, _ABOUT[stage], f"{seconds:.3g}", share, each, told))
+    size = largest.size
+    return Table(
+        title=f"By number of {growth.along}; times at {getattr(size, growth.along)}",
+        columns=("stage", "what", "CPU s", "share", "ms a file", "slope"),
+        rows=tuple(rows),
+        note=f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
+        + (f", {size.angles} directions." if size.angles else "."),
+    )
+
+
+def _workers(found: Pipeline) -> Part:
+    one = found.workers.get(1)
+    rows = tuple(
+        (f"{count}", f"{seconds:.1f}", f"{one / seconds:.2f}" if one else _NOTHING)
+        for count, seconds in found.workers.items()
+    )
+    size = _OF_WORKERS
+    table = Table(
+        title="Time on the wall by number of processes",
+        columns=("processes", "s", "times one"),
+        rows=rows,
+        note=f"{size.scenes} scenes of {size.profiles} files; with the start of the processes.",
+    )
+    return Part(title="Processes", text="The same campaign on one machine.", tables=(table,))

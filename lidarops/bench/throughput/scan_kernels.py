@@ -1,0 +1,126 @@
+"""How fast the kernels and methods for scans are, beside reading their inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from lidarops.bench.accuracy import multiangle_cases as cases
+from lidarops.bench.accuracy.multiangle_cases import Scan
+from lidarops.bench.harness.timing import Machine, least_times, machine
+from lidarops.bench.throughput.retrievals import READ, Cost
+from lidarops.retrieve.multiangle import _block, slant_paths
+from lidarops.retrieve.multiangle import _kano_hamilton as kh
+from lidarops.retrieve.multiangle.vertical import smooth_profile
+
+RAYS: Final = "make_rays"
+"""Logarithms, their variances and how far the rays reach."""
+REGRESS: Final = "regress"
+"""The weighted fit of all altitudes with its scatter, without outliers."""
+SMOOTH: Final = "vertical.smooth"
+INPUTS: Final = "read (np.max), signal and variance"
+_BATCHES: Final = (1, 64, 512)
+_QUICK_BATCHES: Final = (1, 64)
+_REPEATS: Final = 5
+_QUICK_REPEATS: Final = 3
+_FEW: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class MultiAngleThroughput:
+    """The throughput benchmark of scans."""
+
+    date: str
+    machine: Machine
+    angles: int
+    altitudes: int
+    costs: tuple[Cost, ...]
+
+
+def measure_throughput(
+    *,
+    quick: bool = False,
+    date: str = "",
+    batches: Sequence[int] | None = None,
+    repeats: int | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> MultiAngleThroughput:
+    """Time kernels, methods and peers on clear air, beside reading the inputs.
+
+    Parameters
+    ----------
+    quick : bool
+        Fewer profiles and repeats.
+    date : str
+        When it is run, as it is to be stated.
+    batches : sequence of int, optional
+        Profiles of one call.
+    repeats : int, optional
+        Counted rounds, of which the least time counts.
+    progress : callable
+        Is given 1 after each batch.
+    """
+    scene = cases.clear(3000.0)
+    costs: list[Cost] = []
+    for batch in batches or (_QUICK_BATCHES if quick else _BATCHES):
+        rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
+        costs += _costs(scene.draw(batch, batch, 8), rounds)
+        progress(1)
+    angles, altitudes = scene.path.size, scene.altitude.size
+    return MultiAngleThroughput(date, machine(), angles, altitudes, tuple(costs))
+
+
+def _costs(scan: Scan, repeats: int) -> Iterator[Cost]:
+    batch = len(scan.signal)
+    # As a caller holds it: an array, not a view of one row.
+    scan = Scan(scan.scene, scan.signal, np.ascontiguousarray(scan.variance))
+    few = min(batch, _FEW)
+    ours = _kernels(scan)
+    ours |= {name: partial(way, scan) for name, way in cases.ways().items()}
+    ours |= {
+        f"{method}, plain": partial(cases.retrieve, scan, method, robust=False)
+        for method in (cases.KANO_HAMILTON, cases.JOINT)
+    }
+    others = {name: partial(way, scan.first(few)) for name, way in cases.peers().items()}
+    reads: dict[str, Callable[[], object]] = {
+        READ: lambda: np.max(scan.signal),
+        INPUTS: lambda: (np.max(scan.signal), np.max(scan.variance)),
+    }
+    times = least_times({**reads, **ours, **others}, repeats)
+    read = times[READ] / batch
+    for name, seconds in times.items():
+        got = few if name in others else batch
+        each = seconds / got
+        yield Cost(name, batch, got, 1e9 * each, each / read, name in ours)
+
+
+def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:
+    scene = scan.scene
+    geometry = slant_paths.make_scan(scene.zenith_angle, scene.altitude, None)
+    rays = _block.make_rays(scan.signal, scan.variance, geometry)
+    fit = _block.regress(rays, inhomogeneity=None, robust=False)
+    share = fit.column(kh.SHARE) * fit.inhomogeneity
+    residuals = smooth_profile.residual_moments(
+        fit.residual,
+        np.where(np.isfinite(fit.residual), _block.weights_of(rays, fit), 0.0),
+        np.nan_to_num(fit.leverage, nan=1.0),
+        np.broadcast_to(fit.inhomogeneity, share.shape),
+        np.nan_to_num(share),
+    )
+    smooth = partial(
+        smooth_profile.smooth,
+        fit.column(kh.TAU),
+        fit.column(kh.INFORMATION),
+        scene.altitude,
+        station_altitude=0.0,
+        residuals=residuals,
+    )
+    return {
+        RAYS: lambda: _block.make_rays(scan.signal, scan.variance, geometry),
+        REGRESS: lambda: _block.regress(rays, inhomogeneity=None, robust=False),
+        SMOOTH: smooth,
+    }

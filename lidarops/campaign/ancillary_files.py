@@ -1,0 +1,280 @@
+"""Files that are not raw data: soundings and overlap functions, as CSV or NetCDF.
+
+Both hold columns by name. A unit stands in brackets behind the name of a CSV column
+(``pressure [hPa]``) or in the attribute ``units`` of a NetCDF variable; SI where there is none.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.errors import AncillaryError, RetrievalInputError
+from lidarops.records import InputRecord, Plan, Role
+from lidarops.retrieve.air.molecular import MolecularProfile
+
+Array = npt.NDArray[np.float64]
+
+_SCALE: Final[Mapping[str, Mapping[str, float]]] = {
+    "altitude": {"m": 1.0, "km": 1000.0},
+    "range": {"m": 1.0, "km": 1000.0},
+    "pressure": {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0},
+    "temperature": {"K": 1.0, "degC": 1.0},
+    "overlap": {"1": 1.0},
+}
+_FULL: Final = 0.95
+"""Overlap that counts as full."""
+_SHORTEST: Final = 30.0
+"""m, at which no overlap is complete yet."""
+_WIDEST: Final = 5000.0
+"""m between levels of a sounding, below 20 km: temperature is no straight line over more."""
+_ZERO_CELSIUS: Final = 273.15
+_LARGEST: Final = 100_000_000
+"""Bytes; a profile is small."""
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """The overlap function of a lidar."""
+
+    range: Array
+    """m, rising."""
+    overlap: Array
+    """Share of the beam that the telescope sees, above 0 and at most 1."""
+
+    def at(self, range: Array) -> Array:  # noqa: A002 - the field's word
+        """Return the overlap at ranges (m): linear between, NaN before the first, 1 beyond."""
+        found = np.interp(range, self.range, self.overlap, left=np.nan)
+        return np.where(range > self.range[-1], 1.0, found)
+
+
+@dataclass(frozen=True, slots=True)
+class Ancillaries:
+    """The files besides raw data that one scene uses, read once."""
+
+    profiles: Mapping[str, MolecularProfile]
+    overlaps: Mapping[str, Overlap]
+    inputs: tuple[InputRecord, ...]
+    """By name."""
+
+    @classmethod
+    def read(cls, folder: Path, plan: Plan) -> Self:
+        """Read what the steps of a plan name.
+
+        Parameters
+        ----------
+        folder : Path
+            Of the campaign file.
+        plan : Plan
+
+        Raises
+        ------
+        AncillaryError
+            If a file cannot be used.
+        """
+        profiles, overlaps, inputs = {}, {}, {}
+        for step in plan.steps:
+            source = step.settings.get("molecular_profile")
+            if source and source not in profiles:
+                profiles[source], digest = molecular_profile(folder, source)
+                inputs[source] = InputRecord(source, Role.MOLECULAR, digest)
+            source = step.settings.get("overlap_profile")
+            if source and source not in overlaps:
+                overlaps[source], digest = overlap_profile(folder, source)
+                inputs[source] = InputRecord(source, Role.OVERLAP, digest)
+        return cls(profiles, overlaps, tuple(inputs[name] for name in sorted(inputs)))
+
+
+def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
+    """Return pressure and temperature of the air from a sounding or model profile.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the campaign file.
+    name : str
+        Path below it, of a file with the columns ``altitude`` (m above mean sea level, rising),
+        ``pressure`` (Pa; hPa where its size or unit says so) and ``temperature`` (K). One that
+        ends in ``.nc`` is NetCDF.
+
+    Returns
+    -------
+    MolecularProfile
+    str
+        sha256 of the file.
+
+    Raises
+    ------
+    AncillaryError
+        Naming the file, where it is no such profile: columns missing, not numbers, wrong units.
+    """
+    content = _read(folder, name)
+    names = ("altitude", "pressure", "temperature")
+    columns, told = _columns(content, folder, name, names)
+    try:
+        profile = MolecularProfile.from_profile(
+            *(columns[each] for each in names),
+            pressure_unit="Pa" if "pressure" in told else None,
+        )
+    except RetrievalInputError as error:
+        problem, field, remedy = error.problem, error.field, error.remedy
+        raise AncillaryError(problem, file=name, field=field, remedy=remedy) from error
+    low = profile.altitude[:-1] < 20_000.0
+    widest = float(np.max(np.diff(profile.altitude)[low], initial=0.0))
+    if widest > _WIDEST:
+        raise AncillaryError(
+            f"has levels {widest:g} m apart",
+            file=name,
+            field="altitude",
+            remedy=f"give levels at most {_WIDEST:g} m apart",
+        )
+    return profile, hashlib.sha256(content).hexdigest()
+
+
+def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
+    """Return the overlap function of a file, and the sha256 of the file.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the campaign file.
+    name : str
+        Path below it, of a file with the columns ``range`` (m, rising) and ``overlap`` (above
+        0, at most 1). One that ends in ``.nc`` is NetCDF.
+
+    Raises
+    ------
+    AncillaryError
+        Naming the file, where it is no overlap function.
+    """
+    content = _read(folder, name)
+    columns, _ = _columns(content, folder, name, ("range", "overlap"))
+    ranges, overlap = columns["range"], columns["overlap"]
+    if ranges.size != overlap.size or ranges.size < 2 or not np.all(np.diff(ranges) > 0):
+        raise AncillaryError(
+            f"does not rise over {overlap.size} values of overlap",
+            file=name,
+            field="range",
+            remedy="sort the rows",
+        )
+    if not np.all((overlap > 0) & (overlap <= 1.0)):
+        raise AncillaryError(
+            f"reaches from {overlap.min():g} to {overlap.max():g}",
+            file=name,
+            field="overlap",
+            remedy="give shares above 0 and at most 1; leave out ranges without overlap",
+        )
+    if ranges[-1] < _SHORTEST:
+        raise AncillaryError(
+            f"ends at {ranges[-1]:g} m",
+            file=name,
+            field="range",
+            remedy="this looks like km: give m",
+        )
+    if overlap[-1] < _FULL:
+        raise AncillaryError(
+            f"ends at {overlap[-1]:g}, beyond which it is taken as 1",
+            file=name,
+            field="overlap",
+            remedy="continue it to full overlap",
+        )
+    return Overlap(ranges, overlap), hashlib.sha256(content).hexdigest()
+
+
+def _read(folder: Path, name: str) -> bytes:
+    path = folder / name
+    try:
+        inside = path.resolve().is_relative_to(folder.resolve())
+        small = inside and path.stat().st_size <= _LARGEST
+        if small:
+            return path.read_bytes()
+    # RuntimeError: a loop of links; ValueError: a name that no file can have.
+    except (OSError, RuntimeError, ValueError) as error:
+        raise AncillaryError(
+            f"cannot be read: {getattr(error, 'strerror', None) or error}",
+            file=name,
+            remedy="put it beside the campaign file, or correct its name there",
+        ) from error
+    outside = "lies outside the folder of the campaign file"
+    problem = "is larger than any profile" if inside else outside
+    raise AncillaryError(problem, file=name)
+
+
+def _columns(
+    content: bytes, folder: Path, file: str, names: tuple[str, ...]
+) -> tuple[dict[str, Array], frozenset[str]]:
+    """Return the columns in SI units, and the names of those whose unit was told."""
+    found = _netcdf(folder / file, file) if file.lower().endswith(".nc") else _csv(content, file)
+    columns = {}
+    for name in names:
+        if name not in found:
+            raise AncillaryError(
+                f"has no column {name!r}, only {', '.join(found) or 'none'}", file=file
+            )
+        unit, values = found[name]
+        scale = _SCALE[name].get(unit or next(iter(_SCALE[name])))
+        if scale is None:
+            raise AncillaryError(
+                f"is in {unit!r}", file=file, field=name, remedy=f"use {', '.join(_SCALE[name])}"
+            )
+        if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
+            raise AncillaryError("is not a column of finite numbers", file=file, field=name)
+        columns[name] = values * scale + (_ZERO_CELSIUS if unit == "degC" else 0.0)
+    return columns, frozenset(name for name in names if found[name][0])
+
+
+def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise AncillaryError("is not text", file=file) from error
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        rows = list(csv.reader(io.StringIO("\n".join(lines)), skipinitialspace=True))
+    except csv.Error as error:
+        raise AncillaryError(f"is no table: {error}", file=file) from error
+    if len(rows) < 2:
+        raise AncillaryError("holds no rows", file=file)
+    head, *body = rows
+    names = [title.partition("[")[0].strip().lower() for title in head]
+    for name in names:
+        if names.count(name) > 1:
+            raise AncillaryError(f"has more than one column {name!r}", file=file)
+    columns: dict[str, list[float]] = {title: [] for title in head}
+    for number, row in enumerate(body, start=2):
+        if len(row) != len(head):
+            raise AncillaryError(
+                f"row {number} has {len(row)} values for {len(head)} columns", file=file
+            )
+        for title, cell in zip(head, row, strict=True):
+            try:
+                columns[title].append(float(cell))
+            except ValueError:
+                # Columns that nobody asks for may hold anything.
+                columns[title].append(np.nan)
+    return {
+        name.strip().lower(): (unit.rstrip("] ").strip(), np.array(columns[title]))
+        for title in head
+        for name, _, unit in [title.partition("[")]
+    }
+
+
+def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
+    try:
+        with xr.open_dataset(path, decode_times=False) as opened:
+            return {
+                str(name): (str(variable.attrs.get("units", "")), variable.values.astype(float))
+                for name, variable in opened.variables.items()
+                if variable.dtype.kind in "iuf"
+            }
+    except (OSError, ValueError, RuntimeError, TypeError) as error:
+        raise AncillaryError("is not NetCDF that can be read", file=file) from error

@@ -1,0 +1,171 @@
+"""What a campaign file says of the air that simulated lidars look at.
+
+Extinction of particles is given in m-1 at 532 nm. Heights are metres above the ground of the
+origin, places metres east and north of it.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from lidarops.campaign.simulation_base import (
+    Azimuth,
+    DiurnalCourse,
+    Extinction,
+    Length,
+    Metres,
+    Model,
+    NotNegative,
+    Period,
+)
+
+
+class Aerosol(Model):
+    """Optical properties that aerosol keeps."""
+
+    lidar_ratio: float = Field(default=50.0, ge=5, le=150, description="sr")
+    angstrom_exponent: float = Field(default=1.3, ge=-1, le=4, description="of extinction")
+
+
+class BoundaryLayer(Model):
+    """Aerosol that is well mixed from the ground to a top that follows the sun."""
+
+    aerosol: Aerosol = Aerosol()
+    extinction: NotNegative = Field(default=1.0e-4, le=0.1, description="m-1 at 532 nm")
+    height: DiurnalCourse = DiurnalCourse(minimum=500.0, maximum=1600.0, hour_of_maximum=14.0)
+    """m above the ground"""
+    entrainment_depth: float = Field(default=100.0, gt=0, le=2000, description="m")
+
+
+class Layer(Period):
+    """An elevated layer of Gaussian shape, present for part of the time."""
+
+    name: str
+    aerosol: Aerosol = Aerosol()
+    extinction: float = Field(gt=0, le=1.0, description="m-1 at 532 nm at the centre")
+    height: float = Field(gt=0, le=30_000, description="m above the ground, of the centre")
+    depth: float = Field(gt=0, le=10_000, description="m, standard deviation of the Gaussian")
+
+
+class Cloud(Period):
+    """A layer of constant extinction between a sharp base and top, for part of the time."""
+
+    name: str = "cloud"
+    extinction: Extinction = Field(gt=0, description="m-1, the same at every wavelength")
+    base: float = Field(ge=0, le=30_000, description="m above the ground")
+    top: float = Field(gt=0, le=30_000, description="m above the ground")
+    lidar_ratio: float = Field(default=18.8, ge=5, le=150, description="sr; 18.8: water")
+
+    @model_validator(mode="after")
+    def _upright(self) -> Self:
+        if self.top <= self.base:
+            raise ValueError("top must be higher than base")
+        return self
+
+
+class Gradient(Model):
+    """Aerosol that changes along a horizontal direction.
+
+    Its extinction at the origin times exp(distance / scale), towards `azimuth`.
+    """
+
+    aerosol: Aerosol = Aerosol()
+    extinction: Extinction = Field(gt=0, description="m-1 at 532 nm, at the origin")
+    azimuth: Azimuth = Field(default=90.0, description="degree, towards which it grows")
+    scale: Length = Field(description="m over which it grows by a factor e")
+    top: Length = Field(default=1e5, description="m above the ground, up to which it reaches")
+
+
+class Plume(Model):
+    """A Gaussian cloud of aerosol that the wind carries."""
+
+    aerosol: Aerosol = Aerosol()
+    extinction: Extinction = Field(gt=0, description="m-1 at 532 nm, at the centre")
+    east: Metres = Field(default=0.0, description="m, of the centre at the start")
+    north: Metres = Field(default=0.0, description="m, of the centre at the start")
+    height: NotNegative = Field(default=0.0, description="m above the ground, of the centre")
+    horizontal_depth: Length = Field(description="m, standard deviation")
+    vertical_depth: Length = Field(description="m, standard deviation")
+    wind_east: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
+    wind_north: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
+
+
+class Turbulence(Model):
+    """A log-normal factor on the aerosol, random in space and carried by the wind."""
+
+    deviation: float = Field(gt=0, le=3, description="standard deviation of the logarithm")
+    horizontal_length: Length = Field(description="m, correlation length")
+    vertical_length: Length = Field(description="m, correlation length")
+    wind_east: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
+    wind_north: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
+
+
+class Profile(Model):
+    """Aerosol extinction at given heights, linear between them and zero above the last."""
+
+    aerosol: Aerosol = Aerosol()
+    height: list[NotNegative] = Field(min_length=2, description="m above the ground, rising")
+    extinction: list[Extinction] = Field(min_length=2, description="m-1 at 532 nm")
+
+    @model_validator(mode="after")
+    def _rises(self) -> Self:
+        if len(self.height) != len(self.extinction):
+            raise ValueError("height and extinction need as many values")
+        if any(upper <= lower for lower, upper in pairwise(self.height)):
+            raise ValueError("height must rise")
+        return self
+
+
+class Sounding(Model):
+    """Pressure and temperature of the air, in place of the US Standard Atmosphere."""
+
+    altitude: list[float] = Field(min_length=2, description="m above mean sea level, rising")
+    pressure: list[float] = Field(min_length=2, description="Pa")
+    temperature: list[float] = Field(min_length=2, description="K")
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if not len(self.altitude) == len(self.pressure) == len(self.temperature):
+            raise ValueError("altitude, pressure and temperature need as many values")
+        if any(upper <= lower for lower, upper in pairwise(self.altitude)):
+            raise ValueError("altitude must rise")
+        if not all(1e-3 <= p <= 1.2e5 for p in self.pressure):
+            raise ValueError("pressure is in Pa: 101325, not 1013.25")
+        if not all(100 <= t <= 350 for t in self.temperature):
+            raise ValueError("temperature is in K: 288.15, not 15")
+        return self
+
+
+class Homogeneous(Model):
+    """Aerosol that is the same everywhere, and follows the hour of the day."""
+
+    aerosol: Aerosol = Aerosol()
+    extinction: DiurnalCourse = Field(description="m-1 at 532 nm")
+    molecules_constant: bool = Field(
+        default=False,
+        description="whether molecules are everywhere as dense as at the origin, so that the air"
+        " is homogeneous at any height",
+    )
+
+    @model_validator(mode="after")
+    def _is_air(self) -> Self:
+        if self.extinction.maximum > 1.0:
+            raise ValueError("extinction is in m-1: 1e-4 is 0.1 per km")
+        return self
+
+
+class AtmosphereSettings(Model):
+    """The air: molecules, and the sum of what is given here."""
+
+    homogeneous: Homogeneous | None = None
+    boundary_layer: BoundaryLayer | None = None
+    layers: tuple[Layer, ...] = ()
+    clouds: tuple[Cloud, ...] = ()
+    gradients: tuple[Gradient, ...] = ()
+    plumes: tuple[Plume, ...] = ()
+    profiles: tuple[Profile, ...] = ()
+    turbulence: Turbulence | None = None
+    sounding: Sounding | None = None

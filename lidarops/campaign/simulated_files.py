@@ -1,0 +1,241 @@
+"""What a campaign file says of how simulated raw files are taken, headed and damaged."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from enum import StrEnum
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from lidarops.campaign.simulation_base import Azimuth, BinWidth, Instant, Model, Period
+
+DialectName = Literal["licel", "manaus", "saopaulo", "pilar", "golmud"]
+
+
+class Handling(StrEnum):
+    """What a correct chain does with a file."""
+
+    KEEP = "keep"
+    """Use it: it is odd, and all right."""
+    FLAG = "flag"
+    """Use it, and flag what it spoils."""
+    SET_ASIDE = "set_aside"
+    """Use one of the two files that hold the same."""
+    REFUSE = "refuse"
+    """Refuse it, with the reason."""
+
+
+class DamageKind(StrEnum):
+    """What is wrong with a simulated file."""
+
+    TRUNCATED = "truncated"
+    EMPTY = "empty"
+    GARBAGE = "garbage"
+    NEGATIVE_BINS = "negative_bins"
+    TOO_MANY_BINS = "too_many_bins"
+    IMPOSSIBLE_POSITION = "impossible_position"
+    FOREIGN = "foreign"
+    SURPLUS = "surplus"
+    NO_FINAL_NEWLINE = "no_final_newline"
+    GLITCH = "glitch"
+    DEAD_PHOTON = "dead_photon"
+    LONG_SITE = "long_site"
+    BLANK_SITE = "blank_site"
+    ZENITH_MINUS_90 = "zenith_minus_90"
+    WIDE_LINE = "wide_line"
+    DECIMAL_COMMA = "decimal_comma"
+    SATURATION = "saturation"
+    ZERO_SHOTS = "zero_shots"
+    RENAMED = "renamed"
+    ZERO_VOLTAGE = "zero_voltage"
+    LARGEST_INTEGER = "largest_integer"
+    DUPLICATE = "duplicate"
+
+    @property
+    def handling(self) -> Handling:
+        """What a correct chain does with the file."""
+        return _HANDLING.get(self, Handling.KEEP)
+
+    @property
+    def refused(self) -> bool:
+        """Whether a correct reader must refuse the file."""
+        return self.handling is Handling.REFUSE
+
+
+_HANDLING = {
+    **dict.fromkeys(
+        (
+            DamageKind.TRUNCATED,
+            DamageKind.EMPTY,
+            DamageKind.GARBAGE,
+            DamageKind.NEGATIVE_BINS,
+            DamageKind.TOO_MANY_BINS,
+            DamageKind.IMPOSSIBLE_POSITION,
+            DamageKind.FOREIGN,
+            DamageKind.SURPLUS,
+        ),
+        Handling.REFUSE,
+    ),
+    **dict.fromkeys(
+        (
+            DamageKind.GLITCH,
+            DamageKind.DEAD_PHOTON,
+            DamageKind.SATURATION,
+            DamageKind.ZERO_SHOTS,
+            DamageKind.LARGEST_INTEGER,
+        ),
+        Handling.FLAG,
+    ),
+    DamageKind.DUPLICATE: Handling.SET_ASIDE,
+}
+
+
+class Damage(Model):
+    """One file to be damaged."""
+
+    kind: DamageKind
+    index: int = Field(ge=0, description="which signal file of the instrument, from 0")
+
+
+class RandomDamage(Model):
+    """Damage to files that the seed of the simulation chooses."""
+
+    fraction: float = Field(gt=0, le=1, description="of the signal files")
+    kinds: list[DamageKind] = Field(min_length=1)
+
+
+class Pointing(Model):
+    """Where the beam goes: the zenith angles of one cycle, one file each, again and again."""
+
+    zenith_angles: list[Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]] = Field(
+        min_length=1, description="degree, 0 = up"
+    )
+    azimuth: Azimuth = Field(default=0.0, description="degree, clockwise from north")
+    two_sided: bool = Field(
+        default=False,
+        description="whether the scan starts on the other side of the zenith (azimuth + 180) and"
+        " comes over it",
+    )
+
+    @model_validator(mode="after")
+    def _headers_can_say_it(self) -> Self:
+        if any(round(value, 1) != value for value in (*self.zenith_angles, self.azimuth)):
+            raise ValueError("zenith_angles and azimuth have one decimal in the headers")
+        if len(set(self.zenith_angles)) < len(self.zenith_angles):
+            raise ValueError("a zenith angle stands twice in one cycle")
+        return self
+
+    def cycle(self) -> tuple[tuple[float, float], ...]:
+        """Return zenith angle and azimuth of every file of one cycle."""
+        this_side = [(zenith, self.azimuth) for zenith in self.zenith_angles]
+        if not self.two_sided:
+            return tuple(this_side)
+        opposite = round((self.azimuth + 180.0) % 360.0, 1)
+        tilted = sorted((zenith for zenith in self.zenith_angles if zenith % 180.0), reverse=True)
+        return (*((zenith, opposite) for zenith in tilted), *sorted(this_side))
+
+
+class ClockJump(Model):
+    """From a moment on the clock of the computer is off by a number of seconds."""
+
+    at: Instant = Field(description="true time")
+    offset: int = Field(ge=-86400, le=86400, description="s, clock minus true time")
+
+
+class Change(Model):
+    """From a moment on files are taken in another way."""
+
+    at: Instant
+    bins: int | None = Field(default=None, ge=16, le=16_384)
+    bin_width: BinWidth | None = Field(default=None, description="m")
+    shots: int | None = Field(default=None, ge=1, le=999_999)
+
+
+class Acquisition(Model):
+    """How an instrument takes its files."""
+
+    interval: float = Field(default=300.0, ge=1, le=86400, description="s from start to start")
+    shots: int = Field(default=600, ge=1, le=999_999, description="laser shots in a file")
+    repetition_rate: float = Field(default=10.0, gt=0, le=10_000, description="Hz")
+    bins: int = Field(default=2000, ge=16, le=16_384)
+    bin_width: BinWidth = Field(default=7.5, description="m")
+    dark_files: int = Field(
+        default=0,
+        ge=0,
+        le=100,
+        description="with the telescope covered: one half before the first file, one half after",
+    )
+    dialect: DialectName = Field(default="licel", description="whose headers the files have")
+    signs_lost: bool = Field(
+        default=False, description="whether headers lack the minus signs of the position"
+    )
+    gaps: tuple[Period, ...] = Field(default=(), description="when nothing was measured")
+    clock: tuple[ClockJump, ...] = Field(default=(), description="jumps of the clock, in order")
+    changes: tuple[Change, ...] = Field(default=(), description="of bins and shots, in order")
+
+    @property
+    def duration(self) -> float:
+        """Duration of a file, s; where the first shot falls on its start, from that shot on."""
+        rate = self.repetition_rate
+        return (self.shots - 1) / rate if self.shots % rate == 1 else self.shots / rate
+
+    @model_validator(mode="after")
+    def _headers_can_say_it(self) -> Self:
+        if self.interval % 1 or self.duration % 1:
+            raise ValueError(
+                "interval and shots / repetition_rate must be whole seconds: the headers of raw"
+                f" files hold no fractions, and a file here lasts {self.duration:g} s"
+            )
+        if self.repetition_rate % 1:
+            raise ValueError("repetition_rate must be a whole number of Hz, as in the headers")
+        if self.duration > self.interval:
+            raise ValueError(
+                f"a file lasts {self.duration:g} s, longer than the interval of"
+                f" {self.interval:g} s: take fewer shots or a longer interval"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        for name, moments in (
+            ("clock", [jump.at for jump in self.clock]),
+            ("changes", [change.at for change in self.changes]),
+        ):
+            if moments != sorted(set(moments)):
+                raise ValueError(f"the moments of {name} must rise")
+        if len(self.clock) > 99:
+            raise ValueError("clock has more than 99 jumps, which file names cannot tell apart")
+        return self
+
+    @model_validator(mode="after")
+    def _changes_are_possible(self) -> Self:
+        for change in self.changes:
+            later = self.at(change.at)
+            if later.duration % 1 or later.duration > self.interval:
+                raise ValueError(
+                    f"with the change at {change.at:%Y-%m-%d %H:%M} a file lasts"
+                    f" {later.duration:g} s: it must be a whole number, at most the interval"
+                )
+        return self
+
+    def at(self, moment: datetime) -> Acquisition:
+        """Return how a file is taken that starts at `moment`."""
+        told = {
+            name: value
+            for change in self.changes
+            if change.at <= moment
+            for name in ("bins", "bin_width", "shots")
+            if (value := getattr(change, name)) is not None
+        }
+        return self.model_copy(update=told) if told else self
+
+    def clock_error(self, moment: datetime) -> tuple[int, timedelta]:
+        """Return how often the clock has jumped by `moment`, and clock minus true time."""
+        past = [jump.offset for jump in self.clock if jump.at <= moment]
+        return len(past), timedelta(seconds=past[-1] if past else 0)
+
+    def is_missing(self, start: datetime) -> bool:
+        """Whether nothing was measured when a file would start."""
+        stop = start + timedelta(seconds=self.at(start).duration)
+        return any(gap.overlaps(start, stop) for gap in self.gaps)

@@ -1,0 +1,167 @@
+"""What a campaign file says of the light and the electronics of simulated lidars."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from lidarops.campaign.simulation_base import BinWidth, Model, NotNegative
+
+
+class PhotonCounter(Model):
+    """The photon-counting output of a detector. Its dead time is a fact of the campaign."""
+
+    discriminator_level: int = Field(default=8, ge=1, le=63, description="Licel level")
+    paralyzable: bool = Field(
+        default=False, description="whether a lost photon prolongs the dead time"
+    )
+
+
+class AnalogRecorder(Model):
+    """The analog output of a detector."""
+
+    gain: float = Field(gt=0, le=100, description="mV per MHz of photoelectrons")
+    excess_noise: float = Field(
+        default=1.2,
+        ge=1,
+        le=10,
+        description="variance of the charge over that of equal pulses: 1 + relative variance",
+    )
+    noise: float = Field(
+        gt=0, le=1000, description="electronic noise of one sample of one shot, mV"
+    )
+    dark_offset: NotNegative = Field(description="mV, without any light")
+    dark_drift: float = Field(
+        default=0.0, ge=-100, le=100, description="mV per hour, of the dark offset"
+    )
+    adc_range: float = Field(default=500.0, ge=1, le=10_000, description="mV at full scale")
+    adc_bits: int = Field(default=12, ge=8, le=16)
+
+    @property
+    def step(self) -> float:
+        """Least significant bit of the digitiser, mV."""
+        return self.adc_range / 2.0**self.adc_bits
+
+    @model_validator(mode="after")
+    def _noise_dithers(self) -> Self:
+        # Below half a step, rounding does not average out over shots. That is simulated too, down
+        # to what its Fourier series can say.
+        if self.noise < 0.02 * self.step:
+            raise ValueError(
+                f"noise of {self.noise:g} mV is less than 0.02 digitiser steps"
+                f" of {self.step:g} mV: no recorder is so quiet"
+            )
+        if self.dark_offset < 6 * self.noise:
+            raise ValueError(
+                f"dark_offset of {self.dark_offset:g} mV is less than 6 times the noise: the"
+                " digitiser would clip noise at zero"
+            )
+        return self
+
+
+class Background(Model):
+    """Sky light on a detector."""
+
+    night: NotNegative = Field(description="MHz of photoelectrons")
+    day: NotNegative = Field(description="MHz of photoelectrons with the sun at the zenith")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.day < self.night:
+            raise ValueError("day must not be darker than night")
+        return self
+
+
+class Optics(Model):
+    """Laser and telescope, from which the strength of a signal follows."""
+
+    energy: float = Field(gt=0, le=100, description="J, of one pulse")
+    area: float = Field(gt=0, le=1000, description="m2, of the telescope")
+    efficiency: float = Field(
+        gt=0, le=1, description="photoelectrons per photon that enters the telescope"
+    )
+
+    def signal_rate(self, wavelength: float) -> float:
+        r"""Return the rate from a backscatter of 1e-6 m-1 sr-1 at 1 km, MHz.
+
+        Notes
+        -----
+        :math:`(E \lambda / h c) \eta A (c / 2) \beta R^{-2}` (`vasylkivskyi2022`, 23).
+        """
+        photons = self.energy * wavelength * 1e-9 / (6.62607015e-34 * 299_792_458.0)
+        return photons * self.efficiency * self.area * 299_792_458.0 / 2.0 * 1e-6 / 1e6 * 1e-6
+
+
+class Detector(Model):
+    """One detector: one wavelength, read by an analog recorder, a photon counter or both."""
+
+    wavelength: int = Field(ge=200, le=3000, description="nm, as in the headers")
+    polarisation: Literal["o", "p", "s"] = "o"
+    high_voltage: int = Field(default=800, ge=0, le=9999, description="V")
+    signal_rate: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e5,
+        allow_inf_nan=False,
+        description="MHz of photoelectrons from a backscatter coefficient of 1e-6 m-1 sr-1 at a"
+        " range of 1 km, with full overlap and without extinction",
+    )
+    optics: Optics | None = Field(default=None, description="in place of signal_rate")
+    background: Background
+    photon: PhotonCounter | None = None
+    analog: AnalogRecorder | None = None
+    bins: int | None = Field(default=None, ge=16, le=16_384, description="where not the others'")
+    bin_width: BinWidth | None = Field(default=None, description="m, where not the others'")
+
+    @property
+    def label(self) -> str:
+        """Wavelength and polarisation as in channel names, such as ``532o``."""
+        return f"{self.wavelength}{self.polarisation}"
+
+    @property
+    def strength(self) -> float:
+        """The signal rate: as given, or of the optics."""
+        if self.optics is not None:
+            return self.optics.signal_rate(self.wavelength)
+        return self.signal_rate or math.nan
+
+    @property
+    def system_constant(self) -> float:
+        """K of P = K O(R) beta R^-2 T^2, in MHz m3 sr."""
+        return self.strength * 1.0e3**2 / 1.0e-6
+
+    @model_validator(mode="after")
+    def _is_read(self) -> Self:
+        if self.photon is None and self.analog is None:
+            raise ValueError("needs 'photon', 'analog' or both, else nobody reads it")
+        if (self.signal_rate is None) == (self.optics is None):
+            raise ValueError("give either signal_rate or optics")
+        return self
+
+
+class LaserDrift(Model):
+    """How the energy of the laser changes: steadily, from file to file, from shot to shot."""
+
+    per_hour: float = Field(
+        default=0.0, ge=-0.5, le=0.5, description="relative change of the energy in an hour"
+    )
+    jitter: float = Field(
+        default=0.0, ge=0, le=0.3, description="relative standard deviation from file to file"
+    )
+    shot_jitter: float = Field(
+        default=0.0, ge=0, le=0.5, description="relative standard deviation from shot to shot"
+    )
+
+
+class Pulse(Model):
+    """Shape of the laser pulse in time; short against a bin where not given.
+
+    Time zero is its centroid.
+    """
+
+    shape: Literal["rectangle", "gaussian", "exponential"] = "gaussian"
+    width: float = Field(
+        gt=0, le=1e-5, description="s: full width at half maximum; decay time of exponential"
+    )

@@ -1,0 +1,1 @@
+"""Data reduction and drawing of products, for the report and the site."""

@@ -1,0 +1,114 @@
+"""Profiles of elastic products: what is drawn of one, and which one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.figures.series_data import require
+from lidarops.flags import Quality, Severity
+
+Floats = NDArray[np.float64]
+
+CAUSES: Final = ("noise", "background", "reference", "lidar_ratio", "molecular")
+"""Of the errors of backscatter, as in the names of variables."""
+
+_ALONG_TIME: Final = ("time", "reference_bottom", "reference_top")
+_ALONG_BOTH: Final = (
+    "backscatter",
+    "backscatter_standard_error",
+    "quality_flag",
+    *(f"backscatter_error_{cause}" for cause in CAUSES),
+)
+PROFILE_VARIABLES: Final = (
+    *_ALONG_TIME,
+    "range",
+    "molecular_backscatter",
+    "lidar_ratio",
+    *_ALONG_BOTH,
+)
+"""What `clearest_profile` reads of a product."""
+_REJECTED: Final = int(Quality.rejecting())
+_WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
+_BEYOND: Final = 1.15
+"""Times the top of the reference window, to which a profile is shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One mean profile of backscatter, with its error budget, to just beyond the reference."""
+
+    time: np.datetime64
+    """UTC."""
+    range: Floats
+    """m."""
+    backscatter: Floats
+    """m-1 sr-1; NaN where rejected."""
+    standard_error: Floats
+    budget: dict[str, Floats]
+    """Absolute error by each of `CAUSES`, m-1 sr-1."""
+    molecular: Floats
+    """m-1 sr-1."""
+    with_care: NDArray[np.bool_]
+    reference: tuple[float, float]
+    """m."""
+    lidar_ratio: float
+    """sr."""
+
+
+def clearest_profile(product: xr.Dataset) -> Profile | None:
+    """Return the profile with most gates that no bit speaks against, up to its reference.
+
+    Parameters
+    ----------
+    product : Dataset
+        Kind ``elastic``.
+
+    Returns
+    -------
+    Profile or None
+        The first of equals; None where no profile has a reference.
+
+    Raises
+    ------
+    ProductError
+        Where a variable is missing or has other dims.
+    """
+    require(
+        product,
+        dict.fromkeys(_ALONG_TIME, ("time",))
+        | {"range": ("range",), "molecular_backscatter": ("range",), "lidar_ratio": ()}
+        | dict.fromkeys(_ALONG_BOTH, ("time", "range")),
+    )
+    r = product["range"].values.astype(np.float64)
+    top = product["reference_top"].values.astype(np.float64)
+    flag = product["quality_flag"].values.astype(np.int64)
+    below = r[np.newaxis, :] <= np.nan_to_num(top)[:, np.newaxis]
+    clear = ((flag == 0) & below).sum(axis=1)
+    if not np.any(np.isfinite(top)) or clear.max() == 0:
+        return None
+    index = int(np.argmax(clear))
+    shown = r <= _BEYOND * top[index]
+    chosen = product.isel(time=index, range=shown)
+    bits = flag[index, shown]
+    rejected = (bits & _REJECTED) != 0
+
+    def values(name: str) -> Floats:
+        found = chosen[name].values.astype(np.float64)
+        return np.where(rejected, np.nan, found)
+
+    return Profile(
+        time=product["time"].values.astype("datetime64[ns]")[index],
+        range=r[shown],
+        backscatter=values("backscatter"),
+        standard_error=values("backscatter_standard_error"),
+        budget={cause: np.abs(values(f"backscatter_error_{cause}")) for cause in CAUSES},
+        molecular=chosen["molecular_backscatter"].values.astype(np.float64),
+        with_care=(bits & _WITH_CARE) != 0,
+        reference=(float(chosen["reference_bottom"]), float(top[index])),
+        lidar_ratio=float(chosen["lidar_ratio"]),
+    )

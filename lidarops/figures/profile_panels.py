@@ -1,0 +1,80 @@
+"""Panels of one mean profile against range: backscatter, and what its error is made of."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from lidarops.figures.panels import GREY, INK
+from lidarops.figures.profile_data import Profile
+
+_BLUE: Final = "#0072B2"
+_STYLES: Final = {
+    "noise": ("signal noise", "#0072B2", "-"),
+    "background": ("background", "#D55E00", "--"),
+    "reference": ("reference", "#009E73", "-."),
+    "lidar_ratio": ("lidar ratio", "#CC79A7", (0, (4, 1, 1, 1, 1, 1))),
+    "molecular": ("molecules", "#000000", ":"),
+}
+_MEGA: Final = 1e6
+_UNITS: Final = "Mm$^{-1}$ sr$^{-1}$"
+
+
+def backscatter(panel: Axes, profile: Profile) -> None:
+    """Draw backscatter of particles with its standard error, and that of molecules."""
+    _against_range(panel, profile)
+    r = profile.range / 1e3
+    value, error = _MEGA * profile.backscatter, _MEGA * profile.standard_error
+    panel.fill_betweenx(r, value - error, value + error, color=_BLUE, alpha=0.3, linewidth=0)
+    panel.plot(value, r, color=_BLUE, linewidth=1.0, label="particles, $\\pm$1 standard error")
+    panel.plot(
+        _MEGA * profile.molecular, r, color=INK, linewidth=1.0, linestyle=":", label="molecules"
+    )
+    if profile.with_care.any():
+        some = np.flatnonzero(profile.with_care & np.isfinite(value))[::10]
+        panel.plot(
+            value[some],
+            r[some],
+            linestyle="none",
+            marker="o",
+            markersize=4.0,
+            markerfacecolor="none",
+            markeredgecolor=INK,
+            label="use with care",
+        )
+    panel.axvline(0.0, color=INK, linewidth=0.8)
+    inside = value[np.isfinite(value)]
+    if inside.size:
+        # A few noisy gates must not shrink what is seen of the others.
+        low, high = np.percentile(inside, [0.5, 99.5])
+        margin = 0.15 * max(high - low, 0.1 * high)
+        panel.set_xlim(low - margin, high + margin)
+    panel.set_xlabel(f"backscatter ({_UNITS})")
+    panel.set_ylabel("range (km)")
+
+
+def error_budget(panel: Axes, profile: Profile) -> None:
+    """Draw the error by each cause, and the standard error that they add up to."""
+    _against_range(panel, profile)
+    r = profile.range / 1e3
+    for cause, values in profile.budget.items():
+        label, color, style = _STYLES[cause]
+        panel.plot(_MEGA * values, r, color=color, linewidth=1.1, linestyle=style, label=label)
+    total = _MEGA * profile.standard_error
+    panel.plot(total, r, color=GREY, linewidth=2.2, alpha=0.6, label="standard error")
+    panel.set_xscale("log")
+    known = total[np.isfinite(total) & (total > 0)]
+    if known.size:
+        panel.set_xlim(1e-3 * known.max(), 2.0 * known.max())
+    panel.set_xlabel(f"error of backscatter ({_UNITS})")
+
+
+def _against_range(panel: Axes, profile: Profile) -> None:
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.grid(color="#dddddd", linewidth=0.6)
+    panel.set_axisbelow(True)
+    bottom, top = (edge / 1e3 for edge in profile.reference)
+    panel.axhspan(bottom, top, color=GREY, alpha=0.18, linewidth=0, label="reference window")
+    panel.set_ylim(0.0, float(profile.range[-1]) / 1e3)

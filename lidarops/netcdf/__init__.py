@@ -1,0 +1,1 @@
+"""Product files: variables and attributes, building, writing (the only writer), reading."""

@@ -1,0 +1,207 @@
+"""Arrays and context -> encoded CF dataset. No input, no output, no clock.
+
+Everything that a file will hold is settled here: order, types, fill values, attributes,
+extents. What the table of variables does not allow is refused.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from lidarops.errors import ProductError
+from lidarops.netcdf import variables as rows
+from lidarops.netcdf.context import Context, product_path
+from lidarops.netcdf.coordinates import Coordinate, locate
+from lidarops.netcdf.global_attributes import global_attributes
+from lidarops.netcdf.input_checks import (
+    Intake,
+    Values,
+    check_flagged,
+    check_flags,
+    check_range,
+    whole_numbers,
+)
+from lidarops.netcdf.provenance import prov_json
+from lidarops.netcdf.variables import Layout, Row, attributes
+from lidarops.records import DetectionMode
+
+__all__ = ["Context", "bitround", "build_dataset", "product_path"]
+
+_MANTISSA_BITS: Final = 23
+
+
+def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Dataset:
+    """Make the product of one scene, kind and channel.
+
+    Parameters
+    ----------
+    data : xr.Dataset
+        In memory. Every variable of `layout`, with ``time`` and
+        ``time_bnds`` (datetime64, UTC), ``zenith_angle`` and optionally ``azimuth`` (degree;
+        scalar or over time); for ``signal`` also ``range`` (m, bin centres) and optionally
+        ``range_bnds``, for ``homogeneous`` ``section``, ``section_range`` and
+        ``section_bounds`` (m); for ``multiangle``, in place of the angles, ``altitude`` (m above
+        the geoid), ``ray``, ``ray_zenith_angle`` and optionally ``ray_azimuth`` (degree). An
+        attribute ``steps`` goes into the product. NaN is missing.
+    context : Context
+        What the product is of.
+    layout : Layout
+        What the kind of product holds.
+
+    Returns
+    -------
+    xr.Dataset
+        Encoded, as `xarray.open_dataset(..., decode_cf=False)` shows the file.
+
+    Raises
+    ------
+    ProductError
+        Where a variable is missing, unknown, lazy, or of wrong dimensions or type; where a
+        value lies out of its valid range, carries a bit that the kind does not have, or is
+        missing without a quality bit; where coordinates are not finite and rising.
+    """
+    _refuse_mismatch(context)
+    source = Intake(data, layout)
+    coordinates, extents = locate(source, layout, context)
+    product = xr.Dataset(
+        {
+            **_place(coordinates, context.mode),
+            **_measured(source, layout, coordinates, context.mode),
+            **_about(layout, context, profiles=extents.vertical),
+        },
+        attrs=global_attributes(context, layout, extents) | _steps(data),
+    )
+    product.encoding["unlimited_dims"] = {"time"}
+    return product
+
+
+def _refuse_mismatch(context: Context) -> None:
+    provenance = context.provenance
+    told = (provenance.kind, provenance.channel, provenance.scene)
+    if told != (context.kind, context.channel, context.scene):
+        raise ProductError(
+            f"is that of {' '.join(told)}, not of {context.kind} {context.channel} {context.scene}",
+            field="provenance",
+        )
+
+
+def _steps(data: xr.Dataset) -> dict[str, str]:
+    """Return what the retrieval itself says that it did, where it does."""
+    return {"lidarops_steps": str(data.attrs["steps"])} if data.attrs.get("steps") else {}
+
+
+def _place(coordinates: list[Coordinate], mode: DetectionMode) -> dict[str, xr.Variable]:
+    variables = {}
+    for found in coordinates:
+        row = found.row
+        variables[row.name] = xr.Variable(found.dims, found.values, attributes(row, mode=mode))
+        if row.bounds and found.bounds is not None:
+            variables[row.bounds] = xr.Variable((*found.dims, rows.BOUNDS_DIM), found.bounds)
+    return variables
+
+
+def _measured(
+    source: Intake, layout: Layout, coordinates: list[Coordinate], mode: DetectionMode
+) -> dict[str, xr.Variable]:
+    judged = layout.row(rows.QUALITY_FLAG)
+    flags = whole_numbers(judged, source.take(judged.name, judged.dims))
+    check_flags(judged, flags)
+    variables = {}
+    for row in layout.variables:
+        if row.optional and row.name not in source:
+            continue
+        stored = rows.sum_up(flags) if row.summary else _stored(source, row, judged, flags)
+        found_attributes = attributes(row, mode=mode, coordinates=_listed(row, coordinates))
+        variables[row.name] = xr.Variable(row.dims, stored, found_attributes)
+    _refuse_parts(layout, variables)
+    return variables
+
+
+def _refuse_parts(layout: Layout, variables: dict[str, xr.Variable]) -> None:
+    """Refuse optional values without what they name: their errors, limits and judgements."""
+    for row in layout.variables:
+        missing = [name for name in row.ancillaries if name not in variables]
+        if row.name in variables and missing:
+            raise ProductError("is missing", field=missing[0], remedy=f"{row.name} needs it")
+
+
+def _stored(source: Intake, row: Row, judged: Row, flags: Values) -> Values:
+    values = source.take(row.name, row.dims)
+    check_range(row, values)
+    if row.dtype.startswith("i"):
+        return whole_numbers(row, values)
+    stored = _rounded(row, values)
+    # Bits judge what is retrieved; what an option derives may be missing where that stands.
+    if row.dims == judged.dims and not row.optional:
+        check_flagged(row, stored, flags)
+    stored[~np.isfinite(stored)] = rows.FILL_VALUE
+    return stored
+
+
+def _listed(row: Row, coordinates: list[Coordinate]) -> tuple[str, ...]:
+    """Return the auxiliary coordinates of a variable."""
+    # CDO 2.1 cannot read a place that changes along a beam, nor a variable of three dimensions
+    # that names a place without one.
+    unread = tuple(place.name for place in rows.SOUNDED)
+    unread += ("latitude", "longitude") if len(row.dims) > 2 else ()
+    return tuple(
+        found.row.name
+        for found in coordinates
+        if found.auxiliary and set(found.dims) <= set(row.dims) and found.row.name not in unread
+    )
+
+
+def _rounded(row: Row, values: Values) -> Values:
+    # A value too large for the type becomes infinite, and is judged as a missing one.
+    with np.errstate(over="ignore"):
+        stored = values.astype(row.dtype)
+    return stored if row.significant_bits is None else bitround(stored, row.significant_bits)
+
+
+def bitround(values: Values, bits: int) -> Values:
+    """Round to fewer bits of the mantissa, half to even, so that the rest compresses away.
+
+    Parameters
+    ----------
+    values : ndarray of float32
+    bits : int
+        Explicit bits of the mantissa to keep; the relative error is at most 2^-(bits + 1).
+
+    Returns
+    -------
+    ndarray of float32
+        NaN stays NaN; a value beyond the largest float becomes infinite.
+    """
+    drop = _MANTISSA_BITS - bits
+    if drop <= 0:
+        return values.copy()
+    whole = values.view(np.uint32)
+    odd = (whole >> np.uint32(drop)) & np.uint32(1)
+    rounded = whole + odd
+    rounded += np.uint32((1 << (drop - 1)) - 1)
+    rounded &= np.uint32(0xFFFFFFFF & ~((1 << drop) - 1))
+    result: Values = rounded.view(np.float32)
+    missing = np.isnan(values)
+    result[missing] = np.nan
+    return result
+
+
+def _about(layout: Layout, context: Context, *, profiles: bool) -> dict[str, xr.Variable]:
+    station = rows.station(profiles=profiles)
+    texts = {
+        station: context.station.name or context.station_key,
+        rows.PROVENANCE: prov_json(context.provenance),
+    }
+    variables = {
+        row.name: xr.Variable(
+            row.dims, np.frombuffer(text.encode(), "S1"), attributes(row, mode=context.mode)
+        )
+        for row, text in texts.items()
+    }
+    if layout.rounded:
+        row = rows.QUANTIZATION
+        variables[row.name] = xr.Variable((), np.int32(0), attributes(row, mode=context.mode))
+    return variables

@@ -1,0 +1,71 @@
+"""What a product is of, besides its numbers."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from lidarops.campaign.model import Metadata, Station
+from lidarops.errors import ProductError
+from lidarops.records import DetectionMode, ProductKind, Provenance
+
+_SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a product is of: kind, channel, place, instrument, campaign, scene, provenance."""
+
+    kind: ProductKind
+    channel: str
+    mode: DetectionMode
+    wavelength: float
+    """m; NaN where it is not known."""
+    station_key: str
+    station: Station
+    instrument_key: str
+    instrument_name: str
+    metadata: Metadata
+    campaign: str
+    title: str
+    summary: str
+    scene: str
+    start: datetime
+    """Start of the scene's window, not of its first profile."""
+    stop: datetime
+    provenance: Provenance
+    raw_format: str = "Licel"
+
+
+def product_path(context: Context) -> str:
+    """Return the path of a product's file.
+
+    Parameters
+    ----------
+    context : Context
+
+    Returns
+    -------
+    str
+        Relative to the product root, with forward slashes:
+        ``station/instrument/kind/YYYY/station_instrument_kind_channel_YYYYMMDDTHHMMSS.nc``;
+        a scene of one of several range grids adds its key.
+
+    Raises
+    ------
+    ProductError
+        If a name would lead out of its folder.
+    """
+    # What the scene's name says beyond the instrument: its start, and its grid where there are two.
+    when = context.scene.removeprefix(f"{context.instrument_key}_")
+    parts = (context.station_key, context.instrument_key, context.kind.value, context.channel, when)
+    for part in parts:
+        if not _SAFE.fullmatch(part):
+            raise ProductError(
+                f"{part!r} cannot be part of a file name",
+                field=context.scene,
+                remedy="use letters, digits, '.', '_' and '-' in names of the campaign file",
+            )
+    folder = "/".join((*parts[:3], f"{context.start.astimezone(UTC):%Y}"))
+    return f"{folder}/{'_'.join(parts)}.nc"

@@ -1,0 +1,303 @@
+"""Where and when: the coordinates of a product and what they cover."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Final
+
+import numpy as np
+
+from lidarops.errors import ProductError
+from lidarops.netcdf.context import Context
+from lidarops.netcdf.global_attributes import Extents
+from lidarops.netcdf.input_checks import Intake, Values, check_range, whole_numbers
+from lidarops.netcdf.sounded_air import sounded
+from lidarops.netcdf.variables import BOUNDS_DIM, Layout, Row, deployment
+
+NEAR_VERTICAL: Final = 10.0
+"""degree. A beam within this angle of the vertical makes profiles in the sense of CF chapter 9."""
+
+_EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+
+
+@dataclass(frozen=True, slots=True)
+class Coordinate:
+    """A coordinate as stored, with the limits of its cells where it has them."""
+
+    row: Row
+    dims: tuple[str, ...]
+    values: Values
+    bounds: Values | None = None
+
+    @property
+    def auxiliary(self) -> bool:
+        """Whether it must be listed in an attribute ``coordinates``."""
+        return self.dims != (self.row.name,)
+
+
+def locate(source: Intake, layout: Layout, context: Context) -> tuple[list[Coordinate], Extents]:
+    """Return the coordinates of a product in the order of its layout, and what they cover.
+
+    Parameters
+    ----------
+    source : Intake
+    layout : Layout
+    context : Context
+
+    Returns
+    -------
+    list of Coordinate
+    Extents
+
+    Raises
+    ------
+    ProductError
+        If a coordinate is missing, not finite, not rising, or out of its cell.
+    """
+    time = _time(source, layout.row("time"))
+    place = _PLACES.get(layout.sampled, _beam_place)
+    found, vertical = place(source, layout, context.station.altitude, time.values.size)
+    found["time"] = time
+    gates = {} if vertical.profiles else _sounded(found, layout, context)
+    for name, value in _fixed(context).items():
+        if name in found or not any(row.name == name for row in layout.coordinates):
+            continue
+        row = layout.row(name)
+        if f"gate_{name}" in gates:
+            row = deployment(row)
+        if np.isfinite(value):
+            found[name] = Coordinate(row, (), np.asarray(value, np.float64))
+    found |= gates
+    ordered = [found[row.name] for row in layout.coordinates if row.name in found]
+    for coordinate in ordered:
+        check_range(coordinate.row, coordinate.values)
+    horizontal = [
+        gates[f"gate_{name}"].values if gates else found[name].values
+        for name in ("latitude", "longitude")
+    ]
+    return ordered, _extents(source, vertical, horizontal)
+
+
+@dataclass(frozen=True, slots=True)
+class _Vertical:
+    """What a product covers along the vertical."""
+
+    altitude: Values
+    """m, as stored."""
+    exact: Values
+    """m, before it was rounded."""
+    profiles: bool
+    """Whether the beam stands still and points up or down, as CF profiles do."""
+
+
+_Place = tuple[dict[str, Coordinate], _Vertical]
+
+
+def _beam_place(source: Intake, layout: Layout, station: float, profiles: int) -> _Place:
+    """Return the coordinates of a kind whose values lie along the beam."""
+    names = _ALONG[layout.sampled]
+    found = {name: _along(source, layout.row(name)) for name in names}
+    zenith = _beam(source, layout.row("zenith_angle"), profiles)
+    altitude, exact = _altitude(layout.row("altitude"), found[names[-1]], zenith, station)
+    found |= {"altitude": altitude, "zenith_angle": zenith}
+    if "azimuth" in source:
+        found["azimuth"] = _beam(source, layout.row("azimuth"), profiles)
+    tilt = min(zenith.values.flat[0], 180.0 - zenith.values.flat[0])
+    vertical = zenith.dims == () and bool(tilt <= NEAR_VERTICAL)
+    return found, _Vertical(altitude.values, exact, vertical)
+
+
+def _sounded(
+    found: Mapping[str, Coordinate], layout: Layout, context: Context
+) -> dict[str, Coordinate]:
+    """Return latitude and longitude of what lies along a slanting beam of known azimuth."""
+    has_gates = any(row.name == "gate_latitude" for row in layout.coordinates)
+    if not has_gates or "azimuth" not in found:
+        return {}
+    # Places that change over time too are what no tool reads: CDO takes garbage for them.
+    if found["zenith_angle"].dims or found["azimuth"].dims:
+        return {}
+    station = context.station
+    along = found[_ALONG[layout.sampled][-1]]
+    zenith, azimuth = (found[name].values for name in ("zenith_angle", "azimuth"))
+    angle = np.deg2rad(zenith)
+    ahead, up = along.values * np.sin(angle), along.values * np.cos(angle)
+    places = sounded(station.latitude, station.longitude, station.altitude, ahead, azimuth, up)
+    gates = {}
+    for name, values in zip(("gate_latitude", "gate_longitude"), places, strict=True):
+        row = layout.row(name)
+        stored = values.astype(row.dtype)
+        gates[name] = Coordinate(row, row.dims, stored)
+    return gates
+
+
+def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) -> _Place:
+    """Return the coordinates of a kind whose values lie at altitudes seen by several rays."""
+    names = ["ray", "ray_zenith_angle"]
+    names += [name for name in ("ray_azimuth",) if name in source]
+    # Layers are an option; where one is used, its coordinate is none.
+    names += ["layer_altitude"] if "layer_optical_depth" in source else []
+    found = {name: _along(source, layout.row(name)) for name in names}
+    row = layout.row("altitude")
+    values = _along(source, replace(row, bounds=None)).values
+    if values[0] <= station:
+        raise ProductError(
+            f"begins at {values[0]:g} m, the station lies at {station:g} m", field=row.name
+        )
+    tops = np.append(station, values)
+    found["altitude"] = _celled(row, values, np.stack([tops[:-1], tops[1:]], axis=-1))
+    return found, _Vertical(values, values, profiles=False)
+
+
+def _network_place(source: Intake, layout: Layout, _station: float, _profiles: int) -> _Place:
+    """Return the coordinates of a kind whose values lie where beams of several lidars meet."""
+    angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
+    rays = (f"ray_{name}" for name in angles)
+    names = ("vertex_id", "latitude", "longitude", "altitude", "ray", *rays)
+    found = {name: _along(source, layout.row(name)) for name in names}
+    altitude = found["altitude"].values
+    # Points stand in no order of altitude: there is no step from one to the next.
+    return found, _Vertical(altitude, altitude[:, np.newaxis], profiles=False)
+
+
+_PLACES: Final = {"altitude": _scan_place, "vertex": _network_place}
+"""By what a product is sampled over besides time; along a beam where it is none of these."""
+
+
+def _fixed(context: Context) -> dict[str, float]:
+    station = context.station
+    return {
+        "latitude": station.latitude,
+        "longitude": station.longitude,
+        "station_altitude": station.altitude,
+        # Removes the last bits of metres times 1e9, so that 532 nm reads 532.
+        "wavelength": round(context.wavelength * 1e9, 6),
+    }
+
+
+_ALONG: Final = {"range": ("range",), "section": ("section", "section_range")}
+"""Coordinates along the beam; the last holds metres."""
+
+
+def _time(source: Intake, row: Row) -> Coordinate:
+    moments, bounds = _moments(source)
+    if np.isnat(moments).any() or np.isnat(bounds).any():
+        raise ProductError("holds times that are not set", field=row.name)
+    if (np.diff(moments) <= np.timedelta64(0)).any():
+        raise ProductError(
+            "does not rise strictly",
+            field=row.name,
+            remedy="sort the profiles by time, and keep one of those at the same time",
+        )
+    return _celled(row, _seconds(moments), _seconds(bounds))
+
+
+def _moments(source: Intake) -> tuple[Values, Values]:
+    values = []
+    for name, dims in (("time", ("time",)), ("time_bnds", ("time", BOUNDS_DIM))):
+        taken = source.take(name, dims)
+        if taken.dtype.kind != "M":
+            raise ProductError(f"has data of type {taken.dtype}, not datetime64", field=name)
+        values.append(taken.astype("datetime64[ns]"))
+    return values[0], values[1]
+
+
+def _seconds(moments: Values) -> Values:
+    seconds: Values = (moments - _EPOCH) / np.timedelta64(1, "s")
+    return seconds
+
+
+def _along(source: Intake, row: Row) -> Coordinate:
+    values = source.take(row.name, row.dims)
+    values = whole_numbers(row, values) if row.dtype.startswith("i") else _finite(row.name, values)
+    # The middles of sections may come in any order: sections overlap as the user likes.
+    if row.dims == (row.name,) and (np.diff(values) <= 0).any():
+        raise ProductError("does not rise strictly", field=row.name)
+    if row.bounds is None:
+        return Coordinate(row, row.dims, values)
+    if row.bounds in source:
+        bounds = _finite(row.bounds, source.take(row.bounds, (*row.dims, BOUNDS_DIM)))
+    elif row.dims == (row.name,):
+        bounds = _midpoints(row, values)
+    else:
+        # Sections overlap or leave gaps: nothing tells their ends.
+        raise ProductError("is missing", field=row.bounds)
+    return _celled(row, values, bounds)
+
+
+def _finite(name: str, values: Values) -> Values:
+    if values.dtype.kind == "M" or not np.isfinite(values).all():
+        raise ProductError("holds values that are not finite numbers", field=name)
+    return values.astype(np.float64)
+
+
+def _midpoints(row: Row, values: Values) -> Values:
+    if values.size < 2:
+        raise ProductError(
+            "is missing, and cannot be derived of a single value",
+            field=row.bounds,
+            remedy="give the limits of the cell",
+        )
+    inner = (values[1:] + values[:-1]) / 2
+    first, last = 2 * values[0] - inner[0], 2 * values[-1] - inner[-1]
+    edges = np.concatenate([[first], inner, [last]])
+    return np.stack([edges[:-1], edges[1:]], axis=-1)
+
+
+def _celled(row: Row, values: Values, bounds: Values) -> Coordinate:
+    if bounds.shape[-1] != 2:
+        raise ProductError(f"has {bounds.shape[-1]} limits of a cell, not 2", field=row.bounds)
+    if ((bounds[..., 0] > values) | (values > bounds[..., 1])).any():
+        raise ProductError(f"does not enclose {row.name}", field=row.bounds)
+    return Coordinate(row, row.dims, values, bounds)
+
+
+def _beam(source: Intake, row: Row, profiles: int) -> Coordinate:
+    """Return an angle of the beam: one number where it stands still, else over time."""
+    dims = ("time",) if row.name in source and source.dims(row.name) else ()
+    values = _finite(row.name, source.take(row.name, dims))
+    if dims and values.shape != (profiles,):
+        raise ProductError(f"has {values.size} values for {profiles} profiles", field=row.name)
+    if (values == values.flat[0]).all():
+        return Coordinate(row, (), values.flat[0][...])
+    return Coordinate(row, ("time",), values)
+
+
+def _altitude(
+    row: Row, along: Coordinate, zenith: Coordinate, station: float
+) -> tuple[Coordinate, Values]:
+    """Return the altitude as stored, and before it was rounded."""
+    rise = np.cos(np.deg2rad(zenith.values))[..., np.newaxis]
+    exact = station + rise * along.values
+    bounds = None
+    if row.bounds and along.bounds is not None and not zenith.dims:
+        bounds = (station + rise * along.bounds).astype(row.dtype)
+    else:
+        # Limits of cells that change with time too would have to be polygons (CF, section 7.1).
+        row = replace(row, bounds=None)
+    return Coordinate(row, (*zenith.dims, *row.dims), exact.astype(row.dtype), bounds), exact
+
+
+def _extents(source: Intake, vertical: _Vertical, horizontal: list[Values]) -> Extents:
+    moments, bounds = _moments(source)
+    intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
+    steps = np.abs(np.diff(vertical.exact, axis=-1))
+    constant = steps.size > 0 and bool(np.ptp(steps) <= 1e-6 * steps.max())
+    return Extents(
+        start=_datetime(bounds[:, 0].min()),
+        stop=_datetime(bounds[:, 1].max()),
+        interval=float(np.median(intervals / np.timedelta64(1, "s"))),
+        latitudes=(float(horizontal[0].min()), float(horizontal[0].max())),
+        longitudes=(float(horizontal[1].min()), float(horizontal[1].max())),
+        lowest=float(vertical.altitude.min()),
+        highest=float(vertical.altitude.max()),
+        step=float(steps.flat[0]) if constant else None,
+        vertical=vertical.profiles,
+    )
+
+
+def _datetime(moment: np.datetime64) -> datetime:
+    plain: datetime = moment.astype("datetime64[us]").item()
+    return plain.replace(tzinfo=UTC)

@@ -1,0 +1,242 @@
+"""Global attributes: what a product says of itself to catalogs and readers (`acdd13`)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from lidarops import __version__
+from lidarops.netcdf.context import Context
+from lidarops.netcdf.provenance import product_date, product_id
+from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
+from lidarops.records import DetectionMode, LeftOut, Step
+
+
+@dataclass(frozen=True, slots=True)
+class Extents:
+    """What a product covers, computed from its coordinates."""
+
+    start: datetime
+    stop: datetime
+    interval: float
+    """s, between profiles."""
+    latitudes: tuple[float, float]
+    """degree, least and greatest of the sounded air."""
+    longitudes: tuple[float, float]
+    lowest: float
+    """m above the geoid."""
+    highest: float
+    step: float | None
+    """m, vertical distance of neighbouring values; None where it is not one number."""
+    vertical: bool
+    """Whether the beam stands still and points up or down, as CF profiles do."""
+
+
+def global_attributes(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
+    """Return the global attributes of a product, in the order in which they are written.
+
+    Parameters
+    ----------
+    context : Context
+    layout : Layout
+    extents : Extents
+
+    Returns
+    -------
+    dict of str to str, float or numpy scalar
+    """
+    made, why = product_date(extents.stop)
+    profiles = "timeSeriesProfile" if extents.vertical else None
+    feature_type = layout.feature_type or profiles
+    feature = {"featureType": feature_type} if feature_type else {}
+    return {
+        "Conventions": CONVENTIONS,
+        **feature,
+        **_description(context, layout, made, why),
+        **_people(context),
+        **_place(context, layout, extents),
+        **_times(extents, made),
+        **_ours(context),
+    }
+
+
+def _description(context: Context, layout: Layout, made: datetime, why: str) -> dict[str, Any]:
+    metadata = context.metadata
+    station = context.station.name
+    wavelength = _wavelength(context)
+    summary = (
+        f"{layout.summary} Channel {context.channel} ({wavelength},"
+        f" {_DETECTION[context.mode]}) of {context.instrument_name} at {station}."
+    )
+    dates = f"Dates of creation and change are {why}, so that equal inputs give equal files."
+    references = (metadata.references, *layout.references)
+    return {
+        "title": f"{context.title}: {layout.title}, channel {context.channel}, {station}",
+        "summary": _sentences(context.summary, summary),
+        "keywords": ", ".join(layout.keywords),
+        "keywords_vocabulary": "GCMD Science Keywords",
+        "id": product_id(context.provenance),
+        "naming_authority": metadata.naming_authority,
+        "source": f"surface observation: {context.raw_format} raw files of the lidar"
+        f" {context.instrument_name}",
+        "processing_level": layout.processing_level,
+        "product_version": f"{__version__}+{context.provenance.code_version}",
+        "history": _history(context, layout, made),
+        "references": "\n".join(text for text in references if text),
+        "comment": _sentences(metadata.comment, layout.comment, dates),
+        "acknowledgement": metadata.acknowledgement or "Not stated.",
+        "license": metadata.license or "Not stated.",
+        "standard_name_vocabulary": STANDARD_NAME_TABLE,
+    }
+
+
+_DETECTION = {DetectionMode.ANALOG: "analog detection", DetectionMode.PHOTON: "photon counting"}
+
+
+def _sentences(*texts: str) -> str:
+    return " ".join(text.strip() for text in texts if text.strip())
+
+
+def _wavelength(context: Context) -> str:
+    if math.isfinite(context.wavelength):
+        return f"{context.wavelength * 1e9:.6g} nm"
+    return "wavelength not known"
+
+
+def _history(context: Context, layout: Layout, made: datetime) -> str:
+    """One line a step, as CF wants it: when, what, with which program."""
+    program = f"lidarops {__version__} ({context.provenance.code_version})"
+    plan = context.provenance.plan
+
+    def concerns(item: Step | LeftOut) -> bool:
+        return item.channel in ("", context.channel) and item.name not in layout.unused_steps
+
+    done = [f"{step.name}: {step.reason}" for step in plan.steps if concerns(step)]
+    omitted = [f"left out {left.name}: {left.reason}" for left in plan.left_out if concerns(left)]
+    lines = [*done, *omitted, f"wrote the {context.kind.value} product"]
+    return "\n".join(f"{_iso(made)} {' '.join(line.split())} [{program}]" for line in lines)
+
+
+def _people(context: Context) -> dict[str, str]:
+    metadata = context.metadata
+    institution = metadata.institution
+    publisher = metadata.publisher_name or metadata.creator_name
+    return {
+        "institution": institution,
+        "project": metadata.project,
+        "program": metadata.program or metadata.project,
+        "creator_name": metadata.creator_name,
+        "creator_type": _kind_of(metadata.creator_name, institution),
+        "creator_institution": institution,
+        "creator_email": metadata.creator_email,
+        "creator_url": metadata.creator_url,
+        "publisher_name": publisher,
+        "publisher_type": _kind_of(publisher, institution),
+        "publisher_institution": institution,
+        "publisher_email": metadata.publisher_email or metadata.creator_email,
+        "publisher_url": metadata.publisher_url or metadata.creator_url,
+        "contributor_name": "The lidarops developers",
+        "contributor_role": "processing software",
+        "metadata_link": metadata.creator_url,
+    }
+
+
+def _kind_of(name: str, institution: str) -> str:
+    return "institution" if name == institution else "person"
+
+
+def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
+    station = context.station
+    (south, north), (west, east) = extents.latitudes, extents.longitudes
+    spread = "not applicable: one place"
+    if (south, west) != (north, east):
+        spread = _SPREADS.get(layout.sampled, "along the beam")
+    return {
+        "platform": station.name,
+        "platform_vocabulary": "station names of the campaign",
+        "instrument": context.instrument_name,
+        "instrument_vocabulary": "instrument names of the campaign",
+        # Latitude first: the order of axes that EPSG:4326 defines.
+        "geospatial_bounds": _bounds(extents),
+        "geospatial_bounds_crs": "EPSG:4326",
+        "geospatial_bounds_vertical_crs": "EPSG:5714",
+        "geospatial_lat_min": south,
+        "geospatial_lat_max": north,
+        "geospatial_lat_units": "degrees_north",
+        "geospatial_lat_resolution": spread,
+        "geospatial_lon_min": west,
+        "geospatial_lon_max": east,
+        "geospatial_lon_units": "degrees_east",
+        "geospatial_lon_resolution": spread,
+        "geospatial_vertical_min": extents.lowest,
+        "geospatial_vertical_max": extents.highest,
+        "geospatial_vertical_units": "m",
+        "geospatial_vertical_positive": "up",
+        "geospatial_vertical_resolution": (
+            "not constant" if extents.step is None else f"{extents.step:.6g} m"
+        ),
+    }
+
+
+_SPREADS = {"vertex": "irregular: where beams meet"}
+
+
+def _bounds(extents: Extents) -> str:
+    """Return the area of the sounded air as text: a point, or the rectangle around it."""
+    (south, north), (west, east) = extents.latitudes, extents.longitudes
+    if (south, west) == (north, east):
+        return f"POINT ({south!r} {west!r})"
+    corners = ((south, west), (south, east), (north, east), (north, west), (south, west))
+    return f"POLYGON (({', '.join(f'{lat!r} {lon!r}' for lat, lon in corners)}))"
+
+
+def _times(extents: Extents, made: datetime) -> dict[str, str]:
+    dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
+    return {
+        "time_coverage_start": _iso(extents.start),
+        "time_coverage_end": _iso(extents.stop),
+        "time_coverage_duration": _duration((extents.stop - extents.start).total_seconds()),
+        "time_coverage_resolution": _duration(extents.interval),
+        **dict.fromkeys(dates, _iso(made)),
+    }
+
+
+def _ours(context: Context) -> dict[str, Any]:
+    provenance = context.provenance
+    return {
+        "lidarops_campaign": context.campaign,
+        "lidarops_scene": context.scene,
+        "lidarops_window_start": _iso(context.start),
+        "lidarops_window_end": _iso(context.stop),
+        "lidarops_kind": context.kind.value,
+        "lidarops_station": context.station_key,
+        "lidarops_instrument": context.instrument_key,
+        "lidarops_channel": context.channel,
+        "lidarops_detection_mode": context.mode.value,
+        "lidarops_plan_sha256": provenance.plan.hash,
+        "lidarops_code_version": provenance.code_version,
+        "lidarops_input_count": np.int32(len(provenance.inputs)),
+    }
+
+
+def _iso(moment: datetime) -> str:
+    return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")
+
+
+def _duration(seconds: float) -> str:
+    """Write an ISO 8601 duration, such as ``P1DT2H30M0.5S``."""
+    whole, milliseconds = divmod(round(seconds * 1000), 1000)
+    minutes, second = divmod(whole, 60)
+    hours, minute = divmod(minutes, 60)
+    days, hour = divmod(hours, 24)
+    fraction = f".{milliseconds:03d}".rstrip("0") if milliseconds else ""
+    parts = ((hour, "H", ""), (minute, "M", ""), (second, "S", fraction))
+    clock = "".join(f"{n}{end}{unit}" for n, unit, end in parts if n or end)
+    date = f"{days}D" if days else ""
+    if not date and not clock:
+        clock = "0S"
+    return f"P{date}{'T' + clock if clock else ''}"

@@ -1,0 +1,313 @@
+"""Where a product came from: W3C PROV-JSON, the version of the code, the date of a product."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from datetime import UTC, date, datetime, time
+from functools import cache
+from importlib.metadata import version
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Final
+from uuid import NAMESPACE_URL, uuid5
+
+import xarray as xr
+
+from lidarops.errors import NO_FILE, ProductError
+from lidarops.records import InputRecord, LeftOut, Provenance
+
+RELEASE_DATE: Final = date(2026, 11, 21)
+"""Of this version of lidarops; a product is dated no earlier."""
+EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
+NAMESPACE: Final = "urn:lidarops:"
+NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
+"""First bytes of files of netCDF."""
+
+_quoted: Final = json.JSONEncoder().encode
+
+_PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
+_NOT_COMPUTING: Final = (
+    "__main__.py",
+    "aggregate/",
+    "bench/",
+    "campaign/simulat",
+    "campaign/yaml_errors.py",
+    "catalog/",
+    "cli/",
+    "figures/",
+    "netcdf/read.py",
+    "plan/cost_estimate.py",
+    "reports/",
+    "run/",
+    "simulate/",
+    "site/",
+    "system/",
+)
+"""Sources of lidarops that change no byte of a product. Whatever else there is may."""
+
+
+def prov_json(provenance: Provenance) -> str:
+    """Write the provenance of a product as W3C PROV-JSON (`provo2013`).
+
+    Inputs with equal content are one entity, as content is what a product depends on.
+
+    Parameters
+    ----------
+    provenance : Provenance
+
+    Returns
+    -------
+    str
+        ASCII, keys sorted; equal for equal provenance, in whatever order the inputs come.
+    """
+    inputs = sorted(provenance.inputs, key=attrgetter("sha256", "path", "role"))
+    entities = {
+        "lidarops:product": _canonical(_product(provenance)),
+        "lidarops:plan": _canonical(_plan(provenance)),
+        **{
+            f"sha256:{digest}": _input(list(records))
+            for digest, records in groupby(inputs, key=attrgetter("sha256"))
+        },
+    }
+    uses = {
+        f"_:use{number}": '{"prov:activity":"lidarops:processing",'
+        f'"prov:entity":"sha256:{record.sha256}","prov:role":"{record.role}"}}'
+        for number, record in enumerate(inputs, start=1)
+    }
+    others = {
+        "prefix": {"lidarops": NAMESPACE, "sha256": "urn:sha256:"},
+        "activity": {"lidarops:processing": {"lidarops:scene": provenance.scene}},
+        "agent": {"lidarops:software": _software(provenance)},
+        "wasGeneratedBy": {
+            "_:generation": {
+                "prov:entity": "lidarops:product",
+                "prov:activity": "lidarops:processing",
+            }
+        },
+        "wasAssociatedWith": {
+            "_:association": {
+                "prov:activity": "lidarops:processing",
+                "prov:agent": "lidarops:software",
+                "prov:plan": "lidarops:plan",
+            }
+        },
+    }
+    told = {key: _canonical(value) for key, value in others.items()}
+    return _object({**told, "entity": _object(entities), "used": _object(uses)})
+
+
+def _canonical(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def _object(members: Mapping[str, str]) -> str:
+    """Return a canonical JSON object of members that are JSON already.
+
+    Of thousands of inputs `json` would take longer than a product takes to be written.
+    """
+    return f"{{{','.join([f'{_quoted(key)}:{members[key]}' for key in sorted(members)])}}}"
+
+
+def _type(name: str) -> dict[str, str]:
+    return {"$": name, "type": "prov:QUALIFIED_NAME"}
+
+
+def _product(provenance: Provenance) -> dict[str, Any]:
+    return {
+        "prov:type": _type("lidarops:Product"),
+        "lidarops:id": product_id(provenance),
+        "lidarops:campaign": provenance.campaign,
+        "lidarops:scene": provenance.scene,
+        "lidarops:kind": provenance.kind.value,
+        "lidarops:channel": provenance.channel,
+        "lidarops:settings": _canonical(dict(provenance.settings)),
+    }
+
+
+def _plan(provenance: Provenance) -> dict[str, Any]:
+    plan = provenance.plan
+    return {
+        "prov:type": _type("prov:Plan"),
+        "lidarops:sha256": plan.hash,
+        # The very text whose digest that is.
+        "lidarops:json": _canonical(plan.as_dict()),
+        "lidarops:left_out": [
+            f"{left.name} of {left.channel}: {left.reason}{_rule(left)}" for left in plan.left_out
+        ],
+    }
+
+
+def _rule(left: LeftOut) -> str:
+    """Return the rule that decided and its number, in brackets."""
+    number = "" if left.number is None else f", {left.number:g}"
+    return f" [{left.rule}{number}]" if left.rule else ""
+
+
+def _input(records: list[InputRecord]) -> str:
+    paths = [_quoted(record.path) for record in records]
+    path = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
+    return (
+        f'{{"lidarops:path":{path},"lidarops:sha256":"{records[0].sha256}",'
+        '"prov:type":{"$":"lidarops:RawFile","type":"prov:QUALIFIED_NAME"}}'
+    )
+
+
+def _software(provenance: Provenance) -> dict[str, Any]:
+    return {
+        "prov:type": _type("prov:SoftwareAgent"),
+        "lidarops:code_version": provenance.code_version,
+        "lidarops:versions": [
+            f"{name} {number}" for name, number in sorted(provenance.versions.items())
+        ],
+    }
+
+
+def product_id(provenance: Provenance) -> str:
+    """Return the identifier of a product: equal for equal inputs, plan, settings and code.
+
+    Parameters
+    ----------
+    provenance : Provenance
+
+    Returns
+    -------
+    str
+        UUID version 5 of kind, channel, inputs' sha256, plan hash, settings and code version.
+    """
+    content = {
+        "kind": provenance.kind.value,
+        "channel": provenance.channel,
+        "plan": provenance.plan.hash,
+        "settings": dict(provenance.settings),
+        "code_version": provenance.code_version,
+    }
+    inputs = sorted([f'["{record.role}","{record.sha256}"]' for record in provenance.inputs])
+    told = {key: _canonical(value) for key, value in content.items()}
+    text = _object({**told, "inputs": f"[{','.join(inputs)}]"})
+    return str(uuid5(NAMESPACE_URL, NAMESPACE + text))
+
+
+def read_provenance(path: str | Path) -> dict[str, Any]:
+    """Read the PROV-JSON document of a product.
+
+    Parameters
+    ----------
+    path : path or str
+        A product file.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    ProductError
+        If the file cannot be read or holds no provenance.
+    """
+    try:
+        with xr.open_dataset(path, engine="netcdf4", decode_times=False) as product:
+            if "provenance" not in product:
+                raise ProductError(
+                    "has no such variable", file=path, field="provenance", wrong_use=True
+                )
+            text = str(product["provenance"].item())
+    except (OSError, ValueError) as error:
+        raise ProductError(
+            f"cannot be read: {error}",
+            file=path,
+            remedy="give the path of a product of lidarops",
+            wrong_use=not _is_netcdf(Path(path)),
+        ) from error
+    try:
+        document: dict[str, Any] = json.loads(text)
+    except ValueError as error:
+        raise ProductError(f"is not JSON: {error}", file=path, field="provenance") from error
+    return document
+
+
+def _is_netcdf(path: Path) -> bool:
+    """Return whether a file is NetCDF by its first bytes, or there and cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4) in NETCDF_MAGIC
+    except NO_FILE:
+        return False
+    except OSError:
+        return True
+
+
+@cache
+def code_version() -> str:
+    """Return a digest of the sources that compute, so that a changed figure makes nothing stale.
+
+    Everything in the package counts but what is known to change no byte of a product, so that
+    a new module counts until someone says that it does not.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits.
+    """
+    return _digest(Path(__file__).resolve().parents[1])
+
+
+def _digest(root: Path) -> str:
+    digest = hashlib.sha256()
+    for name, source in _sources(root):
+        # A checkout with other line ends is the same code.
+        content = source.read_bytes().replace(b"\r\n", b"\n")
+        digest.update(f"{name}\0{len(content)}\0".encode() + content)
+    return digest.hexdigest()[:16]
+
+
+def _sources(root: Path) -> Iterator[tuple[str, Path]]:
+    names = {source.relative_to(root).as_posix(): source for source in root.rglob("*.py")}
+    for name in sorted(names):
+        if not name.startswith(_NOT_COMPUTING):
+            yield name, names[name]
+
+
+@cache
+def package_versions() -> Mapping[str, str]:
+    """Return the versions of Python and of the packages that can change a product."""
+    return {name: version(name) for name in _PACKAGES} | {"python": platform.python_version()}
+
+
+def product_date(end: datetime) -> tuple[datetime, str]:
+    """Return the date of a product, which must not depend on when or where it is made.
+
+    Parameters
+    ----------
+    end : datetime
+        End of the data, with time zone.
+
+    Returns
+    -------
+    datetime
+        Of the environment variable ``SOURCE_DATE_EPOCH`` if set, else the later of `end` and
+        the release date of the code.
+    str
+        Which of these it is, in words.
+
+    Raises
+    ------
+    ProductError
+        If ``SOURCE_DATE_EPOCH`` is no number of seconds.
+    """
+    epoch = os.environ.get(EPOCH_VARIABLE, "")
+    if epoch:
+        try:
+            return datetime.fromtimestamp(int(epoch), UTC), f"that of {EPOCH_VARIABLE}"
+        except (ValueError, OverflowError, OSError) as error:
+            raise ProductError(
+                f"is {epoch!r}",
+                field=EPOCH_VARIABLE,
+                remedy="set it to whole seconds since 1970-01-01, or unset it",
+            ) from error
+    release = datetime.combine(RELEASE_DATE, time(tzinfo=UTC))
+    return max(end, release), "the later of the end of the data and the release of lidarops"

@@ -1,0 +1,273 @@
+"""Granules -> scenes: what is processed together.
+
+A scene holds the granules of one instrument over one window of the campaign (a UTC day or a
+part of it). It is cut where the facts about the instrument change, because one scene has one
+plan, and where the files' channels or range grid change, because one product has one grid.
+
+A scene of a network holds one part a member instrument, over the same window; it is cut where
+the facts about any member change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from functools import lru_cache
+
+from lidarops.campaign.model import Campaign, InstrumentFacts
+from lidarops.errors import SceneError
+from lidarops.records import ChannelLayout, Granule, Role, Scene, Status
+
+DARK_REACH = timedelta(hours=24)
+_STAMP = "%Y%m%dT%H%M%S"
+"""Of the start of a scene, in its name."""
+"""Dark files serve a scene when they were taken at most this long before or after it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """Scenes, and the granules that belong to none."""
+
+    scenes: tuple[Scene, ...]
+    set_aside: tuple[Granule, ...]
+    """Granules of the same instrument and time as another one, refused with that reason."""
+
+
+def cut(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
+    """Group the good granules of a campaign into scenes.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Gives the window and the validity periods.
+    granules : iterable of Granule
+        In any order; refused ones are passed over.
+
+    Returns
+    -------
+    Cut
+        Scenes by instrument and time, then those of networks, the same for any order of
+        `granules`.
+    """
+    good = sorted(
+        (granule for granule in granules if granule.status is Status.GOOD),
+        key=lambda granule: (granule.instrument, _start(granule), granule.path),
+    )
+    signal, twins = _without_twins([g for g in good if g.role is Role.SIGNAL])
+    dark = [granule for granule in good if granule.role is Role.DARK]
+    groups: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
+    for instrument, own in itertools.groupby(signal, key=lambda granule: granule.instrument):
+        if instrument in campaign.instruments:
+            for granule, window in _in_windows(campaign, (instrument,), own):
+                groups[instrument, *window].append(granule)
+    scenes = [
+        scene
+        for (instrument, start, stop), members in sorted(groups.items())
+        for scene in _by_layout(campaign, instrument, start, stop, members, dark)
+    ]
+    for key in sorted(campaign.networks):
+        scenes += _of_network(campaign, key, signal, dark)
+    return Cut(tuple(scenes), tuple(twins))
+
+
+def _of_network(
+    campaign: Campaign, key: str, signal: list[Granule], dark: list[Granule]
+) -> list[Scene]:
+    """Return the scenes of a network: windows in which two members at least have granules.
+
+    Where a member changed its range grid within a window, each grid makes a scene with the
+    others.
+    """
+    names = tuple(campaign.networks[key].instruments)
+    groups: dict[tuple[datetime, datetime], dict[str, list[Granule]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    own = (granule for granule in signal if granule.instrument in names)
+    for granule, window in _in_windows(campaign, names, own):
+        groups[window][granule.instrument].append(granule)
+    scenes = []
+    for (start, stop), found in sorted(groups.items()):
+        parts = [
+            _by_layout(campaign, name, start, stop, found[name], dark)
+            for name in names
+            if name in found
+        ]
+        chosen = list(itertools.product(*parts)) if len(parts) > 1 else []
+        for members in chosen:
+            suffix = f"-{_grids_key(members)}" if len(chosen) > 1 else ""
+            scenes.append(
+                Scene(
+                    id=f"{key}_{start:{_STAMP}}{suffix}",
+                    campaign=campaign.name,
+                    station=key,
+                    instrument=key,
+                    start=start,
+                    stop=stop,
+                    granules=_in_time(g for member in members for g in member.granules),
+                    dark=_in_time(g for member in members for g in member.dark),
+                    members=members,
+                )
+            )
+    return scenes
+
+
+def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
+    return tuple(sorted(granules, key=lambda granule: (_start(granule), granule.path)))
+
+
+def _grids_key(members: Sequence[Scene]) -> str:
+    text = " ".join(_layout_key(member.granules[0]) for member in members)
+    return hashlib.sha256(text.encode()).hexdigest()[:6]
+
+
+def instrument_and_start(scene: str) -> tuple[str, datetime]:
+    """Return the instrument, or network, and the start that the name of a scene tells."""
+    instrument, _, rest = scene.rpartition("_")
+    return instrument, datetime.strptime(rest.partition("-")[0], _STAMP).replace(tzinfo=UTC)
+
+
+def stop_of(scene: str, campaign: Campaign) -> datetime:
+    """Return when a scene, which may be gone, ends by its name, as the campaign cuts scenes now."""
+    key, start = instrument_and_start(scene)
+    members = campaign.networks[key].instruments if key in campaign.networks else [key]
+    return _window(campaign, [each for each in members if each in campaign.instruments], start)[1]
+
+
+def select(
+    scenes: Sequence[Scene],
+    *,
+    instruments: Sequence[str] = (),
+    since: datetime | None = None,
+    until: datetime | None = None,
+) -> tuple[Scene, ...]:
+    """Return the scenes of these instruments (all where empty) that touch [since, until).
+
+    Raises
+    ------
+    SceneError
+        If an instrument has no scene, naming those that have.
+    """
+    known = sorted({scene.instrument for scene in scenes})
+    for instrument in instruments:
+        if instrument not in known:
+            raise SceneError(
+                f"no scene of instrument {instrument!r}",
+                remedy=f"instruments with scenes: {', '.join(known) or 'none'}",
+            )
+    return tuple(
+        scene
+        for scene in scenes
+        if (not instruments or scene.instrument in instruments)
+        and (since is None or scene.stop > since)
+        and (until is None or scene.start < until)
+    )
+
+
+def _start(granule: Granule) -> datetime:
+    if granule.start is None:
+        raise SceneError("a good granule without a start time", file=granule.path)
+    return granule.start
+
+
+def _without_twins(granules: list[Granule]) -> tuple[list[Granule], list[Granule]]:
+    kept: list[Granule] = []
+    twins: list[Granule] = []
+    first: dict[tuple[str, datetime], Granule] = {}
+    for granule in granules:
+        key = (granule.instrument, _start(granule))
+        if key in first:
+            reason = f"starts at the same time as {first[key].path}, which is used"
+            twins.append(replace(granule, status=Status.REFUSED, reason=reason))
+        else:
+            first[key] = granule
+            kept.append(granule)
+    return kept, twins
+
+
+def _in_windows(
+    campaign: Campaign, instruments: Sequence[str], granules: Iterable[Granule]
+) -> Iterator[tuple[Granule, tuple[datetime, datetime]]]:
+    """Give granules with their windows, quickly where they come by time."""
+    opens = closes = datetime.min.replace(tzinfo=UTC)
+    for granule in granules:
+        if not opens <= _start(granule) < closes:
+            opens, closes = _window(campaign, instruments, _start(granule))
+        yield granule, (opens, closes)
+
+
+def _window(
+    campaign: Campaign, instruments: Sequence[str], start: datetime
+) -> tuple[datetime, datetime]:
+    """Return the window of a granule by its start; no fact about the instruments changes in it."""
+    length = timedelta(days=1) if campaign.scenes.window == "day" else campaign.scenes.window
+    midnight = start.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
+    opens = midnight + (start - midnight) // length * length
+    closes = opens + length
+    for instrument in instruments:
+        for fact in campaign.instruments[instrument].facts:
+            opens, closes = _narrow(fact, start, opens, closes)
+    return opens, closes
+
+
+def _narrow(
+    fact: InstrumentFacts, moment: datetime, opens: datetime, closes: datetime
+) -> tuple[datetime, datetime]:
+    """Shrink a window around `moment` so that no edge of the validity period lies inside."""
+    for edge in (fact.valid_from, fact.valid_to):
+        if opens < edge <= moment:
+            opens = edge
+        elif moment < edge < closes:
+            closes = edge
+    return opens, closes
+
+
+def _by_layout(
+    campaign: Campaign,
+    instrument: str,
+    start: datetime,
+    stop: datetime,
+    members: list[Granule],
+    dark: list[Granule],
+) -> list[Scene]:
+    layouts: dict[str, list[Granule]] = defaultdict(list)
+    for granule in members:
+        layouts[_layout_key(granule)].append(granule)
+    scenes = []
+    for key, group in sorted(layouts.items()):
+        suffix = f"-{key}" if len(layouts) > 1 else ""
+        scenes.append(
+            Scene(
+                id=f"{instrument}_{start:{_STAMP}}{suffix}",
+                campaign=campaign.name,
+                station=campaign.instruments[instrument].station,
+                instrument=instrument,
+                start=start,
+                stop=stop,
+                granules=tuple(group),
+                dark=tuple(
+                    granule
+                    for granule in dark
+                    if granule.instrument == instrument
+                    and _layout_key(granule) == key
+                    and _start(group[0]) - DARK_REACH
+                    <= _start(granule)
+                    <= _start(group[-1]) + DARK_REACH
+                ),
+            )
+        )
+    return scenes
+
+
+def _layout_key(granule: Granule) -> str:
+    return _key_of(granule.layout)
+
+
+# The files of an archive share few layouts.
+@lru_cache(maxsize=128)
+def _key_of(layout: tuple[ChannelLayout, ...]) -> str:
+    text = repr([(c.name, c.bins, c.bin_width, c.adc_bits) for c in layout])
+    return hashlib.sha256(text.encode()).hexdigest()[:6]

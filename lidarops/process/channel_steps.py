@@ -1,0 +1,399 @@
+"""The steps of a plan, carried out for one channel: raw counts in, what its products hold out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from dask.base import compute
+
+from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.flags import Quality
+from lidarops.plan import scan_rules
+from lidarops.plan.preview import WITHOUT
+from lidarops.plan.signal_rules import GLUED, WHOLE, StepName, parts_of
+from lidarops.records import Plan, ProductKind, Step
+from lidarops.retrieve.air import labeled as labeled_visibility
+from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.elastic import labeled as labeled_elastic
+from lidarops.retrieve.homogeneous import labeled
+from lidarops.retrieve.multiangle import labeled as labeled_multiangle
+from lidarops.retrieve.multiangle import labeled_altitudes
+from lidarops.retrieve.signal import (
+    labeled as labeled_signal,
+)
+from lidarops.retrieve.signal import (
+    labeled_averaging,
+    labeled_gluing,
+)
+
+Array = npt.NDArray[np.float64]
+
+FULL_OVERLAP: Final = 0.99
+"""Overlap from which on a homogeneous section may begin."""
+
+AT_ONCE: Final = 2_000_000
+"""Bytes of counts up to which a scene is read before it is worked on: to put off so little costs
+more than to do it, and of more the arrays would leave the cache."""
+_GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What the steps of all channels of a scene work on."""
+
+    plan: Plan
+    archive: xr.Dataset
+    """Raw counts of the scene, lazy."""
+    dark: xr.Dataset | None
+    """Raw counts of its dark files, lazy."""
+    ancillaries: Ancillaries
+    station_altitude: float
+    """m above mean sea level."""
+
+    def steps(self, channel: str) -> Mapping[str, Step]:
+        """Return the steps of a channel by name."""
+        return {step.name: step for step in self.plan.steps if step.channel == channel}
+
+
+def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
+    """Carry out the steps of a channel.
+
+    Parameters
+    ----------
+    bench : Bench
+    channel : str
+
+    Returns
+    -------
+    dict of ProductKind to xr.Dataset
+        In memory, with the variables of `lidarops.products.layouts` and the geometry of the beam.
+
+    Raises
+    ------
+    LidarOpsError
+        Where the data cannot be what the plan says.
+    """
+    steps = bench.steps(channel)
+    if _is_read(steps):
+        bench = at_hand(bench, parts_of(channel) if channel.startswith(GLUED) else (channel,))
+    source = source_of(bench, channel)
+    lazy: dict[ProductKind, xr.Dataset] = {}
+    if StepName.SIGNAL in steps:
+        lazy[ProductKind.SIGNAL] = _signal(source, steps, bench.ancillaries)
+    if StepName.HOMOGENEOUS in steps:
+        lazy[ProductKind.HOMOGENEOUS] = _homogeneous(bench, channel, source)
+    for kind, data in lazy.items():
+        lazy[kind] = data.assign(shots=source.shots).assign_coords(source.geometry.variables)
+    if StepName.ELASTIC in steps:
+        lazy[ProductKind.ELASTIC] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
+    if StepName.MULTIANGLE in steps:
+        lazy[ProductKind.MULTIANGLE] = _rays(source, steps, bench)
+    # Together, so that products of one channel share one reading of the files.
+    found = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
+    if ProductKind.HOMOGENEOUS in found and "visibility" in steps[StepName.HOMOGENEOUS].settings:
+        found[ProductKind.HOMOGENEOUS] = _with_visibility(found[ProductKind.HOMOGENEOUS], steps)
+    if ProductKind.ELASTIC in found:
+        averages = source.joined(found[ProductKind.ELASTIC])
+        found[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
+    if ProductKind.MULTIANGLE in found:
+        settings = steps[StepName.MULTIANGLE].settings
+        found[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve(
+            found[ProductKind.MULTIANGLE],
+            station_altitude=bench.station_altitude,
+            method=settings["method"],
+            largest_gradient=settings["largest_gradient"],
+            layers=[
+                (low + bench.station_altitude, high + bench.station_altitude)
+                for low, high in settings["layers"]
+            ],
+        )
+    return found
+
+
+def at_hand(bench: Bench, channels: Sequence[str]) -> Bench:
+    """Return a bench with the counts of channels in memory, where they are few."""
+    counts = bench.archive[[name for name in channels if name in bench.archive]]
+    small = counts.nbytes <= AT_ONCE
+    return replace(bench, archive=bench.archive.assign(counts.compute())) if small else bench
+
+
+def _is_read(steps: Mapping[str, Step]) -> bool:
+    """Whether a step looks at the counts of the channel."""
+    if any(name in steps for name in WHOLE):
+        return True
+    settings = steps[StepName.HOMOGENEOUS].settings if StepName.HOMOGENEOUS in steps else {}
+    return len(settings.get(WITHOUT, ())) < len(settings.get("sections", ()))
+
+
+def source_of(bench: Bench, channel: str) -> Plain | Glued:
+    """Return what gives the profiles of a channel."""
+    return Glued(bench, channel) if channel.startswith(GLUED) else Plain(bench, channel)
+
+
+class Plain:
+    """A channel of the files."""
+
+    def __init__(self, bench: Bench, channel: str) -> None:
+        self._channel = channel
+        archive, steps = bench.archive, bench.steps(channel)
+        self._dark: labeled_signal.Dark | None = None
+        if bench.dark is not None and StepName.DARK in steps:
+            method = steps[StepName.DARK].settings["method"]
+            self._dark = labeled_signal.dark_of(bench.dark, channel, method=method)
+        self._archive = archive
+        self._settings = {
+            "dead_time": _setting(steps, StepName.DEAD_TIME, "dead_time"),
+            "noise_variance": _setting(steps, StepName.NOISE, "noise_variance"),
+            "dark": self._dark,
+            "range_offset": _setting(steps, StepName.RANGE_OFFSET, "range_offset") or 0.0,
+            "full_overlap_range": _setting(steps, StepName.OVERLAP, "full_overlap_range") or 0.0,
+        }
+        self.geometry = archive[[name for name in _GEOMETRY if name in archive]]
+        self.shots = archive[f"{channel}_shots"]
+
+    def profiles(self) -> xr.Dataset:
+        """Return power, variance and quality of every profile."""
+        return labeled_signal.condition(self._archive, self._channel, **self._settings)
+
+    def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
+        """Return range-corrected signals without background of every profile."""
+        return labeled_signal.signals(
+            self._archive, self._channel, background_range=background_range, **self._settings
+        )
+
+    def averages(self, seconds: float) -> xr.Dataset:
+        """Return means over intervals of the clock, of every part of the channel."""
+        conditioned = self.profiles().assign_coords(self.geometry.variables)
+        shared = None if self._dark is None else self._dark.variance
+        averages = labeled_averaging.clock_average(
+            conditioned, seconds=seconds, shots=self.shots, shared_variance=shared
+        )
+        angles = {
+            name: float(self.geometry[name][0])
+            for name in ("zenith_angle", "azimuth")
+            if name in self.geometry
+        }
+        return averages.assign_coords(angles)
+
+    def joined(self, averages: xr.Dataset) -> xr.Dataset:
+        """Return computed averages as one channel."""
+        return averages
+
+
+class Glued:
+    """A channel made of an analog and a photon counting one."""
+
+    def __init__(self, bench: Bench, channel: str) -> None:
+        steps = bench.steps(channel)
+        parts = steps[StepName.GLUE].settings
+        self._analog = Plain(bench, parts["analog"])
+        self._photon = Plain(bench, parts["photon"])
+        self.geometry, self.shots = self._photon.geometry, self._photon.shots
+        self._lag = self._find_lag(steps.get(StepName.LAG))
+
+    def profiles(self) -> xr.Dataset:
+        """Return power, variance and quality of every profile."""
+        return labeled_gluing.glue(self._analog.profiles(), self._photon.profiles(), lag=self._lag)
+
+    def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
+        """Return range-corrected signals without background of every profile."""
+        joined = self.profiles()
+        return labeled_signal.corrected(joined, background_range).assign(_gluing(joined))
+
+    def averages(self, seconds: float) -> xr.Dataset:
+        """Return means over intervals of the clock, of every part of the channel."""
+        parts = {"analog": self._analog, "photon": self._photon}
+        named = [
+            part.averages(seconds).rename(
+                {name: f"{prefix}_{name}" for name in ("power", "variance", "quality")}
+            )
+            for prefix, part in parts.items()
+        ]
+        shortest = min(part.sizes["range"] for part in named)
+        analog, photon = (part.isel(range=slice(shortest)) for part in named)
+        only = analog[[f"analog_{name}" for name in ("power", "variance", "quality")]]
+        return photon.assign({name: (v.dims, v.data, v.attrs) for name, v in only.items()})
+
+    def joined(self, averages: xr.Dataset) -> xr.Dataset:
+        """Return computed averages as one channel."""
+        parts = [
+            averages.rename(
+                {f"{prefix}_{name}": name for name in ("power", "variance", "quality")}
+            )[["power", "variance", "quality"]]
+            for prefix in ("analog", "photon")
+        ]
+        glued = labeled_gluing.glue(*parts, lag=self._lag)
+        parted = [name for name in averages if str(name) not in ("shots", "profiles")]
+        return averages.drop_vars(parted).assign(glued.variables)
+
+    def _find_lag(self, step: Step | None) -> float:
+        parts = self._analog.profiles(), self._photon.profiles()
+        if step is not None and step.settings["method"] == "estimate":
+            return labeled_gluing.estimate_lag(*parts)
+        # A lag that is given has moved the ranges of the analog part.
+        return labeled_gluing.told_lag(*parts)
+
+
+def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
+    step = steps.get(name)
+    return None if step is None else step.settings.get(key)
+
+
+def _signal(
+    source: Plain | Glued, steps: Mapping[str, Step], ancillaries: Ancillaries
+) -> xr.Dataset:
+    start, stop = steps[StepName.BACKGROUND].settings["range"]
+    result = source.signals((start, stop))
+    overlap = overlap_at(steps, ancillaries, result["range"].to_numpy())
+    if overlap is None:
+        return result
+    along = xr.DataArray(overlap.astype(np.float32), dims="range")
+    lost = along.isnull().astype(np.int32) * np.int32(Quality.INCOMPLETE_OVERLAP)
+    return result.assign(
+        signal=result["signal"] / along,
+        signal_standard_error=result["signal_standard_error"] / along,
+        quality_flag=result["quality_flag"] | lost,
+    )
+
+
+def _gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return what is told of the joining of profiles, where they are joined."""
+    return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}
+
+
+def _homogeneous(bench: Bench, channel: str, source: Plain | Glued) -> xr.Dataset:
+    steps = bench.steps(channel)
+    settings = steps[StepName.HOMOGENEOUS].settings
+    absent = {(near, far): Quality[bit] for near, far, bit in settings.get(WITHOUT, ())}
+    sections = [(near, far) for near, far in settings["sections"]]
+    kept = [section for section in sections if section not in absent]
+    parts = []
+    if kept:
+        parts.append(_retrieved(source.profiles(), kept, steps, bench.ancillaries))
+    if absent:
+        unit = labeled_signal.unit_of(bench.archive, channel)
+        parts.append(_absent(source.shots, unit, absent))
+    result = parts[0]
+    if len(parts) > 1:
+        order = [[*kept, *absent].index(section) for section in sections]
+        number = np.arange(len(sections), dtype=np.int32)
+        joined: xr.Dataset = xr.concat(parts, dim="section")
+        result = joined.isel(section=order).assign_coords(section=("section", number))
+    slanted = labeled.not_level(result, source.geometry["zenith_angle"])
+    return result.assign(quality_flag=result["quality_flag"] | slanted)
+
+
+def _absent(
+    shots: xr.DataArray, unit: str, absent: Mapping[tuple[float, float], Quality]
+) -> xr.Dataset:
+    """Return sections without values, for which no bin is read."""
+    empty = labeled.nothing(shots, unit=unit, sections=list(absent))
+    bits = np.array([int(bit) for bit in absent.values()], dtype=np.int32)
+    missing = np.where(shots.to_numpy() > 0, np.int32(0), np.int32(Quality.INPUT_MISSING))
+    flags = bits | missing[:, np.newaxis]
+    return empty.assign(quality_flag=empty["quality_flag"].copy(data=flags))
+
+
+def _retrieved(
+    conditioned: xr.Dataset,
+    sections: list[tuple[float, float]],
+    steps: Mapping[str, Step],
+    ancillaries: Ancillaries,
+) -> xr.Dataset:
+    quality = conditioned["quality"]
+    overlap = overlap_at(steps, ancillaries, conditioned["range"].to_numpy())
+    if overlap is not None:
+        # A signal with its background cannot be divided: where overlap is not full is left out.
+        partial = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
+        quality = quality | xr.DataArray(partial.astype(np.int32), dims="range")
+    return labeled.homogeneous(
+        conditioned["power"],
+        sections=sections,
+        variance=conditioned["variance"],
+        quality=quality,
+        method=steps[StepName.HOMOGENEOUS].settings["method"],
+        # An estimate scatters, and its scatter must not pass for misfit.
+        relative_variance=steps[StepName.NOISE].settings["method"] == "differences",
+    )
+
+
+def _with_visibility(result: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
+    """Return sections, computed, with visibility along them."""
+    settings = steps[StepName.HOMOGENEOUS].settings
+    definition = Definition(
+        wavelength=steps[StepName.READ].settings["wavelength"], **settings["visibility"]
+    )
+    seen = labeled_visibility.of_extinction(
+        result["extinction"],
+        result["extinction_standard_error"],
+        result["extinction_model_error"],
+        definition,
+    )
+    return result.assign(seen.data_vars).assign_attrs(steps=definition.words)
+
+
+def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+    settings = steps[StepName.ELASTIC].settings
+    window = steps[StepName.REFERENCE].settings
+    found = labeled_elastic.elastic(
+        averages,
+        molecules=_molecules(steps, bench.ancillaries),
+        wavelength=steps[StepName.READ].settings["wavelength"],
+        station_altitude=bench.station_altitude,
+        lidar_ratio=settings["lidar_ratio"],
+        lidar_ratio_standard_error=settings["lidar_ratio_standard_error"],
+        molecular_relative_error=settings["molecular_relative_error"],
+        reference=labeled_elastic.Reference(
+            lowest=window["lowest"],
+            highest=window["highest"],
+            width=window["width"],
+            scattering_ratio=window["scattering_ratio"],
+            relative_error=window["relative_error"],
+        ),
+        known_shape=StepName.KNOWN_SHAPE in steps,
+        overlap=overlap_at(steps, bench.ancillaries, averages["range"].to_numpy()),
+    )
+    return found.assign(_gluing(averages))
+
+
+def _rays(source: Plain | Glued, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+    """Return the rays of every scan cycle on common altitudes, lazy."""
+    settings = steps[StepName.MULTIANGLE].settings
+    profiles, geometry = source.profiles(), source.geometry
+    near, far = settings["background_range"]
+    heights = scan_rules.heights(settings["step"], settings["highest"])
+    return labeled_altitudes.on_altitudes(
+        profiles,
+        zenith_angle=geometry["zenith_angle"].to_numpy(),
+        azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
+        time=geometry["time"].to_numpy(),
+        time_bnds=geometry["time_bnds"].to_numpy(),
+        shots=source.shots.to_numpy(),
+        altitude_grid=bench.station_altitude + heights,
+        station_altitude=bench.station_altitude,
+        background=labeled_altitudes.Background(
+            (near, far),
+            _molecules(steps, bench.ancillaries),
+            steps[StepName.READ].settings["wavelength"],
+        ),
+        overlap=overlap_at(steps, bench.ancillaries, profiles["range"].to_numpy()),
+    )
+
+
+def overlap_at(
+    steps: Mapping[str, Step], ancillaries: Ancillaries, distance: Array
+) -> Array | None:
+    """Return the overlap at ranges where the campaign gives it."""
+    source = _setting(steps, StepName.OVERLAP, "overlap_profile")
+    return None if source is None else ancillaries.overlaps[source].at(distance)
+
+
+def _molecules(steps: Mapping[str, Step], ancillaries: Ancillaries) -> MolecularProfile:
+    source = steps[StepName.MOLECULAR].settings.get("molecular_profile")
+    return MolecularProfile.us_standard() if source is None else ancillaries.profiles[source]

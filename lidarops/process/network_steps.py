@@ -1,0 +1,177 @@
+"""The steps of a network's plan: raw counts of several lidars in, their ``visibility`` out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from dask.base import compute
+
+from lidarops.campaign.model import Station
+from lidarops.flags import Quality
+from lidarops.plan import network_plan
+from lidarops.plan.network_plan import SAME_POINTING, RayPlan
+from lidarops.plan.signal_rules import StepName
+from lidarops.process import channel_steps
+from lidarops.process.channel_steps import Bench
+from lidarops.records import Step
+from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.network import geometry, labeled
+from lidarops.retrieve.network.labeled import BeamSignals
+
+Integers = npt.NDArray[np.int64]
+
+_EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One instrument of a network, and what its steps work on."""
+
+    instrument: str
+    station: Station
+    bench: Bench | None
+    """Its plan holds the steps of the instrument alone; None where no granule can be read."""
+    range: npt.NDArray[np.float64]
+    """m, of the bins that the plan reckons with."""
+
+
+def carry_out(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.Dataset:
+    """Carry out the steps of a network.
+
+    Parameters
+    ----------
+    members : sequence of Member
+    joint : mapping of str to Step
+        The steps that join the members, by name.
+
+    Returns
+    -------
+    xr.Dataset
+        In memory: the variables of the ``visibility`` product.
+
+    Raises
+    ------
+    LidarOpsError
+        Where the data cannot be what the plan says.
+    """
+    seconds = joint[StepName.AVERAGE].settings["seconds"]
+    settings = joint[StepName.VISIBILITY].settings
+    channel = joint[StepName.VISIBILITY].channel
+    by_name = {member.instrument: member for member in members}
+    rays = [RayPlan(**ray) for ray in settings["rays"]]
+    beams = [_Beam(by_name[ray.instrument], ray, channel, seconds) for ray in rays]
+    # Together, so that the beams of one instrument share one reading of its files.
+    computed = compute(*(beam.lazy for beam in beams))  # type: ignore[no-untyped-call]
+    signals = [beam.signals(data) for beam, data in zip(beams, computed, strict=True)]
+    return labeled.retrieve(
+        signals,
+        _network(signals, settings, rays),
+        labeled.Settings(
+            block_intervals=round(settings["block_seconds"] / seconds),
+            visibility=Definition(
+                wavelength=settings["wavelength"],
+                **{name: settings[name] for name in network_plan.SIGHT},
+            ),
+            method=settings["method"],
+            prior=settings["prior"],
+            exponent_relative_error=settings["exponent_relative_error"],
+            lidar_ratio_relative_error=settings["lidar_ratio_relative_error"],
+            overlap_relative_error=settings["overlap_relative_error"],
+        ),
+    )
+
+
+def _network(
+    signals: Sequence[BeamSignals], settings: Mapping[str, Any], rays: Sequence[RayPlan]
+) -> geometry.Network:
+    return geometry.network(
+        [
+            geometry.Ray(*beam.station, azimuth=beam.azimuth, elevation=90.0 - beam.zenith_angle)
+            for beam in signals
+        ],
+        tolerance=settings["tolerance"],
+        nearest=[ray.nearest for ray in rays],
+        farthest=[ray.farthest for ray in rays],
+        smallest_angle=settings["smallest_angle"],
+    )
+
+
+class _Beam:
+    """One beam of a member: the profiles of its pointing, averaged."""
+
+    def __init__(self, member: Member, ray: RayPlan, channel: str, seconds: float) -> None:
+        self._member, self._ray, self._channel = member, ray, channel
+        self._source: channel_steps.Plain | channel_steps.Glued | None = None
+        self._interval: Integers = np.zeros(0, dtype=np.int64)
+        self.lazy = _nothing(member.range)
+        bench = member.bench
+        mine = [] if bench is None else list(_of_pointing(bench.archive, ray))
+        if bench is not None and mine:
+            archive = bench.archive.isel(time=mine)
+            self._source = channel_steps.source_of(replace(bench, archive=archive), channel)
+            self._interval = _intervals(archive["time"].to_numpy(), seconds)
+            self.lazy = self._source.averages(seconds)
+
+    def signals(self, computed: xr.Dataset) -> BeamSignals:
+        """Return the averages with what the network needs to know of them."""
+        member, bench = self._member, self._member.bench
+        averages = computed if self._source is None else self._source.joined(computed)
+        planned = {} if bench is None else bench.steps(self._channel)
+        distance = averages["range"].to_numpy().astype(np.float64)
+        near, far = (
+            planned[StepName.BACKGROUND].settings["range"] if planned else (distance[0], np.inf)
+        )
+        return BeamSignals(
+            averages=averages,
+            interval=self._interval,
+            instrument=member.instrument,
+            station=(member.station.latitude, member.station.longitude, member.station.altitude),
+            background_range=(near, far),
+            nearest=self._ray.nearest,
+            overlap=(
+                None
+                if bench is None
+                else channel_steps.overlap_at(planned, bench.ancillaries, distance)
+            ),
+            exponent=self._ray.exponent,
+            zenith_angle=self._ray.zenith_angle,
+            azimuth=self._ray.azimuth,
+        )
+
+
+def _of_pointing(archive: xr.Dataset, ray: RayPlan) -> Iterator[int]:
+    """Give the profiles of a beam."""
+    pairs = zip(archive["zenith_angle"].to_numpy(), archive["azimuth"].to_numpy(), strict=True)
+    for number, (zenith, azimuth) in enumerate(pairs):
+        found = network_plan.apart((zenith, azimuth), (ray.zenith_angle, ray.azimuth))
+        if found <= SAME_POINTING:
+            yield number
+
+
+def _intervals(moments: npt.NDArray[np.datetime64], seconds: float) -> Integers:
+    """Return the numbers of the intervals of the clock that hold profiles, each once."""
+    length = np.timedelta64(round(seconds * 1e9), "ns")
+    return np.unique((moments.astype("datetime64[ns]") - _EPOCH) // length).astype(np.int64)
+
+
+def _nothing(distance: npt.NDArray[np.float64]) -> xr.Dataset:
+    """Return averages of a beam without profiles."""
+    empty = np.zeros((0, distance.size))
+    pair = ("time", "range")
+    return xr.Dataset(
+        {
+            "power": (pair, empty),
+            "variance": (pair, empty),
+            "quality": (pair, np.full(empty.shape, int(Quality.INPUT_MISSING), dtype=np.int32)),
+            "shots": ("time", np.zeros(0, dtype=np.int32)),
+        },
+        coords={
+            "range": distance,
+            "time_bnds": (("time", "nv"), np.zeros((0, 2), dtype="datetime64[ns]")),
+        },
+    )

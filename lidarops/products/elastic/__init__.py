@@ -1,0 +1,1 @@
+"""The ``elastic`` product: backscatter and extinction of particles from an elastic lidar."""

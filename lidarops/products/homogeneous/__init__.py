@@ -1,0 +1,1 @@
+"""The ``homogeneous`` product: extinction of homogeneous range sections."""

@@ -1,0 +1,1 @@
+"""The ``multiangle`` product: optical depth and extinction from scans."""

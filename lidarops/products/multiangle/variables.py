@@ -1,0 +1,317 @@
+"""The variables of the ``multiangle`` product."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from lidarops.flags import Quality
+from lidarops.netcdf.variables import (
+    NO_NAME,
+    PLACE,
+    TIME,
+    Coverage,
+    ErrorKind,
+    Layout,
+    Row,
+    quality,
+    shots,
+)
+
+_LEVELS: Final = ("time", "altitude")
+_BITS: Final = 12
+"""Significant bits of a retrieved value: 1.2e-4 of it."""
+
+FLAGS: Final = (
+    Quality.INPUT_MISSING
+    | Quality.SATURATED
+    | Quality.PILE_UP
+    | Quality.INCOMPLETE_OVERLAP
+    | Quality.OUTLIER
+    | Quality.BACKGROUND_UNCERTAIN
+    | Quality.NO_GLUING
+    | Quality.NO_LEVERAGE
+    | Quality.POOR_STRATIFICATION
+    | Quality.PRIOR_DOMINATED
+    | Quality.EXTRAPOLATED
+    | Quality.INTERPOLATED
+    | Quality.ONE_SIDED
+    | Quality.LOW_LEVERAGE
+    | Quality.NO_RESIDUAL
+    | Quality.UNDERSMOOTHED
+    | Quality.HIGH_CORRELATION
+    | Quality.HORIZONTAL_GRADIENT
+)
+
+_ALTITUDE: Final = Row(
+    name="altitude",
+    dims=("altitude",),
+    dtype="f8",
+    units="m",
+    standard_name="altitude",
+    long_name="altitude of the sounded air above the geoid",
+    coverage=Coverage.COORDINATE,
+    axis="Z",
+    positive="up",
+    bounds="altitude_bnds",
+    comment="Top of the layer in altitude_bnds, which begins at the altitude below, or at the"
+    " station.",
+)
+_RAY: Final = Row(
+    name="ray",
+    dims=("ray",),
+    dtype="i4",
+    units="1",
+    long_name="number of the direction of the beam",
+    coverage=Coverage.COORDINATE,
+    comment="In order of vertical planes of rising azimuth, from one horizon over the zenith to"
+    " the other.",
+)
+_LAYER: Final = Row(
+    name="layer_altitude",
+    dims=("layer",),
+    dtype="f8",
+    units="m",
+    standard_name="altitude",
+    long_name="altitude of the middle of the layer above the geoid",
+    coverage=Coverage.COORDINATE,
+    positive="up",
+    bounds="layer_bnds",
+    optional=True,
+    comment="Bottom and top in layer_bnds, moved to the nearest altitude of the profile or the"
+    " station.",
+)
+
+
+def _direction(name: str) -> Row:
+    """Return the row of an angle of the rays."""
+    angle = next(row for row in PLACE if row.name == name)
+    return replace(angle, name=f"ray_{name}", dims=("ray",), follows_beam=False)
+
+
+_STATION: Final = tuple(row for row in PLACE if row.name not in ("zenith_angle", "azimuth"))
+
+
+def _gradient_error(quantity: str, called: str, units: str) -> Row:
+    return Row(
+        name=f"{quantity}_gradient_error",
+        dims=_LEVELS,
+        dtype="f4",
+        units=units,
+        long_name=f"systematic error of {called} by a horizontal gradient to allow for",
+        coverage=Coverage.QUALITY,
+        valid_min=0.0,
+        significant_bits=8,
+        error_kind=ErrorKind.SYSTEMATIC,
+        comment=f"Apart from {quantity}_standard_error, of noise and smoothing: what the largest"
+        " horizontal gradient of ln backscatter that the settings declare would do. Near 0 where"
+        f" rays lead to all sides. {NO_NAME}",
+    )
+
+
+MULTIANGLE: Final = Layout(
+    title="Optical depth and extinction of scans over zenith angles",
+    summary="Optical depth and extinction of air and aerosol together, from signals of one lidar"
+    " channel at several zenith angles, without a lidar ratio or a reference, with standard"
+    " errors.",
+    keywords=(
+        "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL OPTICAL DEPTH/THICKNESS",
+        "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
+        "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
+    ),
+    processing_level="L2: retrieved quantities",
+    references=(
+        "Kano, M. (1968), Pap. Meteorol. Geophys. 19, 121-129.",
+        "Hamilton, P. M. (1969), Atmos. Environ. 3, 221-223.",
+        "DerSimonian, R. and Laird, N. (1986), Control. Clin. Trials 7, 177-188.",
+    ),
+    comment="Model: the logarithm of the range-corrected signal at an altitude falls by twice the"
+    " optical depth times the slant path over the vertical one, in air that is level over the"
+    " scan. A profile is one scan cycle. Inhomogeneity and smoothness are common to all cycles"
+    " of the file. What smoothness takes from a profile it takes from every profile of one sky, so"
+    " that a mean over time does not make the errors of optical depth and extinction smaller;"
+    " methods that do not smooth state noise alone, which a mean over time then overstates.",
+    sampled="altitude",
+    unused_steps=frozenset({"average", "reference"}),
+    coordinates=(
+        TIME,
+        _ALTITUDE,
+        _RAY,
+        _direction("zenith_angle"),
+        _direction("azimuth"),
+        _LAYER,
+        *_STATION,
+    ),
+    data=(
+        Row(
+            name="optical_depth",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="optical depth of air and aerosol from the station to the altitude",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean altitude: point",
+            ancillaries=(
+                "optical_depth_gradient_error",
+                "data_share",
+                "inhomogeneity",
+                "quality_flag",
+                "rays",
+                "shots",
+            ),
+            significant_bits=_BITS,
+            uncertain=True,
+            error_kind=ErrorKind.BOTH,
+            comment="Vertical, molecules and particles together, at the wavelength of the channel."
+            f" {NO_NAME}",
+        ),
+        _gradient_error("optical_depth", "optical depth", "1"),
+        Row(
+            name="monotone_optical_depth",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="nearest to optical_depth that nowhere decreases with altitude",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean altitude: point",
+            ancillaries=("quality_flag",),
+            significant_bits=_BITS,
+            optional=True,
+            comment="For pictures of single profiles. Where the signal is weak, means over many"
+            f" profiles are biased high: take those of optical_depth. {NO_NAME}",
+        ),
+        Row(
+            name="extinction",
+            dims=_LEVELS,
+            dtype="f4",
+            units="m-1",
+            long_name="extinction coefficient of air and aerosol together",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean altitude: mean",
+            ancillaries=(
+                "extinction_gradient_error",
+                "data_share",
+                "inhomogeneity",
+                "quality_flag",
+                "rays",
+                "shots",
+            ),
+            significant_bits=_BITS,
+            uncertain=True,
+            error_kind=ErrorKind.BOTH,
+            comment="Of the layer in altitude_bnds; molecules and particles together, at the"
+            f" wavelength of the channel. {NO_NAME}",
+        ),
+        _gradient_error("extinction", "the extinction coefficient", "m-1"),
+        Row(
+            name="log_intercept",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="natural logarithm of the range-corrected signal at an optical depth of zero",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean altitude: point",
+            ancillaries=("quality_flag", "rays", "shots"),
+            uncertain=True,
+            comment="Of the signal in mV m2 (analog) or MHz m2 (photon counting): system constant"
+            f" times backscatter coefficient, not calibrated. {NO_NAME}",
+        ),
+        Row(
+            name="data_share",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="share of the optical depth that the data give",
+            coverage=Coverage.QUALITY,
+            significant_bits=8,
+            comment=f"1 where neither smoothness nor a prior takes or adds anything. {NO_NAME}",
+        ),
+        Row(
+            name="inhomogeneity",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="standard deviation of the logarithms of the signals beyond their noise",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            significant_bits=8,
+            comment=f"Of the air between the rays, common to all cycles of the file. {NO_NAME}",
+        ),
+        Row(
+            name="reduced_chi2",
+            dims=_LEVELS,
+            dtype="f4",
+            units="1",
+            long_name="squared residuals over the rays by their variances, per degree of freedom",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            significant_bits=8,
+            optional=True,
+            comment="About 1, as the inhomogeneity is found from the residuals; less where noise is"
+            f" overstated. Missing where no ray is redundant. {NO_NAME}",
+        ),
+        Row(
+            name="layer_optical_depth",
+            dims=("time", "layer"),
+            dtype="f4",
+            units="1",
+            long_name="optical depth of air and aerosol between the bounds of the layer",
+            coverage=Coverage.PHYSICAL,
+            cell_methods="time: mean",
+            ancillaries=("layer_optical_depth_gradient_error",),
+            significant_bits=_BITS,
+            uncertain=True,
+            error_kind=ErrorKind.BOTH,
+            optional=True,
+            comment="Vertical, molecules and particles together, at the wavelength of the channel."
+            " Missing where quality_flag at a bound of the layer forbids the use of a value."
+            f" {NO_NAME}",
+        ),
+        replace(
+            _gradient_error("layer_optical_depth", "the optical depth of the layer", "1"),
+            dims=("time", "layer"),
+            optional=True,
+        ),
+        Row(
+            name="residual",
+            dims=("time", "ray", "altitude"),
+            dtype="f4",
+            units="1",
+            long_name="natural logarithm of the signal of a ray less its fit over the rays",
+            coverage=Coverage.QUALITY,
+            significant_bits=8,
+            comment=f"Missing where the ray has no usable signal. {NO_NAME}",
+        ),
+        quality(_LEVELS, FLAGS),
+        Row(
+            name="effective_degrees_of_freedom",
+            dims=("time",),
+            dtype="f4",
+            units="1",
+            long_name="how many independent numbers of the profile come from the data",
+            coverage=Coverage.QUALITY,
+            valid_min=0.0,
+            comment=f"Missing where there is no profile. {NO_NAME}",
+        ),
+        Row(
+            name="reach",
+            dims=("time",),
+            dtype="f4",
+            units="m",
+            long_name="highest altitude above the geoid with an estimate",
+            coverage=Coverage.AUXILIARY,
+            comment=f"Missing where there is none. {NO_NAME}",
+        ),
+        Row(
+            name="rays",
+            dims=("time",),
+            dtype="i4",
+            units="1",
+            standard_name="number_of_observations",
+            long_name="number of directions with a signal in the scan cycle",
+            coverage=Coverage.AUXILIARY,
+            valid_min=0.0,
+        ),
+        shots(of="all rays of the scan cycle"),
+    ),
+)

@@ -1,0 +1,1 @@
+"""The ``signal`` product: range-corrected signals of one channel."""

@@ -1,0 +1,1 @@
+"""The ``visibility`` product: extinction and visibility from networks of lidars."""

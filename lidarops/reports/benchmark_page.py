@@ -1,0 +1,121 @@
+"""The report of a benchmark: one HTML page with tables and charts, without network or script."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from lidarops.errors import CatalogError
+from lidarops.figures import product_figures
+from lidarops.figures.charts import Chart, Ladder, draw
+from lidarops.figures.wording import visible
+from lidarops.reports.run_record import write_atomically
+
+INDEX: Final = "index.html"
+"""Name of the page inside its folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """One table, the same on the page and in a terminal."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    """One cell for each column; the first one names the row."""
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One chapter of the page."""
+
+    title: str
+    text: str
+    charts: tuple[Chart | Ladder, ...] = ()
+    tables: tuple[Table, ...] = ()
+    details: tuple[Table, ...] = ()
+    """Tables that the page keeps folded and a terminal leaves out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a benchmark has to say."""
+
+    title: str
+    facts: tuple[tuple[str, str], ...]
+    """Where, when and with what it ran: term and value."""
+    parts: tuple[Part, ...]
+    data: str = ""
+    """Name of the file beside the page that holds every figure; none where empty."""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A chart as a file beside the page."""
+
+    file: str
+    caption: str
+    alt: str
+
+
+def build(report: Report, folder: Path) -> Path:
+    """Write the page of a benchmark and its charts.
+
+    Parameters
+    ----------
+    report : Report
+    folder : Path
+        Made where missing.
+
+    Returns
+    -------
+    Path
+        ``index.html`` in the folder.
+
+    Raises
+    ------
+    CatalogError
+        Where the folder cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        pictures = {part.title: _pictures(part.charts, folder) for part in report.parts}
+        template = _environment().get_template("benchmark.html")
+        page = template.render(report=report, pictures=pictures)
+        write_atomically(folder / INDEX, page.encode())
+    except OSError as error:
+        raise CatalogError(
+            f"the report cannot be written: {error}",
+            file=folder,
+            remedy="choose a folder you can write to",
+        ) from error
+    return folder / INDEX
+
+
+def _pictures(charts: Sequence[Chart | Ladder], folder: Path) -> list[Picture]:
+    pictures = []
+    for chart in charts:
+        drawn = product_figures.render(draw(chart))
+        name = f"{chart.name}.png"
+        write_atomically(folder / name, drawn.png)
+        pictures.append(Picture(name, chart.caption, drawn.alt))
+    return pictures
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("lidarops.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=lambda value: visible(value) if type(value) is str else value,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )

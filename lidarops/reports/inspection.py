@@ -1,0 +1,219 @@
+"""What a raw file or a product holds, as plain data and as tables for the terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields, is_dataclass
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from rich.table import Table
+from rich.text import Text
+
+from lidarops.errors import NO_FILE, LidarOpsError, ProductError, RawFormatError
+from lidarops.flags import Quality
+from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
+from lidarops.raw import licel
+
+_LONG: Final = {"comment", "history", "references"}
+"""Attributes that no table has room for; JSON has them."""
+_CHANNEL: Final = ("name", "wavelength", "bins", "bin_width", "shots", "adc_bits", "device")
+"""Facts about channels that the table shows; JSON has all."""
+_VERDICTS: Final = ("good", "use_with_care", "do_not_use")
+
+
+def describe(file: Path) -> dict[str, Any]:
+    """Describe a raw Licel file or a NetCDF product.
+
+    Parameters
+    ----------
+    file : Path
+
+    Returns
+    -------
+    dict
+        Plain JSON types. Key ``type`` is ``raw`` or ``netcdf``; what is not known is None.
+
+    Raises
+    ------
+    LidarOpsError
+        If the file cannot be read, or is neither.
+    """
+    try:
+        with file.open("rb") as stream:
+            magic = stream.read(4)
+    except OSError as error:
+        raise LidarOpsError(
+            f"cannot be read: {error.strerror}", file=file, wrong_use=isinstance(error, NO_FILE)
+        ) from error
+    return _product(file) if magic in NETCDF_MAGIC else _raw(file)
+
+
+def tables(file: Path) -> list[Table]:
+    """Return the description of a file as tables; see `describe`."""
+    found = describe(file)
+    about = _table(file.name, "field", "value")
+    for key, value in found.items():
+        if isinstance(value, str | int | float) or value is None:
+            _row(about, key.replace("_", " "), "not known" if value is None else value)
+    if found["type"] == "raw":
+        for note in found["notes"] or ["none"]:
+            _row(about, "notes", note)
+        return [about, _listed("Channels", found["channels"], _CHANNEL)]
+    for key, value in found["attributes"].items():
+        if key not in _LONG:
+            _row(about, key, value)
+    held = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
+    shown = [about, _listed("Variables", found["variables"], held)]
+    flags = ("name", "severity", "values", "share", "description")
+    return [*shown, _listed("Quality", found["quality"], flags)]
+
+
+def provenance(file: Path) -> str:
+    """Return the PROV-JSON text of a product.
+
+    Raises
+    ------
+    ProductError
+        If the file is not a product of lidarops.
+    """
+    return json.dumps(read_provenance(file), indent=2)
+
+
+def _raw(file: Path) -> dict[str, Any]:
+    try:
+        header = licel.read_header(file)
+    except RawFormatError as error:
+        error.remedy = error.remedy or "lidarops inspect reads Licel files and NetCDF products"
+        raise
+    told: dict[str, Any] = _plain(header)
+    channels = told.pop("datasets")
+    for told_of, dataset in zip(channels, header.datasets, strict=True):
+        told_of |= {
+            "name": dataset.name,
+            "bin_width": dataset.bin_width,
+            "wavelength": _plain(dataset.wavelength),
+        }
+    told |= {"zenith_angle": header.zenith_angle}
+    return {"type": "raw", "file": str(file), **told, "channels": channels}
+
+
+def _product(file: Path) -> dict[str, Any]:
+    try:
+        dataset = xr.open_dataset(file, decode_times=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ProductError(f"cannot be opened: {error}", file=file) from error
+    with dataset:
+        return {
+            "type": "netcdf",
+            "file": str(file),
+            "size": file.stat().st_size,
+            "dimensions": {str(name): size for name, size in dataset.sizes.items()},
+            "attributes": _plain(dict(dataset.attrs)),
+            "variables": [_variable(str(name), dataset[name]) for name in dataset.variables],
+            "quality": _quality(dataset),
+        }
+
+
+def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
+    told = {
+        "name": name,
+        "dimensions": ", ".join(f"{dim} {size}" for dim, size in variable.sizes.items()),
+        **{key: variable.attrs.get(key) for key in ("units", "standard_name", "long_name")},
+        "type": str(variable.dtype),
+        **dict.fromkeys(("minimum", "maximum", "missing")),
+    }
+    if variable.dtype.kind not in "fiu" or variable.size == 0:
+        return told
+    values = variable.to_numpy().astype(np.float64)
+    finite = values[np.isfinite(values)]
+    told["missing"] = values.size - finite.size
+    if finite.size:
+        told |= {"minimum": float(finite.min()), "maximum": float(finite.max())}
+    return told
+
+
+def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
+    """Count values by verdict and by bit, where the file is a product of ours."""
+    if "quality_flag" not in dataset.variables:
+        return []
+    flags = dataset["quality_flag"].to_numpy().astype(np.int64)
+    found = []
+    if "usable" in dataset.variables:
+        usable = dataset["usable"].to_numpy()
+        found = [
+            _counted(name, "verdict", int(np.count_nonzero(usable == value)), flags.size, "")
+            for value, name in enumerate(_VERDICTS)
+        ]
+    for bit in Quality:
+        count = int(np.count_nonzero(flags & int(bit)))
+        if count:
+            severity = bit.severity.name.lower()
+            name = str(bit.name).lower()
+            found.append(_counted(name, severity, count, flags.size, bit.description))
+    return found
+
+
+def _counted(name: str, severity: str, count: int, size: int, about: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "severity": severity,
+        "values": count,
+        "share": round(count / size, 4) if size else None,
+        "description": about,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return plain JSON types; a number that is none becomes None."""
+    if is_dataclass(value):
+        return {each.name: _plain(getattr(value, each.name)) for each in fields(value)}
+    if isinstance(value, dict):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    return _plain_scalar(value)
+
+
+def _plain_scalar(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return value.name.lower()
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return str(value)
+
+
+def _listed(title: str, items: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
+    table = _table(title, *(column.replace("_", " ") for column in columns))
+    for item in items:
+        _row(table, *(_cell(item.get(column)) for column in columns))
+    return table
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def _row(table: Table, *cells: Any) -> None:
+    # Text, because a header may hold what rich would take for markup.
+    table.add_row(*(Text(str(cell)) for cell in cells))

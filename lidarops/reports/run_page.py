@@ -1,0 +1,240 @@
+"""The report of a run: one HTML page with its figures, readable from the file system."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from lidarops.errors import CatalogError
+from lidarops.figures.wording import duration, lacking, percent, size, visible
+from lidarops.records import RunRecord, SceneOutcome
+from lidarops.reports import gallery, run_tables
+from lidarops.reports.gallery import Compared, Gallery, Picture
+from lidarops.reports.run_record import FILE_NAME, write_atomically
+
+INDEX: Final = "index.html"
+"""Name of the page inside a run's report folder."""
+ROWS: Final = 2000
+"""Most rows of a table on the page; the run record beside it holds all."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProductLink:
+    """One product in the table of scenes."""
+
+    label: str
+    href: str
+    """Empty where the file is missing."""
+    flagged: str
+    size: str
+    sha256: str
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class SceneRow:
+    """One scene in the table of scenes."""
+
+    scene: str
+    station: str
+    instrument: str
+    start: str
+    granules: int
+    outcome: str
+    products: tuple[ProductLink, ...]
+    seconds: tuple[str, ...]
+    """By stage, in the order of the table's columns."""
+    plan_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Files of a report."""
+
+    page: Path
+    quicklook: Path | None
+    """Its first figure of products; None where none can be drawn."""
+
+
+def build(
+    record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES, workers: int = 1
+) -> Report:
+    """Write the report of a run.
+
+    Parameters
+    ----------
+    record : RunRecord
+        Any run, also one without scenes or with failures only.
+    folder : Path
+        Report folder; made where missing. The figures stand beside the page, links are
+        relative, and the page needs neither network nor script.
+    figures : int, optional
+        Most figures of products.
+    workers : int, optional
+        Most processes to read products and to draw with; changes nothing that is shown.
+
+    Returns
+    -------
+    Report
+        Products that are missing or unreadable are named on the page.
+
+    Raises
+    ------
+    CatalogError
+        Where the folder cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        filled = gallery.fill(record, folder, limit=figures, workers=workers)
+        target = folder / INDEX
+        write_atomically(target, _render(record, folder, filled).encode())
+    except OSError as error:
+        raise CatalogError(
+            f"the report cannot be written: {error}",
+            file=folder,
+            remedy=f"make space or choose a folder you can write to, then lidarops report {folder}",
+        ) from error
+    pictures = filled.pictures
+    return Report(target, folder / pictures[0].file if pictures else None)
+
+
+def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:
+    """Return one row of plain values for every instrument, for a table outside the report."""
+    return [
+        {
+            "station": row.station,
+            "instrument": row.instrument,
+            "scenes": row.scenes,
+            "failed": row.failed,
+            "granules": row.granules,
+            "refused": row.refused,
+            "products": row.products,
+            "retrieved values": row.values,
+            "flagged": row.flagged_share,
+            "time": duration(row.seconds),
+        }
+        for row in run_tables.instruments(record)
+    ]
+
+
+def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
+    gone = gallery.missing(record)
+    problems = {problem.path: problem.reason for problem in filled.problems}
+    problems = dict.fromkeys(sorted(gone), "the file is missing") | problems
+    stages = run_tables.stages(record)
+    pictures = _by_instrument(filled.pictures)
+    return _environment().get_template("run.html").render(
+        record=record,
+        summary=run_tables.summary(record),
+        verdict=run_tables.verdict(record),
+        instruments=run_tables.instruments(record),
+        stages=stages,
+        scenes=[
+            _scene_row(scene, record, folder, gone, [stage.stage for stage in stages])
+            for scene in record.scenes[:ROWS]
+        ],
+        left_out=run_tables.left_out(record),
+        barren=run_tables.barren(record),
+        steps=run_tables.done(record),
+        flags=run_tables.flags(record),
+        refused=run_tables.refused(record),
+        failed=[scene for scene in record.scenes if scene.error],
+        problems=sorted(problems.items()),
+        compared=filled.compared,
+        compared_words=_compared_words(filled.compared),
+        pictures=pictures,
+        drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
+        flags_picture=filled.flags,
+        undrawn=filled.undrawn,
+        plan_hash=_plan_hash(record),
+        run_file=FILE_NAME if (folder / FILE_NAME).is_file() else "",
+        rows=ROWS,
+    )  # fmt: skip
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("lidarops.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=lambda value: visible(value) if type(value) is str else value,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"percent": percent, "moment": run_tables.moment, "url": quote}
+    environment.filters |= {"lacking": lacking}
+    return environment
+
+
+def _scene_row(
+    scene: SceneOutcome,
+    record: RunRecord,
+    folder: Path,
+    gone: frozenset[str],
+    stages: Sequence[str],
+) -> SceneRow:
+    flagged = run_tables.flagged_words(scene)
+    return SceneRow(
+        scene=scene.scene,
+        station=scene.station,
+        instrument=scene.instrument,
+        start=run_tables.moment(scene.start).removesuffix(":00 UTC").removesuffix(" UTC"),
+        granules=scene.granules,
+        outcome=run_tables.outcome_word(scene),
+        products=tuple(
+            ProductLink(
+                label=f"{product.kind} {product.channel}",
+                href="" if product.path in gone else _href(record, product.path, folder),
+                flagged=flagged[product.path],
+                size=size(product.size),
+                sha256=product.sha256,
+                path=product.path,
+            )
+            for product in scene.products
+        ),
+        seconds=tuple(
+            duration(scene.seconds[stage]) if stage in scene.seconds else "" for stage in stages
+        ),
+        plan_hash=scene.plan.hash if scene.plan else "",
+    )
+
+
+def _href(record: RunRecord, product: str, folder: Path) -> str:
+    path = (Path(record.products) / product).resolve()
+    try:
+        relative = os.path.relpath(path, folder.resolve())
+    except ValueError:  # on another drive, where no relative path leads
+        return path.as_uri()
+    return quote(os.fsencode(Path(relative).as_posix()))
+
+
+def _by_instrument(pictures: Sequence[Picture]) -> list[tuple[str, list[Picture]]]:
+    ordered = sorted(pictures, key=lambda picture: picture.instrument)
+    return [
+        (name, list(found)) for name, found in groupby(ordered, lambda picture: picture.instrument)
+    ]
+
+
+def _compared_words(compared: Sequence[Compared]) -> Mapping[str, str]:
+    return {
+        quantity: f"{percent(one / count)} within 1 and {percent(three / count)} within 3"
+        f" standard errors of the truth, of {count:,} unflagged values"
+        for quantity, (count, one, three) in gallery.comparisons_by_quantity(compared).items()
+    }
+
+
+def _plan_hash(record: RunRecord) -> str:
+    """Return the sha256 over the hashes of all plans, sorted: equal plans, equal hash."""
+    hashes = sorted(scene.plan.hash for scene in record.scenes if scene.plan)
+    return hashlib.sha256("\n".join(hashes).encode()).hexdigest() if hashes else ""

@@ -1,0 +1,391 @@
+"""A run record as the tables of its report. No files are read here."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Final
+
+from lidarops.figures.wording import counted, decided_on, duration, percent
+from lidarops.flags import Quality, Severity
+from lidarops.plan.signal_rules import idle_gate
+from lidarops.records import LeftOut, ProductKind, RunRecord, SceneOutcome, Step
+
+_NAMED: Final = 8
+"""Most names listed in one cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionRow:
+    """One thing that was done or not, over all scenes where that was so for this reason."""
+
+    step: str
+    reason: str
+    rule: str
+    """Name of the rule that decided."""
+    number: str
+    """That it decided on, over these scenes: one, or the least and the largest."""
+    channels: str
+    instruments: str
+    scenes: int
+
+
+@dataclass(frozen=True, slots=True)
+class FlagRow:
+    """One quality bit over all products of a kind."""
+
+    kind: str
+    bit: str
+    severity: str
+    description: str
+    count: int
+    share: str
+    products: int
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedRow:
+    """Files that were refused for the same reason."""
+
+    reason: str
+    found: str
+    files: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BarrenRow:
+    """Scenes that can give no product for the same reason."""
+
+    reason: str
+    scenes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class StageRow:
+    """Time that a stage took over all scenes."""
+
+    stage: str
+    total: str
+    share: str
+    longest: str
+    longest_scene: str
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentRow:
+    """What became of the scenes of one instrument."""
+
+    station: str
+    instrument: str
+    scenes: int
+    failed: int
+    granules: int
+    refused: int
+    products: int
+    values: int
+    flagged: int
+    seconds: float
+
+    @property
+    def flagged_share(self) -> str:
+        """Share of retrieved values that carry a bit."""
+        return percent(self.flagged / self.values) if self.values else "no value"
+
+
+def summary(record: RunRecord) -> list[tuple[str, str]]:
+    """Return the terms and values at the head of the report."""
+    done = [scene for scene in record.scenes if not scene.error]
+    failed = len(record.scenes) - len(done)
+    processed = sum(max(scene.granules - len(scene.refused), 0) for scene in done)
+    refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
+    products = Counter(p.kind for scene in record.scenes for p in scene.products)
+    kinds = ", ".join(f"{count:,} {kind}" for kind, count in sorted(products.items()))
+    return [
+        ("Campaign", f"{record.title} ({record.campaign})"),
+        ("Run", record.id),
+        ("Version", record.version),
+        ("Started", moment(record.started)),
+        ("Duration", duration((record.finished - record.started).total_seconds())),
+        *_cpu_time(record),
+        ("Scenes", counted(len(record.scenes), "scene") + f", {failed:,} failed"),
+        ("Products", f"{products.total():,}" + (f": {kinds}" if kinds else "")),
+        ("Granules", f"{processed:,} processed, {refused:,} refused"),
+        *(
+            (f"Flagged, {kind}", f"{percent(flagged / values)} of {counted(values, 'value')}")
+            for kind, values, flagged in _flagged_by_kind(record)
+        ),
+    ]
+
+
+def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
+    """Return what scenes took and were to take, where that was measured.
+
+    What a process loads with its first scenes is estimated once, while each worker pays it.
+    """
+    # Of scenes that failed no time is known, and their estimates have nothing beside them.
+    measured = [scene for scene in record.scenes if scene.cpu_seconds]
+    if not measured:
+        return []
+    took = sum(scene.cpu_seconds for scene in measured)
+    estimated = sum(scene.estimated_seconds for scene in measured)
+    told = (
+        f"; {duration(estimated)} were estimated ({record.costs}), with loading counted once,"
+        " which each worker pays"
+    )
+    return [("CPU time of scenes", f"{duration(took)}{told if estimated else ''}")]
+
+
+def verdict(record: RunRecord) -> str:
+    """Return in one sentence whether all went well."""
+    failed = sum(bool(scene.error) for scene in record.scenes)
+    refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
+    if not record.scenes:
+        tail = f" {counted(refused, 'granule')} refused." if refused else ""
+        return f"There was no scene to process.{tail}"
+    empty = [scene.scene for scene in record.scenes if scene.empty]
+    rest = sum(p.usable == 0 for scene in record.scenes if not scene.empty for p in scene.products)
+    tail = f" {counted(rest, 'product')} without a value to use." if rest else ""
+    parts = [f"{counted(failed, 'scene')} failed"] if failed else []
+    parts += [f"{counted(refused, 'granule')} refused"] if refused else []
+    if empty:
+        number = counted(len(empty), "scene")
+        parts.append(f"the retrievals of {number} left nothing to use: {listed(empty)}")
+    barren = len(record.barren) + record.more_barren
+    parts += [f"{counted(barren, 'scene')} can give no product"] if barren else []
+    nowhere = {(each.instrument, each.channel) for each in record.unmet if each.nowhere}
+    if nowhere:
+        named = listed({channel for _, channel in nowhere})
+        parts.append(f"{counted(len(nowhere), 'channel')} named that no file holds: {named}")
+    if not parts:
+        return f"Every scene was processed and no granule was refused.{tail}"
+    *first, last = parts
+    told = f"{', '.join(first)} and {last}" if first else last
+    return f"{told[0].upper()}{told[1:]}.{tail}"
+
+
+def instruments(record: RunRecord) -> list[InstrumentRow]:
+    """Return one row for every station and instrument with a scene or a refused granule."""
+    stations: dict[str, str] = {}
+    scenes: dict[str, list[SceneOutcome]] = defaultdict(list)
+    for scene in record.scenes:
+        stations.setdefault(scene.instrument, scene.station)
+        scenes[scene.instrument].append(scene)
+    refused = Counter(granule.instrument for granule in record.refused)
+    return [
+        _instrument_row(stations.get(name, ""), name, scenes[name], refused[name])
+        for name in sorted({*scenes, *refused})
+    ]
+
+
+def left_out(record: RunRecord) -> list[DecisionRow]:
+    """Group what was not done by step and reason, the most frequent of a step first."""
+    return _decisions(record, _left_out)
+
+
+def done(record: RunRecord) -> list[DecisionRow]:
+    """Group what was done by step and reason, the most frequent of a step first."""
+    return _decisions(record, _done)
+
+
+def _done(scene: SceneOutcome) -> Iterator[Step]:
+    steps = scene.plan.steps if scene.plan else ()
+    for step in steps:
+        idle = idle_gate(step, steps)
+        yield replace(step, reason=f"{step.reason}; of no effect: {idle}") if idle else step
+
+
+def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:
+    yield from scene.plan.left_out if scene.plan else ()
+    yield from scene.left_out
+
+
+def _decisions(
+    record: RunRecord, of: Callable[[SceneOutcome], Iterable[Step | LeftOut]]
+) -> list[DecisionRow]:
+    scenes: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    channels: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    names: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    numbers: dict[tuple[str, str, str], set[float]] = defaultdict(set)
+    for scene in record.scenes:
+        for item in of(scene):
+            key = (item.name, item.reason, item.rule)
+            scenes[key].add(scene.scene)
+            channels[key].add(item.channel)
+            names[key].add(scene.instrument)
+            if item.number is not None:
+                numbers[key].add(item.number)
+    return [
+        DecisionRow(
+            step=key[0],
+            reason=key[1],
+            rule=key[2],
+            number=" to ".join(dict.fromkeys(decided_on(end(numbers[key])) for end in (min, max)))
+            if numbers[key]
+            else "",
+            channels=listed(channels[key]),
+            instruments=listed(names[key]),
+            scenes=len(scenes[key]),
+        )
+        for key in sorted(scenes, key=lambda key: (key[0], -len(scenes[key]), key[1]))
+    ]
+
+
+def flags(record: RunRecord) -> list[FlagRow]:
+    """Return one row for every quality bit that a kind of product carries."""
+    values: Counter[ProductKind] = Counter()
+    counts: dict[ProductKind, Counter[str]] = defaultdict(Counter)
+    products: Counter[tuple[ProductKind, str]] = Counter()
+    for scene in record.scenes:
+        for product in scene.products:
+            values[product.kind] += product.values
+            for name, count in product.flagged.items():
+                if count:
+                    counts[product.kind][name.lower()] += count
+                    products[product.kind, name.lower()] += 1
+    rows = []
+    for kind in sorted(counts):
+        for name in sorted(counts[kind], key=_bit_order):
+            count = counts[kind][name]
+            severity, description = _about(name)
+            rows.append(
+                FlagRow(
+                    kind=kind.value,
+                    bit=name,
+                    severity=severity,
+                    description=description,
+                    count=count,
+                    share=percent(count / values[kind]) if values[kind] else "no value",
+                    products=products[kind, name],
+                )
+            )
+    return rows
+
+
+def refused(record: RunRecord) -> list[RefusedRow]:
+    """Group refused granules by reason, the most frequent first."""
+    files: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for granule in record.refused:
+        files[granule.reason, "while cataloguing"].append(granule.path)
+    for scene in record.scenes:
+        for granule in scene.refused:
+            files[granule.reason, "while processing"].append(granule.path)
+    return [
+        RefusedRow(reason or "no reason was recorded", found, tuple(sorted(paths)))
+        for (reason, found), paths in sorted(
+            files.items(), key=lambda item: (-len(item[1]), item[0])
+        )
+    ]
+
+
+def barren(record: RunRecord) -> list[BarrenRow]:
+    """Group scenes that can give no product by reason, the most frequent first."""
+    scenes: dict[str, list[str]] = defaultdict(list)
+    for scene, reason in record.barren.items():
+        scenes[reason].append(scene)
+    return [
+        BarrenRow(reason, tuple(sorted(found)))
+        for reason, found in sorted(scenes.items(), key=lambda item: (-len(item[1]), item[0]))
+    ]
+
+
+def stages(record: RunRecord) -> list[StageRow]:
+    """Return the time that each stage took, in the order in which scenes name them."""
+    times: dict[str, list[tuple[float, str]]] = defaultdict(list)
+    for scene in record.scenes:
+        for stage, seconds in scene.seconds.items():
+            times[stage].append((seconds, scene.scene))
+    whole = sum(seconds for rows in times.values() for seconds, _ in rows)
+    rows = []
+    for stage, spent in times.items():
+        total = sum(seconds for seconds, _ in spent)
+        longest, scene_id = max(spent, key=lambda row: row[0])
+        rows.append(
+            StageRow(
+                stage=stage,
+                total=duration(total),
+                share=percent(total / whole) if whole > 0 else "0 %",
+                longest=duration(longest),
+                longest_scene=scene_id,
+            )
+        )
+    return rows
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return sorted names in a line, the first few of many."""
+    found = sorted(names)
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    return ", ".join(found[:_NAMED]) + more
+
+
+def moment(time: datetime) -> str:
+    """Return a time in UTC to the second."""
+    zoned = time if time.tzinfo is None else time.astimezone(UTC)
+    return f"{zoned:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def outcome_word(scene: SceneOutcome) -> str:
+    """Return in a word what became of a scene."""
+    if scene.error:
+        return "failed"
+    if scene.empty:
+        return "nothing to use"
+    return "done" if scene.products else "no product"
+
+
+def flagged_words(scene: SceneOutcome) -> Mapping[str, str]:
+    """Return for every product of a scene, by path, the share of its values with a bit."""
+    return {
+        product.path: percent((product.values - product.unflagged) / product.values)
+        if product.values
+        else "no value"
+        for product in scene.products
+    }
+
+
+def _flagged_by_kind(record: RunRecord) -> list[tuple[str, int, int]]:
+    values: Counter[str] = Counter()
+    flagged: Counter[str] = Counter()
+    for scene in record.scenes:
+        for product in scene.products:
+            values[product.kind.value] += product.values
+            flagged[product.kind.value] += product.values - product.unflagged
+    return [(kind, values[kind], flagged[kind]) for kind in sorted(values) if values[kind]]
+
+
+def _instrument_row(
+    station: str, name: str, scenes: Sequence[SceneOutcome], refused_before: int
+) -> InstrumentRow:
+    retrieved = [
+        product
+        for scene in scenes
+        for product in scene.products
+        if product.kind is not ProductKind.SIGNAL
+    ]
+    return InstrumentRow(
+        station=station,
+        instrument=name,
+        scenes=len(scenes),
+        failed=sum(bool(scene.error) for scene in scenes),
+        granules=sum(scene.granules for scene in scenes),
+        refused=refused_before + sum(len(scene.refused) for scene in scenes),
+        products=sum(len(scene.products) for scene in scenes),
+        values=sum(product.values for product in retrieved),
+        flagged=sum(product.values - product.unflagged for product in retrieved),
+        seconds=sum(sum(scene.seconds.values()) for scene in scenes),
+    )
+
+
+def _bit_order(name: str) -> tuple[int, str]:
+    known = Quality.__members__.get(name.upper())
+    return (int(known), name) if known is not None else (1 << 62, name)
+
+
+def _about(name: str) -> tuple[str, str]:
+    known = Quality.__members__.get(name.upper())
+    if known is None:
+        return "unknown", "this version of lidarops does not know the bit"
+    word = "do not use" if known.severity is Severity.REJECT else "use with care"
+    return word, known.description

@@ -1,0 +1,1 @@
+"""Molecular atmosphere and visibility."""

@@ -1,0 +1,297 @@
+"""Meteorological visibility from extinction: Koschmieder's law, and the step to 550 nm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common import inputs
+
+Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
+
+MOR_CONTRAST: Final = 0.05
+"""Contrast threshold of the meteorological optical range (`wmo8`): V = ln 20 / extinction."""
+KOSCHMIEDER_CONTRAST: Final = 0.02
+"""Koschmieder's own threshold: V = 3.912 / extinction (`koschmieder1924`)."""
+PAPER_CONTRAST: Final = float(np.exp(-3.0))
+"""The rounded constant of the multi-position papers: V = 3 / extinction (`drabenko2021`)."""
+
+REFERENCE_WAVELENGTH: Final = 550e-9
+"""m, where visibility is defined."""
+LARGEST_EXTINCTION: Final = 10.0
+"""m-1, ten times that of the densest smoke: a guard of units."""
+LARGE_RELATIVE_ERROR: Final = 0.1
+"""Of extinction; above, the interval of visibility is asymmetric by more than 10 percent."""
+
+_KRUSE_NEAR: Final = 6000.0
+_KRUSE_FAR: Final = 50_000.0
+_KRUSE_PASSES: Final = 60
+"""Of a fixed point that contracts by at least 0.7 a pass at any wavelength from 200 nm to 2 um."""
+
+
+class WavelengthLaw(StrEnum):
+    """How extinction changes with wavelength."""
+
+    NONE = "none"
+    """Visibility at the wavelength of the lidar."""
+    ANGSTROM = "angstrom"
+    """A power of wavelength with a given exponent."""
+    KRUSE = "kruse"
+    """A power of wavelength with an exponent that depends on visibility (`kruse1962`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceExtinction:
+    """Extinction at 550 nm, with the shape of the extinction that it was made of."""
+
+    extinction: Array
+    """m-1."""
+    extinction_standard_error: Array
+    """m-1."""
+    exponent: Array
+    """1, of wavelength, with the sign changed (the Angstrom exponent)."""
+    ambiguous: Booleans
+    """True where two visibilities obey the law; the lower is taken."""
+    law: WavelengthLaw
+
+
+@dataclass(frozen=True, slots=True)
+class VisibilityResult:
+    """Visibility, with the shape of the extinction that it was made of."""
+
+    visibility: Array
+    """m; NaN where extinction is missing or not positive."""
+    visibility_standard_error: Array
+    """m, linear; where `asymmetric`, use the interval."""
+    visibility_lower: Array
+    """m, of extinction plus its standard error."""
+    visibility_upper: Array
+    """m, of extinction minus its standard error; inf where that is not positive."""
+    asymmetric: Booleans
+    """True where the relative standard error of extinction exceeds 0.1."""
+    unbounded: Booleans
+    """True where no upper end can be told."""
+    contrast: float
+    """1, the contrast threshold of the definition."""
+
+
+def koschmieder_constant(contrast: float = MOR_CONTRAST) -> float:
+    """Return the product of visibility and extinction, -ln(contrast).
+
+    Raises
+    ------
+    RetrievalInputError
+        Where the contrast is not between 0 and 1.
+    """
+    if not 0.0 < contrast < 1.0:
+        raise RetrievalInputError(
+            f"is {contrast}",
+            field="contrast",
+            remedy="choose 0.05 (meteorological optical range), 0.02 or exp(-3)",
+        )
+    return -float(np.log(contrast))
+
+
+def from_extinction(
+    extinction: npt.ArrayLike,
+    standard_error: npt.ArrayLike | None = None,
+    *,
+    contrast: float = MOR_CONTRAST,
+) -> VisibilityResult:
+    r"""Return the distance at which a black object's contrast falls to a threshold.
+
+    .. math:: V = -\ln(\epsilon) / \sigma
+
+    Visibility is the reciprocal of a quantity with a standard error: its interval is that of
+    extinction, turned over. The linear standard error is its half-width to first order only.
+
+    Parameters
+    ----------
+    extinction : (...) float
+        m-1, of a homogeneous path or at a point.
+    standard_error : (...) float, optional
+        m-1, broadcast against `extinction`; NaN errors where not given.
+    contrast : float
+        Threshold: 0.05 (meteorological optical range, the default), 0.02, or exp(-3).
+
+    Returns
+    -------
+    VisibilityResult
+
+    Raises
+    ------
+    RetrievalInputError
+        For a contrast not between 0 and 1, negative errors, shapes that do not fit, or
+        extinction above 10 m-1, which is in km-1.
+
+    References
+    ----------
+    koschmieder1924, wmo8.
+    """
+    constant = koschmieder_constant(contrast)
+    value, error = _checked(extinction, standard_error)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        positive = np.isfinite(value) & (value > 0)
+        visibility = np.where(positive, constant / value, np.nan)
+        relative = error / value
+        most, least = value + error, value - error
+        lower = np.where(most > 0, constant / most, np.nan)
+        upper = np.where(least > 0, constant / least, np.where(np.isnan(least), np.nan, np.inf))
+    return VisibilityResult(
+        visibility=visibility,
+        visibility_standard_error=visibility * relative,
+        visibility_lower=lower,
+        visibility_upper=upper,
+        asymmetric=positive & (relative > LARGE_RELATIVE_ERROR),
+        unbounded=np.isinf(upper),
+        contrast=float(contrast),
+    )
+
+
+def at_reference_wavelength(
+    extinction: npt.ArrayLike,
+    standard_error: npt.ArrayLike | None = None,
+    *,
+    wavelength: float,
+    law: str,
+    exponent: npt.ArrayLike | None = None,
+    exponent_standard_error: float = 0.0,
+) -> ReferenceExtinction:
+    r"""Convert extinction at the wavelength of a lidar to 550 nm.
+
+    .. math:: \sigma_{550} = \sigma_\lambda (\lambda / 550\,\mathrm{nm})^{q}
+
+    Kruse's exponent depends on the visibility V (contrast 0.02) itself: q = 1.6 above 50 km,
+    1.3 from 6 km, 0.585 (V / km)^(1/3) below. V is found from its implicit equation. The law
+    jumps at 6 and 50 km: a jump is bridged at its visibility where no branch holds (beyond
+    550 nm), and the lower visibility is taken, and marked, where two hold.
+
+    Parameters
+    ----------
+    extinction, standard_error : (...) float
+        m-1.
+    wavelength : float
+        m.
+    law : {"none", "angstrom", "kruse"}
+    exponent : (...) float, optional
+        Angstrom exponent, for "angstrom" only.
+    exponent_standard_error : float
+        Its standard error, or the spread of the law's exponent; propagated.
+
+    Returns
+    -------
+    ReferenceExtinction
+
+    Raises
+    ------
+    RetrievalInputError
+        For an unknown law, a wavelength outside 200 nm to 2 um, or an exponent that is missing
+        or not wanted.
+
+    References
+    ----------
+    kruse1962, angstrom1929.
+    """
+    value, error = _checked(extinction, standard_error)
+    chosen = inputs.choice(law, WavelengthLaw, "law")
+    if not 200e-9 <= wavelength <= 2e-6:
+        raise RetrievalInputError(
+            f"is {wavelength:g} m", field="wavelength", remedy="give metres, 200e-9 to 2e-6"
+        )
+    if (exponent is None) == (chosen is WavelengthLaw.ANGSTROM):
+        raise RetrievalInputError(
+            f"goes with the law 'angstrom' only, which needs it; the law is '{chosen}'",
+            field="exponent",
+        )
+    if not exponent_standard_error >= 0:
+        raise RetrievalInputError("is negative or NaN", field="exponent_standard_error")
+    logarithm = float(np.log(wavelength / REFERENCE_WAVELENGTH))
+    ambiguous = np.zeros(value.shape, dtype=np.bool_)
+    gain = np.ones(value.shape)
+    if chosen is WavelengthLaw.NONE:
+        power, logarithm = np.zeros(value.shape), 0.0
+    elif chosen is WavelengthLaw.ANGSTROM:
+        power = _exponents(exponent, value.shape)
+    else:
+        power, gain, ambiguous = _kruse(value, logarithm)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        factor = np.exp(power * logarithm)
+        spread = value * factor * logarithm * exponent_standard_error
+        total = np.hypot(factor * gain * error, gain * spread)
+    return ReferenceExtinction(value * factor, total, power, ambiguous, chosen)
+
+
+def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array, Booleans]:
+    """Return Kruse's exponent, d ln(extinction at 550 nm) / d ln(extinction), and ambiguity.
+
+    Where no branch holds, visibility stands still at the jump and the gain is 0; it is set to 1
+    there, so that the error is never understated.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        positive = np.isfinite(extinction) & (extinction > 0)
+        plain = np.where(positive, koschmieder_constant(KOSCHMIEDER_CONTRAST) / extinction, np.nan)
+        near = plain.copy()
+        for _ in range(_KRUSE_PASSES):
+            near = plain * np.exp(-_near_exponent(near) * logarithm)
+        middle = plain * np.exp(-1.3 * logarithm)
+        far = plain * np.exp(-1.6 * logarithm)
+        holds = np.stack(
+            [
+                near < _KRUSE_NEAR,
+                (middle >= _KRUSE_NEAR) & (middle < _KRUSE_FAR),
+                far >= _KRUSE_FAR,
+            ]
+        )
+        exponents = np.stack(
+            [_near_exponent(near), np.full(near.shape, 1.3), np.full(near.shape, 1.6)]
+        )
+        first = np.argmax(holds, axis=0)
+        power = np.take_along_axis(exponents, first[np.newaxis], axis=0)[0]
+        jump = np.where(middle < _KRUSE_NEAR, _KRUSE_NEAR, _KRUSE_FAR)
+        bridged = np.log(plain / jump) / logarithm if logarithm != 0.0 else power
+        none = ~holds.any(axis=0)
+        power = np.where(positive, np.where(none, bridged, power), np.nan)
+        slope = np.where(first == 0, _near_exponent(near) / 3.0 * logarithm, 0.0)
+        gain = np.where(none | ~positive, 1.0, 1.0 / (1.0 + slope))
+    return power, gain, holds.sum(axis=0) > 1
+
+
+def _near_exponent(visibility: Array) -> Array:
+    return 0.585 * np.cbrt(np.minimum(visibility, _KRUSE_NEAR) / 1000.0)
+
+
+def _exponents(exponent: npt.ArrayLike | None, shape: tuple[int, ...]) -> Array:
+    values = inputs.real_array(np.nan if exponent is None else exponent, "exponent")
+    try:
+        return np.broadcast_to(values, shape).astype(np.float64)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {values.shape}, but extinction {shape}", field="exponent"
+        ) from None
+
+
+def _checked(extinction: npt.ArrayLike, error: npt.ArrayLike | None) -> tuple[Array, Array]:
+    value = inputs.real_array(extinction, "extinction").astype(np.float64)
+    if np.any(value[np.isfinite(value)] > LARGEST_EXTINCTION):
+        raise RetrievalInputError(
+            "exceeds 10 m-1: extinction must be in m-1, this looks like km-1",
+            field="extinction",
+            remedy="divide by 1000",
+        )
+    spread = np.nan if error is None else error
+    errors = inputs.real_array(spread, "standard_error").astype(np.float64)
+    if np.any(errors < 0):
+        raise RetrievalInputError("is negative", field="standard_error")
+    try:
+        value, errors = np.broadcast_arrays(value, errors)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {errors.shape}, but extinction {value.shape}", field="standard_error"
+        ) from None
+    return value.copy(), errors.copy()

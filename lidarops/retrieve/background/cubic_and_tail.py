@@ -1,0 +1,334 @@
+"""The background of a profile: by the cubic of a homogeneous path, or as the mean of its tail."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.background import _cubic_kernel, photon_counts
+from lidarops.retrieve.common import inputs
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
+
+FEWEST_BINS: Final = 8
+_LAG_SHARE: Final = 0.4
+LOWEST_CONTRAST: Final = 10.0
+"""Curvature of the quartic at its minimum over what the noise adds to it; below, the minimum may
+be another one, and the standard error understates by a factor of 2 (simulations)."""
+MOST_MISTAKEN: Final = 1.0
+"""Standard errors by which the background may be moved by curvature of the signal that is taken
+for noise."""
+_UNIFORM: Final = 2.0**-22
+"""Largest deviation from a uniform grid over the last range: what float32 ranges need."""
+
+_QUALITY_OF_STATUS: Final = {
+    _cubic_kernel.MISSING: Quality.INPUT_MISSING,
+    _cubic_kernel.CONSTANT: Quality.NO_SIGNAL,
+    _cubic_kernel.LOST: Quality.NO_REAL_SOLUTION,
+}
+
+
+class Statistics(StrEnum):
+    """How the noise of a power is distributed."""
+
+    GAUSS = "gauss"
+    POISSON = "poisson"
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundResult:
+    """Backgrounds, one of each for every profile, with the leading axes of the power."""
+
+    background: Array
+    """In the unit of the power; NaN where it could not be found."""
+    background_standard_error: Array
+    quality: Flags
+    """Bits of `lidarops.flags.Quality`; 0 where no test failed."""
+
+
+def default_lag(bins: int) -> int:
+    """Return the lag at which the cubic scatters least, 0.4 of the bins."""
+    return max(min(round(_LAG_SHARE * bins), (bins - 1) // 2), 1)
+
+
+def cubic(
+    power: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+    *,
+    lag: int | None = None,
+    variance: npt.ArrayLike | None = None,
+    statistics: str = "gauss",
+    shots: npt.ArrayLike | None = None,
+) -> BackgroundResult:
+    r"""Find the background of a homogeneous path without iteration.
+
+    On a homogeneous path, three bins at a distance of `lag` obey
+    :math:`(P_0 - P^*) R_0^2 (P_2 - P^*) R_2^2 = (P_1 - P^*)^2 R_1^4`. The sum of the squared
+    differences over all triples,
+
+    .. math:: S(x) = \sum_i (a_i x^2 + b_i x + c_i)^2,
+
+    has its minimum at the largest real root of the cubic :math:`S'(x) = 0`, which is
+    evaluated in a form that keeps its digits. What the noise adds to the coefficients on
+    average is subtracted first; without that, a short lag gives a background that is too high.
+
+    The scatter is 1.3 to 2.1 times the least possible one (`lidarops.retrieve.homogeneous.path_fit`
+    reaches that), and the start of the section must stand out of the noise.
+
+    Parameters
+    ----------
+    power : (..., range) float
+        Any unit; of a section that begins beyond full overlap.
+    range : (range,) float
+        m, uniform.
+    lag : int, optional
+        Distance of the bins of a triple, `default_lag` where not given.
+    variance : (..., range) float, optional
+        Noise variance in the square of the power's unit, broadcast against `power`. Where not
+        given, one variance for the profile is estimated from differences along range.
+    statistics : {"gauss", "poisson"}
+        "poisson" takes `power` as mean counts per shot, which are their own variance.
+    shots : (...) float, optional
+        Number of shots of which `power` is the mean count; 1 where not given. Needs "poisson".
+
+    Returns
+    -------
+    BackgroundResult
+        The standard error follows from the implicit derivative of the root with respect to the
+        power of each bin. INPUT_MISSING where a bin is not finite, or its variance is 0 where
+        that of others is not; TOO_FEW_BINS below 8 bins (NaN below 3), NO_SIGNAL where the
+        profile is constant, LOW_SIGNAL where the noise may
+        have moved the minimum to another root (or, where no variance is given and the bins are few
+        or a lag short, curvature of the signal that is taken for noise), NO_REAL_SOLUTION where
+        the root is no minimum.
+
+    Raises
+    ------
+    RetrievalInputError
+        For arguments that cannot be right, among them a range that is not uniform.
+
+    References
+    ----------
+    bobrovsky2024 (equation 8 without the outer square, 13 with a misprinted coefficient).
+    """
+    grid = inputs.range_grid(range)
+    rows, leading = inputs.profiles(power, grid)
+    noise = inputs.variance_rows(variance, grid, leading)
+    poisson = inputs.choice(statistics, Statistics, "statistics") is Statistics.POISSON
+    if poisson and variance is not None:
+        raise RetrievalInputError(
+            "is given for counts, which are their own variance",
+            field="variance",
+            remedy="leave it out, or choose statistics='gauss'",
+        )
+    if shots is not None and not poisson:
+        raise RetrievalInputError(
+            "is given for Gaussian noise", field="shots", remedy="choose statistics='poisson'"
+        )
+    result = solve_cubic(
+        rows,
+        grid.values,
+        lag,
+        noise,
+        known_variance=variance is not None,
+        shots=photon_counts.checked(rows, shots, leading) if poisson else None,
+    )[0]
+    return BackgroundResult(
+        result.background.reshape(leading),
+        result.background_standard_error.reshape(leading),
+        result.quality.reshape(leading),
+    )
+
+
+def solve_cubic(
+    power: inputs.Floats,
+    range_: Array,
+    lag: int | None,
+    variance: Array,
+    *,
+    known_variance: bool,
+    shots: Array | None = None,
+    want_gradients: bool = False,
+) -> tuple[BackgroundResult, Array]:
+    """Solve `cubic` on arrays that `lidarops.retrieve.common.inputs` has prepared.
+
+    Parameters
+    ----------
+    power, variance : (profile, bin) float
+        The variance may be one row, and relative where it is not known.
+    range_ : (bin,) float
+        m, ascending.
+    lag : int, optional
+    known_variance : bool
+    shots : (profile or 1,) float, optional
+        Where the power are mean counts of so many shots.
+    want_gradients : bool
+        Whether to return the derivatives of the backgrounds with respect to the power.
+
+    Returns
+    -------
+    BackgroundResult
+        (profile,).
+    gradients : (profile, bin) float
+        One row of no meaning where not wanted.
+    """
+    _require_uniform(range_)
+    count, bins = power.shape
+    out = np.full((count, _cubic_kernel.COLUMNS), np.nan)
+    gradients = np.zeros((count if want_gradients else 1, bins))
+    if bins >= 3:
+        poisson = np.zeros(1) if shots is None else 1.0 / shots
+        triples = _cubic_kernel.make_triples(range_, _checked_lag(lag, bins))
+        _cubic_kernel.solve_profiles(
+            power, variance, known_variance, poisson, triples, gradients, out
+        )
+    status = out[:, _cubic_kernel.STATUS]
+    quality = np.zeros(count, dtype=np.int32)
+    for code, bit in _QUALITY_OF_STATUS.items():
+        quality[status == code] |= np.int32(bit)
+    moved = (out[:, _cubic_kernel.CONTRAST] < LOWEST_CONTRAST) | (
+        out[:, _cubic_kernel.MISTAKEN] > MOST_MISTAKEN
+    )
+    quality[moved] |= np.int32(Quality.LOW_SIGNAL)
+    if bins < FEWEST_BINS:
+        quality[status != _cubic_kernel.MISSING] |= np.int32(Quality.TOO_FEW_BINS)
+    lost = status == _cubic_kernel.LOST
+    background = np.where(lost, np.nan, out[:, _cubic_kernel.BACKGROUND])
+    error = np.sqrt(np.where(lost, np.nan, out[:, _cubic_kernel.VARIANCE]))
+    return BackgroundResult(background, error, quality), gradients
+
+
+def tail_mean(
+    power: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+    *,
+    start: float | None = None,
+    variance: npt.ArrayLike | None = None,
+) -> BackgroundResult:
+    """Take the mean of the far end of a profile as its background, as the field does.
+
+    What is left of the signal there is part of the mean: the background is too high by it.
+
+    Parameters
+    ----------
+    power : (..., range) float
+        Any unit; bins that are not finite are passed over.
+    range : (range,) float
+        m.
+    start : float, optional
+        m; bins from here on are averaged, the last tenth of the bins where not given.
+    variance : (..., range) float, optional
+        Noise variance in the square of the power's unit, broadcast against `power`; bins where
+        it is not finite, or 0 and that of others is not, are passed over. Where not given, the
+        scatter of the averaged bins tells it.
+
+    Returns
+    -------
+    BackgroundResult
+        INPUT_MISSING where no averaged bin is finite, TOO_FEW_BINS where fewer than 8 are.
+
+    Raises
+    ------
+    RetrievalInputError
+        For arguments that cannot be right, among them a start beyond the range.
+    """
+    grid = inputs.range_grid(range)
+    rows, leading = inputs.profiles(power, grid)
+    noise = inputs.variance_rows(variance, grid, leading)
+    first = _first_of_tail(grid.values, start, "start")
+    values = np.ascontiguousarray(rows[:, first:], dtype=np.float64)
+    noise = np.broadcast_to(noise[:, first:], values.shape)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        valid = np.isfinite(values) & np.isfinite(noise)
+        # A variance of 0 among others says nothing; that of all bins says that there is no noise.
+        valid &= (noise > 0) | ~np.any(noise > 0, axis=-1, keepdims=True)
+        bins = valid.sum(axis=-1)
+        mean = np.where(valid, values, 0.0).sum(axis=-1) / bins
+        if variance is None:
+            scatter = np.where(valid, values - mean[:, np.newaxis], 0.0) ** 2
+            error = np.sqrt(scatter.sum(axis=-1) / (bins - 1) / bins)
+        else:
+            error = np.sqrt(np.where(valid, noise, 0.0).sum(axis=-1)) / bins
+    quality = _tail_quality(bins)
+    error[bins < 2 if variance is None else bins < 1] = np.nan
+    return BackgroundResult(mean.reshape(leading), error.reshape(leading), quality.reshape(leading))
+
+
+def solve_tail(
+    power: inputs.Floats, range_: Array, start: float | None, noise: Array
+) -> tuple[BackgroundResult, Array]:
+    """Solve `tail_mean` on arrays that `lidarops.retrieve.common.inputs` has prepared.
+
+    Parameters
+    ----------
+    power : (profile, bin) float
+    range_ : (bin,) float
+        m, ascending.
+    start : float, optional
+        m.
+    noise : (profile or 1, bin) float
+        Variances or weights; where not positive and finite, a bin is passed over.
+
+    Returns
+    -------
+    BackgroundResult
+        (profile,); no standard errors, which follow from the gradients.
+    gradients : (profile, bin) float
+        Derivatives of the backgrounds with respect to the power.
+    """
+    first = _first_of_tail(range_, start, "tail_start")
+    gradients = np.zeros(power.shape)
+    usable = np.isfinite(power) & np.isfinite(noise) & (noise > 0)
+    bins = usable[:, first:].sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        gradients[:, first:] = usable[:, first:] / bins[:, np.newaxis]
+        values = np.where(usable[:, first:], power[:, first:].astype(np.float64), 0.0)
+        mean = values.sum(axis=-1) / bins
+    quality = _tail_quality(bins)
+    return BackgroundResult(mean, np.full(mean.shape, np.nan), quality), gradients
+
+
+def _tail_quality(bins: npt.NDArray[np.intp]) -> Flags:
+    quality = np.zeros(bins.shape, dtype=np.int32)
+    quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
+    quality[(bins > 0) & (bins < FEWEST_BINS)] |= np.int32(Quality.TOO_FEW_BINS)
+    return quality
+
+
+def _first_of_tail(range_: Array, start: float | None, field: str) -> int:
+    if start is None:
+        return int(range_.size - max(range_.size // 10, 1))
+    if not np.isfinite(start) or start > range_[-1]:
+        raise RetrievalInputError(
+            f"is {start} m, but the range ends at {range_[-1]:g} m", field=field
+        )
+    return int(np.searchsorted(range_, start, side="left"))
+
+
+def _checked_lag(lag: int | None, bins: int) -> int:
+    if lag is None:
+        return default_lag(bins)
+    if not 1 <= lag <= (bins - 1) // 2:
+        raise RetrievalInputError(
+            f"is {lag} with {bins} bins",
+            field="lag",
+            remedy=f"choose a whole number from 1 to {(bins - 1) // 2}",
+        )
+    return lag
+
+
+def _require_uniform(range_: Array) -> None:
+    grid = np.linspace(range_[0], range_[-1], range_.size)
+    if np.max(np.abs(range_ - grid)) > _UNIFORM * range_[-1]:
+        raise RetrievalInputError(
+            "is not uniform, as the cubic needs it",
+            field="range",
+            remedy="use the method 'direct' of lidarops.retrieve.homogeneous.path_fit.solve",
+        )

@@ -1,0 +1,1 @@
+"""Backscatter and extinction of particles from an elastic lidar."""

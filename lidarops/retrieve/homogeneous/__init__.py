@@ -1,0 +1,1 @@
+"""Background, amplitude and extinction of a homogeneous path."""

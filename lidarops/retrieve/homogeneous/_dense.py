@@ -1,0 +1,97 @@
+"""The compressed solver behind `lidarops.retrieve.homogeneous.path_fit.solve`: who takes which profile."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from lidarops.flags import Quality
+from lidarops.retrieve.homogeneous import _compressed, _methods
+from lidarops.retrieve.homogeneous._fit_quality import common_limits
+from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
+from lidarops.retrieve.homogeneous._problem import Array, Flat, Problem
+
+FEWEST_BINS: Final = 32
+"""Below, the direct fit is as fast, and a basis of 11 shapes is most of the profile."""
+MOST_BINS: Final = 4096
+"""Above, making the tables would hold more than 100 MB, for longer than a fit takes."""
+DEFAULT_SIZE: Final = 11
+FAST_SIZE: Final = 7
+THINNEST: Final = 0.15
+"""Length over first range, below which shapes are so nearly straight lines that the cells of a
+table are too coarse for them."""
+_UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
+
+
+def compressed(problem: Problem) -> Flat:
+    """Solve by 11 functionals of each profile, and by Newton steps what has gaps."""
+    return _solve(problem, DEFAULT_SIZE, with_residuals=True)
+
+
+def fast(problem: Problem) -> Flat:
+    """Solve by 7 functionals, without a look at the residuals where the variance is known."""
+    return _solve(problem, FAST_SIZE, with_residuals=not problem.known_variance)
+
+
+def _solve(problem: Problem, size: int, *, with_residuals: bool) -> Flat:
+    if not _is_regular(problem):
+        return _methods.direct(problem)
+    tables = _tables(problem, size)
+    if tables is None:
+        return _methods.masked(problem)
+    count, bins = problem.power.shape
+    out = np.empty((len(_compressed.RESULTS), count))
+    quality, state = np.empty(count, np.int32), np.empty(count, np.int64)
+    _compressed.solve_profiles(
+        problem.power,
+        _compressed.weight_roots(tables, _weights(problem), problem.power),
+        tables.envelope.astype(problem.power.dtype),
+        tables,
+        _compressed.Mode(
+            problem.known_variance,
+            with_residuals,
+            0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * np.finfo(np.float64).eps,
+        ),
+        common_limits(bins, _compressed.CURVATURES - 2, known_variance=problem.known_variance),
+        out,
+        quality,
+        state,
+    )
+    found = Flat(
+        **dict(zip(_compressed.RESULTS, out, strict=True)),
+        mean_range=np.where(quality & int(Quality.NO_SIGNAL), math.nan, tables.mean_range),
+        valid_bins=np.full(count, bins, np.int32),
+        quality=quality,
+    )
+    routed = np.flatnonzero(state == _compressed.ROUTED)
+    if routed.size == 0:
+        return found
+    return found.updated(routed, _methods.masked(problem.select(routed, problem.power[routed])))
+
+
+def _is_regular(problem: Problem) -> bool:
+    """Return whether the range is uniform, and the section neither short nor thin."""
+    range_ = problem.range
+    if range_.size < FEWEST_BINS or range_[-1] - range_[0] < THINNEST * range_[0]:
+        return False
+    even = np.linspace(range_[0], range_[-1], range_.size)
+    return bool(np.max(np.abs(range_ - even)) <= _UNIFORM * range_[-1])
+
+
+def _tables(problem: Problem, size: int) -> Tables | None:
+    """Return the tables, or None where profiles of this kind have none."""
+    if not problem.common_noise or problem.range.size > MOST_BINS:
+        return None
+    weights = _weights(problem)
+    if not np.all((weights > 0.0) & (weights < _compressed.HUGE)):
+        return None
+    tables = make_tables(problem.range, weights, problem.bounds, size)
+    return tables if tables.monotonic else None
+
+
+def _weights(problem: Problem) -> Array:
+    with np.errstate(divide="ignore"):
+        weights: Array = 1.0 / problem.noise[0] if problem.known_variance else problem.noise[0]
+    return weights

@@ -1,0 +1,338 @@
+"""Compiled least squares of the homogeneous path, one profile at a time.
+
+The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is evaluated on
+fixed nodes, and the best node is improved by a fixed number of Newton steps, whose residuals are
+taken explicitly. Every sum runs over the bins of one profile in a fixed order: a result does not
+depend on what else is in the batch.
+"""
+
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.homogeneous._estimate import (
+    AMPLITUDE,
+    AMPLITUDE_RELATIVE_VARIANCE,
+    BACKGROUND,
+    BACKGROUND_BEND,
+    BACKGROUND_VARIANCE,
+    BENDS,
+    BINS,
+    BOUNDED,
+    CONSTANT,
+    EMPTY,
+    EXTINCTION,
+    EXTINCTION_VARIANCE,
+    FITTED,
+    LARGEST,
+    MEAN_RANGE,
+    MISFIT,
+    ROUNDING,
+    SIGNAL_ENERGY,
+    STATUS,
+    TOO_SHORT,
+    TREND,
+)
+from lidarops.retrieve.homogeneous._misfit import (
+    describe_bend,
+    describe_bend_given,
+    judge_residuals,
+)
+from lidarops.retrieve.homogeneous._projection import (
+    NODE_SCALE,
+    NODES,
+    Grid,
+    Point,
+    Scratch,
+    compiled,
+    evaluate,
+    largest_of,
+    make_scratch,
+    multiply,
+    power_of_two,
+    product,
+    summing,
+    total_of,
+)
+
+Array = npt.NDArray[np.float64]
+
+STEPS: Final = 7
+"""Newton steps after the start, which is good to some hundredths of the spacing of nodes."""
+HUGE: Final = 1e300
+TINY: Final = 1e-280
+
+# What is asked of the extinction.
+FREE: Final = 0
+GIVEN: Final = 1
+STEP: Final = 2
+"""One linear step from a prior, expanded about the centroid of information."""
+STEP_ABOUT_ZERO: Final = 3
+"""The same, expanded about range zero."""
+
+
+@compiled
+def _weight(value: float, noise: float, is_variance: bool) -> float:
+    """Return the weight of a bin, 0 where value or weight cannot be used."""
+    weight = 1.0 / noise if is_variance else noise
+    return weight if abs(value) < HUGE and 0.0 < weight < HUGE else 0.0
+
+
+@compiled
+def _last_valid(power: Any, noise: Array, is_variance: bool) -> int:
+    for i in range(noise.size - 1, -1, -1):
+        if _weight(np.float64(power[i]), noise[i], is_variance) > 0.0:
+            return i
+    return -1
+
+
+@compiled
+def _load(power: Any, noise: Array, is_variance: bool, reference: float, s: Scratch) -> int:
+    """Copy one profile less its reference, 0 where it cannot be used; return the valid bins."""
+    count = 0
+    for i in range(noise.size):
+        value = np.float64(power[i])
+        weight = _weight(value, noise[i], is_variance)
+        count += weight > 0.0
+        s.w[i] = weight
+        s.used[i] = 1.0 if weight > 0.0 else 0.0
+        s.z[i] = value - reference if weight > 0.0 else 0.0
+    return count
+
+
+@summing
+def _project(shape: Array, w: Array, z: Array, w0: float, wz: float, free: float) -> float:
+    """Return the signed length of the profile along a shape, background projected out."""
+    s1 = s2 = sz = 0.0
+    for i in range(shape.size):
+        weighted = w[i] * shape[i]
+        s1 += weighted
+        s2 += weighted * shape[i]
+        sz += weighted * z[i]
+    norm = s2 - free * s1 * s1 / w0
+    # A shape that is flat over the valid bins, or gone before the first, tells nothing.
+    if not (norm > 1e-13 * s2 and s2 > TINY):
+        return 0.0
+    return float((sz - free * s1 * wz / w0) / math.sqrt(norm))
+
+
+@compiled
+def _start(g: Grid, s: Scratch, w0: float, wz: float, free: float) -> tuple[float, float, float]:
+    """Return tau at the vertex about the best node, and the nodes that bracket it."""
+    shapes, nodes, w, z, lengths = g.shapes, g.nodes, s.w, s.z, s.lengths
+    best = 0
+    for j in range(NODES):
+        lengths[j] = _project(shapes[j], w, z, w0, wz, free)
+        if abs(lengths[j]) > abs(lengths[best]):
+            best = j
+    # At an end of the grid, the vertex is extrapolated from the last three nodes.
+    middle = min(max(best, 1), NODES - 2)
+    sign = math.copysign(1.0, lengths[best])
+    before, here, after = (
+        sign * lengths[middle - 1],
+        sign * lengths[middle],
+        sign * lengths[middle + 1],
+    )
+    low, high = nodes[max(best - 1, 0)], nodes[min(best + 1, NODES - 1)]
+    start = nodes[best]
+    bend = before - 2.0 * here + after
+    if bend < 0.0:
+        vertex = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
+        start = min(max(NODE_SCALE * math.sinh(vertex), low), high)
+    return start, low, high
+
+
+@compiled
+def _newton(tau: float, point: Point, low: float, high: float) -> float:
+    gauss = point.b * point.b * point.slope_norm
+    step = point.gradient / (point.curvature if point.curvature > 0.3 * gauss else gauss)
+    moved = tau + step
+    if not math.isfinite(moved):
+        return tau
+    return float(min(max(moved, low), high))
+
+
+@compiled
+def _describe(g: Grid, p: Point, tau: float, w0: float, free: float, row: Array) -> None:
+    """Write parameters and variances of a least-squares fit, in the scaled variables."""
+    row[BACKGROUND] = p.mean_z - p.b * p.mean_phi
+    row[AMPLITUDE] = p.b
+    row[EXTINCTION] = tau
+    row[SIGNAL_ENERGY] = p.b * p.b * p.norm
+    row[EXTINCTION_VARIANCE] = 1.0 / (p.b * p.b * p.slope_norm)
+    row[BACKGROUND_VARIANCE] = (
+        free / w0 + p.mean_phi * p.mean_phi / p.norm + p.mean_t * p.mean_t / p.slope_norm
+    )
+    # Extinction moves the logarithm of B by twice the range of the centroid.
+    lever = 2.0 * (g.start / g.length + p.centroid)
+    row[AMPLITUDE_RELATIVE_VARIANCE] = (
+        1.0 / row[SIGNAL_ENERGY] + lever * lever * row[EXTINCTION_VARIANCE]
+    )
+
+
+@compiled
+def _describe_given(p: Point, w0: float, free: float, row: Array) -> None:
+    """Write the variances over: the extinction has none."""
+    row[EXTINCTION_VARIANCE] = 0.0
+    row[BACKGROUND_VARIANCE] = free / w0 + p.mean_phi * p.mean_phi / p.norm
+    row[AMPLITUDE_RELATIVE_VARIANCE] = 1.0 / row[SIGNAL_ENERGY]
+
+
+@compiled
+def _step(g: Grid, p: Point, kind: int, tau: float, row: Array) -> None:
+    """Write the linear step from a prior; errors to first order in the two coefficients."""
+    slope = p.gradient / (p.b * p.slope_norm)
+    centroid = g.start / g.length + p.centroid
+    origin = centroid if kind == STEP else 0.0
+    # Shape and slope about the origin; about the centroid, their coefficients are independent.
+    shift = 2.0 * (centroid - origin)
+    b = p.b + shift * slope
+    step = slope / b
+    of_slope, of_b = 1.0 / p.slope_norm, 1.0 / p.norm
+    by_slope, by_b = p.b / (b * b), -slope / (b * b)
+    row[EXTINCTION_VARIANCE] = by_slope * by_slope * of_slope + by_b * by_b * of_b
+    by_slope, by_b = shift / b + 2.0 * origin * by_slope, 1.0 / b + 2.0 * origin * by_b
+    row[AMPLITUDE_RELATIVE_VARIANCE] = by_slope * by_slope * of_slope + by_b * by_b * of_b
+    row[BACKGROUND] -= slope * p.mean_t
+    row[EXTINCTION] = tau + step
+    row[AMPLITUDE] = b * math.exp(2.0 * step * (origin - g.start / g.length))
+
+
+@compiled
+def _moved(p: Point, row: Array) -> Point:
+    """Return a point with the background and amplitude of a row."""
+    return Point(
+        row[AMPLITUDE],
+        row[BACKGROUND] + row[AMPLITUDE] * p.mean_phi,
+        p.mean_phi,
+        p.mean_t,
+        p.centroid,
+        p.norm,
+        p.slope_norm,
+        p.gradient,
+        p.curvature,
+    )
+
+
+@compiled
+def _fit(g: Grid, s: Scratch, free: float, kind: int, tau: float, row: Array) -> None:
+    """Fit one loaded profile and write what became of it, in the scaled variables."""
+    w0, wz = total_of(s.w), product(s.w, s.z)
+    if kind == FREE:
+        tau, low, high = _start(g, s, w0, wz, free)
+        for _ in range(STEPS):
+            tau = _newton(tau, evaluate(tau, g, s, w0, wz, free), low, high)
+    p = evaluate(tau, g, s, w0, wz, free)
+    _describe(g, p, tau, w0, free, row)
+    if kind == GIVEN:
+        _describe_given(p, w0, free, row)
+    elif kind != FREE:
+        _step(g, p, kind, tau, row)
+        tau = row[EXTINCTION]
+        p = _moved(evaluate(tau, g, s, w0, wz, free), row)
+    describe_bend(g, s, p, w0, free, row)
+    if kind == GIVEN:
+        describe_bend_given(p, row)
+    row[MEAN_RANGE] = product(s.w, g.x) / w0
+    judge_residuals(g, s, p, tau, (w0, wz, free), row)
+    if kind == GIVEN:
+        row[BOUNDED] = 0.0
+
+
+@compiled
+def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> None:
+    """Turn a row from the scaled variables into SI units; noise terms into units of the noise."""
+    energy = scale * (scale * unit)
+    sign = math.copysign(1.0, row[AMPLITUDE])
+    logarithm = math.log(abs(row[AMPLITUDE])) + math.log(scale)
+    logarithm += 2.0 * math.log(g.start) + 2.0 * row[EXTINCTION] * g.start / g.length
+    row[BACKGROUND_BEND] *= scale * row[AMPLITUDE] * g.length
+    row[BACKGROUND] = reference + scale * row[BACKGROUND]
+    row[AMPLITUDE] = sign * math.exp(logarithm)
+    row[EXTINCTION] /= g.length
+    row[BACKGROUND_VARIANCE] /= unit
+    row[AMPLITUDE_RELATIVE_VARIANCE] /= energy
+    row[EXTINCTION_VARIANCE] /= energy * g.length * g.length
+    row[SIGNAL_ENERGY] *= energy
+    row[MISFIT] *= energy
+    row[BENDS] *= energy
+    row[TREND] *= energy
+    row[LARGEST] *= math.sqrt(energy)
+    row[MEAN_RANGE] = g.start + g.length * row[MEAN_RANGE]
+
+
+@compiled
+def _solve_profile(
+    power: Any,
+    noise: Array,
+    mode: tuple[bool, float, float, int, float],
+    g: Grid,
+    s: Scratch,
+    row: Array,
+) -> None:
+    is_variance, background, rounding, kind, extinction = mode
+    last = _last_valid(power, noise, is_variance)
+    given = not math.isnan(background)
+    reference = background if given else np.float64(power[last])
+    row[BINS] = 0 if last < 0 else _load(power, noise, is_variance, reference, s)
+    if row[BINS] < 4:
+        row[STATUS] = EMPTY if last < 0 else TOO_SHORT
+        return
+    unit, largest = power_of_two(largest_of(s.w)), largest_of(s.z)
+    multiply(s.w, 1.0 / unit)
+    row[ROUNDING] = (rounding * (abs(reference) + largest)) ** 2 * unit * total_of(s.w) / row[BINS]
+    if largest < TINY:
+        row[STATUS] = CONSTANT
+        row[BACKGROUND] = reference
+        row[BACKGROUND_VARIANCE] = 1.0 / (total_of(s.w) * unit)
+        return
+    scale = power_of_two(largest)
+    multiply(s.z, 1.0 / scale)
+    row[STATUS] = FITTED
+    _fit(g, s, 0.0 if given else 1.0, kind, extinction * g.length, row)
+    unscale(g, reference, scale, unit, row)
+
+
+@compiled
+def solve_profiles(
+    power: Any,
+    noise: Array,
+    is_variance: bool,
+    background: Array,
+    kind: int,
+    extinction: Array,
+    rounding: float,
+    g: Grid,
+    out: Array,
+) -> None:
+    """Fit every profile of a batch.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    noise : (profile or 1, bin) float64
+        Variances or weights; a bin is left out where its weight is not positive and finite.
+    is_variance : bool
+    background : (profile or 1,) float64
+        Given backgrounds, NaN where the background is to be fitted.
+    kind : int
+        `FREE`, `GIVEN`, `STEP` or `STEP_ABOUT_ZERO`.
+    extinction : (profile or 1,) float64
+        m-1; not used where it is free.
+    rounding : float
+        Relative rounding error of the power.
+    g : Grid
+        Of `make_grid`.
+    out : (profile, column) float64
+        Filled with NaN; gets the columns of `lidarops.retrieve.homogeneous._estimate`.
+    """
+    s = make_scratch(g.x.size)
+    for k in range(power.shape[0]):
+        given = extinction[k % extinction.size]
+        mode = (is_variance, background[k % background.size], rounding, kind, given)
+        _solve_profile(power[k], noise[k % noise.shape[0]], mode, g, s, out[k])

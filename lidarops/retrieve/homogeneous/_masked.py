@@ -1,0 +1,575 @@
+"""Least squares of profiles with gaps or weights of their own, in a few passes over the bins.
+
+The fit of `lidarops.retrieve.homogeneous._direct`, sped up: the best of a few extinctions is sought on sums
+over groups of bins, then Newton steps for all three unknowns go over the bins, each in one
+vectorised pass. From a start that is good to some percent each step squares the error, and three
+or four do. The result is that of converged least squares; `lidarops.retrieve.homogeneous._fit_quality` judges it.
+
+Everything is scaled as in `lidarops.retrieve.homogeneous._projection`. Profiles for which this does not work
+out (nearly flat ones, numbers at the end of the floats) are left to the direct fit.
+"""
+
+# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.homogeneous._direct import unscale
+from lidarops.retrieve.homogeneous._estimate import (
+    AMPLITUDE,
+    AMPLITUDE_RELATIVE_VARIANCE,
+    BACKGROUND,
+    BACKGROUND_BEND,
+    BACKGROUND_VARIANCE,
+    BEND_COUNT,
+    BENDS,
+    BINS,
+    BOUNDED,
+    EXTINCTION,
+    EXTINCTION_BEND,
+    EXTINCTION_VARIANCE,
+    FITTED,
+    LARGEST,
+    MEAN_RANGE,
+    MISFIT,
+    ROUNDING,
+    SIGNAL_ENERGY,
+    STATUS,
+    TREND,
+    TREND_COUNT,
+)
+from lidarops.retrieve.homogeneous._misfit import DEPENDENT
+from lidarops.retrieve.homogeneous._vector_loops import (
+    LANES,
+    STRIDE,
+    bend_sums,
+    project_1_16,
+    project_1_32,
+    residuals,
+    step_sums,
+)
+
+Array = npt.NDArray[np.float64]
+
+MOST_PASSES: Final = 8
+FEWEST_BINS: Final = 16
+NODES: Final = 16
+_SCALE: Final = 0.3
+_HUGE: Final = 1e140
+_LEAST: Final = 1e-3
+"""Share of the weight per bin that a shape must keep without its mean to be tried as a start:
+one that is gone before the first bin that is left would fit anything."""
+
+_LATEST: Final = 0.2
+"""Share of the section that may be missing at its start."""
+_DEEPEST: Final = 0.5
+"""Optical depth that may be missing there."""
+CONVERGED: Final = 1e-7
+"""Size of a step, over extinction, whose square is nothing: no other follows."""
+CLOSE: Final = 1e-3
+"""Size of the step before it: where steps fall as their squares do, none is so small at once."""
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+_finding = numba.njit(
+    cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={"nnan", "nsz"}
+)
+_summing = numba.njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    forceinline=True,
+    fastmath={"contract", "nsz", "reassoc"},
+)
+
+
+class Plan(NamedTuple):
+    """What the profiles of a call share."""
+
+    x: Array
+    """Scaled range, padded to whole steps."""
+    envelope: Array
+    """``(R_0 / R)^2``, zero where padded."""
+    step: float
+    edges: npt.NDArray[np.int64]
+    """Of the groups of bins, which widen along range."""
+    shapes: Array
+    """(group, node): phi at the middle of each group."""
+    powers: Array
+    """(group, 2 nodes): phi, then phi squared."""
+    nodes: Array
+    first: float
+    scale: float
+    """Nodes are uniform in ``asinh(tau / scale)``, from `first` in steps of `spacing`."""
+    spacing: float
+    start: float
+    length: float
+
+
+class _Scratch(NamedTuple):
+    z: Array
+    w: Array
+    used: Array
+    root: Array
+    residual: Array
+    weights: Array
+    values: Array
+    lengths: Array
+    sums: Array
+
+
+class _Fit(NamedTuple):
+    level: float
+    amplitude: float
+    tau: float
+    mean: float
+    centre: float
+
+
+def make_plan(range_: Array, bounds: tuple[float, float]) -> Plan:
+    """Tabulate what the profiles of a call share.
+
+    Parameters
+    ----------
+    range_ : (bin,) float
+        m, ascending and uniform.
+    bounds : (float, float)
+        Lowest and highest extinction, m-1.
+    """
+    bins = range_.size
+    length = float(range_[-1] - range_[0])
+    padded = -(-bins // STRIDE) * STRIDE
+    x = np.ones(padded)
+    x[:bins] = (range_ - range_[0]) / length
+    envelope = np.zeros(padded)
+    envelope[:bins] = (range_[0] / range_) ** 2
+    lowest, highest = bounds[0] * length, bounds[1] * length
+    scale = min(_SCALE, _SCALE * length / float(range_[0]))
+    first, last = math.asinh(lowest / scale), math.asinh(highest / scale)
+    nodes = scale * np.sinh(np.linspace(first, last, NODES))
+    edges = _edges(bins)
+    middle = 0.5 * (x[edges[:-1]] + x[edges[1:] - 1])
+    falling = (range_[0] / (range_[0] + length * middle)) ** 2
+    shapes = np.exp(-2.0 * middle[:, np.newaxis] * nodes) * falling[:, np.newaxis]
+    return Plan(
+        x=x,
+        envelope=envelope,
+        step=1.0 / (bins - 1),
+        edges=edges,
+        shapes=np.ascontiguousarray(shapes),
+        powers=np.concatenate([shapes, shapes * shapes], axis=1),
+        nodes=nodes,
+        first=first,
+        scale=scale,
+        spacing=(last - first) / (NODES - 1),
+        start=float(range_[0]),
+        length=length,
+    )
+
+
+def _edges(bins: int) -> npt.NDArray[np.int64]:
+    unit = max(bins // 256, 1)
+    widths = np.repeat([1, 2, 4], 8) * unit
+    near = np.concatenate([[0], np.cumsum(widths)])
+    far = np.arange(near[-1] + 8 * unit, bins, 8 * unit)
+    inside = np.concatenate([near, far])
+    return np.append(inside[inside < bins], bins).astype(np.int64)
+
+
+@_compiled
+def _load(power: Any, weights: Array, s: _Scratch) -> tuple[float, float, float]:
+    """Copy a profile; return its valid bins, its reference and its largest weight."""
+    w, z, used = s.w[: weights.size], s.z[: weights.size], s.used[: weights.size]
+    for i in range(weights.size):
+        weight = weights[i]
+        value = np.float64(power[i])
+        valid = (abs(value) < _HUGE) & (weight > 0.0) & (weight < _HUGE)
+        w[i] = weight if valid else 0.0
+        z[i] = value if valid else 0.0
+        used[i] = 1.0 if valid else 0.0
+    reference = 0.0
+    for i in range(weights.size - 1, -1, -1):
+        if s.used[i] > 0.0:
+            reference = s.z[i]
+            break
+    return _sum(used), reference, _largest(w)
+
+
+@_summing
+def _sum(values: Array) -> float:
+    total = 0.0
+    for i in range(values.size):
+        total += values[i]
+    return total
+
+
+@_finding
+def _largest(values: Array) -> float:
+    largest = 0.0
+    for i in range(values.size):
+        largest = max(largest, values[i])
+    return largest
+
+
+@_compiled
+def _shift(z: Array, used: Array, reference: float) -> None:
+    for i in range(z.size):
+        z[i] = (z[i] - reference) * used[i]
+
+
+@_compiled
+def _multiply(values: Array, factor: float) -> None:
+    for i in range(values.size):
+        values[i] *= factor
+
+
+@_compiled
+def _take_roots(values: Array, roots: Array) -> None:
+    for i in range(values.size):
+        roots[i] = math.sqrt(values[i])
+
+
+@_compiled
+def _group(g: Plan, s: _Scratch) -> tuple[float, float]:
+    """Sum weights, and weighted values, over the groups; return the sums over all."""
+    whole = value = 0.0
+    for k in range(g.edges.size - 1):
+        of_weights = of_values = 0.0
+        for i in range(g.edges[k], g.edges[k + 1]):
+            of_weights += s.w[i]
+            of_values += s.w[i] * s.z[i]
+        s.weights[k], s.values[k] = of_weights, of_values
+        whole += of_weights
+        value += of_values
+    return whole, value
+
+
+@_compiled
+def _seek(g: Plan, s: _Scratch, whole: float, value: float, count: float) -> _Fit:
+    """Return the best node on the groups, moved to the vertex of a parabola through it."""
+    groups, out = g.edges.size - 1, s.sums.ctypes.data
+    weights, values, after = s.weights.ctypes.data, s.values.ctypes.data, g.x.ctypes.data
+    project_1_32(weights, 8, g.powers.ctypes.data, groups, out, after, 0)
+    project_1_16(values, 8, g.shapes.ctypes.data, groups, out + 16 * NODES, after, 0)
+    _energies(s.sums, s.lengths, value, whole, _LEAST * whole / count)
+    best = 0
+    for j in range(NODES):
+        if s.lengths[j] > s.lengths[best]:
+            best = j
+    if best < NODES - 1 and s.lengths[best + 1] == 0.0:
+        # The next node says nothing, or is gone before the first bin that is left.
+        return _Fit(0.0, math.nan, math.nan, 0.0, 0.0)
+    tau = _vertex(g, s, best)
+    one, norm = s.sums[0, best] / whole, s.sums[1, best] - s.sums[0, best] ** 2 / whole
+    amplitude = (s.sums[2, best] - one * value) / norm
+    return _Fit(value / whole - amplitude * one, amplitude, tau, one, 0.0)
+
+
+@_compiled
+def _energies(sums: Array, energies: Array, value: float, whole: float, least: float) -> None:
+    """Fill what each node explains of the squared profile."""
+    ones, twos, products = sums[0], sums[1], sums[2]
+    for j in range(energies.size):
+        norm = twos[j] - ones[j] * ones[j] / whole
+        length = products[j] - ones[j] * value / whole
+        energies[j] = length * length / norm if norm > least else 0.0
+
+
+@_compiled
+def _vertex(g: Plan, s: _Scratch, best: int) -> float:
+    middle = min(max(best, 1), NODES - 2)
+    before, here = math.sqrt(s.lengths[middle - 1]), math.sqrt(s.lengths[middle])
+    after = math.sqrt(s.lengths[middle + 1])
+    bend = before - 2.0 * here + after
+    if not bend < 0.0:
+        return float(g.nodes[best])
+    at = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
+    low, high = g.nodes[max(best - 1, 0)], g.nodes[min(best + 1, NODES - 1)]
+    return float(min(max(g.scale * math.sinh(at), low), high))
+
+
+@_compiled
+def _normal(sums: tuple[float, ...], whole: float) -> tuple[float, float, float, float, float]:
+    """Return the normal equations of the slope, level and shape projected out.
+
+    Its norm and right-hand side, its products with level and shape, and the norm of the shape.
+    """
+    d, dd, g, gd, gg, _, _, rg, _ = sums
+    shape = dd - d * d / whole
+    of_level = g / whole
+    of_shape = (gd - d * of_level) / shape
+    norm = gg - g * of_level - of_shape * of_shape * shape
+    right = rg - of_level * sums[5] - of_shape * (sums[6] - d * sums[5] / whole)
+    return norm, right, of_level, of_shape, shape
+
+
+@_compiled
+def _step(fit: _Fit, sums: tuple[float, ...], whole: float, bounds: tuple[float, float]) -> _Fit:
+    """Return the fit after one Newton step."""
+    d, dd, _, gd, _, r, rd, _, rgx = sums
+    norm, right, of_level, of_shape, shape = _normal(sums, whole)
+    linear = (rd - d * r / whole) / shape
+    amplitude = fit.amplitude + linear
+    curved = norm - rgx / amplitude
+    slope = right / (curved if curved > 0.3 * norm else norm)
+    tau = min(max(fit.tau - 0.5 * slope / amplitude, bounds[0]), bounds[1])
+    moved = tau - fit.tau
+    slope = -2.0 * amplitude * moved
+    along = linear - of_shape * slope
+    level = (r - d * along) / whole - of_level * slope
+    return _Fit(
+        fit.level + level - along * fit.mean,
+        (fit.amplitude + along) * math.exp(2.0 * fit.centre * moved),
+        tau,
+        fit.mean + d / whole,
+        fit.centre + gd / (dd + fit.mean * d),
+    )
+
+
+@_compiled
+def _decays(g: Plan, tau: float) -> tuple[float, float]:
+    e1 = math.exp(-2.0 * tau * g.step)
+    return e1, (e1 * e1) * (e1 * e1)
+
+
+@_compiled
+def _describe(
+    g: Plan, before: _Fit, after: _Fit, sums: tuple[float, ...], whole: float, row: Array
+) -> None:
+    """Write parameters and variances, in the scaled variables."""
+    norm, _, of_level, of_shape, shape = _normal(sums, whole)
+    energy = after.amplitude * after.amplitude * shape
+    extinction = 1.0 / (4.0 * after.amplitude * after.amplitude * norm)
+    mean = before.mean + sums[0] / whole
+    # What a change of the slope does to the level, once the shape has followed.
+    level = of_level - of_shape * mean
+    lever = 2.0 * (g.start / g.length + before.centre + of_shape)
+    row[BACKGROUND] = after.level
+    row[AMPLITUDE] = after.amplitude
+    row[EXTINCTION] = after.tau
+    row[SIGNAL_ENERGY] = energy
+    row[EXTINCTION_VARIANCE] = extinction
+    row[BACKGROUND_VARIANCE] = 1.0 / whole + mean * mean / shape + level * level / norm
+    row[AMPLITUDE_RELATIVE_VARIANCE] = 1.0 / energy + lever * lever * extinction
+
+
+@_compiled
+def _left(
+    product: float, a: tuple[float, float, float], b: tuple[float, float, float], whole: float
+) -> float:
+    """Return what level, shape and slope leave over; `a` and `b` in units of their norms."""
+    return product - (a[0] * b[0] / whole + a[1] * b[1] + a[2] * b[2])
+
+
+@_compiled
+def _components(
+    one: float, d: float, g: float, sums: tuple[float, ...], whole: float
+) -> tuple[float, float, float]:
+    """Return the products of a vector with level, and with normed shape and slope."""
+    norm, _, of_level, of_shape, shape = _normal(sums, whole)
+    along = d - sums[0] * one / whole
+    across = g - of_level * one - of_shape * along
+    return one, along / math.sqrt(shape), across / math.sqrt(norm)
+
+
+@_compiled
+def _describe_bend(
+    before: _Fit, sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array
+) -> None:
+    """Write what a bent signal does to the fit, as `lidarops.retrieve.homogeneous._misfit` has it."""
+    norm, _, of_level, of_shape, shape = _normal(sums, whole)
+    one, along, across = _components(bent[0], bent[1], bent[2], sums, whole)
+    along, across = along / math.sqrt(shape), across / math.sqrt(norm)
+    mean = before.mean + sums[0] / whole
+    row[BACKGROUND_BEND] = one / whole - along * mean - across * (of_level - of_shape * mean)
+    row[EXTINCTION_BEND] = 0.5 - before.centre - 0.5 * across
+
+
+@_compiled
+def _trend(sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array) -> None:
+    """Write the misfit, and the energy of the residuals in two shapes that the model lacks.
+
+    One is backscatter that bends along the path, the other a detector that is not linear, as in
+    `lidarops.retrieve.homogeneous._misfit`.
+    """
+    p = _components(bent[0], bent[1], bent[2], sums, whole)
+    q = _components(bent[3], bent[4], bent[5], sums, whole)
+    # What the last step still took out of the residuals.
+    r = _components(sums[5], sums[6], sums[7], sums, whole)
+    row[MISFIT], row[LARGEST] = _left(bent[11], r, r, whole), math.sqrt(bent[12])
+    pulled = _left(bent[9], p, r, whole)
+    energy = count = shared = 0.0
+    norm = _left(bent[6], p, p, whole)
+    if norm > DEPENDENT * bent[6]:
+        energy += pulled * pulled / norm
+        count += 1.0
+        shared = _left(bent[7], p, q, whole) / norm
+    rest = _left(bent[8], q, q, whole) - shared * shared * norm
+    if rest > DEPENDENT * bent[8]:
+        own = _left(bent[10], q, r, whole) - shared * pulled
+        energy += own * own / rest
+        count += 1.0
+    row[TREND], row[TREND_COUNT] = energy, count
+
+
+@_summing
+def _bends(residual: Array, used: Array) -> tuple[float, float]:
+    total = terms = 0.0
+    last, middle = residual[2:], residual[1:]
+    used_last, used_middle = used[2:], used[1:]
+    for i in range(last.size):
+        bend = last[i] - 2.0 * middle[i] + residual[i]
+        whole = used_last[i] * used_middle[i] * used[i]
+        total += whole * bend * bend
+        terms += whole
+    return total, terms
+
+
+@_compiled
+def _look_back(g: Plan, s: _Scratch, fit: _Fit, row: Array) -> None:
+    """Take the second differences of the residuals, which tell the noise."""
+    decay, e4 = _decays(g, fit.tau)
+    steps = g.x.size // STRIDE
+    here = s.z.ctypes.data
+    _take_roots(s.w, s.root)
+    residuals(
+        s.z,
+        here,
+        here + 8 * STRIDE * (steps - 1),
+        steps,
+        g.envelope.ctypes.data,
+        s.root.ctypes.data,
+        decay,
+        decay * decay,
+        e4,
+        e4 * e4,
+        fit.amplitude,
+        fit.level,
+        s.residual.ctypes.data,
+    )
+    row[BENDS], row[BEND_COUNT] = _bends(s.residual, s.used)
+
+
+@_compiled
+def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bool:
+    """Fit one loaded profile; return whether that worked out."""
+    whole, value = _group(g, s)
+    after = _seek(g, s, whole, value, count)
+    bounds = g.nodes[0], g.nodes[-1]
+    before, sums = after, (0.0,) * 9
+    arrays = g.x.ctypes.data, s.w.ctypes.data, s.z.ctypes.data, g.envelope.ctypes.data
+    steps = g.x.size // LANES
+    moved, settled = math.inf, False
+    for k in range(MOST_PASSES):
+        # The first steps may be small by chance: they start from the amplitude of the node.
+        if k > 2 and settled:
+            break
+        before, last = after, moved
+        e1, e4 = _decays(g, before.tau)
+        sums = step_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
+        after = _step(before, sums, whole, bounds)
+        moved = abs(after.tau - before.tau)
+        size = abs(after.tau) + g.scale
+        # A step about a centre that lies nowhere is small whatever is left to go.
+        strayed = abs(after.centre - before.centre) > 0.1 * (1.0 + abs(after.centre))
+        settled = moved < CONVERGED * size and last < CLOSE * size and not strayed
+    _describe(g, before, after, sums, whole, row)
+    e1, e4 = _decays(g, before.tau)
+    bent = bend_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
+    _trend(sums, bent, whole, row)
+    _describe_bend(before, sums, bent, whole, row)
+    row[BENDS], row[BEND_COUNT] = 0.0, 0.0
+    if want_bends:
+        _look_back(g, s, after, row)
+    row[MEAN_RANGE] = _mean_range(g, s, whole)
+    row[ROUNDING] = whole
+    row[BOUNDED] = 1.0 if after.tau <= bounds[0] or after.tau >= bounds[1] else 0.0
+    first = 0
+    while s.used[first] == 0.0:
+        first += 1
+    # Seen from far behind the start of the section, shapes are too much alike for these sums.
+    if g.x[first] > _LATEST or after.tau * g.x[first] > _DEEPEST:
+        return False
+    return settled and math.isfinite(row[EXTINCTION_VARIANCE] + row[MISFIT] + row[TREND])
+
+
+@_summing
+def _mean_range(g: Plan, s: _Scratch, whole: float) -> float:
+    total = 0.0
+    for i in range(s.w.size):
+        total += s.w[i] * g.x[i]
+    return total / whole
+
+
+@_compiled
+def _scratch(g: Plan) -> _Scratch:
+    bins, groups = g.x.size, g.edges.size - 1
+    return _Scratch(
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros(groups),
+        np.zeros(groups),
+        np.zeros(NODES),
+        np.zeros((3, NODES)),
+    )
+
+
+@_compiled
+def _solve_profile(
+    power: Any, weights: Array, want_bends: bool, rounding: float, g: Plan, s: _Scratch, row: Array
+) -> bool:
+    count, reference, unit = _load(power, weights, s)
+    row[BINS] = count
+    if count < FEWEST_BINS:
+        return False
+    _shift(s.z[: weights.size], s.used[: weights.size], reference)
+    _multiply(s.w, 1.0 / unit)
+    if not _fit(g, s, count, want_bends, row):
+        return False
+    row[STATUS] = FITTED
+    largest = abs(reference) + abs(row[AMPLITUDE])
+    row[ROUNDING] *= (rounding * largest) ** 2 * unit / count
+    unscale(g, reference, 1.0, unit, row)
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def solve_profiles(
+    power: Any,
+    weights: Array,
+    want_bends: bool,
+    rounding: float,
+    g: Plan,
+    out: Array,
+    solved: npt.NDArray[np.bool_],
+) -> None:
+    """Fit every profile of a batch.
+
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    weights : (profile or 1, bin) float64
+        A bin is left out where its weight is not positive and finite.
+    want_bends : bool
+        Whether the second differences of the residuals are taken, 0 otherwise.
+    rounding : float
+        Relative rounding error of the power.
+    g : Plan
+        Of `make_plan`.
+    out : (profile, column) float64
+        Gets the columns of `lidarops.retrieve.homogeneous._estimate`.
+    solved : (profile,) bool
+        False where a profile is left to the direct fit; its columns mean nothing.
+    """
+    s = _scratch(g)
+    for k in range(power.shape[0]):
+        solved[k] = _solve_profile(
+            power[k], weights[k % weights.shape[0]], want_bends, rounding, g, s, out[k]
+        )

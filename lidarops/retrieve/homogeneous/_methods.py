@@ -1,0 +1,232 @@
+"""Solvers of the homogeneous path over the compiled direct fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.background.cubic_and_tail import solve_cubic, solve_tail
+from lidarops.retrieve.homogeneous import _direct, _linearized, _masked, _propagation
+from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, Estimate
+from lidarops.retrieve.homogeneous._fit_quality import judge
+from lidarops.retrieve.homogeneous._problem import Array, Centre, Flags, Flat, Problem
+from lidarops.retrieve.homogeneous._projection import make_grid
+
+_NOTHING: Final = np.zeros(1, dtype=np.int32)
+_KINDS: Final = {Centre.CENTROID: _direct.STEP, Centre.ZERO: _direct.STEP_ABOUT_ZERO}
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """What a background from elsewhere adds to the variances, in absolute terms."""
+
+    background: Array
+    amplitude_relative: Array
+    extinction: Array
+
+
+def direct(problem: Problem) -> Flat:
+    """Solve by least squares for all three unknowns."""
+    return _flat(_estimate(problem), problem)
+
+
+def masked(problem: Problem) -> Flat:
+    """Solve as `direct` does, in fewer passes over the bins where the range is uniform."""
+    plan = _masked.make_plan(problem.range, problem.bounds)
+    count = problem.power.shape[0]
+    table, solved = np.empty((count, len(COLUMNS))), np.empty(count, np.bool_)
+    with np.errstate(divide="ignore"):
+        weights = 1.0 / problem.noise if problem.known_variance else problem.noise
+    _masked.solve_profiles(
+        problem.power,
+        weights,
+        not problem.known_variance,
+        _rounding(problem),
+        plan,
+        table,
+        solved,
+    )
+    others = np.flatnonzero(~solved)
+    if others.size:
+        rest = problem.select(others, problem.power[others])
+        table[others] = _table(rest, np.full(1, np.nan), _direct.FREE, np.full(1, np.nan))
+    return _flat(Estimate(**dict(zip(COLUMNS, table.T, strict=True))), problem)
+
+
+def linearized(problem: Problem) -> Flat:
+    """Solve by one linear step from the prior extinction."""
+    prior = np.zeros(1) if problem.extinction is None else problem.extinction
+    fit = _estimate(problem, kind=_KINDS[problem.centre], extinction=prior)
+    shifts = np.empty((fit.status.size, 3))
+    _linearized.neglected(
+        problem.power,
+        problem.noise,
+        problem.known_variance,
+        problem.range,
+        prior,
+        problem.centre is Centre.ZERO,
+        np.ascontiguousarray(fit.extinction),
+        np.ascontiguousarray(fit.amplitude),
+        shifts,
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        given = _Given(*(shifts**2).T)
+    return _flat(fit, problem, given=given)
+
+
+def known_extinction(problem: Problem) -> Flat:
+    """Solve for background and amplitude at the given extinction."""
+    fit = _estimate(problem, kind=_direct.GIVEN, extinction=problem.extinction)
+    return _flat(fit, problem, unknowns=2)
+
+
+def known_background(problem: Problem) -> Flat:
+    """Solve for amplitude and extinction above the given background."""
+    background = np.zeros(1) if problem.background is None else problem.background
+    variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
+    fit = _estimate(problem, background=background)
+    spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        given = _Given(variance, variance * spread[:, 3] ** 2, variance * spread[:, 4] ** 2)
+    return _flat(fit, problem, unknowns=2, given=given)
+
+
+def cubic(problem: Problem) -> Flat:
+    """Take the background from the cubic and propagate its error into the rest."""
+    with np.errstate(divide="ignore"):
+        variance = problem.noise if problem.known_variance else 1.0 / problem.noise
+    found, gradients = solve_cubic(
+        problem.power,
+        problem.range,
+        problem.lag,
+        variance,
+        known_variance=problem.known_variance,
+        shots=problem.shots,
+        want_gradients=True,
+    )
+    fit = _above(problem, found.background, gradients)
+    fit = replace(fit, status=np.where(np.isnan(found.background), np.nan, fit.status))
+    return _flat(fit, problem, quality=found.quality)
+
+
+def tail_mean(problem: Problem) -> Flat:
+    """Take the background from the mean of the tail and propagate its noise into the rest."""
+    found, gradients = solve_tail(problem.power, problem.range, problem.tail_start, problem.noise)
+    fit = _above(problem, found.background, gradients)
+    fit = replace(fit, status=np.where(np.isnan(found.background), np.nan, fit.status))
+    return _flat(fit, problem, quality=found.quality)
+
+
+def _above(problem: Problem, background: Array, gradients: Array) -> Estimate:
+    """Fit amplitude and extinction above a background that depends on the same power."""
+    fit = _estimate(problem, background=background)
+    spread = _propagated(problem, fit, gradients)
+    return replace(
+        fit,
+        background=background,
+        background_variance=spread[:, 0],
+        amplitude_relative_variance=spread[:, 1],
+        extinction_variance=spread[:, 2],
+        background_bend=spread[:, 5],
+        extinction_bend=fit.extinction_bend + spread[:, 4] * spread[:, 5],
+    )
+
+
+def _propagated(problem: Problem, fit: Estimate, gradients: Array) -> Array:
+    out = np.empty((fit.extinction.size, 6))
+    _propagation.propagate(
+        problem.power,
+        problem.noise,
+        problem.known_variance,
+        np.ascontiguousarray(fit.extinction),
+        np.ascontiguousarray(fit.amplitude),
+        problem.range,
+        gradients,
+        out,
+    )
+    return out
+
+
+def _estimate(
+    problem: Problem,
+    *,
+    background: Array | None = None,
+    kind: int = _direct.FREE,
+    extinction: Array | None = None,
+) -> Estimate:
+    """Run the kernel, with the background fitted where it is NaN."""
+    nowhere = np.full(1, np.nan)
+    table = _table(
+        problem,
+        nowhere if background is None else background,
+        kind,
+        nowhere if extinction is None else extinction,
+    )
+    return Estimate(**dict(zip(COLUMNS, table.T, strict=True)))
+
+
+def _table(problem: Problem, background: Array, kind: int, extinction: Array) -> Array:
+    table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
+    _direct.solve_profiles(
+        problem.power,
+        problem.noise,
+        problem.known_variance,
+        background,
+        kind,
+        extinction,
+        _rounding(problem),
+        make_grid(problem.range, problem.bounds),
+        table,
+    )
+    return table
+
+
+def _rounding(problem: Problem) -> float:
+    """Half a unit in the last place, as a standard deviation, and what the kernels lose."""
+    return 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
+
+
+def _flat(
+    fit: Estimate,
+    problem: Problem,
+    *,
+    unknowns: int = 3,
+    quality: Flags = _NOTHING,
+    given: _Given | None = None,
+) -> Flat:
+    """Judge an estimate and turn it into what is reported."""
+    if given is None:
+        given = _Given(np.zeros(1), np.zeros(1), np.zeros(1))
+    verdict = judge(fit, known_variance=problem.known_variance, unknowns=unknowns)
+    fitted, constant = fit.status == FITTED, fit.status == CONSTANT
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        level = verdict.noise * verdict.widening**2
+        background_error = np.sqrt(fit.background_variance * level + given.background)
+        relative_error = np.sqrt(fit.amplitude_relative_variance * level + given.amplitude_relative)
+        extinction_error = np.sqrt(fit.extinction_variance * level + given.extinction)
+        signal_to_noise = np.copysign(np.sqrt(fit.signal_energy / verdict.noise), fit.amplitude)
+        amplitude_error = np.abs(fit.amplitude) * relative_error
+
+    def of(values: Array, where: npt.NDArray[np.bool_]) -> Array:
+        return np.where(where, values, np.nan)
+
+    known = constant & problem.known_variance
+    return Flat(
+        background=of(fit.background, fitted | constant),
+        background_standard_error=of(background_error, fitted | known),
+        amplitude=np.where(constant, 0.0, of(fit.amplitude, fitted)),
+        amplitude_standard_error=of(amplitude_error, fitted),
+        extinction=of(fit.extinction, fitted),
+        extinction_standard_error=of(extinction_error, fitted),
+        signal_to_noise=of(signal_to_noise, fitted),
+        reduced_chi2=of(verdict.reduced_chi2, fitted),
+        curvature_misfit=np.full(fit.status.shape, np.nan),
+        mean_range=of(fit.mean_range, fitted),
+        background_bend=of(fit.background_bend, fitted),
+        extinction_bend=of(fit.extinction_bend, fitted),
+        valid_bins=np.nan_to_num(fit.bins).astype(np.int32),
+        quality=verdict.quality | quality,
+    )

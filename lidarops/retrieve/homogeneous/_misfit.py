@@ -1,0 +1,170 @@
+"""Compiled tests of what a fit of the homogeneous path leaves over."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.homogeneous._estimate import (
+    BACKGROUND_BEND,
+    BEND_COUNT,
+    BENDS,
+    BOUNDED,
+    EXTINCTION_BEND,
+    LARGEST,
+    MISFIT,
+    TREND,
+    TREND_COUNT,
+)
+from lidarops.retrieve.homogeneous._projection import (
+    Grid,
+    Point,
+    Scratch,
+    compiled,
+    evaluate,
+    largest_of,
+    product,
+    summing,
+)
+
+Array = npt.NDArray[np.float64]
+
+DEPENDENT: Final = 1e-9
+"""Squared part of a shape that other shapes must leave over for it to count as another."""
+
+
+@compiled
+def _residuals(s: Scratch, p: Point) -> None:
+    """Fill the residuals in units of the noise, and times weight; 0 for bins not used."""
+    for i in range(s.z.size):
+        residual = s.z[i] - p.mean_z - p.b * (s.phi[i] - p.mean_phi)
+        s.residual[i] = math.sqrt(s.w[i]) * residual
+        s.pull[i] = s.w[i] * residual
+
+
+@summing
+def _bends(s: Scratch) -> tuple[float, float]:
+    """Sum the squared second differences of the residuals between neighbours; count them."""
+    total = terms = 0.0
+    # Slices, since an index that might be negative keeps a loop from vectorising.
+    last, middle = s.residual[2:], s.residual[1:]
+    used_last, used_middle = s.used[2:], s.used[1:]
+    for i in range(last.size):
+        bend = last[i] - 2.0 * middle[i] + s.residual[i]
+        whole = used_last[i] * used_middle[i] * s.used[i]
+        total += whole * bend * bend
+        terms += whole
+    return total, terms
+
+
+@summing
+def _along(weighted: Array, g: Grid, phi: Array, p: Point) -> tuple[float, float, float]:
+    """Return the products of a weighted vector with the orthogonal shapes of the model."""
+    one = shape = slope = 0.0
+    for i in range(weighted.size):
+        one += weighted[i]
+        shape += weighted[i] * (phi[i] - p.mean_phi)
+        slope += weighted[i] * (-2.0 * (g.x[i] - p.centroid) * phi[i] - p.mean_t)
+    return one, shape, slope
+
+
+@compiled
+def _left(
+    product: float,
+    a: tuple[float, float, float],
+    b: tuple[float, float, float],
+    p: Point,
+    w0: float,
+) -> float:
+    """Return what the model leaves over of the product of two vectors."""
+    return product - (a[0] * b[0] / w0 + a[1] * b[1] / p.norm + a[2] * b[2] / p.slope_norm)
+
+
+@compiled
+def _trend(g: Grid, s: Scratch, p: Point, w0: float) -> tuple[float, float]:
+    """Return the energy of the residuals in two shapes that the model lacks, and their number.
+
+    One is backscatter that bends along the path, ``phi x^2``, the other a detector that is not
+    linear, ``phi^2``; both are orthogonalised against the model.
+    """
+    bent, square, weighted_bent, weighted_square = s.tests
+    for i in range(g.x.size):
+        lever = g.x[i] - p.centroid
+        bent[i] = lever * lever * s.phi[i]
+        square[i] = s.phi[i] * s.phi[i]
+        weighted_bent[i] = s.w[i] * bent[i]
+        weighted_square[i] = s.w[i] * square[i]
+    of_bent = _along(weighted_bent, g, s.phi, p)
+    of_square = _along(weighted_square, g, s.phi, p)
+    of_residual = _along(s.pull, g, s.phi, p)
+    energy = count = shared = 0.0
+    whole = product(bent, weighted_bent)
+    norm = _left(whole, of_bent, of_bent, p, w0)
+    pulled = _left(product(bent, s.pull), of_bent, of_residual, p, w0)
+    if norm > DEPENDENT * whole:
+        energy += pulled * pulled / norm
+        count += 1.0
+        shared = _left(product(bent, weighted_square), of_bent, of_square, p, w0) / norm
+    whole = product(square, weighted_square)
+    norm = _left(whole, of_square, of_square, p, w0) - shared * shared * norm
+    if norm > DEPENDENT * whole:
+        own = _left(product(square, s.pull), of_square, of_residual, p, w0) - shared * pulled
+        energy += own * own / norm
+        count += 1.0
+    return energy, count
+
+
+@summing
+def _bent(g: Grid, s: Scratch, p: Point) -> tuple[float, float, float]:
+    """Return the products of ``phi (x - centroid)^2`` with the orthogonal shapes of the model."""
+    one = shape = slope = 0.0
+    for i in range(g.x.size):
+        lever = g.x[i] - p.centroid
+        weighted = s.w[i] * s.phi[i] * lever * lever
+        one += weighted
+        shape += weighted * (s.phi[i] - p.mean_phi)
+        slope += weighted * (-2.0 * lever * s.phi[i] - p.mean_t)
+    return one, shape, slope
+
+
+@compiled
+def describe_bend(g: Grid, s: Scratch, p: Point, w0: float, free: float, row: Array) -> None:
+    """Write what a bent signal does to the fit, relative to its amplitude.
+
+    About whichever range it bends, the parabolas differ by shapes of the model: the background
+    does not notice, the extinction is carried over to the middle of the section.
+    """
+    one, shape, slope = _bent(g, s, p)
+    across = slope / p.slope_norm
+    row[BACKGROUND_BEND] = free * one / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
+    row[EXTINCTION_BEND] = across + 0.5 - p.centroid
+
+
+@compiled
+def describe_bend_given(p: Point, row: Array) -> None:
+    """Write the same over for a given extinction, which takes up neither bend nor slope.
+
+    The slope is as large as that of the bend at either end, and independent of it.
+    """
+    bent = row[BACKGROUND_BEND] + row[EXTINCTION_BEND] * p.mean_t
+    row[BACKGROUND_BEND] = math.hypot(bent, 0.5 * p.mean_t)
+    row[EXTINCTION_BEND] = 0.0
+
+
+@compiled
+def judge_residuals(
+    g: Grid, s: Scratch, p: Point, tau: float, sums: tuple[float, float, float], row: Array
+) -> None:
+    """Write the tests of the fit, in units of the scaled noise."""
+    w0, wz, free = sums
+    _residuals(s, p)
+    row[MISFIT] = product(s.residual, s.residual)
+    row[BENDS], row[BEND_COUNT] = _bends(s)
+    row[LARGEST] = largest_of(s.residual)
+    # The test shapes are clear of the background even where the background was given.
+    full = p if free > 0.0 else evaluate(tau, g, s, w0, wz, 1.0)
+    row[TREND], row[TREND_COUNT] = _trend(g, s, full, w0)
+    row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]

@@ -1,0 +1,426 @@
+"""The retrievals along range over xarray: units checked, sections cut, quality merged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, TypeGuard
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.background import cubic_and_tail as _background
+from lidarops.retrieve.homogeneous import path_fit as _homogeneous
+
+EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
+"""Bits of a bin that keep it out of a fit."""
+CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
+"""Bits of a bin that its section carries too."""
+FEWEST_BINS: Final = 4
+LEVEL: Final = 100.0
+"""m; largest change of height along a section that counts as level. Aerosol falls off with a
+scale height of 1 to 2 km, so that more fakes an extinction of more than some percent."""
+
+_METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
+_TAIL: Final = {"background": "{}", "background_standard_error": "{}"}
+_SECTION: Final = {
+    **_TAIL,
+    "background_model_error": "{}",
+    "amplitude": "{} m2",
+    "amplitude_standard_error": "{} m2",
+    "extinction": "m-1",
+    "extinction_standard_error": "m-1",
+    "extinction_model_error": "m-1",
+    "reduced_chi2": "1",
+}
+"""Variables and their units, in terms of the unit of the power."""
+_COUNTS: Final = ("valid_bins", "quality_flag")
+
+_Block = npt.NDArray[Any]
+_Function = Callable[..., tuple[_Block, ...]]
+
+
+def homogeneous(
+    power: xr.DataArray,
+    *,
+    sections: Sequence[tuple[float, float]],
+    variance: xr.DataArray | float | None = None,
+    quality: xr.DataArray | None = None,
+    method: str = "auto",
+    relative_variance: bool = False,
+) -> xr.Dataset:
+    """Retrieve background, amplitude and extinction of sections of range.
+
+    Parameters
+    ----------
+    power : xr.DataArray, (..., range)
+        Any unit; the coordinate of ``range`` in m. May be dask-backed, chunked in any way.
+    sections : sequence of (float, float)
+        m; of each, the bins with near <= range < far.
+    variance : xr.DataArray or float, optional
+        Noise variance in the square of the power's unit. Its dimensions are among those of
+        `power`.
+    quality : xr.DataArray, optional
+        Bits of `lidarops.flags.Quality` of each bin. Missing, saturated and incompletely
+        overlapping bins are left out; a section carries SATURATED, PILE_UP and
+        INCOMPLETE_OVERLAP of its bins.
+    method : str
+        See `lidarops.retrieve.homogeneous.path_fit.solve`; one that needs nothing but the power.
+    relative_variance : bool
+        Whether `variance` holds up to a factor, which each section then finds for itself: for a
+        variance that was estimated from the same data.
+
+    Returns
+    -------
+    xr.Dataset, (..., section)
+        ``background``, ``amplitude``, ``extinction``, each with ``_standard_error``,
+        ``background_model_error``, ``extinction_model_error``, ``reduced_chi2``, ``valid_bins``
+        and ``quality_flag``, with the coordinates ``section``, ``section_range`` (its middle)
+        and ``section_bounds``; as lazy as the input, and the same to the last bit for any
+        chunking.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where units, dimensions or sections cannot be right.
+    """
+    distance = _distance(power)
+    edges = _edges(sections)
+    inputs = _Inputs.gather(power, variance, quality)
+    bins = [_bins(distance, near, far) for near, far in edges]
+    reached = slice(min(part.start for part in bins), max(part.stop for part in bins))
+    outputs = inputs.isel(reached).map(
+        _solve,
+        len(_SECTION),
+        2,
+        {
+            "range": distance[reached],
+            "sections": [slice(b.start - reached.start, b.stop - reached.start) for b in bins],
+            "method": method,
+            "relative": relative_variance,
+        },
+        along=("section", len(bins)),
+    )
+    result = xr.Dataset(dict(zip((*_SECTION, *_COUNTS), outputs, strict=True)))
+    _set_units(result, _SECTION, power.attrs.get("units", "1"))
+    return result.assign_coords(_places(edges))
+
+
+def nothing(
+    profiles: xr.DataArray, *, unit: str, sections: Sequence[tuple[float, float]]
+) -> xr.Dataset:
+    """Return sections as of `homogeneous`, without values, and without any power.
+
+    Parameters
+    ----------
+    profiles : xr.DataArray, (...)
+        Whatever the profiles have one of each; its coordinates are kept.
+    unit : str
+        Of the power.
+    sections : sequence of (float, float)
+        m.
+
+    Returns
+    -------
+    xr.Dataset, (..., section)
+        In memory: NaN, 0 valid bins, and a ``quality_flag`` of 0, to be filled.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where the sections cannot be right.
+    """
+    edges = _edges(sections)
+    dims = (*profiles.dims, "section")
+    shape = (*profiles.shape, len(edges))
+    result = xr.Dataset(
+        {name: (dims, np.full(shape, np.nan)) for name in _SECTION}
+        | {name: (dims, np.zeros(shape, np.int32)) for name in _COUNTS},
+        coords=profiles.coords,
+    )
+    _set_units(result, _SECTION, unit)
+    return result.assign_coords(_places(edges))
+
+
+def _places(edges: npt.NDArray[np.float64]) -> dict[str, tuple[Any, ...]]:
+    return {
+        "section": ("section", np.arange(len(edges), dtype=np.int32)),
+        "section_range": ("section", edges.mean(axis=1), {"units": "m"}),
+        "section_bounds": (("section", "nv"), edges, {"units": "m"}),
+    }
+
+
+def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
+    r"""Return NOT_LEVEL for the sections along which a beam changes its height too much.
+
+    Backscatter that falls with height as :math:`e^{-z/H}` looks exactly like an additional
+    extinction of :math:`\cos\theta / 2H`: no residual tells, the geometry does.
+
+    Parameters
+    ----------
+    result : xr.Dataset
+        From `homogeneous`.
+    zenith_angle : xr.DataArray
+        degree, over the dimensions of `result` but ``section``, or fewer.
+
+    Returns
+    -------
+    xr.DataArray
+        Bits to be merged into ``quality_flag``.
+    """
+    length = result["section_bounds"].isel(nv=1) - result["section_bounds"].isel(nv=0)
+    climb = length * np.abs(np.cos(np.deg2rad(zenith_angle)))
+    # Compared so that an unknown angle is not taken for a level one.
+    bits: xr.DataArray = (~(climb <= LEVEL)).astype(np.int32) * np.int32(Quality.NOT_LEVEL)
+    return bits.drop_vars(bits.coords)
+
+
+def tail_mean(
+    power: xr.DataArray,
+    *,
+    start: float | None = None,
+    variance: xr.DataArray | float | None = None,
+) -> xr.Dataset:
+    """Take the mean of the far bins as background; see `lidarops.retrieve.background.cubic_and_tail.tail_mean`.
+
+    Parameters
+    ----------
+    power : xr.DataArray, (..., range)
+        Any unit; the coordinate of ``range`` in m.
+    start : float, optional
+        m; bins from here on are averaged, the last tenth of the bins where not given.
+    variance : xr.DataArray or float, optional
+        Noise variance in the square of the power's unit.
+
+    Returns
+    -------
+    xr.Dataset, (...)
+        ``background``, ``background_standard_error`` and ``quality_flag``.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where units, dimensions or `start` cannot be right.
+    """
+    distance = _distance(power)
+    inputs = _Inputs.gather(power, variance, None)
+    outputs = inputs.map(_tail_mean, len(_TAIL), 1, {"range": distance, "start": start})
+    result = xr.Dataset(dict(zip((*_TAIL, "quality_flag"), outputs, strict=True)))
+    _set_units(result, _TAIL, power.attrs.get("units", "1"))
+    return result
+
+
+class _Inputs:
+    """Power and what comes with it, aligned, the range of each in one chunk."""
+
+    def __init__(self, arrays: Mapping[str, xr.DataArray], variance: float | None) -> None:
+        self._arrays = arrays
+        self._variance = variance
+
+    @classmethod
+    def gather(
+        cls,
+        power: xr.DataArray,
+        variance: xr.DataArray | float | None,
+        quality: xr.DataArray | None,
+    ) -> _Inputs:
+        arrays = {"power": power}
+        number = None
+        if isinstance(variance, xr.DataArray):
+            arrays["variance"] = variance
+        else:
+            number = variance
+        if quality is not None:
+            arrays["quality"] = quality
+            if quality.dtype.kind not in "iu":
+                raise RetrievalInputError(
+                    f"holds {quality.dtype}", field="quality", remedy="give bits as integers"
+                )
+        for name, array in arrays.items():
+            _check_dimensions(array, power, name)
+        return cls({name: _one_chunk(array) for name, array in arrays.items()}, number)
+
+    def isel(self, bins: slice) -> _Inputs:
+        cut = {
+            name: array.isel(range=bins, missing_dims="ignore")
+            for name, array in self._arrays.items()
+        }
+        return _Inputs(cut, self._variance)
+
+    def map(
+        self,
+        function: _Function,
+        values: int,
+        counts: int,
+        settings: Mapping[str, Any],
+        *,
+        along: tuple[str, int] | None = None,
+    ) -> tuple[xr.DataArray, ...]:
+        """Map a function of blocks that gives `values` floats and `counts` integers a profile.
+
+        Each is an array along the dimension and of the length `along`, where that is given.
+        """
+        core = [] if along is None else [along[0]]
+        outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
+            _on_blocks,
+            *self._arrays.values(),
+            input_core_dims=[
+                ["range"] if "range" in array.dims else [] for array in self._arrays.values()
+            ],
+            output_core_dims=[core] * (values + counts),
+            kwargs={
+                "function": function,
+                "ranged": {name: "range" in array.dims for name, array in self._arrays.items()},
+                "settings": {"variance": self._variance} | dict(settings),
+            },
+            dask="parallelized",
+            output_dtypes=[np.float64] * values + [np.int32] * counts,
+            dask_gufunc_kwargs={} if along is None else {"output_sizes": dict([along])},
+            keep_attrs=False,
+        )
+        return outputs
+
+
+def _on_blocks(
+    *blocks: _Block, function: _Function, ranged: Mapping[str, bool], settings: Mapping[str, Any]
+) -> tuple[_Block, ...]:
+    # What holds for whole profiles broadcasts along range.
+    arguments = {
+        name: block if along else np.asarray(block)[..., np.newaxis]
+        for (name, along), block in zip(ranged.items(), blocks, strict=True)
+    }
+    return function(**(dict(settings) | arguments))
+
+
+def _bins(distance: npt.NDArray[np.float64], near: float, far: float) -> slice:
+    inside = np.flatnonzero((distance >= near) & (distance < far))
+    if inside.size < FEWEST_BINS:
+        raise RetrievalInputError(
+            f"[{near:g}, {far:g}] m holds {inside.size} bins of the range grid, which reaches"
+            f" from {distance.min():g} to {distance.max():g} m",
+            field="sections",
+            remedy=f"choose sections that hold at least {FEWEST_BINS}, better 50, bins",
+        )
+    return slice(int(inside[0]), int(inside[-1]) + 1)
+
+
+def _solve(
+    power: _Block,
+    variance: _Block | float | None,
+    quality: _Block | None = None,
+    *,
+    range: _Block,  # noqa: A002 - the field's word
+    sections: Sequence[slice],
+    method: str,
+    relative: bool,
+) -> tuple[_Block, ...]:
+    """Return the values of all sections, stacked along a last axis."""
+    found = [
+        _solve_section(
+            power[..., bins],
+            variance[..., bins] if _along_range(variance) else variance,
+            None if quality is None else quality[..., bins] if _along_range(quality) else quality,
+            range=range[bins],
+            method=method,
+            relative=relative,
+        )
+        for bins in sections
+    ]
+    return tuple(np.stack(parts, axis=-1) for parts in zip(*found, strict=True))
+
+
+def _along_range(block: Any) -> TypeGuard[_Block]:
+    # What holds for whole profiles has one bin.
+    return isinstance(block, np.ndarray) and block.shape[-1] > 1
+
+
+def _solve_section(
+    power: _Block,
+    variance: _Block | float | None,
+    quality: _Block | None,
+    *,
+    range: _Block,  # noqa: A002 - the field's word
+    method: str,
+    relative: bool,
+) -> tuple[_Block, ...]:
+    carried = np.int32(0)
+    if quality is not None:
+        power = np.where((quality & EXCLUDED) != 0, np.nan, power)
+        carried = np.bitwise_or.reduce(quality & CARRIED, axis=-1).astype(np.int32)
+    weights = None
+    if relative and variance is not None:
+        with np.errstate(divide="ignore"):
+            variance, weights = None, 1.0 / np.asarray(variance)
+    found = _homogeneous.solve(power, range, variance=variance, weights=weights, method=method)
+    values = tuple(getattr(found, name) for name in _SECTION)
+    return (*values, found.valid_bins, found.quality | carried)
+
+
+def _tail_mean(
+    power: _Block,
+    variance: _Block | float | None,
+    *,
+    range: _Block,  # noqa: A002 - the field's word
+    start: float | None,
+) -> tuple[_Block, ...]:
+    found = _background.tail_mean(power, range, start=start, variance=variance)
+    return found.background, found.background_standard_error, found.quality
+
+
+def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:
+    """Return the range coordinate, in m and monotonic."""
+    if "range" not in power.dims or "range" not in power.coords:
+        raise RetrievalInputError(
+            f"has the dimensions {power.dims} and coordinates {tuple(power.coords)}",
+            field="power",
+            remedy="give it a dimension range with a coordinate in m",
+        )
+    unit = power["range"].attrs.get("units")
+    if unit not in _METRES:
+        raise RetrievalInputError(
+            f"is in {unit!r}, not in 'm'" if unit else "has no attribute units",
+            field="range",
+            remedy="convert the coordinate to m and set its attribute units to 'm'",
+        )
+    distance = power["range"].to_numpy().astype(np.float64)
+    steps = np.diff(distance)
+    if not (np.all(steps > 0) or np.all(steps < 0)):
+        raise RetrievalInputError("is not finite and strictly monotonic", field="range")
+    return distance
+
+
+def _edges(sections: Sequence[tuple[float, float]]) -> npt.NDArray[np.float64]:
+    try:
+        edges = np.asarray(sections, dtype=np.float64)
+    except (TypeError, ValueError):
+        edges = np.empty(0)
+    if edges.ndim != 2 or edges.shape[1] != 2 or not np.all(edges[:, 0] < edges[:, 1]):
+        raise RetrievalInputError(
+            f"is {sections!r}", field="sections", remedy="give pairs (near, far) in m, near first"
+        )
+    return edges
+
+
+def _check_dimensions(array: xr.DataArray, power: xr.DataArray, name: str) -> None:
+    extra = set(array.dims) - set(power.dims)
+    try:
+        xr.align(power, array, join="exact", copy=False)
+    except ValueError as error:
+        raise RetrievalInputError(f"does not fit power: {error}", field=name) from error
+    if extra:
+        raise RetrievalInputError(
+            f"has the dimensions {array.dims}, power has {power.dims}", field=name
+        )
+
+
+def _one_chunk(array: xr.DataArray) -> xr.DataArray:
+    if array.chunks is not None and "range" in array.dims:
+        return array.chunk({"range": -1})
+    return array
+
+
+def _set_units(result: xr.Dataset, units: Mapping[str, str], own: str) -> None:
+    for name, pattern in units.items():
+        result[name].attrs["units"] = pattern.format(own).removeprefix("1 ")

@@ -1,0 +1,1 @@
+"""Optical depth and extinction from scans at several zenith angles."""

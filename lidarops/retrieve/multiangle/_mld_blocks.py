@@ -1,0 +1,186 @@
+"""Regularised differentiation of all altitudes of a block, whatever rays each of them has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.multiangle import mld
+from lidarops.retrieve.multiangle._block import Rays
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is subtracted before: optical depths, or the answer at the altitude below."""
+
+    optical_depth: Array | None
+    """(profile, altitude)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Optical depths and what they are made of, (profile, altitude); NaN where there is none."""
+
+    optical_depth: Array
+    standard_error: Array
+    data_share: Array
+    freedom: Array
+    slopes: Array
+    """(2, profile, altitude): change per unit of gradient over altitude, east and north."""
+
+
+def solve(
+    rays: Rays, inhomogeneity: Array, regularisation: mld.Regularisation, prior: Prior | None
+) -> Answer:
+    """Solve every altitude with the rays that it has.
+
+    Parameters
+    ----------
+    rays : Rays
+    inhomogeneity : (altitude,) float
+        Variance of the logarithms on top of the noise.
+    regularisation : Regularisation
+    prior : Prior, optional
+    """
+    profiles, _, gates = rays.noise.shape
+    out = np.full((profiles, gates, _ESTIMATES), np.nan)
+    walk = prior is not None and prior.optical_depth is None
+    known = np.zeros((profiles, gates))
+    if prior is not None and prior.optical_depth is not None:
+        known = prior.optical_depth
+    # Gate by gate upwards, as the answer below may be the prior above.
+    below = np.zeros((profiles, 2))
+    operators: dict[bytes, mld.Operator] = {}
+    for k in range(gates):
+        on = np.ascontiguousarray(rays.noise[:, :, k] < np.inf)
+        patterns, which = _patterns(on)
+        for number, pattern in enumerate(patterns):
+            path = rays.path[pattern, k]
+            if path.size < 2 or np.ptp(path) < 1e-9:
+                continue
+            key = path.tobytes()
+            if key not in operators:
+                operators[key] = mld.make_operator(path, regularisation)
+            members = np.flatnonzero(which == number)
+            _solve_gate(
+                rays.logarithm[:, :, k],
+                rays.noise[:, :, k],
+                members,
+                np.flatnonzero(pattern),
+                path,
+                np.ascontiguousarray(rays.distance[:, pattern, k]),
+                inhomogeneity[k],
+                operators[key].coordinates,
+                operators[key].penalty,
+                operators[key].gain,
+                regularisation.strengths,
+                regularisation.rule,
+                below if walk else np.stack([known[:, k], np.zeros(profiles)], axis=1),
+                out[:, k],
+            )
+        if walk:
+            found = np.isfinite(out[:, k, 0])
+            below[found] = out[found, k, :2]
+    return Answer(
+        out[..., 0],
+        np.sqrt(out[..., 1]),
+        out[..., 2],
+        out[..., 3],
+        np.stack([out[..., 4], out[..., 5]]),
+    )
+
+
+def _patterns(on: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
+    """Return the different sets of rays, and which of them each profile has."""
+    if np.array_equal(on, np.broadcast_to(on[:1], on.shape)):
+        # As nearly everywhere; sorting costs more than solving a single profile.
+        return on[:1], np.zeros(len(on), dtype=np.intp)
+    patterns, which = np.unique(on, axis=0, return_inverse=True)
+    return patterns, which.reshape(-1)
+
+
+_ESTIMATES = 6
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_compiled
+def _solve_gate(
+    y: Array,
+    noise: Array,
+    members: npt.NDArray[np.intp],
+    rays: npt.NDArray[np.intp],
+    path: Array,
+    distance: Array,
+    inhomogeneity: float,
+    coordinates: Array,
+    penalty: Array,
+    gain: Array,
+    strengths: Array,
+    rule: int,
+    prior: Array,
+    out: Array,
+) -> None:
+    """Solve the members of one altitude that share one set of rays.
+
+    Parameters
+    ----------
+    y, noise : (profile, angle) float
+    members : (member,) int
+        Profiles.
+    rays : (ray,) int
+        Angles.
+    path : (ray,) float
+    distance : (2, ray) float
+    inhomogeneity : float
+    coordinates, penalty, gain
+        Of the operator.
+    strengths, rule
+        Of the regularisation.
+    prior : (profile, 2) float
+        Optical depth and its variance.
+    out : (profile, 6) float
+        Gets optical depth, variance, data share, degrees of freedom and slopes.
+    """
+    count = rays.size
+    left, variance, t = np.empty(count), np.empty(count), np.empty(count)
+    b = np.empty(penalty.size)
+    for p in members:
+        middle = spread = 0.0
+        for i in range(count):
+            left[i] = y[p, rays[i]] + 2.0 * path[i] * prior[p, 0]
+            variance[i] = noise[p, rays[i]] + inhomogeneity
+            middle += left[i] / count
+            spread += variance[i] / count
+        unit = np.sqrt(spread)
+        rest = 0.0
+        for i in range(count):
+            left[i] -= middle
+            rest += left[i] * left[i] / spread
+        for c in range(b.size):
+            b[c] = 0.0
+            for i in range(count):
+                b[c] += coordinates[c, i] * left[i] / unit
+            rest -= b[c] * b[c]
+        strength = mld.choose_strength(b, max(rest, 0.0), penalty, strengths, count, rule)
+        row = out[p]
+        row[:] = 0.0
+        t[:] = 0.0
+        for c in range(b.size):
+            kept = 1.0 / (1.0 + strength * penalty[c])
+            row[3] += kept
+            for i in range(count):
+                t[i] += gain[c] * kept * coordinates[c, i]
+        for i in range(count):
+            row[0] += t[i] * left[i]
+            row[1] += t[i] * t[i] * variance[i]
+            row[2] -= 2.0 * t[i] * path[i]
+            row[4] += t[i] * distance[0, i]
+            row[5] += t[i] * distance[1, i]
+        row[0] += prior[p, 0]
+        row[1] += (1.0 - row[2]) ** 2 * prior[p, 1]

@@ -1,0 +1,222 @@
+r"""Regularised differentiation of the logarithm along the slant path (the historical method).
+
+The slope of :math:`\ln S` over the slant path x is taken as constant between neighbouring rays,
+:math:`y_l - c = \int_{x_0}^{x_l} \varphi\,dx`, and kept small (order 0) or level (order 1) by a
+penalty of strength :math:`\alpha`. Its mean over the path gives :math:`\tau = -\bar\varphi / 2`.
+
+With order 0, the answer is drawn to an optical depth of zero, or to a prior where one is
+subtracted first; how much of it comes from the data is the data share. With order 1 it lies
+between that of the end rays and that of the regression on the slant path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from typing import Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common import inputs
+
+Array = npt.NDArray[np.float64]
+
+STRENGTHS: Final[Array] = 10.0 ** np.linspace(-6.0, 6.0, 97)
+"""From which the strength is chosen; dimensionless, for paths scaled to a span of 1."""
+_SAME_NODE: Final = 1e-4
+
+
+class Choice(StrEnum):
+    """How the strength of the penalty is found."""
+
+    DISCREPANCY = "discrepancy"
+    """The strongest with which the residuals are no larger than the noise."""
+    CP = "cp"
+    """The least Mallows' Cp, for known noise."""
+    GCV = "gcv"
+    """The least generalised cross-validation score, for unknown noise."""
+    FIXED = "fixed"
+
+
+class Average(StrEnum):
+    """What mean of the slope gives the optical depth."""
+
+    PATH = "path"
+    """Over the slant path."""
+    ANGLES = "angles"
+    """Over the intervals between rays, however short; worse, as the tiny ones near the zenith
+    weigh as much as the long ones."""
+
+
+class _Rule(IntEnum):
+    DISCREPANCY = 0
+    CP = 1
+    GCV = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Regularisation:
+    """Settings of the method.
+
+    Raises
+    ------
+    RetrievalInputError
+        For an order other than 0 and 1, or a strength that does not go with the choice.
+    """
+
+    order: int = 0
+    choice: str = "discrepancy"
+    strength: float | None = None
+    """Of the penalty, for "fixed"."""
+    average: str = "path"
+
+    def __post_init__(self) -> None:
+        if self.order not in {0, 1}:
+            raise RetrievalInputError(
+                f"is {self.order}", field="regularisation.order", remedy="choose 0 or 1"
+            )
+        fixed = inputs.choice(self.choice, Choice, "regularisation.choice") is Choice.FIXED
+        inputs.choice(self.average, Average, "regularisation.average")
+        if fixed != (self.strength is not None):
+            raise RetrievalInputError(
+                f"is {self.strength} with choice {self.choice!r}",
+                field="regularisation.strength",
+                remedy="give a strength with 'fixed', and only then",
+            )
+        if self.strength is not None and not self.strength >= 0:
+            raise RetrievalInputError(
+                f"is {self.strength}", field="regularisation.strength", remedy="give zero or more"
+            )
+
+    @property
+    def strengths(self) -> Array:
+        """Strengths to choose from, ascending."""
+        return STRENGTHS if self.strength is None else np.array([self.strength])
+
+    @property
+    def rule(self) -> int:
+        """Number of the rule of choice; of no effect where one strength is given."""
+        names = {Choice.CP: _Rule.CP, Choice.GCV: _Rule.GCV}
+        return int(names.get(Choice(self.choice), _Rule.DISCREPANCY))
+
+
+@dataclass(frozen=True, slots=True)
+class Operator:
+    """What the method does to the logarithms of one set of rays, up to the strength."""
+
+    coordinates: Array
+    """(component, ray): turns logarithms into uncorrelated coordinates b."""
+    penalty: Array
+    """(component,): each is kept by the share f = 1 / (1 + strength * penalty)."""
+    gain: Array
+    """(component,): optical depth = sum of gain * f * b."""
+    condition: float
+    """Of the system that gives the slopes."""
+
+
+def make_operator(path: Array, regularisation: Regularisation) -> Operator:
+    """Decompose the method for rays that count alike.
+
+    Parameters
+    ----------
+    path : (ray,) float
+        Slant over vertical paths, in any order, at least two different ones.
+    regularisation : Regularisation
+    """
+    order = np.argsort(path, kind="stable")
+    low, span = path[order[0]], path[order[-1]] - path[order[0]]
+    position = (path - low) / span
+    node = np.empty(path.size, dtype=np.intp)
+    node[order] = np.cumsum(np.diff(position[order], prepend=0.0) > _SAME_NODE)
+    nodes = np.array([position[node == i].mean() for i in range(node.max() + 1)])
+    width = np.diff(nodes)
+    matrix = np.where(np.arange(width.size) < node[:, np.newaxis], width, 0.0)
+    matrix -= matrix.mean(axis=0)
+    left, values, right = np.linalg.svd(matrix, full_matrices=False)
+    back = right.T / values
+    rough = _roughness(width, regularisation.order) @ back
+    free = (values[:, np.newaxis] * right).sum(axis=1)[:, np.newaxis]
+    penalty, basis = _modes(rough, free if regularisation.order == 1 else free[:, :0])
+    mean = width if Average(regularisation.average) is Average.PATH else _equal(width)
+    return Operator(
+        np.ascontiguousarray((left @ basis).T),
+        penalty,
+        -0.5 / span * (mean @ back @ basis),
+        float(values[0] / values[-1]),
+    )
+
+
+def _modes(rough: Array, free: Array) -> tuple[Array, Array]:
+    """Return what the penalty is of its own modes, and these; those that it leaves free first.
+
+    Free modes are given, not found: a strong penalty would blow up what rounding leaves of them.
+
+    Parameters
+    ----------
+    rough : (row, component) float
+    free : (component, 0 or 1) float
+    """
+    whole = np.linalg.qr(np.hstack([free, np.eye(rough.shape[1])]))[0]
+    bound = whole[:, free.shape[1] : rough.shape[1]]
+    penalty, basis = np.linalg.eigh((rough @ bound).T @ (rough @ bound))
+    modes = np.hstack([whole[:, : free.shape[1]], bound @ basis])
+    return np.append(np.zeros(free.shape[1]), np.maximum(penalty, 0.0)), modes
+
+
+def _equal(width: Array) -> Array:
+    return np.full(width.size, 1.0 / width.size)
+
+
+def _roughness(width: Array, order: int) -> Array:
+    """Return the matrix whose squared product with the slopes is the penalty."""
+    if order == 0:
+        return np.diag(np.sqrt(width))
+    distance = 0.5 * (width[1:] + width[:-1])
+    return np.diff(np.eye(width.size), axis=0) / np.sqrt(distance)[:, np.newaxis]
+
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_compiled
+def _score(rss: float, freedom: float, rays: int, rule: int) -> float:
+    """Return what the strength is to make least; the discrepancy rule takes the last that is 0."""
+    if rule == 1:
+        return rss + 2.0 * freedom
+    if rule == 2:
+        left = rays - 1.0 - freedom
+        return rss / (left * left) if left > 1e-9 else np.inf
+    return 0.0 if rss <= rays - 1.0 else 1.0
+
+
+@_compiled
+def choose_strength(
+    b: Array, rest: float, penalty: Array, strengths: Array, rays: int, rule: int
+) -> float:
+    """Return the strength that a rule picks from a grid.
+
+    Parameters
+    ----------
+    b : (component,) float
+        Coordinates in units of their standard error.
+    rest : float
+        Sum of squares, in the same units, that no component holds.
+    penalty : (component,) float
+    strengths : (strength,) float
+        Ascending; the first is taken where nothing better is found.
+    rays, rule : int
+    """
+    best, least = strengths[0], np.inf
+    for strength in strengths:
+        rss, freedom = rest, 0.0
+        for i in range(b.size):
+            kept = 1.0 / (1.0 + strength * penalty[i])
+            rss += (b[i] * (1.0 - kept)) ** 2
+            freedom += kept
+        score = _score(rss, freedom, rays, rule)
+        if score < least or (rule == 0 and score == least and score == 0.0):
+            best, least = strength, score
+    return float(best)

@@ -1,0 +1,346 @@
+"""Optical depth and extinction from scans: one atmosphere seen along paths of several lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.common import inputs
+from lidarops.retrieve.multiangle import _methods, slant_paths
+from lidarops.retrieve.multiangle._methods import Settings
+from lidarops.retrieve.multiangle._result import (
+    MultiAngleFlags,
+    MultiAngleResult,
+    Profiles,
+    StepRecord,
+)
+from lidarops.retrieve.multiangle.mld import Regularisation
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+LARGEST_GRADIENT: Final = 5e-5
+"""m-1, of ln backscatter along the horizontal, where the user declares none."""
+
+__all__ = [
+    "LARGEST_GRADIENT",
+    "Method",
+    "MultiAngleFlags",
+    "MultiAngleResult",
+    "Regularisation",
+    "StepRecord",
+    "layer_bounds",
+    "solve",
+]
+
+
+class Method(StrEnum):
+    """How optical depths are found."""
+
+    AUTO = "auto"
+    """`TWO_ANGLE` for two rays; `KANO_HAMILTON` where it is certain enough and no extinction is
+    wanted; else `JOINT`."""
+    TWO_ANGLE = "two_angle"
+    """From the shortest and the longest path alone."""
+    KANO_HAMILTON = "kano_hamilton"
+    """Weighted regression on the slant path, each altitude by itself."""
+    JOINT = "joint"
+    """Kano-Hamilton, then one smooth profile through all altitudes."""
+    MLD = "mld"
+    """Regularised differentiation of the logarithm along the slant path."""
+    MLD_PRIOR = "mld_prior"
+    """The same of what is left after subtracting a prior."""
+
+
+def solve(
+    signal: npt.ArrayLike,
+    zenith_angle: npt.ArrayLike,
+    altitude: npt.ArrayLike,
+    *,
+    variance: npt.ArrayLike,
+    azimuth: npt.ArrayLike | None = None,
+    method: str = "auto",
+    block: npt.ArrayLike | None = None,
+    station_altitude: float = 0.0,
+    inhomogeneity: float | None = None,
+    largest_gradient: float = LARGEST_GRADIENT,
+    robust: bool = True,
+    tolerance: float | None = None,
+    regularisation: Regularisation | None = None,
+    prior_optical_depth: npt.ArrayLike | None = None,
+    layers: Sequence[tuple[float, float]] = (),
+) -> MultiAngleResult:
+    r"""Find optical depth and extinction from signals at several zenith angles.
+
+    In an atmosphere that is the same along the horizontal, the logarithm of the range-corrected
+    signal at an altitude z falls along the slant path x:
+
+    .. math:: y_l(z) = c(z) - 2 x_l \tau(z) + g(z) \cdot d_l + e_l,
+
+    with detector noise and inhomogeneity in e (variance :math:`v_l + s^2`), and a horizontal
+    gradient g over the distance d, which is fitted at the altitudes where rays lead to all sides.
+    x is the secant up to 75 degrees and follows the curvature beyond; a ray with x > 10 is left
+    out. A ray ends where the mean signal of the 15 altitudes around is less than 3 times its
+    noise, or that of the next 5 less than twice.
+
+    :math:`s^2` is the moment estimate of random-effects meta-analysis, pooled over the profiles of
+    a block and 15 altitudes. In a block with a residual that is too large for chance (beyond 4.5
+    standard errors, and with a probability of 1 percent in so many), outliers are weighted
+    down, starting from repeated medians and the pair of rays that most others agree
+    with. Nothing is iterated to convergence.
+
+    Simulated scans of clear air and of a cloud, the air correlated by 0 to 0.9 at neighbouring
+    altitudes and up to 30 percent of the samples missing at random: with "joint", the errors of
+    optical depth are 0.93 to 1.1 times the stated ones in blocks of 32 profiles, those of
+    extinction 0.6 to 1.0 times. With gaps, a block of 8 profiles is told up to 15 percent too
+    uncertain.
+
+    Parameters
+    ----------
+    signal : (..., angle, altitude) float
+        Range-corrected, without background, in any unit, on common altitudes (see
+        `lidarops.retrieve.multiangle._common_altitude`); NaN where missing. From full overlap upwards.
+    zenith_angle : (angle,) float
+        degree, -90 to 90; a negative angle leads opposite to its azimuth.
+    altitude : (altitude,) float
+        m, ascending, above `station_altitude`; uniform for "joint".
+    variance : (..., angle, altitude) float
+        Of the signal, in the square of its unit, broadcast against it. Of the noise alone.
+    azimuth : (angle,) float, optional
+        degree; one and the same for all angles where not given.
+    method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
+    block : (...) int, optional
+        Label of the block of each profile; inhomogeneity, correlation and smoothness are common
+        to a block and depend on nothing outside it. One block where not given.
+    station_altitude : float
+        m, of the lidar, where the optical depth is zero.
+    inhomogeneity : float, optional
+        Standard deviation of the logarithms on top of the noise; estimated where not given.
+    largest_gradient : float
+        m-1, of ln backscatter along the horizontal, which `optical_depth_gradient_error` and
+        `extinction_gradient_error` allow for.
+    robust : bool
+        Whether to look for outliers.
+    tolerance : float, optional
+        For "auto", the standard error of the optical depth that is small enough: give it where
+        no extinction is wanted, and blocks whose median is below it stay with "kano_hamilton".
+    regularisation : Regularisation, optional
+        For "mld" and "mld_prior".
+    prior_optical_depth : (..., altitude) float, optional
+        For "mld_prior", broadcast against the profiles; the optical depth of the altitude below
+        where not given.
+    layers : sequence of (float, float)
+        m, bottom and top of layers whose optical depth is wanted; moved to the nearest of the
+        altitudes and the station, by half the distance to the next one at most.
+
+    Returns
+    -------
+    MultiAngleResult
+
+    Raises
+    ------
+    RetrievalInputError
+        For arguments that cannot be right, or that the method does not take.
+
+    References
+    ----------
+    kano1968, hamilton1969, dersimonian1986, siegel1982.
+    """
+    chosen = inputs.choice(method, Method, "method")
+    _require_known(chosen, tolerance, regularisation, prior_optical_depth)
+    height = slant_paths.altitude_grid(altitude, station_altitude)
+    scan = slant_paths.make_scan(zenith_angle, height, azimuth)
+    rows, noise, leading = _cube(signal, variance, scan.path.shape)
+    labels = _labels(block, leading)
+    settings = Settings(
+        chosen.value,
+        height,
+        scan,
+        float(station_altitude),
+        _positive(inhomogeneity, "inhomogeneity"),
+        _positive(largest_gradient, "largest_gradient") or 0.0,
+        robust,
+        _positive(tolerance, "tolerance"),
+        regularisation or Regularisation(),
+        _layers(layers, np.append(height, 0.0) + station_altitude),
+    )
+    prior = _prior(prior_optical_depth, leading, height.size)
+    angles, gates = scan.path.shape
+    profiles = Profiles.missing(rows.shape[0], angles, gates, len(settings.layers))
+    steps: list[StepRecord] = []
+    for label in np.unique(labels):
+        members = np.flatnonzero(labels == label)
+        part, done = _methods.solve_block(
+            rows[members], noise[members], None if prior is None else prior[members], settings
+        )
+        profiles.put(members, part)
+        steps += [StepRecord(int(label), *step) for step in done]
+    given = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
+    return profiles.result(leading, _quality(profiles, given), tuple(steps))
+
+
+def layer_bounds(
+    layers: Sequence[tuple[float, float]], altitude: npt.ArrayLike, *, station_altitude: float
+) -> Array:
+    """Return the bounds of layers as `solve` moves them.
+
+    Parameters
+    ----------
+    layers : sequence of (float, float)
+        m, bottom and top.
+    altitude : (altitude,) float
+        m, ascending, above `station_altitude`.
+    station_altitude : float
+        m.
+
+    Returns
+    -------
+    (layer, 2) float
+        m, of the nearest of the altitudes and the station.
+
+    Raises
+    ------
+    RetrievalInputError
+        For layers that hold no altitude, or reach beyond them.
+    """
+    height = slant_paths.altitude_grid(altitude, station_altitude)
+    levels = np.append(height, 0.0) + station_altitude
+    return levels[np.array(_layers(layers, levels), dtype=np.int64).reshape(-1, 2)]
+
+
+def _require_known(
+    method: Method, tolerance: float | None, regularisation: Any, prior: npt.ArrayLike | None
+) -> None:
+    """Refuse options that the method would pass over in silence."""
+    allowed = {
+        "tolerance": (tolerance, (Method.AUTO,)),
+        "regularisation": (regularisation, (Method.MLD, Method.MLD_PRIOR)),
+        "prior_optical_depth": (prior, (Method.MLD_PRIOR,)),
+    }
+    for name, (value, methods) in allowed.items():
+        if value is not None and method not in methods:
+            raise RetrievalInputError(
+                f"is given with method {method.value!r}",
+                field=name,
+                remedy=f"leave it out, or choose {' or '.join(methods)}",
+            )
+
+
+def _cube(
+    signal: npt.ArrayLike, variance: npt.ArrayLike, shape: tuple[int, ...]
+) -> tuple[inputs.Floats, Array, tuple[int, ...]]:
+    """Return signal and variance as (profile, angle, altitude), and the leading axes."""
+    array = inputs.real_array(signal, "signal")
+    if array.ndim < 2 or array.shape[-2:] != shape:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, with {shape[0]} angles and {shape[1]} altitudes",
+            field="signal",
+            remedy="give (..., angle, altitude)",
+        )
+    leading = array.shape[:-2]
+    count = int(np.prod(leading, dtype=np.int64))
+    noise = inputs.real_array(variance, "variance").astype(np.float64, copy=False)
+    if np.any(noise < 0):
+        raise RetrievalInputError(
+            "is negative", field="variance", remedy="give squares of the signal's unit"
+        )
+    try:
+        noise = np.broadcast_to(noise, array.shape)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {noise.shape}, which does not broadcast to {array.shape}",
+            field="variance",
+        ) from None
+    return array.reshape(count, *shape), noise.reshape(count, *shape), leading
+
+
+def _labels(block: npt.ArrayLike | None, leading: tuple[int, ...]) -> Integers:
+    count = int(np.prod(leading, dtype=np.int64))
+    if block is None:
+        return np.zeros(count, dtype=np.int64)
+    labels = np.asarray(block)
+    if labels.dtype.kind not in "iu" or labels.shape != leading:
+        raise RetrievalInputError(
+            f"has the shape {labels.shape} and the type {labels.dtype}",
+            field="block",
+            remedy=f"give one whole number per profile, in the shape {leading}",
+        )
+    return labels.reshape(count).astype(np.int64)
+
+
+def _layers(layers: Sequence[tuple[float, float]], levels: Array) -> tuple[tuple[int, int], ...]:
+    """Return the altitudes nearest to the bounds of layers, -1 for the station."""
+    try:
+        bounds = np.asarray(layers, dtype=np.float64)
+    except (TypeError, ValueError):
+        bounds = np.empty(0)
+    if len(layers) and (bounds.shape != (len(layers), 2) or not np.all(np.isfinite(bounds))):
+        raise RetrievalInputError(
+            f"is {layers!r}", field="layers", remedy="give pairs (bottom, top) in m"
+        )
+    found = []
+    order = np.sort(levels)
+    for bottom, top in bounds:
+        low, high = (int(np.argmin(np.abs(levels - level))) for level in (bottom, top))
+        slack = 0.5 * np.max(np.diff(order), initial=0.0)
+        if max(abs(levels[low] - bottom), abs(levels[high] - top)) > slack or (
+            levels[low] >= levels[high]
+        ):
+            raise RetrievalInputError(
+                f"[{bottom:g}, {top:g}] m holds no altitude of the grid, or reaches beyond it",
+                field="layers",
+                remedy=f"give bounds from {order[0]:g} to {order[-1]:g} m, bottom first",
+            )
+        found.append((-1 if low == levels.size - 1 else low, high))
+    return tuple(found)
+
+
+def _positive(value: float | None, name: str) -> float | None:
+    if value is not None and not (np.isfinite(value) and value >= 0):
+        raise RetrievalInputError(f"is {value}", field=name, remedy="give zero or more")
+    return value
+
+
+def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], gates: int) -> Array | None:
+    if values is None:
+        return None
+    prior = inputs.real_array(values, "prior_optical_depth").astype(np.float64, copy=False)
+    if not np.all(np.isfinite(prior)):
+        raise RetrievalInputError(
+            "holds values that are not finite",
+            field="prior_optical_depth",
+            remedy="give a value for every altitude",
+        )
+    try:
+        return np.broadcast_to(prior, (*leading, gates)).reshape(-1, gates)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {prior.shape}, which does not broadcast to {(*leading, gates)}",
+            field="prior_optical_depth",
+        ) from None
+
+
+def _quality(profiles: Profiles, given: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    """Return the bits that every product knows; each missing optical depth has a rejecting one.
+
+    Parameters
+    ----------
+    profiles : Profiles
+    given : (profile, altitude) bool
+        Whether any angle has a signal and its variance.
+    """
+    quality = np.zeros(profiles.optical_depth.shape, dtype=np.int32)
+    quality[~given.any(axis=1)] |= np.int32(Quality.INPUT_MISSING)
+    lost = profiles.flags["extrapolated"] & ~profiles.flags["no_data"]
+    quality[lost] |= np.int32(Quality.LOW_SIGNAL)
+    quality[profiles.flags["outlier"]] |= np.int32(Quality.OUTLIER)
+    silent = np.isnan(profiles.optical_depth) & (quality & int(Quality.rejecting()) == 0)
+    quality[silent & ~given] |= np.int32(Quality.INPUT_MISSING)
+    quality[silent & given] |= np.int32(Quality.NO_LEVERAGE)
+    return quality

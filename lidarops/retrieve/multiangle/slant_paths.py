@@ -1,0 +1,191 @@
+"""Slant paths of a scan: how much longer than the vertical one each is, and where they lead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.inputs import real_array
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
+
+EARTH_RADIUS: Final = 6_371_000.0
+"""m, mean."""
+SPHERICAL_BEYOND: Final = 75.0
+"""degree. Up to here the secant errs by less than 0.3 percent of the optical depth."""
+LONGEST: Final = 10.0
+"""Slant over vertical path beyond which refraction and curvature make the model wrong."""
+_UPRIGHT: Final = 1e-9
+"""Horizontal distance over altitude up to which a ray has no azimuth."""
+_OPPOSITE: Final = 1e-6
+"""radian by which a gap between azimuths may exceed half a turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """The rays of a scan on an altitude grid."""
+
+    path: Array
+    """(angle, altitude): slant over vertical path; NaN for rays that are not used."""
+    east: Array
+    """(angle, altitude): horizontal distance over altitude, component along azimuth 90 degree."""
+    north: Array
+    """(angle, altitude): the same along azimuth 0."""
+    azimuth: Array
+    """(angle,) radian, of where the ray leads (a negative zenith angle leads backwards)."""
+    usable: Mask
+    """(angle,): false for rays whose path is longer than ten times the vertical one."""
+
+    @property
+    def leaning(self) -> Array:
+        """Azimuths of the usable rays that leave the zenith, radian."""
+        off = np.abs(self.east[:, 0]) + np.abs(self.north[:, 0]) > _UPRIGHT
+        return self.azimuth[self.usable & off]
+
+
+def make_scan(
+    zenith_angle: npt.ArrayLike, altitude: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
+) -> Scan:
+    r"""Build the slant paths of a scan.
+
+    Up to 75 degrees :math:`x = \sec\theta`; beyond, the mean of the path through a spherical
+    atmosphere whose extinction does not change with altitude,
+
+    .. math:: x(z) = \left[\sqrt{R^2\cos^2\theta + 2Rz + z^2} - R\cos\theta\right] / z .
+
+    Parameters
+    ----------
+    zenith_angle : (angle,) float
+        degree, -90 to 90; negative ones lead opposite to their azimuth.
+    altitude : (altitude,) float
+        m above the lidar, ascending.
+    azimuth : (angle,) float, optional
+        degree; 0 where not given.
+
+    Returns
+    -------
+    Scan
+        Rays with x > 10 at any altitude, or whose angle is missing, are not usable.
+
+    Raises
+    ------
+    RetrievalInputError
+        For angles beyond the horizon or altitudes that are not positive and ascending.
+    """
+    angle = _angles(zenith_angle, "zenith_angle")
+    if np.any(np.abs(angle) > 90.0):
+        raise RetrievalInputError(
+            "holds angles below the horizon", field="zenith_angle", remedy="give -90 to 90 degree"
+        )
+    heading = np.zeros_like(angle) if azimuth is None else _angles(azimuth, "azimuth")
+    if heading.shape != angle.shape:
+        raise RetrievalInputError(
+            f"has the shape {heading.shape}, zenith_angle {angle.shape}",
+            field="azimuth",
+            remedy="give one value per angle",
+        )
+    height = altitude_grid(altitude, 0.0)
+    return _scan(slant_path(np.abs(angle), height), angle, heading)
+
+
+def rising(zenith_angle: Array, altitude: Array) -> Integers:
+    """Return which rays lead up, and are usable at all altitudes.
+
+    Parameters
+    ----------
+    zenith_angle : (angle,) float
+        degree, 0 to 180.
+    altitude : (altitude,) float
+        m above the lidar, ascending.
+    """
+    upward = np.flatnonzero(zenith_angle < 90.0)
+    return upward[make_scan(zenith_angle[upward], altitude).usable] if upward.size else upward
+
+
+def slant_path(angle: Array, altitude: Array) -> Array:
+    """Return slant over vertical path of `make_scan` as (angle, altitude); inf at the horizon."""
+    cosine = np.cos(np.radians(angle))[:, np.newaxis]
+    with np.errstate(divide="ignore"):
+        secant = np.where(cosine > 1e-12, 1.0 / cosine, np.inf)
+    # The textbook form subtracts two numbers of the Earth's size; this one keeps its digits.
+    root = np.sqrt((EARTH_RADIUS * cosine) ** 2 + (2.0 * EARTH_RADIUS + altitude) * altitude)
+    spherical = (2.0 * EARTH_RADIUS + altitude) / (root + EARTH_RADIUS * cosine)
+    steep = angle[:, np.newaxis] <= SPHERICAL_BEYOND
+    return np.asarray(np.where(steep, secant, spherical), dtype=np.float64)
+
+
+def surrounds_zenith(azimuth: Array) -> bool:
+    """Tell whether no half turn is free of rays, so that a horizontal gradient can be found.
+
+    The zero vector lies inside the convex hull of the directions exactly then.
+
+    Parameters
+    ----------
+    azimuth : (angle,) float
+        radian; only of rays that leave the zenith.
+    """
+    return free_turn(azimuth) <= np.pi + _OPPOSITE
+
+
+def free_turn(azimuth: Array) -> float:
+    """Return the largest angle around the zenith that is free of rays, radian.
+
+    Parameters
+    ----------
+    azimuth : (angle,) float
+        radian; only of rays that leave the zenith.
+    """
+    if azimuth.size == 0:
+        return 2.0 * np.pi
+    ordered = np.sort(np.mod(azimuth, 2.0 * np.pi))
+    return float(np.max(np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))))
+
+
+def altitude_grid(altitude: npt.ArrayLike, station_altitude: float) -> Array:
+    """Check an altitude axis in m; return heights above the station.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where it is not one-dimensional, finite, above the station and strictly ascending.
+    """
+    grid = real_array(altitude, "altitude").astype(np.float64)
+    if grid.ndim != 1 or grid.size == 0:
+        raise RetrievalInputError(
+            f"has the shape {grid.shape}", field="altitude", remedy="give one value in m per gate"
+        )
+    if not np.isfinite(station_altitude):
+        raise RetrievalInputError(f"is {station_altitude}", field="station_altitude")
+    height = grid - station_altitude
+    if not np.all(np.isfinite(grid)) or height[0] <= 0 or np.any(np.diff(grid) <= 0):
+        raise RetrievalInputError(
+            f"is not finite, strictly ascending and above the lidar at {station_altitude:g} m",
+            field="altitude",
+            remedy="give m, and the lidar's altitude as station_altitude",
+        )
+    return np.ascontiguousarray(height)
+
+
+def _scan(path: Array, angle: Array, heading: Array) -> Scan:
+    with np.errstate(invalid="ignore"):
+        usable = np.all(np.isfinite(path) & (path <= LONGEST), axis=1) & np.isfinite(heading)
+    azimuth = np.radians(np.where(angle < 0, heading + 180.0, heading))
+    path = np.where(usable[:, np.newaxis], path, np.nan)
+    reach = path * np.sin(np.radians(np.abs(angle)))[:, np.newaxis]
+    east, north = np.sin(azimuth)[:, np.newaxis], np.cos(azimuth)[:, np.newaxis]
+    return Scan(path, reach * east, reach * north, azimuth, usable)
+
+
+def _angles(values: npt.ArrayLike, name: str) -> Array:
+    angles = real_array(values, name).astype(np.float64)
+    if angles.ndim != 1 or angles.size == 0:
+        raise RetrievalInputError(
+            f"has the shape {angles.shape}", field=name, remedy="give one value in degree per angle"
+        )
+    return angles

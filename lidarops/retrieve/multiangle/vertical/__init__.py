@@ -1,0 +1,1 @@
+"""Optical depths of single heights joined into one profile of smooth extinction."""

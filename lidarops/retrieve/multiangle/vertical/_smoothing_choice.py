@@ -1,0 +1,132 @@
+"""How smooth a block of profiles is: restricted likelihood and Mallows' Cp over a fixed grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.multiangle.vertical import _banded
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+PER_DECADE: Final = 6
+GRID: Final = 10.0 ** (np.arange(11 * PER_DECADE + 1) / PER_DECADE - 10.0)
+"""Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
+LEAST_FREEDOM: Final = 2.0
+FEWEST_TO_CHOOSE: Final = 8
+"""Profiles of a block from which one weight is chosen; below, solutions are averaged."""
+_SCORED_PROFILES: Final = 64
+_SCORED_HEIGHTS: Final = 25_600
+"""What a block is scored on at most: as many profiles, or heights of all of them together."""
+_SWITCH: Final = 1.2
+_STRANGE: Final = 3.0
+_NEGLIGIBLE: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Weights of smoothness of one block."""
+
+    smoothing: Array
+    """(candidate,): dimensionless; one of them, or several to be averaged over."""
+    share: Array
+    """(candidate,): what each counts, 1 together."""
+    effective_degrees_of_freedom: float
+    """Mean over the scored profiles and the candidates."""
+    saturated: bool
+    """Whether the best is the smoothest that is admitted."""
+
+    @property
+    def mean_smoothing(self) -> float:
+        """Geometric mean of the candidates."""
+        return float(np.exp((self.share * np.log(self.smoothing)).sum()))
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """The criteria on the grid, summed over the scored profiles of a block."""
+
+    likelihood: Array
+    """(smoothing,): minus twice the restricted log-likelihood, but for a constant."""
+    risk: Array
+    """(smoothing,): Mallows' Cp, but for a constant."""
+    freedom: Array
+    """(smoothing,): mean effective degrees of freedom of a profile."""
+    profiles: int
+    """Profiles of the block, scored or not."""
+
+
+def score(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scores:
+    r"""Score every weight on the grid for the profiles of one block that have data.
+
+    With :math:`x` the solution, :math:`C` its covariance and the profiles pooled,
+
+    .. math::
+        J = \sum [t'\Omega(t - x) + \ln|\Omega + \lambda K|] - r \ln\lambda, \quad
+        C_p = \sum [(t - x)'\Omega(t - x) + 2 tr C\Omega],
+
+    where profiles unlike the others are left out of Cp: those with 3 times the median where the
+    median is least. A long block is scored on every n-th profile.
+
+    Parameters
+    ----------
+    bands : (3, profile, height) float64
+    estimates : (profile, height) float64
+        0 where there is none.
+    stiffness : (3, height) float64
+    unit : float
+        What the dimensionless weights are multiplied by.
+
+    Returns
+    -------
+    Scores
+    """
+    profiles, heights = estimates.shape
+    most = max(_SCORED_PROFILES, _SCORED_HEIGHTS // heights)
+    scored = np.arange(0, profiles, -(-profiles // most))
+    right = _banded.multiply_rows(bands, estimates)
+    profile = np.repeat(scored, GRID.size)
+    lam = np.tile(GRID * unit, scored.size)
+    raw = _banded.scores(bands, right, estimates, stiffness, profile, lam)
+    fit, misfit, freedom, logarithm = raw.reshape(4, scored.size, GRID.size)
+    likelihood = (fit + logarithm - (heights - 1) * np.log(GRID * unit)).sum(axis=0)
+    # Where a pivot lost all its digits, the weight is too large to be thought of.
+    likelihood = np.where(np.isfinite(likelihood), likelihood, np.inf)
+    risk = misfit + 2.0 * freedom
+    typical = np.median(risk, axis=0)
+    best = int(np.argmin(typical))
+    sane = risk[:, best] <= _STRANGE * typical[best]
+    return Scores(likelihood, risk[sane].sum(axis=0), freedom.mean(axis=0), profiles)
+
+
+def choose(scores: Scores) -> Choice:
+    """Choose the weight of a block, or the weights to average over.
+
+    Profiles of a block share their shape, which the likelihood takes for independent draws: in
+    clouds it then smooths too much. Cp knows the noise, but is erratic; it is followed only
+    where it asks for 1.2 times the degrees of freedom, and at most by a factor of 10.
+    """
+    admitted = np.flatnonzero((scores.freedom >= LEAST_FREEDOM) & np.isfinite(scores.likelihood))
+    last = int(admitted[-1]) if admitted.size else 0
+    likely = int(np.argmin(scores.likelihood[: last + 1]))
+    if scores.profiles < FEWEST_TO_CHOOSE:
+        return _average(scores, last)
+    risky = int(np.argmin(scores.risk[: last + 1]))
+    risky = max(risky, likely - PER_DECADE)
+    rougher = scores.freedom[risky] > _SWITCH * scores.freedom[likely]
+    best = risky if rougher else likely
+    return Choice(GRID[best : best + 1], np.ones(1), float(scores.freedom[best]), best == last)
+
+
+def _average(scores: Scores, last: int) -> Choice:
+    likelihood = scores.likelihood[: last + 1]
+    share = np.exp(-0.5 * (likelihood - likelihood.min()))
+    kept = np.flatnonzero(share > _NEGLIGIBLE)
+    share = share[kept] / share[kept].sum()
+    freedom = float((share * scores.freedom[kept]).sum())
+    saturated = int(kept[np.argmax(share)]) == last
+    return Choice(GRID[kept], share, freedom, saturated)

@@ -1,0 +1,1 @@
+"""Extinction and visibility where the beams of several lidars meet."""

@@ -1,0 +1,1 @@
+"""Signals of the beams of a network: averaged, with their noise and outlying bins."""

@@ -1,0 +1,1 @@
+"""Raw counts to signals: dead time, dark signal, lag, gluing, averaging."""

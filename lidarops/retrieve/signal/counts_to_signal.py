@@ -1,0 +1,579 @@
+"""From raw counts to a clean signal with known noise: arrays in, arrays out.
+
+The last axis is range, the one before it time. Signals are in mV (analog) and MHz (photon
+counting), as the field has them; everything else is SI. Any layout, byte order and type of
+integers or floats is taken; masked entries are missing. A profile gives the same bits whatever
+profiles come with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.constants import DEFAULT_DEAD_TIME, LICEL_RANGE_PER_MICROSECOND
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.inputs import Floats
+from lidarops.retrieve.signal import _signal_kernels as kernels
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.int32]
+
+PILE_UP_CORRECTION = 0.1
+"""Relative dead-time correction above which `Quality.PILE_UP` is raised."""
+PILE_UP_LEFT = 0.01
+"""The same where no dead time is known, so that nothing is corrected."""
+NEAR_FULL_SCALE = 0.5
+"""Share of full scale from which on a bin is looked at for shots that were clipped."""
+CLIPPING = 3.5
+"""Standard deviations of a shot below full scale within which clipping shifts a mean: there by
+6e-5 of that deviation."""
+PARALYSIS = 0.5
+"""Measured rate times dead time above which a rate cannot be corrected (`Quality.SATURATED`)."""
+NOISE_WINDOW = 0.1
+"""Half-width, relative to range, of the window in which noise is smoothed."""
+WEIGHT_WINDOW = 0.3
+"""The same for the weights of the noise model."""
+MIN_NOISE_BINS = kernels.BLOCK
+"""Smallest half-width of such a window in bins: 16."""
+_FINE = 0.5
+"""Variance of a shot in squares of a digitiser step above which rounding needs no thought: there
+the error that does not average out is below 1e-4 steps."""
+LEAK = 0.05
+"""Largest share of the noise that the fall of the signal may fake in a third difference."""
+
+_Number = TypeVar("_Number", bound=np.generic)
+_COUNT_LIMITS = np.iinfo(np.int32)
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """A signal with the variance of its noise and its quality, all of one shape."""
+
+    power: Floats
+    """mV or MHz; NaN where `quality` holds INPUT_MISSING or SATURATED."""
+    variance: Floats
+    """Of the noise, in the square of the signal's unit."""
+    quality: Flags
+    """Bits of `lidarops.flags.Quality`."""
+
+
+def analog(
+    counts: npt.NDArray[np.int32],
+    shots: npt.NDArray[np.integer],
+    range: Array,  # noqa: A002 - the field's word
+    *,
+    adc_bits: int,
+    input_range: Array,
+    dark: Array | None = None,
+    dark_variance: Array | None = None,
+    noise_variance: float | None = None,
+    full_overlap_range: float = 0.0,
+) -> Signal:
+    r"""Turn summed ADC counts into voltage with known noise.
+
+    .. math:: U = \frac{n \cdot 1000\, U_{max}}{N \, 2^{b}} - D
+
+    with counts :math:`n`, shots :math:`N`, bits :math:`b`, input range :math:`U_{max}` in V and
+    dark signal :math:`D` in mV. A bin at full scale, :math:`n \ge N (2^b - 1)`, is SATURATED, and
+    one so near to it that single shots reached it: within 3.5 standard deviations of a shot. A
+    bin at an extreme of the integer type, or of a profile without shots or of zeros alone, or
+    without a finite input range or dark signal, is INPUT_MISSING.
+
+    Each shot is rounded to whole steps of the digitiser. Where the noise of a shot is above half
+    a step, that averages out and is part of the noise that is seen; below, all shots err to one
+    side, by up to half a step however many there are, and the variance is raised to cover it. That
+    part of the error is the same in neighbouring bins: a mean over bins does not reduce it.
+
+    Parameters
+    ----------
+    counts : (..., time, range) int32
+        Sum over the shots.
+    shots : (..., time) int
+    range : (range,) float
+        m.
+    adc_bits : int
+    input_range : (..., time) float
+        V.
+    dark, dark_variance : (range,) or (..., time, range) float, optional
+        Mean of the dark files in mV, and the variance of that mean in mV^2; one for all profiles,
+        or one for each.
+    noise_variance : float, optional
+        mV^2, of one profile; estimated from the profile (`difference_variance`) where absent.
+    full_overlap_range : float
+        m; nearer bins are INCOMPLETE_OVERLAP.
+
+    Returns
+    -------
+    Signal
+        In mV.
+
+    Raises
+    ------
+    RetrievalInputError
+        For counts that are no 32-bit integers, shapes that do not fit, a range that is not finite
+        or has a bin twice, a noise variance that is negative or not finite.
+
+    References
+    ----------
+    licel2023
+    """
+    grid = _grid(range)
+    summed = _counts(counts, grid, shots)
+    leading = summed.shape[:-1]
+    fired = _per_profile(shots, "shots", leading)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step = _per_profile(input_range, "input_range", leading) * 1000.0 / (fired * 2.0**adc_bits)
+    power, quality = np.empty(summed.shape), np.empty(summed.shape, np.int32)
+    kernels.voltage_profiles(
+        frozen(_rows(summed)),
+        frozen(fired),
+        frozen(step),
+        frozen(fired * (2.0**adc_bits - 1.0)),
+        frozen(_per_bin(dark, "dark", summed.shape)),
+        _overlap_bits(grid, full_overlap_range),
+        _rows(power),
+        _rows(quality),
+    )
+    scale = _Scale(summed, step, fired * (2.0**adc_bits - 1.0), fired)
+    if noise_variance is None:
+        variance = _estimated_variance(power, grid)
+        again = _flag_clipped(power, quality, scale, variance)
+        if again.size:
+            # Clipped bins are less noisy than others, and have drawn the estimate down.
+            _rows(variance)[again] = _estimated_variance(_rows(power)[again], grid)
+        return Signal(power, _with_rounding(variance, scale), quality)
+    _refuse_unless(
+        0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2"
+    )
+    known = np.full(power.shape, noise_variance)
+    of_dark = _per_bin(dark_variance, "dark_variance", summed.shape)
+    _flag_clipped(power, quality, scale, (_rows(known) + of_dark).reshape(power.shape))
+    variance = _rows(_with_rounding(known, scale)) + of_dark
+    return Signal(power, variance.reshape(power.shape), quality)
+
+
+class _Scale(NamedTuple):
+    """Summed counts of profiles, and what they are counted against."""
+
+    counts: npt.NDArray[np.int32]
+    """(..., time, range)"""
+    step: Array
+    """(profile,), mV of the mean for one count of the sum."""
+    top: Array
+    """(profile,), counts at full scale."""
+    shots: Array
+    """(profile,)"""
+
+
+def _with_rounding(variance: Array, scale: _Scale) -> Array:
+    """Return variances of the noise as seen, raised by what rounding does unseen.
+
+    Each shot is rounded on its own. Noise of half a step or more makes that a noise of 1 / 12,
+    which is part of what is seen and averages out. Less noise leaves all shots on the same side:
+    an error that no number of shots takes away and that no scatter tells, uniform within half a
+    step where there is no noise at all. In between, shots fall on two steps with variance
+    m (1 - m), and their mean m may be off by sqrt(1/4 - m (1 - m)); above a variance of 1/4 the
+    first harmonic of the error is left. The variance of a bin scatters, that of the middle one of
+    a profile does not: the smaller of the two is asked.
+    """
+    found = variance.copy()
+    rows = _rows(found)
+    # Without a shot, nothing is known.
+    rows[scale.shots <= 0] += np.inf
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        unit = (scale.step**2 * scale.shots)[:, np.newaxis]
+        coarse = np.flatnonzero((rows < _FINE * unit).any(axis=-1))
+        unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
+        seen = rows[coarse] / unit
+        middle = np.sort(seen, axis=-1)[:, (seen.shape[-1] - 1) // 2, np.newaxis]
+        least = np.fmin(seen, middle)
+        harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(least - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
+        common = np.maximum((0.25 - least) / 3.0, harmonic)
+        raised = unit * (np.maximum(seen, 1.0 / 12.0) + shots * common)
+    rows[coarse] = np.where(seen >= _FINE, rows[coarse], raised)
+    return found
+
+
+def _flag_clipped(
+    power: Array, quality: Flags, scale: _Scale, variance: Array
+) -> npt.NDArray[np.intp]:
+    """Mark the bins of which some shots reached full scale though their mean did not.
+
+    Returns
+    -------
+    (profile,) int
+        Those with such bins.
+    """
+    rows, noise = _rows(scale.counts), _rows(variance)
+    fired = (scale.shots > 0)[:, np.newaxis]
+    profile, bins = np.nonzero(fired & (rows > NEAR_FULL_SCALE * scale.top[:, np.newaxis]))
+    one_shot = np.sqrt(noise[profile, bins] * scale.shots[profile])
+    room = (scale.top[profile] - rows[profile, bins]) * scale.step[profile]
+    clipped = room < CLIPPING * one_shot
+    where = profile[clipped], bins[clipped]
+    _rows(power)[where] = np.nan
+    _rows(quality)[where] |= np.int32(Quality.SATURATED)
+    return np.unique(where[0])
+
+
+def photon(
+    counts: npt.NDArray[np.int32],
+    shots: npt.NDArray[np.integer],
+    range: Array,  # noqa: A002 - the field's word
+    *,
+    bin_width: float,
+    dead_time: float | None = None,
+    full_overlap_range: float = 0.0,
+) -> Signal:
+    r"""Turn summed photon counts into a count rate with known noise.
+
+    The measured rate is :math:`m = n / (N T)`, with the nominal bin time :math:`T` = bin width
+    / 150 m per microsecond; a non-paralysable dead time :math:`\tau` is undone by
+
+    .. math:: r = \frac{m}{1 - m \tau}, \qquad \mathrm{var}(r) = \frac{r}{N T (1 - m \tau)}
+
+    (renewal statistics: :math:`\mathrm{var}(n) = n (1 - m\tau)^2`). The variance is evaluated on
+    the rate smoothed over +- 10 % of range, so that the weights made of it do not follow the
+    noise of the single bin. PILE_UP where the correction exceeds 10 %, SATURATED where
+    :math:`m \tau > 0.5`. Where no dead time is known nothing is corrected; both are judged with
+    4 ns then, and PILE_UP is raised where 1 % is left uncorrected.
+
+    Parameters
+    ----------
+    counts : (..., time, range) int32
+        Sum over the shots.
+    shots : (..., time) int
+    range : (range,) float
+        m.
+    bin_width : float
+        m.
+    dead_time : float, optional
+        s.
+    full_overlap_range : float
+        m; nearer bins are INCOMPLETE_OVERLAP.
+
+    Returns
+    -------
+    Signal
+        In MHz.
+
+    Raises
+    ------
+    RetrievalInputError
+        For counts that are no 32-bit integers, shapes that do not fit, a range that is not finite
+        or has a bin twice, a bin width or dead time that cannot be right.
+
+    References
+    ----------
+    licel2023
+    """
+    grid = _grid(range)
+    summed = _counts(counts, grid, shots)
+    leading = summed.shape[:-1]
+    fired = _per_profile(shots, "shots", leading)
+    _refuse_unless(0.0 < bin_width < np.inf, bin_width, "bin_width", "a positive width in m")
+    dead = 0.0 if dead_time is None else dead_time
+    _refuse_unless(0.0 <= dead < np.inf, dead, "dead_time", "a time in s")
+    power, variance = np.empty(summed.shape), np.empty(summed.shape)
+    quality = np.empty(summed.shape, np.int32)
+    kernels.photon_profiles(
+        frozen(_rows(summed)),
+        frozen(fired),
+        frozen(fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)),
+        kernels.Counter(
+            dead_time=dead * 1e6,
+            judged=(dead or DEFAULT_DEAD_TIME) * 1e6,
+            paralysis=PARALYSIS,
+            pile_up=PILE_UP_LEFT if dead_time is None else PILE_UP_CORRECTION,
+        ),
+        _overlap_bits(grid, full_overlap_range),
+        _windows(grid, NOISE_WINDOW),
+        kernels.scratch(grid.size),
+        _rows(power),
+        _rows(variance),
+        _rows(quality),
+    )
+    return Signal(power, variance, quality)
+
+
+def _refuse_unless(good: bool, value: float, name: str, wanted: str) -> None:  # noqa: FBT001
+    if not good:
+        raise RetrievalInputError(f"is {value}", field=name, remedy=f"give {wanted}")
+
+
+def _grid(range: npt.ArrayLike) -> Array:  # noqa: A002 - the field's word
+    grid = inputs.real_array(range, "range").astype(np.float64)
+    if grid.ndim != 1 or grid.size == 0:
+        raise RetrievalInputError(
+            f"has the shape {grid.shape}", field="range", remedy="give one value in m per bin"
+        )
+    if not np.isfinite(grid).all() or not np.diff(grid).all():
+        raise RetrievalInputError(
+            "is not finite, or two bins have the same", field="range", remedy="give centres in m"
+        )
+    return grid
+
+
+def _counts(counts: npt.ArrayLike, grid: Array, shots: npt.ArrayLike) -> npt.NDArray[np.int32]:
+    """Return counts as they are, but of the one type that the kernels know."""
+    if isinstance(counts, np.ma.MaskedArray):
+        masked = np.ma.getmaskarray(counts)
+        counts = np.where(masked, _COUNT_LIMITS.min, counts.data.astype(np.int64))
+    array = np.asarray(counts)
+    if array.shape[-1:] != grid.shape or array.shape[:-1] != np.shape(shots):
+        raise RetrievalInputError(
+            f"counts {array.shape}, shots {np.shape(shots)} and range {grid.shape} do not fit",
+            field="counts",
+            remedy="counts are (..., time, range), shots (..., time), range (range,)",
+        )
+    # Other integers pass where no count is too large.
+    if array.dtype.kind not in "iu" or not (
+        np.can_cast(array.dtype, np.int32) or np.array_equal(array, array.astype(np.int32))
+    ):
+        raise RetrievalInputError(
+            f"holds {array.dtype} that is no 32-bit count",
+            field="counts",
+            remedy="open the archive with mask_and_scale=False",
+        )
+    return np.require(array, np.int32, "A")
+
+
+def _per_profile(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
+    """Return one value for every profile, flat."""
+    array = np.require(inputs.real_array(values, name), np.float64, "A")
+    try:
+        return np.broadcast_to(array, leading).reshape(-1)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, which does not broadcast to the shape {leading} of the"
+            " profiles",
+            field=name,
+        ) from None
+
+
+def _per_bin(values: npt.ArrayLike | None, name: str, shape: tuple[int, ...]) -> Array:
+    """Return one value for every bin, (profile or 1, bin); zeros for None."""
+    if values is None:
+        return np.zeros((1, shape[-1]))
+    array = np.require(inputs.real_array(values, name), np.float64, "A")
+    if array.shape not in (shape, shape[-1:]):
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, the counts {shape}",
+            field=name,
+            remedy="give it over range, or over all axes of the counts",
+        )
+    return _rows(array)
+
+
+def _profiles(values: npt.ArrayLike, name: str, bins: int) -> Array:
+    array = inputs.real_array(values, name)
+    if array.shape[-1:] != (bins,):
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, but range has {bins} bins",
+            field=name,
+            remedy="the last axis is range",
+        )
+    return np.require(array, np.float64, "A")
+
+
+def _rows(array: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
+    """Return an array as (profile, bin)."""
+    return array.reshape(int(np.prod(array.shape[:-1], dtype=np.int64)), array.shape[-1])
+
+
+def _overlap_bits(grid: Array, full_overlap_range: float) -> Flags:
+    _refuse_unless(
+        full_overlap_range < np.inf, full_overlap_range, "full_overlap_range", "a range in m"
+    )
+    near = grid < full_overlap_range
+    return frozen(np.where(near, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0)))
+
+
+def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kernels.Windows:
+    """Return the smoothing window of each bin; `ends` are bins that never hold a value."""
+    size = grid.size
+    index = np.arange(size)
+    steps = np.abs(np.diff(grid))
+    spacing = float(np.min(steps)) if size > 1 else 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = np.nan_to_num(np.abs(grid) * (window / spacing))
+    half = np.clip(reach, MIN_NOISE_BINS, max(size, MIN_NOISE_BINS)).astype(np.intp)
+    begin, end = _stretch(steps > MIN_NOISE_BINS * spacing)
+    # Symmetric up to the ends, so that a steep signal is not smoothed to one side.
+    half = np.minimum(half, np.maximum(np.minimum(index - begin, end - 1 - index), MIN_NOISE_BINS))
+    first, past = np.maximum(index - half, begin), np.minimum(index + half + 1, end)
+    bins = np.minimum(past, size - ends[1]) - np.maximum(first, ends[0])
+    past[past == size] = -(-size // kernels.BLOCK) * kernels.BLOCK
+    return kernels.Windows(
+        frozen(first.astype(np.uint32)),
+        frozen(past.astype(np.uint32)),
+        frozen(np.maximum(bins, 0).astype(np.float64)),
+    )
+
+
+def _stretch(gaps: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Return, for each bin, the first bin of its stretch without a gap and the one past its last.
+
+    Light on the two sides of a gap, where bins were left on disk, has nothing in common.
+    """
+    edges = np.concatenate([[0], np.flatnonzero(gaps) + 1, [gaps.size + 1]])
+    lengths = np.diff(edges)
+    return np.repeat(edges[:-1], lengths), np.repeat(edges[1:], lengths)
+
+
+def _noise(grid: Array) -> kernels.Noise:
+    spacing = np.abs(np.gradient(grid)) if grid.size > 1 else np.ones(1)
+    with np.errstate(divide="ignore"):
+        # The third difference of R^-2 is 24 (h / R)^3 of the signal.
+        leak = 24.0 * (spacing / grid) ** 3 / np.sqrt(20.0 * LEAK)
+    return kernels.Noise(
+        narrow=_windows(grid, NOISE_WINDOW),
+        # A third difference needs a bin before and two behind.
+        wide=_windows(grid, WEIGHT_WINDOW, ends=(1, 2)),
+        leak=frozen(leak),
+    )
+
+
+def _estimated_variance(power: Array, grid: Array) -> Array:
+    rows, variance = _rows(power), np.empty(power.shape)
+    kernels.noise_profiles(frozen(rows), _noise(grid), kernels.scratch(grid.size), _rows(variance))
+    return variance
+
+
+def smooth(
+    values: Array,
+    range: Array,  # noqa: A002 - the field's word
+    *,
+    window: float = NOISE_WINDOW,
+) -> Array:
+    """Average over a window that grows with range, at least 33 bins, passing over NaN.
+
+    Parameters
+    ----------
+    values : (..., range) float
+    range : (range,) float
+        m.
+    window : float
+        Half-width of the window, relative to range.
+
+    Returns
+    -------
+    (..., range) float
+        NaN where the window holds no finite value. Good to some 20 roundings of the mean of
+        absolute values within the window, whatever the near range holds.
+
+    Raises
+    ------
+    RetrievalInputError
+        For shapes that do not fit, a range that is not finite or has a bin twice, a window that
+        is negative or not finite.
+    """
+    grid = _grid(range)
+    _refuse_unless(0.0 <= window < np.inf, window, "window", "a share of range")
+    rows = _profiles(values, "values", grid.size)
+    averages = np.empty(rows.shape)
+    kernels.smooth_profiles(
+        frozen(_rows(rows)), _windows(grid, window), kernels.scratch(grid.size), _rows(averages)
+    )
+    return averages
+
+
+def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - the field's word
+    r"""Estimate the noise variance of an analog signal from third differences along range.
+
+    Electronic noise is constant and shot noise follows the light, so that
+
+    .. math:: v(R) = a + b \, (\overline{P}(R) - \overline{P}_{min}), \qquad
+              \left\langle \frac{(P_{i-1} - 3 P_i + 3 P_{i+1} - P_{i+2})^2}{20} \right\rangle
+              = v(R_i)
+
+    over the lowest level (an offset of the electronics makes no noise) is fitted by weighted
+    least squares with :math:`a, b \ge 0`, one pair a profile: weights made of two
+    well-determined numbers do not follow the noise of the single bin. Exact for noise that is
+    white along range; noise that is correlated from bin to bin is underestimated. Bins so near
+    that the fall of the signal itself would be taken for noise are left out of the fit.
+
+    Parameters
+    ----------
+    power : (..., range) float
+        NaN where unusable; differences that touch NaN are passed over.
+    range : (range,) float
+        m.
+
+    Returns
+    -------
+    (..., range) float
+        In the square of the unit of `power`; NaN where no difference is finite.
+
+    Raises
+    ------
+    RetrievalInputError
+        For shapes that do not fit, a range that is not finite or has a bin twice.
+    """
+    grid = _grid(range)
+    rows = _profiles(power, "power", grid.size)
+    return _estimated_variance(rows, grid)
+
+
+def range_corrected(
+    signal: Signal,
+    range: Array,  # noqa: A002 - the field's word
+    *,
+    background: npt.ArrayLike,
+    background_variance: npt.ArrayLike,
+    dtype: npt.DTypeLike = np.float64,
+) -> Signal:
+    r"""Subtract the background and multiply with the square of range.
+
+    .. math:: X = (P - P^*) R^2, \qquad \mathrm{var}(X) = (v_P + v_{P^*}) R^4
+
+    Parameters
+    ----------
+    signal : Signal
+        (..., range).
+    range : (range,) float
+        m.
+    background, background_variance : (...) float
+        In the unit of the signal and its square.
+    dtype : {float64, float32}
+        Of power and variance; the arithmetic is that of float64.
+
+    Returns
+    -------
+    Signal
+        In mV m2 or MHz m2. Negative values stay: clipping would bias every mean.
+
+    Raises
+    ------
+    RetrievalInputError
+        For shapes that do not fit, a range that is not finite or has a bin twice, another dtype.
+    """
+    grid = _grid(range)
+    kind = np.dtype(dtype)
+    if kind not in (np.float32, np.float64):
+        raise RetrievalInputError(f"is {kind}", field="dtype", remedy="choose float32 or float64")
+    powers = _profiles(signal.power, "power", grid.size)
+    variances = _profiles(signal.variance, "variance", grid.size)
+    if variances.shape != powers.shape:
+        raise RetrievalInputError(
+            f"has the shape {variances.shape}, the power {powers.shape}", field="variance"
+        )
+    leading = powers.shape[:-1]
+    result = Signal(np.empty(powers.shape, kind), np.empty(powers.shape, kind), signal.quality)
+    kernels.range_corrected_profiles(
+        frozen(_rows(powers)),
+        frozen(_rows(variances)),
+        frozen(_per_profile(background, "background", leading)),
+        frozen(_per_profile(background_variance, "background_variance", leading)),
+        frozen(grid**2),
+        _rows(result.power),
+        _rows(result.variance),
+    )
+    return result

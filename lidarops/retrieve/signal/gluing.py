@@ -1,0 +1,308 @@
+"""Gluing of analog and photon-counting signals where both are linear."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.signal import _line_fit, averaging
+
+Array = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
+Indices = npt.NDArray[np.intp]
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+COUNT_RATES: Final = (0.5, 20.0)
+"""MHz between which photon counting is linear after its dead time, and above its noise."""
+LEAST_SNR: Final = 10.0
+FEWEST_BINS: Final = 8
+LEAST_FALL: Final = 1.5
+"""Factor by which the smoothed count rate must fall within a window."""
+SMOOTHING: Final = 31
+"""Bins over which signals are averaged before the window is sought in them: ends of a window
+that follow the noise of single bins would bias the slope."""
+LEAST_SLOPE: Final = 5.0
+"""Standard errors by which a slope must stand out."""
+_LARGEST_MISFIT: Final = 1.5
+_FALSE_ALARM: Final = 1e-4
+
+
+class HandOver(StrEnum):
+    """How the glued signal goes from analog to photon counting."""
+
+    BLEND = "blend"
+    """Within the window, the mean of both by their inverse variances."""
+    SWITCH = "switch"
+    """In the middle of the window, at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class GluedSignal:
+    """Glued signals, and the line that glues them, one for every profile."""
+
+    power: Array
+    """(..., range), MHz: analog near, photon counting far; NaN where there is no line."""
+    variance: Array
+    """(..., range), MHz2, of the noise."""
+    systematic_variance: Array
+    """(..., range), MHz2, from the error of the line: it has the same cause in all bins and all
+    profiles of a block and does not average down."""
+    slope: Array
+    """(...), MHz mV-1."""
+    slope_standard_error: Array
+    intercept: Array
+    """(...), MHz: 0 within its error where both backgrounds are right."""
+    intercept_standard_error: Array
+    chi2: Array
+    """(...), of the line."""
+    degrees_of_freedom: npt.NDArray[np.int64]
+    start: Array
+    """(...), m: first bin of the window; NaN where there is none."""
+    stop: Array
+    """(...), m: last bin of the window."""
+    no_window: Booleans
+    """(...): fewer than 8 neighbouring bins are within both limits, or the count rate changes by
+    less than a factor of 1.5 within them, which is too little for a line."""
+    poor_fit: Booleans
+    """(...): the slope is not 5 standard errors above 0, or the residuals are half as large again
+    as noise allows: one channel is not linear there (dead time, saturation), or both see different
+    light (overlap, fields of view). A wrong lag need not show: it scales a signal that falls."""
+
+
+def glue(
+    analog: npt.ArrayLike,
+    photon_counting: npt.ArrayLike,
+    range: npt.ArrayLike,  # noqa: A002 - the field's word
+    *,
+    analog_variance: npt.ArrayLike,
+    photon_variance: npt.ArrayLike,
+    count_rate_window: tuple[float, float] = COUNT_RATES,
+    least_snr: float = LEAST_SNR,
+    photon_background: npt.ArrayLike = 0.0,
+    block: npt.ArrayLike | None = None,
+    correlation: float = 0.0,
+    hand_over: str = "blend",
+) -> GluedSignal:
+    r"""Scale analog to photon counting by a line through the bins where both are linear.
+
+    The line :math:`y = s x + a` minimises
+
+    .. math:: \chi^2 = \sum \frac{(y_i - s x_i - a)^2}
+                    {v_{y,i} + s^2 v_{x,i} - 2 s \rho \sqrt{v_{x,i} v_{y,i}}}
+
+    by 4 fixed passes of the equations of york2004 from the ratio of the spreads: a slope from
+    a regression on noisy analog values would be too small. The window is the longest run of
+    bins in which the smoothed mean of a block has a count rate within `count_rate_window`, and
+    an analog value of at least `least_snr` times the noise of one bin of one profile.
+
+    Parameters
+    ----------
+    analog : (..., range) float
+        mV, dark and background subtracted, aligned with photon counting (`lidarops.retrieve.signal.lag`).
+    photon_counting : (..., range) float
+        MHz, corrected for dead time, background subtracted.
+    range : (range,) float
+        m.
+    analog_variance, photon_variance : (..., range) float
+        mV2, MHz2, of the noise; broadcast. They must not follow the noise of the single bin.
+    count_rate_window : (float, float)
+        MHz; the upper limit holds for signal and background together.
+    least_snr : float
+    photon_background : (...) float
+        MHz that were subtracted from photon counting.
+    block : (...) int, optional
+        Profiles of equal number share a window and a line; every profile has its own where not
+        given.
+    correlation : float
+        Of the noise of both in a bin, from -1 to 1: shot noise is common to them. With 0 the
+        standard errors are too large where it is not, and the variance of a blend too small.
+    hand_over : {"blend", "switch"}
+
+    Returns
+    -------
+    GluedSignal
+
+    Raises
+    ------
+    RetrievalInputError
+        For arguments that cannot be right.
+
+    References
+    ----------
+    york2004, licel2023
+    """
+    grid = inputs.range_grid(range)
+    way = inputs.choice(hand_over, HandOver, "hand_over")
+    _check_limits(count_rate_window, least_snr, correlation)
+    x, leading = _rows(analog, "analog", grid)
+    y, other = _rows(photon_counting, "photon_counting", grid)
+    if other != leading:
+        raise RetrievalInputError(
+            f"has the leading shape {other}, analog {leading}", field="photon_counting"
+        )
+    xv = _variance(analog_variance, "analog_variance", grid, leading)
+    yv = _variance(photon_variance, "photon_variance", grid, leading)
+    sky = inputs.profile_values(photon_background, "photon_background", leading)
+    inverse = _blocks(block, leading)
+    number = int(inverse.max(initial=-1)) + 1
+    top = np.full(len(x), count_rate_window[1]) - (0.0 if sky is None else sky)
+    first, past = _search(x, y, xv, inverse, top, count_rate_window[0], least_snr)
+    lines = np.full((number, _line_fit.COLUMNS), np.nan)
+    order = np.argsort(inverse, kind="stable")
+    starts = np.searchsorted(inverse[order], np.arange(number + 1))
+    _line_fit.fit_lines(x, y, xv, yv, float(correlation), order, starts, first, past, lines)
+    near, far = first, past
+    if way is HandOver.SWITCH:
+        near = far = (first + past) // 2
+    glued = np.empty((3, *x.shape))
+    _line_fit.combine(x, y, xv, yv, float(correlation), lines, inverse, near, far, glued)
+    bounds = _bounds(grid.values, first, past)
+    return _result(lines, inverse, bounds, glued, leading, grid)
+
+
+def _check_limits(rates: tuple[float, float], least_snr: float, correlation: float) -> None:
+    if not 0 < rates[0] < rates[1]:
+        raise RetrievalInputError(
+            f"is {rates}", field="count_rate_window", remedy="give two rates in MHz, rising"
+        )
+    if not least_snr >= 0:
+        raise RetrievalInputError(f"is {least_snr}", field="least_snr", remedy="give 0 or more")
+    if not -1 < correlation < 1:
+        raise RetrievalInputError(
+            f"is {correlation}", field="correlation", remedy="choose between -1 and 1"
+        )
+
+
+def _rows(
+    values: npt.ArrayLike, name: str, grid: inputs.RangeGrid
+) -> tuple[Array, tuple[int, ...]]:
+    array = inputs.real_array(values, name)
+    if array.ndim == 0 or array.shape[-1] != grid.size:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, but range has {grid.size} bins",
+            field=name,
+            remedy="the last axis is range",
+        )
+    rows = grid.turn(array).reshape(-1, grid.size).astype(np.float64, copy=False)
+    return frozen(rows), array.shape[:-1]
+
+
+def _variance(
+    values: npt.ArrayLike, name: str, grid: inputs.RangeGrid, leading: tuple[int, ...]
+) -> Array:
+    rows = inputs.noise_rows(values, name, grid, leading)
+    if np.any(rows < 0):
+        raise RetrievalInputError("is negative", field=name)
+    count = int(np.prod(leading, dtype=np.int64))
+    return frozen(np.broadcast_to(rows, (count, grid.size)))
+
+
+def _blocks(block: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:
+    """Return the number of the block of each profile, counted from 0."""
+    count = int(np.prod(leading, dtype=np.int64))
+    if block is None:
+        return np.arange(count)
+    labels = np.asarray(block)
+    if labels.dtype.kind not in "iu":
+        raise RetrievalInputError(f"holds {labels.dtype}", field="block", remedy="give integers")
+    try:
+        labels = np.broadcast_to(labels, leading).reshape(count)
+    except ValueError:
+        raise RetrievalInputError(
+            f"has the shape {labels.shape}, which does not broadcast to the shape {leading} of"
+            " the profiles",
+            field="block",
+        ) from None
+    return np.unique(labels, return_inverse=True)[1].reshape(count).astype(np.intp)
+
+
+def _search(
+    x: Array,
+    y: Array,
+    xv: Array,
+    inverse: Indices,
+    top: Array,
+    bottom: float,
+    least_snr: float,
+) -> tuple[Indices, Indices]:
+    """Return first and past-the-last bin of the window of each block, (0, 0) for none."""
+    analog = averaging.mean(x, xv, groups=inverse)
+    rate = _smooth(averaging.mean(y, 0.0, groups=inverse).values)
+    highest = np.full(len(rate), np.inf)
+    np.minimum.at(highest, inverse, top)
+    with np.errstate(invalid="ignore"):
+        noise = np.sqrt(_smooth(analog.variance * analog.count))
+        bright = _smooth(analog.values) >= least_snr * noise
+        good = (rate >= bottom) & (rate <= highest[:, np.newaxis]) & bright
+    first, past = (np.zeros(len(good), dtype=np.intp) for _ in (0, 1))
+    _line_fit.longest_runs(good, first, past)
+    index = np.arange(rate.shape[1])
+    inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
+    most = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
+    least = np.where(inside, rate, np.inf).min(axis=1, initial=np.inf)
+    usable = (past - first >= FEWEST_BINS) & (most >= LEAST_FALL * least)
+    return np.where(usable, first, 0), np.where(usable, past, 0)
+
+
+def _smooth(values: Array) -> Array:
+    """Average over `SMOOTHING` bins, fewer at the ends, passing over NaN."""
+    smooth = np.empty(values.shape)
+    _line_fit.running_means(frozen(values), SMOOTHING // 2, smooth)
+    return smooth
+
+
+def _bounds(range_: Array, first: Indices, past: Indices) -> tuple[Array, Array]:
+    empty = past == 0
+    return (
+        np.where(empty, np.nan, range_[first]),
+        np.where(empty, np.nan, range_[np.maximum(past - 1, 0)]),
+    )
+
+
+def _result(
+    lines: Array,
+    inverse: Indices,
+    bounds: tuple[Array, Array],
+    glued: Array,
+    leading: tuple[int, ...],
+    grid: inputs.RangeGrid,
+) -> GluedSignal:
+    freedom = np.maximum(np.nan_to_num(lines[:, _line_fit.POINTS]).astype(np.int64) - 2, 0)
+    slope, chi2 = lines[:, _line_fit.SLOPE], lines[:, _line_fit.CHI2]
+    slope_error = np.sqrt(lines[:, _line_fit.SLOPE_VARIANCE])
+    intercept_error = np.sqrt(
+        lines[:, _line_fit.CENTRE_VARIANCE] + (lines[:, _line_fit.CENTRE] * slope_error) ** 2
+    )
+    largest = np.maximum(_LARGEST_MISFIT * freedom, special.chdtri(freedom, _FALSE_ALARM))
+    with np.errstate(invalid="ignore"):
+        poor = (chi2 > largest) | ~(slope >= LEAST_SLOPE * slope_error)
+    empty = np.isnan(bounds[0])
+    whole = (*leading, grid.size)
+
+    def each(values: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
+        return values[inverse].reshape(leading)
+
+    power, variance, systematic = (grid.turn(values.reshape(whole)) for values in glued)
+    return GluedSignal(
+        power=power,
+        variance=variance,
+        systematic_variance=systematic,
+        slope=each(slope),
+        slope_standard_error=each(slope_error),
+        intercept=each(lines[:, _line_fit.INTERCEPT]),
+        intercept_standard_error=each(intercept_error),
+        chi2=each(chi2),
+        degrees_of_freedom=each(freedom),
+        start=each(bounds[0]),
+        stop=each(bounds[1]),
+        no_window=each(empty),
+        poor_fit=each(poor & ~empty),
+    )

@@ -1,0 +1,393 @@
+"""The signal chain over xarray: `lidarops.retrieve.signal.counts_to_signal` mapped along time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.flags import Quality
+from lidarops.records import DetectionMode
+from lidarops.retrieve.background import cubic_and_tail
+from lidarops.retrieve.signal import counts_to_signal
+from lidarops.retrieve.signal.counts_to_signal import Signal
+from lidarops.retrieve.signal.dark import DarkProfile
+from lidarops.retrieve.signal.dark import profile as dark_profile
+
+_Block = npt.NDArray[Any]
+
+_PARTS = ("power", "variance", "quality")
+_DTYPES: Final[list[np.dtype[Any]]] = [
+    np.dtype(np.float64),
+    np.dtype(np.float64),
+    np.dtype(np.int32),
+]
+_OF_SIGNAL: Final[list[np.dtype[Any]]] = [
+    np.dtype(np.float32),
+    np.dtype(np.float32),
+    np.dtype(np.int32),
+    np.dtype(np.float64),
+    np.dtype(np.float64),
+]
+_FEWEST: Final = 8
+"""Bins before the tail that tell whether the signal still falls."""
+_FALLS: Final = 4.0
+"""Standard errors by which it then exceeds the tail."""
+_AT_ONCE: Final = 64
+"""Profiles that are worked on together: their arrays stay in the cache."""
+
+
+def condition(
+    archive: xr.Dataset,
+    channel: str,
+    *,
+    dead_time: float | None = None,
+    noise_variance: float | None = None,
+    dark: Dark | None = None,
+    range_offset: float = 0.0,
+    full_overlap_range: float = 0.0,
+) -> xr.Dataset:
+    """Turn the raw counts of one channel into a signal with known noise.
+
+    Parameters
+    ----------
+    archive : xr.Dataset
+        As `lidarops.open_archive(..., mask_and_scale=False)` gives it; may be dask-backed.
+    channel : str
+        Name of the channel.
+    dead_time : float, optional
+        s; photon counting only.
+    noise_variance : float, optional
+        mV^2; analog only.
+    dark : Dark, optional
+        From `dark_of`; analog only.
+    range_offset : float
+        m, added to the range of every bin.
+    full_overlap_range : float
+        m; nearer bins are flagged.
+
+    Returns
+    -------
+    xr.Dataset
+        ``power`` (mV or MHz), ``variance`` and ``quality`` over (time, range), as lazy as the
+        input.
+    """
+    source = _Source(
+        archive,
+        channel,
+        dead_time=dead_time,
+        noise_variance=noise_variance,
+        dark=dark,
+        range_offset=range_offset,
+        full_overlap_range=full_overlap_range,
+    )
+    parts = source.mapped(_conditioned, ranged=3, plain=0, dtypes=_DTYPES)
+    # With the coordinates that they share, which need not be compared.
+    variables = {name: part.variable for name, part in zip(_PARTS, parts, strict=True)}
+    result = xr.Dataset(variables, coords=parts[0].coords)
+    result["power"].attrs = {"units": source.unit}
+    result["variance"].attrs = {"units": f"{source.unit}2"}
+    result["range"].attrs = source.inputs[0]["range"].attrs
+    return result
+
+
+def signals(
+    archive: xr.Dataset,
+    channel: str,
+    *,
+    background_range: tuple[float, float],
+    dead_time: float | None = None,
+    noise_variance: float | None = None,
+    dark: Dark | None = None,
+    range_offset: float = 0.0,
+    full_overlap_range: float = 0.0,
+) -> xr.Dataset:
+    """Turn the raw counts of one channel into range-corrected signals without background.
+
+    The same as `condition` and then `corrected`, to the last bit, in one pass over the counts.
+
+    Parameters
+    ----------
+    background_range : (float, float)
+        m; as of `corrected`.
+    archive, channel, dead_time, noise_variance, dark, range_offset, full_overlap_range
+        As of `condition`.
+
+    Returns
+    -------
+    xr.Dataset
+        As of `corrected`.
+    """
+    source = _Source(
+        archive,
+        channel,
+        dead_time=dead_time,
+        noise_variance=noise_variance,
+        dark=dark,
+        range_offset=range_offset,
+        full_overlap_range=full_overlap_range,
+    )
+    parts = source.mapped(
+        _signals, ranged=3, plain=2, dtypes=_OF_SIGNAL, background_range=background_range
+    )
+    return _named(parts)
+
+
+def corrected(conditioned: xr.Dataset, background_range: tuple[float, float]) -> xr.Dataset:
+    """Subtract the mean of far bins as background and correct for range.
+
+    Parameters
+    ----------
+    conditioned : xr.Dataset
+        From `condition`.
+    background_range : (float, float)
+        m; the bins whose mean is the background.
+
+    Returns
+    -------
+    xr.Dataset
+        ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
+        over (time, range), ``background`` and ``background_standard_error`` over time.
+        INPUT_MISSING where there is no background, BACKGROUND_UNCERTAIN where the bins before
+        those are brighter by 4 standard errors: signal is left in them.
+    """
+    parts = xr.apply_ufunc(
+        _corrected,
+        *(conditioned[name] for name in _PARTS),
+        input_core_dims=[["range"]] * 3,
+        output_core_dims=[["range"]] * 3 + [[]] * 2,
+        kwargs={
+            "range": conditioned["range"].to_numpy().astype(np.float64),
+            "background_range": background_range,
+        },
+        dask="parallelized",
+        output_dtypes=_OF_SIGNAL,
+    )
+    return _named(parts)
+
+
+def unit_of(archive: xr.Dataset, channel: str) -> str:
+    """Return the unit of the power of a channel: MHz of photon counting, mV of analog ones."""
+    return "MHz" if archive[channel].attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
+
+
+def _named(parts: Sequence[xr.DataArray]) -> xr.Dataset:
+    names = ("signal", "signal_standard_error", "quality_flag")
+    along_time = ("background", "background_standard_error")
+    return xr.Dataset(dict(zip((*names, *along_time), parts, strict=True)))
+
+
+class _Source:
+    """The counts of one channel, and what turns them into a signal."""
+
+    def __init__(
+        self,
+        archive: xr.Dataset,
+        channel: str,
+        *,
+        dead_time: float | None,
+        noise_variance: float | None,
+        dark: Dark | None,
+        range_offset: float,
+        full_overlap_range: float,
+    ) -> None:
+        counts = archive[channel]
+        grid = str(counts.dims[-1])
+        if grid != "range":
+            counts = counts.rename({grid: "range"})
+        if range_offset:
+            counts = counts.assign_coords(
+                range=counts["range"].copy(data=counts["range"].to_numpy() + range_offset)
+            )
+        self.settings: dict[str, Any] = {
+            "range": counts["range"].to_numpy().astype(np.float64),
+            "full_overlap_range": full_overlap_range,
+        }
+        self.inputs = [counts, archive[f"{channel}_shots"]]
+        self.unit = unit_of(archive, channel)
+        self.photon = self.unit == "MHz"
+        if self.photon:
+            self.settings |= {"bin_width": counts.attrs["bin_width"], "dead_time": dead_time}
+            return
+        self.inputs.append(archive[f"{channel}_input_range"])
+        self.settings |= {"adc_bits": counts.attrs["adc_bits"], "noise_variance": noise_variance}
+        if dark is not None:
+            self.inputs.append(archive["time"].astype(np.int64).drop_vars(archive["time"].coords))
+            self.settings["dark"] = dark
+
+    def mapped(
+        self,
+        function: Callable[..., tuple[_Block, ...]],
+        *,
+        ranged: int,
+        plain: int,
+        dtypes: Sequence[np.dtype[Any]],
+        **settings: Any,
+    ) -> tuple[xr.DataArray, ...]:
+        """Map a function that gives so many arrays over range, and so many over time alone."""
+        outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
+            function,
+            *self.inputs,
+            input_core_dims=[["range"]] + [[]] * (len(self.inputs) - 1),
+            output_core_dims=[["range"]] * ranged + [[]] * plain,
+            kwargs={"photon": self.photon, **self.settings, **settings},
+            dask="parallelized",
+            output_dtypes=list(dtypes),
+        )
+        return outputs
+
+
+@dataclass(frozen=True, slots=True)
+class Dark:
+    """The dark signals of one analog channel, and how they serve a profile."""
+
+    signals: npt.NDArray[np.float64]
+    """(dark, range), mV."""
+    times: npt.NDArray[np.datetime64]
+    """(dark,)"""
+    method: str
+
+    def at(self, times: npt.NDArray[np.datetime64]) -> DarkProfile:
+        """Return dark signal and variance at times; see `lidarops.retrieve.signal.dark.profile`."""
+        return dark_profile(self.signals, self.times, times, method=self.method)
+
+    def variance(self, times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.float64]:
+        """Return the variance of the dark signal at times, (time, range), mV2."""
+        return self.at(times).variance
+
+
+def dark_of(archive: xr.Dataset, channel: str, *, method: str) -> Dark:
+    """Read the dark files of one analog channel.
+
+    Parameters
+    ----------
+    archive : xr.Dataset
+        The dark files, as `lidarops.open_archive(..., mask_and_scale=False)` gives them.
+    channel : str
+        Name of the channel.
+    method : {"nearest", "interpolated"}
+        See `lidarops.retrieve.signal.dark.profile`.
+
+    Returns
+    -------
+    Dark
+        In memory.
+    """
+    power = condition(archive, channel, noise_variance=0.0)["power"]
+    return Dark(power.to_numpy(), archive["time"].to_numpy(), method)
+
+
+def _conditioned(*inputs: _Block, photon: bool, **settings: Any) -> tuple[_Block, _Block, _Block]:
+    return (_photon if photon else _analog)(*inputs, **settings)
+
+
+def _analog(
+    counts: _Block,
+    shots: _Block,
+    input_range: _Block,
+    times: _Block | None = None,
+    *,
+    dark: Dark | None = None,
+    **settings: Any,
+) -> tuple[_Block, _Block, _Block]:
+    if dark is None or times is None:
+        return _tuple(counts_to_signal.analog(counts, shots, input_range=input_range, **settings))
+    found = dark.at(times.astype("datetime64[ns]"))
+    return _tuple(
+        counts_to_signal.analog(
+            counts,
+            shots,
+            input_range=input_range,
+            dark=found.dark,
+            dark_variance=found.variance,
+            **settings,
+        )
+    )
+
+
+def _photon(counts: _Block, shots: _Block, **settings: Any) -> tuple[_Block, _Block, _Block]:
+    return _tuple(counts_to_signal.photon(counts, shots, **settings))
+
+
+def _tuple(result: Signal) -> tuple[_Block, _Block, _Block]:
+    return result.power, result.variance, result.quality
+
+
+def _corrected(
+    power: _Block,
+    variance: _Block,
+    quality: _Block,
+    *,
+    range: _Block,  # noqa: A002
+    background_range: tuple[float, float],
+) -> tuple[_Block, ...]:
+    start, stop = background_range
+    far = slice(*np.searchsorted(range, (start, np.nextafter(stop, np.inf))))
+    tail = cubic_and_tail.tail_mean(
+        power[..., far], range[far], start=start, variance=variance[..., far]
+    )
+    result = counts_to_signal.range_corrected(
+        Signal(power, variance, np.empty(0, np.int32)),
+        range,
+        background=tail.background,
+        background_variance=tail.background_standard_error**2,
+        dtype=np.float32,
+    )
+    lost = np.where(np.isnan(tail.background), np.int32(Quality.INPUT_MISSING), np.int32(0))
+    falling = _still_falls(power, variance, range, background_range, tail)
+    lost |= np.where(falling, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
+    # The noise is far above the 24 bits of float32, and a day of profiles fits in memory.
+    return (
+        result.power,
+        np.sqrt(result.variance, out=result.variance),
+        quality | lost[..., np.newaxis],
+        tail.background,
+        tail.background_standard_error,
+    )
+
+
+def _still_falls(
+    power: _Block,
+    variance: _Block,
+    range: _Block,  # noqa: A002
+    background_range: tuple[float, float],
+    tail: cubic_and_tail.BackgroundResult,
+) -> _Block:
+    """Return which profiles are brighter in the bins before the tail, as far as it is long."""
+    start, stop = background_range
+    first, past = np.searchsorted(range, (2.0 * start - stop, start))
+    if past - first < _FEWEST:
+        return np.zeros(power.shape[:-1], dtype=bool)
+    near = slice(first, past)
+    before = cubic_and_tail.tail_mean(
+        power[..., near], range[near], start=float(range[first]), variance=variance[..., near]
+    )
+    error = np.hypot(before.background_standard_error, tail.background_standard_error)
+    with np.errstate(invalid="ignore"):
+        falls: _Block = before.background - tail.background > _FALLS * error
+    return falls
+
+
+def _signals(
+    counts: _Block,
+    *others: _Block,
+    range: _Block,  # noqa: A002
+    background_range: tuple[float, float],
+    **settings: Any,
+) -> tuple[_Block, ...]:
+    parts = [
+        _corrected(
+            *_conditioned(
+                counts[some], *(array[some] for array in others), range=range, **settings
+            ),
+            range=range,
+            background_range=background_range,
+        )
+        for first in np.arange(0, max(len(counts), 1), _AT_ONCE)
+        for some in [slice(first, first + _AT_ONCE)]
+    ]
+    return tuple(np.concatenate(pieces) for pieces in zip(*parts, strict=True))

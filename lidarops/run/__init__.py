@@ -1,0 +1,1 @@
+"""An archive brought up to date: what is stale, runs, clusters, reproduction, publication."""

@@ -1,0 +1,273 @@
+"""One run in the ledger: every scene is entered as it ends."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from lidarops import __version__
+from lidarops.campaign.model import Campaign
+from lidarops.catalog import versions
+from lidarops.catalog.ledger import Entry, NewProduct, Run, RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+from lidarops.netcdf.provenance import code_version
+from lidarops.plan import cost_estimate
+from lidarops.plan.product_dependence import Wanted
+from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
+from lidarops.run.staleness import Judge, Judgement
+
+MOST_INPUTS: Final = 100_000
+"""Granules whose names the record of a run keeps; the ledger keeps all."""
+MOST_BARREN: Final = 1000
+"""Scenes without any product that the record of a run names; it counts the others."""
+
+_LOG = logging.getLogger(__name__)
+
+
+class Session:
+    """A run that is entered in the ledger as it goes.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    store : Store
+    lock : Lock
+        Held by whoever begins the session.
+    judge : Judge
+    """
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        store: Store,
+        lock: Lock,
+        judge: Judge,
+        *,
+        started: datetime | None = None,
+    ) -> None:
+        self._campaign = campaign
+        self._store = store
+        self._lock = lock
+        self._judge = judge
+        self._output = Path(campaign.output)
+        self._kept: dict[str, str] = {}
+        self._outcomes: list[SceneOutcome] = []
+        self._left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
+        self._named = 0
+        self.settled: set[str] = set()
+        """Scenes of which another look would find every product fresh."""
+        self._tally = cost_estimate.Tally(cost_estimate.load())
+        self.started = started or datetime.now(UTC)
+        self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+
+    def begin(self) -> None:
+        """Enter the run, and clear away what a killed one left."""
+        for path in versions.sweep(self._output):
+            _LOG.warning("removed %s, which a killed run left", path)
+        run = Run(
+            id=self.id,
+            started=self.started,
+            finished=None,
+            status=RunStatus.RUNNING,
+            holder=Lock.holder_name(),
+            version=__version__,
+            code_version=code_version(),
+        )
+        self._store.begin_run(run, self._lock.token)
+
+    def take(self, judged: Judgement, *, note: bool) -> None:
+        """Prepare for a scene that is about to start.
+
+        Parameters
+        ----------
+        judged : Judgement
+        note : bool
+            Whether the scene may take this very process down, which the ledger then remembers.
+        """
+        for stale in judged.stale:
+            reason = stale.reason
+            _LOG.info("%s %s of %s: %s", stale.kind.value, stale.channel, judged.scene.id, reason)
+            if stale.before is not None and self._campaign.superseded == "keep":
+                path, sha256 = stale.before.path, stale.before.sha256
+                self._kept[path] = versions.keep(self._output, path, sha256)
+        if note:
+            self._store.begin_scene(judged.scene.id, judged.day, self.id, self._lock.token)
+
+    def end(self, judged: Judgement, outcome: SceneOutcome, *, final: bool) -> SceneOutcome:
+        """Enter what became of a scene.
+
+        Returns
+        -------
+        SceneOutcome
+            As it was entered: failed where its files are not there any more.
+        """
+        new, outcome = self._new_products(judged, outcome)
+        entry = Entry(
+            outcome=outcome,
+            day=judged.day,
+            key=self._judge.key(judged),
+            final=final,
+            products=tuple(new),
+            digests=_unknown_digests(judged.scene, outcome),
+        )
+        self._store.record(entry, self.id, self._lock.token)
+        self._settle(judged, outcome, new)
+        # Once it is entered, as an estimate is no reason to lose a scene.
+        outcome = replace(
+            outcome,
+            estimated_seconds=self._estimated(judged),
+            left_out=self._beyond(judged, outcome),
+        )
+        self._settle_versions(judged, outcome)
+        self._tell(outcome)
+        self._named += outcome.granules
+        # The page shows a few scenes; the names of a million files would only fill memory.
+        self._outcomes.append(
+            outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
+        )
+        return outcome
+
+    def _settle(self, judged: Judgement, outcome: SceneOutcome, new: Sequence[NewProduct]) -> None:
+        # What was refused is no part of the scene any more.
+        if outcome.error or outcome.refused:
+            return
+        made = {(each.record.kind, each.record.channel): each.depends_on for each in new}
+        if self._judge.settles(judged, outcome.inputs, made):
+            self.settled.add(judged.scene.id)
+
+    def add(self, outcome: SceneOutcome) -> None:
+        """Add to the record of the run what was not tried."""
+        self._outcomes.append(outcome)
+
+    def finish(
+        self,
+        status: RunStatus,
+        set_aside: Sequence[Granule],
+        *,
+        barren: Mapping[str, str] | None = None,
+        unmet: tuple[Unmet, ...] = (),
+    ) -> RunRecord:
+        """Close the run in the ledger and return its record.
+
+        Parameters
+        ----------
+        status : RunStatus
+        set_aside : sequence of Granule
+            Good ones that stand in no scene.
+        barren : mapping of str to str, optional
+            Scene -> why it can give no product.
+        unmet : tuple of Unmet
+        """
+        refused = (*self._store.refused(), *set_aside)
+        self._store.end_run(self.id, status, refused=len(refused), token=self._lock.token)
+        _LOG.info("run %s %s: %d scenes", self.id, status.value, len(self._outcomes))
+        return RunRecord(
+            id=self.id,
+            campaign=self._campaign.name,
+            title=self._campaign.title,
+            started=self.started,
+            finished=datetime.now(UTC),
+            version=__version__,
+            archive=self._campaign.archive,
+            products=str(self._campaign.products_root),
+            scenes=tuple(sorted(self._outcomes, key=lambda outcome: outcome.scene)),
+            refused=refused,
+            truth=_truth(self._campaign),
+            costs=self._tally.costs.words,
+            unmet=unmet,
+            barren=dict(islice((barren or {}).items(), MOST_BARREN)),
+            more_barren=max(len(barren or {}) - MOST_BARREN, 0),
+        )
+
+    def _estimated(self, judged: Judgement) -> float:
+        """Return the CPU time that a scene was to take, s, with what it is the first to load."""
+        before = self._tally.loading
+        whole = self._campaign.all_steps
+        own = self._tally.add(judged.scene, judged.needed(), whole=whole)
+        return own + self._tally.loading - before
+
+    def _beyond(self, judged: Judgement, outcome: SceneOutcome) -> tuple[LeftOut, ...]:
+        """Return what was left out of what is asked for, and is in no plan of a product."""
+        told = set(() if outcome.plan is None else outcome.plan.left_out)
+        found = tuple(left for left in judged.asked.left_out if left not in told)
+        # Equal in nearly all scenes of an instrument, of which a run may have 100,000.
+        return self._left_out.setdefault(found, found)
+
+    def _new_products(
+        self, judged: Judgement, outcome: SceneOutcome
+    ) -> tuple[list[NewProduct], SceneOutcome]:
+        new = []
+        for record in outcome.products:
+            mtime_ns = self._written(record)
+            if mtime_ns is None:
+                error = f"{record.path}: vanished or changed after it was written"
+                return [], replace(outcome, products=(), error=error)
+            product: Wanted = (record.kind, record.channel)
+            depends_on, used = self._judge.depends_on(
+                judged.scene, judged.plan, product, outcome.inputs
+            )
+            new.append(
+                NewProduct(record, mtime_ns, depends_on, used, self._kept.get(record.path, ""))
+            )
+        return new, outcome
+
+    def _written(self, record: ProductRecord) -> int | None:
+        try:
+            about = (self._campaign.products_root / record.path).stat()
+        except OSError:
+            return None
+        return about.st_mtime_ns if about.st_size == record.size else None
+
+    def _settle_versions(self, judged: Judgement, outcome: SceneOutcome) -> None:
+        """Drop the kept versions that nothing has replaced."""
+        now = {record.path: record.sha256 for record in outcome.products}
+        for stale in judged.stale:
+            if stale.before is not None:
+                path = stale.before.path
+                kept = self._kept.pop(path, "")
+                if now.get(path, stale.before.sha256) == stale.before.sha256:
+                    versions.drop(self._output, kept)
+
+    def _tell(self, outcome: SceneOutcome) -> None:
+        about = {
+            "scene": outcome.scene,
+            "granules": outcome.granules,
+            "products": [record.path for record in outcome.products],
+            "seconds": dict(outcome.seconds),
+        }
+        if outcome.error:
+            _LOG.error("scene %s failed: %s", outcome.scene, outcome.error, extra=about)
+        else:
+            _LOG.info(
+                "scene %s: %d granules, %d products",
+                outcome.scene,
+                outcome.granules,
+                len(outcome.products),
+                extra=about,
+            )
+        for granule in outcome.refused:
+            facts = {"scene": outcome.scene, "granule": granule.path}
+            _LOG.warning("refused %s: %s", granule.path, granule.reason, extra=facts)
+
+
+def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:
+    """Return the digests of the files of a scene that the catalog holds otherwise, or not."""
+    known = {granule.path: granule.sha256 for granule in (*scene.granules, *scene.dark)}
+    return {
+        used.path: used.sha256
+        for used in outcome.inputs
+        if used.path in known and used.sha256 != known[used.path]
+    }
+
+
+def _truth(campaign: Campaign) -> str:
+    if campaign.simulation is None or not campaign.truth_path.exists():
+        return ""
+    return str(campaign.truth_path)

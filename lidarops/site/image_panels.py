@@ -1,0 +1,198 @@
+"""Quantities against time and range, as images of block means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.figures.raster import Raster
+from lidarops.figures.time_axis import TimeAxis, time_axis
+from lidarops.site import svg
+from lidarops.site.series_panels import Line, limits, time_scale, time_ticks, values
+from lidarops.site.svg import BAR, BLANK, COLOURS, LEFT, REJECTED, WIDTH, Panel, Scale, Sheet
+
+Floats = NDArray[np.float64]
+
+COLUMNS: Final = 780
+"""Most columns of block means: what the eye tells apart across a figure."""
+ROWS: Final = 200
+_STRIPE: Final = 5
+"""Pixels of a stripe of rejection."""
+_DECADES: Final = 4.0
+"""Most decades of a colour scale."""
+_BEYOND: Final = 1.2
+"""Times the reach of the signal, to which it is shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Block means with where they lie."""
+
+    left: Floats
+    """(column,) Position along the axis of time."""
+    right: Floats
+    edges: Floats
+    """(row + 1,) m."""
+    mean: Floats
+    """(column, row) NaN where nothing can be used."""
+    flagged: NDArray[np.bool_]
+    """(column, row) Whether at least half of a block is rejected."""
+
+
+def grid(raster: Raster, axis: TimeAxis) -> Grid:
+    """Cut a raster where its signal drowns, and merge its rows to what a page shows."""
+    full, reach = float(raster.edges[-1]), raster.reach
+    cut = raster.shown_to(min(full, _BEYOND * reach) if reach > 0 else full)
+    rows = cut.gates.size
+    starts = np.arange(0, rows, -(-rows // ROWS))
+
+    def merged(sums: Floats | NDArray[np.float32]) -> Floats:
+        return np.add.reduceat(np.asarray(sums, dtype=np.float64), starts, axis=-1)
+
+    used, rejected = merged(cut.used), merged(cut.rejected)
+    blocks = cut.profiles[:, None] * merged(cut.gates)[None, :]
+    return Grid(
+        left=axis.x(cut.start),
+        right=axis.x(cut.stop),
+        edges=np.append(cut.edges[starts], cut.edges[-1]),
+        mean=np.where(used > 0, merged(cut.total) / np.maximum(used, 1.0), np.nan),
+        flagged=(rejected > 0) & (2 * rejected >= blocks),
+    )
+
+
+def colour_range(found: Grid) -> tuple[float, float] | None:
+    """Return the ends of a logarithmic colour scale; None where no value is above zero."""
+    shown = found.mean[~found.flagged]
+    positive = shown[np.isfinite(shown) & (shown > 0)]
+    if positive.size == 0:
+        return None
+    low, high = (float(level) for level in np.percentile(positive, [2.0, 99.8]))
+    low = max(low, high * 10.0**-_DECADES)
+    return low, max(high, 1.05 * low)
+
+
+def pixels(found: Grid, axis: TimeAxis, width: int, height: int) -> NDArray[np.uint8]:
+    """Return the image of a grid, shape (height, width), top row farthest."""
+    first, last = axis.limits
+    x = first + (np.arange(width) + 0.5) / width * (last - first)
+    column = np.clip(np.searchsorted(found.left, x, side="right") - 1, 0, found.left.size - 1)
+    within = (x >= found.left[column]) & (x <= found.right[column])
+    near, far = found.edges[0], found.edges[-1]
+    along = far - (np.arange(height) + 0.5) / height * (far - near)
+    row = np.clip(np.searchsorted(found.edges, along, side="right") - 1, 0, found.edges.size - 2)
+    where = np.ix_(column, row)
+    image = np.where(found.flagged, REJECTED, _colours(found))[where].T
+    stripes = (np.arange(height)[:, None] + np.arange(width)[None, :]) // _STRIPE % 2
+    image = np.where(image == REJECTED, REJECTED + stripes, image)
+    return np.where(within[None, :], image, BLANK).astype(np.uint8)
+
+
+def _colours(found: Grid) -> NDArray[np.int64]:
+    ends = colour_range(found)
+    if ends is None:
+        return np.full(found.mean.shape, BLANK)
+    low, high = ends
+    # A logarithm has no place for a mean at or below zero: it takes the lowest colour.
+    level = np.clip(np.nan_to_num(found.mean, nan=low), low, high)
+    share = np.log(level / low) / np.log(high / low)
+    steps = 3 + np.rint(share * (COLOURS - 1)).astype(np.int64)
+    return np.where(np.isfinite(found.mean), steps, BLANK)
+
+
+def draw(raster: Raster, *, along: str, label: str, key: str) -> tuple[Sheet, str]:
+    """Draw a raster, with the background beneath where it has one.
+
+    Parameters
+    ----------
+    raster : Raster
+    along : str
+        ``range`` or ``altitude``.
+    label : str
+        Of the colour bar.
+    key : str
+        Unique on the page.
+
+    Returns
+    -------
+    Sheet
+    str
+        What is seen, in words.
+    """
+    axis = time_axis(raster.start + (raster.stop - raster.start) / 2)
+    known = bool(np.isfinite(raster.background).any())
+    found = grid(raster, axis)
+    sheet = Sheet(height=520 if known else 390)
+    right = WIDTH - BAR
+    near, far = float(found.edges[0]) / 1e3, float(found.edges[-1]) / 1e3
+    upper = Panel(time_scale(axis, right), Scale(near, far, 330, 24))
+    sheet.parts.append(f'<rect class="gap" x="{LEFT}" y="24" width="{right - LEFT}" height="306"/>')
+    lower = _background(raster, axis, right) if known else None
+    panels = [upper, lower[0]] if lower else [upper]
+    time_ticks(sheet, axis, panels)
+    sheet.frame(upper, f"{along} (km)")
+    sheet.image(upper, svg.png(pixels(found, axis, right - LEFT, 306)))
+    _clouds(sheet, upper, axis, raster)
+    if lower:
+        sheet.frame(lower[0], f"background ({svg.units(raster.background_units)})", at_most=4)
+        values(sheet, lower[0], axis, [lower[1]], f"{key}-b")
+    ends = colour_range(found)
+    if ends is None:
+        sheet.text((LEFT + right) / 2, 180, "no usable value above zero", css="t m s")
+    else:
+        _bar(sheet, ends, label, right)
+    return sheet, _in_words(raster, found, ends, along)
+
+
+def _background(raster: Raster, axis: TimeAxis, right: float) -> tuple[Panel, Line]:
+    middle = raster.start + (raster.stop - raster.start) / 2
+    none = np.array([])
+    line = Line("", middle, raster.background, raster.background_error, middle[:0], none)
+    return Panel(time_scale(axis, right), Scale(*limits([line]), 470, 356)), line
+
+
+def _clouds(sheet: Sheet, panel: Panel, axis: TimeAxis, raster: Raster) -> None:
+    middle = raster.start + (raster.stop - raster.start) / 2
+    x, y = panel.x(axis.x(middle)), panel.y(raster.clouds / 1e3)
+    low, high = panel.y.ends
+    shown = (raster.clouds / 1e3 >= low) & (raster.clouds / 1e3 <= high)
+    sheet.path(
+        svg.marks(x[shown], y[shown], lambda a, b: f"M{a - 5:.1f} {b - 8:.1f}h10l-5 8z"), "cloud"
+    )
+
+
+def _bar(sheet: Sheet, ends: tuple[float, float], label: str, right: float) -> None:
+    left = right + 14
+    ramp = np.repeat(np.arange(COLOURS + 2, 2, -1, dtype=np.uint8)[:, None], 4, axis=1)
+    panel = Panel(Scale(0, 1, left, left + 14), Scale(*ends, 330, 24, log=True))
+    sheet.image(panel, svg.png(ramp))
+    for value in panel.y.ticks():
+        y = float(panel.y(value))
+        sheet.path(f"M{left + 14:.1f} {y:.1f}h4", "axis")
+        sheet.text(left + 21, y + 4, svg.number(float(f"{value:.2g}")), css="t")
+    sheet.text(WIDTH - 6, 177, label, css="t m s", turned=True)
+
+
+def _in_words(raster: Raster, found: Grid, ends: tuple[float, float] | None, along: str) -> str:
+    far = float(found.edges[-1]) / 1e3
+    words = [f"Shown to {far:.3g} km {along}"]
+    if raster.reach > 0:
+        words.append(f"it stands out from its noise up to {raster.reach / 1e3:.3g} km")
+    if ends:
+        words.append(f"colours from {svg.number(ends[0])} to {svg.number(ends[1])}")
+    words.append(f"{np.mean(found.flagged):.0%} of the image rejected by a quality bit (striped)")
+    cloudy = int(np.isfinite(raster.clouds).sum())
+    if cloudy:
+        words.append(f"a cloud base in {cloudy} of {raster.clouds.size} columns (triangles)")
+    return "; ".join(words)
+
+
+def thumbnail(raster: Raster, width: float, height: float) -> Sheet:
+    """Return the image of a raster alone."""
+    axis = time_axis(raster.start + (raster.stop - raster.start) / 2)
+    sheet = Sheet(height=height, width=width, stretched=True)
+    panel = Panel(Scale(0, 1, 0, width), Scale(0, 1, height, 0))
+    sheet.image(panel, svg.png(pixels(grid(raster, axis), axis, int(width), int(height))))
+    return sheet

@@ -1,0 +1,106 @@
+"""A map of the beams of several lidars and of the points in which they meet."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.figures.network_data import NetworkMap
+from lidarops.figures.wording import counted
+from lidarops.site import svg
+from lidarops.site.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
+
+Floats = NDArray[np.float64]
+
+_TOP: Final = 28
+_FOOT: Final = 492
+_ROOM: Final = 0.08
+"""Of the extent, on each side."""
+_LEAST: Final = 0.05
+"""km that an axis spans at least."""
+_RING: Final = "M-5 0a5 5 0 1 0 10 0a5 5 0 1 0-10 0"
+_TRIANGLE: Final = "M-5 4h10l-5-9z"
+
+
+def draw(network: NetworkMap) -> tuple[Sheet, str]:
+    """Draw beams and vertices to one scale, with the median visibility at each vertex.
+
+    Parameters
+    ----------
+    network : NetworkMap
+        From `lidarops.figures.network_data.read_map`.
+
+    Returns
+    -------
+    Sheet
+    str
+        What it shows, in words.
+    """
+    sheet = Sheet(height=_FOOT + 50)
+    panel = _panel(np.concatenate([network.stations, network.ends, network.vertices]))
+    sheet.frame(panel, network.axes[1], below=network.axes[0])
+    for start, end in zip(
+        _placed(panel, network.stations), _placed(panel, network.ends), strict=True
+    ):
+        sheet.path(f"M{start[0]:.1f} {start[1]:.1f}L{end[0]:.1f} {end[1]:.1f}", "line d2 c1")
+    for station in _placed(panel, network.stations):
+        _mark(sheet, station, _TRIANGLE, "mark c1")
+    vertices = _placed(panel, network.vertices)
+    for place, number, seen in zip(vertices, network.numbers, network.visibility, strict=True):
+        known = bool(np.isfinite(seen))
+        _mark(sheet, place, _RING, "mark c0" if known else "off")
+        sheet.text(place[0] + 9, place[1] - 7, f"{number}: {_km(seen)}" if known else f"{number}")
+    svg.legend(
+        sheet,
+        LEFT + 14,
+        14,
+        [
+            (_TRIANGLE, "mark c1", "lidar"),
+            ("M-9 0H9", "line d2 c1", "beam"),
+            (_RING, "mark c0", "vertex, with its median visibility"),
+            (_RING, "off", "vertex without a value to use"),
+        ],
+    )
+    return sheet, _words(network)
+
+
+def _panel(points: Floats) -> Panel:
+    """Return a panel of equal scales on both axes, with all points in it."""
+    across, up = WIDTH - RIGHT - LEFT, _FOOT - _TOP
+    low, high = points.min(axis=0), points.max(axis=0)
+    span = np.maximum(high - low, _LEAST) * (1.0 + 2.0 * _ROOM)
+    length = max(span[0] / across, span[1] / up)
+    middle = (low + high) / 2.0
+    half = 0.5 * length * np.array([across, up])
+    (left, bottom), (right, top) = middle - half, middle + half
+    return Panel(
+        Scale(float(left), float(right), LEFT, WIDTH - RIGHT),
+        Scale(float(bottom), float(top), _FOOT, _TOP),
+    )
+
+
+def _placed(panel: Panel, points: Floats) -> list[tuple[float, float]]:
+    return list(zip(panel.x(points[:, 0]).tolist(), panel.y(points[:, 1]).tolist(), strict=True))
+
+
+def _mark(sheet: Sheet, place: tuple[float, float], data: str, css: str) -> None:
+    sheet.parts.append(
+        f'<path class="{css}" transform="translate({place[0]:.1f} {place[1]:.1f})" d="{data}"/>'
+    )
+
+
+def _km(visibility: float) -> str:
+    return f"{svg.number(float(f'{visibility:.3g}'))} km"
+
+
+def _words(network: NetworkMap) -> str:
+    seen = zip(network.numbers, network.visibility, network.used, strict=True)
+    known = [
+        f"{_km(visibility)} at vertex {number} ({used} of {counted(network.values, 'value')})"
+        for number, visibility, used in seen
+        if np.isfinite(visibility)
+    ]
+    beams = counted(len(network.stations), "beam")
+    return f"{beams}; median visibility {', '.join(known) or 'nowhere, as no value can be used'}"

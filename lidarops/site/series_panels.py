@@ -1,0 +1,182 @@
+"""Values against time: one panel a quantity, one mark and line a series."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarops.figures.series_data import Section, thin
+from lidarops.figures.time_axis import TimeAxis, Times, segments
+from lidarops.figures.wording import counted
+from lidarops.site import svg
+from lidarops.site.svg import LEFT, RIGHT, WIDTH, Panel, Scale, Sheet
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POINTS: Final = 600
+"""More values than these are drawn as block means."""
+_BARS: Final = 160
+"""Up to so many values get an error bar, more get a band."""
+_CROSSES: Final = 300
+SERIES: Final = 4
+"""Most series that marks tell apart."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One series to draw."""
+
+    label: str
+    time: Times
+    value: Floats
+    """Values that no bit speaks against."""
+    error: Floats
+    """Their standard errors; NaN where unknown."""
+    off_time: Times
+    off_value: Floats
+    """Values that a quality bit speaks against; NaN where there is no value."""
+
+
+def line_of(section: Section, quantity: str, factor: float) -> Line:
+    """Return a quantity of a section of a homogeneous product, in units times `factor`."""
+    few = thin(section, POINTS)
+    estimate = few.estimates[quantity]
+    off = section.flag != 0
+    return Line(
+        label=section.label,
+        time=few.time,
+        value=factor * estimate.value,
+        error=factor * estimate.standard_error,
+        off_time=section.time[off],
+        off_value=factor * section.estimates[quantity].value[off],
+    )
+
+
+def limits(lines: Sequence[Line]) -> tuple[float, float]:
+    """Return where a panel begins and ends: all but the outermost hundredths, with room."""
+    good = _finite([line.value for line in lines])
+    values = good if good.size else _finite([line.off_value for line in lines])
+    if values.size == 0:
+        return 0.0, 1.0
+    low, high = (float(level) for level in np.percentile(values, [1.0, 99.0]))
+    errors = _finite([line.error for line in lines])
+    room = 0.15 * (high - low) + (float(np.median(errors)) if errors.size else 0.0)
+    room = room or 0.1 * abs(high) or 1.0
+    return low - room, high + room
+
+
+def _finite(parts: Sequence[Floats]) -> Floats:
+    whole: Floats = np.concatenate([*parts, np.array([])])
+    return np.asarray(whole[np.isfinite(whole)])
+
+
+def time_scale(axis: TimeAxis, right: float = WIDTH - RIGHT) -> Scale:
+    """Return the scale of a time axis across a figure."""
+    first, last = axis.limits
+    return Scale(first, last, LEFT, right)
+
+
+def time_ticks(sheet: Sheet, axis: TimeAxis, panels: Sequence[Panel]) -> None:
+    """Draw ticks of UTC through panels, labels below the last, and marks where time is cut."""
+    scale = panels[-1].x
+    _, top, _, height = panels[-1].box
+    for tick in axis.ticks(8):
+        x = float(scale(tick.x))
+        for panel in panels:
+            _, above, _, tall = panel.box
+            sheet.path(f"M{x:.1f} {above:.1f}v{tall:.1f}", "grid")
+        sheet.path(f"M{x:.1f} {top + height:.1f}v4", "axis")
+        for row, words in enumerate(tick.label.split("\n")):
+            sheet.text(x, top + height + 19 + 16 * row, words, css="t m")
+    for x in scale(axis.breaks).tolist() if axis.broken else ():
+        sheet.path(f"M{x - 5:.1f} {top + height + 5:.1f}l4-10m2 10l4-10", "axis")
+    sheet.text(panels[0].box[0], 14, "time in UTC", css="t s")
+
+
+def values(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line], key: str) -> int:
+    """Draw series into a panel; return how many values lie beyond its ends."""
+    sheet.clipped(panel, lambda: _draw(sheet, panel, axis, lines), key)
+    low, high = panel.y.ends
+    found = _finite([line.value for line in lines])
+    return int(np.count_nonzero((found < low) | (found > high)))
+
+
+def _draw(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line]) -> None:
+    for line in lines:
+        _rejected(sheet, panel, axis, line)
+    for index, line in enumerate(lines):
+        x, y = panel.x(axis.x(line.time)), panel.y(line.value)
+        low, high = panel.y(line.value - line.error), panel.y(line.value + line.error)
+        parts = segments(line.time)
+        if line.time.size > _BARS:
+            for part in parts:
+                sheet.path(svg.band(x[part], low[part], high[part]), f"band c{index}")
+        else:
+            bars = "".join(
+                f"M{a:.1f} {b:.1f}V{c:.1f}"
+                for a, b, c in zip(x.tolist(), low.tolist(), high.tolist(), strict=True)
+                if np.isfinite(a + b + c)
+            )
+            sheet.path(bars, f"err c{index}")
+        sheet.path("".join(svg.line(x[part], y[part]) for part in parts), f"line c{index}")
+        if line.time.size <= _BARS:
+            sheet.path(svg.marks(x, y, svg.MARKS[index]), f"mark c{index}")
+
+
+def _rejected(sheet: Sheet, panel: Panel, axis: TimeAxis, line: Line) -> None:
+    some = slice(None, None, max(1, -(-line.off_time.size // _CROSSES)))
+    x, y = panel.x(axis.x(line.off_time[some])), panel.y(line.off_value[some])
+    sheet.path(svg.marks(x, y, svg.cross), "off")
+    # What has no value at all still happened: a short line at the foot of the panel.
+    foot = panel.box[1] + panel.box[3]
+    lost = x[~np.isfinite(y)]
+    sheet.path("".join(f"M{a:.1f} {foot:.1f}v-8" for a in lost.tolist()), "off")
+
+
+def legend(sheet: Sheet, y: float, lines: Sequence[Line], x: float = LEFT + 110) -> None:
+    """Name the series, and how flagged values are drawn."""
+    rows = [
+        (f"M-9 0H9{svg.MARKS[index](0.0, 0.0)}", f"mark line c{index}", line.label)
+        for index, line in enumerate(lines)
+    ]
+    if any(line.off_time.size for line in lines):
+        rows.append((svg.cross(0.0, 0.0), "off", "flagged"))
+    svg.legend(sheet, x, y, rows)
+
+
+def in_words(lines: Sequence[Line], units: str) -> str:
+    """Return the reach of every series in words."""
+    words = []
+    for line in lines:
+        good = _finite([line.value])
+        reach = (
+            f"{svg.number(float(good.min()))} to {svg.number(float(good.max()))} {units}"
+            if good.size
+            else "no unflagged value"
+        )
+        flagged = counted(line.off_time.size, "flagged value")
+        words.append(f"{line.label}: {reach.strip()}, {flagged}".removeprefix(": "))
+    return "; ".join(words)
+
+
+def sparkline(lines: Sequence[Line], width: float, height: float) -> Sheet:
+    """Return series without axes, for a thumbnail."""
+    sheet = Sheet(height=height, width=width)
+    times = np.unique(np.concatenate([line.time for line in lines]))
+    low, high = limits(lines)
+    if times.size == 0:
+        sheet.text(width / 2, height / 2 + 5, "no unflagged value", css="t m")
+        return sheet
+    first, last = times[0].astype(np.int64), times[-1].astype(np.int64)
+    x = Scale(float(first), float(max(last, first + 1)), 6, width - 6)
+    y = Scale(low, high, height - 5, 5)
+    for index, line in enumerate(lines):
+        some = slice(None, None, max(1, -(-line.time.size // 150)))
+        at = x(line.time[some].astype(np.int64).astype(np.float64))
+        sheet.path(svg.marks(at, y(line.value[some]), svg.MARKS[index]), f"mark c{index}")
+    return sheet

@@ -1,0 +1,1 @@
+"""File systems, object stores and processes of a machine."""

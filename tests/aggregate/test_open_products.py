@@ -1,0 +1,149 @@
+"""Products as one lazy dataset."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.aggregate_archive import add_day, facts_of
+
+from lidarops.aggregate.index import write_index
+from lidarops.aggregate.open_products import open_products
+from lidarops.errors import ProductError, RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.netcdf.variables import sum_up
+from lidarops.records import ProductKind
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("archive")
+    for day in (1, 0, 2):
+        add_day(root, day, ProductKind.ELASTIC)
+        add_day(root, day, sections=3)
+    return root
+
+
+def test_a_folder_opens_in_order_of_time_with_units_and_flags(archive: Path):
+    data = open_products(archive, kind="homogeneous", usable=2)
+    assert data.indexes["time"].is_monotonic_increasing
+    assert data.sizes["time"] == 15
+    assert data.extinction.attrs["units"] == "m-1"
+    assert data.quality_flag.attrs["flag_meanings"].split()[0] == "input_missing"
+    assert data.extinction.chunks == ((5, 5, 5), (3,))
+    assert {"altitude", "zenith_angle", "section_range"} <= set(data.coords)
+    parts = []
+    for facts in facts_of(archive):
+        if facts.kind is ProductKind.HOMOGENEOUS:
+            with xr.open_dataset(archive / facts.path) as product:
+                parts.append(product.load())
+    for name in ("extinction", "quality_flag", "time_bnds"):
+        expected = np.concatenate([part[name] for part in parts])
+        np.testing.assert_array_equal(data[name], expected)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_unusable_values_are_missing(level: int, archive: Path):
+    data = open_products(archive, kind="elastic", usable=level).load()
+    everything = open_products(archive, kind="elastic", usable=2).load()
+    flags = everything.quality_flag.to_numpy()
+    worst = sum_up(flags)
+    np.testing.assert_array_equal(data.usable, worst)
+    assert set(np.unique(worst)) == {0, 1, 2}
+    np.testing.assert_array_equal(
+        data.backscatter, np.where(worst <= level, everything.backscatter, np.nan)
+    )
+    np.testing.assert_array_equal(data.quality_flag, flags)
+    np.testing.assert_array_equal(data.background, everything.background)
+    assert data.backscatter.attrs == everything.backscatter.attrs
+
+
+def test_usable_is_derived_where_a_product_lacks_it(tmp_path: Path):
+    path = add_day(tmp_path, 0)
+    with xr.open_dataset(tmp_path / path, decode_cf=False) as product:
+        older = product.drop_vars("usable").load()
+    older.to_netcdf(tmp_path / "older.nc", format="NETCDF4_CLASSIC")
+    found, expected = (open_products(tmp_path / name).load() for name in ("older.nc", path))
+    xr.testing.assert_identical(found.usable.variable, expected.usable.variable)
+    assert found.usable.attrs["flag_meanings"] == "good use_with_care do_not_use"
+
+
+def test_what_belongs_to_a_whole_product_keeps_to_it(tmp_path: Path):
+    for day in range(2):
+        add_day(
+            tmp_path,
+            day,
+            ProductKind.ELASTIC,
+            change=lambda data, day=day: data.assign(lidar_ratio=((), 40.0 + day)),
+        )
+    data = open_products(tmp_path)
+    assert data.lidar_ratio.dims == ("product",)
+    np.testing.assert_array_equal(data.lidar_ratio, [40.0, 41.0])
+    ratio = data.lidar_ratio.isel(product=data.product_index)
+    np.testing.assert_array_equal(ratio, np.repeat([40.0, 41.0], 5))
+    assert data["product"].to_numpy().tolist() == [each.id for each in facts_of(tmp_path)]
+
+
+def test_an_index_gives_the_same_as_the_folder(archive: Path):
+    pytest.importorskip("pyarrow")
+    index = archive / write_index(archive, facts_of(archive))
+    asked = {"kind": "elastic", "since": "2026-03-02", "until": "2026-03-03T00:00"}
+    found = open_products(index, **asked).load()
+    assert found.sizes["time"] == 5
+    xr.testing.assert_identical(found, open_products(archive, **asked).load())
+
+
+def test_files_open_in_any_order(archive: Path):
+    paths = [archive / each.path for each in facts_of(archive) if each.kind == "elastic"]
+    found = open_products(reversed(paths)).load()
+    xr.testing.assert_identical(found, open_products(archive, kind="elastic").load())
+
+
+def test_several_groups_are_told_apart_not_mixed(archive: Path):
+    with pytest.raises(ProductError, match=r"2 groups.*elastic photon_532o grid .*homogeneous"):
+        open_products(archive)
+
+
+def test_a_product_twice_is_refused_by_name(tmp_path: Path):
+    path = tmp_path / add_day(tmp_path, 0)
+    shutil.copy(path, tmp_path / "copy.nc")
+    with pytest.raises(ProductError, match=r"copy\.nc: holds a profile at .*20260301T000000\.nc"):
+        open_products([path, tmp_path / "copy.nc"])
+
+
+def test_a_damaged_product_is_named(tmp_path: Path):
+    add_day(tmp_path, 0)
+    damaged = tmp_path / add_day(tmp_path, 1)
+    damaged.write_bytes(damaged.read_bytes()[:5000])
+    with pytest.raises(ProductError, match=r"20260302T000000\.nc: cannot be read"):
+        open_products(tmp_path)
+
+
+def test_a_damaged_chunk_is_no_silent_value(tmp_path: Path):
+    path = tmp_path / add_day(tmp_path, 0, ProductKind.SIGNAL, profiles=30, bins=1000)
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 2000] = bytes(2000)
+    path.write_bytes(content)
+    with pytest.raises((ProductError, RuntimeError)):
+        open_products(path, usable=2).load()
+
+
+def test_wrong_use_says_what_is_right(archive: Path, tmp_path: Path):
+    with pytest.raises(RetrievalInputError, match=r"usable: is 3 .*0 keeps"):
+        open_products(archive, kind="elastic", usable=3)
+    with pytest.raises(ProductError, match="no product is found"):
+        open_products(archive, station="nowhere")
+    with pytest.raises(ProductError, match="no product is found"):
+        open_products([])
+    with pytest.raises(ProductError, match="is no file"):
+        open_products(tmp_path / "nothing.nc")
+
+
+def test_rejecting_bits_are_those_of_the_flags():
+    for bit in Quality:
+        rejects = bool(bit & Quality.rejecting())
+        assert sum_up(np.array([int(bit)], np.int32))[0] == (2 if rejects else 1)

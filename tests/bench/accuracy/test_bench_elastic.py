@@ -1,0 +1,350 @@
+"""The elastic benchmark: its signals, bounds, scores, peers and pages are right."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from scipy.integrate import quad
+from typer.testing import CliRunner
+
+from lidarops.bench import registry
+from lidarops.bench.accuracy import elastic, elastic_cases, homogeneous_report
+from lidarops.bench.accuracy.homogeneous import Measured, background_score, inversion_score
+from lidarops.bench.harness import results
+from lidarops.bench.harness.terms import Effort
+from lidarops.bench.throughput import retrievals
+from lidarops.cli import app
+from lidarops.errors import CampaignError, RawFormatError
+from lidarops.figures.charts import Chart, Panel, Series, draw
+from lidarops.reports.benchmark_page import build
+from lidarops.retrieve.air.molecular import MolecularProfile
+
+DRAWS = 60
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return elastic_cases.simulated()
+
+
+@pytest.fixture(scope="module")
+def found():
+    return elastic.measure(quick=True, date="2024-01-01", draws=DRAWS)
+
+
+@pytest.fixture(scope="module")
+def published(data_root):
+    return elastic._published(data_root / "synthetic" / "boeckmann")
+
+
+@pytest.fixture(scope="module")
+def timed():
+    return retrievals.measure_elastic(date="2024-01-01", batches=(1, 20), repeats=1)
+
+
+# Signals --------------------------------------------------------------------------------------
+
+
+def test_the_signal_obeys_the_lidar_equation(sky):
+    """Two bins differ by backscatter, range and an optical depth that scipy integrates."""
+    air = MolecularProfile.us_standard()
+    near, far = 60, 700
+
+    def extinction(z):
+        loss = elastic_cases.LIDAR_RATIO * float(elastic_cases.particles(z))
+        return loss + float(air.extinction(z, elastic_cases.WAVELENGTH))
+
+    bends = [1750.0, 3900.0, 5700.0, 6000.0]
+    depth = quad(extinction, sky.range[near], sky.range[far], points=bends, epsrel=1e-9)[0]
+    total = sky.backscatter + sky.molecular_backscatter
+    expected = total[far] / total[near] * (sky.range[near] / sky.range[far]) ** 2
+    ratio = sky.signal[far] / sky.signal[near]
+    assert ratio == pytest.approx(expected * math.exp(-2.0 * depth), rel=1e-4)
+
+
+def test_the_set_is_like_the_intercomparison(sky):
+    assert sky.signal.max() == pytest.approx(elastic_cases.BRIGHTEST)
+    clean = sky.range >= elastic_cases.CLEAN_FROM
+    assert not np.any(sky.backscatter[clean])
+    assert np.all(sky.backscatter[sky.range < 2000.0] > 1e-6)
+    depth = elastic_cases.LIDAR_RATIO * np.sum(sky.backscatter) * 15.0
+    assert depth == pytest.approx(1.4, abs=0.05)
+    assert sky.signal[-1] == pytest.approx(2.15, rel=0.8)
+
+
+def test_counts_are_means_of_poisson_counts_and_repeat(sky):
+    level, draws = 50.0, 4000
+    counts = sky.counts(level, draws, 3)
+    assert np.array_equal(counts, sky.counts(level, draws, 3))
+    assert not np.array_equal(counts[:5], sky.counts(level, 5, 4))
+    assert np.allclose(counts * elastic_cases.SHOTS, np.round(counts * elastic_cases.SHOTS))
+    mean = sky.signal + level
+    error = np.sqrt(mean / elastic_cases.SHOTS / draws)
+    deviation = (counts.mean(axis=0) - mean) / error
+    assert np.std(deviation) == pytest.approx(1.0, abs=0.1)
+    spread = counts.var(axis=0) / (mean / elastic_cases.SHOTS)
+    assert spread.mean() == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("level", [1.0, 1e4, 1e8])
+def test_the_bound_is_that_of_a_weighted_straight_line(sky, level):
+    """The textbook's variance of an intercept, and what told fits scatter by."""
+    far = sky.range >= elastic_cases.CLEAN_FROM
+    x, w = sky.shape[far] * 1e15, elastic_cases.SHOTS / (sky.signal[far] + level)
+    determinant = w.sum() * (w * x * x).sum() - (w * x).sum() ** 2
+    bound = elastic_cases.least_error(sky, level)
+    assert bound == pytest.approx(math.sqrt((w * x * x).sum() / determinant), rel=1e-6)
+    told = elastic_cases.ways()[elastic_cases.TOLD](sky.counts(level, 400, 9), sky)
+    assert np.std(told.background) == pytest.approx(bound, rel=0.15)
+
+
+# Peers ----------------------------------------------------------------------------------------
+
+
+def test_the_peers_find_the_same(sky):
+    counts = sky.counts(1e3, 3, 1)
+    told = elastic_cases.ways()[elastic_cases.TOLD](counts, sky)
+    apart = elastic_cases.lstsq_backgrounds(counts, sky) - told.background
+    # Their weights follow the noise of the bins: a bias far below the error.
+    assert np.abs(apart).max() < 0.1 * elastic_cases.least_error(sky, 1e3)
+    clean = sky.signal[np.newaxis]
+    looped, summed = elastic_cases.klett_python(clean, sky), elastic_cases.klett_numpy(clean, sky)
+    assert np.abs(looped - summed).max() < 1e-9 * np.abs(summed).max()
+    power = np.where(sky.inverted, clean, np.nan)
+    ours = elastic_cases.particles_of(power, sky, elastic_cases.GIVEN).backscatter
+    apart = np.abs(looped - ours)[:, sky.compared]
+    # They take the window as one point, in which attenuation is a straight line.
+    assert apart.max() < 3e-3 * sky.backscatter[sky.compared].mean()
+
+
+# Scores ---------------------------------------------------------------------------------------
+
+
+def test_background_scores_of_known_errors():
+    error = np.array([3.0, -1.0, 1.0, 50.0, np.nan])
+    rejected = np.array([False, False, False, True, False])
+    score = background_score(error, np.array([1.0, 2.0, 0.8, 1.0, 1.0]), rejected)
+    assert score.profiles == 3
+    assert score.bias.value == pytest.approx(1.0)
+    assert score.bias.error == pytest.approx(math.sqrt(8 / 3 / 3))
+    assert score.scatter.value == pytest.approx(math.sqrt(8 / 3))
+    assert score.rmse.value == pytest.approx(math.sqrt(11 / 3))
+    assert score.stated == pytest.approx(1.0)
+    assert score.deviation.value == pytest.approx((3.0 - 0.5 + 1.25) / 3)
+    assert score.spread.value == pytest.approx(math.sqrt((9 + 0.25 + 1.5625) / 3))
+    assert [part.value for part in score.coverage] == pytest.approx([1 / 3, 2 / 3])
+    assert background_score(error[:1], np.ones(1), rejected[:1]) is None
+
+
+def test_inversion_scores_of_known_errors():
+    error = np.array([[2.0, -1.0], [np.nan, 3.0], [np.nan, np.nan], [1.0, 1.0]])
+    stated = np.array([[1.0, 1.5], [1.0, 4.0], [1.0, 1.0], [0.6, np.nan]])
+    score = inversion_score(error, stated, 10.0)
+    assert score.profiles == 3
+    assert score.solved == pytest.approx(4 / 8)
+    biases = np.array([0.05, 0.3, 0.1])
+    assert score.bias.value == pytest.approx(biases.mean())
+    assert score.scatter == pytest.approx(biases.std())
+    assert score.rmse.value == pytest.approx(math.sqrt((2.5 + 9.0 + 1.0) / 3) / 10)
+    assert score.stated == pytest.approx(math.sqrt((3.25 / 2 + 16.0 + 0.36) / 3) / 10)
+    assert [part.value for part in score.coverage] == pytest.approx([0.5, 2.5 / 3])
+    assert inversion_score(error[1:3], stated[1:3], 10.0) is None
+    assert inversion_score(error[1:2], stated[1:2], 10.0).profiles == 1
+
+
+# What it finds --------------------------------------------------------------------------------
+
+
+def test_the_tail_is_biased_by_its_signal_and_the_shape_is_not(found, sky):
+    tail = sky.signal[-(sky.range.size // 10) :].mean()
+    assert [level.level for level in found.levels] == list(elastic_cases.LEVELS)
+    for level in found.levels:
+        assert level.profiles == DRAWS
+        told = level.backgrounds[elastic_cases.TOLD]
+        assert abs(told.bias.value) < 4.5 * told.bias.error
+        assert told.stated == pytest.approx(level.least_error, rel=0.05)
+        assert told.spread.value == pytest.approx(1.0, abs=0.4)
+        mean = level.backgrounds[elastic_cases.TAIL_MEAN]
+        assert abs(mean.bias.value - tail) < 4.5 * mean.bias.error
+        free = level.backgrounds[elastic_cases.KNOWN_SHAPE]
+        assert level.level > 1e6 or abs(free.bias.value) < 4.5 * free.bias.error
+        assert set(level.rejected) == set(elastic_cases.ways())
+
+
+def test_backscatter_is_found_as_well_as_stated_where_the_window_is_given(found):
+    for level in found.levels:
+        given = level.inversions["window given"]
+        if level.level <= 1e5:
+            assert given.solved == 1.0
+            assert abs(given.bias.value) < 0.01
+            assert given.rmse.value == pytest.approx(given.stated, rel=0.35)
+            assert given.coverage[0].value == pytest.approx(0.68, abs=0.15)
+        if level.level <= 1e3:
+            tail = level.inversions["tail_mean, given"]
+            assert tail.bias.value > 0.03
+            assert tail.coverage[1].value < 0.1
+        if level.level == 1e8:
+            assert given.solved < 0.3
+        chosen, carried = (
+            level.inversions.get(name) for name in ("window chosen", "chosen, error carried")
+        )
+        assert (chosen is None) == (carried is None)
+        if chosen is not None:
+            assert carried.bias == chosen.bias
+            assert carried.stated > chosen.stated
+
+
+def test_without_noise_little_is_left(found):
+    assert [loop.level for loop in found.closed] == [None, 1.0, 1e4, 1e8]
+    for loop in found.closed:
+        assert abs(loop.background) < 1e-6
+        assert abs(loop.bias) < 2e-4
+        assert abs(loop.bias) <= loop.largest < 1e-3
+
+
+def test_published_files_are_met(data_root, published):
+    sky, files = elastic_cases.published(data_root / "synthetic" / "boeckmann")
+    truths = {file.level: file for file in files}
+    assert sorted(truths) == [file.level for file in files]
+    loud = truths[1e8]
+    assert loud.background - 1e8 == pytest.approx(250.0, abs=2.0)
+    assert loud.background_error == pytest.approx(math.sqrt(1e8 / 1000 / 945), rel=0.05)
+    assert np.all(np.isfinite(sky.backscatter[sky.inverted]))
+    for score in published:
+        if score.way == elastic_cases.KNOWN_SHAPE:
+            assert score.inversion is None
+            assert abs(score.deviation) < 3.0
+            assert score.level > 1e5 or abs(score.background) < 1.0
+        if score.way == "window given" and score.level <= 1e5:
+            assert abs(score.inversion.bias.value) < 0.01
+        if score.way == elastic_cases.TAIL_MEAN and score.level <= 1e4:
+            assert score.background == pytest.approx(2.75, abs=0.1)
+
+
+def test_times_are_multiples_of_the_read_of_their_batch(timed):
+    assert {cost.batch for cost in timed.costs} == {1, 20}
+    for batch in (1, 20):
+        group = {cost.step: cost for cost in timed.costs if cost.batch == batch}
+        read = group[retrievals.READ]
+        assert (read.reads, read.ours) == (1.0, False)
+        assert {"known_shape", "layers.screen", "reference.choose", "elastic.solve"} <= set(group)
+        assert group[retrievals.ALL_STEPS].ours
+        assert not group["Klett, Python"].ours
+        for cost in group.values():
+            assert cost.reads == pytest.approx(cost.nanoseconds / read.nanoseconds)
+            assert 1 <= cost.profiles <= batch
+
+
+# Pages and the command ------------------------------------------------------------------------
+
+
+def test_pages_hold_tables_and_figures(found, timed, published, tmp_path):
+    whole = replace(found, published=published)
+    assert results.load(elastic.Elastic, results.save(whole, tmp_path / "whole.json")) == whole
+    reports = {
+        "accuracy": elastic.accuracy_report(whole, "result.json"),
+        "throughput": homogeneous_report.elastic_throughput_report(timed, "result.json"),
+    }
+    for name, report in reports.items():
+        folder = tmp_path / name
+        text = build(report, folder).read_text()
+        for part in report.parts:
+            for chart in part.charts:
+                assert (folder / f"{chart.name}.png").read_bytes().startswith(b"\x89PNG")
+            for table in (*part.tables, *part.details):
+                assert table.title in text
+                assert table.rows
+                assert all(len(row) == len(table.columns) for row in table.rows)
+        assert "2024-01-01" in text
+    titles = [part.title for part in reports["accuracy"].parts]
+    assert "Files of the intercomparison" in titles
+    alone = [part.title for part in elastic.accuracy_report(found).parts]
+    assert [title for title in titles if title not in alone] == ["Files of the intercomparison"]
+
+
+def test_results_survive_json(found, timed, tmp_path):
+    for result in (found, timed):
+        path = results.save(result, tmp_path / "result.json")
+        assert results.load(type(result), path) == result
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "told"),
+    [
+        (4.17487, 0.00021, "+4.1749(2)"),
+        (-22.4, 1.6, "-22(2)"),
+        (-5.24, 0.53, "-5.2(5)"),
+        (-40.0, 0.0, "-40"),
+    ],
+)
+def test_errors_stand_in_the_last_digits(value, error, told):
+    assert elastic._signed(Measured(value, error)) == told
+
+
+def test_a_band_is_an_area_between_its_edges():
+    series = Series("way", (1.0, 10.0), (5.0, 6.0), (0.1, 0.2), (2.0, 3.0), band=True)
+    figure = draw(Chart("name", "Title", "Caption.", (Panel("panel", "x", "y", (series,)),)))
+    (area,) = [one for one in figure.axes[0].collections if isinstance(one, PolyCollection)]
+    corners = {tuple(corner) for corner in area.get_paths()[0].vertices.tolist()}
+    assert {(1.0, 0.1), (10.0, 0.2), (1.0, 2.0), (10.0, 3.0)} <= corners
+
+
+@pytest.mark.parametrize(
+    ("what", "data", "said"),
+    [("luck", None, "accuracy or throughput"), ("throughput", "folder", "leave it out")],
+)
+def test_wrong_use_is_told(what, data, said):
+    with pytest.raises(CampaignError, match=said):
+        registry.run(what, "elastic", [], Effort(), data=data)
+
+
+def test_folders_without_the_published_files_are_refused(tmp_path):
+    with pytest.raises(CampaignError, match="no files background_1e"):
+        elastic_cases.published(tmp_path)
+    named = tmp_path / "background_1ex.licel"
+    named.write_text("")
+    with pytest.raises(CampaignError, match="names no background"):
+        elastic_cases.published(tmp_path)
+    named.rename(tmp_path / "background_1e2.licel")
+    table = tmp_path / "molecular_profile_hPa.csv"
+    for content, said in (
+        (None, "cannot be read"),
+        ("a,b,c\n", "cannot be read"),
+        ("1013,288\n500,250\n", "2 columns"),
+    ):
+        if content is not None:
+            table.write_text(content)
+        with pytest.raises(CampaignError, match=said):
+            elastic_cases.published(tmp_path)
+    table.write_text("1013.25,288.15,0\n540.2,255.65,5000\n")
+    (tmp_path / "noise_free.licel").write_bytes(b"no licel file")
+    with pytest.raises(RawFormatError):
+        elastic_cases.published(tmp_path)
+
+
+def test_the_command_prints_writes_and_refuses(monkeypatch, found, tmp_path):
+    asked = {}
+
+    def measure(**arguments):
+        asked.update(arguments)
+        return found
+
+    monkeypatch.setattr(elastic, "measure", measure)
+    words = ["bench", "accuracy", "--case", "elastic", "--quick", "--data", str(tmp_path)]
+    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path), "--json"])
+    assert result.exit_code == 0, result.output
+    assert asked["quick"]
+    assert asked["data"] == tmp_path
+    assert json.loads(result.stdout) == json.loads((tmp_path / "result.json").read_text())
+    for wrong in (
+        ["bench", "accuracy", "--case", "homogeneous", "--data", str(tmp_path)],
+        ["bench", "accuracy", str(tmp_path / "result.json"), "--case", "elastic"],
+    ):
+        refused = CliRunner().invoke(app, wrong)
+        assert refused.exit_code == 2
+        assert "elastic" in refused.output

@@ -1,0 +1,303 @@
+"""The benchmark of the homogeneous path: its bounds, its peers and what it writes are right."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lidarops.bench import registry
+from lidarops.bench.accuracy import homogeneous, homogeneous_report
+from lidarops.bench.accuracy.homogeneous_cases import (
+    QUANTITIES,
+    Scenario,
+    background_bias,
+    difficulty,
+    least_errors,
+    methods,
+    scenarios,
+)
+from lidarops.bench.accuracy.peers import JIT, peers
+from lidarops.bench.harness import results
+from lidarops.bench.harness.terms import Effort
+from lidarops.bench.harness.timing import in_threads, least_times
+from lidarops.bench.throughput import retrievals
+from lidarops.cli import app
+from lidarops.errors import CampaignError, CatalogError, RawFormatError
+from lidarops.figures.charts import pareto
+from lidarops.reports.benchmark_page import build
+
+PATH = Scenario(2500.0, 8000.0, 3e-5, 1000.0)
+PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e-3, 1e4)]
+
+
+@pytest.fixture(scope="module")
+def found() -> homogeneous.Accuracy:
+    return homogeneous.measure(quick=True, date="2024-01-01", profiles=200)
+
+
+@pytest.fixture(scope="module")
+def timed() -> retrievals.Throughput:
+    return retrievals.measure(profiles=40, repeats=1, date="2024-01-01")
+
+
+def _bound_by_mpmath(path: Scenario) -> dict[str, float]:
+    """Invert the Fisher matrix of (P*, B, extinction) as it stands, with 60 digits."""
+    with mpmath.workdps(60):
+        sigma, amplitude = mpmath.mpf(path.extinction), mpmath.mpf(path.amplitude)
+        fisher = mpmath.zeros(3)
+        for distance in map(mpmath.mpf, path.range.tolist()):
+            shape = mpmath.exp(-2 * sigma * distance) / distance**2
+            slopes = mpmath.matrix([1, shape, -2 * distance * amplitude * shape])
+            fisher += slopes * slopes.T
+        covariance = fisher**-1
+        order = {"background": 0, "amplitude": 1, "extinction": 2}
+        error = {name: mpmath.sqrt(covariance[k, k]) for name, k in order.items()}
+        error["log_amplitude"] = error.pop("amplitude") / amplitude
+        return {name: float(value) for name, value in error.items()}
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.label)
+def test_the_bound_is_the_inverse_fisher_matrix(path):
+    expected = _bound_by_mpmath(path)
+    for name, value in least_errors(path).items():
+        assert value == pytest.approx(expected[name], rel=1e-9)
+
+
+def test_the_bound_follows_from_finite_differences_of_the_signal():
+    steps = {"background": 1e-2, "signal": 1e-2, "extinction": 1e-10}
+    slopes = np.stack(
+        [
+            (
+                replace(PATH, **{name: getattr(PATH, name) + step}).mean
+                - replace(PATH, **{name: getattr(PATH, name) - step}).mean
+            )
+            / (2 * step)
+            for name, step in steps.items()
+        ],
+        axis=1,
+    )
+    scale = np.linalg.norm(slopes, axis=0)
+    covariance = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
+    bound = least_errors(PATH)
+    assert bound["background"] == pytest.approx(math.sqrt(covariance[0, 0]), rel=1e-5)
+    assert bound["extinction"] == pytest.approx(math.sqrt(covariance[2, 2]), rel=1e-5)
+
+
+def test_the_second_order_bias_is_what_least_squares_has():
+    path = Scenario(2500.0, 4000.0, 3e-5, 40.0)
+    count = 40_000
+    found = methods()["direct"](path.powers(count, 3), path)
+    error = found.values["background"] - path.background
+    expected = background_bias(path)
+    spread = error.std() / math.sqrt(count)
+    assert abs(expected) > 8 * spread
+    # Terms of fourth order in the noise are left out of the expectation.
+    assert error.mean() == pytest.approx(expected, abs=4 * spread + 0.1 * abs(expected))
+
+
+def test_scenarios_span_what_can_be_solved():
+    every = scenarios()
+    assert len(every) >= 40
+    assert len(set(every)) == len(every)
+    assert {path.start for path in every} == {2500.0, 10500.0}
+    assert max(difficulty(path) for path in every) <= 0.1
+    assert max(difficulty(path) for path in every) > 0.05
+    assert len(scenarios(quick=True)) == 8
+    assert set(scenarios(quick=True)) < set(every)
+
+
+def test_profiles_are_the_model_and_unit_noise_and_repeat():
+    power = PATH.powers(3000, 5)
+    assert np.array_equal(power, PATH.powers(3000, 5))
+    assert not np.array_equal(power, PATH.powers(3000, 6))
+    assert PATH.mean[0] == pytest.approx(PATH.background + PATH.signal)
+    at = PATH.range[100]
+    model = PATH.background + PATH.amplitude / at**2 * math.exp(-2 * PATH.extinction * at)
+    assert PATH.mean[100] == pytest.approx(model, rel=1e-12)
+    assert (power - PATH.mean).std() == pytest.approx(1.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.label)
+def test_every_peer_agrees_with_solve(path):
+    power = path.powers(20)
+    ours = methods()["direct"](power, path)
+    bound = least_errors(path)
+    for name, way in peers().items():
+        theirs = way(power, path)
+        for quantity in QUANTITIES:
+            apart = np.abs(theirs.values[quantity] - ours.values[quantity]) / bound[quantity]
+            assert apart.max() < 1e-3, (name, quantity)
+            ratio = theirs.standard_errors[quantity] / ours.standard_errors[quantity]
+            assert np.abs(ratio - 1).max() < 1e-3, (name, quantity)
+
+
+def test_the_compiled_fit_takes_what_cannot_converge():
+    power = PATH.powers(3)
+    power[1] = np.nan
+    solved = peers()[JIT](power, PATH)
+    alone = peers()[JIT](power[:1], PATH)
+    assert solved.rejected.tolist() == [False, True, False]
+    assert solved.values["extinction"][0] == alone.values["extinction"][0]
+
+
+def test_scores_of_known_errors():
+    bound = least_errors(PATH)
+    error = np.array([3.0, -1.0, 1.0, 5.0, np.nan])
+
+    def way(power, scenario):
+        return homogeneous.Estimates(
+            values={name: scenario.truth[name] + error * bound[name] for name in QUANTITIES},
+            standard_errors={
+                "extinction": np.full(5, bound["extinction"]),
+                "background": np.full(5, 2 * bound["background"]),
+                "log_amplitude": np.zeros(5),
+            },
+            flagged=np.array([True, False, False, True, True]),
+            rejected=np.array([False, False, False, True, True]),
+        )
+
+    truth = way(np.empty((5, PATH.bins)), PATH)
+    outcome = homogeneous._outcome("way", way, PATH, np.empty((5, PATH.bins)), bound, truth)
+    score = outcome.scores["extinction"]
+    assert score.rmse.value == pytest.approx(math.sqrt(11 / 3), rel=1e-6)
+    assert score.rmse_of_all == pytest.approx(3.0, rel=1e-6)
+    assert score.bias.value == pytest.approx(1.0, rel=1e-6)
+    assert score.bias.error == pytest.approx(math.sqrt(8 / 3 / 3), rel=1e-6)
+    assert score.coverage.value == pytest.approx(2 / 3)
+    assert outcome.scores["background"].coverage.value == pytest.approx(1.0)
+    assert set(outcome.scores) == {"extinction", "background"}, "what was given has no score"
+    assert (outcome.flagged, outcome.rejected) == (0.6, 0.4)
+    assert outcome.distances["extinction"] == 0.0
+
+
+def test_least_squares_reaches_the_bound(found):
+    for case in found.cases:
+        for outcome in case.outcomes:
+            if outcome.way in {"compressed", "direct", JIT}:
+                for quantity, score in outcome.scores.items():
+                    assert abs(score.rmse.value - 1) < 5 * score.rmse.error + 0.02, quantity
+                    assert score.coverage.value > 0.85
+                    assert outcome.distances[quantity] < 0.05
+    assert {o.way for o in found.cases[0].outcomes} == set(methods()) | set(peers())
+
+
+def test_lag_1_is_biased_as_published_and_least_squares_is_not():
+    measured = homogeneous.offsets(1500)
+    single = {o.length: o for o in measured if o.averaged == 1 and o.start < 5e3}
+    for length, expected in {1e3: 10.2, 4e3: 2.7, 6e3: 1.4, 8e3: 0.8}.items():
+        assert single[length].lag_1.value == pytest.approx(expected, abs=0.3)
+    for offset in measured:
+        assert offset.lag_1.value > 50 * offset.lag_1.error
+        if offset.averaged > 1 and offset.start < 5e3 and offset.length >= 2e3:
+            rest = offset.compressed.value - offset.expected
+            assert abs(rest) < 4 * offset.compressed.error
+            assert offset.compressed.error < 0.02 * offset.lag_1.value
+
+
+def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
+    assert {s.setting for s in timed.speeds} == set(retrievals.settings())
+    for setting in retrievals.settings():
+        group = {s.way: s for s in timed.speeds if s.setting == setting}
+        read = group[retrievals.READ]
+        assert read.reads == 1.0
+        assert set(group) >= {"compressed", "direct"}
+        for one in group.values():
+            assert one.reads == pytest.approx(one.nanoseconds / read.nanoseconds)
+    assert {t.way for t in timed.threads} == set(retrievals.THREADED)
+
+
+def test_ways_take_turns_and_the_least_time_counts(monkeypatch):
+    clock = iter([0.0, 5.0, 0.0, 7.0, 0.0, 4.0, 0.0, 9.0])
+    calls: list[str] = []
+    monkeypatch.setattr("time.process_time", lambda: next(clock))
+    ways = {name: (lambda name=name: calls.append(name)) for name in "ab"}
+    assert least_times(ways, 2) == {"a": 4.0, "b": 7.0}
+    assert calls == ["a", "b"] * 3
+
+
+def test_threads_pass_errors_on():
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda part: 1 / part, 2)
+
+
+def test_results_survive_json(found, timed, tmp_path):
+    for result in (found, timed):
+        path = results.save(result, tmp_path / "sub" / "result.json")
+        assert results.load(type(result), path) == result
+    path.write_text("{}")
+    with pytest.raises(CatalogError, match="run the benchmark again"):
+        results.load(homogeneous.Accuracy, path)
+    with pytest.raises(CatalogError, match="cannot be written"):
+        results.save(found, path / "result.json")
+
+
+def test_pages_hold_tables_and_figures(found, timed, tmp_path):
+    reports = {
+        "accuracy": homogeneous_report.accuracy_report(found, "result.json"),
+        "throughput": homogeneous_report.throughput_report(timed, "result.json"),
+    }
+    for name, report in reports.items():
+        folder = tmp_path / name
+        text = build(report, folder).read_text()
+        charts = [chart for part in report.parts for chart in part.charts]
+        assert charts
+        for chart in charts:
+            assert (folder / f"{chart.name}.png").read_bytes().startswith(b"\x89PNG")
+            assert f'src="{chart.name}.png" alt="{chart.title}' in text
+        for part in report.parts:
+            for table in (*part.tables, *part.details):
+                assert table.title in text
+                assert all(len(row) == len(table.columns) for row in table.rows)
+        assert "compressed" in text
+        assert "2024-01-01" in text
+        assert "<script" not in text
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CatalogError, match="cannot be written"):
+        build(report, tmp_path / "file")
+
+
+def test_the_pareto_front_holds_what_nothing_beats():
+    points = [(3.0, 1.0), (1.0, 4.0), (2.0, 4.0), (2.0, 2.0), (4.0, 1.0), (1.0, 5.0)]
+    assert pareto(points) == ((1.0, 4.0), (2.0, 2.0), (3.0, 1.0))
+    assert pareto(points, gain=0.4) == ((1.0, 4.0), (3.0, 1.0))
+    assert pareto([]) == ()
+
+
+@pytest.mark.parametrize(
+    ("what", "case", "files", "error", "said"),
+    [
+        ("luck", None, [], CampaignError, "throughput"),
+        ("accuracy", "weather", [], CampaignError, "pipeline or reader"),
+        ("accuracy", "reader", ["file"], CampaignError, "no accuracy"),
+        ("throughput", "homogeneous", ["file"], CampaignError, "takes no files"),
+        ("throughput", "reader", [], RawFormatError, "at least one file"),
+    ],
+)
+def test_wrong_use_is_told(what, case, files, error, said):
+    with pytest.raises(error, match=said):
+        registry.run(what, case, files, Effort())
+
+
+def test_the_command_prints_writes_and_dates(monkeypatch, found, tmp_path):
+    asked = {}
+
+    def measure(**arguments):
+        asked.update(arguments)
+        return found
+
+    monkeypatch.setattr(homogeneous, "measure", measure)
+    words = ["bench", "accuracy", "--case", "homogeneous", "--quick", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert asked["quick"]
+    assert len(asked["date"]) == len("2024-01-01")
+    assert "compressed" in result.stdout
+    assert "index.html" in result.stdout.replace("\n", "")
+    printed = CliRunner().invoke(app, [*words, "--json"])
+    assert json.loads(printed.stdout) == json.loads((tmp_path / "result.json").read_text())

@@ -1,0 +1,116 @@
+"""The page of all retrievals: whole, without name clashes, and the same figures as its parts."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from lidarops.bench import all_retrievals, overview, registry
+from lidarops.bench.accuracy import (
+    elastic,
+    homogeneous,
+    multiangle_cases,
+    multiangle_scores,
+    network,
+)
+from lidarops.bench.accuracy.homogeneous import Measured
+from lidarops.bench.accuracy.multiangle_scores import Size
+from lidarops.bench.harness import results
+from lidarops.bench.harness.terms import Effort
+
+SMALL = Size(blocks=2, profiles=4, slow=1, published=20, random=4)
+
+
+@pytest.fixture(scope="module")
+def finding():
+    """Return the finding of few profiles, and how often it told of progress."""
+    steps = []
+    small = {
+        (homogeneous, "measure"): partial(homogeneous.measure, profiles=64),
+        (elastic, "measure"): partial(elastic.measure, draws=4),
+        (all_retrievals, "measure_scans"): partial(multiangle_scores.measure, size=SMALL),
+        (network, "measure"): partial(network.measure, profiles=25, peer_profiles=4),
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for (module, name), measure in small.items():
+            patch.setattr(module, name, measure)
+        scenes = (multiangle_cases.clear(3000.0, gates=25), multiangle_cases.cloud())
+        patch.setattr(multiangle_cases, "scenes", lambda: scenes)
+        effort = Effort(quick=True, repeats=1, date="2024-01-01", progress=steps.append)
+        found = registry.run("accuracy", None, [], effort)
+    assert len(steps) > 40
+    return found
+
+
+def test_every_retrieval_has_ways_of_ours_and_peers(finding):
+    works = finding.result.works
+    for retrieval in (overview.HOMOGENEOUS, overview.ELASTIC, overview.SCANS, overview.NETWORKS):
+        of = [work for work in works if work.retrieval == retrieval]
+        assert {work.ours for work in of} == {True, False}, retrieval
+        assert all(work.nanoseconds > 0 and work.error.value > 0 for work in of)
+
+
+def test_rows_hold_the_figures_of_the_retrievals(finding):
+    works = {(w.setting, w.quantity, w.way): w for w in finding.result.works}
+    scene = finding.result.multiangle.scenes[0]
+    score = next(score for score in scene.scores if score.way == "joint")
+    row = works[scene.label, "optical depth", "joint"]
+    assert (row.error, row.nanoseconds) == (score.rmse, score.nanoseconds)
+    case = finding.result.multiposition.cases[0]
+    way, networked = next(iter(case.scores.items()))
+    found = [w for w in finding.result.works if w.retrieval == overview.NETWORKS and w.way == way]
+    assert found[0].nanoseconds == pytest.approx(1e3 * networked.microseconds)
+    assert found[0].error == networked.rmse
+
+
+def test_the_short_table_shows_the_best_and_nothing_that_is_told_more(finding):
+    table = overview.short(finding.result.works)
+    ways = [row[1] for row in table.rows]
+    assert any(way.startswith("peer: ") for way in ways)
+    assert not any("known_" in way.removeprefix("known_shape") or "told" in way for way in ways)
+    scans = [work for work in finding.result.works if work.retrieval == overview.SCANS]
+    first = [work for work in scans if work.setting == scans[0].setting and work.ours]
+    best = min(first, key=lambda work: work.error.value)
+    told = [row[1] for row in table.rows if row[0].startswith(overview.SCANS)]
+    (shown,) = (work for work in first if work.way in told)
+    assert shown.error.value <= best.error.value + 3.0 * (shown.error.error + best.error.error)
+    assert shown.nanoseconds <= best.nanoseconds
+
+
+def test_of_ways_that_are_as_good_the_short_table_shows_the_fastest():
+    def work(way: str, error: float, nanoseconds: float) -> overview.Work:
+        measured = Measured(error, 0.01)
+        return overview.Work(
+            "paths", "all", "extinction", way, ours=True, error=measured, coverage=None,
+            nanoseconds=nanoseconds,
+        )  # fmt: skip
+
+    found = [work("slow", 1.0, 90.0), work("fast", 1.02, 9.0), work("rough", 1.2, 1.0)]
+    ((_, way, *_),) = overview.short(found).rows
+    assert way == "fast"
+
+
+def test_page_and_figures_are_written_once_each(finding, tmp_path):
+    page = registry.write(finding, tmp_path)
+    text = page.read_text(encoding="utf-8")
+    titles = [part.title for part in finding.report.parts]
+    charts = [chart.name for part in finding.report.parts for chart in part.charts]
+    assert len(set(titles)) == len(titles)
+    assert len(set(charts)) == len(charts)
+    assert all(f"{name}.png" in text and (tmp_path / f"{name}.png").is_file() for name in charts)
+    assert "http://" not in text
+    assert "https://" not in text
+    read = results.load(all_retrievals.Everything, tmp_path / "result.json")
+    assert read.works == finding.result.works
+
+
+def test_floors_are_measured(finding):
+    assert [floor.nanoseconds > 0 for floor in finding.result.baselines] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("nanoseconds", "told"), [(3.21, "3.21 ns"), (4.2e3, "4.2 µs"), (5e6, "5 ms"), (2e9, "2 s")]
+)
+def test_times_are_told_in_a_unit_that_fits(nanoseconds, told):
+    assert overview.spelled_time(nanoseconds) == told

@@ -1,0 +1,238 @@
+"""Sounding and overlap files: units, and that nothing but such a file is taken for one."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from support import factories
+
+from lidarops.campaign.ancillary_files import (
+    Ancillaries,
+    molecular_profile,
+    overlap_profile,
+)
+from lidarops.errors import AncillaryError
+from lidarops.plan.scene_plan import plan
+from lidarops.plan.scenes import cut
+from lidarops.records import Role
+from lidarops.retrieve.air.molecular import us_standard
+
+ALTITUDE = np.linspace(0.0, 20_000.0, 41)
+PRESSURE, TEMPERATURE = us_standard(ALTITUDE)
+OVERLAP = "range [m],overlap\n200,0.25\n400,0.75\n600,1\n"
+
+
+def _sounding(folder: Path, head: str, *columns: np.ndarray, name: str = "air.csv") -> str:
+    rows = [",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True)]
+    (folder / name).write_text("\n".join([head, *rows, ""]))
+    return name
+
+
+@pytest.mark.parametrize(
+    ("head", "scales"),
+    [
+        ("altitude,pressure,temperature", (1.0, 1.0, 0.0)),
+        ("altitude [m],pressure [Pa],temperature [K]", (1.0, 1.0, 0.0)),
+        ("Altitude [km], Pressure [hPa] ,temperature [degC]", (1e-3, 1e-2, -273.15)),
+        ("\ufeffaltitude,pressure[mbar],temperature", (1.0, 1e-2, 0.0)),
+        # Where no unit is told, the size of the pressure tells it.
+        ("# made by hand\n\naltitude,pressure,temperature", (1.0, 1e-2, 0.0)),
+    ],
+)
+def test_units_in_brackets_are_turned_into_si(
+    tmp_path: Path, head: str, scales: tuple[float, float, float]
+) -> None:
+    length, force, zero = scales
+    name = _sounding(tmp_path, head, ALTITUDE * length, PRESSURE * force, TEMPERATURE + zero)
+    found, digest = molecular_profile(tmp_path, name)
+    np.testing.assert_allclose(found.altitude, ALTITUDE, rtol=1e-8)
+    np.testing.assert_allclose(found.pressure, PRESSURE, rtol=1e-8)
+    np.testing.assert_allclose(found.temperature, TEMPERATURE, rtol=1e-8)
+    assert digest == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+
+
+def test_columns_that_nobody_asks_for_may_hold_anything(tmp_path: Path) -> None:
+    (tmp_path / "o.csv").write_text("note,overlap,range [km]\nnear,0.25,0.2\n,1,0.4\n")
+    found, _ = overlap_profile(tmp_path, "o.csv")
+    np.testing.assert_allclose(found.range, [200.0, 400.0])
+    np.testing.assert_array_equal(found.overlap, [0.25, 1.0])
+
+
+def test_netcdf_is_the_same_as_csv(tmp_path: Path) -> None:
+    (tmp_path / "o.csv").write_text(OVERLAP)
+    xr.Dataset(
+        {"overlap": ("range", [0.25, 0.75, 1.0], {"units": "1"})},
+        coords={"range": ("range", [0.2, 0.4, 0.6], {"units": "km"})},
+    ).to_netcdf(tmp_path / "o.nc")
+    text, _ = overlap_profile(tmp_path, "o.csv")
+    binary, digest = overlap_profile(tmp_path, "o.nc")
+    np.testing.assert_allclose(binary.range, text.range)
+    np.testing.assert_array_equal(binary.overlap, text.overlap)
+    assert digest == hashlib.sha256((tmp_path / "o.nc").read_bytes()).hexdigest()
+    xr.Dataset(
+        {
+            "pressure": ("level", np.rint(PRESSURE).astype(np.int32), {"units": "Pa"}),
+            "temperature": ("level", TEMPERATURE - 273.15, {"units": "degC"}),
+            "altitude": ("level", ALTITUDE.astype(np.float32)),
+        }
+    ).to_netcdf(tmp_path / "air.nc")
+    air, _ = molecular_profile(tmp_path, "air.nc")
+    np.testing.assert_allclose(air.pressure, PRESSURE, atol=0.5)
+    np.testing.assert_allclose(air.temperature, TEMPERATURE, rtol=1e-12)
+
+
+def test_overlap_between_its_ranges(tmp_path: Path) -> None:
+    (tmp_path / "o.csv").write_text(OVERLAP)
+    found, _ = overlap_profile(tmp_path, "o.csv")
+    at = found.at(np.array([-10.0, 199.9, 200.0, 300.0, 600.0, 601.0, 9000.0]))
+    np.testing.assert_array_equal(at, [np.nan, np.nan, 0.25, 0.5, 1.0, 1.0, 1.0])
+
+
+def _text(content: str | bytes, name: str = "o.csv") -> Callable[[Path], str]:
+    def write(folder: Path) -> str:
+        data = content if isinstance(content, bytes) else content.encode()
+        (folder / name).write_bytes(data)
+        return name
+
+    return write
+
+
+def _folder(folder: Path) -> str:
+    (folder / "o.csv").mkdir()
+    return "o.csv"
+
+
+def _escape(folder: Path) -> str:
+    (folder.parent / "secret.csv").write_text(OVERLAP)
+    return "../secret.csv"
+
+
+def _link(folder: Path) -> str:
+    outside = folder.parent / "outside.csv"
+    outside.write_text(OVERLAP)
+    (folder / "o.csv").symlink_to(outside)
+    return "o.csv"
+
+
+def _loop(folder: Path) -> str:
+    (folder / "o.csv").symlink_to(folder / "o.csv")
+    return "o.csv"
+
+
+def _unequal(folder: Path) -> str:
+    xr.Dataset({"range": ("a", [1.0, 2.0, 3.0]), "overlap": ("b", [0.5, 1.0])}).to_netcdf(
+        folder / "o.nc"
+    )
+    return "o.nc"
+
+
+def _two_dimensions(folder: Path) -> str:
+    xr.Dataset({"range": ("a", [1.0, 2.0]), "overlap": (("t", "a"), np.ones((3, 2)))}).to_netcdf(
+        folder / "o.nc"
+    )
+    return "o.nc"
+
+
+_GARBAGE = np.random.default_rng(0).bytes(5000)
+REFUSED = [
+    pytest.param(lambda _: "none.csv", "none.csv: cannot be read", id="absent"),
+    pytest.param(_folder, "cannot be read", id="folder"),
+    pytest.param(_escape, "lies outside", id="dots"),
+    pytest.param(_link, "lies outside", id="link"),
+    pytest.param(_loop, "o.csv", id="loop"),
+    pytest.param(lambda _: "a\0b", "cannot be read", id="nul"),
+    pytest.param(_text(_GARBAGE), "not text", id="garbage"),
+    pytest.param(_text(_GARBAGE, "o.nc"), "not NetCDF", id="garbage.nc"),
+    pytest.param(_text(b"\x89HDF\r\n\x1a\n" + bytes(500), "o.nc"), "not NetCDF", id="cut.nc"),
+    pytest.param(_text(b"CDF\x01" + b"\xff" * 500, "o.nc"), "not NetCDF", id="classic.nc"),
+    pytest.param(_text(OVERLAP, "o.nc"), "not NetCDF", id="text.nc"),
+    pytest.param(_text("x" * 200_000 + "\n1\n"), "o.csv", id="long"),
+    pytest.param(_text(""), "no rows", id="empty"),
+    pytest.param(_text("range,overlap\n# 100,1\n"), "no rows", id="comments"),
+    pytest.param(_text("range,overlap\n100,0.5,1\n"), "3 values for 2 columns", id="ragged"),
+    pytest.param(_text("range;overlap\n100;0.5\n"), "no column 'range'", id="semicolons"),
+    pytest.param(_text("height,overlap\n1,0.5\n2,1\n"), "only height, overlap", id="name"),
+    pytest.param(_text("range [feet],overlap\n1,0.5\n2,1\n"), "range: is in 'feet'", id="feet"),
+    pytest.param(_text("range,overlap [%]\n1,50\n2,100\n"), "overlap: is in '%'", id="percent"),
+    pytest.param(_text("range,overlap\n1,0.5\n2,x\n"), "overlap: is not a column", id="word"),
+    pytest.param(_text("range,overlap\n1,0.5\n2,inf\n"), "overlap: is not a column", id="inf"),
+    pytest.param(_text("range,overlap\n1,0.5\n1,1\n"), "range: does not rise", id="twice"),
+    pytest.param(_text("range,overlap\n1,0.5\n"), "range: does not rise", id="single"),
+    pytest.param(_text("range,overlap\n1,0\n2,1\n"), "from 0 to 1", id="zero"),
+    pytest.param(_text("range,overlap\n1,0.5\n2,1.01\n"), "from 0.5 to 1.01", id="above 1"),
+    pytest.param(_text("range,overlap,overlap\n1,0.1,0.5\n2,1,1\n"), "overlap", id="double"),
+    pytest.param(_text("range [m],overlap,range [km]\n1,0.1,5\n2,1,6\n"), "range", id="both"),
+    pytest.param(_unequal, "overlap", id="unequal"),
+    pytest.param(_two_dimensions, "overlap: is not a column", id="matrix"),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), REFUSED)
+def test_what_is_no_overlap_function_is_refused_by_name(
+    tmp_path: Path, make: Callable[[Path], str], words: str
+) -> None:
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    name = make(folder)
+    with pytest.raises(AncillaryError) as caught:
+        overlap_profile(folder, name)
+    assert words in str(caught.value)
+    assert caught.value.file == name
+
+
+@pytest.mark.parametrize(
+    ("head", "scales", "field", "words"),
+    [
+        ("altitude [ft],pressure,temperature", (1, 1, 0), "altitude", "'ft'"),
+        ("altitude,pressure [bar],temperature", (1, 1e-5, 0), "pressure", "'bar'"),
+        ("altitude,pressure,temperature [F]", (1, 1, 0), "temperature", "'F'"),
+        # Units that the numbers contradict.
+        ("altitude,pressure,temperature", (1, 1, -273.15), "temperature", "Celsius"),
+        ("altitude,pressure,temperature", (1e-3, 1, 0), "altitude", "km"),
+        ("altitude,pressure,temperature", (3.2808, 1, 0), "altitude", "feet"),
+        ("altitude,pressure [Pa],temperature", (1, 1e-2, 0), "pressure_unit", "hPa, not Pa"),
+        ("altitude,pressure [hPa],temperature", (1, 1, 0), "pressure", "neither Pa nor hPa"),
+    ],
+)
+def test_wrong_units_of_a_sounding_are_refused_by_name(
+    tmp_path: Path, head: str, scales: tuple[float, float, float], field: str, words: str
+) -> None:
+    length, force, zero = scales
+    name = _sounding(tmp_path, head, ALTITUDE * length, PRESSURE * force, TEMPERATURE + zero)
+    with pytest.raises(AncillaryError, match=words) as caught:
+        molecular_profile(tmp_path, name)
+    assert (caught.value.file, caught.value.field) == (name, field)
+
+
+def test_a_file_too_large_for_a_profile_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "o.csv").open("wb") as file:
+        os.truncate(file.fileno(), 200_000_000)
+    with pytest.raises(AncillaryError, match="larger than any profile"):
+        overlap_profile(tmp_path, "o.csv")
+
+
+def test_a_plan_tells_what_is_read_once_and_recorded(tmp_path: Path) -> None:
+    _sounding(tmp_path, "altitude,pressure,temperature", ALTITUDE, PRESSURE, TEMPERATURE)
+    (tmp_path / "o.csv").write_text(OVERLAP)
+    campaign = factories.campaign(
+        facts=[{"molecular_profile": "air.csv", "overlap_profile": "o.csv", "zenith_angle": 0}],
+        products={"elastic": {"channels": ["analog_532o", "photon_532o"]}},
+    )
+    scene = cut(campaign, (factories.granule(0),)).scenes[0]
+    found = Ancillaries.read(tmp_path, plan(scene, campaign))
+    assert list(found.profiles) == ["air.csv"]
+    assert list(found.overlaps) == ["o.csv"]
+    assert [(each.path, each.role) for each in found.inputs] == [
+        ("air.csv", Role.MOLECULAR),
+        ("o.csv", Role.OVERLAP),
+    ]
+    for each in found.inputs:
+        assert each.sha256 == hashlib.sha256((tmp_path / each.path).read_bytes()).hexdigest()
+    bare = factories.campaign()
+    assert Ancillaries.read(tmp_path, plan(scene, bare)) == Ancillaries({}, {}, ())

@@ -1,0 +1,280 @@
+"""Campaign files: what is accepted, and how a mistake is told."""
+
+from __future__ import annotations
+
+import pickle
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import yaml
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from lidarops.campaign.model import Campaign, ElasticSettings, load
+from lidarops.cli import app
+from lidarops.errors import CampaignError, CatalogError
+
+MINIMAL = """\
+name: small
+title: A small campaign
+archive: raw
+output: out
+stations:
+  coast: {name: Coast, latitude: 46.4, longitude: 30.7}
+instruments:
+  lidar:
+    station: coast
+    files: "h*"
+"""
+
+
+def _write(folder: Path, text: str) -> Path:
+    path = folder / "campaign.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LIDAROPS_ARCHIVE", raising=False)
+    path = _write(tmp_path, MINIMAL)
+    assert load(path).archive == str(tmp_path / "raw")
+    assert load(path, output="/elsewhere").products_root == Path("/elsewhere/products")
+    monkeypatch.setenv("LIDAROPS_ARCHIVE", "/archive")
+    assert load(path).archive == "/archive"
+    assert load(path, archive="/given").archive == "/given"
+    assert load(path, archive="memory://raw").archive == "memory://raw"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("latitude: 46.4", "latitude: 146.4", r"line 6: stations\.coast\.latitude"),
+        ("station: coast", "station: cost", "known: coast"),
+        ('files: "h*"', 'files: "../h*"', "inside its folder"),
+        ('files: "h*"', 'files: "/h*"', "inside its folder"),
+        ("archive: raw", "archve: raw", "line 3: archve: .* known: archive, all_steps, "),
+        ("station: coast", "products: {elastik: {}}", r"elastik: .* known: elastic, homogeneous"),
+        ("lidar:", "my_lidar:", r"line 8: instruments\.my_lidar: .*letters, digits and hyphens"),
+        ("station: coast", "station: x y", r"line 9: .*letters, digits and hyphens.*not 'x y'"),
+        ("output: out", "output: out\ntitle: B", "title: stands twice, in lines 2 and 5"),
+        ('"h*"', '"h*"\n    files: x', r"instruments\.lidar\.files: stands twice, in lines 10 and"),
+        ("output: out", "output: s3://bucket/out", "output: is a URL"),
+        ("title: A small campaign", "title: [", "not valid YAML"),
+        ("title: A small campaign", "title: 2024-02-30", "not YAML"),
+        ("name: small", "name: !!python/object/apply:os.getcwd []", "not valid YAML"),
+    ],
+)
+def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, expected: str) -> None:
+    path = _write(tmp_path, MINIMAL.replace(old, new))
+    with pytest.raises(CampaignError, match=expected) as caught:
+        load(path)
+    assert str(path) in str(caught.value)
+
+
+SIMULATED = """
+simulation:
+  start: 2026-01-01
+  duration: 60
+  instruments:
+    lidar:
+      kind: horizontal
+      aquisition: {}
+"""
+
+
+def test_a_wrong_key_of_one_of_several_kinds_is_told_with_those_of_its_kind(tmp_path: Path) -> None:
+    path = _write(tmp_path, MINIMAL + SIMULATED)
+    with pytest.raises(CampaignError) as caught:
+        load(path)
+    (told,) = [line for line in str(caught.value).splitlines() if "aquisition" in line]
+    assert told.strip().startswith("line 18: ")
+    assert "known: acquisition, " in told
+    assert "aerosol_extinction" in told
+    assert "scan" not in told
+
+
+def test_keys_that_stand_twice_in_different_places_are_no_mistake(tmp_path: Path) -> None:
+    anchored = """
+networks: {}
+metadata: {license: x, comment: y}
+"""
+    path = _write(tmp_path, MINIMAL + anchored)
+    assert load(path).metadata.comment == "y"
+    merged = MINIMAL.replace('"h*"', '"h*"\n    <<: *a\n    <<: *b').replace(
+        "instruments:", "x: [&a {name: A}, &b {header_position: ignore}]\ninstruments:"
+    )
+    with pytest.raises(CampaignError) as caught:
+        load(_write(tmp_path, merged))
+    assert "stands twice" not in str(caught.value)
+    loop = MINIMAL + "metadata: &a {comment: x, program: *a}\n"
+    with pytest.raises(CampaignError, match="program"):
+        load(_write(tmp_path, loop))
+
+
+def test_a_url_of_the_command_line_is_no_folder(tmp_path: Path) -> None:
+    path = _write(tmp_path, MINIMAL)
+    for command in (["runs", str(path)], ["publish", str(path), "memory://there"]):
+        told = CliRunner().invoke(app, [*command, "--out", "s3://bucket/out"])
+        assert told.exit_code == 2
+        assert "output: is a URL" in told.stderr
+    told = CliRunner().invoke(app, ["bench", "luck", "--out", "s3://bucket/out"])
+    assert told.exit_code == 2
+    assert "is a URL" in " ".join(told.stderr.split())
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CampaignError, match=r"none\.yaml"):
+        load(tmp_path / "none.yaml")
+
+
+def _with_facts(*facts: dict[str, object]) -> Campaign:
+    raw = yaml.safe_load(MINIMAL)
+    raw["instruments"]["lidar"]["facts"] = list(facts)
+    return Campaign.model_validate(raw)
+
+
+def test_facts_follow_time() -> None:
+    campaign = _with_facts(
+        {"valid_to": "2020-01-01", "zenith_angle": 10},
+        {"valid_from": "2020-01-01", "zenith_angle": 20},
+    )
+    lidar = campaign.instruments["lidar"]
+    assert lidar.facts_at(datetime(2019, 12, 31, 23, 59, 59, tzinfo=UTC)).zenith_angle == 10
+    assert lidar.facts_at(datetime(2020, 1, 1, tzinfo=UTC)).zenith_angle == 20
+
+
+def test_overlapping_periods_are_refused() -> None:
+    with pytest.raises(ValueError, match="overlap"):
+        _with_facts({"valid_to": "2020-01-02"}, {"valid_from": "2020-01-01"})
+    with pytest.raises(ValueError, match="later"):
+        _with_facts({"valid_from": "2020-01-01", "valid_to": "2019-01-01"})
+
+
+@pytest.mark.parametrize(("window", "seconds"), [("6h", 21600), ("30min", 1800), ("day", None)])
+def test_windows(window: str, seconds: float | None) -> None:
+    raw = yaml.safe_load(MINIMAL) | {"scenes": {"window": window}}
+    found = Campaign.model_validate(raw).scenes.window
+    assert found == "day" if seconds is None else found.total_seconds() == seconds  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("window", ["7h", "10s", "fortnight", "2d"])
+def test_odd_windows_are_refused(window: str) -> None:
+    raw = yaml.safe_load(MINIMAL) | {"scenes": {"window": window}}
+    with pytest.raises(ValueError, match="window"):
+        Campaign.model_validate(raw)
+
+
+# Settings of the elastic product, and files beside the campaign file ---------------------------
+
+
+def _instrument(**changes: object) -> Campaign:
+    raw = yaml.safe_load(MINIMAL)
+    raw["instruments"]["lidar"].update(changes)
+    return Campaign.model_validate(raw)
+
+
+def _elastic(**settings: object) -> ElasticSettings:
+    wanted = {"elastic": {"channels": ["photon_532o"], **settings}}
+    found = _instrument(products=wanted).instruments["lidar"].products.elastic
+    assert found is not None
+    return found
+
+
+def test_elastic_defaults_are_those_of_a_scientist() -> None:
+    found = _elastic()
+    assert found.average == timedelta(minutes=30)
+    assert (found.lidar_ratio, found.lidar_ratio_standard_error) == (50.0, 10.0)
+    assert found.background == "known_shape"
+    assert found.molecular_relative_error == 0.01
+    window = found.reference
+    assert (window.lowest, window.highest, window.width) == (3000.0, 12_000.0, 1000.0)
+    assert (window.scattering_ratio, window.relative_error) == (1.0, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10s", 10), ("5min", 300), ("2h", 7200), ("1d", 86400), (900, 900)]
+)
+def test_averages(text: object, seconds: float) -> None:
+    assert _elastic(average=text).average.total_seconds() == seconds
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"average": "7min"}, "divide a day"),
+        ({"average": "2d"}, "divide a day"),
+        ({"average": "0s"}, "divide a day"),
+        ({"average": "0.5s"}, "divide a day"),
+        ({"average": "-30min"}, "average"),
+        ({"average": "soon"}, "average"),
+        ({"average": "infh"}, "average"),
+        ({"average": "nanh"}, "average"),
+        ({"average": "min"}, "average"),
+        ({"average": "999999999999d"}, "average"),
+        ({"lidar_ratio": 0}, "lidar_ratio"),
+        ({"lidar_ratio": 250}, "lidar_ratio"),
+        ({"lidar_ratio": "nan"}, "lidar_ratio"),
+        ({"lidar_ratio_standard_error": -1}, "lidar_ratio_standard_error"),
+        ({"lidar_ratio_standard_error": float("nan")}, "lidar_ratio_standard_error"),
+        ({"molecular_relative_error": 1.5}, "molecular_relative_error"),
+        ({"background": "cubic"}, "known_shape"),
+        ({"channels": []}, "channels"),
+        ({"lidar_ration": 40}, "lidar_ration"),
+        ({"reference": {"lowest": 5000, "highest": 5999}}, "at least width above lowest"),
+        ({"reference": {"lowest": -1}}, "lowest"),
+        ({"reference": {"lowest": float("inf"), "highest": float("inf")}}, "lowest"),
+        ({"reference": {"width": 50}}, "width"),
+        ({"reference": {"width": float("nan")}}, "width"),
+        ({"reference": {"scattering_ratio": 0.9}}, "scattering_ratio"),
+        ({"reference": {"relative_error": -0.1}}, "relative_error"),
+    ],
+)
+def test_elastic_settings_that_cannot_be_right_are_refused(
+    settings: dict[str, object], words: str
+) -> None:
+    with pytest.raises(ValidationError, match=words):
+        _elastic(**settings)
+
+
+@pytest.mark.parametrize("lag", [-100, 3.5, 0, "estimate", None])
+def test_lags(lag: object) -> None:
+    facts = _with_facts({"channels": {"analog_532o": {"lag": lag}}}).instruments["lidar"].facts[0]
+    assert facts.channels["analog_532o"].lag == lag
+
+
+@pytest.mark.parametrize("lag", [101, -101, "guess", float("nan"), float("inf")])
+def test_odd_lags_are_refused(lag: object) -> None:
+    with pytest.raises(ValidationError, match="lag"):
+        _with_facts({"channels": {"analog_532o": {"lag": lag}}})
+
+
+@pytest.mark.parametrize("name", ["overlap_profile", "molecular_profile"])
+@pytest.mark.parametrize("path", ["../air.csv", "/etc/air.csv", "~/air.csv", "a/../../air.csv"])
+def test_profiles_stay_beside_the_campaign_file(name: str, path: str) -> None:
+    with pytest.raises(ValidationError, match="inside its folder"):
+        _with_facts({name: path})
+    assert getattr(_with_facts({name: "air/o.csv"}).instruments["lidar"].facts[0], name)
+
+
+def test_the_folder_is_that_of_the_campaign_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _write(tmp_path, MINIMAL)
+    monkeypatch.chdir(tmp_path)
+    assert load("campaign.yaml").folder == tmp_path.resolve()
+    assert load(tmp_path / "campaign.yaml", output="/elsewhere").folder == tmp_path.resolve()
+    assert load("campaign.yaml").model_copy().folder == tmp_path.resolve()
+
+
+@pytest.mark.parametrize("wrong_use", [False, True])
+def test_an_error_tells_the_same_in_other_processes(*, wrong_use: bool) -> None:
+    error = CatalogError("is away", file="a", field="b", remedy="wait", wrong_use=wrong_use)
+    told = pickle.loads(pickle.dumps(error))
+    assert (str(told), told.wrong_use) == ("a: b: is away (wait)", wrong_use)
+    assert pickle.loads(pickle.dumps(CampaignError("is no campaign"))).wrong_use
+
+
+def test_the_folder_goes_with_a_campaign_to_other_processes(tmp_path: Path) -> None:
+    campaign = load(_write(tmp_path, MINIMAL))
+    assert pickle.loads(pickle.dumps(campaign)).folder == campaign.folder

@@ -1,0 +1,59 @@
+"""What stands in the README works."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import xarray as xr
+import yaml
+from typer.testing import CliRunner
+
+from lidarops.campaign.model import Campaign
+from lidarops.cli import app
+
+
+@pytest.fixture(scope="module")
+def readme(repository: Path) -> str:
+    """Its text."""
+    return (repository / "README.md").read_text(encoding="utf-8")
+
+
+def _block(readme: str, language: str) -> str:
+    found = re.search(rf"```{language}\n(.*?)```", readme, re.DOTALL)
+    assert found
+    return found[1]
+
+
+def test_it_is_short(readme: str) -> None:
+    assert len(readme.splitlines()) <= 150
+
+
+def test_the_campaign_file_is_valid(readme: str) -> None:
+    campaign = Campaign.model_validate(yaml.safe_load(_block(readme, "yaml")))
+    assert len(campaign.instruments["pier-lidar"].facts) == 2
+
+
+def test_the_python_lines_run(readme: str, demo_archive: Path) -> None:
+    code = _block(readme, "python").replace("demo/raw", str(demo_archive))
+    names: dict[str, object] = {}
+    exec(code, names)
+    fit = names["fit"]
+    assert isinstance(fit, xr.Dataset)
+    assert fit["extinction"].sizes["time"] > 50
+
+
+def test_every_command_is_there(readme: str) -> None:
+    commands = set(re.findall(r"^    lidarops (\w+)", readme, re.MULTILINE))
+    shown = CliRunner().invoke(app, ["--help"]).output
+    assert {"simulate", "catalog", "plan", "reprocess", "report", "inspect", "bench"} < commands
+    for command in commands:
+        assert command in shown
+        assert "Example" in CliRunner().invoke(app, [command, "--help"]).output
+
+
+def test_files_that_it_names_exist(readme: str, repository: Path) -> None:
+    for name in re.findall(r"`([\w./-]+\.(?:py|toml|bib|md|yaml))`|\]\(([\w./-]+)\)", readme):
+        path = next(part for part in name if part)
+        assert (repository / path).exists(), path

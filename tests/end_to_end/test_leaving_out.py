@@ -1,0 +1,608 @@
+"""What plans leave out: every rule by name, and that nothing good is lost by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+import xarray as xr
+from support import factories, mixed_campaign, raw_archives
+
+from lidarops.catalog.schema import GRANULE
+from lidarops.catalog.store import Store
+from lidarops.flags import Quality
+from lidarops.plan import product_dependence
+from lidarops.plan.preview import GAP, WITHOUT, refine
+from lidarops.plan.rule_table import RULES
+from lidarops.plan.scene_plan import CHANNEL, GATE, PRODUCTS, plan
+from lidarops.plan.scenes import cut
+from lidarops.plan.signal_rules import gates, idle_gate
+from lidarops.process import channel_steps
+from lidarops.process import scene as processing
+from lidarops.process.scene import Job, process
+from lidarops.raw.licel import RawFile
+from lidarops.records import Plan, ProductKind, Role, RunRecord, Step
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
+from lidarops.run.archive import Options, prepare, reprocess
+from lidarops.run.executor import run
+from lidarops.simulate.campaign import simulate
+
+SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}
+HOMOGENEOUS = {"homogeneous": SECTIONS}
+
+
+def planned(*granules: Any, all_steps: bool = False, **changes: Any) -> Plan:
+    campaign = factories.campaign(**changes).model_copy(update={"all_steps": all_steps})
+    return plan(cut(campaign, granules or (factories.granule(0),)).scenes[0], campaign)
+
+
+def decided(made: Plan, rule: str) -> tuple[list[str], list[str]]:
+    """Return the steps that a rule asks for, and what it leaves out."""
+    steps = [step.name for step in made.steps if step.rule == rule]
+    return steps, [left.reason for left in made.left_out if left.rule == rule]
+
+
+# The table ------------------------------------------------------------------------------------
+
+
+def test_rules_have_names_and_questions():
+    assert len({rule.name for rule in RULES}) == len(RULES)
+    assert all(rule.asks.endswith("?") for rule in RULES)
+    assert {CHANNEL, GATE, *PRODUCTS} <= set(RULES)
+
+
+def told(**facts: Any) -> dict[str, Any]:
+    return {"facts": [facts]}
+
+
+def wanted(**products: Any) -> dict[str, Any]:
+    return {"products": products}
+
+
+LEVEL = factories.granule(0)
+UP = factories.granule(0, zenith_angle=0.0)
+DARK = factories.granule(-30, path="dark/d", role=Role.DARK)
+SCAN = [factories.granule(k, zenith_angle=15.0 * k) for k in range(6)]
+ANALOG = wanted(signal={"channels": ["analog_532o"]})
+ELASTIC = wanted(elastic={"channels": ["photon_532o"]})
+TAIL = wanted(elastic={"channels": ["photon_532o"], "background": "tail_mean"})
+GLUED = wanted(elastic={"channels": ["glued_532o"]})
+LATE = {**GLUED, **told(channels={"analog_532o": {"lag": 3}})}
+MULTI = wanted(multiangle={"channels": ["photon_532o"]})
+CALM = wanted(multiangle={"channels": ["photon_532o"], "largest_gradient": 0.0})
+FEW = wanted(signal={"channels": ["photon_532o"], "background_range": [14_990, 15_000]})
+OF_ANALOG = wanted(homogeneous={**SECTIONS, "channels": ["analog_532o"]})
+OFFSET = told(channels={"photon_532o": {"range_offset": 5}})
+SEEN = wanted(homogeneous={**SECTIONS, "visibility": {}})
+
+
+def scans(*beams: tuple[float, float | None]) -> list[Any]:
+    """Return granules of beams, by zenith angle and azimuth."""
+    return [
+        factories.granule(k, path=f"coast/h{k}", zenith_angle=zenith, azimuth=azimuth)
+        for k, (zenith, azimuth) in enumerate(beams)
+    ]
+
+
+def multi(**settings: Any) -> dict[str, Any]:
+    return wanted(multiangle={"channels": ["photon_532o"], **settings})
+
+
+ONE_SIDE = scans(*((15.0 * k, 90.0) for k in range(6)))
+BOTH_SIDES = scans(*((15.0 * k, side) for k in range(6) for side in (90.0, 270.0)))
+TWO_BEAMS = scans((0.0, 90.0), (60.0, 90.0))
+BEYOND = wanted(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 16_000]]})
+
+
+@pytest.mark.parametrize(
+    ("rule", "needing", "needless"),
+    [
+        ("channel", ([LEVEL], {}), ([LEVEL], wanted(signal={"channels": []}))),
+        ("range_gate", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
+        ("overlap", ([LEVEL], {}), ([LEVEL], told())),
+        ("range_offset", ([LEVEL], OFFSET), ([LEVEL], {})),
+        ("dark", ([LEVEL, DARK], ANALOG), ([LEVEL], ANALOG)),
+        ("dead_time", ([LEVEL], {}), ([LEVEL], told())),
+        ("lag", ([UP], LATE), ([UP], GLUED)),
+        ("signal", ([LEVEL], ANALOG), ([LEVEL], FEW)),
+        ("homogeneous", ([LEVEL], {}), ([LEVEL], ANALOG)),
+        ("known_shape", ([UP], ELASTIC), ([UP], TAIL)),
+        ("elastic", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
+        ("gradient", (SCAN, MULTI), (SCAN, CALM)),
+        ("multiangle", (SCAN, MULTI), ([UP], MULTI)),
+        ("along_path", ([LEVEL], SEEN), ([LEVEL], {})),
+        ("gradient_regressor", (BOTH_SIDES, MULTI), (ONE_SIDE, MULTI)),
+        ("gradient_regressor", (BOTH_SIDES, MULTI), (SCAN, MULTI)),
+        ("gradient_regressor", (BOTH_SIDES, MULTI), (BOTH_SIDES, multi(method="mld"))),
+        ("robust", (ONE_SIDE, MULTI), (TWO_BEAMS, MULTI)),
+        ("vertical", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="kano_hamilton"))),
+        ("vertical", (ONE_SIDE, MULTI), (TWO_BEAMS, MULTI)),
+        ("correlation", (ONE_SIDE, MULTI), (TWO_BEAMS, multi(method="joint"))),
+        ("correlation", (ONE_SIDE, MULTI), (ONE_SIDE, multi(method="mld"))),
+        ("layers", (ONE_SIDE, multi(layers=[[600, 1200]])), (ONE_SIDE, MULTI)),
+    ],
+)  # fmt: skip
+def test_a_scene_that_needs_a_step_and_one_that_does_not(rule, needing, needless):
+    granules, changes = needing
+    steps, _ = decided(planned(*granules, **changes), rule)
+    assert steps
+    granules, changes = needless
+    made = planned(*granules, **changes)
+    steps, reasons = decided(made, rule)
+    assert reasons
+    assert all(reasons)
+    channels = {left.channel for left in made.left_out if left.rule == rule}
+    assert not [step for step in made.steps if step.rule == rule and step.channel in channels]
+
+
+@pytest.mark.parametrize(
+    ("rule", "asked", "unasked"),
+    [
+        ("noise", ([LEVEL], {}), ([LEVEL], wanted())),
+        ("glue", ([UP], GLUED), ([UP], ELASTIC)),
+        ("background", ([LEVEL], ANALOG), ([LEVEL], {})),
+        ("average", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
+        ("molecular", ([UP], ELASTIC), ([LEVEL], {})),
+        ("reference", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
+        ("look", ([LEVEL], {}), ([UP], {})),
+    ],
+)
+def test_a_question_that_does_not_arise_is_not_answered(rule, asked, unasked):
+    assert decided(planned(*asked[0], **asked[1]), rule)[0]
+    assert decided(planned(*unasked[0], **unasked[1]), rule) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("rule", "changes"),
+    [
+        ("section_inside", BEYOND),
+        ("channel_present", wanted(signal={"channels": ["photon_999x"]})),
+        ("facts_fit", told(channels={"photon_999x": {}})),
+    ],
+)
+def test_what_cannot_be_is_left_out_by_name(rule, changes):
+    assert decided(planned(LEVEL, **changes), rule)[1]
+    assert decided(planned(LEVEL), rule) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("granules", "rule", "number"),
+    [
+        (ONE_SIDE, "gradient_regressor", 360.0),
+        (BOTH_SIDES, "gradient_regressor", 180.0),
+        (scans((0.0, 0.0), (30.0, 0.0), (30.0, 120.0), (30.0, 240.0)), "gradient_regressor", 120.0),
+        # The azimuths of a beam near the zenith are one direction, negative angles the other side.
+        (scans((0.0, 0.0), (0.0, 200.0), (50.0, 10.0)), "robust", 2.0),
+        (scans((60.0, 90.0), (-60.0, 90.0), (0.0, 90.0)), "gradient_regressor", 180.0),
+        (ONE_SIDE, "correlation", 4.0),
+        (ONE_SIDE, "vertical", 100.0),
+    ],
+)
+def test_numbers_of_scans(granules, rule, number):
+    made = planned(*granules, **MULTI)
+    (found,) = (each for each in (*made.steps, *made.left_out) if each.rule == rule)
+    assert found.number == pytest.approx(number)
+
+
+JITTER = scans(
+    *((zenith + off, 90.0) for zenith in (10.0, 30.0, 50.0) for off in (-0.2, -0.07, 0.07, 0.2))
+)
+NEARLY_OPPOSITE = scans((0.0, 0.0), (30.0, 0.0), (60.0, 0.0), (30.0, 180.1), (60.0, 180.1))
+FLAT = scans((0.0, 90.0), (30.0, 90.0), (60.0, 90.0), (88.0, 270.0))
+
+
+@pytest.mark.parametrize(
+    ("granules", "count"), [(JITTER, 3), (NEARLY_OPPOSITE, 5), (FLAT, 3), (BOTH_SIDES, 11)]
+)
+def test_the_rays_of_a_plan_are_those_of_the_retrieval(granules, count):
+    made = planned(*granules, **MULTI)
+    told = {each.rule: each for each in (*made.steps, *made.left_out)}
+    found, surrounded = retrieved(granules, highest=6000.0, step=60.0)
+    assert found == told["robust"].number == count
+    assert surrounded == (told["gradient_regressor"] in made.steps)
+
+
+def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int, bool]:
+    """Return how many rays the retrieval uses, and whether it can find a gradient."""
+    times = np.datetime64("2026-03-01", "ns") + np.arange(len(granules)) * np.timedelta64(60, "s")
+    distance = 7.5 * (np.arange(4000) + 0.5)
+    power = np.tile(1e6 / distance**2, (len(granules), 1))
+    flat = (("time", "range"), np.zeros(power.shape, dtype=np.int32))
+    profiles = xr.Dataset(
+        {"power": (("time", "range"), power), "variance": flat, "quality": flat},
+        coords={"range": distance},
+    )
+    rays = labeled_altitudes.on_altitudes(
+        profiles,
+        zenith_angle=np.array([granule.zenith_angle for granule in granules]),
+        azimuth=np.array([granule.azimuth for granule in granules]),
+        time=times,
+        time_bnds=np.stack([times, times + np.timedelta64(60, "s")], axis=-1),
+        shots=np.ones(len(granules)),
+        altitude_grid=np.arange(step, highest + 1e-6, step) + 20.0,
+        station_altitude=20.0,
+        background=labeled_altitudes.Background(
+            (27_000.0, 30_000.0), MolecularProfile.us_standard(), 532e-9
+        ),
+    ).compute()
+    scan = slant_paths.make_scan(
+        rays["ray_zenith_angle"].to_numpy(),
+        rays["altitude"].to_numpy() - 20.0,
+        rays["ray_azimuth"].to_numpy(),
+    )
+    signal = rays["signal"].to_numpy()
+    return rays.sizes["ray"], _block.make_rays(signal, np.ones(signal.shape), scan).sides
+
+
+def test_angles_that_cannot_be_leave_the_plan_to_the_retrieval():
+    made = planned(*scans((-30.0, None), (0.0, None), (30.0, None)), **MULTI)
+    assert decided(made, "robust") == (
+        [],
+        ["fewer than 4 directions do not tell which of them is an outlier"],
+    )
+
+
+def test_every_decision_has_a_rule_of_the_table():
+    names = {rule.name for rule in RULES}
+    for granules, changes in (
+        ([LEVEL, DARK], {}), ([UP], ELASTIC), ([UP], LATE), (BOTH_SIDES, MULTI), ([LEVEL], FEW),
+    ):  # fmt: skip
+        made = planned(*granules, **changes)
+        assert {each.rule for each in (*made.steps, *made.left_out)} <= names
+
+
+def test_every_row_is_asked_for_here():
+    """No row of the table without a test that names it."""
+    here = Path(__file__)
+    told = here.read_text() + (here.parents[1] / "plan/test_network_plan.py").read_text()
+    missing = {rule.name for rule in RULES if f'"{rule.name}"' not in told}
+    # Tested by the bit that they set.
+    assert missing <= {"section_saturated", "member_background"}
+
+
+# Headers --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("angles", "kept"),
+    [
+        ([90.0], 2),
+        ([89.0], 1),
+        ([88.0], 0),
+        ([None], 0),
+        ([0.0, 90.0], 2),
+        ([0.0, None], 0),
+    ],
+)
+def test_sections_are_retrieved_where_a_beam_may_be_level(angles, kept):
+    # At 89 degree 3750 m climb by 65 m, 6000 m by 105 m, and 100 m are level.
+    granules = [factories.granule(k, zenith_angle=angle) for k, angle in enumerate(angles)]
+    made = planned(*granules, products=HOMOGENEOUS)
+    step = [step for step in made.steps if step.name == "homogeneous"]
+    assert sum(len(each.settings["sections"]) for each in step) == kept
+    assert len(decided(made, "section_level")[1]) == 2 - kept
+    whole = planned(*granules, products=HOMOGENEOUS, all_steps=True)
+    (step,) = (step for step in whole.steps if step.name == "homogeneous")
+    assert len(step.settings["sections"]) == 2
+    assert any("all steps" in left.reason for left in whole.left_out)
+
+
+def test_the_gate_holds_the_farthest_section_and_what_tells_its_noise():
+    # 7500 m, a tenth more for the variance, and two bins for rounding.
+    made = planned(products=HOMOGENEOUS)
+    (gate,) = (step for step in made.steps if step.name == "range_gate")
+    assert gate.settings == {"bins": [[0, 1102]]}
+    assert gate.number == 1102
+    assert gate.as_dict()["rule"] == "range_gate"
+    moved = told(channels={"photon_532o": {"range_offset": -75.0}})
+    (gate,) = (s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_gate")
+    assert gate.settings == {"bins": [[0, 1112]]}
+
+
+@pytest.mark.parametrize(
+    ("products", "why"),
+    [
+        (HOMOGENEOUS, ""),
+        ({**HOMOGENEOUS, "signal": {"channels": ["analog_532o"]}}, ""),
+        ({**HOMOGENEOUS, "signal": {}}, "signal needs all bins"),
+        ({**HOMOGENEOUS, **ELASTIC["products"]}, "elastic needs all bins"),
+        ({**HOMOGENEOUS, **GLUED["products"]}, "glued_532o needs all bins"),
+        ({**HOMOGENEOUS, **ELASTIC["products"], "signal": {}}, "signal and elastic need all bins"),
+    ],
+)
+def test_a_gate_that_keeps_no_bin_from_being_read_says_so(products, why):
+    # It climbs by 90 m along the section, which is level enough, and reaches clean air.
+    steep = factories.granule(0, zenith_angle=0.0)
+    wanted = {**products, "homogeneous": {**SECTIONS, "sections": [[750, 840]]}}
+    made = planned(steep, products=wanted)
+    (gate,) = (step for step in made.steps if step.name == "range_gate")
+    assert idle_gate(gate, made.steps) == why
+    assert ("photon_532o" in gates(made.steps)) == (not why)
+    assert not any(idle_gate(step, made.steps) for step in made.steps if step is not gate)
+    # The product of sections tells the same of itself, whatever else is made.
+    alone = product_dependence.part(made, [(ProductKind.HOMOGENEOUS, "photon_532o")])
+    assert gate in alone.steps
+    assert not idle_gate(gate, alone.steps)
+
+
+def test_a_gate_of_one_lidar_is_not_idle_for_what_another_needs():
+    gate = Step("range_gate", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
+    signal = Step("signal", "photon_532o", {}, "asked for", "west")
+    assert not idle_gate(gate, [gate, signal])
+    assert gates([gate, signal]) == {"photon_532o": ((0, 9),)}
+
+
+def test_the_gate_of_an_older_product_is_understood():
+    step = Step("range_gate", "photon_532o", {"bins": 1102}, "as it was told")
+    assert gates([step]) == {"photon_532o": ((0, 1102),)}
+
+
+# Looks ----------------------------------------------------------------------------------------
+
+RANGE = 7.5 * (np.arange(2000) + 0.5)
+
+
+def sky(light, *, saturated=()):
+    """Give profiles of a constant sky, in some of which there is light, by minute."""
+    seen: list[float] = []
+
+    def profiles(_channel, granules):
+        minutes = [(g.start - factories.DAY).total_seconds() / 60 for g in granules]
+        seen.extend(minutes)
+        power = np.full((len(minutes), RANGE.size), 3.0)
+        power += np.array([[light(minute)] for minute in minutes]) * 1e6 / RANGE**2
+        quality = np.zeros(power.shape, np.int32)
+        quality[[minute in saturated for minute in minutes], 200] = int(Quality.SATURATED)
+        pair = ("time", "range")
+        return xr.Dataset(
+            {
+                "power": (pair, power),
+                "variance": (pair, np.full(power.shape, 0.01)),
+                "quality": (pair, quality),
+            },
+            coords={"range": RANGE},
+        )
+
+    return profiles, seen
+
+
+def looked(profiles, count=600):
+    granules = [factories.granule(float(k)) for k in range(count)]
+    return refine(planned(*granules, products=HOMOGENEOUS), granules, profiles)
+
+
+def absent(made):
+    (step,) = (step for step in made.steps if step.name == "homogeneous")
+    return step.settings.get(WITHOUT, [])
+
+
+def test_sixteen_profiles_with_light_are_enough():
+    profiles, seen = sky(lambda _: 1.0)
+    made = looked(profiles)
+    assert absent(made) == []
+    assert len(seen) == 16
+
+
+def test_a_dark_scene_is_left_out_and_told_with_its_number():
+    made = looked(sky(lambda _: 0.0)[0])
+    assert absent(made) == [[750.0, 4500.0, "LOW_SIGNAL"], [1500.0, 7500.0, "LOW_SIGNAL"]]
+    left = [each for each in made.left_out if each.rule == "section_dark"]
+    assert [each.channel for each in left] == ["photon_532o"] * 2
+    assert all(each.number is not None and each.number < 1e-6 for each in left)
+    assert "no light" in left[0].reason
+
+
+@pytest.mark.parametrize("begins", [3, 101, 333, 580])
+def test_light_of_ten_minutes_in_a_dark_day_is_not_lost(begins):
+    made = looked(sky(lambda minute: float(begins <= minute <= begins + 10))[0])
+    assert absent(made) == []
+
+
+def test_profiles_that_are_looked_at_lie_close():
+    profiles, seen = sky(lambda _: 0.0)
+    looked(profiles)
+    assert np.diff(sorted(seen)).max() <= GAP.total_seconds() / 60
+    assert len(seen) == len(set(seen))
+
+
+def test_sections_that_are_always_saturated_are_left_out():
+    profiles, _ = sky(lambda _: 1.0, saturated=set(range(600)))
+    # Bin 200 lies at 1504 m: in both.
+    assert [bit for *_, bit in absent(looked(profiles))] == ["SATURATED"] * 2
+    profiles, _ = sky(lambda _: 1.0, saturated=set(range(600)) - set(range(70, 81)))
+    assert absent(looked(profiles)) == []
+
+
+def test_a_refined_plan_stays_as_it_is():
+    made = looked(sky(lambda _: 0.0)[0])
+    granules = [factories.granule(float(k)) for k in range(600)]
+    assert refine(made, granules, sky(lambda _: 1.0)[0]) == made
+
+
+# Files ----------------------------------------------------------------------------------------
+
+
+def archive(folder: Path, **changes: Any):
+    for k in range(4):
+        raw_archives.write(folder / "raw" / "coast" / f"h{k}", raw_archives.content(k, bins=1000))
+    return factories.campaign(**changes).model_copy(
+        update={"archive": str(folder / "raw"), "output": str(folder / "out")}
+    )
+
+
+def test_a_file_that_is_known_is_not_read_again(tmp_path):
+    campaign = archive(tmp_path)
+    first = reprocess(campaign)
+    again = reprocess(campaign, options=Options(force=True))
+    whole = reprocess(campaign.model_copy(update={"all_steps": True}), options=Options(force=True))
+    size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
+    (one,), (two,), (three,) = first.scenes, again.scenes, whole.scenes
+    assert one.inputs == two.inputs == three.inputs
+    assert one.bytes_read - two.bytes_read == size
+    assert three.bytes_read == size + 4 * 1000 * 4
+
+
+@pytest.mark.parametrize("far", [1500, 3000, 4500, 6700])
+@pytest.mark.parametrize("offset", [-60.0, 0.0, 40.0])
+def test_the_gate_changes_no_bit_of_a_section(tmp_path, far, offset):
+    facts = {"zenith_angle": 90, "channels": {"photon_532o": {"range_offset": offset}}}
+    products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, far]]}}
+    campaign = archive(tmp_path, facts=[facts], products=products)
+    scene = prepare(campaign).scenes[0]
+    made = plan(scene, campaign)
+    values, read = [], []
+    for dropped in (["look"], ["look", "range_gate"]):
+        steps = tuple(step for step in made.steps if step.name not in dropped)
+        outcome = process(Job(campaign, scene, replace(made, steps=steps)))
+        values.append(xr.load_dataset(campaign.products_root / outcome.products[0].path))
+        read.append(outcome.bytes_read)
+    assert read[0] < read[1]
+    for name in ("extinction", "extinction_standard_error", "reduced_chi2", "quality_flag"):
+        one, two = (each[name].to_numpy() for each in values)
+        np.testing.assert_array_equal(one, two)
+    assert np.isfinite(values[0]["extinction"]).any()
+
+
+def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeypatch):
+    products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, 1500]]}}
+    campaign = archive(tmp_path, products=products)
+    scene = prepare(campaign).scenes[0]
+    made = plan(scene, campaign)
+    absent = {WITHOUT: [[700.0, 1500.0, "LOW_SIGNAL"]]}
+    told = [
+        replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
+        for step in made.steps
+        if step.name != "look"
+    ]
+    opened = processing.open_archive
+
+    def without_shots(*files: Any, **settings: Any) -> xr.Dataset:
+        found = opened(*files, **settings)
+        found["photon_532o_shots"][1] = 0
+        return found
+
+    monkeypatch.setattr(processing, "open_archive", without_shots)
+    (product,) = process(Job(campaign, scene, replace(made, steps=tuple(told)))).products
+    flags = xr.load_dataset(campaign.products_root / product.path)["quality_flag"].to_numpy()
+    bits = flags[:, 0] & int(Quality.LOW_SIGNAL | Quality.INPUT_MISSING)
+    low = int(Quality.LOW_SIGNAL)
+    assert bits.tolist() == [low, low | int(Quality.INPUT_MISSING), low, low]
+
+
+@pytest.mark.parametrize("bytes_at_once", [0, 10**9])
+def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
+    tmp_path, monkeypatch, bytes_at_once
+):
+    campaign = archive(tmp_path)
+    scene = prepare(campaign).scenes[0]
+    job = Job(campaign, scene, plan(scene, campaign))
+    usual = [product.sha256 for product in process(job).products]
+    monkeypatch.setattr(channel_steps, "AT_ONCE", bytes_at_once)
+    assert [product.sha256 for product in process(job).products] == usual
+
+
+def test_a_changed_time_has_a_file_read_again(tmp_path, monkeypatch):
+    campaign = archive(tmp_path)
+    one = reprocess(campaign).scenes[0]
+    size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
+    scene = prepare(campaign).scenes[0]
+    stale = replace(scene, granules=tuple(replace(g, mtime_ns=1) for g in scene.granules))
+    found = process(Job(campaign, stale, plan(stale, campaign)))
+    assert found.inputs == one.inputs
+    assert found.bytes_read > size
+    seen: list[str] = []
+    read = RawFile.read_header
+    monkeypatch.setattr(
+        RawFile, "read_header", lambda file: seen.append(Path(file.path).name) or read(file)
+    )
+    process(Job(campaign, stale, plan(stale, campaign)))
+    assert set(seen) == {"h0", "h1", "h2", "h3"}
+
+
+def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
+    campaign = archive(tmp_path)
+    first = reprocess(campaign).scenes[0]
+    seen: list[str] = []
+    read = RawFile.read_header
+    monkeypatch.setattr(
+        RawFile, "read_header", lambda file: seen.append(Path(file.path).name) or read(file)
+    )
+
+    def again(**changes: Any) -> list[str]:
+        seen.clear()
+        asked = campaign.model_copy(update=changes)
+        (scene,) = reprocess(asked, options=Options(force=True)).scenes
+        if not changes:
+            assert [each.sha256 for each in scene.products] == [
+                each.sha256 for each in first.products
+            ]
+        return seen
+
+    # Once for the look, of which all files are a part, and once for the whole.
+    assert again() == ["h0", "h0"]
+    assert set(again(all_steps=True)) == {"h0", "h1", "h2", "h3"}
+    with Store(campaign.catalog_url, campaign.name) as store, store.transaction() as connection:
+        connection.execute(sa.update(GRANULE).values(header_digest=None))
+    assert set(again()) == {"h0", "h1", "h2", "h3"}
+
+
+def test_what_was_asked_for_is_told_first_where_there_is_nothing_to_do(tmp_path):
+    campaign = archive(tmp_path, facts=[{"zenith_angle": 0.0}])
+    (scene,) = run(campaign, prepare(campaign)).scenes
+    assert scene.error.startswith("nothing to do: homogeneous of photon_532o: section 750-4500 m")
+    assert "no product of the campaign asks" not in scene.error
+
+
+# All together ---------------------------------------------------------------------------------
+
+
+def _opened(record: RunRecord) -> dict[str, xr.Dataset]:
+    root = Path(record.products)
+    return {
+        product.path: xr.load_dataset(root / product.path)
+        for scene in record.scenes
+        for product in scene.products
+    }
+
+
+_MAIN = {
+    "homogeneous": ("extinction", "extinction_standard_error"),
+    "elastic": ("backscatter", "backscatter_standard_error"),
+    "multiangle": ("extinction", "extinction_standard_error"),
+    "visibility": ("extinction", "extinction_standard_error"),
+}
+
+
+@pytest.mark.slow
+def test_what_is_left_out_loses_and_changes_nothing_good(tmp_path):
+    campaign = mixed_campaign.write(tmp_path, profiles=40)
+    simulate(campaign)
+    reprocess(campaign)
+    planned_run = reprocess(campaign, options=Options(force=True))
+    everything = campaign.model_copy(
+        update={"all_steps": True, "output": str(tmp_path / "everything")}
+    )
+    whole = reprocess(everything, options=Options(force=True))
+    assert len(whole.scenes) >= 8
+    ours, theirs = _opened(planned_run), _opened(whole)
+    good = 0
+    for path, full in theirs.items():
+        kind = path.rsplit("/", 1)[-1]
+        value, error = next(names for key, names in _MAIN.items() if key in kind)
+        unflagged = full["quality_flag"].to_numpy() == 0
+        good += int(unflagged.sum())
+        if path not in ours:
+            assert not unflagged.any()
+            continue
+        mine = ours[path]
+        assert (mine["quality_flag"].to_numpy()[unflagged] == 0).all()
+        apart = np.abs(mine[value].to_numpy() - full[value].to_numpy())[unflagged]
+        assert np.all(apart <= 0.1 * full[error].to_numpy()[unflagged])
+    assert good > 1000
+    read = [sum(scene.bytes_read for scene in record.scenes) for record in (planned_run, whole)]
+    assert read[0] <= 0.5 * read[1]

@@ -1,0 +1,181 @@
+"""Networks from raw files to products: the truth within the stated errors, the same bits always."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from support import network_campaigns as made
+
+from lidarops.campaign.model import Campaign
+from lidarops.flags import Quality
+from lidarops.process.scene import Job
+from lidarops.records import SceneOutcome
+from lidarops.run.archive import prepare
+from lidarops.run.executor import make_jobs, process_all
+
+AIRS = {"homogeneous": made.HOMOGENEOUS, "gradient": made.GRADIENT, "plume": made.PLUME}
+
+
+def jobs_of(campaign: Campaign) -> list[Job]:
+    return [job for job in make_jobs(campaign, prepare(campaign)) if job.scene.members]
+
+
+def opened(campaign: Campaign, outcome: SceneOutcome) -> xr.Dataset:
+    assert outcome.error == ""
+    (product,) = outcome.products
+    return xr.load_dataset(campaign.products_root / product.path)
+
+
+def beams_of(job: Job) -> list[str]:
+    (step,) = (step for step in job.plan.steps if step.name == "visibility")
+    return [ray["instrument"] for ray in step.settings["rays"]]
+
+
+def scores(product: xr.Dataset, truth: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """(retrieved - true) / stated error of visibility, of unflagged values."""
+    whole = np.hypot(product["extinction_standard_error"], product["extinction_systematic_error"])
+    score = ((product["extinction"] - truth) / whole).values
+    return score[product["quality_flag"].values == 0]
+
+
+@pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
+def test_visibility_is_found_within_its_errors(six_beams, tmp_path):
+    found = []
+    for air, told in AIRS.items():
+        campaign, truth = made.written(tmp_path / air, made.tree(told, six_beams=six_beams))
+        (job,) = jobs_of(campaign)
+        (outcome,) = process_all([job])
+        product = opened(campaign, outcome)
+        true = made.truth_at(product, truth, beams_of(job))
+        usable = product["usable"].values < 2
+        assert usable.mean() > 0.95
+        error = (product["extinction"].values / true - 1.0)[usable]
+        assert np.sqrt(np.mean(error**2)) < 0.08
+        seen = -np.log(0.05) / true
+        inside = (product["visibility_in_air_lower"] <= seen) & (
+            seen <= product["visibility_in_air_upper"]
+        )
+        assert inside.values[usable].mean() > 0.5
+        found.append(scores(product, true))
+    score = np.concatenate(found)
+    assert score.size > 100
+    assert (np.abs(score) < 3.0).mean() >= 0.98
+    assert 0.6 < np.sqrt(np.mean(score**2)) < 1.4
+
+
+def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
+    told = made.tree(made.PLUME, duration=1200)
+    told["scenes"] = {"window": "10min"}
+    campaign, _ = made.written(tmp_path, told)
+    jobs = jobs_of(campaign)
+    assert len(jobs) == 2
+    digests = [
+        {outcome.scene: outcome.products[0].sha256 for outcome in process_all(again, workers=n)}
+        for again, n in (
+            (jobs, 1),
+            ([replace(job, profiles_per_chunk=1) for job in jobs], 1),
+            ([replace(job, profiles_per_chunk=4) for job in jobs], 2),
+        )
+    ]
+    assert digests[0] == digests[1] == digests[2]
+
+
+def test_the_gate_leaves_the_product_as_it_is(tmp_path):
+    told = made.tree(made.PLUME, duration=1200)
+    campaign, _ = made.written(tmp_path, told)
+    (job,) = jobs_of(campaign)
+    gates = [step for step in job.plan.steps if step.rule == "member_gate"]
+    assert gates
+    steps = tuple(step for step in job.plan.steps if step not in gates)
+    (gated,) = process_all([job])
+    near = opened(campaign, gated)
+    (whole,) = process_all([replace(job, plan=replace(job.plan, steps=steps))])
+    full = opened(campaign, whole)
+    assert gated.bytes_read < whole.bytes_read
+    np.testing.assert_array_equal(near["quality_flag"], full["quality_flag"])
+    for name in ("extinction", "extinction_standard_error", "extinction_systematic_error"):
+        # Sums over windows begin elsewhere, and are rounded differently.
+        np.testing.assert_allclose(near[name], full[name], rtol=1e-6)
+
+
+def test_thin_air_is_flagged_and_never_believed(tmp_path):
+    air = {
+        "homogeneous": {
+            "extinction": {"minimum": 2e-5, "maximum": 2e-5, "hour_of_maximum": 12},
+            "molecules_constant": True,
+        }
+    }
+    campaign, truth = made.written(tmp_path, made.tree(air, rate=1.0))
+    (job,) = jobs_of(campaign)
+    product = opened(campaign, process_all([job])[0])
+    true = made.truth_at(product, truth, beams_of(job))
+    usable = product["usable"].values < 2
+    wrong = np.abs(product["extinction"].values / true - 1.0) > 0.5
+    assert usable.mean() < 0.2
+    assert not (usable & wrong).any()
+
+
+def test_a_lidar_that_falls_silent_leaves_a_reason(tmp_path):
+    campaign, _ = made.written(tmp_path, made.tree(made.HOMOGENEOUS, duration=1800))
+    raw = Path(campaign.archive)
+    # From its tenth file on, north is silent.
+    for path in sorted((raw / "north").iterdir())[10:]:
+        path.unlink()
+    (job,) = jobs_of(campaign)
+    product = opened(campaign, process_all([job])[0])
+    bits = product["quality_flag"].values
+    assert (bits[:2] == 0).all()
+    assert (bits[2:] != 0).all()
+    assert ((bits[2:] & int(Quality.rejecting())) != 0).any(axis=1).all()
+    assert (np.isnan(product["visibility_in_air"]) <= (product["usable"] == 2)).all()
+
+
+def test_the_record_of_the_product_names_what_went_in(tmp_path):
+    told = made.tree(made.HOMOGENEOUS, duration=900)
+    campaign, _ = made.written(tmp_path, told)
+    (job,) = jobs_of(campaign)
+    outcome = process_all([job])[0]
+    product = opened(campaign, outcome)
+    assert product.attrs["lidarops_input_count"] == 45
+    assert product.attrs["lidarops_kind"] == "visibility"
+    assert product.attrs["lidarops_station"] == "valley"
+    history = product.attrs["history"]
+    for name in beams_of(job):
+        assert f"dead_time: {name}: given by the campaign" in history
+    assert "averaged before they are solved" in history
+
+
+def test_a_level_path_gives_visibility_too(tmp_path):
+    told = made.tree(made.HOMOGENEOUS, duration=600, rate=2.0)
+    instrument = told["instruments"]["west-lidar"]
+    instrument["products"] = {
+        "homogeneous": {
+            "channels": ["photon_532o"],
+            "sections": [[600, 4500]],
+            "visibility": {"contrast": 0.02},
+        }
+    }
+    campaign, truth = made.written(tmp_path, told)
+    (job,) = [
+        job
+        for job in make_jobs(campaign, prepare(campaign))
+        if job.scene.instrument == "west-lidar"
+    ]
+    product = opened(campaign, process_all([job])[0])
+    usable = product["usable"].values < 2
+    assert usable.any()
+    seen = product["visibility_in_air"].values
+    np.testing.assert_allclose(
+        (seen * product["extinction"].values)[usable], -np.log(0.02), rtol=3e-4
+    )
+    true = -np.log(0.02) / float(truth["extinction"].mean())
+    inside = (product["visibility_in_air_lower"] <= true) & (
+        true <= product["visibility_in_air_upper"]
+    )
+    assert inside.values[usable].mean() > 0.6
+    assert "contrast 0.02" in product.attrs["lidarops_steps"]

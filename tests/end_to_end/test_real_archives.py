@@ -1,0 +1,204 @@
+"""Two real archives from raw files to products."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidarops.campaign.model import load
+from lidarops.flags import Quality
+from lidarops.plan.scene_plan import plan
+from lidarops.records import Role, RunRecord
+from lidarops.run.archive import prepare, report_run
+from lidarops.run.executor import run
+
+CAMPAIGNS = Path(__file__).parent / "campaigns"
+
+
+def _reprocess(name: str, data_root: Path, out: Path) -> RunRecord:
+    campaign = load(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=out)
+    # What a plan would leave out has to be flagged by what is found.
+    campaign = campaign.model_copy(update={"all_steps": True})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cut = prepare(campaign)
+        record = run(campaign, cut)
+    report_run(campaign, record)
+    return record
+
+
+@pytest.fixture(scope="module")
+def pilar(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
+    """A run over 120 files of Pilar."""
+    return _reprocess("pilar", data_root, tmp_path_factory.mktemp("pilar"))
+
+
+@pytest.fixture(scope="module")
+def saopaulo(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
+    """A run over 16 files of Sao Paulo, with 12 dark files."""
+    return _reprocess("saopaulo", data_root, tmp_path_factory.mktemp("saopaulo"))
+
+
+def _open(record: RunRecord, kind: str, channel: str) -> xr.Dataset:
+    paths = [
+        product.path
+        for scene in record.scenes
+        for product in scene.products
+        if product.kind == kind and product.channel == channel
+    ]
+    assert len(paths) == 1
+    return xr.load_dataset(Path(record.products) / paths[0])
+
+
+def test_pilar_loses_no_file(pilar: RunRecord) -> None:
+    (scene,) = pilar.scenes
+    assert scene.error == ""
+    assert scene.granules == 120
+    assert not pilar.failed
+    # The header's 53200 nm is told by the campaign for one of its two channels only.
+    told = [
+        left.channel
+        for left in (scene.plan.left_out if scene.plan else ())
+        if "wavelength" in left.reason
+    ]
+    assert told == ["photon_53200o"]
+    assert len(scene.products) == 11 + 2 + 3
+
+
+def test_inputs_are_digested(pilar: RunRecord, data_root: Path) -> None:
+    for used in pilar.scenes[0].inputs[:3]:
+        content = (data_root / "pilar" / used.path).read_bytes()
+        assert used.sha256 == hashlib.sha256(content).hexdigest()
+
+
+def test_daylight_saturates_the_photon_counting_of_pilar(pilar: RunRecord) -> None:
+    signal = _open(pilar, "signal", "photon_532p")
+    flags = signal["quality_flag"].values
+    assert ((flags & Quality.PILE_UP) != 0).mean() > 0.9
+    assert signal["background"].min() > 40.0
+    homogeneous = _open(pilar, "homogeneous", "photon_532p")
+    assert (homogeneous["quality_flag"].values != 0).all()
+
+
+def test_analog_at_full_scale_is_flagged(pilar: RunRecord) -> None:
+    signal = _open(pilar, "signal", "analog_1064o")
+    saturated = (signal["quality_flag"].values & Quality.SATURATED) != 0
+    assert saturated.any()
+    assert np.isnan(signal["signal"].values[saturated]).all()
+    near = signal["range"].values < 600
+    assert ((signal["quality_flag"].values[:, near] & Quality.INCOMPLETE_OVERLAP) != 0).all()
+
+
+@pytest.mark.parametrize("channel", ["analog_532p", "photon_532p"])
+def test_a_vertical_atmosphere_is_not_taken_for_homogeneous(pilar: RunRecord, channel: str) -> None:
+    product = _open(pilar, "homogeneous", channel)
+    assert (product["quality_flag"].values != 0).all()
+    assert product["time"].size == 120
+
+
+def test_saopaulo_has_physical_values(saopaulo: RunRecord) -> None:
+    assert not saopaulo.failed
+    photon = _open(saopaulo, "signal", "photon_532o")
+    rate = photon["signal"] / photon["range"] ** 2 + photon["background"]
+    # Dead-time corrected; measured rates stay below 140 MHz, and above 125 MHz are masked.
+    assert 5.0 < float(rate.max()) < 280.0
+    assert photon["signal"].attrs["units"].startswith("MHz")
+    analog = _open(saopaulo, "signal", "analog_532o")
+    assert analog["signal"].attrs["units"].startswith("mV")
+    voltage = analog["signal"] / analog["range"] ** 2 + analog["background"]
+    assert float(voltage.min()) > -5.0
+    assert float(voltage.max()) < 500.0
+    assert analog["time"].size == 16
+    assert str(analog["time"].values[0]) == "2017-09-28T16:17:06.000000000"
+
+
+def test_dark_files_are_subtracted(saopaulo: RunRecord) -> None:
+    (scene,) = saopaulo.scenes
+    assert sum(used.role is Role.DARK for used in scene.inputs) == 12
+    analog = _open(saopaulo, "signal", "analog_532o")
+    # The dark offset of this channel is several mV; the sky above Sao Paulo adds less than that.
+    assert abs(analog["background"].values).max() < 2.0
+
+
+def test_saopaulo_is_not_homogeneous(saopaulo: RunRecord) -> None:
+    product = _open(saopaulo, "homogeneous", "analog_532o")
+    assert (product["quality_flag"].values != 0).all()
+
+
+@pytest.mark.parametrize("name", ["pilar", "saopaulo"])
+def test_sections_of_a_vertical_path_are_left_out(
+    data_root: Path, tmp_path: Path, name: str
+) -> None:
+    campaign = load(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=tmp_path)
+    (scene,) = prepare(campaign).scenes
+    planned = plan(scene, campaign)
+    assert not [step for step in planned.steps if step.name == "homogeneous"]
+    left = [item for item in planned.left_out if item.rule == "section_level"]
+    assert left
+    assert all(item.number is not None and item.number > 100.0 for item in left)
+
+
+def test_nothing_is_invented_where_photon_counting_is_paralysed(pilar: RunRecord) -> None:
+    for channel, bit in (
+        ("photon_532p", Quality.PILE_UP),
+        ("glued_532p", Quality.NO_GLUING),
+    ):
+        product = _open(pilar, "elastic", channel)
+        flags = product["quality_flag"].values
+        assert (flags & bit).all()
+        assert ((flags & int(Quality.rejecting())) != 0).all() or (flags != 0).all()
+    glued = _open(pilar, "elastic", "glued_532p")
+    assert np.isnan(glued["backscatter"].values).all()
+
+
+def test_pilar_has_aerosol_below_clean_air(pilar: RunRecord) -> None:
+    product = _open(pilar, "elastic", "analog_532p")
+    values = product[["backscatter", "scattering_ratio"]]
+    good = values.where(product["quality_flag"] == 0)
+    assert float(good["backscatter"].count()) > 0.5 * product["backscatter"].size
+    near = good["scattering_ratio"].sel(range=slice(800, 2000)).mean()
+    far = good["scattering_ratio"].sel(range=slice(8000, 10_000)).mean()
+    assert 1.2 < float(near) < 20.0
+    assert abs(float(far) - 1.0) < 0.5
+    assert product["profiles"].sum() == 120
+    # What the campaign assumes, and its error, decide on the error near the ground.
+    ratio = product["extinction"] / product["backscatter"]
+    np.testing.assert_allclose(ratio.values[np.isfinite(ratio.values)], 60.0, rtol=1e-3)
+
+
+def test_saopaulo_is_glued_with_the_lag_that_its_noise_tells(saopaulo: RunRecord) -> None:
+    product = _open(saopaulo, "signal", "glued_532o")
+    slope, error = product["glue_slope"].values, product["glue_slope_standard_error"].values
+    assert np.isfinite(slope).all()
+    # One detector and one recorder: the same slope in all profiles, but for their errors.
+    assert np.abs(slope / np.median(slope) - 1.0).max() < 0.1
+    assert (np.abs(slope - np.median(slope)) < 8.0 * error).all()
+    photon = _open(saopaulo, "signal", "photon_532o")
+    far = slice(float(product["glue_top"].max()) + 100.0, 12_000.0)
+    joined, alone = (item["signal"].sel(range=far).values for item in (product, photon))
+    np.testing.assert_allclose(joined, alone, rtol=1e-3, atol=1e-3 * np.nanmax(np.abs(alone)))
+    # Photon counting alone is paralysed near the lidar, and the joined signal is not.
+    near = {"range": slice(700.0, 900.0)}
+    assert ((photon["quality_flag"].sel(near).values & Quality.PILE_UP) != 0).mean() > 0.9
+    assert (product["quality_flag"].sel(near).values == 0).all()
+
+
+def test_saopaulo_has_aerosol_in_its_mixed_layer(saopaulo: RunRecord) -> None:
+    product = _open(saopaulo, "elastic", "glued_532o")
+    good = product["backscatter"].where(product["quality_flag"] == 0)
+    low = good.sel(range=slice(700, 1500)).mean("range")
+    assert (low > 1e-6).all()
+    assert (low < 2e-5).all()
+    budget = [
+        product[f"backscatter_error_{cause}"]
+        for cause in ("noise", "background", "reference", "lidar_ratio", "molecular")
+    ]
+    total = np.sqrt(sum(part**2 for part in budget))
+    stated = product["backscatter_standard_error"]
+    known = np.isfinite(stated.values)
+    np.testing.assert_allclose(total.values[known], stated.values[known], rtol=0.01)

@@ -1,0 +1,309 @@
+"""A product is made again from its own provenance, or it is said what is not what it was."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import netCDF4
+import pytest
+import xarray as xr
+import yaml
+from support import network_campaigns as networks
+from support import scan_campaign as scans
+from typer.testing import CliRunner
+
+from lidarops.campaign.model import Campaign, load
+from lidarops.cli import app
+from lidarops.errors import CatalogError, ProductError
+from lidarops.netcdf.provenance import read_provenance
+from lidarops.netcdf.write import write
+from lidarops.records import ProductKind
+from lidarops.run.archive import prepare
+from lidarops.run.executor import make_jobs, process_all
+from lidarops.run.reproduction import Reproduction, explain, reproduce
+from lidarops.simulate.campaign import simulate
+
+SOUNDING = "altitude [m],pressure [hPa],temperature [K]\n" + "".join(
+    f"{km * 1000},{1013.25 * (1 - 0.0065 * km * 1000 / 288.15) ** 5.256:.4f},{288.15 - 6.5 * km}\n"
+    for km in range(12)
+)
+OVERLAP = "range [m],overlap\n100,0.2\n300,0.7\n600,1\n"
+KINDS = [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS, ProductKind.ELASTIC, ProductKind.MULTIANGLE]
+
+
+def tree(repository: Path) -> dict[str, Any]:
+    """Both instruments of the demo and a scanner, for little more than an hour."""
+    found = yaml.safe_load((repository / "catalogs/demo.yaml").read_text(encoding="utf-8"))
+    found |= {"archive": "raw", "output": "out", "name": "again"}
+    vertical = found["instruments"]["hill-vertical"]
+    vertical["facts"][0] |= {"molecular_profile": "air.csv", "overlap_profile": "overlap.csv"}
+    found["stations"] |= scans.TREE["stations"]
+    found["instruments"] |= scans.TREE["instruments"]
+    simulation = found["simulation"]
+    simulation |= {"start": "2024-09-21T20:00:00Z", "duration": 1800}
+    scanner = copy.deepcopy(scans.TREE["simulation"])
+    scanner["atmosphere"].pop("layers")
+    simulation["atmosphere"] = scanner["atmosphere"]
+    simulation["instruments"] |= scanner["instruments"]
+    for instrument in simulation["instruments"].values():
+        instrument.pop("damage", None)
+    return found
+
+
+@pytest.fixture(scope="module")
+def campaign(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """The campaign, simulated and processed."""
+    folder = tmp_path_factory.mktemp("again")
+    (folder / "air.csv").write_text(SOUNDING, encoding="utf-8")
+    (folder / "overlap.csv").write_text(OVERLAP, encoding="utf-8")
+    path = folder / "again.yaml"
+    path.write_text(yaml.safe_dump(tree(repository)), encoding="utf-8")
+    told = load(path)
+    simulate(told)
+    outcomes = process_all(make_jobs(told, prepare(told)))
+    assert not [outcome.error for outcome in outcomes if outcome.error]
+    return told
+
+
+def of_kind(campaign: Campaign, kind: ProductKind) -> Path:
+    return sorted(campaign.products_root.rglob(f"{kind}/**/*.nc"))[-1]
+
+
+def names(result: Reproduction, what: str) -> list[str]:
+    return [each.name for each in result.differences if each.what == what]
+
+
+@pytest.fixture
+def moved(campaign: Campaign, tmp_path: Path) -> Campaign:
+    """The same archive where it can be changed, without the campaign file."""
+    shutil.copytree(campaign.archive, tmp_path / "raw")
+    for name in ("air.csv", "overlap.csv"):
+        shutil.copy(campaign.folder / name, tmp_path)
+    return campaign.model_copy(update={"archive": str(tmp_path / "raw")})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_made_again_to_the_last_byte(kind: ProductKind, campaign: Campaign):
+    # Raw files and soundings are found by themselves, in folders above the product.
+    result = reproduce(of_kind(campaign, kind))
+    assert result.identical, explain(result)
+    assert result.differences == ()
+    assert "identical" in explain(result)
+
+
+@pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
+def test_the_product_of_a_network_is_made_again(six_beams: bool, tmp_path: Path):
+    told, _ = networks.written(tmp_path, networks.tree(networks.HOMOGENEOUS, six_beams=six_beams))
+    process_all([job for job in make_jobs(told, prepare(told)) if job.scene.members])
+    product = of_kind(told, ProductKind.VISIBILITY)
+    result = reproduce(product)
+    assert result.identical, explain(result)
+    with xr.open_dataset(product) as opened:
+        paths = json.loads(opened["provenance"].item())["entity"].values()
+    changed = Path(told.archive) / max(str(each.get("lidarops:path", "")) for each in paths)
+    content = bytearray(changed.read_bytes())
+    content[-3] ^= 1
+    changed.write_bytes(content)
+    assert len(names(reproduce(product), "input")) == 1
+
+
+def test_products_that_were_dated_by_the_environment_are_dated_so_again(
+    campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    dated = campaign.model_copy(update={"output": str(tmp_path / "out")})
+    process_all([job for job in make_jobs(dated, prepare(dated)) if "coast" in job.scene.id][:1])
+    product = of_kind(dated, ProductKind.HOMOGENEOUS)
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    assert reproduce(product, archive=campaign.archive).identical
+    # And the other way: what was not dated so must not be.
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    assert reproduce(of_kind(campaign, ProductKind.HOMOGENEOUS)).identical
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_changed_byte_and_a_missing_file_are_told_by_name(
+    kind: ProductKind, moved: Campaign, tmp_path: Path
+):
+    product = of_kind(moved, kind)
+    with xr.open_dataset(product) as opened:
+        document = json.loads(opened["provenance"].item())
+    paths = [
+        entity["lidarops:path"]
+        for entity in document["entity"].values()
+        if str(entity.get("lidarops:path", "")).startswith(("coast/", "hill/", "plain/"))
+    ]
+    changed, missing = sorted(paths)[-2:]
+    raw = Path(moved.archive)
+    content = bytearray((raw / changed).read_bytes())
+    content[-3] ^= 1
+    (raw / changed).write_bytes(content)
+    (raw / missing).unlink()
+    result = reproduce(product, archive=raw, ancillary=tmp_path)
+    assert not result.identical
+    assert sorted(names(result, "input")) == [changed, missing]
+    text = explain(result)
+    assert f"input {changed}: changed" in text
+    assert f"input {missing}: missing" in text
+
+
+def test_a_changed_sounding_is_told(moved: Campaign, tmp_path: Path):
+    (tmp_path / "air.csv").write_text(SOUNDING.replace("288.15", "289.15"), encoding="utf-8")
+    product = of_kind(moved, ProductKind.ELASTIC)
+    result = reproduce(product, archive=moved.archive, ancillary=tmp_path)
+    assert names(result, "input") == ["air.csv"]
+
+
+def test_one_changed_byte_of_an_input_changes_the_id(moved: Campaign, tmp_path: Path):
+    file = sorted(Path(moved.archive).glob("coast/h*"))[0]
+    content = bytearray(file.read_bytes())
+    content[-3] ^= 1
+    file.write_bytes(content)
+    other = moved.model_copy(update={"output": str(tmp_path / "out")})
+    process_all([job for job in make_jobs(other, prepare(other)) if "coast" in job.scene.id])
+    for product in sorted(other.products_root.rglob("*.nc")):
+        before = moved.products_root / product.relative_to(other.products_root)
+        with xr.open_dataset(product) as after, xr.open_dataset(before) as original:
+            assert after.attrs["id"] != original.attrs["id"]
+
+
+def test_other_software_is_told_where_the_bytes_differ(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+):
+    for module in ("lidarops.run.reproduction", "lidarops.netcdf.provenance"):
+        monkeypatch.setattr(f"{module}.code_version", lambda: "0" * 16)
+        monkeypatch.setattr(f"{module}.package_versions", lambda: {"numpy": "0.1"})
+    result = reproduce(of_kind(campaign, ProductKind.HOMOGENEOUS))
+    assert not result.identical
+    assert names(result, "code") == ["lidarops"]
+    assert "numpy" in names(result, "package")
+    assert ":lidarops_code_version" in names(result, "attribute")
+
+
+def test_a_tampered_value_is_found(campaign: Campaign, tmp_path: Path):
+    source = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    copied = Path(shutil.copy(source, tmp_path / "tampered.nc"))
+    with netCDF4.Dataset(copied, "a") as file:
+        file.set_auto_maskandscale(False)
+        file["background"][0, 0] = 42.0
+        file.title = "Another title"
+    result = reproduce(copied, archive=campaign.archive)
+    assert names(result, "variable") == ["background"]
+    assert names(result, "attribute") == [":title"]
+    assert "1 of" in explain(result)
+
+
+def test_the_same_content_in_other_bytes_is_told(campaign: Campaign, tmp_path: Path):
+    source = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    copied = Path(shutil.copy(source, tmp_path / "same.nc"))
+    copied.write_bytes(copied.read_bytes() + b"\0")
+    with h5py.File(copied):
+        pass
+    result = reproduce(copied, archive=campaign.archive)
+    assert names(result, "bytes") == ["same.nc"]
+
+
+def test_a_product_that_tells_too_little_is_refused(campaign: Campaign, tmp_path: Path):
+    source = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    with xr.open_dataset(source, decode_cf=False) as opened:
+        product = opened.load()
+    text = product["provenance"].values.tobytes().decode()
+    document = json.loads(text)
+    settings = json.loads(document["entity"]["lidarops:product"]["lidarops:settings"])
+    del settings["keys"]
+    document["entity"]["lidarops:product"]["lidarops:settings"] = json.dumps(settings)
+    characters = xr.Variable("provenance_strlen", list(json.dumps(document).encode())).astype("u1")
+    product = product.drop_vars("provenance").assign(
+        provenance=(
+            "provenance_strlen",
+            characters.values.view("S1"),
+            opened["provenance"].attrs,
+        )
+    )
+    write(product, tmp_path / "old.nc")
+    with pytest.raises(ProductError, match="does not tell enough"):
+        reproduce(tmp_path / "old.nc", archive=campaign.archive)
+
+
+def test_inputs_that_are_nowhere_are_asked_for(campaign: Campaign, tmp_path: Path):
+    lost = shutil.copy(of_kind(campaign, ProductKind.SIGNAL), tmp_path / "deep.nc")
+    with pytest.raises(ProductError, match="--archive"):
+        reproduce(lost)
+
+
+def test_raw_files_may_lie_behind_a_url(campaign: Campaign):
+    product = of_kind(campaign, ProductKind.MULTIANGLE)
+    assert reproduce(product, archive=f"file://{campaign.archive}").identical
+
+
+def test_a_store_that_cannot_be_reached_lacks_nothing(campaign: Campaign) -> None:
+    """Of no file it is known that it is missing, so none is named."""
+    pytest.importorskip("aiohttp")
+    product = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    with pytest.raises(CatalogError, match=r"^http://127\.0\.0\.1:1/: cannot be read") as caught:
+        reproduce(product, archive="http://127.0.0.1:1/")
+    assert not caught.value.wrong_use
+
+
+def test_what_a_store_lacks_is_told_with_its_url(campaign: Campaign, moved: Campaign) -> None:
+    (gone, *_) = sorted(Path(moved.archive).glob("coast/h*"))
+    gone.unlink()
+    product = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    result = reproduce(product, archive=f"file://{moved.archive}")
+    (lost,) = result.differences
+    assert lost.name == f"coast/{gone.name}"
+    assert lost.problem.startswith(f"missing from file://{moved.archive}: ")
+
+
+@pytest.mark.parametrize(
+    "words", [["--archive", "s3x://foo"], ["--archive", "nowhere"], ["--ancillary", "nowhere"]]
+)
+def test_a_place_that_is_none_is_wrong_use(words: list[str], campaign: Campaign) -> None:
+    product = of_kind(campaign, ProductKind.ELASTIC)
+    refused = CliRunner().invoke(app, ["reproduce", str(product), *words])
+    assert refused.exit_code == 2
+    assert refused.output.startswith(f"error: {words[1]}: ")
+    assert len(refused.output.splitlines()) == 1
+
+
+def test_a_damaged_product_is_no_wrong_use(campaign: Campaign, tmp_path: Path) -> None:
+    whole = of_kind(campaign, ProductKind.SIGNAL).read_bytes()
+    (tmp_path / "cut.nc").write_bytes(whole[:20_000])
+    (tmp_path / "log.nc").write_bytes(b"no product")
+    for name, code in (("cut.nc", 1), ("log.nc", 2), ("nowhere.nc", 2), (".", 2)):
+        for command in (["reproduce"], ["inspect", "--provenance"]):
+            assert CliRunner().invoke(app, [*command, str(tmp_path / name)]).exit_code == code
+
+
+def test_the_command_tells_by_its_exit_code(campaign: Campaign, moved: Campaign):
+    product = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    good = CliRunner().invoke(app, ["reproduce", str(product)])
+    assert (good.exit_code, "identical" in good.output) == (0, True)
+    gone = sorted(Path(moved.archive).glob("coast/h*"))[0]
+    gone.unlink()
+    bad = CliRunner().invoke(app, ["reproduce", str(product), "--archive", moved.archive, "--json"])
+    assert bad.exit_code == 1
+    told = json.loads(bad.output)
+    assert not told["identical"]
+    assert told["differences"][0]["name"] == f"coast/{gone.name}"
+
+
+@pytest.mark.parametrize("escape", ["{outside}", "../outside"])
+def test_a_product_that_names_raw_files_elsewhere_is_refused(
+    escape: str, campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    outside = tmp_path / "outside"
+    outside.write_bytes(b"of somebody else")
+    product = of_kind(campaign, ProductKind.HOMOGENEOUS)
+    told = read_provenance(product)
+    raw = next(each for each in told["entity"].values() if "/h" in each.get("lidarops:path", ""))
+    raw["lidarops:path"] = escape.format(outside=outside)
+    monkeypatch.setattr("lidarops.run.reproduction.read_provenance", lambda _: told)
+    with pytest.raises(ProductError, match="outside its archive"):
+        reproduce(product, archive=campaign.archive, catalog=campaign.catalog_url)
+    assert outside.read_bytes() == b"of somebody else"

@@ -1,0 +1,89 @@
+"""Scans from raw files to products: the truth within the stated errors, the same bits always."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+import yaml
+from support.scan_campaign import ALTITUDE, TREE
+
+from lidarops.campaign.model import Campaign, load
+from lidarops.run.archive import prepare
+from lidarops.run.executor import make_jobs, process_all
+from lidarops.simulate.campaign import simulate
+
+
+def campaign(folder: Path, **simulation: Any) -> tuple[Campaign, xr.Dataset]:
+    """The campaign, written to a folder and simulated there, and its truth."""
+    tree = TREE | {"simulation": TREE["simulation"] | simulation}
+    path = folder / "scans.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    told = load(path)
+    return told, simulate(told).truth
+
+
+def scores(told: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarray[Any, Any]:
+    """(retrieved - true) / stated error of the unflagged optical depths."""
+    granule = truth["profile_granule_scanner"].values
+    upward = truth["zenith_angle"].values[granule] < 1.0
+    time = truth["time"].values[granule][upward]
+    depth = truth["profile_optical_depth_scanner"].values[upward, 0]
+    ends = np.append(0.0, truth["range_end_scanner"].values)
+    found = []
+    for path in paths:
+        product = xr.load_dataset(told.products_root / path)
+        error = np.hypot(
+            product["optical_depth_standard_error"], product["optical_depth_gradient_error"]
+        ).values
+        for cycle in range(product.sizes["time"]):
+            nearest = np.argmin(np.abs(time - product["time"].values[cycle]))
+            true = np.interp(
+                product["altitude"].values - ALTITUDE, ends, np.append(0.0, depth[nearest])
+            )
+            score = (product["optical_depth"].values[cycle] - true) / error[cycle]
+            found.append(score[product["quality_flag"].values[cycle] == 0])
+    return np.concatenate(found)
+
+
+def test_scans_become_optical_depths_within_their_errors(tmp_path):
+    told, truth = campaign(tmp_path)
+    jobs = make_jobs(told, prepare(told))
+    (outcome,) = process_all(jobs)
+    assert outcome.error == ""
+    (product,) = outcome.products
+    score = scores(told, truth, [product.path])
+    assert score.size > 300
+    assert (np.abs(score) < 3.0).mean() > 0.97
+    assert 0.7 < np.sqrt(np.mean(score**2)) < 1.3
+    # The plan names what it did, and that the beam scans.
+    assert any(step.name == "multiangle" and "scans" in step.reason for step in outcome.plan.steps)
+    for chunk in (1, 7):
+        (again,) = process_all([replace(jobs[0], profiles_per_chunk=chunk)])
+        assert again.products[0].sha256 == product.sha256
+
+
+def test_a_beam_that_stands_still_is_no_scan(tmp_path):
+    simulation = dict(TREE["simulation"])
+    instrument = simulation["instruments"]["scanner"]
+    still = instrument | {"scan": {"zenith_angles": [0], "azimuth": 90}}
+    told, _ = campaign(tmp_path, duration=400, instruments={"scanner": still})
+    (outcome,) = process_all(make_jobs(told, prepare(told)))
+    assert "does not scan" in outcome.error
+
+
+@pytest.mark.slow
+def test_two_hundred_scans(tmp_path):
+    told, truth = campaign(tmp_path, duration=86_400)
+    outcomes = process_all(make_jobs(told, prepare(told)))
+    assert [outcome.error for outcome in outcomes] == [""] * 4
+    paths = [product.path for outcome in outcomes for product in outcome.products]
+    cycles = sum(xr.open_dataset(told.products_root / path).sizes["time"] for path in paths)
+    assert cycles >= 200
+    score = scores(told, truth, paths)
+    assert score.size > 5000
+    assert (np.abs(score) < 3.0).mean() >= 0.99

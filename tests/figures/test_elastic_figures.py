@@ -1,0 +1,261 @@
+"""Figures of elastic products, drawn from files as the engine writes them."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.collections import QuadMesh
+from PIL import Image
+from support import fabricated as fab
+from support.fabricated import CHANNEL, START, Archive
+from support.made_products import context, elastic
+
+from lidarops.errors import ProductError
+from lidarops.figures import product_figures
+from lidarops.figures.profile_data import CAUSES, clearest_profile
+from lidarops.figures.raster import read_raster
+from lidarops.flags import Quality
+from lidarops.netcdf.write import write
+from lidarops.products.layouts import build_product
+from lidarops.records import ProductKind, RunRecord
+from lidarops.reports import gallery
+
+MEGA = 1e6
+QUANTITY = "attenuated_backscatter"
+
+
+def stored(path: Path, data: xr.Dataset) -> xr.Dataset:
+    """Build and write a product, and read it back as a report does."""
+    write(build_product(data, context(ProductKind.ELASTIC)), path)
+    with xr.open_dataset(path, decode_timedelta=False) as opened:
+        return opened.load()
+
+
+@pytest.fixture
+def made() -> xr.Dataset:
+    """Eight profiles of 300 m; the first has a cloud at 40 m, the last no reference."""
+    return elastic(profiles=8)
+
+
+@pytest.fixture
+def product(made: xr.Dataset, tmp_path: Path) -> xr.Dataset:
+    return stored(tmp_path / "elastic.nc", made)
+
+
+def lines(panel, label):
+    return [line for line in panel.get_lines() if line.get_label() == label]
+
+
+def legend_texts(panel):
+    return [text.get_text() for text in panel.get_legend().get_texts()]
+
+
+class TestRaster:
+    def test_means_are_those_of_what_is_not_rejected(self, product):
+        raster = read_raster(product, quantity=QUANTITY, profiles=4)
+        rejected = (product["quality_flag"] & int(Quality.rejecting())) != 0
+        values = product[QUANTITY].where(~rejected).to_numpy()
+        assert raster.total.shape[0] == 2
+        for column, members in enumerate((slice(0, 4), slice(4, 8))):
+            total = np.nansum(values[members], axis=0)
+            np.testing.assert_allclose(raster.total[column], total, rtol=1e-5)
+        assert raster.units == "m-1 sr-1"
+        assert raster.background_units == "MHz"
+
+    def test_the_lowest_cloud_of_a_column_is_kept(self, made, tmp_path):
+        made["cloud_base_range"][:] = [90.0, np.nan, 40.0, 60.0, *[np.nan] * 4]
+        product = stored(tmp_path / "clouds.nc", made)
+        raster = read_raster(product, quantity=QUANTITY, profiles=4)
+        np.testing.assert_array_equal(raster.clouds, [40.0, np.nan])
+        none = read_raster(product.drop_vars("cloud_base_range"), quantity=QUANTITY, profiles=4)
+        assert np.isnan(none.clouds).all()
+
+    @pytest.mark.parametrize("name", [QUANTITY, f"{QUANTITY}_standard_error", "quality_flag"])
+    def test_a_missing_variable_is_named(self, product, name):
+        with pytest.raises(ProductError) as caught:
+            read_raster(product.drop_vars(name), quantity=QUANTITY)
+        assert caught.value.field == name
+
+
+class TestQuicklook:
+    def test_the_image_holds_the_backscatter(self, product):
+        figure = product_figures.backscatter_quicklook([product], title="lidar")
+        upper, lower, *_ = figure.axes
+        meshes = [item for item in upper.collections if isinstance(item, QuadMesh)]
+        drawn = np.concatenate([np.ma.filled(m.get_array(), np.nan).ravel() for m in meshes[:1]])
+        known = product[QUANTITY].to_numpy()
+        known = known[np.isfinite(known)]
+        inside = drawn[np.isfinite(drawn)]
+        assert inside.size > 100
+        assert known.min() * 0.999 <= inside.min()
+        assert inside.max() <= known.max() * 1.001
+        labels = [axes.get_ylabel() for axes in figure.axes]
+        assert "attenuated\nbackscatter (m$^{-1}$ sr$^{-1}$)" in labels
+        assert "background" in lower.get_ylabel()
+
+    def test_triangles_stand_at_cloud_bases(self, product):
+        figure = product_figures.backscatter_quicklook([product])
+        (triangles,) = [line for line in figure.axes[0].get_lines() if line.get_marker() == "v"]
+        np.testing.assert_allclose(triangles.get_ydata(), [0.04])
+        assert triangles.get_gid() == "cloud-base"
+        assert len(triangles.get_xdata()) == 1
+        words = product_figures.alt_text(figure)
+        assert "base of the lowest cloud or dense layer, in 1 columns" in words
+        assert "attenuated backscatter" in words
+
+    def test_without_clouds_there_are_no_triangles(self, made, tmp_path):
+        made["cloud_base_range"][:] = np.nan
+        figure = product_figures.backscatter_quicklook([stored(tmp_path / "clear.nc", made)])
+        assert not [line for line in figure.axes[0].get_lines() if line.get_marker() == "v"]
+        assert "triangles" not in product_figures.alt_text(figure)
+
+    def test_rejected_gates_are_black(self, product):
+        figure = product_figures.backscatter_quicklook([product])
+        assert "flagged" in product_figures.alt_text(figure)
+        assert "no reference" in product_figures.alt_text(figure).replace("_", " ")
+        assert [c for c in figure.axes[0].collections if c.get_gid() == "flagged-signal"]
+
+    def test_nothing_at_all_is_said(self, made, tmp_path):
+        made["quality_flag"][:] |= np.int32(Quality.NO_REFERENCE)
+        empty = stored(tmp_path / "empty.nc", made)
+        figure = product_figures.backscatter_quicklook([empty])
+        product_figures.render(figure)
+        texts = [text.get_text() for text in figure.axes[0].texts]
+        assert any("no usable signal" in text for text in texts)
+
+
+class TestClearestProfile:
+    def test_it_is_the_one_with_most_unflagged_gates_below_its_reference(self, made, tmp_path):
+        made["quality_flag"][1:4, 10:20] |= np.int32(Quality.PILE_UP)
+        made["quality_flag"][5:7, 10:12] |= np.int32(Quality.PILE_UP)
+        product = stored(tmp_path / "flags.nc", made)
+        profile = clearest_profile(product)
+        assert profile is not None
+        assert profile.time == product["time"].to_numpy()[4]
+        assert profile.reference == (200.0, 250.0)
+        assert profile.lidar_ratio == 50.0
+        assert profile.range[-1] <= 1.15 * 250.0 < profile.range[-1] + 7.5
+        shown = slice(0, profile.range.size)
+        flag = product["quality_flag"].to_numpy()[4, shown]
+        good = (flag & int(Quality.rejecting())) == 0
+        assert np.isnan(profile.backscatter[~good]).all()
+        values = product["backscatter"].to_numpy()[4, shown]
+        np.testing.assert_allclose(profile.backscatter[good], values[good])
+        for cause in CAUSES:
+            errors = product[f"backscatter_error_{cause}"].to_numpy()[4, shown]
+            np.testing.assert_allclose(profile.budget[cause][good], np.abs(errors[good]))
+
+    def test_gates_to_use_with_care_are_marked(self, made, tmp_path):
+        made["quality_flag"][1:, 10:20] |= np.int32(Quality.PILE_UP)
+        profile = clearest_profile(stored(tmp_path / "care.nc", made))
+        assert profile is not None
+        assert profile.with_care[10:20].all()
+        assert not profile.with_care[20:].any()
+
+    @pytest.mark.parametrize("lost", ["reference", "flags"])
+    def test_none_where_no_profile_is_clear(self, made, tmp_path, lost):
+        if lost == "reference":
+            made["reference_bottom"][:] = np.nan
+            made["reference_top"][:] = np.nan
+        else:
+            made["quality_flag"][:] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
+        assert clearest_profile(stored(tmp_path / "lost.nc", made)) is None
+
+    @pytest.mark.parametrize("name", ["backscatter", "backscatter_error_noise", "lidar_ratio"])
+    def test_a_missing_variable_is_named(self, product, name):
+        with pytest.raises(ProductError) as caught:
+            clearest_profile(product.drop_vars(name))
+        assert caught.value.field == name
+
+
+class TestErrorBudget:
+    def test_curves_hold_the_profile_in_inverse_megametres(self, product):
+        profile = clearest_profile(product)
+        figure = product_figures.error_budget(profile, title="lidar")
+        left, right = figure.axes
+        (value,) = lines(left, "particles, $\\pm$1 standard error")
+        np.testing.assert_allclose(value.get_xdata(), MEGA * profile.backscatter)
+        np.testing.assert_allclose(value.get_ydata(), profile.range / 1e3)
+        (air,) = lines(left, "molecules")
+        np.testing.assert_allclose(air.get_xdata(), MEGA * profile.molecular)
+        (total,) = lines(right, "standard error")
+        np.testing.assert_allclose(total.get_xdata(), MEGA * profile.standard_error)
+        for cause, label in zip(
+            CAUSES,
+            ("signal noise", "background", "reference", "lidar ratio", "molecules"),
+            strict=True,
+        ):
+            (curve,) = lines(right, label)
+            np.testing.assert_allclose(curve.get_xdata(), MEGA * profile.budget[cause])
+        for panel in (left, right):
+            assert "reference window" in legend_texts(panel)
+            assert "sr$^{-1}$" in panel.get_xlabel()
+
+    def test_words_say_what_is_seen(self, product):
+        figure = product_figures.error_budget(clearest_profile(product), title="lidar")
+        words = product_figures.alt_text(figure)
+        assert words.startswith("lidar: backscatter of particles")
+        assert "0.2" in words
+        assert "0.25" in words
+        rendered = product_figures.render(figure)
+        assert rendered.alt == words
+        image = np.asarray(Image.open(io.BytesIO(rendered.png)).convert("L"))
+        assert image.std() > 5
+
+    def test_equal_profiles_give_equal_bytes(self, product):
+        first, second = (
+            product_figures.render(
+                product_figures.error_budget(clearest_profile(product), title=r"$\broken{")
+            )
+            for _ in range(2)
+        )
+        assert first == second
+
+
+def _run(archive: Archive, *paths_and_data) -> RunRecord:
+    products = []
+    for name, data in paths_and_data:
+        path = archive.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        whole = stored(path, data)
+        kept = path.read_bytes()
+        products.append(archive.write(name, whole, ProductKind.ELASTIC))
+        path.write_bytes(kept)
+    scene = fab.outcome("horizontal_20240301T000000", START, products=tuple(products))
+    return fab.run_record(archive.root, [scene])
+
+
+class TestGallery:
+    def test_a_run_shows_backscatter_and_a_profile(self, archive, made, tmp_path):
+        record = _run(archive, ("e/elastic.nc", made))
+        folder = tmp_path / "report"
+        folder.mkdir()
+        found = gallery.fill(record, folder)
+        assert not found.problems
+        names = [picture.file.removesuffix(".png") for picture in found.pictures]
+        assert names == [f"elastic_horizontal_{CHANNEL}", f"profile_horizontal_{CHANNEL}"]
+        for picture in found.pictures:
+            assert (folder / picture.file).stat().st_size > 10_000
+            assert CHANNEL in picture.caption
+            assert picture.alt
+        assert found.flags is not None
+
+    def test_a_damaged_product_is_named_and_the_others_are_drawn(self, archive, made, tmp_path):
+        record = _run(archive, ("e/bad.nc", made), ("e/good.nc", made.isel(time=slice(0, 6))))
+        bad = archive.root / "e/bad.nc"
+        bad.write_bytes(bad.read_bytes()[:2000])
+        found = gallery.fill(record, tmp_path)
+        assert [problem.path for problem in found.problems] == ["e/bad.nc"]
+        assert len(found.pictures) == 2
+
+    def test_a_run_without_references_has_no_profile(self, archive, made, tmp_path):
+        made["quality_flag"][:] |= np.int32(Quality.NO_REFERENCE)
+        made["reference_bottom"][:] = np.nan
+        made["reference_top"][:] = np.nan
+        found = gallery.fill(_run(archive, ("e/none.nc", made)), tmp_path)
+        assert [picture.file.split("_")[0] for picture in found.pictures] == ["elastic"]
+        assert not found.problems

@@ -1,0 +1,176 @@
+"""Figures of networks: what they show is what the product says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.colors import to_rgba
+from support.made_network import EXTINCTION, product
+
+from lidarops.errors import ProductError
+from lidarops.figures import network_figures, product_figures
+from lidarops.figures.network_data import (
+    instruments_of,
+    join_vertices,
+    read_map,
+    read_vertices,
+)
+from lidarops.figures.series_data import compare
+from lidarops.flags import Quality
+from lidarops.records import LeftOut, Plan, SceneOutcome, Step
+
+NAMES = ("lidar-0", "lidar-1", "lidar-2")
+
+
+@pytest.fixture(scope="module")
+def made() -> xr.Dataset:
+    return product(intervals=12)
+
+
+def truth(made: xr.Dataset, extinction: float = EXTINCTION) -> xr.Dataset:
+    """Of homogeneous air, a file a minute from each lidar."""
+    start = made["time_bnds"].values[0, 0]
+    times = start + np.arange(60) * np.timedelta64(60, "s")
+    return xr.Dataset(
+        {
+            "instrument": ("granule", np.repeat(NAMES, 60)),
+            "time": ("granule", np.tile(times, 3)),
+            "extinction": ("granule", np.full(180, extinction)),
+        }
+    )
+
+
+def test_series_hold_values_errors_and_truth(made):
+    series = read_vertices(made, truth(made), instruments=NAMES)
+    assert [one.label for one in series] == ["vertex 0", "vertex 1", "vertex 2"]
+    for v, one in enumerate(series):
+        np.testing.assert_array_equal(
+            one.estimates["extinction"].value, made["extinction"].values[:, v]
+        )
+        whole = np.hypot(
+            made["extinction_standard_error"], made["extinction_systematic_error"]
+        ).values[:, v]
+        np.testing.assert_allclose(one.estimates["extinction"].standard_error, whole)
+        np.testing.assert_allclose(one.estimates["extinction"].truth, EXTINCTION)
+        np.testing.assert_allclose(
+            one.estimates["visibility"].truth, -np.log(0.05) / EXTINCTION / 1e3, rtol=1e-6
+        )
+        assert one.near < 1600.0
+        found = compare(one, "extinction")
+        assert found is not None
+        assert found.within_3 == 1.0
+        assert found.count == 12
+
+
+def test_a_wrong_truth_is_seen(made):
+    (one, *_) = read_vertices(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
+    found = compare(one, "extinction")
+    assert found is not None
+    assert found.bias < -3.0
+
+
+def test_truth_is_that_of_the_beams_where_they_meet(made):
+    known = truth(made).drop_vars("extinction")
+    known["extinction"] = ("granule", np.full(180, np.nan))
+    middle = np.arange(50.0, 5000.0, 100.0)
+    for number, name in enumerate(NAMES):
+        suffix = name.replace("-", "_")
+        known[f"profile_granule_{suffix}"] = (f"p{number}", np.arange(60) + 60 * number)
+        known[f"range_{suffix}"] = (f"r{number}", middle)
+        field = np.broadcast_to(1e-4 + 1e-7 * middle, (60, 1, middle.size))
+        known[f"profile_extinction_{suffix}"] = ((f"p{number}", f"w{number}", f"r{number}"), field)
+    for v, one in enumerate(read_vertices(made, known, instruments=NAMES)):
+        expected = 1e-4 + 1e-7 * np.nanmean(made["ray_range"].values[:, v])
+        np.testing.assert_allclose(one.estimates["extinction"].truth, expected, rtol=1e-6)
+
+
+def test_scenes_are_joined_in_time(made):
+    halves = [made.isel(time=slice(6, 12)), made.isel(time=slice(6))]
+    joined = join_vertices([one for half in halves for one in read_vertices(half)])
+    whole = read_vertices(made)
+    assert [one.vertex for one in joined] == [0, 1, 2]
+    for one, other in zip(joined, whole, strict=True):
+        np.testing.assert_array_equal(one.time, other.time)
+        np.testing.assert_array_equal(
+            one.estimates["visibility"].value, other.estimates["visibility"].value
+        )
+
+
+def test_the_map_tells_each_vertex_in_words_and_colour(made):
+    network = read_map(made, NAMES)
+    figure = network_figures.draw_map(network, title="valley")
+    (panel, *_) = figure.axes
+    texts = [text.get_text() for text in panel.texts]
+    medians = np.median(made["visibility_in_air"].values, axis=0) / 1e3
+    assert texts == [f"{v}: {value:.3g} km" for v, value in enumerate(medians)]
+    marks = [line for line in panel.lines if line.get_gid() == "vertex"]
+    assert len({to_rgba(mark.get_markerfacecolor()) for mark in marks}) == 3
+    assert sum(line.get_gid() == "beam" for line in panel.lines) == 3
+    alt = product_figures.alt_text(figure)
+    assert "3 beams of 3 instruments" in alt
+    assert f"vertex 0: {medians[0]:.3g} km of 12 values" in alt
+    # Where it lies: the first beam leads north-east of its lidar.
+    assert network.axes[0].startswith("east")
+    np.testing.assert_allclose(
+        np.hypot(*(network.vertices[2] - network.stations[0])), 1.588, atol=0.01
+    )
+
+
+def test_a_vertex_without_a_value_says_so(made):
+    lost = made.copy(deep=True)
+    lost["quality_flag"][:, 1] = int(Quality.LOW_SIGNAL)
+    figure = network_figures.draw_map(read_map(lost))
+    assert "1: no value" in [text.get_text() for text in figure.axes[0].texts]
+
+
+def test_beams_in_a_vertical_plane_are_drawn_upright(made):
+    plane = made.copy(deep=True)
+    plane = plane.assign_coords(
+        ray_latitude=("ray", np.full(3, 47.25)),
+        ray_longitude=("ray", [11.3, 11.3265, 11.353]),
+        ray_azimuth=("ray", np.full(3, 90.0)),
+        ray_zenith_angle=("ray", [45.0, 30.0, 20.0]),
+        latitude=("vertex", np.full(3, 47.25)),
+        longitude=("vertex", [11.32, 11.33, 11.34]),
+        altitude=("vertex", [1500.0, 2000.0, 2500.0]),
+    )
+    network = read_map(plane)
+    assert network.axes == ("east of the first lidar (km)", "above the first lidar (km)")
+    np.testing.assert_allclose(network.vertices[:, 1], [0.9, 1.4, 1.9], atol=0.01)
+
+
+def test_series_are_drawn_with_errors_and_truth(made):
+    series = read_vertices(made, truth(made), instruments=NAMES)
+    figure = network_figures.draw_series(series, title="valley")
+    upper, lower = figure.axes
+    for panel, quantity, scale in ((upper, "visibility", 1.0), (lower, "extinction", 1e3)):
+        gids = [line.get_gid() for line in panel.lines]
+        assert gids.count(f"values-{quantity}") == 3
+        assert gids.count(f"truth-{quantity}") == 3
+        lines = [line for line in panel.lines if line.get_gid() == f"values-{quantity}"]
+        for line, one in zip(lines, series, strict=True):
+            np.testing.assert_allclose(
+                line.get_ydata(), scale * one.estimates[quantity].value, rtol=1e-6
+            )
+        assert "km" in panel.get_ylabel()
+    assert "0 of 12 rejected" in product_figures.alt_text(figure)
+    again = network_figures.draw_series(series, title="valley")
+    assert product_figures.render(figure).png == product_figures.render(again).png
+
+
+def test_a_foreign_product_is_refused(made):
+    with pytest.raises(ProductError, match="ray_range"):
+        read_vertices(made.drop_vars("ray_range"))
+
+
+def test_instruments_are_those_of_the_plan(made):
+    rays = [{"instrument": name} for name in NAMES]
+    plan = Plan("s", (Step("visibility", "photon_532o", {"rays": rays}, "why"),), ())
+    start = made["time"].values[0].astype("datetime64[us]").item()
+    outcome = SceneOutcome("s", "valley", "valley", start, 3, plan)
+    assert instruments_of(outcome) == NAMES
+    none = Plan("s", (), (LeftOut("visibility", "photon_532o", "why"),))
+    assert instruments_of(replace(outcome, plan=none)) == ()

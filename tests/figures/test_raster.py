@@ -1,0 +1,179 @@
+"""Products as images: block means, flags, edges and reach."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.fabricated import START, signal, times
+
+from lidarops.errors import ProductError
+from lidarops.figures import panels, product_figures, raster
+from lidarops.figures.raster import joined, read_raster, share_with_care
+from lidarops.flags import Quality
+
+BAD = int(Quality.rejecting())
+CARE = [bit for bit in Quality if bit not in Quality.rejecting()]
+
+
+def oracle(product, columns, rows):
+    """Mean of the gates that no bit rejects, by plain loops."""
+    flag, value = product["quality_flag"].values, product["signal"].values.astype(float)
+    good = ((flag & BAD) == 0) & np.isfinite(value)
+    out = np.full((len(columns), len(rows)), np.nan)
+    for i, column in enumerate(columns):
+        for j, row in enumerate(rows):
+            block = value[column, row][good[column, row]]
+            out[i, j] = block.mean() if block.size else np.nan
+    return out
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    count=st.integers(1, 40),
+    gates=st.integers(2, 50),
+    profiles=st.integers(1, 9),
+    seed=st.integers(0, 9),
+)
+def test_blocks_are_means_of_usable_gates(count, gates, profiles, seed):
+    random = np.random.default_rng(seed)
+    product = signal(times(START, count, 60.0), gates=gates, seed=seed)
+    flag = random.choice([0, 0, 0, *(int(bit) for bit in Quality)], size=(count, gates))
+    product["quality_flag"][:] = flag.astype(np.int32)
+    product["signal"].values[random.random((count, gates)) < 0.1] = np.nan
+    found = read_raster(product, profiles=profiles)
+    columns = [slice(i, min(i + profiles, count)) for i in range(0, count, profiles)]
+    rows = [slice(j, j + 1) for j in range(gates)]
+    np.testing.assert_allclose(found.mean, oracle(product, columns, rows), rtol=1e-5, atol=1e-3)
+    assert found.with_care == np.isin(flag, CARE).sum()
+    visible = BAD & ~int(Quality.INPUT_MISSING)
+    rejected = [(flag[c] & visible != 0).mean(axis=0) for c in columns]
+    np.testing.assert_array_equal(found.flagged, np.array(rejected) >= 0.5)
+
+
+@given(gates=st.integers(2, 3000), share=st.floats(0.01, 1.0))
+@settings(max_examples=20, deadline=None)
+def test_rows_merge_without_loss(gates, share):
+    product = signal(times(START, 3, 60.0), gates=gates, gate=5.0)
+    found = read_raster(product)
+    cut = found.shown_to(share * gates * 5.0)
+    assert cut.edges.size - 1 <= raster.ROWS
+    assert cut.edges[-1] >= share * gates * 5.0 - 1e-6 or cut.edges[-1] == found.edges[-1]
+    rows = int(np.searchsorted(found.edges, cut.edges[-1]))
+    np.testing.assert_allclose(cut.total.sum(), found.total[:, :rows].sum(), rtol=1e-4)
+    assert cut.used.sum() == found.used[:, :rows].sum()
+    assert cut.gates.sum() == found.gates[:rows].sum()
+
+
+def test_many_gates_are_read_in_blocks(monkeypatch):
+    product = signal(times(START, 30, 60.0), gates=9000, gate=3.0)
+    whole = read_raster(product, profiles=4)
+    assert whole.mean.shape == (8, 3000)
+    monkeypatch.setattr(raster, "_READ_BYTES", 1)
+    in_blocks = read_raster(product, profiles=4)
+    np.testing.assert_array_equal(whole.total, in_blocks.total)
+    np.testing.assert_array_equal(whole.rejected, in_blocks.rejected)
+    rows = [slice(j, j + 3) for j in range(0, 9000, 3)]
+    columns = [slice(i, min(i + 4, 30)) for i in range(0, 30, 4)]
+    np.testing.assert_allclose(whole.mean, oracle(product, columns, rows), rtol=1e-4, atol=0.1)
+
+
+def test_columns_touch_and_leave_gaps_open():
+    time = np.concatenate([times(START, 10, 60.0), times(START + timedelta(hours=2), 4, 60.0)])
+    found = read_raster(signal(time), profiles=3)
+    gaps = (found.start[1:] - found.stop[:-1]) / np.timedelta64(1, "m")
+    # 10 profiles in 4 columns, then 4 in 2: one gap, from 10 min to 2 h.
+    np.testing.assert_allclose(gaps, [0, 0, 0, 110, 0], atol=1e-9)
+    assert found.profiles.tolist() == [3, 3, 3, 1, 3, 1]
+    assert found.start[0] == np.datetime64("2024-03-01T00:00:00")
+
+
+def test_background_is_the_mean_with_its_error():
+    product = signal(times(START, 6, 60.0))
+    product["background"].values[4:] = np.nan
+    found = read_raster(product, profiles=2)
+    expected = product["background"].values[:4].reshape(2, 2).mean(axis=1)
+    np.testing.assert_allclose(found.background[:2], expected, rtol=1e-6)
+    np.testing.assert_allclose(found.background_error[:2], 4e-3 / np.sqrt(2), rtol=1e-6)
+    assert np.isnan(found.background[2])
+
+
+def test_reach_is_where_the_signal_drowns():
+    product = signal(times(START, 60, 60.0), gates=2000, gate=15.0)
+    product["signal"].values[:, 400:] = (
+        product["signal_standard_error"].values[:, 400:]
+        * np.random.default_rng(0).standard_normal((60, 1600))
+    )  # fmt: skip
+    product["signal"].values[:, :400] = 5 * product["signal_standard_error"].values[:, :400]
+    assert read_raster(product).reach == pytest.approx(6000.0, abs=15.0 * 25)
+    product["signal"].values[:] = 0.0
+    assert read_raster(product).reach == 0.0
+
+
+def test_altitude_is_a_line_in_range():
+    found = read_raster(signal(times(START, 3, 60.0)))
+    np.testing.assert_allclose(found.altitude, (120.0, 0.94))
+    assert read_raster(signal(times(START, 3, 60.0)).drop_vars("altitude")).altitude is None
+
+
+def test_unsorted_times_are_sorted():
+    product = signal(times(START, 12, 60.0))
+    backwards = product.isel(time=slice(None, None, -1))
+    np.testing.assert_array_equal(read_raster(product).total, read_raster(backwards).total)
+
+
+def test_share_with_care_is_over_all_gates():
+    product = signal(times(START, 5, 60.0), gates=100)
+    product["quality_flag"].values[:] = 0
+    product["quality_flag"].values[:, :25] = int(Quality.PILE_UP)
+    assert share_with_care([read_raster(product)]) == 0.25
+    assert share_with_care([]) == 0.0
+
+
+@pytest.mark.parametrize("name", ["signal", "background", "quality_flag", "range"])
+def test_missing_variable_is_named(name):
+    with pytest.raises(ProductError, match=f"{name}: is missing"):
+        read_raster(signal(times(START, 3, 60.0)).drop_vars(name))
+
+
+def test_empty_product_is_refused():
+    with pytest.raises(ProductError, match="no profile"):
+        read_raster(signal(times(START, 3, 60.0)).isel(time=slice(0)))
+
+
+def rasters_of(*starts: float, gates: int = 30) -> list[raster.Raster]:
+    """Rasters of an hour each, from so many hours after the start."""
+    return [
+        read_raster(signal(times(START + timedelta(hours=hours), 60, 60.0), gates=gates, seed=seed))
+        for seed, hours in enumerate(starts)
+    ]
+
+
+def test_joined_are_those_that_follow_one_another_with_the_same_rows():
+    following = rasters_of(0, 1, 5)
+    (whole,) = joined(following)
+    assert whole.start.size == 180
+    np.testing.assert_array_equal(whole.mean, np.concatenate([one.mean for one in following]))
+    np.testing.assert_array_equal(whole.flagged, np.concatenate([one.flagged for one in following]))
+    np.testing.assert_array_equal(whole.edges, following[0].edges)
+    assert whole.with_care == sum(one.with_care for one in following)
+    assert share_with_care([whole]) == pytest.approx(share_with_care(following))
+    assert whole.bits == following[0].bits | following[1].bits | following[2].bits
+
+
+def test_joined_are_no_others():
+    overlapping, backwards = rasters_of(0, 0.5), rasters_of(1, 0)
+    other_rows = [*rasters_of(0), *rasters_of(1, gates=31)]
+    for apart in (overlapping, backwards, other_rows):
+        assert joined(apart) == apart
+    assert joined([]) == []
+
+
+def test_the_picture_of_joined_rasters_is_that_of_each(monkeypatch):
+    parts = rasters_of(0, 1, 2, 6, 6.5)
+    one = product_figures.render(product_figures.draw_quicklook(parts, title="joined"))
+    monkeypatch.setattr(panels, "joined", list)
+    assert product_figures.render(product_figures.draw_quicklook(parts, title="joined")) == one

@@ -1,0 +1,672 @@
+"""Figures of multi-angle products hold the values, mark the flagged ones and show the truth."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.collections import QuadMesh
+from PIL import Image
+from support.fabricated import CHANNEL, START, Archive, outcome, run_record, times
+
+from lidarops.errors import ProductError
+from lidarops.figures import product_figures, scan_data
+from lidarops.flags import Quality
+from lidarops.records import ProductKind
+from lidarops.reports import gallery
+
+STATION = 180.0
+ALTITUDE = STATION + 300.0 + 50.0 * np.arange(90)
+ZENITH = np.array([60.0, 45.0, 30.0, 0.0, 30.0, 45.0, 60.0])
+AZIMUTH = np.array([270.0, 270.0, 270.0, 90.0, 90.0, 90.0, 90.0])
+REACH = 3500.0
+RAYS = ("time", "ray", "altitude")
+BOTH = ("time", "altitude")
+
+
+def true_extinction(altitude):
+    """Extinction in m-1 of a boundary layer under cleaner air."""
+    return 2e-5 + 1.3e-4 / (1.0 + np.exp((altitude - 1500.0) / 80.0))
+
+
+def true_depth(altitude):
+    """Optical depth from the station, by the closed integral of `true_extinction`."""
+
+    def below(z):
+        return 2e-5 * z - 1.3e-4 * 80.0 * np.log1p(np.exp(-(z - 1500.0) / 80.0))
+
+    return below(altitude) - below(STATION)
+
+
+def multiangle(cycles=12, *, seed=0, tilt=0.02):
+    """A product of kind ``multiangle`` whose residuals grow with the sine of the zenith angle."""
+    random = np.random.default_rng(seed)
+    time = times(START, cycles, 1020.0)
+    shape = (cycles, ALTITUDE.size)
+    beyond = np.broadcast_to(ALTITUDE > REACH, shape)
+    flag = np.where(beyond, int(Quality.EXTRAPOLATED), 0).astype(np.int32)
+    flag[:, (ALTITUDE > 1450) & (ALTITUDE < 1600)] |= int(Quality.PRIOR_DOMINATED)
+    flag[:, ALTITUDE < 600] |= int(Quality.HORIZONTAL_GRADIENT)
+    depth_error = np.broadcast_to(0.002 + 1e-6 * ALTITUDE, shape)
+    error = np.broadcast_to(4e-6 + 2e-9 * ALTITUDE, shape)
+    depth = true_depth(ALTITUDE) + depth_error * random.standard_normal(shape)
+    extinction = true_extinction(ALTITUDE) + error * random.standard_normal(shape)
+    depth, extinction = np.where(beyond, np.nan, depth), np.where(beyond, np.nan, extinction)
+    slant = np.sin(np.radians(ZENITH)) * np.where(AZIMUTH == 90.0, 1.0, -1.0)
+    residual = tilt * slant[None, :, None] + 0.01 * random.standard_normal(
+        (cycles, ZENITH.size, ALTITUDE.size)
+    )
+    residual = np.where(beyond[:, None, :], np.nan, residual)
+    per_m = {"units": "m-1"}
+    one = {"units": "1"}
+    return xr.Dataset(
+        {
+            "optical_depth": (BOTH, depth, one),
+            "optical_depth_standard_error": (BOTH, depth_error, one),
+            "optical_depth_gradient_error": (BOTH, 0.5 * depth_error, one),
+            "extinction": (BOTH, extinction, per_m),
+            "extinction_standard_error": (BOTH, error, per_m),
+            "extinction_gradient_error": (BOTH, 2.0 * error, per_m),
+            "data_share": (BOTH, np.ones(shape)),
+            "inhomogeneity": (BOTH, np.full(shape, 0.01)),
+            "reach": ("time", np.full(cycles, REACH), {"units": "m"}),
+            "residual": (RAYS, residual),
+            "quality_flag": (BOTH, flag),
+        },
+        coords={
+            "time": ("time", time),
+            "altitude": ("altitude", ALTITUDE, {"units": "m"}),
+            "ray_zenith_angle": ("ray", ZENITH, {"units": "degree"}),
+            "ray_azimuth": ("ray", AZIMUTH, {"units": "degree"}),
+            "station_altitude": ((), STATION, {"units": "m"}),
+            "wavelength": ((), 532.0, {"units": "nm"}),
+        },
+    )
+
+
+def truth_of(product, *, instrument="plain-scanner", zenith=(60.0, 30.0, 45.0)):
+    """Truth of a campaign: in each cycle one file at every zenith angle, told along its beam."""
+    middles = np.repeat(product["time"].values, len(zenith))
+    time = middles + np.tile(np.arange(len(zenith)) * 60, product.sizes["time"]).astype(
+        "timedelta64[s]"
+    )
+    angle = np.tile(zenith, product.sizes["time"])
+    end = 100.0 * np.arange(1, 81)
+    # Files of another instrument come first, so that rows of profiles are not those of files.
+    other = 4
+    upright = np.cos(np.radians(angle))[:, None]
+    depth = true_depth(STATION + end * upright) / upright
+    cells = np.diff(depth, axis=1, prepend=0.0) / 100.0
+    suffix = instrument.replace("-", "_")
+    dims = (f"profile_{suffix}", f"wavelength_{suffix}", f"range_{suffix}")
+
+    def filled(values, first):
+        return np.concatenate([np.repeat(first, other), values])
+
+    return xr.Dataset(
+        {
+            "path": ("granule", np.array([f"m{i}" for i in range(other + time.size)], object)),
+            "instrument": ("granule", np.array(["other"] * other + [instrument] * time.size)),
+            "time": ("granule", filled(time, time[0])),
+            "zenith_angle": ("granule", filled(angle, 0.0)),
+            "extinction": ("granule", np.full(other + time.size, np.nan)),
+            f"profile_granule_{suffix}": (dims[0], other + np.arange(time.size)),
+            f"range_end_{suffix}": (dims[2], end),
+            f"profile_extinction_{suffix}": (dims, np.stack([0 * cells, cells], axis=1)),
+            f"profile_optical_depth_{suffix}": (dims, np.stack([0 * depth, depth], axis=1)),
+        },
+        coords={
+            f"wavelength_{suffix}": (dims[1], [355e-9, 532e-9]),
+            f"range_{suffix}": (dims[2], end - 50.0),
+        },
+    )
+
+
+def artist(panel, gid):
+    found = [each for each in panel.get_children() if each.get_gid() == gid]
+    assert len(found) <= 1
+    return found[0] if found else None
+
+
+def picture(figure):
+    return np.asarray(Image.open(io.BytesIO(product_figures.render(figure).png)).convert("RGB"))
+
+
+def drawn(product, truth=None):
+    profile = scan_data.clearest_cycle(product, truth, instrument="plain-scanner")
+    return product_figures.scan_profile(profile, title="scanner").axes
+
+
+def half_width(band, z):
+    """Half the width of a band between x at the altitude z (km)."""
+    vertices = band.get_paths()[0].vertices
+    x = vertices[np.isclose(vertices[:, 1], z), 0]
+    return np.ptp(x) / 2
+
+
+class TestClearestCycle:
+    def test_most_unflagged_values_win(self):
+        product = multiangle()
+        product["quality_flag"][7] = np.where(ALTITUDE > REACH, int(Quality.EXTRAPOLATED), 0)
+        profile = scan_data.clearest_cycle(product)
+        assert profile.time == product["time"].values[7]
+        assert profile.altitude[-1] <= ALTITUDE[0] + 1.15 * (REACH - ALTITUDE[0])
+        assert profile.altitude[-1] > REACH
+
+    def test_where_all_carry_a_bit_of_care_rejections_decide_then_the_first(self):
+        product = multiangle(cycles=4)
+        flag = np.full((4, ALTITUDE.size), int(Quality.ONE_SIDED))
+        flag[0, :5] |= int(Quality.POOR_STRATIFICATION)
+        flag[:, ALTITUDE > REACH] |= int(Quality.EXTRAPOLATED)
+        product["quality_flag"] = (BOTH, flag)
+        assert scan_data.clearest_cycle(product).time == product["time"].values[1]
+
+    def test_where_all_are_rejected_the_cycle_with_most_values_is_shown(self):
+        product = multiangle()
+        product["quality_flag"][:] = int(Quality.POOR_STRATIFICATION)
+        product["optical_depth"][:9, :3] = np.nan
+        profile = scan_data.clearest_cycle(product)
+        assert profile.time == product["time"].values[9]
+        assert np.isnan(profile.estimates["extinction"].value).all()
+        for panel, name in zip(drawn(product), scan_data.QUANTITIES, strict=True):
+            low, high = panel.get_xlim()
+            marks = artist(panel, f"flagged-{name}").get_xdata()
+            assert ((marks >= low) & (marks <= high)).all()
+            assert np.ptp(marks) > 0.7 * (high - low)
+        panel = drawn(product, truth_of(product))[0]
+        assert panel.get_xlim()[0] < 0.0 < panel.get_xlim()[1]
+
+    def test_nothing_where_there_is_no_value(self):
+        product = multiangle()
+        product["optical_depth"][:] = np.nan
+        assert scan_data.clearest_cycle(product) is None
+        assert scan_data.clearest_cycle(multiangle().isel(time=slice(0))) is None
+
+    def test_values_that_a_bit_rejects_are_kept_apart(self):
+        product = multiangle()
+        profile = scan_data.clearest_cycle(product)
+        low = profile.altitude < 600
+        for estimate in profile.estimates.values():
+            assert np.isnan(estimate.value[low]).all()
+            assert np.isfinite(estimate.rejected[low]).all()
+            assert np.isnan(estimate.rejected[~low]).all()
+        assert not profile.with_care[low].any()
+
+    def test_everything_is_shown_where_there_is_no_reach(self):
+        product = multiangle()
+        product["reach"][:] = np.nan
+        assert scan_data.clearest_cycle(product).altitude.size == ALTITUDE.size
+
+    def test_a_fill_value_in_the_flags_means_missing(self):
+        product = multiangle()
+        product["quality_flag"] = product["quality_flag"].astype(np.float64)
+        product["quality_flag"][:, 20] = np.nan
+        profile = scan_data.clearest_cycle(product)
+        assert profile.flag[20] == int(Quality.INPUT_MISSING)
+        assert np.isnan(profile.estimates["optical_depth"].value[20])
+
+
+class TestTruth:
+    def test_the_file_nearest_to_the_zenith_is_taken(self):
+        product = multiangle()
+        profile = scan_data.clearest_cycle(product, truth_of(product), instrument="plain-scanner")
+        assert profile.truth.zenith_angle == 30.0
+        assert profile.truth.time == profile.time + np.timedelta64(60, "s")
+
+    @pytest.mark.parametrize("zenith", [0.0, 30.0, -60.0, 75.0])
+    def test_layers_are_level_so_that_any_beam_tells_the_vertical_profile(self, zenith):
+        product = multiangle(cycles=3)
+        truth = truth_of(product, zenith=(zenith,))
+        told = scan_data.true_profile(product, 1, truth, instrument="plain-scanner")
+        assert told.edges[0] == STATION
+        np.testing.assert_allclose(told.optical_depth, true_depth(told.edges), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            told.extinction, np.diff(true_depth(told.edges)) / np.diff(told.edges), rtol=1e-6
+        )
+        assert told.time == product["time"].values[1]
+
+    def test_no_truth_near_the_horizon_far_off_in_time_or_of_another_kind(self):
+        product = multiangle(cycles=3)
+        for truth in (
+            truth_of(product, zenith=(85.0,)),
+            truth_of(product, instrument="other"),
+            truth_of(product).drop_vars("zenith_angle"),
+            truth_of(product.assign_coords(time=product["time"] + np.timedelta64(3, "h"))),
+        ):
+            assert scan_data.true_profile(product, 1, truth, instrument="plain-scanner") is None
+        truth = truth_of(product)
+        for other in (
+            product.drop_vars("station_altitude"),
+            product.assign_coords(wavelength=1064.0),
+            product.drop_vars("wavelength"),
+        ):
+            assert scan_data.true_profile(other, 1, truth, instrument="plain-scanner") is None
+
+    def test_bounds_of_the_cycle_say_how_far_off_a_file_may_be(self):
+        product = multiangle(cycles=1)
+        truth = truth_of(product, zenith=(30.0,))
+        truth["time"] = truth["time"] + np.timedelta64(10, "m")
+        assert scan_data.true_profile(product, 0, truth, instrument="plain-scanner") is None
+        half = np.timedelta64(510, "s")
+        middle = product["time"].values
+        product["time_bnds"] = (("time", "nv"), np.stack([middle - half, middle + half], axis=1))
+        assert scan_data.true_profile(product, 0, truth, instrument="plain-scanner") is not None
+
+    def test_a_wavelength_in_metres_is_understood(self):
+        product = multiangle(cycles=2)
+        product = product.assign_coords(wavelength=((), 532e-9, {"units": "m"}))
+        truth = truth_of(product)
+        assert scan_data.true_profile(product, 0, truth, instrument="plain-scanner") is not None
+
+
+class TestProfileFigure:
+    @pytest.mark.parametrize(
+        ("place", "quantity", "scale"), [(0, "optical_depth", 1.0), (1, "extinction", 1e3)]
+    )
+    def test_lines_and_bands_hold_values_and_errors(self, place, quantity, scale):
+        product = multiangle()
+        panel = drawn(product)[place]
+        line = artist(panel, f"values-{quantity}")
+        value, z = line.get_xdata(), line.get_ydata()
+        chosen = product.isel(time=0, altitude=slice(0, value.size))
+        use = (chosen["quality_flag"].values & int(Quality.rejecting())) == 0
+        np.testing.assert_array_equal(np.isfinite(value), use)
+        np.testing.assert_allclose(value[use], scale * chosen[quantity].values[use])
+        np.testing.assert_allclose(z, chosen["altitude"].values / 1e3)
+        error = scale * chosen[f"{quantity}_standard_error"].values[20]
+        gradient = scale * chosen[f"{quantity}_gradient_error"].values[20]
+        np.testing.assert_allclose(half_width(artist(panel, f"error-{quantity}"), z[20]), error)
+        np.testing.assert_allclose(
+            half_width(artist(panel, f"gradient-{quantity}"), z[20]), error + gradient
+        )
+
+    def test_flagged_values_and_missing_ones_are_marked_at_their_altitude(self):
+        for panel, name in zip(drawn(multiangle()), scan_data.QUANTITIES, strict=True):
+            z = 1e3 * artist(panel, f"flagged-{name}").get_ydata()
+            np.testing.assert_allclose(z, ALTITUDE[ALTITUDE < 600])
+            z = 1e3 * artist(panel, f"care-{name}").get_ydata()
+            np.testing.assert_allclose(z, ALTITUDE[(ALTITUDE > 1450) & (ALTITUDE < 1600)])
+            assert (1e3 * artist(panel, f"empty-{name}").get_ydata() > REACH).all()
+
+    def test_without_flags_there_are_no_marks(self):
+        product = multiangle().sel(altitude=slice(None, REACH))
+        product["quality_flag"][:] = 0
+        for panel, name in zip(drawn(product), scan_data.QUANTITIES, strict=True):
+            for kind in ("flagged", "care", "empty"):
+                assert artist(panel, f"{kind}-{name}") is None
+
+    def test_a_rejected_value_far_off_is_drawn_at_the_edge(self):
+        product = multiangle()
+        product["extinction"][:, 0] = 1.0
+        panel = drawn(product)[1]
+        marks = artist(panel, "flagged-extinction")
+        assert marks.get_xdata().max() == panel.get_xlim()[1] < 1.0
+
+    def test_the_reach_is_a_line_where_there_is_one(self):
+        for panel in drawn(multiangle()):
+            assert set(artist(panel, "reach").get_ydata()) == {REACH / 1e3}
+        product = multiangle()
+        product["reach"][:] = np.nan
+        assert artist(drawn(product)[0], "reach") is None
+
+    def test_the_truth_is_black_and_dashed_and_lies_on_the_curve(self):
+        product = multiangle()
+        depth, extinction = drawn(product, truth_of(product))
+        line = artist(depth, "truth-optical_depth")
+        assert line.get_color() == "black"
+        assert line.is_dashed()
+        np.testing.assert_allclose(
+            line.get_xdata(), true_depth(1e3 * line.get_ydata()), rtol=1e-9, atol=1e-9
+        )
+        steps = artist(extinction, "truth-extinction")
+        np.testing.assert_allclose(
+            np.trapezoid(steps.get_xdata(), steps.get_ydata()), line.get_xdata()[-1], rtol=1e-9
+        )
+        assert artist(drawn(product)[0], "truth-optical_depth") is None
+
+    def test_a_cloud_above_the_reach_does_not_shrink_what_lies_below(self):
+        product = multiangle()
+        truth = truth_of(product)
+        height = truth["range_plain_scanner"].values * np.cos(np.radians(30.0))
+        truth["profile_extinction_plain_scanner"].values[..., height > REACH - STATION + 60] = 0.1
+        panel = drawn(product, truth)[1]
+        cloud = artist(panel, "truth-extinction")
+        inside = cloud.get_ydata() < panel.get_ylim()[1]
+        assert cloud.get_xdata()[inside].max() == pytest.approx(100.0)
+        assert panel.get_xlim()[1] < 1.0
+
+    def test_a_huge_systematic_error_leaves_the_profile_a_third_of_the_panel(self):
+        product = multiangle()
+        product["extinction_gradient_error"][:] = 1.0
+        low, high = drawn(product)[1].get_xlim()
+        value = artist(drawn(product)[1], "values-extinction").get_xdata()
+        assert np.nanmax(value) - np.nanmin(value) > 0.2 * (high - low)
+
+    def test_an_unknown_systematic_error_hides_nothing_else(self):
+        product = multiangle()
+        product["extinction_gradient_error"][:] = np.nan
+        panel = drawn(product)[1]
+        assert artist(panel, "error-extinction").get_paths()
+        assert np.isfinite(panel.get_xlim()).all()
+
+    def test_extinction_withheld_where_the_optical_depth_is_known(self):
+        product = multiangle()
+        product["extinction"][:] = np.nan
+        figure = product_figures.scan_profile(scan_data.clearest_cycle(product), title="scanner")
+        assert "extinction none to use" in product_figures.alt_text(figure)
+        assert np.isfinite(figure.axes[1].get_xlim()).all()
+
+    def test_words_say_what_is_seen(self):
+        product = multiangle()
+        profile = scan_data.clearest_cycle(product, truth_of(product), instrument="plain-scanner")
+        words = product_figures.alt_text(product_figures.scan_profile(profile, title="scanner"))
+        for part in ("scanner", "2024-03-01 00:08:30 UTC", "reach 3.5 km", "truth"):
+            assert part in words
+        flagged = int((profile.flag != 0).sum())
+        assert f"{flagged} of {profile.flag.size} altitudes flagged" in words
+        for name in ("horizontal_gradient", "prior_dominated", "extrapolated"):
+            assert name in words
+
+
+class TestResiduals:
+    def test_means_and_rms_are_those_of_the_product_in_per_cent(self):
+        product = multiangle()
+        read = scan_data.read_residuals(product)
+        residual = 100 * product["residual"].values[..., ALTITUDE <= REACH]
+        np.testing.assert_array_equal(read.zenith_angle, [-60, -45, -30, 0, 30, 45, 60])
+        np.testing.assert_allclose(read.mean, residual.mean(axis=0).T)
+        np.testing.assert_allclose(read.rms, np.sqrt((residual**2).mean(axis=(0, 2))))
+        np.testing.assert_allclose(
+            read.rms_of_mean, np.sqrt((residual.mean(axis=0) ** 2).mean(axis=1))
+        )
+        assert read.cycles == 12
+        assert read.altitudes == 1
+        assert read.azimuths == (90.0,)
+        np.testing.assert_allclose(read.edges[[0, -1]], [ALTITUDE[0] - 25, REACH + 5], atol=30)
+
+    def test_noise_averages_out_and_a_gradient_does_not(self):
+        read = scan_data.read_residuals(multiangle(cycles=100, tilt=0.02))
+        upright = int(np.flatnonzero(read.zenith_angle == 0)[0])
+        assert read.rms_of_mean[upright] == pytest.approx(0.1, rel=0.3)
+        assert read.rms_of_mean[[0, -1]] == pytest.approx(2 * np.sin(np.radians(60)), rel=0.05)
+        assert (read.mean[:, 0] < 0).all()
+        assert (read.mean[:, -1] > 0).all()
+
+    def test_altitudes_that_few_cycles_reach_count_little(self):
+        product = multiangle(cycles=100)
+        high = ALTITUDE > 2000
+        product["residual"][1:, :, high] = np.nan
+        product["residual"][0, :, high] = 0.5
+        read = scan_data.read_residuals(product)
+        assert (read.rms_of_mean <= read.rms).all()
+        residual = 100 * product["residual"].values
+        np.testing.assert_allclose(read.rms, np.sqrt(np.nanmean(residual**2, axis=(0, 2))))
+        clim = artist(product_figures.scan_residuals(read).axes[0], "residual").get_clim()
+        assert 1.5 < clim[1] < 5.0
+
+    def test_rows_join_altitudes_where_there_are_many(self):
+        product = multiangle(cycles=2).sel(altitude=slice(None, REACH))
+        fine = np.linspace(ALTITUDE[0], REACH, 950)
+        product = product.interp(altitude=fine, method="nearest").assign(
+            quality_flag=(BOTH, np.zeros((2, 950), dtype=np.int32))
+        )
+        read = scan_data.read_residuals(product)
+        assert read.altitudes == 10
+        assert read.mean.shape == (95, ZENITH.size)
+        assert read.edges.size == 96
+        first = 100 * product["residual"].values[:, :, :10].mean(axis=(0, 2))
+        np.testing.assert_allclose(read.mean[0], first)
+
+    def test_what_is_zero_by_construction_is_left_out(self):
+        product = multiangle()
+        product["residual"][:6] = 0.0
+        product["quality_flag"][:6] |= int(Quality.NO_RESIDUAL)
+        read = scan_data.read_residuals(product)
+        assert read.cycles == 6
+        kept = 100 * product["residual"].values[6:][..., ALTITUDE <= REACH]
+        np.testing.assert_allclose(read.rms, np.sqrt((kept**2).mean(axis=(0, 2))))
+        product["quality_flag"][:] |= int(Quality.NO_RESIDUAL)
+        assert scan_data.read_residuals(product) is None
+
+    def test_reading_in_parts_changes_nothing(self, monkeypatch):
+        product = multiangle()
+        whole = scan_data.read_residuals(product)
+        monkeypatch.setattr(scan_data, "_READ_BYTES", 1)
+        parts = scan_data.read_residuals(product)
+        np.testing.assert_allclose(parts.mean, whole.mean)
+        np.testing.assert_allclose(parts.rms, whole.rms)
+        assert parts.cycles == whole.cycles
+
+    @pytest.mark.parametrize(
+        ("zenith", "azimuth", "signed", "planes", "azimuths"),
+        [
+            # A negative angle leads opposite to its azimuth.
+            ([-60, 0, 60], [90, 90, 90], [-60, 0, 60], [0, 0, 0], (90.0,)),
+            # Around north azimuths jump, the plane does not.
+            ([30, 40, 50], [359.8, 0.1, 180.0], [-50, 30, 40], [0, 0, 0], (0.1,)),
+            ([30, 30, 30, 30], [0, 90, 180, 270], [-30, 30, -30, 30], [0, 0, 1, 1], (0.0, 90.0)),
+            ([60, 0, -30], [np.nan] * 3, [-30, 0, 60], [0, 0, 0], (np.nan,)),
+            ([30, 50, 40], [90, np.nan, 270], [-40, 30, 50], [0, 0, 1], (90.0, np.nan)),
+            ([0, 0], [0, 90], [0, 0], [0, 0], ()),
+        ],
+    )
+    def test_rays_stand_in_the_order_of_the_sky(self, zenith, azimuth, signed, planes, azimuths):
+        rays = len(zenith)
+        product = multiangle().isel(ray=slice(rays))
+        product = product.assign_coords(
+            ray_zenith_angle=("ray", np.array(zenith, dtype=float)),
+            ray_azimuth=("ray", np.array(azimuth, dtype=float)),
+        )
+        read = scan_data.read_residuals(product)
+        np.testing.assert_array_equal(read.zenith_angle, signed)
+        np.testing.assert_array_equal(read.plane, planes)
+        np.testing.assert_array_equal(read.azimuths, azimuths)
+        upper, lower = product_figures.scan_residuals(read).axes[:2]
+        borders = [line for line in upper.get_lines() if line.get_gid() == "plane"]
+        assert len(borders) == max(planes)
+        assert ("not known" in lower.get_xlabel()) == bool(np.isnan(azimuths).any())
+
+    def test_azimuths_may_be_left_out_where_nobody_knows_them(self):
+        read = scan_data.read_residuals(multiangle().drop_vars("ray_azimuth"))
+        np.testing.assert_array_equal(read.zenith_angle, np.sort(ZENITH))
+        assert np.isnan(read.azimuths).all()
+
+    def test_the_map_holds_the_means_on_a_scale_around_zero(self):
+        read = scan_data.read_residuals(multiangle())
+        panel, below = product_figures.scan_residuals(read).axes[:2]
+        mesh = artist(panel, "residual")
+        np.testing.assert_allclose(mesh.get_array(), read.mean)
+        low, high = mesh.get_clim()
+        assert low == -high < 0
+        np.testing.assert_allclose(artist(below, "rms").get_ydata(), read.rms)
+        np.testing.assert_allclose(artist(below, "rms-of-mean").get_ydata(), read.rms_of_mean)
+        assert below.get_xticklabels()[0].get_text() == "\u221260"
+
+    def test_negative_residuals_are_told_from_positive_ones_in_grey(self):
+        read = scan_data.read_residuals(multiangle())
+        hatched = artist(product_figures.scan_residuals(read).axes[0], "negative").get_array()
+        shown = ~np.ma.getmaskarray(hatched)
+        assert (read.mean[shown] < 0).all()
+        assert shown[:, 0].mean() > 0.95
+        assert not shown[:, 4:].any()
+
+    def test_one_cycle_has_no_mean_apart(self):
+        below = product_figures.scan_residuals(scan_data.read_residuals(multiangle(cycles=1))).axes[
+            1
+        ]
+        assert artist(below, "rms-of-mean") is None
+
+    def test_residuals_that_are_all_zero_can_be_drawn(self):
+        product = multiangle()
+        product["residual"][:] = 0.0
+        figure = product_figures.scan_residuals(scan_data.read_residuals(product))
+        assert artist(figure.axes[0], "negative") is None
+        assert picture(figure).std() > 0
+
+    def test_words_name_the_worst_ray(self):
+        product = multiangle()
+        product["residual"][:, 1] += 0.2
+        words = product_figures.alt_text(
+            product_figures.scan_residuals(scan_data.read_residuals(product), title="s")
+        )
+        assert "mean of 12 cycles" in words
+        assert "zenith angle of -45 degrees" in words
+
+
+class TestQuicklook:
+    def test_extinction_in_km_with_rejected_gates_black(self):
+        product = multiangle()
+        figure = product_figures.extinction_quicklook([product], title="scanner")
+        panel = figure.axes[0]
+        mesh, black = (each for each in panel.collections if isinstance(each, QuadMesh))
+        assert black.get_gid() == "flagged-signal"
+        use = (product["quality_flag"].values & int(Quality.rejecting())) == 0
+        rows = mesh.get_array().shape[0]
+        good = use.T[:rows]
+        value = np.maximum(1e3 * product["extinction"].values.T[:rows][good], 0.0)
+        drawn_values = mesh.get_array()[good].filled(np.nan)
+        positive = value > 0
+        np.testing.assert_allclose(drawn_values[positive], value[positive], rtol=1e-6)
+        np.testing.assert_array_equal(~np.ma.getmaskarray(black.get_array()), ~good)
+        np.testing.assert_allclose(panel.get_ylim()[0], (ALTITUDE[0] - 25) / 1e3)
+        assert panel.get_ylabel() == "altitude (km)"
+        assert figure.axes[-1].get_ylabel() == "extinction (km$^{-1}$)"
+        words = product_figures.alt_text(figure)
+        assert "horizontal_gradient" in words
+        assert "prior_dominated" in words
+
+    def test_many_cycles_become_columns_of_means(self):
+        product = multiangle(cycles=60)
+        raster = scan_data.read_extinction(product, profiles=20)
+        assert raster.mean.shape == (3, ALTITUDE.size)
+        np.testing.assert_allclose(
+            raster.mean[0, 10], 1e3 * product["extinction"].values[:20, 10].mean(), rtol=1e-6
+        )
+        assert raster.units == "km$^{-1}$"
+
+    def test_one_cycle_is_enough(self):
+        assert picture(product_figures.extinction_quicklook([multiangle(cycles=1)])).std() > 0
+
+
+READERS = {
+    "profile": scan_data.clearest_cycle,
+    "residuals": scan_data.read_residuals,
+    "quicklook": lambda product: product_figures.extinction_quicklook([product]),
+}
+NEEDED = {
+    "profile": (
+        *(
+            f"{q}{e}"
+            for q in scan_data.QUANTITIES
+            for e in ("", "_standard_error", "_gradient_error")
+        ),
+        "reach",
+        "quality_flag",
+        "time",
+        "altitude",
+    ),
+    "residuals": ("residual", "ray_zenith_angle", "quality_flag", "time", "altitude"),
+    "quicklook": ("extinction", "extinction_standard_error", "quality_flag", "time"),
+}
+
+
+class TestRefusal:
+    @pytest.mark.parametrize(
+        ("reader", "name"), [(reader, name) for reader in NEEDED for name in NEEDED[reader]]
+    )
+    def test_a_missing_variable_is_named(self, reader, name):
+        with pytest.raises(ProductError, match=f"^{name}: "):
+            READERS[reader](multiangle(cycles=2).drop_vars(name))
+
+    @pytest.mark.parametrize("reader", READERS)
+    def test_other_dims_are_refused(self, reader):
+        product = multiangle(cycles=2)
+        product["quality_flag"] = product["quality_flag"].T
+        with pytest.raises(ProductError, match="quality_flag"):
+            READERS[reader](product)
+
+    @pytest.mark.parametrize("reader", ["profile", "quicklook"])
+    def test_other_units_are_refused(self, reader):
+        product = multiangle(cycles=2)
+        product["extinction"].attrs["units"] = "km-1"
+        with pytest.raises(ProductError, match="km-1"):
+            READERS[reader](product)
+
+
+class TestRendering:
+    def test_equal_figures_give_equal_bytes(self):
+        product = multiangle()
+
+        def files():
+            profile = scan_data.clearest_cycle(
+                product, truth_of(product), instrument="plain-scanner"
+            )
+            yield product_figures.render(product_figures.scan_profile(profile, title="s")).png
+            yield product_figures.render(
+                product_figures.scan_residuals(scan_data.read_residuals(product))
+            ).png
+            yield product_figures.render(product_figures.extinction_quicklook([product])).png
+
+        assert list(files()) == list(files())
+
+    def test_names_are_text_not_formulas(self):
+        title = "$\\frac{broken \x1b"
+        product = multiangle(cycles=2)
+        for figure in (
+            product_figures.scan_profile(scan_data.clearest_cycle(product), title=title),
+            product_figures.scan_residuals(scan_data.read_residuals(product), title=title),
+            product_figures.extinction_quicklook([product], title=title),
+        ):
+            assert picture(figure).std() > 0
+            assert "\x1b" not in product_figures.alt_text(figure)
+
+
+class TestGallery:
+    def run(self, tmp_path, products, truth=None):
+        archive = Archive(tmp_path / "products")
+        records = tuple(
+            archive.write(name, data, ProductKind.MULTIANGLE) for name, data in products.items()
+        )
+        path = ""
+        if truth is not None:
+            path = str(tmp_path / "truth.nc")
+            truth.to_netcdf(path)
+        scene = outcome("s", products=records, instrument="plain-scanner")
+        folder = tmp_path / "report"
+        folder.mkdir()
+        return gallery.fill(run_record(archive.root, [scene], truth=path), folder), folder
+
+    def test_three_figures_of_every_channel_with_the_truth(self, tmp_path):
+        product = multiangle()
+        made, folder = self.run(tmp_path, {"a.nc": product}, truth_of(product))
+        assert not made.problems
+        assert [each.file for each in made.pictures] == [
+            f"{kind}_plain-scanner_{CHANNEL}.png"
+            for kind in ("multiangle", "scan-profile", "scan-residuals")
+        ]
+        for each in made.pictures:
+            assert Image.open(folder / each.file).size[0] == 1500
+        assert "truth of the simulation" in made.pictures[1].alt
+        assert made.flags is not None
+
+    def test_a_product_that_cannot_be_read_is_named_once_and_the_next_is_drawn(self, tmp_path):
+        broken = multiangle().drop_vars(["optical_depth", "residual"])
+        made, _ = self.run(tmp_path, {"a.nc": broken, "b.nc": multiangle()})
+        assert [problem.path for problem in made.problems] == ["a.nc"]
+        assert "optical_depth" in made.problems[0].reason
+        assert len(made.pictures) == 3
+
+    def test_what_cannot_be_told_is_left_out(self, tmp_path):
+        product = multiangle()
+        product["quality_flag"][:] = int(Quality.NO_LEVERAGE | Quality.NO_RESIDUAL)
+        product["optical_depth"][:] = np.nan
+        made, _ = self.run(tmp_path, {"a.nc": product})
+        assert not made.problems
+        assert [each.file.partition("_")[0] for each in made.pictures] == ["multiangle"]
+
+    def test_multiangle_comes_after_homogeneous_and_before_the_others(self):
+        ranks = [gallery._KINDS.index(kind) for kind in ("homogeneous", "multiangle", "elastic")]
+        assert ranks == sorted(ranks)
+        assert set(gallery._KINDS) == set(ProductKind)

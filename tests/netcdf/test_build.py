@@ -1,0 +1,582 @@
+"""What the builder makes of results, and what it refuses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from datetime import UTC, date, datetime, timedelta
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from support.made_products import (
+    MAKERS,
+    PLACED,
+    STATION,
+    context,
+    homogeneous,
+    multiangle,
+    provenance,
+    signal,
+)
+
+from lidarops.campaign.model import Metadata, Station
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.netcdf.build import bitround, product_path
+from lidarops.netcdf.global_attributes import _duration
+from lidarops.products.layouts import LAYOUTS, build_product
+from lidarops.records import DetectionMode, ProductKind
+from lidarops.retrieve.multiangle import labeled
+
+KINDS = list(MAKERS)
+
+
+def decoded(data: xr.Dataset, kind: ProductKind, **changes) -> xr.Dataset:
+    return xr.decode_cf(build_product(data, context(kind, **changes)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numbers_come_through(kind: ProductKind):
+    data = MAKERS[kind]()
+    product = decoded(data, kind)
+    for row in LAYOUTS[kind].variables:
+        if row.optional and row.name not in data:
+            assert row.name not in product
+            continue
+        if row.summary:
+            continue
+        bits = 23 if row.significant_bits is None else row.significant_bits
+        np.testing.assert_allclose(
+            product[row.name].to_numpy().astype(float),
+            data[row.name].to_numpy().astype(float),
+            rtol=2.0 ** -(bits + 1) * (1 + 1e-6),
+            atol=0,
+            err_msg=row.name,
+        )
+    np.testing.assert_array_equal(product["time"], data["time"])
+    np.testing.assert_array_equal(product["time_bnds"], data["time_bnds"])
+    assert product["station"].item() == STATION.name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_attribute_names_what_is_not_there(kind: ProductKind):
+    product = build_product(MAKERS[kind](), context(kind))
+    for name, variable in product.variables.items():
+        for attribute in ("ancillary_variables", "coordinates", "bounds"):
+            for named in variable.attrs.get(attribute, "").split():
+                assert named in product.variables, (name, attribute)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_usable_is_the_worst_severity_of_the_bits(kind: ProductKind):
+    data = MAKERS[kind]()
+    flags = data["quality_flag"]
+    allowed = [0, *(LAYOUTS[kind].row("quality_flag").flags or Quality(0))]
+    flags[...] = np.resize(np.array(allowed, np.int32), flags.shape)
+    flags[0, 0] = int(allowed[1] | allowed[-1])
+    # A value that is missing without a bit would be refused.
+    data = data.fillna(1.0)
+    product = build_product(data, context(kind))
+    expected = [
+        max((bit.severity for bit in Quality(int(value))), default=0) for value in flags.values.flat
+    ]
+    np.testing.assert_array_equal(product["usable"].values.ravel(), expected)
+    assert product["usable"].dims == product["quality_flag"].dims
+    assert product["usable"].dtype == np.int8
+    main = next(row for row in LAYOUTS[kind].variables if row.uncertain)
+    assert "quality_flag usable" in product[main.name].attrs["ancillary_variables"]
+    decoded_flags = xr.decode_cf(product)["usable"]
+    assert decoded_flags.attrs["flag_meanings"] == "good use_with_care do_not_use"
+    np.testing.assert_array_equal(decoded_flags.attrs["flag_values"], [0, 1, 2])
+
+
+def test_usable_cannot_be_handed_over():
+    data = homogeneous()
+    data["usable"] = (data["quality_flag"].dims, np.zeros(data["quality_flag"].shape, np.int8))
+    with pytest.raises(ProductError, match="usable"):
+        build_product(data, context())
+
+
+def test_storage_types_and_fill_values():
+    product = build_product(signal(), context(ProductKind.SIGNAL))
+    assert product["signal"].dtype == np.float32
+    assert product["time"].dtype == np.float64
+    assert product["shots"].dtype == product["quality_flag"].dtype == np.int32
+    fill = np.float32(9.969209968386869e36)
+    assert product["signal"].values[0, 0] == fill
+    for name, variable in product.variables.items():
+        is_data = name in {row.name for row in LAYOUTS[ProductKind.SIGNAL].variables}
+        assert ("_FillValue" in variable.attrs) == (is_data and variable.dtype.kind == "f"), name
+    assert "calendar" not in product["time"].attrs
+    assert not product["time_bnds"].attrs
+    assert not product["range_bnds"].attrs
+
+
+def test_order_of_dimensions_does_not_matter():
+    data = homogeneous()
+    turned = data.transpose("section", "nv", "time")
+    xr.testing.assert_identical(build_product(data, context()), build_product(turned, context()))
+
+
+def test_the_input_is_left_as_it_was():
+    data = signal()
+    before = data.copy(deep=True)
+    build_product(data, context(ProductKind.SIGNAL))
+    xr.testing.assert_identical(data, before)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
+    product = build_product(MAKERS[kind](zenith=30.0, azimuth=10.0), context(kind))
+    for name, variable in product.variables.items():
+        for listed in variable.attrs.get("coordinates", "").split():
+            assert set(product[listed].dims) <= set(variable.dims), (name, listed)
+        assert "station" not in variable.attrs.get("coordinates", "").split()
+    main, beam = {
+        ProductKind.SIGNAL: ("signal", {"altitude", "zenith_angle", "azimuth"}),
+        ProductKind.MULTIANGLE: ("residual", {"ray_zenith_angle", "ray_azimuth"}),
+        ProductKind.VISIBILITY: ("extinction", {"latitude", "longitude", "altitude", "vertex_id"}),
+    }.get(kind, ("extinction", {"altitude", "zenith_angle", "azimuth"}))
+    assert beam | {"wavelength"} <= set(product[main].attrs["coordinates"].split())
+    assert not beam & set(product["shots"].attrs["coordinates"].split()) - {
+        "zenith_angle",
+        "azimuth",
+    }
+
+
+def test_no_variable_of_three_dimensions_names_a_place_which_cdo_could_not_read():
+    product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
+    for row in LAYOUTS[ProductKind.MULTIANGLE].variables:
+        if row.name not in product:
+            continue
+        listed = set(product[row.name].attrs["coordinates"].split())
+        assert listed & {"latitude", "longitude"} == (
+            {"latitude", "longitude"} if len(row.dims) < 3 else set()
+        )
+
+
+def test_range_limits_are_half_way_between_centres():
+    product = build_product(signal(), context(ProductKind.SIGNAL))
+    np.testing.assert_array_equal(product["range_bnds"][:, 0], 7.5 * np.arange(40))
+    np.testing.assert_array_equal(product["range_bnds"][:, 1], 7.5 * np.arange(1, 41))
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    zenith=st.floats(0, 180),
+    altitude=st.floats(-500, 9000),
+    start=st.floats(0, 100),
+    width=st.floats(1, 100),
+)
+def test_altitude_is_that_of_a_straight_beam(zenith, altitude, start, width):
+    data = signal(profiles=2, bins=5, zenith=zenith)
+    centres = start + width * (np.arange(5) + 0.5)
+    station = Station(name="s", latitude=1, longitude=2, altitude=altitude)
+    product = build_product(
+        data.assign_coords(range=centres), context(ProductKind.SIGNAL, station=station)
+    )
+    expected = [altitude + r * math.cos(math.radians(zenith)) for r in centres]
+    assert product["altitude"].dims == ("range",)
+    np.testing.assert_allclose(product["altitude"], expected, rtol=1e-6, atol=1e-3)
+    assert product.attrs["geospatial_vertical_min"] == product["altitude"].values.min()
+    assert product.attrs["geospatial_vertical_max"] == product["altitude"].values.max()
+    vertical = min(zenith, 180 - zenith) <= 10
+    assert (product.attrs.get("featureType") == "timeSeriesProfile") == vertical
+    assert (product["station"].attrs.get("cf_role") == "timeseries_id") == vertical
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in PLACED])
+def test_a_moving_beam_gives_altitudes_over_time(kind: ProductKind):
+    zenith = [0.0, 30.0, 60.0, 30.0, 90.0]
+    product = decoded(MAKERS[kind](zenith=zenith), kind)
+    along = "section" if kind is ProductKind.HOMOGENEOUS else "range"
+    distance = product["range" if along == "range" else "section_range"]
+    assert product["altitude"].dims == ("time", along)
+    np.testing.assert_array_equal(product["zenith_angle"], zenith)
+    np.testing.assert_allclose(product["altitude"][0], STATION.altitude + distance, rtol=1e-6)
+    np.testing.assert_allclose(product["altitude"][2], STATION.altitude + distance / 2, rtol=1e-6)
+    np.testing.assert_allclose(product["altitude"][4], STATION.altitude, rtol=1e-6)
+    assert "featureType" not in product.attrs
+
+
+def test_ends_of_sections_have_their_altitude():
+    product = build_product(homogeneous(zenith=60.0), context())
+    np.testing.assert_allclose(
+        product["altitude_bnds"], STATION.altitude + product["section_bounds"] / 2, rtol=1e-6
+    )
+
+
+def test_extents_are_those_of_the_data():
+    product = build_product(homogeneous(profiles=3, zenith=90.0), context())
+    attrs = product.attrs
+    assert attrs["time_coverage_start"] == "2026-03-01T10:00:00Z"
+    assert attrs["time_coverage_end"] == "2026-03-01T10:30:00Z"
+    assert attrs["time_coverage_duration"] == "PT30M"
+    assert attrs["time_coverage_resolution"] == "PT10M"
+    assert attrs["geospatial_vertical_min"] == attrs["geospatial_vertical_max"] == 53.5
+    assert attrs["geospatial_lat_min"] == attrs["geospatial_lat_max"] == STATION.latitude
+    assert attrs["geospatial_bounds"] == "POINT (46.44 30.76)"
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10**9))
+def test_durations_read_back(milliseconds: int):
+    assert pd.Timedelta(_duration(milliseconds / 1000)) == pd.Timedelta(milliseconds, "ms")
+
+
+def test_dates_are_those_of_data_or_release_or_environment(monkeypatch: pytest.MonkeyPatch):
+    def created() -> str:
+        return build_product(homogeneous(), context()).attrs["date_created"]
+
+    monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
+    monkeypatch.setattr("lidarops.netcdf.provenance.RELEASE_DATE", date(2020, 1, 1))
+    assert created() == "2026-03-01T10:50:00Z"
+    monkeypatch.setattr("lidarops.netcdf.provenance.RELEASE_DATE", date(2030, 1, 1))
+    assert created() == "2030-01-01T00:00:00Z"
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert created() == "1970-01-02T00:00:00Z"
+    assert "SOURCE_DATE_EPOCH" in build_product(homogeneous(), context()).attrs["comment"]
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+    with pytest.raises(ProductError, match="SOURCE_DATE_EPOCH"):
+        created()
+
+
+@pytest.mark.parametrize(
+    ("kind", "steps"),
+    [
+        (ProductKind.HOMOGENEOUS, ["read", "homogeneous"]),
+        (ProductKind.SIGNAL, ["read", "background"]),
+        (ProductKind.ELASTIC, ["read", "elastic"]),
+        (ProductKind.MULTIANGLE, ["read", "background", "multiangle"]),
+        (ProductKind.VISIBILITY, ["read", "background", "visibility"]),
+    ],
+)
+def test_history_tells_what_made_this_product_one_line_a_step(kind: ProductKind, steps: list[str]):
+    lines = build_product(MAKERS[kind](), context(kind)).attrs["history"].splitlines()
+    assert all(line.startswith("2026-") and "lidarops" in line for line in lines)
+    *done, omitted, last = lines
+    assert [line.split()[1].rstrip(":") for line in done] == steps
+    assert "left out dark: photon counting has no dark signal" in omitted
+    assert f"wrote the {kind} product" in last
+
+
+def test_empty_metadata_still_says_something():
+    bare = Metadata(publisher_name="", references="", acknowledgement="", license="")
+    attrs = build_product(homogeneous(), context(metadata=bare)).attrs
+    assert all(attrs[name] for name in ("publisher_name", "publisher_email", "publisher_url"))
+    assert attrs["license"] == attrs["acknowledgement"] == "Not stated."
+    assert "Golub" in attrs["references"]
+
+
+def test_no_attribute_is_empty():
+    for kind in KINDS:
+        product = build_product(MAKERS[kind](), context(kind, summary=""))
+        assert all(value != "" for value in product.attrs.values())
+        for variable in product.variables.values():
+            assert all(np.size(value) and str(value) for value in variable.attrs.values())
+
+
+def test_paths():
+    path = product_path(context(ProductKind.SIGNAL))
+    assert path == ("odesa/lidar-1/signal/2026/odesa_lidar-1_signal_photon_532o_20260301T000000.nc")
+    local = context(start=datetime.fromisoformat("2026-01-01T01:00:00+03:00"))
+    assert product_path(local).startswith("odesa/lidar-1/homogeneous/2025/")
+
+
+def test_scenes_of_two_range_grids_have_two_files():
+    start = "lidar-1_20260301T000000"
+    paths = {
+        product_path(context(scene=scene)) for scene in (f"{start}-4096x75", f"{start}-100x30")
+    }
+    assert len(paths) == 2
+
+
+@pytest.mark.parametrize("channel", ["../x", "", "a/b", ".hidden", "a b"])
+def test_paths_stay_in_their_folder(channel: str):
+    with pytest.raises(ProductError, match="file name"):
+        product_path(context(channel=channel))
+
+
+# What is refused
+
+
+def drop(name: str) -> Callable[[xr.Dataset], xr.Dataset]:
+    return lambda data: data.drop_vars(name)
+
+
+def put(name: str, value: float, where: tuple[int, ...] = ()) -> Callable[[xr.Dataset], xr.Dataset]:
+    def change(data: xr.Dataset) -> xr.Dataset:
+        values = data[name].to_numpy().copy()
+        if isinstance(value, float) and values.dtype.kind == "i":
+            values = values.astype(float)
+        values[where] = value
+        return data.assign({name: (data[name].dims, values)})
+
+    return change
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_missing_variable_is_named(kind: ProductKind):
+    data = MAKERS[kind]()
+    rows = (*LAYOUTS[kind].coordinates, *LAYOUTS[kind].variables)
+    optional = {row.name for row in rows if row.optional and "standard_error" not in row.name}
+    needed = [str(name) for name in data.variables if name not in optional]
+    assert len(needed) > 9
+    for name in needed:
+        with pytest.raises(ProductError) as caught:
+            build_product(data.drop_vars(name), context(kind))
+        assert caught.value.field == name
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "problem"),
+    [
+        (put("time", np.datetime64("NaT"), (1,)), "time", "not set"),
+        (lambda data: data.isel(time=[1, 0]), "time", "rise"),
+        (lambda data: data.isel(time=[1, 1]), "time", "rise"),
+        (lambda data: data.isel(time=[]), None, "empty"),
+        (lambda data: data.assign_coords(time=np.arange(5)), "time", "datetime64"),
+        (put("time_bnds", np.datetime64("2027-01-01"), (0, 0)), "time_bnds", "enclose"),
+        (put("zenith_angle", math.nan, (1,)), "zenith_angle", "finite"),
+        (put("zenith_angle", -90.0), "zenith_angle", "valid range"),
+        (put("section_range", math.inf, (0,)), "section_range", "finite"),
+        (put("section_range", 0.0, (0,)), "section_bounds", "enclose"),
+        (put("section", 1.5, (0,)), "section", "whole numbers"),
+        (put("extinction", math.nan, (1, 1)), "extinction", "carry no quality bit"),
+        (put("extinction", 1e300, (1, 1)), "extinction", "carry no quality bit"),
+        (put("extinction_standard_error", math.inf, (1, 1)), "extinction_standard_error", "bit"),
+        (put("extinction_standard_error", -1.0, (1, 1)), "extinction_standard_error", "range"),
+        (put("reduced_chi2", -0.1, (1, 1)), "reduced_chi2", "valid range"),
+        (put("quality_flag", 1 << 20, (0, 0)), "quality_flag", "no_leverage"),
+        (put("quality_flag", -1, (0, 0)), "quality_flag", "unknown bits"),
+        (put("quality_flag", 0.5, (0, 0)), "quality_flag", "whole numbers"),
+        (put("valid_bins", math.nan, (0, 0)), "valid_bins", "whole numbers"),
+        (put("valid_bins", 2**40, (0, 0)), "valid_bins", "whole numbers"),
+        (put("shots", -1, (0,)), "shots", "valid range"),
+        (lambda data: data.isel(section=0, drop=True), "section", "missing"),
+        (lambda data: data.rename(section="level"), "section", "missing"),
+        (lambda data: data.assign(shots=data["extinction"]), "shots", "dimensions"),
+        (lambda data: data.assign(shots=data["shots"].astype(str)), "shots", "not numbers"),
+        (lambda data: data.assign(extra=data["shots"]), "extra", "no variable"),
+        (lambda data: data.chunk(), "time_bnds", "dask"),
+    ],
+)
+def test_bad_results_are_refused(change, field, problem):
+    with pytest.raises(ProductError, match=problem) as caught:
+        build_product(change(homogeneous()), context())
+    assert field is None or caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "problem"),
+    [
+        (put("quality_flag", int(Quality.POOR_FIT), (0, 0)), "quality_flag", "poor_fit"),
+        (lambda data: data.isel(range=[1, 0]), "range", "rise"),
+        (lambda data: data.isel(range=[0]), "range_bnds", "single value"),
+        (lambda data: data.assign_coords(range=np.full(40, np.nan)), "range", "finite"),
+        (lambda data: data.assign_coords(range=np.arange(40) * 1j), "range", "not numbers"),
+        (
+            lambda data: data.drop_vars("time_bnds").assign_coords(
+                time_bnds=(("time", "nv"), np.tile(data["time"], (3, 1)).T)
+            ),
+            "time_bnds",
+            "3 limits",
+        ),
+    ],
+)
+def test_bad_signals_are_refused(change, field, problem):
+    with pytest.raises(ProductError, match=problem) as caught:
+        build_product(change(signal()), context(ProductKind.SIGNAL))
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "problem"),
+    [
+        (put("altitude", 53.5, (0,)), "altitude", "station"),
+        (put("altitude", math.nan, (3,)), "altitude", "finite"),
+        (lambda data: data.isel(altitude=slice(None, None, -1)), "altitude", "rise"),
+        (put("ray_zenith_angle", -30.0, (1,)), "ray_zenith_angle", "valid range"),
+        (put("ray_zenith_angle", math.nan, (1,)), "ray_zenith_angle", "finite"),
+        (put("ray", 0.5, (0,)), "ray", "whole numbers"),
+        (put("optical_depth", math.nan, (2, 2)), None, ""),
+        (put("quality_flag", int(Quality.CLOUD), (0, 0)), "quality_flag", "cloud"),
+        (put("extinction_gradient_error", -1.0, (1, 1)), "extinction_gradient_error", "range"),
+        (lambda data: data.assign_coords(zenith_angle=0.0), None, ""),
+    ],
+)
+def test_bad_scans_are_refused(change, field, problem):
+    data = change(multiangle())
+    if field is None:
+        # A missing value with a bit, and coordinates that the kind does not have, do no harm.
+        assert "zenith_angle" not in build_product(data, context(ProductKind.MULTIANGLE))
+        return
+    with pytest.raises(ProductError, match=problem) as caught:
+        build_product(data, context(ProductKind.MULTIANGLE))
+    assert caught.value.field == field
+
+
+def test_a_missing_optical_depth_without_a_bit_is_refused():
+    data = multiangle()
+    data["quality_flag"][2] = 0
+    with pytest.raises(ProductError, match="carry no quality bit"):
+        build_product(put("optical_depth", math.nan, (2, 2))(data), context(ProductKind.MULTIANGLE))
+
+
+def test_layers_of_a_scan_reach_from_the_station_upwards():
+    product = build_product(multiangle(levels=4), context(ProductKind.MULTIANGLE))
+    assert product["altitude"].attrs["axis"] == "Z"
+    assert product["altitude"].attrs["bounds"] == "altitude_bnds"
+    tops = STATION.altitude + 60.0 * np.arange(5)
+    np.testing.assert_array_equal(product["altitude_bnds"], np.stack([tops[:-1], tops[1:]], -1))
+    assert product.attrs["geospatial_vertical_resolution"] == "60 m"
+    assert "featureType" not in product.attrs
+
+
+def test_a_product_tells_the_steps_of_its_retrieval():
+    product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
+    assert product.attrs["lidarops_steps"] == "joint: extinction is wanted"
+    assert "lidarops_steps" not in build_product(homogeneous(), context()).attrs
+
+
+def test_a_bin_alone_may_bring_its_limits():
+    data = signal(bins=4).isel(range=[2])
+    data = data.assign_coords(range_bnds=(("range", "nv"), [[15.0, 22.5]]))
+    product = build_product(data, context(ProductKind.SIGNAL))
+    np.testing.assert_array_equal(product["range_bnds"], [[15.0, 22.5]])
+
+
+@pytest.mark.parametrize(
+    "changes", [{"kind": ProductKind.SIGNAL}, {"channel": "analog_355o"}, {"scene": "scene-2"}]
+)
+def test_provenance_of_another_product_is_refused(changes):
+    with pytest.raises(ProductError, match="provenance"):
+        build_product(homogeneous(), context(provenance=provenance(**changes)))
+
+
+def test_a_missing_value_with_a_bit_is_written_as_missing():
+    data = put("amplitude", 1e300, (0, 0))(homogeneous())
+    product = decoded(data, ProductKind.HOMOGENEOUS)
+    assert np.isnan(product["amplitude"].values[0, 0])
+    assert product["quality_flag"].values[0, 0] != 0
+
+
+# Properties
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.sampled_from(KINDS).flatmap(
+        lambda kind: st.tuples(
+            st.just(kind),
+            hnp.arrays(
+                np.int32,
+                (3, 4),
+                elements=st.lists(
+                    st.sampled_from(list(LAYOUTS[kind].row("quality_flag").flags))
+                ).map(lambda bits: int(np.bitwise_or.reduce([0, *map(int, bits)]))),
+            ),
+        )
+    )
+)
+def test_flags_read_back_from_masks_and_meanings(case):
+    kind, flags = case
+    data = MAKERS[kind](3, 4)
+    data = data.fillna(1.0)
+    data["quality_flag"][:] = flags
+    stored = decoded(data, kind)["quality_flag"]
+    masks = stored.attrs["flag_masks"].tolist()
+    named = dict(zip(stored.attrs["flag_meanings"].split(), masks, strict=True))
+    for value, read in zip(flags.flat, stored.values.flat, strict=True):
+        expected = {str(bit.name).lower() for bit in Quality if value & bit}
+        assert {name for name, mask in named.items() if read & mask} == expected
+
+
+normal = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)
+
+
+@settings(deadline=None)
+@given(values=st.lists(normal, min_size=1), bits=st.integers(1, 23))
+def test_bitround_is_rounding_of_the_mantissa_half_to_even(values: list[float], bits: int):
+    given_ = np.array(values, np.float32)
+    mantissa, exponent = np.frexp(given_.astype(float))
+    expected = np.ldexp(np.rint(np.ldexp(mantissa, bits + 1)), exponent - bits - 1)
+    with np.errstate(over="ignore"):
+        expected = expected.astype(np.float32)
+    rounded = bitround(given_, bits)
+    np.testing.assert_array_equal(rounded, expected)
+    np.testing.assert_array_equal(bitround(rounded, bits), rounded)
+
+
+def test_bitround_keeps_what_is_no_number():
+    # A NaN with all bits set would overflow into zero.
+    worst = np.array([0x7FFFFFFF, 0xFFFFFFFF, 0x7F800000], np.uint32).view(np.float32)
+    rounded = bitround(worst, 13)
+    assert np.isnan(rounded[:2]).all()
+    assert rounded[2] == np.inf
+
+
+def test_profiles_may_follow_each_other_faster_than_a_millisecond():
+    data = homogeneous(profiles=3)
+    starts = np.datetime64("2026-03-01T10:00:00", "ns") + np.arange(3) * np.timedelta64(500, "us")
+    data = data.assign_coords(
+        time=starts + np.timedelta64(250, "us"),
+        time_bnds=(("time", "nv"), np.stack([starts, starts + np.timedelta64(500, "us")], -1)),
+    )
+    times = decoded(data, ProductKind.HOMOGENEOUS)["time"].values
+    assert all(
+        abs((later - sooner) / np.timedelta64(1, "us") - 500) < 1
+        for sooner, later in pairwise(times)
+    )
+
+
+def test_every_mode_has_its_unit():
+    for mode, unit in ((DetectionMode.ANALOG, "mV m2"), (DetectionMode.PHOTON, "MHz m2")):
+        assert build_product(homogeneous(), context(mode=mode))["amplitude"].attrs["units"] == unit
+
+
+def test_the_window_is_told_in_utc():
+    start = datetime(2026, 3, 1, tzinfo=UTC)
+    attrs = build_product(
+        homogeneous(), context(start=start, stop=start + timedelta(hours=6))
+    ).attrs
+    assert attrs["lidarops_window_end"] == "2026-03-01T06:00:00Z"
+
+
+def test_a_scan_goes_from_profiles_to_a_product():
+    zenith = np.tile([0.0, 30.0, 50.0, 60.0], 3)
+    distance = 15.0 * (np.arange(400) + 0.5)
+    power = 1e7 * np.exp(-distance / 2e4) / distance**2 + 3.0
+    noise = np.random.default_rng(1).normal(0.0, 0.05, (12, 400))
+    starts = np.datetime64("2026-03-01T10:00:00", "ns") + np.arange(12) * np.timedelta64(60, "s")
+    ends = starts + np.timedelta64(60, "s")
+    dims = ("time", "range")
+    found = labeled.scan(
+        xr.Dataset(
+            {
+                "power": (dims, power + noise),
+                "variance": (dims, np.full(noise.shape, 0.05**2)),
+                "quality": (dims, np.zeros(noise.shape, np.int32)),
+            },
+            coords={"range": distance},
+        ),
+        zenith_angle=zenith,
+        azimuth=np.full(12, 90.0),
+        time=starts + (ends - starts) // 2,
+        time_bnds=np.stack([starts, ends], axis=-1),
+        shots=np.full(12, 600),
+        altitude_grid=STATION.altitude + 60.0 * np.arange(1, 60),
+        station_altitude=STATION.altitude,
+        background=labeled.Background((5400.0, 6000.0)),
+    )
+    product = decoded(found, ProductKind.MULTIANGLE)
+    assert {"time": 3, "altitude": 59, "ray": 4}.items() <= product.sizes.items()
+    np.testing.assert_array_equal(product["quality_flag"], found["quality_flag"])
+    np.testing.assert_allclose(product["ray_azimuth"], 90.0)
+    assert "joint" in product.attrs["lidarops_steps"]

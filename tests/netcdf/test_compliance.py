@@ -1,0 +1,104 @@
+"""Products of every shape against compliance-checker in strict mode."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from compliance_checker.runner import CheckSuite, ComplianceChecker
+from support.made_products import MAKERS, context, homogeneous
+
+from lidarops.flags import Quality
+from lidarops.netcdf.write import write
+from lidarops.products.layouts import LAYOUTS, build_product
+from lidarops.records import DetectionMode, ProductKind
+
+SCAN = {"zenith": [0.0, 30.0, 60.0, 80.0, 90.0], "azimuth": [0.0, 1.0, 2.0, 3.0, 4.0]}
+SHAPES: dict[str, dict[str, Any]] = {
+    "vertical": {"zenith": 0.0},
+    "horizontal": {"zenith": 90.0, "azimuth": 200.0},
+    "scan": SCAN,
+    "one_profile": {"zenith": 3.0, "profiles": 1},
+    "many_profiles": {"zenith": 0.0, "profiles": 300},
+}
+
+
+def missing(kind: ProductKind) -> xr.Dataset:
+    data = MAKERS[kind](zenith=90.0)
+    data["quality_flag"][:] = int(Quality.INPUT_MISSING)
+    for variable in data.data_vars.values():
+        if variable.dtype.kind == "f":
+            variable[...] = np.nan
+    return data
+
+
+def findings(path: Path) -> tuple[set[str], set[str]]:
+    """Everything that the checker has to say of a file: of CF, and of ACDD."""
+    checks = ["cf:1.11", "acdd:1.3"]
+    CheckSuite.load_all_available_checkers()
+    report = path.with_suffix(".json")
+    ComplianceChecker.run_checker(
+        str(path), checks, 0, "strict", output_filename=str(report), output_format="json"
+    )
+    results = json.loads(report.read_text(encoding="utf-8"))
+    said = []
+    for check in checks:
+        said.append(set(_said(results[check]["all_priorities"])))
+        assert results[check]["possible_points"] > 90
+        full = results[check]["scored_points"] == results[check]["possible_points"]
+        assert full == (not said[-1])
+    return said[0], said[1]
+
+
+def _said(results: list[dict[str, Any]]) -> Iterator[str]:
+    for result in results:
+        scored, possible = result["value"]
+        # A test that is passed may still give advice, such as on the default calendar.
+        if scored != possible:
+            yield from (f"{result['name']} {message}" for message in result["msgs"])
+        yield from _said(result["children"])
+
+
+def permitted(kind: ProductKind, data: xr.Dataset) -> set[str]:
+    """One finding for each quantity that CF has no standard name for; none is left out."""
+    return {
+        f'variable "{row.name}" missing the following attributes: standard_name'
+        for row in LAYOUTS[kind].variables
+        if row.standard_name is None and (row.name in data or not row.optional)
+    }
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_products_comply(kind: ProductKind, shape: str, tmp_path: Path):
+    path = tmp_path / "product.nc"
+    data = MAKERS[kind](**SHAPES[shape])
+    write(build_product(data, context(kind)), path)
+    assert findings(path) == (set(), permitted(kind, data))
+
+
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_a_product_of_nothing_but_missing_values_complies(kind: ProductKind, tmp_path: Path):
+    path = tmp_path / "product.nc"
+    of = context(kind, mode=DetectionMode.ANALOG, wavelength=float("nan"))
+    data = missing(kind)
+    write(build_product(data, of), path)
+    assert findings(path) == (set(), permitted(kind, data))
+    with xr.open_dataset(path) as product:
+        main = "signal" if kind is ProductKind.SIGNAL else "extinction"
+        assert np.isnan(product[main]).all()
+        assert "wavelength" not in product
+
+
+def test_the_checker_would_find_a_fault(tmp_path: Path):
+    product = build_product(homogeneous(), context())
+    product["extinction"].attrs["units"] = "kg"
+    product["extinction"].attrs["standard_name"] = "altitude"
+    path = tmp_path / "product.nc"
+    write(product, path)
+    assert any("extinction" in said for said in findings(path)[0])

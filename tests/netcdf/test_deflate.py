@@ -1,0 +1,138 @@
+"""What is put into a file as a chunk must be what HDF5's own filters would have made of it."""
+
+from __future__ import annotations
+
+import itertools
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from lidarops.netcdf._deflate import deflated, inflated, planes
+
+DTYPES = ["i1", "u1", "i2", "i4", "i8", "f4", "f8"]
+
+
+def unshuffled(data: bytes, dtype: np.dtype, chunk: tuple[int, ...]) -> np.ndarray:
+    """Inflate by the standard library, and put the bytes of each element together again."""
+    raw = np.frombuffer(zlib.decompress(data), np.uint8)
+    return np.ascontiguousarray(raw.reshape(dtype.itemsize, -1).T).view(dtype).reshape(chunk)
+
+
+def assembled(values: np.ndarray, chunk: tuple[int, ...], fill_value) -> np.ndarray:
+    """The array that the chunks make, with what lies beyond its edges."""
+    grid = [-(-size // step) * step for size, step in zip(values.shape, chunk, strict=True)]
+    whole = np.zeros(grid, values.dtype)
+    seen = set()
+    for offset, data in deflated(values, chunk, fill_value):
+        assert offset not in seen
+        seen.add(offset)
+        place = tuple(slice(at, at + step) for at, step in zip(offset, chunk, strict=True))
+        whole[place] = unshuffled(data, values.dtype, chunk)
+    assert len(seen) == np.prod([all_ // step for all_, step in zip(grid, chunk, strict=True)])
+    return whole
+
+
+@st.composite
+def cut_arrays(draw: st.DrawFn) -> tuple[np.ndarray, tuple[int, ...]]:
+    shape = draw(npst.array_shapes(max_dims=3, max_side=9))
+    values = draw(npst.arrays(draw(st.sampled_from(DTYPES)), shape))
+    return values, tuple(draw(st.integers(1, size)) for size in shape)
+
+
+@settings(deadline=None)
+@given(cut=cut_arrays())
+@example(cut=(np.array([np.nan, -0.0, np.inf], "f4"), (2,)))
+def test_chunks_hold_the_array_and_beyond_its_edge_the_fill_value(cut):
+    values, chunk = cut
+    fill_value = values.dtype.type(77)
+    whole = assembled(values, chunk, fill_value)
+    inside = tuple(slice(size) for size in values.shape)
+    # As bytes: NaN and the sign of zero count.
+    assert whole[inside].tobytes() == values.tobytes()
+    whole[inside] = fill_value
+    assert (whole == fill_value).all()
+
+
+@settings(deadline=None)
+@given(cut=cut_arrays())
+def test_inflated_is_what_was_deflated(cut):
+    values, chunk = cut
+    for offset, data in deflated(values, chunk, values.dtype.type(77)):
+        whole = inflated(data, chunk, values.dtype)
+        assert whole.tobytes() == unshuffled(data, values.dtype, chunk).tobytes()
+        assert whole[(0,) * whole.ndim].tobytes() == values[offset].tobytes()
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "longer", "shorter", "empty"])
+def test_damaged_chunks_are_refused(damage):
+    values = np.random.default_rng(2).normal(size=1000)
+    ((_, data),) = deflated(values, (1000,), 0.0)
+    damaged = {
+        "cut": data[:-6],
+        "flipped": data[:3000] + bytes([data[3000] ^ 0xFF]) + data[3001:],
+        "longer": zlib.compress(values.tobytes() + b"12345678"),
+        "shorter": zlib.compress(values.tobytes()[:-8]),
+        "empty": b"",
+    }
+    with pytest.raises(ValueError, match="a chunk"):
+        inflated(damaged[damage], (1000,), values.dtype)
+
+
+def test_text_is_cut_as_numbers_are():
+    text = np.frombuffer(b"provenance" * 7, "S1")
+    whole = assembled(text, (64,), b"\0")
+    assert whole.tobytes() == text.tobytes() + bytes(128 - 70)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_layout_in_memory_does_not_matter(dtype: str):
+    values = np.arange(12 * 50).reshape(12, 50).astype(dtype)
+    read_only = values.copy()
+    read_only.setflags(write=False)
+    strided = np.zeros((24, 100), dtype)[::2, ::2]
+    strided[:] = values
+    expected = list(deflated(values, (5, 50), 0))
+    for other in (read_only, strided, np.asfortranarray(values), values[::-1][::-1]):
+        assert list(deflated(other, (5, 50), 0)) == expected
+
+
+def test_planes_are_the_bytes_of_the_elements_in_order():
+    values = np.array([[1.0, -2.5], [3e-300, np.pi]])
+    expected = np.frombuffer(values.tobytes(), np.uint8).reshape(4, 8).T
+    np.testing.assert_array_equal(list(planes(values)), expected)
+
+
+def test_the_last_chunk_is_cut_at_every_edge():
+    values = np.arange(7 * 5, dtype="i4").reshape(7, 5)
+    offsets = [offset for offset, _ in deflated(values, (3, 2), -1)]
+    assert offsets == list(itertools.product((0, 3, 6), (0, 2, 4)))
+
+
+def test_bytes_do_not_depend_on_what_was_compressed_before():
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(64, 1024)).astype("f4")
+    expected = list(deflated(values, (64, 1024), 0))
+    for _ in range(20):
+        other = rng.integers(0, 9, (64, int(rng.integers(100, 4000))), "i4")
+        list(deflated(other, other.shape, 0))
+        assert list(deflated(values, (64, 1024), 0)) == expected
+
+
+@pytest.mark.parametrize("bits", [8, 12, 23])
+def test_noise_that_was_rounded_is_as_small_as_zlib_makes_it(bits: int):
+    values = np.random.default_rng(4).normal(1e6, 1e4, (64, 4096)).astype("f4")
+    step = np.uint32(1 << (23 - bits))
+    rounded = (values.view("u4") // step * step).view("f4")
+    size = sum(len(data) for _, data in deflated(rounded, rounded.shape, 0))
+    shuffled = rounded.reshape(-1).view(np.uint8).reshape(-1, 4).T.tobytes()
+    assert size <= 1.03 * len(zlib.compress(shuffled, 4))
+
+
+def test_a_constant_takes_next_to_nothing():
+    values = np.full((128, 4096), 9.96921e36, "f4")
+    size = sum(len(data) for _, data in deflated(values, (64, 4096), 0))
+    assert size < values.nbytes / 500

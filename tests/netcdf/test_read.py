@@ -1,0 +1,260 @@
+"""What is read fast must be what xarray reads, whatever part of it is asked for."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.made_products import MAKERS, context, signal
+
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.netcdf import read
+from lidarops.netcdf.read import open_product, profiles_in
+from lidarops.netcdf.write import BULK_BYTES, write
+from lidarops.products.layouts import build_product
+from lidarops.records import ProductKind
+
+
+def by_xarray(path: Path) -> xr.Dataset:
+    with xr.open_dataset(path, engine="netcdf4", decode_timedelta=False) as product:
+        return product.load()
+
+
+def assert_same(found: xr.Variable, known: xr.Variable) -> None:
+    assert found.dims == known.dims
+    assert found.dtype == known.dtype
+    np.testing.assert_array_equal(found.values, known.values)
+    assert found.attrs.get("units") == known.attrs.get("units")
+
+
+@pytest.fixture(scope="module")
+def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A signal product of three chunks, the last of them cut, with missing values."""
+    data = signal(300, 2000)
+    values = np.random.default_rng(3).normal(size=(300, 2000))
+    values[5, 7:1900] = np.nan
+    values[299] = np.nan
+    values[0, 0] = np.nan
+    flags = data["quality_flag"].values | np.where(np.isnan(values), Quality.INPUT_MISSING, 0)
+    both = data["signal"].dims
+    data = data.assign(signal=(both, values), quality_flag=(both, flags.astype(np.int32)))
+    path = tmp_path_factory.mktemp("products") / "chunked.nc"
+    write(build_product(data, context(ProductKind.SIGNAL)), path)
+    with h5py.File(path) as file:
+        assert file["signal"].id.get_num_chunks() == 3
+    return path
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_every_variable_of_every_kind_is_as_xarray_has_it(kind: ProductKind, tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write(build_product(MAKERS[kind](), context(kind)), path)
+    known = by_xarray(path)
+    with open_product(path, map(str, known.variables)) as found:
+        assert set(found.variables) == set(known.variables)
+        for name, variable in known.variables.items():
+            assert_same(found.variables[name], variable)
+        assert found.sizes == known.sizes
+        assert set(known.dims) & set(known.coords) <= set(found.coords)
+    for name, variable in known.variables.items():
+        # Bounds have no units of their own.
+        with open_product(path, [str(name), "time"]) as found:
+            assert_same(found.variables[name], variable)
+    assert profiles_in(path) == known.sizes["time"]
+
+
+def test_missing_values_are_nan(chunked: Path):
+    with open_product(chunked, ["signal"]) as product:
+        missing = np.isnan(product["signal"].values)
+    assert missing[5, 7:1900].all()
+    assert missing[299].all()
+    assert missing.sum() == 1893 + 2000 + 1
+
+
+def slices(size: int) -> st.SearchStrategy[slice]:
+    # Of an empty one xarray cannot tell where it ends if it goes backwards.
+    return st.slices(size).filter(lambda part: len(range(size)[part]) > 0)
+
+
+KEYS = st.one_of(
+    st.integers(0, 299),
+    slices(300),
+    st.lists(st.integers(0, 299), min_size=1, max_size=5).map(np.array),
+    st.lists(st.booleans(), min_size=300, max_size=300).map(np.array),
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
+@given(time=KEYS, gates=st.one_of(st.integers(0, 1999), slices(2000)))
+def test_any_part_is_that_part_of_the_whole(chunked: Path, time: object, gates: object):
+    with open_product(chunked, ["signal", "quality_flag"]) as product:
+        whole = product["signal"].values
+        part = product["signal"].isel(time=time, range=gates)
+        np.testing.assert_array_equal(part.values, whole[time][..., gates])
+        twice = product.isel(range=gates).isel(time=time)["quality_flag"]
+        flags = product["quality_flag"].values
+        np.testing.assert_array_equal(twice.values, flags[time][..., gates])
+
+
+def test_only_what_is_asked_for_is_read(chunked: Path, monkeypatch: pytest.MonkeyPatch):
+    inflated = []
+    before = read.inflated
+
+    def counted(data: bytes, chunk: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        inflated.append(chunk)
+        return before(data, chunk, dtype)
+
+    monkeypatch.setattr(read, "inflated", counted)
+    with open_product(chunked, ["signal", "quality_flag"]) as product:
+        assert not inflated
+        chunk = h5py.File(chunked)["signal"].chunks[0]
+        assert product["signal"].isel(time=slice(chunk, 2 * chunk)).values.shape == (chunk, 2000)
+    assert len(inflated) == 1
+
+
+def test_what_a_product_does_not_have_is_left_out(chunked: Path):
+    with open_product(chunked, ["signal", "nothing", "nv"]) as product:
+        assert set(product.variables) == {"signal"}
+
+
+class TestOfOtherWriters:
+    """Read by HDF5 itself, and decoded as xarray would."""
+
+    @pytest.mark.parametrize(
+        "encoding",
+        [
+            {"dtype": "i2", "scale_factor": 0.5, "add_offset": 3.0, "_FillValue": -1},
+            {"dtype": "f8", "_FillValue": np.nan, "fletcher32": True},
+            {"dtype": "f4", "zlib": True, "shuffle": False},
+            {"dtype": ">f4", "zlib": True, "shuffle": True},
+            {"dtype": "i4", "_FillValue": -9},
+        ],
+    )
+    def test_numbers(self, encoding: dict[str, object], tmp_path: Path):
+        path = tmp_path / "other.nc"
+        values = np.round(np.random.default_rng(1).uniform(0, 900, (100, 100)))
+        values[3, 4] = np.nan
+        if encoding["dtype"] in ("f4", ">f4"):
+            values[3, 4] = 1.0
+        xr.Dataset(
+            {"x": (("time", "y"), values)},
+            coords={"time": np.datetime64("2026-03-01", "ns") + np.arange(100) * 10**9},
+        ).to_netcdf(path, encoding={"x": encoding, "time": {"dtype": "i8"}})
+        known = by_xarray(path)
+        with open_product(path, ["x", "time"]) as found:
+            for name in ("x", "time"):
+                np.testing.assert_array_equal(found[name].values, known[name].values)
+            assert found["x"].dtype == known["x"].dtype
+
+    def test_chunks_that_were_never_written(self, tmp_path: Path):
+        path = tmp_path / "sparse.nc"
+        with h5py.File(path, "w") as file:
+            options = {"chunks": (100,), "shuffle": True, "compression": "gzip", "fillvalue": 7.0}
+            values = file.create_dataset("time", 10000, "f8", **options)
+            values.make_scale("time")
+            values[:100] = 1.0
+        with open_product(path, ["time"]) as product:
+            np.testing.assert_array_equal(product["time"], np.repeat([1.0, 7.0], [100, 9900]))
+
+    def test_name_of_a_dimension_that_it_does_not_have(self, tmp_path: Path):
+        path = tmp_path / "named.nc"
+        xr.Dataset({"y": ("time", np.arange(3.0)), "x": ("y", np.arange(4.0))}).drop_vars(
+            "y"
+        ).to_netcdf(path)
+        import netCDF4
+
+        with netCDF4.Dataset(path, "a") as file:
+            file.createDimension("time", 3)
+            file.createVariable("y", "f8", ("time",))[:] = np.arange(3.0)
+        with open_product(path, ["x", "y"]) as product:
+            assert product["y"].dims == ("time",)
+            assert product["x"].dims == ("y",)
+
+    def test_times_without_sense(self, tmp_path: Path):
+        path = tmp_path / "times.nc"
+        units = {"units": "fortnights since the flood"}
+        xr.Dataset({"time": ("time", np.arange(3.0), units)}).to_netcdf(path)
+        with pytest.raises(ProductError, match="time: cannot be decoded"):
+            open_product(path, ["time"])
+
+
+def _cut(whole: bytes) -> bytes:
+    return whole[: len(whole) // 2]
+
+
+def _spoilt(whole: bytes) -> bytes:
+    return whole[:40] + b"\xff" * 400 + whole[440:]
+
+
+class TestDamage:
+    @pytest.mark.parametrize("damage", [bytes, lambda whole: b"garbage", _cut, _spoilt])
+    @pytest.mark.parametrize("opened", [lambda p: open_product(p, ["signal"]).load(), profiles_in])
+    def test_of_a_file_is_told(
+        self,
+        damage: Callable[[bytes], bytes],
+        opened: Callable[[Path], object],
+        chunked: Path,
+        tmp_path: Path,
+    ):
+        path = tmp_path / "damaged.nc"
+        path.write_bytes(b"" if damage is bytes else damage(chunked.read_bytes()))
+        with pytest.raises(ProductError, match=r"damaged\.nc: cannot be read: .+"):
+            opened(path)
+
+    def test_missing_file(self, tmp_path: Path):
+        with pytest.raises(ProductError, match=r"no\.nc: the file is missing"):
+            open_product(tmp_path / "no.nc", [])
+        with pytest.raises(ProductError, match="the file is missing"):
+            profiles_in(tmp_path)
+
+    def test_of_one_chunk_is_told_when_it_is_read(self, chunked: Path, tmp_path: Path):
+        path = tmp_path / "rotten.nc"
+        whole = bytearray(chunked.read_bytes())
+        with h5py.File(chunked) as file:
+            assert file["signal"].nbytes > BULK_BYTES
+            place = file["signal"].id.get_chunk_info(1)
+            first = place.chunk_offset[0]
+        middle = place.byte_offset + place.size // 2
+        whole[middle] ^= 0xFF
+        path.write_bytes(whole)
+        with open_product(path, ["signal"]) as product:
+            product["signal"].isel(time=slice(0, first)).load()
+            with pytest.raises(ProductError, match=r"rotten\.nc: cannot be read: a chunk"):
+                product["signal"].isel(time=slice(first, first + 1)).load()
+
+    def test_leaves_no_file_open(self, tmp_path: Path):
+        path = tmp_path / "times.nc"
+        xr.Dataset({"time": ("time", [1.0], {"units": "x since y"})}).to_netcdf(path)
+        with pytest.raises(ProductError):
+            open_product(path, ["time"])
+        # HDF5 refuses to write to a file that it has open for reading.
+        with h5py.File(path, "a") as file:
+            file.attrs["title"] = "still writable"
+
+
+@pytest.mark.parametrize("skipped", [1, 3])
+def test_chunks_stored_without_some_filters_are_as_hdf5_has_them(
+    chunked: Path, tmp_path: Path, skipped: int
+):
+    path = tmp_path / "other.nc"
+    path.write_bytes(chunked.read_bytes())
+    with h5py.File(path, "r+") as file:
+        target = file["signal"]
+        rows = target.chunks[0]
+        for corner in range(0, target.shape[0], rows):
+            whole = np.zeros(target.chunks, target.dtype)
+            part = target[corner : corner + rows]
+            whole[: len(part)] = part
+            plain = whole.tobytes()
+            stored = zlib.compress(plain) if skipped == 1 else plain
+            target.id.write_direct_chunk((corner, 0), stored, filter_mask=skipped)
+    with open_product(path, ["signal"]) as found:
+        assert_same(found["signal"][1:, 3:], by_xarray(chunked)["signal"][1:, 3:])

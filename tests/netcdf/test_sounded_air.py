@@ -1,0 +1,106 @@
+"""Where slanting beams are, against Cartesian coordinates that are made the other way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.made_products import MAKERS, STATION, context
+
+from lidarops.campaign.model import Station
+from lidarops.netcdf.sounded_air import sounded
+from lidarops.products.layouts import build_product
+from lidarops.records import ProductKind
+
+SEMI_MAJOR, INVERSE_FLATTENING = 6378137.0, 298.257223563
+
+
+def cartesian(latitude: float, longitude: float, altitude: float) -> np.ndarray:
+    lat, lon = np.deg2rad(latitude), np.deg2rad(longitude)
+    squared = (2 - 1 / INVERSE_FLATTENING) / INVERSE_FLATTENING
+    normal = SEMI_MAJOR / np.sqrt(1 - squared * np.sin(lat) ** 2)
+    return np.array(
+        [
+            (normal + altitude) * np.cos(lat) * np.cos(lon),
+            (normal + altitude) * np.cos(lat) * np.sin(lon),
+            (normal * (1 - squared) + altitude) * np.sin(lat),
+        ]
+    )
+
+
+@given(
+    latitude=st.floats(-90, 90),
+    longitude=st.floats(-180, 180),
+    altitude=st.floats(-400, 9000),
+    ahead=st.floats(0, 60e3),
+    azimuth=st.floats(0, 360),
+    up=st.floats(-1e3, 60e3),
+)
+def test_places_lie_on_the_straight_beam(latitude, longitude, altitude, ahead, azimuth, up):
+    found = sounded(latitude, longitude, altitude, *map(np.float64, (ahead, azimuth, up)))
+    lat, lon, direction = np.deg2rad([latitude, longitude, azimuth])
+    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+    north = np.array([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
+    upward = np.cross(east, north)
+    there = (
+        cartesian(latitude, longitude, altitude)
+        + ahead * (np.sin(direction) * east + np.cos(direction) * north)
+        + up * upward
+    )
+    # At the place that is found, some height above the ellipsoid must be the point itself.
+    ground = cartesian(float(found[0]), float(found[1]), 0.0)
+    above = cartesian(float(found[0]), float(found[1]), 1.0) - ground
+    height = (there - ground) @ above
+    assert np.linalg.norm(ground + height * above - there) < 0.01
+    assert -180 <= found[1] <= 180
+
+
+def test_north_and_east_are_what_they_are():
+    east = np.array([0.0, 90.0])
+    latitude, longitude = sounded(0.0, 179.99, 0.0, np.float64(10e3), east, np.float64(0))
+    assert latitude[0] > 0.09
+    assert longitude[0] == pytest.approx(179.99)
+    assert longitude[1] == pytest.approx(-179.92, abs=0.001)
+
+
+@pytest.mark.parametrize("kind", [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS])
+def test_gates_of_slanting_beams_have_their_own_place(kind: ProductKind):
+    product = build_product(MAKERS[kind](zenith=80.0, azimuth=90.0), context(kind))
+    gates = product["gate_longitude"]
+    along = product["range" if kind is ProductKind.SIGNAL else "section_range"]
+    assert gates.dims == along.dims
+    metres = (gates - STATION.longitude) * 111_320 * np.cos(np.deg2rad(STATION.latitude))
+    np.testing.assert_allclose(metres, along * np.sin(np.deg2rad(80)), rtol=0.005, atol=1.0)
+    assert product["latitude"].attrs["standard_name"] == "deployment_latitude"
+    assert product["gate_latitude"].attrs["standard_name"] == "latitude"
+    assert product.attrs["geospatial_lon_max"] == float(gates.max())
+    assert product.attrs["geospatial_bounds"].startswith("POLYGON ((")
+    main = "signal" if kind is ProductKind.SIGNAL else "extinction"
+    # CDO 2.1 would skip the variable, or read garbage where the beam moves.
+    assert "gate_latitude" not in product[main].attrs["coordinates"].split()
+
+
+def test_a_moving_beam_has_the_place_of_the_station_alone():
+    # No tool reads places that change over time and along the beam.
+    angles = [0.0, 90.0, 180.0, 270.0, 0.0]
+    product = build_product(
+        MAKERS[ProductKind.SIGNAL](zenith=45.0, azimuth=angles), context(ProductKind.SIGNAL)
+    )
+    assert "gate_latitude" not in product
+    assert product["latitude"].attrs["standard_name"] == "latitude"
+
+
+def test_where_the_place_is_that_of_the_station_or_unknown_there_is_no_other():
+    for beam in ({"zenith": 90.0}, {"zenith": 3.0, "azimuth": 10.0}):
+        product = build_product(MAKERS[ProductKind.SIGNAL](**beam), context(ProductKind.SIGNAL))
+        assert "gate_latitude" not in product
+        assert product["latitude"].attrs["standard_name"] == "latitude"
+
+
+def test_stations_at_a_pole_have_gates_too():
+    pole = Station(name="Pole", latitude=90.0, longitude=0.0)
+    data = MAKERS[ProductKind.SIGNAL](zenith=90.0, azimuth=90.0)
+    product = build_product(data, context(ProductKind.SIGNAL, station=pole))
+    assert np.isfinite(product["gate_longitude"]).all()
+    np.testing.assert_allclose(product["gate_longitude"], 90.0)

@@ -1,0 +1,488 @@
+"""Whole or not at all, and the same bytes every time."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import shutil
+import signal as signals
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+import scipy.io
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from support.made_products import MAKERS, context, homogeneous, signal
+
+from lidarops.errors import ProductError
+from lidarops.netcdf import write as writer
+from lidarops.netcdf.write import BULK_BYTES, CHUNK_BYTES, chunk_sizes, write, write_plain
+from lidarops.products.layouts import build_product
+from lidarops.records import ProductKind
+
+HERE = Path(__file__).parent
+TESTS = HERE.parent
+
+
+@pytest.fixture
+def product() -> xr.Dataset:
+    return build_product(homogeneous(), context())
+
+
+def truth() -> xr.Dataset:
+    return xr.Dataset(
+        {
+            "extinction": (("scene", "level"), np.array([[1e-5, np.nan], [2e-5, 3e-5]])),
+            "label": ("scene", np.array(["hazy", "чисто"])),
+            "weather": "fair",
+            "good": ("scene", np.array([True, False])),
+            "seed": ("scene", np.array([2**40, 1])),
+            "nothing": ("scene", np.array(["", ""])),
+        },
+        coords={"scene": np.array(["2026-03-01", "2026-03-02"], "datetime64[ns]")},
+        attrs={"title": "Truth", "seed": 7},
+    )
+
+
+def test_what_is_written_is_what_is_read(product: xr.Dataset, tmp_path: Path):
+    path = tmp_path / "new" / "folder" / "product.nc"
+    written = write(product, path)
+    assert written.size == path.stat().st_size
+    assert written.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    with xr.open_dataset(path, decode_cf=False) as stored:
+        assert set(stored.variables) == set(product.variables)
+        for name, variable in product.variables.items():
+            np.testing.assert_array_equal(stored[name].values, variable.values)
+            assert stored[name].dtype == variable.dtype
+            assert set(stored[name].attrs) == set(variable.attrs)
+        assert set(stored.attrs) == set(product.attrs)
+        assert stored.attrs["institution"] == "Université d'Été"
+
+
+def of_noise(profiles: int = 299, bins: int = 2000) -> xr.Dataset:
+    """A signal product of several chunks, the last of them cut; its standard errors vary too."""
+    rng = np.random.default_rng(5)
+    data = signal(profiles, bins)
+    level = np.exp(-np.arange(bins) / 500) * rng.uniform(0.5, 2, (profiles, 1)) * 1e6
+    error = np.sqrt(level) * 10
+    found = build_product(
+        data.assign(
+            signal=data["signal"].copy(data=rng.normal(level, error)),
+            signal_standard_error=data["signal"].copy(
+                data=error * rng.normal(1, 0.05, error.shape)
+            ),
+        ),
+        context(ProductKind.SIGNAL),
+    )
+    assert found["signal"].nbytes > CHUNK_BYTES
+    return found
+
+
+def assert_stored(path: Path, expected: xr.Dataset) -> None:
+    """Compare bytes, as plain netCDF reads them."""
+    with netCDF4.Dataset(path) as file:
+        file.set_auto_mask(False)
+        file.set_auto_scale(False)
+        file.set_auto_chartostring(False)
+        assert list(file.variables) == [str(name) for name in expected.variables]
+        for name, variable in expected.variables.items():
+            assert file[name].shape == variable.shape, name
+            native = variable.values.astype(variable.dtype.newbyteorder("="))
+            assert file[name][...].tobytes() == native.tobytes(), name
+
+
+def test_large_variables_are_read_as_they_were_by_every_library(tmp_path: Path):
+    product = of_noise()
+    path = tmp_path / "product.nc"
+    write(product, path)
+    assert_stored(path, product)
+    with xr.open_dataset(path, decode_cf=False) as stored:
+        xr.testing.assert_equal(stored, product)
+    with h5py.File(path) as file:
+        for name, variable in product.variables.items():
+            assert file[name][...].tobytes() == variable.values.tobytes()
+
+
+@pytest.mark.skipif(shutil.which("nccopy") is None, reason="needs the netCDF utilities")
+def test_tools_of_another_netcdf_read_large_variables(tmp_path: Path):
+    product = of_noise()
+    write(product, tmp_path / "product.nc")
+    nccopy = [shutil.which("nccopy"), "-k", "classic"]
+    subprocess.run([*nccopy, tmp_path / "product.nc", tmp_path / "classic.nc"], check=True)
+    with scipy.io.netcdf_file(tmp_path / "classic.nc", mmap=False) as file:
+        assert file.dimensions["time"] is None
+        for name, variable in product.variables.items():
+            stored = file.variables[name].data
+            assert stored.astype(variable.dtype).tobytes() == variable.values.tobytes(), name
+
+
+def test_files_are_hardly_larger_than_netcdf_makes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    product = of_noise()
+    written = write(product, tmp_path / "product.nc")
+    monkeypatch.setattr(writer, "BULK_BYTES", math.inf)
+    assert written.size <= 1.05 * write(product, tmp_path / "plain.nc").size
+    assert_stored(tmp_path / "plain.nc", product)
+
+
+def test_a_file_may_be_continued(tmp_path: Path):
+    product = of_noise()
+    path = tmp_path / "product.nc"
+    write(product, path)
+    with netCDF4.Dataset(path, "a") as file:
+        file["time"][299:310] = 0.0
+        assert file["signal"].shape == (310, 2000)
+        # The rest of the last chunk lay in the file all the time.
+        assert file["signal"][299:].mask.all()
+        assert (file["quality_flag"][299:310].filled() == netCDF4.default_fillvals["i4"]).all()
+        file["signal"][305] = 1.0
+    with netCDF4.Dataset(path) as file:
+        np.testing.assert_array_equal(file["signal"][:299].data, product["signal"])
+        np.testing.assert_array_equal(file["signal"][305], 1.0)
+        assert file["signal"][306].mask.all()
+
+
+@settings(deadline=None, max_examples=25)
+@given(data=st.data())
+def test_arrays_of_any_type_layout_and_size_are_kept(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+):
+    dtype = data.draw(st.sampled_from(["<f4", ">f4", "<f8", ">f8", "<i4", ">i2", "i1", "S1"]))
+    rows = data.draw(st.integers(1, 3)) * BULK_BYTES // np.dtype(dtype).itemsize // 100
+    pattern = data.draw(npst.arrays(dtype, (7, 11)))
+    values = np.resize(pattern, (rows + data.draw(st.integers(0, 2)), 100))
+    if data.draw(st.booleans()):
+        values = np.asfortranarray(values)
+    values.setflags(write=False)
+    fill_value = {"_FillValue": values.dtype.type(5)} if values.dtype.kind != "S" else {}
+    dims = data.draw(st.permutations(["time", "range"]))
+    dataset = xr.Dataset({"x": (dims, values, fill_value), "y": 1.0})
+    dataset.encoding["unlimited_dims"] = data.draw(st.sampled_from([(), ("time",), ("range",)]))
+    path = tmp_path_factory.mktemp("any") / "any.nc"
+    write(dataset, path)
+    assert_stored(path, dataset)
+    assert write(dataset, path) == write(dataset.copy(deep=True), path)
+
+
+@pytest.mark.parametrize("name", ["time", "range", "сигнал", "x"])
+def test_large_variables_may_have_any_name(name: str, tmp_path: Path):
+    # A variable called like a dimension that is not its own has another name in HDF5.
+    variables = {
+        "x": xr.Variable(("time", "range"), np.ones((2, 2))),
+        name: xr.Variable("time", np.arange(BULK_BYTES, dtype="f8")[: 2 if name == "x" else None]),
+    }
+    variables["x"] = xr.Variable(("time", "range"), np.ones((variables[name].size, 2)))
+    dataset = xr.Dataset(variables)
+    dataset.encoding["unlimited_dims"] = ("time",)
+    write_plain(dataset, tmp_path / "any.nc")
+    write(dataset, tmp_path / "any.nc")
+    assert_stored(tmp_path / "any.nc", dataset)
+
+
+def test_what_is_defined_is_written_once(
+    product: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ends: list[str] = []
+    kept_from = writer._DefinedAtOnce._enddef
+    written = writer._DefinedAtOnce.end_definitions
+    monkeypatch.setattr(
+        writer._DefinedAtOnce, "_enddef", lambda file: ends.append("kept") or kept_from(file)
+    )
+    monkeypatch.setattr(
+        writer._DefinedAtOnce, "end_definitions", lambda file: ends.append("end") or written(file)
+    )
+    write(product, tmp_path / "product.nc")
+    # Otherwise netCDF4 has another way, and this one would be in vain.
+    assert ends.count("kept") > len(product.variables)
+    assert ends.count("end") == 1
+
+
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_xarray_decodes_times_flags_bounds_and_coordinates(kind: ProductKind, tmp_path: Path):
+    data = MAKERS[kind](zenith=0.0)
+    path = tmp_path / "product.nc"
+    write(build_product(data, context(kind)), path)
+    with xr.open_dataset(path, decode_coords="all") as stored:
+        np.testing.assert_array_equal(stored["time"], data["time"])
+        np.testing.assert_array_equal(stored["quality_flag"], data["quality_flag"])
+        assert {"time_bnds", "altitude", "latitude", "wavelength"} <= set(stored.coords)
+        assert stored["wavelength"].item() == 532.0
+
+
+def test_files_are_classic_with_one_unlimited_dimension(product: xr.Dataset, tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write(product, path)
+    with netCDF4.Dataset(path) as file:
+        assert file.data_model == "NETCDF4_CLASSIC"
+        assert [name for name, dim in file.dimensions.items() if dim.isunlimited()] == ["time"]
+        assert not file.groups
+
+
+@pytest.mark.parametrize(("profiles", "bins"), [(1, 40), (5, 40), (100, 4096)])
+def test_every_variable_has_the_declared_chunks_and_filters(
+    profiles: int, bins: int, tmp_path: Path
+):
+    path = tmp_path / "product.nc"
+    write(build_product(signal(profiles, bins), context(ProductKind.SIGNAL)), path)
+    with netCDF4.Dataset(path) as file:
+        for name, variable in file.variables.items():
+            if not variable.dimensions:
+                assert variable.chunking() == "contiguous"
+                continue
+            filters = variable.filters()
+            assert (filters["zlib"], filters["complevel"], filters["shuffle"]) == (True, 4, True)
+            assert tuple(variable.chunking()) == chunk_sizes(
+                variable.shape, variable.dtype.itemsize
+            ), name
+        rows = min(profiles, CHUNK_BYTES // (4 * bins))
+        assert file["signal"].chunking() == [rows, bins]
+
+
+@settings(deadline=None)
+@given(
+    shape=st.lists(st.integers(1, 10**5), min_size=1, max_size=3).map(tuple),
+    itemsize=st.sampled_from([1, 2, 4, 8]),
+)
+def test_chunks_fit_and_are_whole_rows(shape: tuple[int, ...], itemsize: int):
+    chunk = chunk_sizes(shape, itemsize)
+    assert math.prod(chunk) * itemsize <= CHUNK_BYTES
+    assert all(1 <= part <= whole for part, whole in zip(chunk, shape, strict=True))
+    if math.prod(shape) * itemsize <= CHUNK_BYTES:
+        assert chunk == shape
+    else:
+        # One axis is cut, where not one row more would fit; those before it are single.
+        axis = max(i for i, whole in enumerate(shape) if chunk[i] < whole)
+        assert chunk[:axis] == (1,) * axis
+        assert chunk[axis + 1 :] == shape[axis + 1 :]
+        assert (chunk[axis] + 1) * math.prod(shape[axis + 1 :]) * itemsize > CHUNK_BYTES
+
+
+def run(script: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", script, *arguments],
+        capture_output=True,
+        text=True,
+        env={
+            **os.environ,
+            "PYTHONPATH": f"{HERE}{os.pathsep}{TESTS}",
+            "OMP_NUM_THREADS": "1",
+            **environment,
+        },
+        timeout=120,
+        check=False,
+    )
+
+
+SHA = """
+import sys
+from support.made_products import MAKERS, context
+from test_write import of_noise, truth
+from lidarops.products.layouts import build_product
+from lidarops.netcdf.write import write, write_plain
+for kind, maker in MAKERS.items():
+    print(write(build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind)), sys.argv[1]).sha256)
+print(write(of_noise(), sys.argv[1]).sha256)
+print(write_plain(truth(), sys.argv[1]).sha256)
+"""
+
+
+def test_bytes_are_equal_in_any_process_at_any_time(tmp_path: Path):
+    # MALLOC_PERTURB_ shows memory that goes into the file without having been set.
+    one = {"PYTHONHASHSEED": "1", "TZ": "Asia/Tokyo", "MALLOC_PERTURB_": "85"}
+    two = {"PYTHONHASHSEED": "2", "TZ": "UTC", "MALLOC_PERTURB_": "170"}
+    first = run(SHA, str(tmp_path / "a.nc"), **one)
+    (tmp_path / "elsewhere").mkdir()
+    second = run(SHA, str(tmp_path / "elsewhere" / "b.nc"), **two)
+    assert first.returncode == 0, first.stderr
+    hashes = first.stdout.split()
+    assert len(set(hashes)) == len(MAKERS) + 2
+    assert hashes == second.stdout.split()
+
+
+THREADS = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+import h5py
+from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
+from test_write import assert_stored, of_noise
+from lidarops.netcdf.write import write
+product = of_noise(150)
+def work(number):
+    path = f"{sys.argv[1]}/{number}.nc"
+    sha256 = write(product, path).sha256
+    with NETCDF4_PYTHON_LOCK:
+        assert_stored(Path(path), product)
+        with h5py.File(path) as file:
+            assert (file["signal"][...] == product["signal"].values).all()
+    return sha256
+with ThreadPoolExecutor(4) as pool:
+    print(len(set(pool.map(work, range(16)))))
+"""
+
+
+def test_threads_may_write_at_once_and_read_under_the_lock(tmp_path: Path):
+    done = run(THREADS, str(tmp_path))
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip() == "1"
+
+
+@pytest.mark.parametrize("failure", [OSError("no"), RuntimeError("NetCDF: HDF error")])
+def test_a_failure_leaves_what_was_there(
+    failure: Exception, product: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "product.nc"
+    write(product, path)
+    before = path.read_bytes()
+
+    def fail(_: Path) -> None:
+        assert len(list(tmp_path.iterdir())) == 2
+        raise failure
+
+    monkeypatch.setattr(writer, "_settle", fail)
+    with pytest.raises(ProductError, match="disk has space") as caught:
+        write(product, path)
+    assert caught.value.file == str(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_interrupt_leaves_nothing(
+    product: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupt(_: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(writer, "_settle", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write(product, tmp_path / "product.nc")
+    assert list(tmp_path.iterdir()) == []
+
+
+KILLED = """
+import os, signal, sys
+from support.made_products import context, homogeneous
+from lidarops.netcdf import write as writer
+from lidarops.products.layouts import build_product
+writer._settle = lambda path: os.kill(os.getpid(), signal.SIGKILL)
+writer.write(build_product(homogeneous(), context()), sys.argv[1])
+"""
+
+
+def test_a_killed_process_leaves_no_product(tmp_path: Path):
+    done = run(KILLED, str(tmp_path / "product.nc"))
+    assert done.returncode == -signals.SIGKILL
+    assert not list(tmp_path.glob("*.nc"))
+
+
+FULL = """
+import resource, signal, sys
+from test_write import of_noise
+from lidarops.errors import ProductError
+from lidarops.netcdf.write import write
+product = of_noise()
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+# Nothing; enough for some variables, for all but their data, for half of these; all.
+for room in (100, 10_000, 100_000, 1_000_000, resource.RLIM_INFINITY):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+    try:
+        write(product, sys.argv[1])
+        print("written")
+    except ProductError as error:
+        print(error)
+"""
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path):
+    path = tmp_path / "product.nc"
+    done = run(FULL, str(path))
+    assert done.returncode == 0, done.stderr[-2000:]
+    *full, last = done.stdout.splitlines()
+    assert len(full) == 4
+    for line in full:
+        assert str(path) in line
+        assert "disk has space" in line
+    assert last == "written"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_cannot_be_is_an_error(product: xr.Dataset, tmp_path: Path):
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(ProductError, match="folder can be written"):
+        write(product, tmp_path / "file" / "product.nc")
+    (tmp_path / "taken.nc").mkdir()
+    with pytest.raises(ProductError, match=r"taken\.nc"):
+        write(product, tmp_path / "taken.nc")
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "taken.nc"}
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_an_error(product: xr.Dataset, tmp_path: Path):
+    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    try:
+        with pytest.raises(ProductError, match="folder can be written"):
+            write(product, tmp_path / "product.nc")
+    finally:
+        tmp_path.chmod(stat.S_IRWXU)
+
+
+def test_products_have_the_permissions_that_the_user_wants(product: xr.Dataset, tmp_path: Path):
+    before = os.umask(0o022)
+    try:
+        write(product, tmp_path / "product.nc")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "product.nc").stat().st_mode) == 0o644
+
+
+@pytest.mark.parametrize("function", [write, write_plain])
+def test_dask_arrays_are_refused(function, product: xr.Dataset, tmp_path: Path):
+    lazy = product.assign(extinction=product["extinction"].chunk())
+    with pytest.raises(ProductError, match="load the dataset") as caught:
+        function(lazy, tmp_path / "product.nc")
+    assert caught.value.field == "extinction"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        (np.array(["text"]), "NetCDF cannot hold"),
+        (np.array(["2026-01-01"], "datetime64[ns]"), "NetCDF cannot hold"),
+        (np.ones(9999, np.float16), "NetCDF cannot hold"),
+        (np.array([b"text"]), "NetCDF cannot hold"),
+        (np.array([1j]), "NetCDF cannot hold"),
+        (np.zeros(0), "empty"),
+    ],
+)
+def test_what_netcdf_cannot_hold_is_refused(values, problem, tmp_path: Path):
+    with pytest.raises(ProductError, match=problem):
+        write(xr.Dataset({"x": ("n", values)}), tmp_path / "product.nc")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_plain_datasets_read_back_as_they_were(tmp_path: Path):
+    path = tmp_path / "truth.nc"
+    written = write_plain(truth(), path)
+    assert written.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    with xr.open_dataset(path) as stored:
+        xr.testing.assert_identical(stored.load().drop_encoding(), truth())
+        assert stored["label"].values.tolist() == ["hazy", "чисто"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_plain_datasets_that_xarray_cannot_encode_are_refused(tmp_path: Path):
+    bad = xr.Dataset({"x": ("n", np.array([{}, []], dtype=object))})
+    with pytest.raises(ProductError, match=r"bad\.nc"):
+        write_plain(bad, tmp_path / "bad.nc")
+    assert list(tmp_path.iterdir()) == []

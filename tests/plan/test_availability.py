@@ -1,0 +1,124 @@
+"""A name that no file has is told from a channel that came or went with the lidar."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import factories
+
+from lidarops.catalog.rows import row_of
+from lidarops.catalog.store import Store
+from lidarops.plan.availability import edges, lacks_any, names_any, unmet
+from lidarops.records import Granule, ProductKind, Role, Unmet
+
+DAY = 1440
+OLD = factories.PHOTON
+NEW = replace(OLD, name="photon_607o", wavelength=607e-9)
+EDGE = "2026-03-02T00:00:00Z"
+BEFORE, AFTER = {"valid_to": EDGE}, {"valid_from": EDGE}
+
+
+def _found(
+    facts: list[dict[str, Any]],
+    *granules: Granule,
+    products: dict[str, Any] | None = None,
+    folder: Path,
+    **asked: Any,
+) -> list[Unmet]:
+    campaign = factories.campaign(facts=facts, products=products or {"signal": {}})
+    with Store(f"sqlite:///{folder}/catalog.sqlite", campaign.name) as store:
+        store.replace([row_of(granule, campaign.name, "key") for granule in granules])
+        found = list(unmet(campaign, store.holdings(edges(campaign)), **asked))
+        # The quick look finds whatever the long one finds.
+        assert lacks_any(campaign, store.layouts()) or not found
+        return found
+
+
+def _file(day: int, *layout: Any, minutes: float = 0.0, role: Role = Role.SIGNAL) -> Granule:
+    name = f"coast/h{day}{minutes:g}{role}"
+    return factories.granule(day * DAY + minutes, path=name, role=role, layout=layout)
+
+
+def _told(*channels: str) -> dict[str, Any]:
+    return {"channels": {name: {"dead_time": 4e-9} for name in channels}}
+
+
+def test_a_name_that_no_file_has_is_told_with_its_number(tmp_path: Path) -> None:
+    wanted = {"homogeneous": {"channels": ["photon_999o"], "sections": [[750, 900]]}}
+    files = [_file(0, OLD), _file(1, OLD), _file(1, NEW, role=Role.DARK)]
+    facts = [_told("photon_533o", "photon_532o")]
+    found = {each.channel: each for each in _found(facts, *files, products=wanted, folder=tmp_path)}
+    assert found.keys() == {"photon_999o", "photon_533o"}
+    assert found["photon_999o"].asked == "homogeneous"
+    assert found["photon_533o"].asked == "facts"
+    for each in found.values():
+        assert (each.nowhere, each.files, each.of) == (True, 2, 2)
+        assert "photon_532o" in each.reason
+
+
+def test_a_channel_that_came_with_a_new_detector_is_no_slip(tmp_path: Path) -> None:
+    wanted = {"signal": {"channels": ["photon_607o", "photon_607o"]}}
+    files = [_file(0, OLD), _file(1, OLD), _file(2, OLD, NEW)]
+    found = _found([_told("photon_607o")], *files, products=wanted, folder=tmp_path)
+    assert {(each.asked, each.nowhere, each.files, each.of) for each in found} == {
+        ("signal", False, 2, 3),
+        ("facts", False, 2, 3),
+    }
+
+
+def test_facts_are_compared_with_the_files_of_their_period(tmp_path: Path) -> None:
+    # At the edge itself the later facts hold.
+    files = [_file(0, OLD), _file(1, NEW, minutes=0.0), _file(2, NEW)]
+    right = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_607o")}]
+    assert _found(right, *files, folder=tmp_path) == []
+    wrong = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_532o")}]
+    (each,) = _found(wrong, *files, folder=tmp_path)
+    assert (each.asked, each.files, each.of) == ("facts from 2026-03-02T00:00:00Z", 2, 2)
+    # It is told, and no trouble for ever: facts of two periods may share what they say.
+    assert each.held == 1
+    assert not each.nowhere
+    slip = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_606o")}]
+    (each,) = _found(slip, *files, folder=tmp_path)
+    assert each.nowhere
+
+
+def test_facts_of_a_time_without_files_are_no_slip(tmp_path: Path) -> None:
+    facts = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_533o")}]
+    assert _found(facts, _file(0, OLD), folder=tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("asked", "channels"),
+    [
+        ({}, {"photon_533o", "photon_999o"}),
+        ({"since": datetime(2026, 3, 2, tzinfo=UTC)}, {"photon_999o"}),
+        ({"until": datetime(2026, 3, 2, tzinfo=UTC)}, {"photon_533o", "photon_999o"}),
+        ({"kinds": (ProductKind.SIGNAL,)}, {"photon_533o", "photon_999o"}),
+        ({"kinds": (ProductKind.ELASTIC,)}, {"photon_533o"}),
+        ({"instruments": {"another"}}, set()),
+    ],
+)
+def test_only_what_is_asked_for(asked: dict[str, Any], channels: set[str], tmp_path: Path) -> None:
+    wanted = {"signal": {"channels": ["photon_999o"]}}
+    facts = [{**BEFORE, **_told("photon_533o")}, {**AFTER, **_told("photon_532o")}]
+    files = [_file(0, OLD), _file(1, OLD)]
+    found = _found(facts, *files, products=wanted, folder=tmp_path, **asked)
+    assert {each.channel for each in found} == channels
+
+
+def test_a_campaign_that_names_no_channel_needs_no_look() -> None:
+    assert not names_any(factories.campaign(facts=[{}], products={"signal": {}}))
+    assert names_any(factories.campaign(facts=[_told("photon_532o")], products={"signal": {}}))
+    assert names_any(factories.campaign(facts=[{}], products={"signal": {"channels": ["a"]}}))
+
+
+def test_files_that_hold_all_need_no_count() -> None:
+    """As in most archives: a count over a million files takes seconds."""
+    campaign = factories.campaign(facts=[_told("photon_532o")], products={"signal": {}})
+    assert not lacks_any(campaign, [("lidar", (OLD,)), ("lidar", (OLD, NEW))])
+    assert not lacks_any(campaign, [("another", (NEW,))])
+    assert lacks_any(campaign, [("lidar", (OLD, NEW)), ("lidar", (NEW,))])

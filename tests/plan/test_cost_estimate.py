@@ -1,0 +1,193 @@
+"""Estimates of run times: amounts of a plan, costs of a machine, sums of a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import factories
+
+from lidarops.errors import CatalogError
+from lidarops.plan import cost_estimate
+from lidarops.plan.cost_estimate import DEFAULTS, Costs, Tally, Term, amounts
+from lidarops.plan.scene_plan import plan
+from lidarops.plan.scenes import cut
+from lidarops.records import ChannelLayout, Plan, Role, Scene
+from lidarops.reports import gallery
+
+SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500]]}
+LEVEL = {"homogeneous": SECTIONS}
+UNITS = dict.fromkeys(Term, 1.0)
+
+
+def planned(
+    count: int = 10, *, products: dict[str, Any] | None = None, dark: int = 0, **changes: Any
+) -> tuple[Scene, Plan]:
+    granules = [factories.granule(5.0 * k, **changes) for k in range(count)]
+    granules += [
+        factories.granule(-30.0 - k, path=f"dark/{k}", role=Role.DARK) for k in range(dark)
+    ]
+    campaign = factories.campaign(products=LEVEL if products is None else products)
+    scene = cut(campaign, granules).scenes[0]
+    return scene, plan(scene, campaign)
+
+
+def of(**changes: Any) -> dict[Term, float]:
+    return amounts(*planned(**changes))
+
+
+# Amounts --------------------------------------------------------------------------------------
+
+
+def test_amounts_of_sections():
+    found = of(count=10)
+    (gate,) = (s for s in planned()[1].steps if s.name == "range_gate")
+    assert found[Term.FILE] == 10
+    assert found[Term.DIGEST] == 10 * 1000
+    assert found[Term.CHANNEL] == found[Term.HOMOGENEOUS] == found[Term.LOOK] == 1
+    assert found[Term.VALUE] == 10 * gate.number
+    assert found[Term.HOMOGENEOUS_VALUE] == 10 * (4500 - 750) / 7.5
+    assert Term.SIGNAL not in found
+
+
+def test_what_is_known_is_not_digested():
+    assert Term.DIGEST not in of(sha256="0" * 64)
+    scene, made = planned(sha256="0" * 64)
+    assert amounts(scene, made, whole=True)[Term.DIGEST] == 10 * 1000
+
+
+def test_sections_beside_a_product_of_all_bins_read_all_of_them():
+    signal = {"signal": {"channels": ["photon_532o"]}}
+    assert of(products={**signal, **LEVEL})[Term.VALUE] == of(products=signal)[Term.VALUE]
+    assert of(products=LEVEL)[Term.VALUE] < of(products=signal)[Term.VALUE]
+
+
+def test_dark_files_cost_where_they_are_subtracted():
+    analog = {"signal": {"channels": ["analog_532o"]}}
+    photon = {"signal": {"channels": ["photon_532o"]}}
+    assert of(products=analog, dark=3)[Term.FILE] == 13
+    assert of(products=analog, dark=3)[Term.DARK] == 1
+    assert of(products=photon, dark=3)[Term.FILE] == 10
+
+
+def test_a_joined_channel_reads_both():
+    up = {"zenith_angle": 0.0}
+    joined = of(products={"elastic": {"channels": ["glued_532o"]}}, **up)
+    alone = of(products={"elastic": {"channels": ["photon_532o"]}}, **up)
+    assert joined[Term.VALUE] == 2 * alone[Term.VALUE] == 10 * 2 * 2000
+    # Ten profiles, 5 min apart, in two averages of 30 min.
+    assert joined[Term.ELASTIC_VALUE] == alone[Term.ELASTIC_VALUE] == 2 * 2000
+
+
+def test_nothing_to_do_costs_nothing():
+    assert of(products={}) == {}
+
+
+@given(st.integers(1, 60), st.integers(1, 60), st.sampled_from([1000, 2000, 4000]))
+def test_more_profiles_and_bins_never_cost_less(few, more, bins):
+    layout = tuple(replace(each, bins=bins) for each in (factories.PHOTON, factories.ANALOG))
+    wider: tuple[ChannelLayout, ...] = tuple(replace(each, bins=2 * bins) for each in layout)
+    model = Costs(DEFAULTS)
+    products = {"signal": {}, **LEVEL}
+    one = model.of(of(count=few, products=products, layout=layout))
+    assert model.of(of(count=few + more, products=products, layout=layout)) > one
+    assert model.of(of(count=few, products=products, layout=wider)) > one
+
+
+# Sums -----------------------------------------------------------------------------------------
+
+
+def test_a_run_adds_what_it_costs_once():
+    tally = Tally(Costs(UNITS))
+    assert tally.parts == {"scenes": 0.0, "start": 0.0, "report": 0.0, "all": 0.0}
+    first = tally.add(*planned(count=3))
+    tally.add(*planned(count=3))
+    assert tally.scenes == 2 * first
+    # The process, what any scene loads, what homogeneous sections load.
+    assert tally.start == 3
+    # The page and the figures of one channel, though of two scenes.
+    assert tally.report == 2
+    assert tally.total == pytest.approx(2 * first + 5)
+    tally.add(*planned(products={}))
+    assert tally.count == 2
+
+
+def test_figures_are_limited_as_those_of_reports():
+    assert cost_estimate.MOST_FIGURES == gallery.FIGURES
+
+
+# Calibrations ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return cost_estimate.calibration_path()
+
+
+def test_a_calibration_comes_back(cache: Path):
+    seconds = {term: 0.1 * number for number, term in enumerate(Term)}
+    kept = cost_estimate.save(
+        Costs(seconds, processor=cost_estimate.processor(), date="2026-01-02")
+    )
+    assert kept == cache
+    found = cost_estimate.load()
+    assert found.seconds == seconds
+    assert found.words == "calibrated on this machine on 2026-01-02"
+    assert [path.name for path in cache.parent.iterdir()] == [cache.name]
+
+
+def test_without_a_calibration_the_note_says_so(cache: Path):
+    found = cost_estimate.load()
+    assert found.seconds == DEFAULTS
+    assert found.words.startswith("not calibrated on this machine")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"processor": "abacus"}, "another machine, abacus"),
+        ({"format": "letter"}, "no calibration"),
+        ({"seconds": {}}, "run"),
+        ({"seconds": dict.fromkeys(Term, -1.0)}, "no time"),
+        ({"seconds": dict.fromkeys(Term, "soon")}, "soon"),
+    ],
+)
+def test_a_strange_calibration_is_not_used_and_told(cache: Path, change: Any, said: str):
+    cost_estimate.save(Costs(DEFAULTS, processor=cost_estimate.processor(), date="2026-01-02"))
+    cache.write_text(json.dumps({**json.loads(cache.read_text()), **change}))
+    found = cost_estimate.load()
+    assert found.seconds == DEFAULTS
+    assert "not calibrated" in found.note
+    assert said in found.note
+
+
+@pytest.fixture
+def homeless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container that runs as a user that its system does not know."""
+
+    def unknown(*_: object) -> None:
+        raise KeyError("getpwuid(): uid not found")
+
+    for name in ("XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+
+
+@pytest.mark.usefixtures("homeless")
+def test_without_a_home_there_is_no_calibration():
+    found = cost_estimate.load()
+    assert found.seconds == DEFAULTS
+    assert "XDG_CACHE_HOME" in found.words
+    with pytest.raises(CatalogError, match="XDG_CACHE_HOME"):
+        cost_estimate.save(Costs(DEFAULTS))
+
+
+def test_all_terms_have_defaults():
+    assert set(DEFAULTS) == set(Term)
+    assert all(seconds > 0 for seconds in DEFAULTS.values())

@@ -1,0 +1,363 @@
+"""Networks in the campaign file, their scenes and their plans."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import timedelta
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from support.factories import ANALOG, DAY, PHOTON, granule
+
+from lidarops.campaign.model import Campaign
+from lidarops.plan.network_plan import apart
+from lidarops.plan.rule_table import RULES
+from lidarops.plan.scene_plan import plan
+from lidarops.plan.scenes import cut
+from lidarops.records import Granule, Plan, Scene
+
+PLACES = {
+    "west": (47.25, 11.3, 70.0),
+    "east": (47.25, 11.353, 310.0),
+    "north": (47.2811, 11.3265, 190.0),
+}
+MEMBERS = [f"{name}-lidar" for name in PLACES]
+
+
+def campaign(
+    visibility: dict[str, Any] | None = None, facts: dict[str, Any] | None = None, **changes: Any
+) -> Campaign:
+    """Three lidars; `facts` by instrument replace those of it."""
+    known = [{"full_overlap_range": 150.0}]
+    return Campaign.model_validate(
+        {
+            "name": "net",
+            "title": "Network",
+            "archive": "raw",
+            "output": "out",
+            "stations": {
+                name: {"name": name, "latitude": lat, "longitude": lon, "altitude": 600}
+                for name, (lat, lon, _) in PLACES.items()
+            },
+            "instruments": {
+                f"{name}-lidar": {
+                    "station": name,
+                    "files": f"{name}/*",
+                    "facts": (facts or {}).get(f"{name}-lidar", known),
+                }
+                for name in PLACES
+            },
+            "networks": {
+                "valley": {
+                    "instruments": MEMBERS,
+                    "visibility": {"channel": "photon_532o"} | (visibility or {}),
+                }
+            },
+        }
+        | changes
+    )
+
+
+def granules(minutes: float = 0.0, **changes: Any) -> list[Granule]:
+    """One granule of each member."""
+    return [
+        granule(
+            minutes,
+            **(
+                {"path": f"{name}/{minutes}", "instrument": f"{name}-lidar", "azimuth": azimuth}
+                | changes
+            ),
+        )
+        for name, (_, _, azimuth) in PLACES.items()
+    ]
+
+
+def networks(told: Campaign, given_: list[Granule]) -> list[Scene]:
+    return [scene for scene in cut(told, given_).scenes if scene.members]
+
+
+def planned(told: Campaign, given_: list[Granule] | None = None) -> Plan:
+    (scene,) = networks(told, granules() if given_ is None else given_)
+    return plan(scene, told)
+
+
+def reasons(found: Plan) -> str:
+    return "; ".join(left.reason for left in found.left_out if left.name == "visibility")
+
+
+RED = replace(granules()[2], layout=(replace(PHOTON, wavelength=1064e-9),))
+
+
+def turned(degree: float) -> list[Granule]:
+    """One granule of each member, whose beams are turned."""
+    return [replace(g, azimuth=(g.azimuth or 0.0) + degree) for g in granules(10 + degree)]
+
+
+class TestCampaign:
+    def test_a_network_has_defaults(self):
+        settings = campaign().networks["valley"].visibility
+        assert settings.visibility.threshold == 0.05
+        assert settings.method == "network"
+        assert settings.average == timedelta(minutes=10)
+
+    @pytest.mark.parametrize(
+        ("visibility", "said"),
+        [
+            ({"average": "7min"}, "divide a day"),
+            ({"average": "20min", "block": "30min"}, "multiple of average"),
+            ({"exponents": {"south-lidar": 1.2}}, "not in instruments"),
+            ({"background_range": [9000, 8000]}, "end farther"),
+            ({"visibility": {"contrast": 1.5}}, "contrast"),
+            ({"visibility": {"law": "angstrom"}}, "angstrom_exponent"),
+            ({"visibility": {"exponent_standard_error": 0.2}}, "needs a law"),
+            ({"method": "magic"}, "method"),
+        ],
+    )
+    def test_what_cannot_be_is_refused(self, visibility, said):
+        with pytest.raises(ValidationError, match=said):
+            campaign(visibility)
+
+    @pytest.mark.parametrize(
+        ("network", "said"),
+        [
+            ({"instruments": ["west-lidar"]}, "at least 2"),
+            ({"instruments": ["west-lidar", "west-lidar"]}, "twice"),
+            ({"instruments": ["west-lidar", "moon-lidar"]}, "unknown instrument 'moon-lidar'"),
+        ],
+    )
+    def test_members_are_instruments(self, network, said):
+        told = {"valley": network | {"visibility": {"channel": "photon_532o"}}}
+        with pytest.raises(ValidationError, match=said):
+            campaign(networks=told)
+
+    def test_a_network_has_a_key_of_its_own(self):
+        told = {"west": {"instruments": MEMBERS, "visibility": {"channel": "photon_532o"}}}
+        with pytest.raises(ValidationError, match="key of an instrument or station"):
+            campaign(networks=told)
+
+    @pytest.mark.parametrize(("contrast", "value"), [(0.02, 0.02), ("paper", 0.049787)])
+    def test_contrasts(self, contrast, value):
+        settings = campaign({"visibility": {"contrast": contrast}}).networks["valley"].visibility
+        assert settings.visibility.threshold == pytest.approx(value, abs=1e-6)
+
+
+class TestScenes:
+    def test_members_keep_scenes_of_their_own(self):
+        told = campaign()
+        found = cut(told, granules()).scenes
+        assert [scene.instrument for scene in found] == [*sorted(MEMBERS), "valley"]
+        scene = found[-1]
+        assert scene.id == "valley_20260301T000000"
+        assert [member.instrument for member in scene.members] == MEMBERS
+        union = {g.path for member in scene.members for g in member.granules}
+        assert {g.path for g in scene.granules} == union
+
+    def test_it_is_cut_where_the_facts_of_any_member_change(self):
+        noon = DAY + timedelta(hours=12)
+        changed = [
+            {"full_overlap_range": 150.0, "valid_to": noon},
+            {"full_overlap_range": 300.0, "valid_from": noon},
+        ]
+        told = campaign(facts={"east-lidar": changed})
+        first, second = networks(told, [*granules(10), *granules(721)])
+        assert first.stop == noon == second.start
+        assert [len(member.granules) for member in first.members] == [1, 1, 1]
+        near = [ray["nearest"] for ray in plan(second, told).steps[-1].settings["rays"]]
+        assert near == [150.0, 300.0, 150.0]
+
+    def test_one_lidar_alone_is_no_network(self):
+        assert networks(campaign(), granules()[:1]) == []
+        (scene,) = networks(campaign(), granules()[:2])
+        assert len(scene.members) == 2
+
+    def test_each_range_grid_makes_a_scene(self):
+        short = replace(PHOTON, bins=1000)
+        late = replace(granules(30)[0], layout=(short,))
+        found = networks(campaign(), [*granules(), late])
+        assert len(found) == 2
+        assert len({scene.id for scene in found}) == 2
+        # Nothing is lost: each granule is in one of them at least.
+        assert {g.path for s in found for g in s.granules} == {g.path for g in [*granules(), late]}
+
+    @given(st.permutations(granules() + granules(10) + granules(20)))
+    def test_the_order_of_files_does_not_matter(self, shuffled):
+        told = campaign()
+        assert networks(told, shuffled) == networks(told, granules() + granules(10) + granules(20))
+
+    def test_without_a_network_nothing_changes(self):
+        with_one = [s for s in cut(campaign(), granules()).scenes if not s.members]
+        assert with_one == list(cut(campaign(networks={}), granules()).scenes)
+
+
+class TestPlans:
+    def test_it_names_beams_and_members(self):
+        found = planned(campaign())
+        step = found.steps[-1]
+        assert step.name == "visibility"
+        assert [ray["azimuth"] for ray in step.settings["rays"]] == [70.0, 310.0, 190.0]
+        assert "3 beams of 3 instruments meet in 3 points, 3 of which are near ones" in step.reason
+        per_member = [s for s in found.steps if s.instrument]
+        assert {s.instrument for s in per_member} == set(MEMBERS)
+        assert all(s.reason.startswith(f"{s.instrument}: ") for s in per_member)
+        names = [s.name for s in found.steps if s.instrument == "west-lidar"]
+        assert names == ["read", "overlap", "noise", "background", "range_gate"]
+        joint = [s.name for s in found.steps if not s.instrument]
+        assert joint == ["average", "prior", "visibility"]
+
+    def test_members_are_not_read_for_themselves(self):
+        told = campaign()
+        alone = next(s for s in cut(told, granules()).scenes if s.instrument == "west-lidar")
+        found = plan(alone, told)
+        assert found.steps == ()
+        left_out = {left.channel: left.reason for left in found.left_out}
+        assert left_out["photon_532o"] == "used by network valley alone"
+        assert left_out["analog_532o"] == "no product of the campaign asks for this channel"
+        joined = plan(alone, campaign({"channel": "glued_532o"}))
+        assert {left.reason for left in joined.left_out} == {"used by network valley alone"}
+
+    def test_it_is_plain_data(self):
+        found = planned(campaign({"exponents": {"east-lidar": 1.2}}))
+        assert found.as_dict()["steps"][0]["instrument"] == "west-lidar"
+        assert [ray["exponent"] for ray in found.steps[-1].settings["rays"]] == [1.0, 1.2, 1.0]
+        assert found.hash != planned(campaign()).hash
+
+    @pytest.mark.parametrize(
+        ("facts", "changes", "said"),
+        [
+            ({"west-lidar": [{}]}, {}, "west-lidar: the campaign gives neither full_overlap_range"),
+            ({}, {"layout": (ANALOG,)}, "the files hold no photon_532o, only analog_532o"),
+            ({}, {"zenith_angle": None}, "neither headers nor campaign tell where"),
+            (
+                {},
+                {"layout": (replace(PHOTON, wavelength=float("nan")),)},
+                "wavelength is implausible",
+            ),
+        ],
+    )
+    def test_what_a_member_lacks_is_told(self, facts, changes, said):
+        found = planned(campaign(facts=facts), granules(**changes))
+        assert found.steps == ()
+        assert said in reasons(found)
+
+    def test_beams_that_do_not_meet_are_told(self):
+        found = planned(campaign(), granules(zenith_angle=0.0))
+        assert found.steps == ()
+        assert "no beam meets others in two points" in reasons(found)
+        assert "fewer than two points that others see" in reasons(found)
+
+    def test_a_missing_member_is_told(self):
+        found = planned(campaign(), granules()[:2])
+        assert "north-lidar: no granule in the window" in reasons(found)
+
+    def test_colours_must_be_one(self):
+        other = (replace(PHOTON, wavelength=1064e-9),)
+        red = [*granules()[:2], replace(granules()[2], layout=other)]
+        assert "different wavelengths: 532, 1064 nm" in reasons(planned(campaign(), red))
+
+    def test_a_cycle_is_asked_of_one_cycle(self):
+        found = planned(campaign({"method": "cycle"}))
+        assert found.steps[-1].settings["method"] == "cycle"
+
+    @pytest.mark.parametrize(
+        ("rule", "told", "given_", "number"),
+        [
+            ("member_present", {}, granules()[:2], 0.0),
+            ("member", {"facts": {"west-lidar": [{}]}}, None, 0.0),
+            ("beams_meet", {}, granules(zenith_angle=0.0), 0.0),
+            ("some_meet", {}, granules(zenith_angle=0.0), 0.0),
+            ("one_colour", {}, [*granules()[:2], RED], 532e-9),
+            ("few_beams", {}, [g for k in range(180) for g in turned(k)], 540.0),
+            ("cycle", {"visibility": {"method": "cycle"}}, [*granules(), *turned(4)], 6.0),
+            ("prior", {"visibility": {"prior": "none"}}, None, None),
+            ("prior", {"visibility": {"method": "klett"}}, None, None),
+        ],
+    )
+    def test_rules_of_what_cannot_be(self, rule, told, given_, number):
+        found = planned(campaign(**told), given_)
+        left = [each for each in found.left_out if each.rule == rule]
+        assert left
+        assert all(each.number == pytest.approx(number) for each in left)
+        fine = planned(campaign())
+        assert not [each for each in fine.left_out if each.rule == rule]
+
+    @pytest.mark.parametrize(
+        ("rule", "number"),
+        [
+            ("member_channel", 532e-9),
+            ("member_background", 200.0),
+            ("network_average", 600.0),
+            ("prior", 36.0),
+            ("visibility", 3.0),
+        ],
+    )
+    def test_rules_of_what_runs(self, rule, number):
+        found = planned(campaign())
+        steps = [each for each in found.steps if each.rule == rule]
+        assert steps
+        assert all(each.number == pytest.approx(number) for each in steps)
+        apart_ = planned(campaign(), granules(zenith_angle=0.0))
+        assert not [each for each in apart_.steps if each.rule == rule]
+
+    def test_the_gate_holds_beams_and_what_tells_their_background(self):
+        found = planned(campaign())
+        gates = [step for step in found.steps if step.rule == "member_gate"]
+        assert len(gates) == len(MEMBERS)
+        for gate in gates:
+            kept = gate.settings["bins"]
+            assert gate.number == sum(past - first for first, past in kept)
+            assert kept[0][0] == 0
+            assert kept[-1][1] == PHOTON.bins
+            # The points are 4 km away; the tail begins at 13.5 km.
+            assert 4000.0 < kept[0][1] * PHOTON.bin_width < 8000.0
+            assert 13_450.0 < kept[-1][0] * PHOTON.bin_width < 13_500.0
+            (before,) = kept[1:-1]
+            assert -50.0 < before[0] * PHOTON.bin_width - 0.6 * 13_500 < 0.0
+            assert 0.0 < before[1] * PHOTON.bin_width - 0.7 * 13_500 < 50.0
+
+    @pytest.mark.parametrize(
+        ("told", "layout", "said"),
+        [
+            ({"all_steps": True}, PHOTON, "all steps"),
+            ({"visibility": {"channel": "analog_532o"}}, ANALOG, "noise of analog records"),
+            ({}, replace(PHOTON, bins=650), "reach over all bins"),
+        ],
+    )
+    def test_all_bins_are_read_where_they_are_needed(self, told, layout, said):
+        given_ = granules(layout=(layout,))
+        found = planned(campaign(**told), given_)
+        assert found.steps[-1].name == "visibility"
+        left = [each for each in found.left_out if each.rule == "member_gate"]
+        assert len(left) == len(MEMBERS)
+        assert all(said in each.reason for each in left)
+        assert not [step for step in found.steps if step.rule == "member_gate"]
+
+    def test_every_decision_has_a_rule_of_the_table(self):
+        names = {rule.name for rule in RULES}
+        for given_ in (granules(), granules(zenith_angle=0.0), granules()[:2]):
+            found = planned(campaign(), given_)
+            assert {each.rule for each in (*found.steps, *found.left_out)} <= names
+
+    def test_facts_win_over_headers(self):
+        facts = [{"full_overlap_range": 150.0, "zenith_angle": 90.0, "azimuth": 70.0}]
+        strange = [replace(granules()[0], azimuth=12.0, zenith_angle=3.0), *granules()[1:]]
+        found = planned(campaign(facts={"west-lidar": facts}), strange)
+        assert found.steps[-1].settings["rays"][0]["azimuth"] == 70.0
+
+    def test_beams_of_one_instrument_are_told_apart(self):
+        other = [replace(g, azimuth=(g.azimuth or 0) + 2.0) for g in granules(10)]
+        jitter = [replace(g, azimuth=(g.azimuth or 0) + 0.05) for g in granules(20)]
+        rays = planned(campaign(), [*granules(), *other, *jitter]).steps[-1].settings["rays"]
+        assert [ray["instrument"] for ray in rays] == [m for m in MEMBERS for _ in range(2)]
+
+
+@given(st.floats(0, 180), st.floats(0, 360), st.floats(0, 180), st.floats(0, 360))
+def test_angles_between_pointings(zenith, azimuth, other_zenith, other_azimuth):
+    one, two = (zenith, azimuth), (other_zenith, other_azimuth)
+    assert apart(one, one) < 1e-5
+    assert apart(one, two) == pytest.approx(apart(two, one), abs=1e-9)
+    assert apart((zenith, 0.0), (other_zenith, 0.0)) == pytest.approx(
+        abs(zenith - other_zenith), abs=1e-5
+    )

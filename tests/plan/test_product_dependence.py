@@ -1,0 +1,21 @@
+"""What products depend on, in digests that stay as they are."""
+
+from __future__ import annotations
+
+import hashlib
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarops.plan import product_dependence
+from lidarops.records import InputRecord, Role
+
+DIGESTS = st.integers(0, 3).map(lambda k: hashlib.sha256(bytes([k])).hexdigest())
+RECORDS = st.builds(InputRecord, st.text(), st.sampled_from(Role), DIGESTS)
+
+
+@given(st.lists(RECORDS, max_size=12))
+def test_inputs_have_the_digest_of_their_sorted_contents(files):
+    contents = sorted([used.role.value, used.sha256] for used in files)
+    assert product_dependence.digest_of_inputs(files) == product_dependence.digest(contents)
+    assert product_dependence.digest_of_inputs(files[::-1]) == product_dependence.digest(contents)

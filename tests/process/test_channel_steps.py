@@ -1,0 +1,513 @@
+"""The steps of a plan, carried out: counts of a simulated lidar in, its truth out."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from functools import cache
+from pathlib import Path
+
+import dask
+import dask.array as da
+import numpy as np
+import pytest
+import xarray as xr
+from support import factories
+
+from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.campaign.model import Campaign, Metadata
+from lidarops.flags import Quality
+from lidarops.netcdf.build import Context
+from lidarops.plan.scene_plan import plan
+from lidarops.plan.scenes import cut
+from lidarops.process import channel_steps
+from lidarops.products.layouts import build_product
+from lidarops.records import DetectionMode, Plan, ProductKind, Provenance, Role
+from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
+
+AIR = MolecularProfile.us_standard()
+STATION = 20.0
+LIDAR_RATIO = 50.0
+SHOTS = 600
+DEAD_TIME = 4e-9
+INPUT_RANGE = 0.5
+"""V."""
+RATIO = 20.0
+"""MHz a mV."""
+SKY = 0.1
+"""MHz."""
+MINUTE = np.timedelta64(60_000_000_000, "ns")
+START = np.datetime64("2026-03-01T00:00", "ns")
+NONE = Ancillaries({}, {}, ())
+distance = 7.5 * (np.arange(1200) + 0.5)
+
+
+def particles(altitude):
+    z = np.asarray(altitude, dtype=float)
+    return 2e-6 / (1.0 + np.exp(np.clip((z - 1200.0) / 120.0, -50.0, 50.0)))
+
+
+def count_rate(r, *, zenith=0.0, constant=4e12, air=AIR):
+    """MHz, without sky."""
+    climb = np.cos(np.deg2rad(zenith))
+    fine = np.linspace(0.0, r[-1], 10 * r.size)
+    z = STATION + climb * fine
+    extinction = LIDAR_RATIO * particles(z) + air.extinction(z, 532e-9)
+    steps_ = np.diff(fine) * (extinction[1:] + extinction[:-1]) / 2.0
+    depth = np.interp(r, fine, np.concatenate([[0.0], np.cumsum(steps_)]))
+    z = STATION + climb * r
+    total = particles(z) + air.backscatter(z, 532e-9)
+    return constant * total * np.exp(-2.0 * depth) / r**2
+
+
+def archive(rate=None, *, profiles=20, zenith=0.0, seed=0, lag=0, ripple=0.0, first=START, chunk=7):
+    """Raw counts of an analog and a photon counting channel, one profile a minute."""
+    rng = np.random.default_rng(seed)
+    rate = count_rate(distance, zenith=zenith) if rate is None else rate
+    light = rate + SKY
+    bins, exposure = light.size, SHOTS * 7.5 / 150.0
+    measured = light / (1.0 + light * DEAD_TIME * 1e6)
+    counts = rng.poisson(np.broadcast_to(measured * exposure, (profiles, bins)))
+    voltage = 1.0 + np.interp(np.arange(bins) - lag, np.arange(bins), light) / RATIO
+    voltage = voltage + ripple * np.sin(np.arange(bins) / 5.0)
+    voltage = voltage + 0.02 * rng.standard_normal((profiles, bins))
+    scale = SHOTS * 4096 / (1000 * INPUT_RANGE)
+    starts = first + np.arange(profiles) * MINUTE
+    common = {"bin_width": 7.5}
+    fired = np.full(profiles, SHOTS, np.int32)
+
+    def lazy(values):
+        return da.from_array(np.rint(values).astype(np.int32), chunks=(chunk, bins))
+
+    return xr.Dataset(
+        {
+            "photon_532o": (
+                ("time", "range"),
+                lazy(counts),
+                {"detection_mode": "photon", **common},
+            ),
+            "analog_532o": (
+                ("time", "range"),
+                lazy(np.clip(voltage * scale, 0, SHOTS * 4095)),
+                {"detection_mode": "analog", "adc_bits": 12, **common},
+            ),
+            "photon_532o_shots": ("time", fired),
+            "analog_532o_shots": ("time", fired),
+            "analog_532o_input_range": ("time", np.full(profiles, INPUT_RANGE)),
+        },
+        coords={
+            "time": starts + MINUTE // 2,
+            "time_bnds": (("time", "nv"), np.stack([starts, starts + MINUTE], axis=-1)),
+            "range": ("range", 7.5 * (np.arange(bins) + 0.5), {"units": "m"}),
+            "zenith_angle": ("time", np.full(profiles, zenith)),
+        },
+    )
+
+
+ELASTIC = {
+    "channels": ["photon_532o", "glued_532o"],
+    "lidar_ratio_standard_error": 0.0,
+    "molecular_relative_error": 0.0,
+    "reference": {"lowest": 3000, "highest": 8000, "relative_error": 0.0},
+}
+
+
+def campaign(products, **facts) -> Campaign:
+    channels = {
+        "photon_532o": {"dead_time": DEAD_TIME},
+        "analog_532o": {"noise_variance": 4e-4},
+    }
+    told = {"zenith_angle": 0.0, "channels": channels, **facts}
+    made = factories.campaign(products=products, facts=[told])
+    # Sections along a vertical beam too: this asks what a step does, not whether it is worth it.
+    return made.model_copy(update={"all_steps": True})
+
+
+def planned(settings: Campaign, *, dark: bool = False, bins: int = 1200) -> Plan:
+    layout = tuple(
+        type(each)(each.name, each.mode, each.wavelength, bins, each.bin_width, each.adc_bits)
+        for each in (factories.PHOTON, factories.ANALOG)
+    )
+    granules = [factories.granule(0, layout=layout)]
+    if dark:
+        granules.append(
+            factories.granule(-30, path="dark/d", role=Role.DARK, layout=layout, size=7)
+        )
+    return plan(cut(settings, granules).scenes[0], settings)
+
+
+def carried(products, raw=None, *, channel="photon_532o", dark=None, ancillaries=None, **facts):
+    raw = archive() if raw is None else raw
+    made = planned(campaign(products, **facts), dark=dark is not None, bins=raw.sizes["range"])
+    files = NONE if ancillaries is None else ancillaries
+    return channel_steps.carry_out(channel_steps.Bench(made, raw, dark, files, STATION), channel)
+
+
+def read(folder: Path, **files: str) -> Ancillaries:
+    """Write and read the files beside a campaign file."""
+    for name, content in files.items():
+        (folder / f"{name}.csv").write_text(content)
+    facts = {f"{name}_profile": f"{name}.csv" for name in files}
+    made = planned(campaign({"elastic": ELASTIC}, **facts))
+    return Ancillaries.read(folder, made)
+
+
+def between(low, high):
+    return (distance > low) & (distance < high)
+
+
+@cache
+def both():
+    """The elastic products of the plain and of the joined channel."""
+    wanted = {"elastic": {**ELASTIC, "average": "10min"}}
+    return {
+        channel: carried(wanted, channel=channel)[ProductKind.ELASTIC]
+        for channel in ("photon_532o", "glued_532o")
+    }
+
+
+def off(found, inside):
+    """Deviation from the truth in standard errors, of values that no bit speaks against."""
+    score = (found["backscatter"] - particles(STATION + distance)) / found[
+        "backscatter_standard_error"
+    ]
+    return score.where(found["quality_flag"] == 0).to_numpy()[:, inside]
+
+
+@pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
+def test_elastic_gives_the_truth_back(channel: str) -> None:
+    found = both()[channel]
+    assert found.sizes == {"time": 2, "range": 1200, "nv": 2}
+    assert np.isfinite(found["reference_bottom"]).all()
+    for low, high in ((800, 1500), (1500, 3000), (3000, 6000)):
+        score = off(found, between(low, high))
+        assert np.isfinite(score).mean() > 0.9
+        assert np.sqrt(np.nanmean(score**2)) < 1.3
+    np.testing.assert_array_equal(found["profiles"], [10, 10])
+    np.testing.assert_array_equal(found["shots"], [6000, 6000])
+    np.testing.assert_array_equal(found["time"], START + np.array([5, 15]) * MINUTE)
+
+
+def test_the_joined_channel_reaches_nearer_than_photon_counting() -> None:
+    near = between(300, 700)
+    plain, joined = (off(both()[c], near) for c in ("photon_532o", "glued_532o"))
+    assert np.isfinite(plain).mean() < 0.1
+    assert np.isfinite(joined).all()
+    assert np.abs(joined).max() < 4.0
+    slope = both()["glued_532o"]
+    score = (slope["glue_slope"] - RATIO) / slope["glue_slope_standard_error"]
+    assert np.abs(score).max() < 4.0
+    assert not [name for name in both()["photon_532o"] if str(name).startswith("glue_")]
+
+
+@pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
+def test_results_are_products(channel: str) -> None:
+    made = planned(campaign({"elastic": ELASTIC}))
+    found = both()[channel]
+    told = {
+        "kind": ProductKind.ELASTIC,
+        "channel": channel,
+        "mode": DetectionMode.PHOTON,
+        "wavelength": 532e-9,
+        "station_key": "coast",
+        "station": factories.campaign().stations["coast"],
+        "instrument_key": "lidar",
+        "instrument_name": "",
+        "metadata": Metadata(),
+        "campaign": "test",
+        "title": "Test",
+        "summary": "",
+        "scene": made.scene,
+        "start": datetime(2026, 3, 1, tzinfo=UTC),
+        "stop": datetime(2026, 3, 1, tzinfo=UTC) + timedelta(days=1),
+        "provenance": Provenance(
+            "test", made.scene, ProductKind.ELASTIC, channel, (), made, {}, {}, "0"
+        ),
+    }
+    product = build_product(found, Context(**told))
+    assert product["backscatter"].dims == ("time", "range")
+    stored = product["backscatter"].to_numpy()
+    np.testing.assert_allclose(
+        stored[np.isfinite(found["backscatter"])],
+        found["backscatter"].to_numpy()[np.isfinite(found["backscatter"])],
+        rtol=2e-4,
+    )
+    np.testing.assert_allclose(product["altitude"][..., 100], STATION + distance[100], rtol=1e-6)
+
+
+@pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
+@pytest.mark.parametrize("chunk", [1, 13])
+def test_any_chunks_and_threads_give_the_same_bits(channel: str, chunk: int) -> None:
+    wanted = {"elastic": {**ELASTIC, "average": "10min"}}
+    with dask.config.set(scheduler="threads", num_workers=2):
+        found = carried(wanted, archive(chunk=chunk), channel=channel)[ProductKind.ELASTIC]
+    xr.testing.assert_identical(found, both()[channel])
+
+
+def test_a_slanted_beam_gives_the_same_truth() -> None:
+    wanted = {"elastic": {**ELASTIC, "reference": {"lowest": 3000, "highest": 6000}}}
+    raw = archive(zenith=30.0)
+    found = carried(wanted, raw, zenith_angle=30.0)[ProductKind.ELASTIC]
+    altitude = STATION + np.cos(np.deg2rad(30.0)) * distance
+    assert float(found["zenith_angle"]) == 30.0
+    score = (found["backscatter"] - particles(altitude)) / found["backscatter_standard_error"]
+    inside = score.to_numpy()[:, between(800, 3000)]
+    assert np.sqrt(np.nanmean(inside**2)) < 1.4
+    assert float(found["reference_bottom"][0]) >= 3000.0 / np.cos(np.deg2rad(30.0)) - 1e-6
+
+
+def test_missing_profiles_give_flags_and_no_error() -> None:
+    raw = archive()
+    for name in ("photon_532o", "analog_532o"):
+        counts = raw[name].to_numpy().copy()
+        counts[10:] = 0
+        raw[name] = (("time", "range"), da.from_array(counts, chunks=(6, -1)), raw[name].attrs)
+    raw["photon_532o_shots"] = ("time", np.where(np.arange(20) < 10, SHOTS, 0).astype(np.int32))
+    raw["analog_532o_shots"] = raw["photon_532o_shots"]
+    wanted = {"elastic": {**ELASTIC, "average": "10min"}, "signal": {"channels": ["glued_532o"]}}
+    for channel in ("photon_532o", "glued_532o"):
+        for kind, found in carried(wanted, raw, channel=channel).items():
+            flag = found["quality_flag"].to_numpy()
+            name = "backscatter" if kind is ProductKind.ELASTIC else "signal"
+            assert (flag[np.isnan(found[name].to_numpy())] != 0).all()
+            assert np.isnan(found[name].to_numpy()[-1]).all()
+            assert np.isfinite(found[name].to_numpy()[0]).mean() > 0.9
+
+
+# Files beside the campaign file ---------------------------------------------------------------
+
+
+def test_a_sounding_replaces_the_standard_atmosphere(tmp_path: Path) -> None:
+    z = np.linspace(0.0, 20_000.0, 201)
+    pressure, temperature = us_standard(z)
+    warm = temperature + 8.0
+    force = pressure[0] * (pressure / pressure[0]) ** (1.0 - 8.0 / 260.0)
+    rows = [f"{a:.1f},{p / 100:.6f},{t:.3f}" for a, p, t in zip(z, force, warm, strict=True)]
+    text = "\n".join(["altitude [m],pressure [hPa],temperature [K]", *rows])
+    found = read(tmp_path, molecular=text)
+    air = found.profiles["molecular.csv"]
+    raw = archive(count_rate(distance, air=air))
+    wanted = {"elastic": ELASTIC}
+    right = carried(wanted, raw, ancillaries=found, molecular_profile="molecular.csv")
+    plain = carried(wanted, raw)
+    np.testing.assert_allclose(
+        right[ProductKind.ELASTIC]["molecular_backscatter"],
+        air.backscatter(STATION + distance, 532e-9),
+        rtol=1e-12,
+    )
+    inside = between(800, 1500)
+    assert np.sqrt(np.nanmean(off(right[ProductKind.ELASTIC], inside) ** 2)) < 1.4
+    away = plain[ProductKind.ELASTIC]["molecular_backscatter"]
+    assert np.abs(away / right[ProductKind.ELASTIC]["molecular_backscatter"] - 1.0).max() > 0.02
+
+
+OVERLAP = "range [m],overlap\n300,0.1\n600,0.4\n1200,0.8\n1800,1\n"
+SEEN = np.where(
+    distance < 300.0, 0.05, np.interp(distance, [300, 600, 1200, 1800], [0.1, 0.4, 0.8, 1])
+)
+FACTS = {"overlap_profile": "overlap.csv"}
+
+
+class TestOverlap:
+    raw = staticmethod(lambda: archive(count_rate(distance, constant=4e11) * SEEN))
+
+    def test_the_signal_is_divided_by_it(self, tmp_path: Path) -> None:
+        wanted = {"signal": {"channels": ["photon_532o"]}}
+        files = read(tmp_path, overlap=OVERLAP)
+        whole = carried(wanted, self.raw(), ancillaries=files, **FACTS)[ProductKind.SIGNAL]
+        plain = carried(wanted, self.raw())[ProductKind.SIGNAL]
+        known = distance > 300.0
+        for name in ("signal", "signal_standard_error"):
+            np.testing.assert_allclose(
+                whole[name].to_numpy()[:, known],
+                plain[name].to_numpy()[:, known] / SEEN[known],
+                rtol=1e-6,
+            )
+        flag = whole["quality_flag"].to_numpy() & int(Quality.INCOMPLETE_OVERLAP)
+        np.testing.assert_array_equal(flag != 0, np.broadcast_to(~known, flag.shape))
+        assert np.isnan(whole["signal"].to_numpy()[:, ~known]).all()
+
+    def test_elastic_is_unbiased_where_it_is_given(self, tmp_path: Path) -> None:
+        files = read(tmp_path, overlap=OVERLAP)
+        found = carried({"elastic": ELASTIC}, self.raw(), ancillaries=files, **FACTS)
+        score = off(found[ProductKind.ELASTIC], between(450, 1200))
+        assert np.isfinite(score).mean() > 0.9
+        assert np.sqrt(np.nanmean(score**2)) < 1.4
+
+    def test_it_holds_for_the_joined_channel_too(self, tmp_path: Path) -> None:
+        files = read(tmp_path, overlap=OVERLAP)
+        wanted = {"signal": {"channels": ["photon_532o", "glued_532o"]}}
+        found = carried(wanted, channel="glued_532o", ancillaries=files, **FACTS)
+        flag = found[ProductKind.SIGNAL]["quality_flag"].to_numpy()
+        assert (flag[:, distance < 300.0] & int(Quality.INCOMPLETE_OVERLAP) != 0).all()
+
+    def test_one_product_does_not_depend_on_another(self, tmp_path: Path) -> None:
+        files = read(tmp_path, overlap=OVERLAP)
+        sections = {"channels": ["photon_532o"], "sections": [[100, 900], [900, 4500]]}
+        alone = carried({"homogeneous": sections}, self.raw(), ancillaries=files, **FACTS)
+        wanted = {"homogeneous": sections, "signal": {"channels": ["photon_532o"]}}
+        beside = carried(wanted, self.raw(), ancillaries=files, **FACTS)
+        xr.testing.assert_identical(alone[ProductKind.HOMOGENEOUS], beside[ProductKind.HOMOGENEOUS])
+
+    def test_a_path_through_partial_overlap_is_corrected_or_flagged(self, tmp_path: Path) -> None:
+        files = read(tmp_path, overlap=OVERLAP)
+        level = 1e9 * np.exp(-2.0 * 3e-4 * distance) / distance**2
+        sections = {"channels": ["photon_532o"], "sections": [[400, 3000]]}
+        told = {**FACTS, "zenith_angle": 90.0}
+        found = carried(
+            {"homogeneous": sections}, archive(level * SEEN), ancillaries=files, **told
+        )[ProductKind.HOMOGENEOUS]
+        right = np.abs(found["extinction"] - 3e-4) < 5 * found["extinction_standard_error"]
+        assert (right | (found["quality_flag"] != 0)).all()
+
+
+# Dark signals, lags and the rest of a plan ------------------------------------------------------
+
+
+def _dark(profiles: int = 12, ripple: float = 0.5) -> xr.Dataset:
+    nothing = np.full(distance.size, -SKY)
+    return archive(nothing, profiles=profiles, ripple=ripple, seed=8, first=START - 30 * MINUTE)
+
+
+def test_the_dark_signal_is_subtracted_and_its_error_is_told() -> None:
+    wanted = {"signal": {"channels": ["analog_532o"]}}
+    raw = archive(ripple=0.5)
+    dirty = carried(wanted, raw, channel="analog_532o")[ProductKind.SIGNAL]
+    clean = carried(wanted, raw, channel="analog_532o", dark=_dark())[ProductKind.SIGNAL]
+    r2 = distance**2
+    true = count_rate(distance) / RATIO * r2
+    far = between(3000, 6000)
+    error = clean["signal_standard_error"].to_numpy()[:, far]
+    score = (clean["signal"].to_numpy() - true)[:, far] / error
+    # A fixed dark signal has one error for all 20 profiles, told for each of them.
+    assert 0.85 < np.sqrt(np.mean(score**2)) < 1.15
+    missed = (dirty["signal"].to_numpy() - true)[:, far]
+    assert np.sqrt(np.mean((missed / error) ** 2)) > 5.0
+    noise = dirty["signal_standard_error"].to_numpy()[:, far]
+    np.testing.assert_allclose(np.median(error / noise), np.sqrt(1 + 1 / 12), rtol=0.02)
+
+
+def test_means_of_many_profiles_keep_the_error_of_the_dark_signal() -> None:
+    wanted = {"elastic": {**ELASTIC, "channels": ["analog_532o"], "average": "2h"}}
+    raw = archive(count_rate(distance, constant=4e13), profiles=120)
+    errors = {}
+    for name, dark in (("without", None), ("with", _dark(profiles=3, ripple=0.0))):
+        found = carried(wanted, raw, channel="analog_532o", dark=dark)[ProductKind.ELASTIC]
+        assert found.sizes["time"] == 1
+        inside = between(2000, 3000)
+        errors[name] = np.nanmedian(found["backscatter_error_noise"].to_numpy()[0, inside])
+    # 120 profiles average down, 3 dark files do not: sqrt((1/120 + 1/3) / (1/120)).
+    assert errors["with"] / errors["without"] == pytest.approx(np.sqrt(41.0), rel=0.25)
+
+
+def _glued(raw: xr.Dataset, **analog: object) -> xr.Dataset:
+    channels = {
+        "photon_532o": {"dead_time": DEAD_TIME},
+        "analog_532o": {"noise_variance": 4e-4, **analog},
+    }
+    wanted = {"signal": {"channels": ["glued_532o"]}}
+    return carried(wanted, raw, channel="glued_532o", channels=channels)[ProductKind.SIGNAL]
+
+
+@pytest.mark.parametrize(
+    ("lag", "told"),
+    [
+        (6, {"lag": 6}),
+        (6, {"range_offset": -45.0}),
+        (-4, {"range_offset": 30.0}),
+        (6, {"lag": 4, "range_offset": -15.0}),
+        (0, {}),
+        (0, {"lag": "estimate"}),
+    ],
+)
+def test_a_lag_that_is_known_is_undone(lag: int, told: dict[str, object]) -> None:
+    """Whether the campaign gives the lag or the range of the analog bins."""
+    found = _glued(archive(lag=lag), **told)
+    score = (found["glue_slope"] - RATIO) / found["glue_slope_standard_error"]
+    assert abs(float(score.mean())) < 1.0
+    near = between(250, 600)
+    true = count_rate(distance) * distance**2
+    apart = found["signal"].to_numpy()[:, near] / true[near] - 1.0
+    assert np.abs(np.nanmean(apart, axis=0)).max() < 0.03
+    np.testing.assert_array_equal(found["range"], distance)
+
+
+def test_a_lag_that_is_not_known_shows_near_the_lidar() -> None:
+    found = _glued(archive(lag=6))
+    near = between(250, 600)
+    apart = found["signal"].to_numpy()[:, near] / (count_rate(distance) * distance**2)[near] - 1.0
+    assert np.abs(np.nanmean(apart, axis=0)).max() > 0.05
+
+
+def test_geometry_and_shots_go_with_every_product() -> None:
+    wanted = {
+        "signal": {"channels": ["photon_532o"]},
+        "homogeneous": {"channels": ["photon_532o"], "sections": [[1500, 4500]]},
+        "elastic": {**ELASTIC, "channels": ["photon_532o"]},
+    }
+    found = carried(wanted, archive().assign_coords(azimuth=("time", np.full(20, 40.0))))
+    assert list(found) == [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS, ProductKind.ELASTIC]
+    for data in found.values():
+        assert {"time", "time_bnds", "zenith_angle", "azimuth"} <= set(data.coords)
+        assert data["shots"].dims == ("time",)
+        assert all(array.chunks is None for array in data.variables.values())
+    assert int(found[ProductKind.SIGNAL]["shots"][0]) == SHOTS
+    assert int(found[ProductKind.ELASTIC]["shots"][0]) == 20 * SHOTS
+
+
+def test_only_what_the_plan_holds_is_made() -> None:
+    found = carried({"signal": {"channels": ["photon_532o"]}})
+    assert list(found) == [ProductKind.SIGNAL]
+
+
+def test_a_plan_that_says_yes_can_be_carried_out() -> None:
+    """The bins end just where the nearest reference window does."""
+    wanted = {"elastic": {**ELASTIC, "reference": {"lowest": 3002.5, "highest": 8000}}}
+    raw = archive(count_rate(7.5 * (np.arange(534) + 0.5)))
+    made = planned(campaign(wanted), bins=534)
+    names = [step.name for step in made.steps if step.channel == "photon_532o"]
+    if "elastic" in names:
+        assert carried(wanted, raw)[ProductKind.ELASTIC].sizes["time"] == 1
+
+
+@pytest.mark.parametrize("zenith", [0.0, 20.0, 30.0, 60.0])
+def test_a_single_window_that_the_plan_allows_is_found_at_any_angle(zenith: float) -> None:
+    window = {"lowest": 2500, "highest": 3500, "width": 1000, "relative_error": 0.0}
+    found = carried(
+        {"elastic": {**ELASTIC, "reference": window}}, archive(zenith=zenith), zenith_angle=zenith
+    )[ProductKind.ELASTIC]
+    climb = np.cos(np.deg2rad(zenith))
+    assert float(found["reference_bottom"][0]) * climb == pytest.approx(2500.0)
+    assert float(found["reference_top"][0]) * climb == pytest.approx(3500.0)
+
+
+def test_bins_nearer_than_full_overlap_are_flagged_and_not_retrieved_from() -> None:
+    wanted = {"signal": {"channels": ["photon_532o"]}, "elastic": ELASTIC}
+    for channel in ("photon_532o", "glued_532o"):
+        found = carried(wanted, channel=channel, full_overlap_range=450.0)
+        near = distance < 450.0
+        for kind, data in found.items():
+            hit = (data["quality_flag"].to_numpy() & int(Quality.INCOMPLETE_OVERLAP)) != 0
+            np.testing.assert_array_equal(hit, np.broadcast_to(near, hit.shape), err_msg=kind)
+        elastic = found[ProductKind.ELASTIC]["backscatter"].to_numpy()
+        assert np.isnan(elastic[:, near]).all()
+        assert np.isfinite(elastic[:, between(900, 3000)]).all()
+
+
+def test_the_background_is_found_as_the_campaign_asks() -> None:
+    dim = archive(count_rate(distance, constant=4e12), profiles=20)
+    kinds = {}
+    for way in ("known_shape", "tail_mean"):
+        wanted = {"elastic": {**ELASTIC, "background": way}}
+        kinds[way] = float(carried(wanted, dim)[ProductKind.ELASTIC]["background"][0])
+    left = count_rate(distance)[-120:].mean()
+    assert kinds["known_shape"] == pytest.approx(SKY, abs=0.2 * left)
+    assert kinds["tail_mean"] == pytest.approx(SKY + left, abs=0.2 * left)
+
+
+def test_counts_at_hand_are_not_those_of_the_caller():
+    lazy = archive(profiles=3)
+    bench = channel_steps.Bench(planned(campaign({"signal": {}})), lazy, None, NONE, STATION)
+    near = channel_steps.at_hand(bench, ["photon_532o"]).archive
+    assert isinstance(near["photon_532o"].data, np.ndarray)
+    assert isinstance(near["analog_532o"].data, da.Array)
+    assert isinstance(lazy["photon_532o"].data, da.Array)

@@ -1,0 +1,202 @@
+"""The table of variables against the CF tables, not against itself."""
+
+from __future__ import annotations
+
+import importlib.resources
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from compliance_checker.cfunits import Unit
+
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.netcdf.variables import PROVENANCE, Coverage, Row, attributes, station, units
+from lidarops.products.layouts import LAYOUTS
+from lidarops.records import DetectionMode, ProductKind
+
+ROWS = [
+    pytest.param(kind, row, id=f"{kind}-{row.name}")
+    for kind, layout in LAYOUTS.items()
+    for row in (*layout.coordinates, *layout.variables, station(profiles=True), PROVENANCE)
+]
+NAMED = [
+    pytest.param(value.values[1], id=str(value.id))
+    for value in ROWS
+    if value.values[1].standard_name
+]
+
+
+@pytest.fixture(scope="module")
+def standard_names() -> dict[str, str | None]:
+    """Standard name -> canonical unit, of the table that the compliance checker holds."""
+    source = importlib.resources.files("compliance_checker") / "data/cf-standard-name-table.xml"
+    table = ET.fromstring(source.read_text(encoding="utf-8"))
+    assert table.findtext("version_number") == "93"
+    # Aliases are elements of their own and so no names here.
+    return {entry.attrib["id"]: entry.findtext("canonical_units") for entry in table.iter("entry")}
+
+
+@pytest.mark.parametrize("row", NAMED)
+def test_standard_names_exist_and_their_units_convert(
+    row: Row, standard_names: dict[str, str | None]
+):
+    name, _, modifier = str(row.standard_name).partition(" ")
+    assert modifier in ("", "standard_error")
+    assert name in standard_names
+    canonical = standard_names[name]
+    if canonical:
+        # The canonical unit of time is s; a time coordinate counts from an epoch.
+        unit = units(row, DetectionMode.ANALOG).split(" since ")[0]
+        assert Unit(unit).is_convertible(Unit(canonical))
+    else:
+        assert row.units is None
+
+
+@pytest.mark.parametrize(("kind", "row"), ROWS)
+@pytest.mark.parametrize("mode", list(DetectionMode))
+def test_every_unit_is_one_and_no_placeholder_is_left(
+    kind: ProductKind, row: Row, mode: DetectionMode
+):
+    found = attributes(row, mode=mode)
+    assert found["long_name"]
+    assert found["coverage_content_type"] in set(Coverage)
+    assert "{" not in "".join(str(value) for value in found.values())
+    if row.dtype != "S1":
+        Unit(found["units"].split(" since ")[0])
+
+
+_CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular")
+
+
+def test_what_has_no_standard_name_is_what_the_table_does_not_know():
+    gluing = {"glue_slope", "glue_slope_standard_error", "glue_bottom", "glue_top"}
+    unnamed = {
+        kind: {row.name for row in layout.variables if not row.standard_name}
+        for kind, layout in LAYOUTS.items()
+    }
+    assert unnamed == {
+        ProductKind.SIGNAL: {
+            "signal",
+            "signal_standard_error",
+            "background",
+            "background_standard_error",
+            *gluing,
+        },
+        ProductKind.ELASTIC: {
+            *(f"backscatter_error_{cause}" for cause in _CAUSES),
+            "molecular_backscatter",
+            "molecular_extinction",
+            "reference_bottom",
+            "reference_top",
+            "cloud_base_range",
+            "background",
+            "background_standard_error",
+            "scattering_ratio",
+            "scattering_ratio_standard_error",
+            *gluing,
+        },
+        ProductKind.MULTIANGLE: {
+            *(
+                f"{quantity}{error}"
+                for quantity in ("optical_depth", "extinction", "layer_optical_depth")
+                for error in ("", "_standard_error", "_gradient_error")
+            ),
+            "monotone_optical_depth",
+            "reduced_chi2",
+            "log_intercept",
+            "log_intercept_standard_error",
+            "data_share",
+            "inhomogeneity",
+            "residual",
+            "effective_degrees_of_freedom",
+            "reach",
+        },
+        ProductKind.VISIBILITY: {
+            "visibility_in_air_lower",
+            "visibility_in_air_upper",
+            "extinction",
+            "extinction_standard_error",
+            "extinction_systematic_error",
+            "condition",
+            "optical_depth",
+            "reduced_chi2",
+            "degrees_of_freedom",
+            "prior_deviation",
+            "ray_range",
+        },
+        ProductKind.HOMOGENEOUS: {
+            "visibility_in_air_lower",
+            "visibility_in_air_upper",
+            "extinction",
+            "extinction_standard_error",
+            "extinction_model_error",
+            "amplitude",
+            "amplitude_standard_error",
+            "background",
+            "background_standard_error",
+            "background_model_error",
+            "reduced_chi2",
+        },
+    }
+
+
+def test_no_standard_name_means_total_extinction_in_air(standard_names: dict[str, str | None]):
+    known = {name for name in standard_names if name.startswith("volume_extinction_coefficient")}
+    assert known == {
+        "volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient_aerosol_particles",
+        "volume_extinction_coefficient_of_radiative_flux_in_air_due_to_cloud_particles",
+    }
+
+
+@pytest.mark.parametrize(
+    ("mode", "name", "unit"),
+    [
+        (DetectionMode.ANALOG, "signal", "mV m2"),
+        (DetectionMode.PHOTON, "signal", "MHz m2"),
+        (DetectionMode.ANALOG, "signal_standard_error", "mV m2"),
+        (DetectionMode.PHOTON, "background_standard_error", "MHz"),
+        (DetectionMode.ANALOG, "background", "mV"),
+    ],
+)
+def test_units_of_the_signal_follow_the_mode(mode: DetectionMode, name: str, unit: str):
+    assert attributes(LAYOUTS[ProductKind.SIGNAL].row(name), mode=mode)["units"] == unit
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=list(LAYOUTS))
+def test_ancillaries_and_flags_hang_together(layout):
+    names = [row.name for row in (*layout.coordinates, *layout.variables)]
+    assert len(set(names)) == len(names)
+    for row in layout.variables:
+        assert set(row.ancillaries) <= set(names)
+        if row.uncertain:
+            error = layout.row(f"{row.name}_standard_error")
+            assert row.ancillaries[0] == error.name
+            assert (error.units, error.dims, error.dtype) == (row.units, row.dims, row.dtype)
+            assert error.valid_min == 0
+    assert all(row.valid_min is None for row in layout.variables if row.uncertain)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=list(LAYOUTS))
+def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
+    row = layout.row("quality_flag")
+    found = attributes(row, mode=DetectionMode.ANALOG)
+    masks, meanings = found["flag_masks"], found["flag_meanings"].split()
+    assert masks.dtype == np.dtype(row.dtype)
+    assert len(masks) == len(meanings) == len(set(meanings))
+    assert all(mask > 0 and mask & (mask - 1) == 0 for mask in masks.tolist())
+    for mask, meaning in zip(masks.tolist(), meanings, strict=True):
+        bit = Quality[meaning.upper()]
+        assert bit == mask
+        assert f"{meaning} ({bit.severity.name.lower()}): {bit.description}" in found["comment"]
+
+
+def test_retrieved_quantities_keep_all_their_bits_and_signals_13():
+    bits = {row.name: row.significant_bits for row in LAYOUTS[ProductKind.SIGNAL].variables}
+    assert bits["signal"] == 13
+    assert all(row.significant_bits is None for row in LAYOUTS[ProductKind.HOMOGENEOUS].variables)
+
+
+def test_unknown_row_is_refused_with_the_choices():
+    with pytest.raises(ProductError, match=r"bogus.*extinction_standard_error"):
+        LAYOUTS[ProductKind.HOMOGENEOUS].row("bogus")

@@ -1,0 +1,42 @@
+"""What a product of scans may hold besides its profiles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.made_products import context, multiangle
+
+from lidarops.errors import ProductError
+from lidarops.products.layouts import build_product
+from lidarops.records import ProductKind
+
+
+def test_layers_have_their_errors():
+    product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
+    layer = product["layer_optical_depth"]
+    assert layer.dims == ("time", "layer")
+    np.testing.assert_allclose(layer[1:], 0.1, rtol=1e-3)
+    told = set(layer.attrs["ancillary_variables"].split())
+    assert {f"layer_optical_depth_{kind}_error" for kind in ("standard", "gradient")} == told
+    assert product["layer_optical_depth_gradient_error"].attrs["error_kind"] == "systematic"
+
+
+def test_layers_come_with_their_errors_and_places_or_not_at_all():
+    plain = build_product(multiangle(layers=False), context(ProductKind.MULTIANGLE))
+    assert not [name for name in plain.variables if str(name).startswith("layer")]
+    whole = multiangle()
+    named = ("layer_optical_depth_standard_error", "layer_optical_depth_gradient_error")
+    for name in (*named, "layer_altitude", "layer_bnds"):
+        with pytest.raises(ProductError) as caught:
+            build_product(whole.drop_vars(name), context(ProductKind.MULTIANGLE))
+        assert caught.value.field == name
+    bad = whole.assign(layer_optical_depth_standard_error=-whole["layer_optical_depth"])
+    with pytest.raises(ProductError, match="valid range"):
+        build_product(bad, context(ProductKind.MULTIANGLE))
+
+
+def test_each_optional_row_may_be_left_out():
+    for name in ("monotone_optical_depth", "reduced_chi2"):
+        product = build_product(multiangle().drop_vars(name), context(ProductKind.MULTIANGLE))
+        assert name not in product
+        assert name in build_product(multiangle(), context(ProductKind.MULTIANGLE))

@@ -1,0 +1,84 @@
+"""The ``visibility`` product: CF discrete sampling geometry, complete and compliant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.made_network import product as made
+from support.made_products import context
+from test_compliance import findings, permitted
+
+from lidarops.errors import ProductError
+from lidarops.flags import Quality
+from lidarops.netcdf.write import write
+from lidarops.products.layouts import LAYOUTS, build_product
+from lidarops.records import ProductKind
+
+KIND = ProductKind.VISIBILITY
+
+
+@pytest.fixture(scope="module")
+def data() -> xr.Dataset:
+    return made()
+
+
+@pytest.mark.parametrize("intervals", [1, 6])
+def test_it_complies(intervals: int, tmp_path: Path):
+    found = made(intervals)
+    path = tmp_path / "product.nc"
+    write(build_product(found, context(KIND)), path)
+    assert findings(path) == (set(), permitted(KIND, found))
+
+
+def test_nothing_but_missing_values_complies(data: xr.Dataset, tmp_path: Path):
+    lost = data.copy(deep=True)
+    lost["quality_flag"][:] = int(Quality.INPUT_MISSING)
+    for name, variable in lost.data_vars.items():
+        if variable.dtype.kind == "f" and name != "ray_range":
+            variable[...] = np.nan
+    path = tmp_path / "product.nc"
+    write(build_product(lost, context(KIND)), path)
+    assert findings(path) == (set(), permitted(KIND, lost))
+
+
+def test_each_vertex_is_a_time_series(data: xr.Dataset, tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write(build_product(data, context(KIND)), path)
+    with xr.open_dataset(path) as found:
+        assert found.attrs["featureType"] == "timeSeries"
+        roles = [name for name, v in found.variables.items() if "cf_role" in v.attrs]
+        assert roles == ["vertex_id"]
+        assert found["vertex_id"].dims == ("vertex",)
+        main = found["visibility_in_air"]
+        assert main.attrs["standard_name"] == "visibility_in_air"
+        assert main.attrs["units"] == "m"
+        assert main.dims == ("time", "vertex")
+        assert {"latitude", "longitude", "altitude", "vertex_id"} <= set(main.coords)
+        assert found.attrs["geospatial_lat_min"] == pytest.approx(float(data["latitude"].min()))
+        assert found.attrs["geospatial_lon_max"] == pytest.approx(float(data["longitude"].max()))
+        assert "POLYGON" in found.attrs["geospatial_bounds"]
+        # Where the lidars stand and point is told.
+        np.testing.assert_allclose(found["ray_azimuth"], [70, 310, 190])
+        np.testing.assert_allclose(found["ray_latitude"], data["ray_latitude"])
+        assert np.isfinite(found["ray_range"]).sum() == 6
+        assert "ray 0: lidar-0" in found.attrs["lidarops_steps"]
+        np.testing.assert_allclose(main, data["visibility_in_air"], rtol=2e-4)
+
+
+def test_a_value_may_not_be_missing_without_a_reason(data: xr.Dataset):
+    silent = data.copy(deep=True)
+    silent["extinction"][0, 0] = np.nan
+    with pytest.raises(ProductError, match="no quality bit"):
+        build_product(silent, context(KIND))
+
+
+def test_bits_are_those_that_a_network_can_raise(data: xr.Dataset):
+    flags = LAYOUTS[KIND].row("quality_flag").flags
+    assert flags is not None
+    strange = data.copy(deep=True)
+    strange["quality_flag"][0, 0] = int(Quality.CLOUD)
+    with pytest.raises(ProductError, match="cloud"):
+        build_product(strange, context(KIND))

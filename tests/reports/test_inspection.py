@@ -1,0 +1,79 @@
+"""What `lidarops inspect` shows of raw files and products."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import xarray as xr
+from support.made_products import MAKERS, context
+from typer.testing import CliRunner
+
+from lidarops.cli import app
+from lidarops.errors import LidarOpsError
+from lidarops.netcdf.write import write
+from lidarops.products.layouts import build_product
+from lidarops.records import ProductKind
+from lidarops.reports.inspection import describe, tables
+
+
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_products_tell_verdicts_bits_and_extremes(kind: ProductKind, tmp_path: Path):
+    data = MAKERS[kind]()
+    path = tmp_path / "product.nc"
+    write(build_product(data, context(kind)), path)
+    shown = CliRunner().invoke(app, ["inspect", str(path), "--json"])
+    assert shown.exit_code == 0
+    told = json.loads(shown.output)
+    assert told == describe(path)
+    assert told["attributes"]["lidarops_kind"] == kind
+    held = {each["name"]: each for each in told["variables"]}
+    with xr.open_dataset(path) as opened:
+        assert set(held) == set(opened.variables)
+        for name in opened.data_vars:
+            if opened[name].dtype.kind == "f" and opened[name].size and name in data:
+                assert held[name]["missing"] == int(opened[name].isnull().sum())
+                largest = None if opened[name].isnull().all() else float(opened[name].max())
+                assert held[name]["maximum"] == pytest.approx(largest)
+    counts = {each["name"]: each for each in told["quality"]}
+    size = data["quality_flag"].size
+    assert sum(counts[name]["values"] for name in ("good", "use_with_care", "do_not_use")) == size
+    good = int((data["quality_flag"] == 0).sum())
+    assert counts["good"]["values"] == good
+    table = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"})
+    assert all(word in table.output for word in ("Variables", "Quality", "do_not_use", "units"))
+
+
+def test_raw_files_tell_all_their_channels(demo_archive: Path):
+    path = sorted((demo_archive / "hill").glob("v*"))[0]
+    shown = CliRunner().invoke(app, ["inspect", str(path), "--json"])
+    told = json.loads(shown.output)
+    assert told["type"] == "raw"
+    assert told["start"].startswith("2024-09-2")
+    assert {"analog_532o", "photon_532o"} <= {each["name"] for each in told["channels"]}
+    widths = {each["name"]: (each["bins"], each["bin_width"]) for each in told["channels"]}
+    assert set(widths.values()) == {(4000, 7.5)}, widths
+    green = {each["wavelength"] for each in told["channels"] if "532" in each["name"]}
+    assert list(green) == [pytest.approx(532e-9)]
+    _, channels = tables(path)
+    for column in channels.columns:
+        assert any(str(cell) for cell in column.cells), column.header
+    table = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"})
+    assert all(word in table.output for word in ("Channels", "photon_532o", "zenith angle"))
+
+
+def test_foreign_netcdf_is_shown_too(tmp_path: Path):
+    path = tmp_path / "other.nc"
+    xr.Dataset({"x": ("n", [1.0, float("nan")])}).to_netcdf(path)
+    told = describe(path)
+    assert told["quality"] == []
+    assert told["variables"][0]["missing"] == 1
+    assert CliRunner().invoke(app, ["inspect", str(path)]).exit_code == 0
+
+
+def test_what_is_neither_is_refused(tmp_path: Path):
+    path = tmp_path / "text.txt"
+    path.write_text("nothing")
+    with pytest.raises(LidarOpsError, match=r"text\.txt"):
+        describe(path)

@@ -1,0 +1,157 @@
+"""The elastic inversion of published simulations, the intercomparisons of EARLINET."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidarops.raw import licel
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.elastic.inversion import solve
+
+GREEN = 532e-9
+
+
+def within(r, window):
+    return (r >= window[0]) & (r <= window[1])
+
+
+def sounding(folder, columns):
+    rows = np.loadtxt(folder / "molecular_profile_hPa.csv", delimiter=",")
+    altitude, pressure, temperature = (rows[:, columns.index(name)] for name in "zpT")
+    return MolecularProfile.from_profile(altitude, pressure, temperature, pressure_unit="hPa")
+
+
+def green_counts(path):
+    return licel.read_counts(path, ["analog_532o"])[1]["analog_532o"].astype(np.float64)
+
+
+def clear_shape(clear, r):
+    """Attenuated backscatter of air over range squared."""
+    extinction = clear["molecular_extinction"]
+    steps = 0.5 * (extinction[1:] + extinction[:-1]) * np.diff(r)
+    depth = extinction[0] * r[0] + np.concatenate([[0.0], np.cumsum(steps)])
+    return clear["molecular_backscatter"] * np.exp(-2.0 * depth) / r**2
+
+
+def line(shape, values, variance):
+    """Return the coefficients of a constant and a shape, and their covariance."""
+    design = np.stack([np.ones_like(shape), shape], axis=-1)
+    weighted = design / variance[:, np.newaxis]
+    covariance = np.linalg.inv(weighted.T @ design)
+    return covariance @ (weighted.T @ values), covariance
+
+
+GREEN_MAXIMUM = 1.9093e7
+"""Counts at the maximum of the 532 nm signal of the set."""
+
+
+@pytest.fixture(scope="module")
+def boeckmann(data_root):
+    folder = data_root / "synthetic/boeckmann"
+    r = 15.0 * (np.arange(1005) + 0.5)
+    profile = sounding(folder, "pTz")
+    clear = {
+        "molecular_backscatter": profile.backscatter(r, GREEN),
+        "molecular_extinction": profile.extinction(r, GREEN),
+    }
+    clean = green_counts(folder / "noise_free.licel")
+    clean = clean / clean.max() * GREEN_MAXIMUM
+    setup = {**clear, "lidar_ratio": 39.0, "reference": (7e3, 8e3)}
+    overlap = r > 400.0
+    clean[~overlap] = np.nan
+    return folder, r, clear, clean, setup
+
+
+@pytest.mark.parametrize("level", [0, 2, 4, 6, 8])
+def test_boeckmann_set_is_found_or_said_to_be_uncertain(boeckmann, level):
+    folder, r, clear, clean, setup = boeckmann
+    truth = solve(clean, r, **setup).backscatter
+    assert np.all(np.isfinite(truth[r > 400.0]))
+
+    raw = green_counts(folder / f"background_1e{level}.licel")
+    total = raw / raw.max() * (GREEN_MAXIMUM + 10.0**level)
+    power = np.where(r > 400.0, total, np.nan)
+    # Weights that follow from a model, not from each bin's own noise.
+    variance = (np.nan_to_num(clean) + 10.0**level) / 1000.0
+    far = r > 9e3
+    phi = clear_shape(clear, r)
+    found_line, covariance = line(phi[far] / phi[far].mean(), power[far], variance[far])
+    background_error = np.sqrt(covariance[0, 0])
+    assert abs(found_line[0] - true_background(r, clean, total, level)) < max(
+        1.0, 3.5 * background_error
+    )
+
+    found = solve(
+        power - found_line[0], r, **setup, variance=variance,
+        background_standard_error=background_error,
+    )  # fmt: skip
+    near = within(r, (500.0, 6e3))
+    if level <= 5:
+        assert np.all(found.valid[near])
+        bias = np.mean(found.backscatter[near] - truth[near]) / np.mean(truth[near])
+        assert abs(bias) < 0.01
+    deviation = (found.backscatter - truth) / found.backscatter_standard_error
+    told = near & found.valid
+    if np.any(told):
+        assert np.sqrt(np.mean(deviation[told] ** 2)) < 2.0
+    if level == 8:
+        assert np.all(found.unstable[within(r, (7e3, 8e3))])
+
+
+def true_background(r, clean, total, level):
+    """The background of a file by the noise-free signal, as the scale is not known exactly."""
+    use = np.arange(r.size) >= 60
+    variance = (clean + 10.0**level)[use] / 1000.0
+    return line(clean[use], total[use], variance)[0][0]
+
+
+@pytest.fixture(scope="module")
+def pappalardo(data_root):
+    folder = data_root / "synthetic/pappalardo"
+    files = sorted(folder.glob("*.licel"))
+    counts = np.stack([green_counts(file) for file in files])
+    r = 15.0 * (np.arange(counts.shape[1]) + 0.5)
+    profile = sounding(folder, "zTp")
+    return r, counts, {
+        "molecular_backscatter": profile.backscatter(r, GREEN),
+        "molecular_extinction": profile.extinction(r, GREEN),
+        "lidar_ratio": 65.41,
+        "reference": (7e3, 9e3),
+    }  # fmt: skip
+
+
+def test_pappalardo_files_agree_within_their_errors(pappalardo):
+    """Each file against the mean of all others, whose noise is 3.7 times less."""
+    r, counts, setup = pappalardo
+    near = within(r, (500.0, 5e3))
+    x = np.where(r > 300.0, counts, np.nan)
+    deviations = []
+    for k in range(len(x)):
+        others = np.delete(x, k, axis=0).mean(axis=0)
+        variance = np.maximum(np.nan_to_num(others), 1.0 / (len(x) - 1))
+        one = solve(x[k], r, **setup, variance=variance)
+        rest = solve(others, r, **setup, variance=variance / (len(x) - 1))
+        assert np.all(one.valid[near])
+        error = np.hypot(one.backscatter_standard_error, rest.backscatter_standard_error)
+        deviations.append(((one.backscatter - rest.backscatter) / error)[near])
+    deviations = np.array(deviations)
+    assert np.mean(np.abs(deviations) < 3.0) > 0.994
+    assert 0.95 < np.std(deviations) < 1.05
+    # The mean of each file is as good as its own error of the reference allows.
+    assert np.max(np.abs(deviations.mean(axis=1))) < 3.0
+
+
+def test_pappalardo_particles_do_not_depend_on_the_reference_in_clean_air(pappalardo):
+    r, counts, setup = pappalardo
+    total = np.where(r > 300.0, counts.sum(axis=0), np.nan)
+    variance = np.maximum(np.nan_to_num(total), 1.0)
+    near = within(r, (500.0, 5e3))
+    solutions = [
+        solve(total, r, **setup | {"reference": window}, variance=variance)
+        for window in ((7e3, 8.5e3), (8.5e3, 10e3), (10e3, 12e3))
+    ]
+    for other in solutions[1:]:
+        error = np.hypot(solutions[0].budget.total, other.budget.total)
+        difference = np.abs(other.backscatter - solutions[0].backscatter)
+        assert np.all(difference[near] < 3.0 * error[near])

@@ -1,0 +1,221 @@
+"""The reference window: found in clean air, refused with reasons, not drawn by fluctuations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.elastic.inversion import solve
+from lidarops.retrieve.elastic.reference_window import Rejection, candidate_windows, choose
+
+AIR = MolecularProfile.us_standard()
+RANGE = 15.0 * (np.arange(900) + 0.5)[20:]
+BACKSCATTER = AIR.backscatter(RANGE, 532e-9)
+EXTINCTION = AIR.extinction(RANGE, 532e-9)
+SHAPE = BACKSCATTER * np.exp(-2.0 * np.cumsum(EXTINCTION) * 15.0) / RANGE**2
+WINDOWS = candidate_windows(3e3, 12e3, 1e3, 250.0)
+CLEAN = {"molecular_attenuated": SHAPE, "candidates": WINDOWS}
+
+
+def attenuated(particles, lidar_ratio=50.0):
+    depth = np.cumsum(EXTINCTION + lidar_ratio * particles, axis=-1) * 15.0
+    return (BACKSCATTER + particles) * np.exp(-2.0 * depth) / RANGE**2
+
+
+def layered(count, rng):
+    """Mixed layers of all depths and, in most profiles, a layer aloft up to 7 km."""
+    top, soft = rng.uniform(800.0, 2500.0, (2, count, 1)) * np.array([1.0, 0.05])[:, None, None]
+    mixed = 10.0 ** rng.uniform(-6.5, -5.3, (count, 1)) / (1.0 + np.exp((RANGE - top) / soft))
+    height, width = rng.uniform(2e3, 6e3, (count, 1)), rng.uniform(150.0, 500.0, (count, 1))
+    strength = rng.uniform(0.0, 1.3, (count, 1)) * np.interp(height, RANGE, BACKSCATTER)
+    return mixed + strength * np.exp(-0.5 * ((RANGE - height) / width) ** 2)
+
+
+def counted(expected, background, rng):
+    """Photon counts less their background, and their variance."""
+    counts = rng.poisson(expected + background)
+    return counts - background, np.broadcast_to(expected + background, counts.shape)
+
+
+def mean_over(values, window):
+    bottom, top = window
+    return values[..., np.logical_and(bottom <= RANGE, top >= RANGE)].mean(axis=-1)
+
+
+@pytest.mark.parametrize("counts", [1e17, 1e18, 1e19])
+def test_chosen_windows_hold_few_particles(counts):
+    rng = np.random.default_rng(1)
+    true = attenuated(layered(600, rng))
+    found = choose(*three(counted(counts * true, 2.0, rng)), **CLEAN)
+    assert np.all(found.chosen)
+    ratio = true / SHAPE
+    clean = mean_over(ratio, (11e3, 12e3))
+    excess = [
+        mean_over(one, (a, b)) / c - 1.0
+        for one, a, b, c in zip(ratio, found.bottom, found.top, clean, strict=True)
+    ]
+    # What is left cannot be told from air by the power of the windows.
+    relative = found.scale_standard_error / found.scale
+    assert np.percentile(excess / relative, 95) < 3.0
+    assert np.percentile(excess, 95) < 0.01
+
+
+def three(powers):
+    return powers[0], RANGE, powers[1]
+
+
+def test_choice_is_hardly_drawn_by_fluctuations():
+    rng = np.random.default_rng(2)
+    expected = np.broadcast_to(3e17 * SHAPE, (4000, RANGE.size))
+    found = choose(*three(counted(expected, 5.0, rng)), **CLEAN)
+    assert np.mean(found.chosen) > 0.999
+    deviation = (found.scale / 3e17 - 1.0) / (found.scale_standard_error / found.scale)
+    usable = deviation[found.chosen]
+    assert abs(np.mean(usable)) < 0.15
+    assert np.std(usable) < 1.1
+
+
+def test_scale_and_slope_are_those_of_a_weighted_fit():
+    rng = np.random.default_rng(3)
+    power, variance = counted(1e18 * SHAPE, 30.0, rng)
+    found = choose(power, RANGE, variance, molecular_attenuated=SHAPE, candidates=[[6e3, 8e3]])
+    inside = (RANGE >= 6e3) & (RANGE <= 8e3)
+    p, phi, v, z = power[inside], SHAPE[inside], variance[inside], RANGE[inside] - 7e3
+    flat = np.sum(p * phi / v) / np.sum(phi**2 / v)
+    assert found.scale == pytest.approx(flat, rel=1e-10)
+    assert found.scale_standard_error == pytest.approx(np.sum(phi**2 / v) ** -0.5, rel=1e-10)
+    chi_square = np.sum((p - flat * phi) ** 2 / v)
+    assert found.reduced_chi_square == pytest.approx(chi_square / (p.size - 1), rel=1e-9)
+
+    def fit(powers):
+        design = (phi[:, np.newaxis] * z[:, np.newaxis] ** powers) / np.sqrt(v)[:, np.newaxis]
+        covariance = np.linalg.inv(design.T @ design)
+        return covariance @ (design.T @ (p / np.sqrt(v))), covariance
+
+    coefficients, covariance = fit(np.arange(2))
+    assert found.slope == pytest.approx(coefficients[1] / flat, rel=1e-8)
+    assert found.slope_standard_error == pytest.approx(covariance[1, 1] ** 0.5 / flat, rel=1e-8)
+    coefficients, covariance = fit(np.arange(3))
+    assert found.curvature == pytest.approx(coefficients[2] / covariance[2, 2] ** 0.5, rel=1e-6)
+
+
+def test_clean_windows_pass_at_the_rate_of_the_tests():
+    rng = np.random.default_rng(4)
+    spread = 0.05 * SHAPE
+    power = SHAPE + spread * rng.standard_normal((4000, RANGE.size))
+    found = choose(
+        power, RANGE, spread**2, molecular_attenuated=SHAPE, candidates=[[6e3, 7e3]],
+        most_deviation=2.0,
+    )  # fmt: skip
+    for reason in (Rejection.SLOPE, Rejection.CURVATURE):
+        rate = np.mean((found.rejections[:, 0] & reason) != 0)
+        assert rate == pytest.approx(2.0 * stats.norm.sf(2.0), abs=0.012)
+    freedom = 66 - 1
+    expected = stats.chi2.sf(freedom * (1.0 + 2.0 * np.sqrt(2.0 / freedom)), freedom)
+    rate = np.mean((found.rejections[:, 0] & Rejection.SCATTER) != 0)
+    assert rate == pytest.approx(expected, abs=0.012)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda z: np.exp(-(z - 7e3) / 4e3), Rejection.SLOPE),
+        (lambda z: 1.0 + 0.6 * ((z - 7e3) / 1e3) ** 2, Rejection.CURVATURE),
+        (lambda z: np.where((z > 6.4e3) & (z < 6.5e3), 1.4, 1.0), Rejection.SCATTER),
+        (lambda z: 1e-3 * np.ones_like(z), Rejection.LOW_SIGNAL),
+        (lambda z: np.where(z > 6.45e3, np.nan, 1.0), Rejection.TOO_FEW_BINS),
+    ],
+)
+def test_each_fault_is_told_and_nothing_is_chosen(spoil, reason):
+    rng = np.random.default_rng(5)
+    spread = 0.03 * SHAPE
+    power = SHAPE * spoil(RANGE) + spread * rng.standard_normal(RANGE.size)
+    found = choose(power, RANGE, spread**2, molecular_attenuated=SHAPE, candidates=[6e3, 7e3 + 900])
+    assert not found.chosen
+    assert found.index == -1
+    assert found.rejections[0] & reason
+    for value in (found.bottom, found.top, found.scale, found.slope, found.curvature):
+        assert np.isnan(value)
+
+
+def test_excluded_bins_bar_their_windows():
+    power = 1e18 * SHAPE
+    exclude = (RANGE > 3.5e3) & (RANGE < 5e3)
+    free = choose(power, RANGE, power, **CLEAN)
+    barred = choose(power, RANGE, power, **CLEAN, exclude=exclude)
+    assert free.bottom == 3e3
+    assert barred.bottom == 5e3
+    touched = (WINDOWS[:, 0] < 5e3) & (WINDOWS[:, 1] > 3.5e3)
+    assert np.array_equal((barred.rejections & Rejection.EXCLUDED) != 0, touched)
+
+
+def test_a_window_in_a_steady_layer_gives_way_to_cleaner_air():
+    # Backscatter of air times 1.2 from 3 to 6 km has the shape of air but for its extinction.
+    particles = np.where((RANGE > 3e3) & (RANGE < 6e3), 0.2 * BACKSCATTER, 0.0)
+    true = 1e19 * attenuated(particles, lidar_ratio=8.4)
+    rng = np.random.default_rng(6)
+    found = choose(*three(counted(true, 1.0, rng)), **CLEAN, most_deviation=4.0)
+    assert found.bottom >= 6e3
+    inside = WINDOWS[:, 1] <= 6e3
+    told = found.rejections[inside]
+    assert np.all(told != 0)
+
+
+def test_profiles_are_chosen_alone_and_their_windows_fit_the_inversion():
+    rng = np.random.default_rng(7)
+    true = attenuated(layered(20, rng))
+    power, variance = counted(1e19 * true, 2.0, rng)
+    power = power.astype(float)
+    power[3] = np.nan
+    power[5] = rng.standard_normal(RANGE.size)
+    whole = choose(power.reshape(4, 5, -1), RANGE, variance.reshape(4, 5, -1), **CLEAN)
+    assert whole.chosen.shape == (4, 5)
+    assert whole.rejections.shape == (4, 5, len(WINDOWS))
+    assert not whole.chosen[0, 3]
+    assert not whole.chosen[1, 0]
+    assert np.all(whole.rejections[0, 3] == Rejection.TOO_FEW_BINS)
+    alone = choose(power[7], RANGE, variance[7], **CLEAN)
+    assert alone.scale == whole.scale[1, 2]
+    turned = choose(
+        power[7, ::-1], RANGE[::-1], variance[7, ::-1], molecular_attenuated=SHAPE[::-1],
+        candidates=WINDOWS,
+    )  # fmt: skip
+    assert turned.scale == alone.scale
+
+    found = solve(
+        power, RANGE, molecular_backscatter=BACKSCATTER, molecular_extinction=EXTINCTION,
+        lidar_ratio=50.0, reference=tuple(edge.reshape(20) for edge in whole.edges),
+    )  # fmt: skip
+    assert np.array_equal(found.calibrated, whole.chosen.reshape(20))
+
+
+def test_candidates_are_made_within_their_bounds():
+    windows = candidate_windows(3e3, 6e3, 1e3, 500.0)
+    assert windows.tolist() == [[3000 + 500 * k, 4000 + 500 * k] for k in range(5)]
+    for bad in ((6e3, 3e3, 1e3, 500.0), (3e3, 3.5e3, 1e3, 1e2), (0.0, 1e4, 1e3, 0.0)):
+        with pytest.raises(RetrievalInputError, match="window"):
+            candidate_windows(*bad)
+    with pytest.raises(RetrievalInputError, match="larger step"):
+        candidate_windows(0.0, 1e5, 1e3, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"candidates": [[20e3, 21e3]]}, "candidates"),
+        ({"candidates": [[8e3, 7e3]]}, "candidates"),
+        ({"candidates": [1.0, 2.0, 3.0]}, "candidates"),
+        ({"molecular_attenuated": -SHAPE}, "molecular_attenuated"),
+        ({"exclude": np.zeros(RANGE.size)}, "exclude"),
+        ({"exclude": np.zeros(3, dtype=bool)}, "exclude"),
+        ({"most_deviation": 0.0}, "most_deviation"),
+        ({"least_signal": -1.0}, "least_signal"),
+    ],
+)
+def test_impossible_arguments_are_refused_by_name(change, field):
+    with pytest.raises(RetrievalInputError) as caught:
+        choose(SHAPE, RANGE, SHAPE**2, **{**CLEAN, **change})
+    assert caught.value.field == field

@@ -1,0 +1,78 @@
+"""Tests of a homogeneous path for shapes that its model lacks, on their own terms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.oracle_homogeneous import section, signal
+
+from lidarops.flags import Quality
+from lidarops.retrieve.homogeneous._fit_quality import FALSE_ALARM
+from lidarops.retrieve.homogeneous.path_fit import solve
+
+KM = 1e-3
+BIT = int(Quality.NOT_HOMOGENEOUS)
+ENERGY = stats.chi2.isf(0.5 * FALSE_ALARM, 5)
+SQUARE = stats.norm.isf(0.25 * FALSE_ALARM)
+
+
+def along_square(r, power, found):
+    """Return the residuals along what three tangents leave over of the squared shape."""
+    out = []
+    for values, extinction in zip(power, found.extinction, strict=True):
+        shape = signal(r, 1.0, extinction)
+        x = (r - r[0]) / np.ptp(r)
+        model = np.linalg.qr(np.stack([np.ones_like(r), shape, shape * x], axis=1))[0]
+        square = shape**2
+        for _ in range(2):
+            square = square - model @ (model.T @ square)
+        fit = np.linalg.lstsq(np.stack([np.ones_like(r), shape], axis=1), values, rcond=None)[0]
+        residual = values - fit[0] - fit[1] * shape
+        out.append(residual @ square / np.linalg.norm(square))
+    return np.array(out)
+
+
+def cut(r, height, extinction, top, count, seed):
+    """Return profiles whose signal is cut off at a share of its first bin."""
+    profile = np.minimum(signal(r, height, extinction), top * height)
+    return 370.0 + profile + np.random.default_rng(seed).standard_normal((count, r.size))
+
+
+@pytest.mark.parametrize(
+    ("length", "height", "extinction", "top"),
+    [
+        (1700.0, 60.0, 0.5 * KM, 0.95),
+        (8000.0, 35.0, 3.0 * KM, 0.8),
+        (8000.0, 50.0, 6.0 * KM, 0.8),
+    ],
+)
+def test_the_bit_is_that_of_energy_and_square(length, height, extinction, top):
+    r = section(2500.0, length)
+    power = cut(r, height, extinction, top, 400, seed=11)
+    found = solve(power, r, variance=1.0)
+    square = np.abs(along_square(r, power, found))
+    clear = np.abs(square - SQUARE) > 0.02
+    raised = (found.quality & BIT) != 0
+    expected = (found.curvature_misfit > ENERGY) | (square > SQUARE)
+    np.testing.assert_array_equal(raised[clear], expected[clear])
+    assert 0.05 < np.mean(raised) < 0.95
+
+
+@pytest.mark.parametrize("variance", [1.0, None])
+@pytest.mark.parametrize("extinction", [0.0, 0.3 * KM, 5.0 * KM])
+def test_false_alarms_of_both_are_as_rare_as_those_of_one(variance, extinction):
+    r = section(2500.0, 8000.0)
+    power = cut(r, 100.0, extinction, np.inf, 40_000, seed=12)
+    found = solve(power, r, variance=variance)
+    assert 1e-4 < np.mean((found.quality & BIT) != 0) < 8e-4
+
+
+def test_a_top_that_is_cut_off_is_seen_more_often_than_by_energy():
+    r = section(2500.0, 8000.0)
+    power = cut(r, 50.0, 6.0 * KM, 0.8, 4000, seed=13)
+    found = solve(power, r, variance=1.0)
+    by_energy = np.mean(found.curvature_misfit > stats.chi2.isf(FALSE_ALARM, 5))
+    seen = np.mean((found.quality & BIT) != 0)
+    assert by_energy > 0.05
+    assert seen > 2.0 * by_energy

@@ -1,0 +1,267 @@
+"""The xarray layer: the same bits as numpy, whatever the chunks; units and dimensions checked."""
+
+from __future__ import annotations
+
+import dask
+import numpy as np
+import pytest
+import xarray as xr
+from support.oracle_homogeneous import signal
+
+import lidarops
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.background import cubic_and_tail
+from lidarops.retrieve.homogeneous import labeled, path_fit
+from lidarops.retrieve.signal import labeled as labeled_signal
+
+RANGE = np.arange(1, 401) * 30.0
+SECTIONS = [(1500.0, 6000.0), (3000.0, 12000.0), (6000.0, 9000.0)]
+VALUES = [
+    "background",
+    "background_standard_error",
+    "amplitude",
+    "amplitude_standard_error",
+    "extinction",
+    "extinction_standard_error",
+    "reduced_chi2",
+    "valid_bins",
+]
+
+
+@pytest.fixture
+def power():
+    rng = np.random.default_rng(0)
+    values = 50.0 + signal(RANGE, 3e6, 5e-5) + rng.normal(size=(2, 13, RANGE.size))
+    values[0, 3, 100:130] = np.nan
+    values[1, 7] = np.nan
+    return xr.DataArray(
+        values,
+        dims=("channel", "time", "range"),
+        coords={
+            "range": ("range", RANGE, {"units": "m"}),
+            "time": np.arange(13),
+            "channel": ["a", "b"],
+        },
+        attrs={"units": "mV"},
+    )
+
+
+def in_section(array, near, far):
+    first, past = np.searchsorted(RANGE, [near, far])
+    return np.asarray(array)[..., first:past], RANGE[first:past]
+
+
+def test_result_is_that_of_numpy_for_each_section(power):
+    found = labeled.homogeneous(power, sections=SECTIONS, variance=1.0)
+    assert found["extinction"].dims == ("channel", "time", "section")
+    for k, edges in enumerate(SECTIONS):
+        expected = path_fit.solve(*in_section(power, *edges), variance=1.0)
+        for name in VALUES:
+            np.testing.assert_array_equal(found[name][..., k], getattr(expected, name))
+        np.testing.assert_array_equal(found["quality_flag"][..., k], expected.quality)
+    np.testing.assert_allclose(found["extinction"].median("time")[:, 0], 5e-5, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    "chunks",
+    [
+        {"time": 1, "channel": 1, "range": -1},
+        {"time": 5, "channel": 2, "range": 64},
+        {"time": (1, 7, 5), "channel": -1, "range": 13},
+    ],
+)
+@pytest.mark.parametrize("method", ["auto", "cubic"])
+def test_any_chunking_gives_the_same_bits_lazily(power, chunks, method):
+    rng = np.random.default_rng(1)
+    variance = power.copy(data=rng.uniform(0.5, 2.0, power.shape))
+    bits = rng.choice([0, Quality.PILE_UP], power.shape, p=[0.9, 0.1]).astype(np.int32)
+    quality = power.copy(data=bits)
+    expected = labeled.homogeneous(
+        power, sections=SECTIONS, variance=variance, quality=quality, method=method
+    )
+    found = labeled.homogeneous(
+        power.chunk(chunks),
+        sections=SECTIONS,
+        variance=variance.chunk({"time": 4}),
+        quality=quality,
+        method=method,
+    )
+    assert all(dask.is_dask_collection(found[name]) for name in found.data_vars)
+    xr.testing.assert_identical(found.compute(scheduler="synchronous"), expected)
+    assert found["quality_flag"].dtype == expected["quality_flag"].dtype == np.int32
+    assert found["valid_bins"].dtype == np.int32
+
+
+def test_threads_give_the_same_bits(power):
+    lazy = labeled.homogeneous(power.chunk({"time": 2}), sections=SECTIONS, variance=1.0)
+    xr.testing.assert_identical(
+        lazy.compute(scheduler="threads", num_workers=2),
+        labeled.homogeneous(power, sections=SECTIONS, variance=1.0),
+    )
+
+
+def test_bad_bins_are_left_out_and_their_bits_carried(power):
+    quality = xr.zeros_like(power, dtype=np.int32)
+    quality[0, 0, 60:90] = Quality.SATURATED
+    quality[0, 1, 60:70] = Quality.INCOMPLETE_OVERLAP
+    quality[0, 2, 60:70] = Quality.INPUT_MISSING
+    quality[0, 4, 60:90] = Quality.PILE_UP
+    spoiled = xr.where(quality & labeled.EXCLUDED, 1e6, power).transpose(*power.dims)
+    spoiled["range"].attrs = power["range"].attrs
+    found = labeled.homogeneous(spoiled, sections=SECTIONS[:2], variance=1.0, quality=quality)
+    clean = labeled.homogeneous(power, sections=SECTIONS[:2], variance=1.0)
+
+    masked = np.where((quality & labeled.EXCLUDED) != 0, np.nan, power)
+    expected = path_fit.solve(*in_section(masked, *SECTIONS[0]), variance=1.0)
+    np.testing.assert_array_equal(found["extinction"][..., 0], expected.extinction)
+    carried = found["quality_flag"][0, :, 0] & labeled.CARRIED
+    assert carried[0] == Quality.SATURATED
+    assert carried[1] == Quality.INCOMPLETE_OVERLAP
+    assert carried[2] == 0
+    assert carried[4] == Quality.PILE_UP
+    assert found["extinction"][0, 4, 0] == clean["extinction"][0, 4, 0]
+    # The second section begins beyond the spoiled bins.
+    np.testing.assert_array_equal(found["extinction"][..., 1], clean["extinction"][..., 1])
+    assert not np.any(found["quality_flag"][0, :3, 1] & labeled.CARRIED)
+
+
+@pytest.mark.parametrize("dims", [("range",), ("time", "range"), ("time",), ("channel", "time")])
+def test_variance_may_lack_dimensions(power, dims):
+    shape = [power.sizes[dim] for dim in dims]
+    values = np.random.default_rng(2).uniform(0.5, 2.0, shape)
+    variance = xr.DataArray(values, dims=dims)
+    full = variance.broadcast_like(power).transpose(*power.dims)
+    expected = labeled.homogeneous(power, sections=SECTIONS, variance=full)
+    found = labeled.homogeneous(power, sections=SECTIONS, variance=variance)
+    # A variance that all profiles share is solved another way, to the same end.
+    for name in ("background", "amplitude", "extinction"):
+        apart = abs(found[name] - expected[name])
+        error = expected[f"{name}_standard_error"]
+        assert (apart < 0.01 * error).where(error.notnull(), other=True).all()
+    chunked = labeled.homogeneous(
+        power.chunk({"time": 3}), sections=SECTIONS, variance=variance.chunk()
+    )
+    xr.testing.assert_identical(chunked.compute(scheduler="synchronous"), found)
+
+
+def test_coordinates_and_units_describe_the_sections(power):
+    found = labeled.homogeneous(power, sections=SECTIONS)
+    assert found["section"].to_numpy().tolist() == [0, 1, 2]
+    assert found["section_range"].to_numpy().tolist() == [3750.0, 7500.0, 7500.0]
+    np.testing.assert_array_equal(found["section_bounds"], SECTIONS)
+    assert found["section_bounds"].dims == ("section", "nv")
+    units = {name: found[name].attrs["units"] for name in VALUES[:-1]}
+    assert units["background"] == units["background_standard_error"] == "mV"
+    assert units["amplitude"] == "mV m2"
+    assert units["extinction_standard_error"] == "m-1"
+    assert {"time", "channel"} <= set(found.coords)
+    plain = power.copy()
+    plain.attrs = {}
+    assert labeled.homogeneous(plain, sections=SECTIONS)["amplitude"].attrs["units"] == "m2"
+
+
+def test_single_profile_and_descending_range(power):
+    one = power.isel(channel=0, time=0)
+    found = labeled.homogeneous(one, sections=SECTIONS, variance=1.0)
+    assert found["extinction"].dims == ("section",)
+    turned = labeled.homogeneous(one[::-1], sections=SECTIONS, variance=1.0)
+    np.testing.assert_array_equal(found["extinction"], turned["extinction"])
+
+
+def test_near_is_inside_and_far_is_not(power):
+    found = labeled.homogeneous(power, sections=[(1500.0, 3000.0)])
+    assert found["valid_bins"].max() == 50
+
+
+def with_units(power, units):
+    changed = power.copy()
+    changed["range"] = changed["range"].assign_attrs({"units": units})
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "field", "words"),
+    [
+        (lambda p: with_units(p, "km"), {}, "range", "'km'"),
+        (lambda p: p.assign_coords(range=RANGE), {}, "range", "no attribute units"),
+        (lambda p: p.rename(range="height"), {}, "power", "dimension range"),
+        (lambda p: p.drop_vars("range"), {}, "power", "coordinate"),
+        (lambda p: p[..., [1, 0, *range(2, 400)]], {}, "range", "monotonic"),
+        (lambda p: p, {"sections": []}, "sections", "pairs"),
+        (lambda p: p, {"sections": [(2000.0, 1000.0)]}, "sections", "near first"),
+        (lambda p: p, {"sections": [(13000.0, 15000.0)]}, "sections", "30 to 12000 m"),
+        (lambda p: p, {"sections": [(3000.0, 3080.0)]}, "sections", "3 bins"),
+        (lambda p: p, {"method": "fernald"}, "method", "cubic"),
+        (lambda p: p, {"variance": -1.0}, "variance", "negative"),
+        (lambda p: p, {"variance": "misaligned"}, "variance", "does not fit"),
+        (lambda p: p, {"quality": "extra"}, "quality", "dimensions"),
+    ],
+)
+def test_arguments_that_cannot_be_right_are_refused(power, change, arguments, field, words):
+    arguments = {"sections": SECTIONS} | arguments
+    if arguments.get("variance") == "misaligned":
+        arguments["variance"] = xr.ones_like(power).assign_coords(time=np.arange(13) + 1)
+    if arguments.get("quality") == "extra":
+        arguments["quality"] = xr.zeros_like(power, dtype=np.int32).expand_dims(angle=2)
+    with pytest.raises(RetrievalInputError, match=words) as caught:
+        labeled.homogeneous(change(power), **arguments)
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_tail_mean_is_that_of_numpy(power, chunked):
+    given = power.chunk({"time": 3, "range": 50}) if chunked else power
+    variance = xr.full_like(power, 2.0)
+    found = labeled.tail_mean(given, start=9000.0, variance=variance)
+    expected = cubic_and_tail.tail_mean(power.to_numpy(), RANGE, start=9000.0, variance=2.0)
+    assert found["background"].dims == ("channel", "time")
+    assert found["background"].attrs["units"] == "mV"
+    np.testing.assert_array_equal(found["background"], expected.background)
+    np.testing.assert_array_equal(
+        found["background_standard_error"], expected.background_standard_error
+    )
+    np.testing.assert_array_equal(found["quality_flag"], expected.quality)
+    np.testing.assert_array_equal(
+        labeled.tail_mean(given)["background"],
+        cubic_and_tail.tail_mean(power.to_numpy(), RANGE).background,
+    )
+    with pytest.raises(RetrievalInputError, match="12000 m"):
+        labeled.tail_mean(power, start=20_000.0)
+
+
+def test_real_vertical_profiles_are_flagged(data_root):
+    files = sorted((data_root / "pilar" / "20241002").glob("h*"))[:30]
+    archive = lidarops.open_archive(files, mask_and_scale=False)
+    signal_ = labeled_signal.condition(archive, "analog_532p")
+    found = labeled.homogeneous(
+        signal_["power"],
+        sections=[(1000.0, 3000.0), (1500.0, 5000.0), (2500.0, 10500.0)],
+        variance=signal_["variance"],
+        quality=signal_["quality"],
+    ).compute(scheduler="synchronous")
+    assert found.sizes["time"] == len(files)
+    assert np.all(found["quality_flag"] != 0)
+
+
+def test_one_pass_gives_the_bits_of_two(data_root):
+    """Condition and correct in one step, in chunks of any size, or one after the other."""
+    files = sorted((data_root / "pilar" / "20241002").iterdir())[:5]
+    for channel in ("analog_532p", "photon_387o"):
+        results = []
+        for chunk in (1, 2, 5):
+            archive = lidarops.open_archive(
+                files, mask_and_scale=False, profiles_per_chunk=chunk, header_position="ignore"
+            )
+            conditioned = labeled_signal.condition(archive, channel, full_overlap_range=500.0)
+            far = (27_000.0, 30_000.0)
+            results.append(labeled_signal.corrected(conditioned, far).load())
+            results.append(
+                labeled_signal.signals(
+                    archive, channel, background_range=far, full_overlap_range=500.0
+                ).load()
+            )
+        for other in results[1:]:
+            for name in results[0].data_vars:
+                np.testing.assert_array_equal(other[name].values, results[0][name].values)
+        assert np.isfinite(results[0]["background"].values).any()

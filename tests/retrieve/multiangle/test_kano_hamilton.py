@@ -1,0 +1,361 @@
+"""Regression on the slant path, height by height: against numpy, exact numbers and simulations."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.oracle_multiangle import (
+    ANGLES,
+    PATHS,
+    clear,
+    coverage,
+    least_squares,
+    rms,
+    signals,
+)
+
+from lidarops.retrieve.multiangle import _block, slant_paths
+from lidarops.retrieve.multiangle import _kano_hamilton as kh
+from lidarops.retrieve.multiangle.optical_depth import solve
+
+SIDES = np.array([-70.0, -55.0, -40.0, -20.0, 0.0, 15.0, 35.0, 50.0, 65.0, 75.0])
+HEIGHT = np.arange(300.0, 2100.0, 30.0)
+
+
+def fit(y, variance, path, distance=None, keep=None, *, sides=False, inhomogeneity=0.0):
+    """Return table, residuals and leverages of the general kernel."""
+    profiles, angles, gates = y.shape
+    distance = np.zeros((2, angles, gates)) if distance is None else distance
+    keep = np.ones((profiles, 0, gates)) if keep is None else keep
+    table = np.empty((profiles, kh.COLUMNS, gates))
+    residual, leverage = np.empty(y.shape), np.empty(y.shape)
+    added = np.full(gates, inhomogeneity)
+    kh.fit_gates(y, variance, keep, added, path, distance, sides, table, residual, leverage)
+    return table, residual, leverage
+
+
+def tiled(y, variance, path, keep=None, inhomogeneity=0.0):
+    """Return the table of the tiled kernel."""
+    table = np.empty((y.shape[0], kh.COLUMNS, y.shape[2]))
+    nowhere = np.zeros((2, *path.shape))
+    residual, leverage = np.empty(y.shape), np.empty(y.shape)
+    added = np.full(y.shape[2], inhomogeneity)
+    keep = np.ones((y.shape[0], 0, y.shape[2])) if keep is None else keep
+    kh.fit_details(y, variance, keep, added, path, nowhere, table, residual, leverage)
+    short = np.full_like(table, np.nan)
+    kh.fit_profiles(y, variance, keep, added, path, short)
+    for column in (kh.TAU, kh.INFORMATION, kh.CHI2, kh.TRACE, kh.EXPECTED):
+        assert np.array_equal(short[:, column], table[:, column], equal_nan=True)
+    general = fit(y, variance, path, keep=keep, inhomogeneity=inhomogeneity)
+    np.testing.assert_allclose(residual, general[1], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(leverage, general[2], rtol=1e-9)
+    return table
+
+
+def some_rays(rng, profiles=3, angles=7, gates=70):
+    path = np.repeat(np.sort(rng.uniform(1, 4, angles))[:, np.newaxis], gates, axis=1)
+    y = rng.normal(size=(profiles, angles, gates)) - 20
+    return y, rng.uniform(0.5, 2, y.shape), path
+
+
+# Algebra ------------------------------------------------------------------------------------
+
+
+def test_both_kernels_agree_with_numpy():
+    y, variance, path = some_rays(np.random.default_rng(1))
+    table, residual, leverage = fit(y, variance, path)
+    assert tiled(y, variance, path) == pytest.approx(table, rel=1e-11, abs=1e-11)
+    for t, k in ((0, 0), (1, 63), (2, 64), (2, 69)):
+        columns = [np.ones(7), -2 * path[:, k]]
+        solution, covariance = least_squares(columns, y[t, :, k], variance[t, :, k])
+        row = table[t, :, k]
+        assert row[kh.TAU] == pytest.approx(solution[1], abs=1e-11)
+        assert row[kh.INTERCEPT] == pytest.approx(solution[0], abs=1e-11)
+        assert 1 / row[kh.INFORMATION] == pytest.approx(covariance[1, 1], rel=1e-11)
+        assert row[kh.INTERCEPT_VARIANCE] == pytest.approx(covariance[0, 0], rel=1e-11)
+        left = y[t, :, k] - np.stack(columns, axis=-1) @ solution
+        assert residual[t, :, k] == pytest.approx(left, abs=1e-11)
+        assert row[kh.CHI2] == pytest.approx(np.sum(left**2 / variance[t, :, k]), rel=1e-10)
+        design = np.stack(columns, axis=-1)
+        hat = np.einsum("ai,ij,aj->a", design, covariance, design) / variance[t, :, k]
+        assert leverage[t, :, k] == pytest.approx(hat, rel=1e-10)
+        assert row[kh.TRACE] == pytest.approx(np.sum((1 - hat) / variance[t, :, k]), rel=1e-10)
+
+
+def test_reduced_weights_agree_between_kernels():
+    rng = np.random.default_rng(14)
+    y, variance, path = some_rays(rng)
+    keep = rng.uniform(0, 1, y.shape)
+    keep[0, 2], keep[1, :5, 3] = 0.0, 0.0
+    table = fit(y, variance, path, keep=keep, inhomogeneity=0.3)[0]
+    np.testing.assert_allclose(tiled(y, variance, path, keep, 0.3), table, rtol=1e-9, atol=1e-9)
+    assert np.all(table[2, kh.EXPECTED] < table[2, kh.FREEDOM])
+
+
+def test_gradients_agree_with_numpy():
+    rng = np.random.default_rng(2)
+    scan = slant_paths.make_scan(SIDES, HEIGHT, rng.uniform(0, 360, SIDES.size))
+    distance = np.stack([scan.east, scan.north])
+    y = rng.normal(size=(2, SIDES.size, HEIGHT.size))
+    variance = rng.uniform(0.5, 2, y.shape)
+    table, residual, _ = fit(y, variance, scan.path, distance, sides=True)
+    assert np.all(table[:, kh.SIDES] == 2)
+    columns = [np.ones(SIDES.size), -2 * scan.path[:, 7], distance[0, :, 7], distance[1, :, 7]]
+    solution, covariance = least_squares(columns, y[1, :, 7], variance[1, :, 7])
+    assert table[1, kh.TAU, 7] == pytest.approx(solution[1], abs=1e-11)
+    assert table[1, kh.INTERCEPT, 7] == pytest.approx(solution[0], abs=1e-11)
+    assert 1 / table[1, kh.INFORMATION, 7] == pytest.approx(covariance[1, 1], rel=1e-10)
+    assert table[1, kh.INTERCEPT_VARIANCE, 7] == pytest.approx(covariance[0, 0], rel=1e-10)
+    left = y[1, :, 7] - np.stack(columns, axis=-1) @ solution
+    assert residual[1, :, 7] == pytest.approx(left, abs=1e-11)
+
+
+@given(st.integers(0, 2**31), st.permutations(range(7)))
+@settings(max_examples=25, deadline=None)
+def test_order_of_the_rays_is_of_no_effect(seed, order):
+    y, variance, path = some_rays(np.random.default_rng(seed), gates=5)
+    there, back = (
+        tiled(y, variance, path),
+        tiled(y[:, list(order)], variance[:, list(order)], path[list(order)]),
+    )
+    assert back == pytest.approx(there, rel=1e-11, abs=1e-12)
+
+
+def test_missing_rays_are_as_if_never_measured():
+    rng = np.random.default_rng(3)
+    y, variance, path = some_rays(rng)
+    missing = rng.random(7) < 0.4
+    variance[:, missing], y[:, missing] = np.inf, 0.0
+    whole, subset = (
+        tiled(y, variance, path),
+        tiled(y[:, ~missing], variance[:, ~missing], path[~missing]),
+    )
+    assert np.array_equal(whole, subset)
+
+
+def test_two_rays_are_the_two_angle_formula():
+    y, variance, path = some_rays(np.random.default_rng(4), angles=2)
+    expected = -(y[:, 1] - y[:, 0]) / (2 * (path[1] - path[0]))
+    tau = tiled(y, variance, path)[:, kh.TAU]
+    assert tau == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("last", [15.0, 2.56, 60.0])
+def test_noise_free_rays_give_the_truth(last):
+    path = 1 / np.cos(np.radians(np.linspace(0.0, last, 6)))
+    tau = np.linspace(0.0, 5.0, 40)
+    with mp.workdps(40):
+        y = np.array([[float(-20 - 2 * mp.mpf(x) * mp.mpf(t)) for t in tau] for x in path])
+    x = np.repeat(path[:, np.newaxis], tau.size, axis=1)
+    error = tiled(y[np.newaxis], np.ones((1, *y.shape)), x)[0, kh.TAU] - tau
+    assert np.max(np.abs(error)) < 1e-12 / np.ptp(path)
+
+
+@pytest.mark.parametrize("path", [[2.0, 2.0, 2.0], [1.5]])
+def test_equal_paths_tell_nothing(path):
+    x = np.repeat(np.array(path)[:, np.newaxis], 3, axis=1)
+    for table in (tiled(np.ones((1, *x.shape)), np.ones((1, *x.shape)), x),):
+        assert np.all(np.isnan(table[:, kh.TAU]))
+        assert np.all(table[:, kh.INFORMATION] == 0)
+    assert np.all(np.isnan(fit(np.ones((1, *x.shape)), np.ones((1, *x.shape)), x)[0][:, kh.TAU]))
+
+
+# Noise --------------------------------------------------------------------------------------
+
+
+def test_regression_reaches_the_bound_and_knows_its_error():
+    rng = np.random.default_rng(5)
+    path = 1 / np.cos(np.radians(np.linspace(0, 30, 6)))
+    x = np.repeat(path[:, np.newaxis], 8, axis=1)
+    y = 0.147 * rng.normal(size=(4000, 6, 8))
+    table = tiled(y, np.full(y.shape, 0.147**2), x)
+    bound = 0.147 / 2 / np.sqrt(np.sum((path - path.mean()) ** 2))
+    assert rms(table[:, kh.TAU]) == pytest.approx(bound, rel=0.02)
+    np.testing.assert_allclose(1 / np.sqrt(table[:, kh.INFORMATION]), bound, rtol=1e-10)
+    one, two = coverage(table[:, kh.TAU], bound)
+    assert one == pytest.approx(68, abs=2)
+    assert two == pytest.approx(95, abs=1.5)
+
+
+def test_inhomogeneity_is_found_and_intervals_are_right():
+    atmosphere = clear(60)
+    signal, variance, tau = signals(
+        np.random.default_rng(6), 200, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.03
+    )
+    result = solve(
+        signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton", robust=False
+    )
+    np.testing.assert_allclose(result.inhomogeneity, 0.03, rtol=0.06)
+    one, two = coverage(result.optical_depth - tau, result.optical_depth_standard_error)
+    assert one == pytest.approx(68, abs=2)
+    assert two == pytest.approx(95, abs=1.5)
+    intercept = result.log_intercept - np.log(atmosphere[2])
+    one, two = coverage(intercept, result.log_intercept_standard_error)
+    assert one == pytest.approx(68, abs=2)
+    assert two == pytest.approx(95, abs=1.5)
+    assert np.nanmean(result.reduced_chi_square) == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("ratio", [30.0, 10.0])
+def test_weak_signals_are_not_biased(ratio):
+    rng = np.random.default_rng(7)
+    noise = np.exp(-0.4) / ratio * PATHS[:, np.newaxis] ** 2
+    mean = np.exp(-0.4 * PATHS)[:, np.newaxis]
+    signal = mean + noise * rng.normal(size=(2500, 12, 12))
+    height = 1000.0 + 30.0 * np.arange(12)
+    result = solve(signal, ANGLES, height, variance=noise**2, method="kano_hamilton", robust=False)
+    error = result.optical_depth[:, 2:] - 0.2
+    assert abs(np.nanmean(error)) < 0.05 * np.nanstd(error)
+    # Taking the samples above twice their noise instead is off by far more.
+    strong = signal > 2 * noise
+    y = np.where(strong, np.log(np.where(strong, signal, 1.0)), 0.0)
+    x = np.repeat(PATHS[:, np.newaxis], 12, axis=1)
+    naive = tiled(y, np.where(strong, (noise / mean) ** 2, np.inf), x)[:, kh.TAU] - 0.2
+    assert np.nanmean(naive) < -0.1 * np.nanstd(naive)
+
+
+# Outliers -----------------------------------------------------------------------------------
+
+
+def test_outliers_cost_little():
+    atmosphere = clear(70)
+    options = {"ratio": 3000, "inhomogeneity": 0.03}
+    below = atmosphere[0] < 2000
+
+    def error(outliers, *, robust):
+        rng = np.random.default_rng(8)
+        signal, variance, tau = signals(rng, 100, ANGLES, atmosphere, outliers=outliers, **options)
+        result = solve(
+            signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton", robust=robust
+        )
+        return rms((result.optical_depth - tau)[:, below])
+
+    clean = error(0.0, robust=False)
+    assert error(0.0, robust=True) <= 1.015 * clean
+    assert error(0.1, robust=True) <= 1.15 * clean
+    assert error(0.1, robust=False) > 4 * clean
+
+
+def test_clean_blocks_skip_the_robust_passes():
+    atmosphere = clear(30)
+    for outliers, expected in ((0.0, False), (0.02, True)):
+        signal, variance, _ = signals(
+            np.random.default_rng(9), 4, ANGLES, atmosphere, inhomogeneity=0.03, outliers=outliers
+        )
+        result = solve(signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton")
+        ran = {step.step: step.ran for step in result.steps}
+        assert ran["robust_passes"] is expected
+        assert result.flags.outlier.any() == expected
+
+
+# Gradients ----------------------------------------------------------------------------------
+
+
+def test_scans_to_both_sides_do_not_see_a_gradient():
+    rng = np.random.default_rng(10)
+    angles = np.concatenate([-ANGLES[1::2], ANGLES[::2]])
+    atmosphere = clear(60)
+    known = {"ratio": 1e5, "inhomogeneity": 0.03}
+    signal, variance, tau = signals(rng, 200, angles, atmosphere, gradient=0.05 / 1000, **known)
+    options = {"variance": variance, "method": "kano_hamilton"}
+    both = solve(signal, angles, atmosphere[0], **options)
+    error = (both.optical_depth - tau)[:, 28]
+    assert abs(error.mean()) < 0.001 + 3 * error.std() / np.sqrt(200)
+    signal, variance, _ = signals(rng, 200, np.abs(angles), atmosphere, **known)
+    alone = solve(signal, np.abs(angles), atmosphere[0], **options)
+    ratio = both.optical_depth_standard_error / alone.optical_depth_standard_error
+    assert np.nanmedian(ratio) < 1.05
+    assert not both.flags.one_sided.any()
+    assert not both.flags.gradient.any()
+    assert np.nanmax(both.optical_depth_gradient_error) < 1e-12
+
+
+def test_scans_to_one_side_bound_a_gradient_and_tell_of_it():
+    rng = np.random.default_rng(11)
+    atmosphere = clear(100)
+    results = []
+    for gradient in (0.0, 0.05 / 1000):
+        signal, variance, tau = signals(
+            rng, 100, ANGLES, atmosphere, ratio=1e5, inhomogeneity=0.03, gradient=gradient
+        )
+        options = {"variance": variance, "method": "kano_hamilton"}
+        results.append(solve(signal, ANGLES, atmosphere[0], **options))
+    clean, tilted = results
+    assert clean.flags.one_sided.all()
+    assert not clean.flags.gradient.any()
+    assert tilted.flags.gradient.mean() > 0.9
+    bias = np.mean(tilted.optical_depth - tau, axis=0)
+    bound = tilted.optical_depth_gradient_error.mean(axis=0)
+    # The bound for 5 percent per km is what that gradient does.
+    assert bound == pytest.approx(np.abs(bias), abs=0.006)
+    assert bound[28] > 3 * clean.optical_depth_standard_error[:, 28].mean()
+
+
+def test_azimuths_far_apart_find_the_gradient_at_no_cost():
+    rng = np.random.default_rng(12)
+    angles = np.tile([0.0, 40.0, 60.0, 75.0], 3)
+    height = np.array([1000.0])
+    y = rng.normal(size=(1, 12, 1))
+    for azimuths, free in (([0, 120, 240], True), ([0, 180, 180], True), ([0, 60, 120], False)):
+        scan = slant_paths.make_scan(angles, height, np.repeat(azimuths, 4))
+        distance = np.stack([scan.east, scan.north])
+        one, both = (
+            fit(y, np.ones_like(y), scan.path, distance, sides=sides)[0][0, :, 0]
+            for sides in (False, True)
+        )
+        assert (both[kh.SIDES] > 0) == free
+        if free:
+            assert one[kh.INFORMATION] / both[kh.INFORMATION] < 1.05**2
+
+
+def test_inhomogeneity_that_changes_with_height_is_followed():
+    rng = np.random.default_rng(13)
+    height = np.arange(100.0, 4100.0, 50.0)
+    spread = np.where(height < 2000, 0.01, 0.2)
+    signal = np.exp(spread * rng.normal(size=(8, 3, height.size)))
+    result = solve(
+        signal, [0.0, 35.0, 66.0], height, variance=1e-12, method="kano_hamilton", robust=False
+    )
+    found = result.inhomogeneity[0]
+    assert found[:30] == pytest.approx(0.01, rel=0.3)
+    assert found[-30:] == pytest.approx(0.2, rel=0.3)
+
+
+def test_student_factor_widens_for_few_residuals():
+    factor = _block.student_factor(np.array([0.0, 5.0, 30.0, 1e6]))
+    assert factor == pytest.approx([1.0, np.sqrt(5 / 3), np.sqrt(30 / 28), 1.0], rel=1e-5)
+
+
+# Gaps -----------------------------------------------------------------------------------------
+
+
+def gappy(signal):
+    """Rays and their fit, altitude by altitude, of signals at six angles."""
+    angles = np.linspace(0.0, 60.0, signal.shape[1])
+    scan = slant_paths.make_scan(angles, HEIGHT, None)
+    rays = _block.make_rays(signal, np.full(signal.shape, 1e-4), scan)
+    return rays, _block.regress(rays, inhomogeneity=0.05, robust=False)
+
+
+def test_information_is_whole_where_rays_begin_late_or_end():
+    signal = np.ones((2, 6, HEIGHT.size))
+    signal[0, 2, :5] = signal[1, 4, 40:] = np.nan
+    np.testing.assert_array_equal(_block.kept_information(*gappy(signal)), 1.0)
+
+
+def test_information_that_gaps_leave_is_that_of_the_other_rays():
+    signal = np.ones((2, 6, HEIGHT.size))
+    signal[1, 5, 7] = signal[1, 1, 20:23] = np.nan
+    kept = _block.kept_information(*gappy(signal))
+    path = 1.0 / np.cos(np.radians(np.linspace(0.0, 60.0, 6)))
+
+    def spread(rays):
+        return np.sum((rays - rays.mean()) ** 2)
+
+    expected = np.ones(kept.shape)
+    expected[1, 7] = spread(path[:5]) / spread(path)
+    expected[1, 20:23] = spread(np.delete(path, 1)) / spread(path)
+    np.testing.assert_allclose(kept, expected, rtol=1e-3)

@@ -1,0 +1,452 @@
+"""Profiles of a scanning lidar, simulated by the lidar equation, and what is retrieved of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.multiangle import labeled, labeled_altitudes
+from lidarops.retrieve.multiangle.labeled import Background
+from lidarops.retrieve.multiangle.optical_depth import Method
+
+STATION = 120.0
+RANGE = 15.0 * (np.arange(1200) + 0.5)
+ALTITUDE = STATION + 300.0 + 60.0 * np.arange(60)
+ONE_SIDE = np.array([0.0, 20.0, 32.0, 42.0, 50.0, 56.0, 61.0, 65.0, 68.0, 70.0])
+TWO_SIDED = np.concatenate([-ONE_SIDE[:0:-2], ONE_SIDE[::2]])
+MISSING, OVERLAP = np.int32(Quality.INPUT_MISSING), np.int32(Quality.INCOMPLETE_OVERLAP)
+SETTINGS = {
+    "altitude_grid": ALTITUDE,
+    "station_altitude": STATION,
+    "background": Background((16200.0, 18000.0)),
+}
+
+
+def optical_depth(height):
+    """Molecules, and haze of scale height 1.2 km."""
+    height = np.asarray(height, dtype=np.float64)
+    return 0.05 * -np.expm1(-height / 8000.0) + 0.3 * -np.expm1(-height / 1200.0)
+
+
+def backscatter(height):
+    return 1.5e-6 * np.exp(-height / 8000.0) + 5e-6 * np.exp(-height / 1200.0)
+
+
+def power(zenith):
+    """Received power along rays without background, (ray, range)."""
+    cosine = np.cos(np.radians(zenith))[:, np.newaxis]
+    height = RANGE * cosine
+    return 3e14 * backscatter(height) / RANGE**2 * np.exp(-2.0 * optical_depth(height) / cosine)
+
+
+def scan(
+    cycles: int = 24,
+    zenith=TWO_SIDED,
+    seed: int = 5,
+    *,
+    sigma: float = 0.5,
+    scatter: float = 0.01,
+    jitter: float = 0.0,
+) -> tuple[xr.Dataset, dict[str, Any]]:
+    """Return profiles as the signal chain leaves them, and where they look to.
+
+    Noise is white with the standard deviation `sigma`; the backscatter of each ray and cycle is
+    off by `scatter` from altitude to altitude, and the energy of each profile by `jitter`.
+    """
+    rng = np.random.default_rng(seed)
+    rays = len(zenith)
+    clean = power(np.abs(zenith))
+    patches = rng.normal(0.0, scatter, (cycles, rays, RANGE.size))
+    energy = np.exp(rng.normal(0.0, jitter, (cycles, rays, 1)))
+    values = clean * energy * np.exp(patches) + rng.normal(5.0, 0.2, (cycles, rays, 1))
+    values = (values + rng.normal(0.0, sigma, values.shape)).reshape(-1, RANGE.size)
+    bits = np.zeros(values.shape, dtype=np.int32)
+    bits[:, RANGE < 300.0] = OVERLAP
+    starts = np.datetime64("2026-03-01", "ns") + 30 * np.arange(cycles * rays).astype(
+        "timedelta64[s]"
+    )
+    length = np.timedelta64(30, "s")
+    dims = ("time", "range")
+    conditioned = xr.Dataset(
+        {
+            "power": (dims, values),
+            "variance": (dims, np.full(values.shape, sigma**2)),
+            "quality": (dims, bits),
+        },
+        coords={"range": RANGE},
+    )
+    return conditioned, {
+        "zenith_angle": np.tile(np.abs(zenith), cycles),
+        "azimuth": np.tile(np.where(np.asarray(zenith) < 0, 200.0, 20.0), cycles),
+        "time": starts + length // 2,
+        "time_bnds": np.stack([starts, starts + length], axis=-1),
+        "shots": np.full(cycles * rays, 600),
+    }
+
+
+def take(conditioned: xr.Dataset, pointing: dict[str, Any], kept) -> tuple[xr.Dataset, dict]:
+    return conditioned.isel(time=kept), {name: v[kept] for name, v in pointing.items()}
+
+
+def solve(conditioned: xr.Dataset, pointing: dict[str, Any], **changes: Any) -> xr.Dataset:
+    return labeled.scan(conditioned, **(pointing | SETTINGS | changes))
+
+
+def has(found: xr.Dataset, bit: Quality) -> np.ndarray:
+    return (found["quality_flag"].to_numpy() & int(bit)) != 0
+
+
+def assert_explained(found: xr.Dataset) -> None:
+    flagged = found["quality_flag"].to_numpy() != 0
+    for name, variable in found.data_vars.items():
+        if variable.dims == ("time", "altitude"):
+            assert np.all(flagged | np.isfinite(variable.to_numpy())), name
+
+
+AIR = MolecularProfile(
+    altitude=np.arange(0.0, 40e3, 500.0),
+    pressure=101325.0 * np.exp(-np.arange(0.0, 40e3, 500.0) / 8000.0),
+    temperature=np.full(80, 273.0),
+)
+"""Of the scale height of the molecules that are simulated."""
+FAR = Background((16200.0, 18000.0), AIR, 532e-9)
+
+
+def errors(found: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors over standard errors, and where nothing but one-sidedness is flagged."""
+    truth = optical_depth(ALTITUDE - STATION)
+    off = (found["optical_depth"] - truth) / found["optical_depth_standard_error"]
+    plain = (found["quality_flag"].to_numpy() & ~int(Quality.ONE_SIDED)) == 0
+    return off.to_numpy(), plain
+
+
+# The truth comes back
+
+
+@pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
+@pytest.mark.parametrize("background", [SETTINGS["background"], FAR], ids=["tail", "known_shape"])
+@pytest.mark.parametrize(
+    ("zenith", "noise"),
+    [(TWO_SIDED, (0.5, 0.01)), (ONE_SIDE, (0.5, 0.01)), (TWO_SIDED, (0.02, 0.03))],
+    ids=["two_sided", "one_sided", "bright"],
+)
+def test_unflagged_optical_depths_lie_within_three_standard_errors(
+    zenith, noise, background, method
+):
+    off, plain = [], []
+    for seed in range(1, 5):
+        profiles = scan(32, zenith, seed, sigma=noise[0], scatter=noise[1])
+        found = solve(*profiles, method=method, background=background)
+        assert_explained(found)
+        for kept, part in zip((off, plain), errors(found), strict=True):
+            kept.append(part)
+    good = np.concatenate(plain)
+    size = np.abs(np.concatenate(off)[good])
+    assert np.mean(size < 3) >= 0.99
+    assert np.mean(size < 1) >= 0.6
+    assert good.mean() >= (0.4 if background is FAR else 0.1)
+
+
+def test_where_energy_jitters_single_altitudes_stand():
+    profiles = scan(32, sigma=0.05, scatter=0.002, jitter=0.02)
+    joint = solve(*profiles, method="joint", background=FAR)
+    assert has(joint, Quality.HIGH_CORRELATION).all()
+    found = solve(*profiles, background=FAR)
+    assert "left out joint" in found.attrs["steps"]
+    off, _ = errors(found)
+    stands = ~has(found, Quality.rejecting())
+    assert stands.mean() > 0.5
+    assert np.mean(np.abs(off[stands]) < 3) >= 0.99
+    assert_explained(found)
+
+
+def test_extinction_is_that_of_the_layers():
+    found = solve(*scan(32), method="joint", background=FAR)
+    tops = np.append(0.0, ALTITUDE - STATION)
+    truth = np.diff(optical_depth(tops)) / np.diff(tops)
+    off = ((found["extinction"] - truth) / found["extinction_standard_error"]).to_numpy()
+    good = ~has(found, Quality.rejecting())
+    assert np.mean(np.abs(off[good]) < 3) >= 0.98
+    assert float(found["extinction_standard_error"].median()) < 3e-5
+
+
+@pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
+def test_optical_depths_of_layers_lie_within_their_errors(method):
+    wanted = [(STATION, STATION + 600.0), (STATION + 610.0, STATION + 1500.0)]
+    off = []
+    for seed in range(4):
+        found = solve(*scan(32, seed=seed), method=method, background=FAR, layers=wanted)
+        bounds = found["layer_bnds"].to_numpy()
+        np.testing.assert_allclose(bounds, STATION + np.array([[0, 600], [600, 1500]]))
+        np.testing.assert_allclose(found["layer_altitude"], STATION + np.array([300, 1050]))
+        truth = np.diff(optical_depth(bounds - STATION), axis=1)[:, 0]
+        error = np.hypot(
+            found["layer_optical_depth_standard_error"],
+            found["layer_optical_depth_gradient_error"],
+        )
+        off.append(((found["layer_optical_depth"] - truth) / error).to_numpy())
+        reject = has(found, Quality.rejecting())
+        hidden = np.stack([reject[:, 5], reject[:, 5] | reject[:, 20]], axis=1)
+        np.testing.assert_array_equal(np.isnan(found["layer_optical_depth"]), hidden)
+        # As a difference of the optical depths, to the last bits.
+        depth = found["optical_depth"].to_numpy()
+        layer = np.where(hidden[:, 1], np.nan, depth[:, 20] - depth[:, 5])
+        np.testing.assert_allclose(found["layer_optical_depth"][:, 1], layer, atol=1e-12)
+    size = np.abs(np.concatenate(off))
+    size = size[np.isfinite(size)]
+    assert size.size > 100
+    assert np.mean(size < 3) >= 0.97
+    assert "layer_optical_depth" not in solve(*scan(3), method=method)
+
+
+def test_monotone_profiles_and_chi_square_come_along():
+    found = solve(*scan(16), background=FAR)
+    depth, risen = found["optical_depth"].to_numpy(), found["monotone_optical_depth"].to_numpy()
+    np.testing.assert_array_equal(np.isnan(depth), np.isnan(risen))
+    for one, plain in zip(risen, depth, strict=True):
+        steps = np.diff(one[np.isfinite(one)])
+        assert np.all(steps >= 0)
+        rising = np.all(np.diff(plain[np.isfinite(plain)], prepend=0.0) >= 0)
+        assert np.array_equal(one, plain, equal_nan=True) == rising
+    assert float(found["reduced_chi2"].mean()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_extinction_stays_withheld_where_single_altitudes_stand_in():
+    """Energy that jitters, in a cloud whose extinction varies along the paths."""
+    rng = np.random.default_rng(3)
+    height, cycles, rays = 10.0 * np.arange(1, 61), 24, 8
+    zenith = np.linspace(0.0, 60.0, rays)
+    path = 1.0 / np.cos(np.radians(zenith))[:, np.newaxis]
+    air = 0.1 * rng.normal(size=(cycles, rays, 1)) + 0.1 * rng.normal(size=(cycles, rays, 60))
+    lost = np.cumsum(5e-3 * 10.0 * np.exp(2.0 * air), axis=-1)
+    lost *= np.clip((height - 200.0) / 100.0, 0.0, 1.0)
+    signal = np.exp(air - 2.0 * path * lost)
+    dims = ("time", "ray", "altitude")
+    rays = xr.Dataset(
+        {
+            "signal": (dims, signal),
+            "variance": (dims, (1e-5 * signal) ** 2),
+            "quality": (dims[::2], np.zeros((cycles, 60), np.int32)),
+            "left": (dims[:2], np.zeros((cycles, rays))),
+            "shots": ("time", np.ones(cycles, np.int32)),
+        },
+        coords={"altitude": height, "ray_zenith_angle": ("ray", zenith)},
+    )
+    found = labeled.retrieve(rays, station_altitude=0.0)
+    assert "left out joint" in found.attrs["steps"]
+    assert has(found, Quality.POOR_STRATIFICATION).all()
+    assert np.isfinite(found["optical_depth"]).any()
+    for name in ("extinction", "extinction_standard_error", "extinction_gradient_error"):
+        assert np.isnan(found[name]).all()
+
+
+def test_signal_left_in_the_tail_is_flagged_where_it_matters():
+    conditioned, pointing = scan(32, sigma=0.02, scatter=0.003)
+    found = solve(conditioned, pointing, method="kano_hamilton")
+    off, _ = errors(found)
+    wrong = np.abs(off) > 4
+    assert wrong.mean() > 0.2
+    assert np.mean(has(found, Quality.BACKGROUND_UNCERTAIN)[wrong]) > 0.99
+    # The nearest air outshines what is left.
+    assert not has(found, Quality.BACKGROUND_UNCERTAIN)[:, :3].all()
+
+
+# What it is made of
+
+
+def test_cycles_times_and_shots():
+    conditioned, pointing = scan(3)
+    found = solve(conditioned, pointing)
+    assert dict(found.sizes) == {"time": 3, "altitude": 60, "ray": 10, "nv": 2}
+    bounds = pointing["time_bnds"].reshape(3, 10, 2)
+    np.testing.assert_array_equal(found["time_bnds"][:, 0], bounds[:, 0, 0])
+    np.testing.assert_array_equal(found["time_bnds"][:, 1], bounds[:, -1, 1])
+    np.testing.assert_array_equal(
+        found["time"], bounds[:, 0, 0] + (bounds[:, -1, 1] - bounds[:, 0, 0]) // 2
+    )
+    np.testing.assert_array_equal(found["shots"], 6000)
+    np.testing.assert_array_equal(found["rays"], 10)
+    np.testing.assert_allclose(found["ray_zenith_angle"], np.abs(np.sort(TWO_SIDED)))
+    np.testing.assert_allclose(found["ray_azimuth"], [200.0] * 5 + [20.0] * 5)
+    assert "joint" in found.attrs["steps"]
+
+
+def test_missing_files_leave_their_cycle_with_the_others():
+    conditioned, pointing = scan(6)
+    whole = solve(conditioned, pointing)
+    kept = np.setdiff1d(np.arange(60), [21, 24, 25])
+    found = solve(*take(conditioned, pointing, kept))
+    assert found["rays"].to_numpy().tolist() == [10, 10, 7, 10, 10, 10]
+    assert found["shots"].to_numpy().tolist() == [6000, 6000, 4200, 6000, 6000, 6000]
+    gone = np.isnan(found["residual"].to_numpy()).all(axis=2)
+    assert np.flatnonzero(gone[2]).tolist() == [1, 4, 5]
+    assert not gone[[0, 1, 3, 4, 5]].any()
+    np.testing.assert_array_equal(found["time"], whole["time"])
+    off, plain = errors(found)
+    assert np.nanmax(np.abs(off[2])[plain[2]], initial=0.0) < 4
+    assert_explained(found)
+
+
+def test_what_is_left_of_a_cycle_is_used_as_far_as_it_goes():
+    conditioned, pointing = scan(6)
+    kept = np.setdiff1d(np.arange(60), [*range(22, 30), *range(41, 50)])
+    found = solve(*take(conditioned, pointing, kept), method="kano_hamilton")
+    assert found["rays"].to_numpy().tolist() == [10, 10, 2, 10, 1, 10]
+    # Two rays to one side, of a scan to both: nothing cancels a gradient.
+    two, full = found.isel(time=2), found.isel(time=1)
+    assert has(two, Quality.ONE_SIDED)[np.isfinite(two["optical_depth"])].all()
+    wider = two["optical_depth_standard_error"] > full["optical_depth_standard_error"]
+    assert wider.to_numpy()[np.isfinite(two["optical_depth"])].all()
+    assert np.isnan(found["optical_depth"][4]).all()
+    assert np.isnan(found["reach"][4])
+    assert has(found, Quality.NO_LEVERAGE)[4].all()
+    assert_explained(found)
+
+
+@pytest.mark.parametrize("method", [m.value for m in Method])
+def test_every_missing_value_is_explained_whatever_the_method(method):
+    conditioned, pointing = scan(5, ONE_SIDE, sigma=8.0)
+    conditioned["power"][7] = np.nan
+    conditioned["power"][20:30] = np.nan
+    conditioned["quality"][33, 200:400] |= np.int32(Quality.SATURATED)
+    conditioned["quality"][40:48, 60:120] |= np.int32(Quality.SATURATED)
+    conditioned["quality"][2, 30:40] |= np.int32(Quality.PILE_UP)
+    found = solve(conditioned, pointing, method=method)
+    assert_explained(found)
+    assert has(found, Quality.INPUT_MISSING)[2].all()
+    assert has(found, Quality.PILE_UP)[0].any()
+    assert found["rays"].to_numpy().tolist() == [9, 10, 0, 10, 10]
+    assert has(found, Quality.EXTRAPOLATED).any()
+
+
+def test_an_angle_to_one_side_is_flagged_and_has_a_systematic_error():
+    one, two = (solve(*scan(4, zenith), method="kano_hamilton") for zenith in (ONE_SIDE, TWO_SIDED))
+    assert has(one, Quality.ONE_SIDED)[np.isfinite(one["optical_depth"])].all()
+    assert not has(two, Quality.ONE_SIDED)[:, 5:50].any()
+    ratio = one["optical_depth_gradient_error"] / two["optical_depth_gradient_error"]
+    assert float(ratio[:, 5:50].median()) > 100
+    half = solve(*scan(4, ONE_SIDE), method="kano_hamilton", largest_gradient=2.5e-5)
+    np.testing.assert_allclose(
+        2.0 * half["optical_depth_gradient_error"], one["optical_depth_gradient_error"]
+    )
+
+
+def test_rays_along_the_horizon_and_unknown_ones_are_left_out():
+    zenith = np.concatenate([ONE_SIDE, [85.5, 90.0, 95.0]])
+    conditioned, pointing = scan(3, zenith)
+    pointing["zenith_angle"][12] = 180.0
+    pointing["zenith_angle"][5] = np.nan
+    found = solve(conditioned, pointing)
+    np.testing.assert_allclose(found["ray_zenith_angle"], ONE_SIDE)
+    assert found["rays"].to_numpy().tolist() == [9, 10, 10]
+    bounds = pointing["time_bnds"]
+    assert found["time_bnds"].to_numpy()[0, 0] == bounds[0, 0]
+    assert found["time_bnds"].to_numpy()[0, 1] == bounds[9, 1]
+
+
+def test_profiles_of_one_visit_are_averaged_by_their_shots():
+    conditioned, pointing = scan(8, np.repeat(ONE_SIDE, 2))
+    pointing["shots"][::2] = 1
+    pointing["shots"][1::2] = 10**6
+    every = labeled.on_altitudes(conditioned, **(pointing | SETTINGS)).compute()
+    last = labeled.on_altitudes(
+        *take(conditioned, pointing, slice(1, None, 2))[:1],
+        **(take(conditioned, pointing, slice(1, None, 2))[1] | SETTINGS),
+    ).compute()
+    assert every.sizes["time"] == 8
+    np.testing.assert_array_equal(every["shots"], 10 * (10**6 + 1))
+    np.testing.assert_allclose(
+        every["signal"], last["signal"], atol=float(10 * np.sqrt(last["variance"].max())) * 1e-5
+    )
+
+
+def test_an_overlap_divides_the_signal():
+    conditioned, pointing = scan(4)
+    overlap = np.clip(RANGE / 800.0, 0.0, 1.0)
+    unknown = np.where(RANGE < 400.0, np.nan, overlap)
+    dimmed = conditioned.assign(
+        power=(conditioned["power"] - 5.0) * overlap + 5.0,
+        variance=conditioned["variance"] * overlap**2,
+    )
+    plain = solve(conditioned, pointing, method="kano_hamilton")
+    found = solve(dimmed, pointing, method="kano_hamilton", overlap=unknown)
+    above = ALTITUDE - STATION > 900.0
+    np.testing.assert_allclose(
+        found["log_intercept"][:, above], plain["log_intercept"][:, above], atol=1e-9
+    )
+    assert_explained(found)
+    with_hole = solve(dimmed, pointing, overlap=np.where(RANGE < 1500, np.nan, overlap))
+    first = np.isnan(with_hole["residual"].to_numpy()[:, 5]).sum(axis=1)
+    assert np.all(first >= np.count_nonzero(ALTITUDE - STATION < 1450))
+
+
+# Bits do not hang on chunks
+
+
+@pytest.mark.parametrize("size", [1, 7, 64, 10_000])
+def test_any_chunking_gives_the_same_bits(size):
+    conditioned, pointing = scan(40)
+    whole = solve(conditioned, pointing, background=FAR)
+    chunked = solve(
+        conditioned.chunk(time=size, range=-1 if size > 7 else 500), pointing, background=FAR
+    )
+    xr.testing.assert_identical(whole, chunked)
+
+
+def test_bins_that_no_ray_reaches_and_pieces_do_not_matter(monkeypatch):
+    conditioned, pointing = scan(12)
+    cut = solve(conditioned, pointing, background=FAR)
+    monkeypatch.setattr(labeled_altitudes, "_BESIDE", 10**6)
+    monkeypatch.setattr(labeled_altitudes, "_AT_ONCE", 5)
+    xr.testing.assert_identical(cut, solve(conditioned, pointing, background=FAR))
+
+
+def test_rays_stay_lazy_until_they_are_wanted():
+    conditioned, pointing = scan(3)
+    rays = labeled.on_altitudes(conditioned.chunk(time=10), **(pointing | SETTINGS))
+    assert rays["signal"].chunks is not None
+    assert rays["shots"].chunks is None
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"background": Background((20e3, 30e3))}, "background"),
+        ({"background": Background((16e3, 18e3), AIR)}, "background"),
+        ({"altitude_grid": ALTITUDE - 1000.0}, "altitude"),
+        ({"method": "none"}, "method"),
+        ({"zenith_angle": np.full(30, 90.0)}, "zenith_angle"),
+        ({"zenith_angle": np.full(30, np.nan)}, "zenith_angle"),
+        ({"zenith_angle": np.full(30, -30.0), "azimuth": None}, "zenith_angle"),
+        ({"largest_gradient": -1.0}, "largest_gradient"),
+        ({"layers": [(STATION, 1e5)]}, "layers"),
+        ({"layers": [(1000.0, 500.0)]}, "layers"),
+    ],
+)
+def test_what_cannot_be_right_is_refused(change, field):
+    with pytest.raises(RetrievalInputError) as caught:
+        solve(*scan(3), **change)
+    assert caught.value.field == field
+
+
+def test_where_nothing_tells_what_is_left_in_the_tail_all_is_uncertain():
+    conditioned, pointing = scan(3)
+    # The signal before the tail is hidden.
+    before = (conditioned["range"] > 5000.0) & (conditioned["range"] < 16000.0)
+    hidden = conditioned.assign(
+        quality=conditioned["quality"] | before.astype(np.int32) * np.int32(Quality.SATURATED)
+    )
+    found = solve(hidden, pointing, method="kano_hamilton")
+    stands = np.isfinite(found["optical_depth"].to_numpy())
+    assert stands.any()
+    assert has(found, Quality.BACKGROUND_UNCERTAIN)[stands].all()
+    assert_explained(found)

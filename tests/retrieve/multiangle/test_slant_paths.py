@@ -1,0 +1,100 @@
+"""Slant paths: the spherical one against exact geometry, and which rays are usable."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.multiangle import slant_paths
+
+HEIGHT = np.array([100.0, 1000.0, 5000.0])
+
+
+def exact(angle, height):
+    """Return the slant over the vertical path from the triangle to the Earth's centre."""
+    with mp.workdps(50):
+        earth, z = mp.mpf(slant_paths.EARTH_RADIUS), mp.mpf(height)
+        cosine = mp.cos(mp.mpf(float(angle)) * mp.pi / 180)
+        return (mp.sqrt((earth * cosine) ** 2 + 2 * earth * z + z**2) - earth * cosine) / z
+
+
+@pytest.mark.parametrize("angle", [75.001, 80.0, 83.0, 88.0])
+def test_spherical_path_keeps_its_digits(angle):
+    path = slant_paths.slant_path(np.array([angle]), HEIGHT)[0]
+    for x, z in zip(path, HEIGHT, strict=True):
+        assert abs(x / exact(angle, z) - 1) < 1e-14
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0, 60.0, 75.0])
+def test_secant_is_what_the_sphere_gives_up_to_75_degrees(angle):
+    path = slant_paths.slant_path(np.array([angle]), HEIGHT)[0]
+    assert path == pytest.approx(1 / np.cos(np.radians(angle)), rel=1e-15)
+    # The curvature that the secant leaves out changes an optical depth by at most 0.6 percent.
+    assert abs(path[-1] / float(exact(angle, 5000.0)) - 1) < 0.006
+
+
+@pytest.mark.parametrize(("angle", "deviation"), [(84.3, 0.036), (88.0, 0.20)])
+def test_secant_is_wrong_near_the_horizon(angle, deviation):
+    path = slant_paths.slant_path(np.array([angle]), np.array([5000.0]))[0, 0]
+    assert 1 - path * np.cos(np.radians(angle)) == pytest.approx(deviation, abs=0.006)
+
+
+def test_long_paths_are_not_used():
+    scan = slant_paths.make_scan([0.0, 60.0, -75.0, 84.0, 86.0, 89.99, 90.0, np.nan], HEIGHT)
+    assert scan.usable.tolist() == [True, True, True, True, False, False, False, False]
+    assert np.all(np.isfinite(scan.path[scan.usable]))
+    assert np.all(np.isnan(scan.path[~scan.usable]))
+    assert np.nanmax(scan.path) <= 10.0
+
+
+def test_a_negative_angle_leads_backwards():
+    scan = slant_paths.make_scan([-40.0, 40.0], HEIGHT, [10.0, 190.0])
+    assert scan.path[0] == pytest.approx(scan.path[1])
+    assert scan.east[0] == pytest.approx(scan.east[1])
+    assert scan.north[0] == pytest.approx(scan.north[1])
+    assert np.hypot(scan.east, scan.north) == pytest.approx(np.tan(np.radians(40.0)))
+
+
+@given(
+    st.lists(st.floats(0.0, 2 * np.pi), min_size=1, max_size=8),
+    st.floats(0.0, 2 * np.pi),
+)
+@settings(max_examples=200, deadline=None)
+def test_rays_surround_the_zenith_when_no_half_plane_holds_them(azimuth, turn):
+    directions = np.array(azimuth)
+    normals = np.linspace(0, 2 * np.pi, 3601)
+    # The zero vector is outside the convex hull if one half plane strictly holds all directions.
+    closest = np.min(np.cos(directions[:, np.newaxis] - normals), axis=0).max()
+    if abs(closest) > 2e-3:
+        assert slant_paths.surrounds_zenith(directions + turn) == (closest < 0)
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "around"),
+    [([0.0, 180.0], True), ([0.0, 120.0, 240.0], True), ([0.0, 150.0], False), ([7.0, 7.0], False)],
+)
+def test_opposite_rays_surround_the_zenith(azimuth, around):
+    assert slant_paths.surrounds_zenith(np.radians(azimuth)) == around
+
+
+@pytest.mark.parametrize(
+    ("angles", "altitude", "azimuth", "field"),
+    [
+        ([0.0, 91.0], HEIGHT, None, "zenith_angle"),
+        ([[0.0]], HEIGHT, None, "zenith_angle"),
+        ([], HEIGHT, None, "zenith_angle"),
+        ([0.0, 10.0], HEIGHT, [0.0], "azimuth"),
+        ([0.0, 10.0], [0.0, 100.0], None, "altitude"),
+        ([0.0, 10.0], [200.0, 100.0], None, "altitude"),
+        ([0.0, 10.0], [100.0, np.inf], None, "altitude"),
+        ([0.0, 10.0], [], None, "altitude"),
+        (["a"], HEIGHT, None, "zenith_angle"),
+    ],
+)
+def test_refuses_what_cannot_be_a_scan(angles, altitude, azimuth, field):
+    with pytest.raises(RetrievalInputError, match=field):
+        slant_paths.make_scan(angles, altitude, azimuth)

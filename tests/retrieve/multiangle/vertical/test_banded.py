@@ -1,0 +1,171 @@
+"""The banded solution against dense algebra and against 60 digits."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.banded_matrices import dense
+
+from lidarops.retrieve.multiangle.vertical import _banded
+from lidarops.retrieve.multiangle.vertical._correlation import precision
+
+STATION = 35.0
+
+
+def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
+    """Precision bands, estimates, penalty and weights of random profiles."""
+    information = rng.uniform(1.0, 100.0, (profiles, heights))
+    information[rng.random((profiles, heights)) < missing] = 0.0
+    information[:, heights // 2] = 5.0
+    estimates = np.where(information > 0.0, rng.normal(size=(profiles, heights)), 0.0)
+    bands = precision(information, rng.uniform(0.3, 1.0, (profiles, heights)), correlation)
+    altitude = STATION + 120.0 + 30.0 * np.arange(heights)
+    stiffness = _banded.penalty(altitude, STATION)
+    return bands, estimates, stiffness, 10.0 ** rng.uniform(3.0, 8.0, profiles)
+
+
+def solved(bands, estimates, stiffness, lam):
+    profiles, heights = estimates.shape
+    out = np.empty((4, profiles, heights))
+    right = _banded.multiply_rows(bands, estimates)
+    _banded.solve(bands, right, stiffness, np.arange(profiles), lam, out)
+    return out
+
+
+@pytest.mark.parametrize("heights", [1, 2, 3, 7, 60])
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_solution_and_inverse_equal_dense_algebra(heights, correlation):
+    rng = np.random.default_rng(heights)
+    bands, estimates, stiffness, lam = systems(rng, 19, heights, correlation)
+    out = solved(bands, estimates, stiffness, lam)
+    for t in range(19):
+        weight = dense(bands[:, t])
+        inverse = np.linalg.inv(weight + lam[t] * dense(stiffness))
+        scale = np.abs(inverse).max()
+        np.testing.assert_allclose(out[0, t], inverse @ weight @ estimates[t], rtol=1e-8, atol=1e-9)
+        for step in range(min(3, heights)):
+            off = np.diag(inverse, step)
+            np.testing.assert_allclose(out[1 + step, t, : off.size], off, atol=1e-9 * scale)
+
+
+def test_scores_equal_dense_algebra():
+    bands, estimates, stiffness, lam = systems(np.random.default_rng(1), 21, 33)
+    right = _banded.multiply_rows(bands, estimates)
+    which = np.array([20, 3, 3, 7, *range(15)])
+    scores = _banded.scores(bands, right, estimates, stiffness, which, lam[which])
+    for i, t in enumerate(which):
+        weight = dense(bands[:, t])
+        system = weight + lam[t] * dense(stiffness)
+        inverse = np.linalg.inv(system)
+        left = estimates[t] - inverse @ weight @ estimates[t]
+        expected = (
+            estimates[t] @ weight @ left,
+            left @ weight @ left,
+            np.trace(inverse @ weight),
+            np.linalg.slogdet(system)[1],
+        )
+        np.testing.assert_allclose(scores[:, i], expected, rtol=1e-8)
+
+
+@pytest.mark.parametrize("smoothing", [1e-10, 1e-3, 1.0])
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_solution_keeps_8_digits_of_60(smoothing, correlation):
+    heights = 200
+    rng = np.random.default_rng(4)
+    information = 10.0 ** rng.uniform(-4.0, 4.0, (1, heights))
+    altitude = 150.0 + 30.0 * np.arange(heights)
+    truth = 1e-4 * altitude
+    estimates = (truth + rng.normal(size=heights) / np.sqrt(information[0]))[np.newaxis]
+    bands = precision(information, np.full((1, heights), 0.9), correlation)
+    stiffness = _banded.penalty(altitude, 0.0)
+    lam = np.array([smoothing * information.mean() * altitude[-1] ** 3])
+    right = _banded.multiply_rows(bands, estimates)
+    out = np.empty((4, 1, heights))
+    _banded.solve(bands, right, stiffness, np.zeros(1, dtype=np.int64), lam, out)
+    with mp.workdps(60):
+        exact, inverse_last = _exact(bands[:, 0], stiffness, float(lam[0]), estimates[0])
+    assert np.abs(out[0, 0] - exact).max() <= 1e-8 * np.abs(exact).max()
+    assert abs(out[1, 0, -1] / inverse_last - 1.0) <= 1e-8
+
+
+def _exact(bands, stiffness, lam, estimates):
+    """Solve in the precision of mpmath; return the solution and the last variance."""
+    heights = estimates.size
+    a = [[mp.mpf(float(b)) for b in row] for row in bands]
+    k = [[mp.mpf(float(b)) for b in row] for row in stiffness]
+    t = [mp.mpf(float(v)) for v in estimates]
+    right = [
+        a[0][i] * t[i]
+        + sum(a[s][i] * t[i + s] for s in (1, 2) if i + s < heights)
+        + sum(a[s][i - s] * t[i - s] for s in (1, 2) if i - s >= 0)
+        for i in range(heights)
+    ]
+    m = [[a[s][i] + mp.mpf(lam) * k[s][i] for i in range(heights)] for s in range(3)]
+    pivot, near, far = [], [], []
+    for i in range(heights):
+        d = m[0][i]
+        across = m[1][i]
+        if i > 0:
+            d -= near[i - 1] ** 2 * pivot[i - 1]
+            across -= near[i - 1] * far[i - 1] * pivot[i - 1]
+            right[i] -= near[i - 1] * right[i - 1]
+        if i > 1:
+            d -= far[i - 2] ** 2 * pivot[i - 2]
+            right[i] -= far[i - 2] * right[i - 2]
+        pivot.append(d)
+        near.append(across / d)
+        far.append(m[2][i] / d)
+    x = [mp.mpf(0)] * (heights + 2)
+    for i in range(heights - 1, -1, -1):
+        x[i] = right[i] / pivot[i] - near[i] * x[i + 1] - far[i] * x[i + 2]
+    return np.array([float(v) for v in x[:heights]]), float(1 / pivot[-1])
+
+
+def test_penalty_is_the_integral_of_the_squared_slope_of_extinction():
+    altitude = STATION + np.array([120.0, 150.0, 180.0, 240.0, 250.0])
+    rng = np.random.default_rng(0)
+    depth = rng.normal(size=5)
+    levels = np.concatenate([[STATION], altitude])
+    extinction = np.diff(np.concatenate([[0.0], depth])) / np.diff(levels)
+    middle = 0.5 * (levels[1:] + levels[:-1])
+    expected = (np.diff(extinction) ** 2 / np.diff(middle)).sum()
+    stiffness = dense(_banded.penalty(altitude, STATION))
+    assert depth @ stiffness @ depth == pytest.approx(expected, rel=1e-12)
+    constant = altitude - STATION
+    assert np.abs(stiffness @ constant).max() < 1e-12 * np.abs(stiffness).max() * constant.max()
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
+@settings(max_examples=25, deadline=None)
+def test_lanes_do_not_know_of_each_other(seed, count):
+    rng = np.random.default_rng(seed)
+    bands, estimates, stiffness, lam = systems(rng, count, 12)
+    together = solved(bands, estimates, stiffness, lam)
+    chosen = int(rng.integers(count))
+    alone = solved(
+        np.ascontiguousarray(bands[:, chosen : chosen + 1]),
+        estimates[chosen : chosen + 1],
+        stiffness,
+        lam[chosen : chosen + 1],
+    )
+    np.testing.assert_array_equal(alone[:, 0], together[:, chosen])
+
+
+@pytest.mark.parametrize("missing", [(), (3,), (3, 4), (0, 9)])
+def test_precision_is_the_inverse_of_the_covariance_of_an_autoregressive_process(missing):
+    information = np.linspace(2.0, 9.0, 10)[np.newaxis].copy()
+    information[0, list(missing)] = 0.0
+    bands = precision(information, np.ones((1, 10)), 0.6)
+    there = np.flatnonzero(information[0])
+    apart = np.abs(np.subtract.outer(there, there))
+    # A hole of two heights and more separates what is below it from what is above.
+    if missing == (3, 4):
+        apart = np.where((there[:, None] < 3) == (there < 3), apart, 99)
+    decay = np.where(apart < 99, 0.6**apart, 0.0)
+    error = 1.0 / np.sqrt(information[0, there])
+    covariance = decay * np.outer(error, error)
+    found = dense(bands[:, 0])[np.ix_(there, there)]
+    np.testing.assert_allclose(found @ covariance, np.eye(there.size), atol=1e-12)

@@ -1,0 +1,793 @@
+"""The vertical solution: identities, coverage in simulated scans, and what it withholds."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import erf
+from support.angle_scenes import (
+    clear,
+    clear_depth,
+    cloud,
+    estimates,
+    kano_hamilton,
+    simulate,
+)
+from support.banded_matrices import dense
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.multiangle.vertical import _banded, _correlation, _outliers
+from lidarops.retrieve.multiangle.vertical.smooth_profile import (
+    LARGEST_GRADIENT,
+    gradient_bound,
+    layer_optical_depth,
+    monotone_optical_depth,
+    residual_moments,
+    respond,
+    smooth,
+)
+
+ALTITUDE = 150.0 + 30.0 * np.arange(60)
+PER_KM = 1e-3
+
+
+def solve(scene, found, **options):
+    return smooth(
+        found.optical_depth,
+        found.information,
+        scene.altitude,
+        station_altitude=0.0,
+        residuals=found.residuals,
+        **options,
+    )
+
+
+def plain(profiles, rng, *, error=0.02, altitude=ALTITUDE):
+    """Estimates of equal, independent errors of a hazy atmosphere."""
+    truth = clear_depth(altitude)
+    depth = truth + error * rng.normal(size=(profiles, altitude.size))
+    return depth, np.full(depth.shape, error**-2.0), truth
+
+
+def take(moments, index):
+    return dataclasses.replace(
+        moments, **{f.name: getattr(moments, f.name)[index] for f in dataclasses.fields(moments)}
+    )
+
+
+def rms(values):
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def truth_of(scene, result):
+    """Optical depth and extinction where the result has values."""
+    depth = np.broadcast_to(scene.truth, result.optical_depth.shape)
+    steps = np.diff(scene.altitude, prepend=0.0)
+    return depth, np.diff(depth, axis=1, prepend=0.0) / steps
+
+
+def coverage(value, error, truth):
+    """Share of finite values within 1 and 1.96 standard errors."""
+    score = np.abs(value - truth) / error
+    score = score[np.isfinite(score)]
+    return float((score < 1.0).mean()), float((score < 1.96).mean())
+
+
+# Algebra ------------------------------------------------------------------------------------
+
+
+def test_solution_is_that_of_intercepts_and_optical_depths_together():
+    """Kano-Hamilton before smoothing loses nothing."""
+    rng = np.random.default_rng(1)
+    x, heights = 1.0 / np.cos(np.radians([0.0, 20.0, 40.0, 60.0])), 25
+    weight = rng.uniform(50.0, 400.0, (x.size, heights))
+    y = rng.normal(-8.0, 1.0, heights) - 2.0 * x[:, None] * np.linspace(0.01, 0.3, heights)
+    y += rng.normal(size=y.shape) / np.sqrt(weight)
+    total = weight.sum(axis=0)
+    centred = x[:, None] - (weight * x[:, None]).sum(axis=0) / total
+    square = (weight * centred**2).sum(axis=0)
+    depth = -0.5 * (weight * centred * y).sum(axis=0) / square
+    altitude = 100.0 + 30.0 * np.arange(heights)
+    result = smooth(depth[None], 4.0 * square[None], altitude, station_altitude=0.0)
+    shares = result.system.pairs.share
+    stiffness = dense(_banded.penalty(altitude, 0.0))
+    together = np.zeros(heights)
+    for lam, share in zip(result.system.pairs.smoothing, shares, strict=True):
+        normal = np.zeros((2 * heights, 2 * heights))
+        normal[:heights, :heights] = np.diag(total)
+        cross = -2.0 * (weight * x[:, None]).sum(axis=0)
+        normal[:heights, heights:] = normal[heights:, :heights] = np.diag(cross)
+        normal[heights:, heights:] = np.diag(4.0 * (weight * x[:, None] ** 2).sum(axis=0))
+        normal[heights:, heights:] += lam * stiffness
+        right = np.concatenate([(weight * y).sum(axis=0), -2.0 * (weight * x[:, None] * y).sum(0)])
+        together += share * np.linalg.solve(normal, right)[heights:]
+    np.testing.assert_allclose(result.optical_depth[0], together, atol=1e-9)
+
+
+def test_constant_extinction_is_returned_exactly_and_called_saturated():
+    depth = np.tile(4e-5 * ALTITUDE, (10, 1))
+    result = smooth(depth, np.full(depth.shape, 1e4), ALTITUDE, station_altitude=0.0)
+    np.testing.assert_allclose(result.optical_depth, depth, rtol=1e-9)
+    np.testing.assert_allclose(result.extinction, 4e-5, rtol=1e-7)
+    np.testing.assert_allclose(result.data_share, 1.0, rtol=1e-9)
+    assert result.saturated.all()
+    assert result.prior_dominated.all()
+
+
+def test_extinction_adds_up_to_the_optical_depth():
+    depth, information, _ = plain(12, np.random.default_rng(0))
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    steps = np.diff(ALTITUDE, prepend=0.0)
+    sums = np.cumsum(result.extinction * steps, axis=1)
+    np.testing.assert_allclose(sums, result.optical_depth, atol=1e-12)
+
+
+@pytest.mark.parametrize("profiles", [3, 12])
+def test_station_may_lie_at_any_altitude(profiles):
+    depth, information, _ = plain(profiles, np.random.default_rng(0))
+    low = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    high = smooth(depth, information, ALTITUDE + 2500.0, station_altitude=2500.0)
+    np.testing.assert_allclose(high.optical_depth, low.optical_depth, rtol=1e-9)
+    np.testing.assert_allclose(high.reach, low.reach + 2500.0)
+
+
+def test_response_is_linear_and_of_the_solution_itself():
+    rng = np.random.default_rng(2)
+    for profiles in (3, 12):
+        depth, information, _ = plain(profiles, rng)
+        information[0, 10:13] = 0.0
+        result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+        np.testing.assert_allclose(
+            respond(result.system, depth), result.optical_depth, rtol=1e-9, atol=1e-12
+        )
+        other = rng.normal(size=depth.shape)
+        both = respond(result.system, 2.0 * depth + other)
+        parts = 2.0 * result.optical_depth + respond(result.system, other)
+        np.testing.assert_allclose(both, parts, atol=1e-10)
+        line = np.tile(ALTITUDE, (profiles, 1))
+        np.testing.assert_allclose(respond(result.system, line), line, rtol=1e-8)
+
+
+# Simulated scans ----------------------------------------------------------------------------
+
+SCENES = {
+    "clear 3000": (clear(3000.0), 0.0),
+    "clear 300": (clear(300.0), 0.0),
+    "clear 3000, correlated": (clear(3000.0), 0.7),
+    "clear 300, correlated": (clear(300.0), 0.7),
+    "cloud 30": (cloud(), 0.0),
+    "cloud 30, rho 0.5": (cloud(), 0.5),
+    "cloud 30, rho 0.8": (cloud(), 0.8),
+    "cloud 30, rho 0.95": (cloud(), 0.95),
+    "cloud 15": (cloud(largest=15.0), 0.0),
+    "cloud 15, rho 0.8": (cloud(largest=15.0), 0.8),
+}
+
+
+def joined(scene, correlation, profiles, blocks, seed):
+    """Results and truths of several blocks, each made and solved by itself."""
+    rng = np.random.default_rng(seed)
+    solutions = [solve(scene, estimates(scene, profiles, rng, correlation)) for _ in range(blocks)]
+    names = ("optical_depth", "optical_depth_standard_error", "extinction")
+    names += ("extinction_standard_error", "correlation")
+    rows = {name: np.concatenate([getattr(s, name) for s in solutions]) for name in names}
+    depth, extinction = truth_of(scene, solutions[0])
+    return rows, depth[:1], extinction[:1]
+
+
+# The truth is one per block and errors of neighbouring heights go together: the shares of few
+# blocks scatter by some 2 percent around what many blocks give (64-74 and 93-97 percent).
+DEPTH_68, DEPTH_95 = (0.60, 0.78), (0.91, 0.985)
+
+
+@pytest.mark.parametrize(("profiles", "blocks"), [(300, 2), (32, 12), (8, 30)])
+@pytest.mark.parametrize("name", SCENES)
+def test_standard_errors_cover_the_truth(name, profiles, blocks):
+    rows, depth, extinction = joined(*SCENES[name], profiles, blocks, seed=1)
+    one, two = coverage(rows["optical_depth"], rows["optical_depth_standard_error"], depth)
+    assert DEPTH_68[0] <= one <= DEPTH_68[1]
+    assert DEPTH_95[0] <= two <= DEPTH_95[1]
+    one, two = coverage(rows["extinction"], rows["extinction_standard_error"], extinction)
+    assert two >= 0.90
+    assert one >= 0.57
+    if profiles == 300:
+        assert one <= 0.84
+
+
+@pytest.mark.parametrize("name", ["clear 3000", "clear 300, correlated", "cloud 30"])
+def test_standard_errors_of_single_profiles_cover_the_truth(name):
+    rows, depth, extinction = joined(*SCENES[name], 1, 120, seed=1)
+    one, two = coverage(rows["optical_depth"], rows["optical_depth_standard_error"], depth)
+    assert 0.60 <= one <= 0.80
+    assert two >= 0.89
+    assert coverage(rows["extinction"], rows["extinction_standard_error"], extinction)[1] >= 0.93
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_standard_errors_cover_truths_that_differ_within_a_block(correlation):
+    rng = np.random.default_rng(3)
+    aerosol = np.exp(0.7 * rng.normal(size=256))
+    scene = clear(3000.0, aerosol=aerosol, layer=rng.uniform(1500.0, 4500.0, 256))
+    result = solve(scene, estimates(scene, 256, rng, correlation))
+    depth, extinction = truth_of(scene, result)
+    one, two = coverage(result.optical_depth, result.optical_depth_standard_error, depth)
+    assert 0.62 <= one <= 0.78
+    assert 0.91 <= two <= 0.98
+    assert coverage(result.extinction, result.extinction_standard_error, extinction)[1] >= 0.87
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_standard_errors_are_as_honest_of_thick_hazes_as_of_thin_ones(correlation):
+    rng = np.random.default_rng(3)
+    amounts, deviations = [], []
+    for _ in range(12):
+        aerosol = np.exp(0.7 * rng.normal(size=32))
+        scene = clear(3000.0, aerosol=aerosol, layer=rng.uniform(1500.0, 4500.0, 32))
+        result = solve(scene, estimates(scene, 32, rng, correlation))
+        error = result.extinction - truth_of(scene, result)[1]
+        amounts.append(aerosol)
+        deviations.append(error / result.extinction_standard_error)
+    amount, deviation = np.concatenate(amounts), np.concatenate(deviations)
+    thin, thick = (amount < np.quantile(amount, 0.25)), (amount > np.quantile(amount, 0.75))
+    assert 0.7 < rms(deviation[thick]) / rms(deviation[thin]) < 1.4
+    assert rms(deviation) < 1.0
+    assert np.nanmax(np.abs(deviation)) < 5.0
+
+
+def test_sharp_layers_in_thin_hazes_are_nearly_as_honest_beside_thick_ones():
+    """Hazes that are smooth and thick do not make smoothing look harmless where air is thin."""
+    thin, extinction = 8, 1e-4
+    deviations = []
+    for seed in range(8):
+        scene = clear(3000.0)
+        amount = np.where(np.arange(32) < thin, 0.3, 5.0)[:, np.newaxis]
+        haze = 0.05e-3 * 1200.0 * -np.expm1(-scene.altitude / 1200.0)
+        air = 0.0131e-3 * 8000.0 * -np.expm1(-scene.altitude / 8000.0)
+        sharp = extinction * 100.0 * np.sqrt(0.5 * np.pi)
+        sharp = sharp * (erf((scene.altitude - 2500.0) / (100.0 * np.sqrt(2.0))) + 1.0)
+        scene = dataclasses.replace(scene, truth=air + amount * haze + (amount < 1.0) * sharp)
+        result = solve(scene, estimates(scene, 32, np.random.default_rng(seed), 0.3))
+        score = (result.extinction - truth_of(scene, result)[1]) / result.extinction_standard_error
+        deviations.append(np.where(result.prior_dominated, np.nan, score)[:thin])
+    deviation = np.concatenate(deviations)
+    assert rms(deviation) < 1.0
+    assert np.mean(np.abs(deviation[np.isfinite(deviation)]) > 4.0) < 0.01
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.8, 0.95])
+def test_correlation_is_found_within_2_percent(correlation):
+    found = joined(cloud(), correlation, 32, 8, seed=2)[0]["correlation"]
+    assert np.abs(found.mean() - correlation) <= 0.02
+    found = joined(clear(3000.0), 0.7, 32, 2, seed=2)[0]["correlation"]
+    assert np.abs(found.mean() - 0.7) <= 0.02
+
+
+def test_clear_profile_is_far_better_than_height_by_height():
+    scene = clear(3000.0)
+    found = estimates(scene, 300, np.random.default_rng(4))
+    result = solve(scene, found)
+    depth, extinction = truth_of(scene, result)
+    reached = np.isfinite(result.optical_depth)
+    error = rms(result.optical_depth - depth)
+    assert error <= 0.010
+    # A ninth of it in the study; the scenes differ in how noisy the highest gates are.
+    assert error <= rms(np.where(reached, found.optical_depth - depth, np.nan)) / 8.0
+    assert rms(result.extinction - extinction) <= 0.010 * PER_KM
+
+
+def test_cloud_at_30_degrees_is_resolved():
+    scene = cloud()
+    result = solve(scene, estimates(scene, 300, np.random.default_rng(5)))
+    depth, extinction = truth_of(scene, result)
+    assert rms(result.optical_depth - depth) <= 0.16
+    assert rms(result.extinction - extinction) <= 3.0 * PER_KM
+    two_angles = 0.144 * np.sqrt(2.0) / (2.0 * (scene.secant[-1] - 1.0))
+    assert rms(result.optical_depth - depth) <= two_angles / 3.0
+
+
+def test_smoothing_error_is_less_than_the_standard_error():
+    scene = clear(3000.0)
+    found = estimates(scene, 600, np.random.default_rng(6))
+    result = solve(scene, found)
+    bias = np.nanmean(result.optical_depth - scene.truth, axis=0)
+    typical = np.nanmean(result.optical_depth_standard_error, axis=0)
+    assert np.nanmax(np.abs(bias) / typical) < 1.0
+
+
+# Layers, gradients, outliers ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("profiles", [2, 300])
+def test_layers_are_as_uncertain_as_stated(profiles):
+    scene = clear(3000.0)
+    rng = np.random.default_rng(8)
+    scores = []
+    for _ in range(max(2, 120 // profiles)):
+        result = solve(scene, estimates(scene, profiles, rng))
+        for bottom, top in ((600.0, 1590.0), (1500.0, 2010.0), (2400.0, 3600.0)):
+            layer = layer_optical_depth(result, bottom, top)
+            lower, upper = np.interp((bottom, top), scene.altitude, scene.truth)
+            scores.append(
+                (layer.optical_depth - upper + lower) / layer.optical_depth_standard_error
+            )
+    score = np.abs(np.concatenate(scores))
+    assert 0.5 <= (score < 1.0).mean() <= 0.93
+    assert (score < 1.96).mean() >= 0.88
+
+
+@pytest.mark.parametrize("profiles", [3, 12])
+def test_layer_from_the_station_is_the_optical_depth(profiles):
+    depth, information, _ = plain(profiles, np.random.default_rng(0))
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    layer = layer_optical_depth(result, 0.0, ALTITUDE[20] + 3.0)
+    np.testing.assert_allclose(layer.optical_depth, result.optical_depth[:, 20])
+    error = result.optical_depth_standard_error[:, 20]
+    np.testing.assert_allclose(layer.optical_depth_standard_error, error, rtol=1e-6)
+    one = layer_optical_depth(result, ALTITUDE[20], ALTITUDE[21])
+    np.testing.assert_allclose(one.optical_depth, 30.0 * result.extinction[:, 21], rtol=1e-9)
+    error = 30.0 * result.extinction_standard_error[:, 21]
+    np.testing.assert_allclose(one.optical_depth_standard_error, error, rtol=1e-6)
+
+
+def test_gradient_bound_is_the_bias_that_a_gradient_makes():
+    """A noise-free scan to one side with the largest gradient, solved with the same weights."""
+    scene = clear(3000.0, largest=75.0)
+    rng = np.random.default_rng(9)
+    logarithm, variance = simulate(scene, 20, rng)
+    tangent = np.tan(np.arccos(1.0 / scene.secant))[:, np.newaxis]
+    flat = solve(scene, kano_hamilton(scene, logarithm, variance), gate_pass=False)
+    tilted = kano_hamilton(scene, logarithm + 1e-9 * scene.altitude * tangent, variance)
+    plain_estimates = kano_hamilton(scene, logarithm, variance)
+    shift = tilted.optical_depth - plain_estimates.optical_depth
+    bound = gradient_bound(flat.system, plain_estimates.slope, largest_gradient=1e-9)
+    found = respond(flat.system, shift)
+    reached = np.isfinite(bound)
+    np.testing.assert_allclose(bound[reached], -found[reached], rtol=0.01)
+    usual = gradient_bound(flat.system, plain_estimates.slope)
+    np.testing.assert_allclose(usual, bound * LARGEST_GRADIENT / 1e-9)
+    at_1_km = usual[:, np.argmin(np.abs(scene.altitude - 1000.0))].mean()
+    assert 0.02 < at_1_km < 0.04
+    assert not np.nanmax(gradient_bound(flat.system, np.zeros(scene.altitude.size)))
+
+
+def test_outlying_estimates_do_little_harm():
+    rng = np.random.default_rng(10)
+    depth, information, truth = plain(100, rng)
+    wrong = depth + (rng.random(depth.shape) < 0.05) * 0.4
+    clean, robust, naive = (
+        smooth(rows, information, ALTITUDE, station_altitude=0.0, gate_pass=gate_pass)
+        for rows, gate_pass in ((depth, True), (wrong, True), (wrong, False))
+    )
+    errors = [rms(result.optical_depth - truth) for result in (clean, robust, naive)]
+    assert errors[1] < 1.15 * errors[0]
+    assert errors[2] > 2.0 * errors[0]
+    hit = wrong != depth
+    assert robust.downweighted[hit].all()
+    assert robust.downweighted[~hit].mean() < 0.003
+    one, two = coverage(robust.optical_depth, robust.optical_depth_standard_error, truth)
+    assert one >= 0.6
+    assert two >= 0.91
+
+
+def test_gate_pass_costs_clean_data_nothing():
+    rng = np.random.default_rng(11)
+    depth, information, _ = plain(100, rng)
+    depth[0, 30] += 0.12
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    assert result.downweighted[0, 30]
+    share = result.system.information / information
+    assert np.median(share[1:]) > 1.0
+    assert share[1:].mean() == pytest.approx(1.0, abs=0.01)
+
+
+def test_monotone_profile_is_near_and_never_decreases():
+    depth, information, truth = plain(40, np.random.default_rng(12), error=0.1)
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    monotone = monotone_optical_depth(result)
+    assert np.all(np.diff(monotone, axis=1) >= 0.0)
+    assert rms(monotone - truth) <= 1.001 * rms(result.optical_depth - truth)
+
+
+def test_screen_passes_what_is_only_steep():
+    """A cloud edge of any steepness is no outlier; a single estimate off it is."""
+    steep = np.concatenate([np.zeros(20), np.linspace(0.0, 4.0, 40)])[np.newaxis]
+    information = np.full(steep.shape, 1e6)
+    np.testing.assert_array_equal(_outliers.screen(steep, information), information)
+    information = np.full(steep.shape, 400.0)
+    steep[0, 33] -= 3.0
+    reduced = _outliers.screen(steep, information) < information
+    np.testing.assert_array_equal(np.flatnonzero(reduced), [33])
+
+
+# What is missing and what is extreme --------------------------------------------------------
+
+
+@pytest.mark.parametrize("profiles", [3, 12])
+def test_missing_estimates_are_bridged_and_said_so(profiles):
+    depth, information, truth = plain(profiles, np.random.default_rng(20))
+    depth[0, :4] = np.nan
+    information[0, 20:26] = np.nan
+    depth[1, 50:] = np.nan
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    np.testing.assert_array_equal(
+        np.flatnonzero(result.interpolated[0]), [*range(4), *range(20, 26)]
+    )
+    assert np.isfinite(result.optical_depth[0]).all()
+    np.testing.assert_array_equal(np.flatnonzero(result.extrapolated[1]), np.arange(50, 60))
+    assert result.reach[1] == ALTITUDE[49]
+    for values in (
+        result.optical_depth,
+        result.optical_depth_standard_error,
+        result.extinction,
+        result.extinction_standard_error,
+        result.data_share,
+        result.resolution,
+    ):
+        assert np.isnan(values[1, 50:]).all()
+    assert np.abs(result.optical_depth - truth)[0].max() < 0.05
+    middle = result.optical_depth_standard_error[0, 22]
+    assert middle > 0.9 * result.optical_depth_standard_error[2, 22]
+
+
+def test_profile_without_data_stays_empty_and_leaves_the_others_alone():
+    depth, information, _ = plain(9, np.random.default_rng(21))
+    alone = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    empty = np.full((1, 60), np.nan)
+    depth = np.concatenate([depth[:4], empty, depth[4:]])
+    information = np.concatenate([information[:4], np.zeros((1, 60)), information[4:]])
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    assert result.no_data[4]
+    assert not np.delete(result.no_data, 4).any()
+    np.testing.assert_array_equal(np.delete(result.optical_depth, 4, axis=0), alone.optical_depth)
+    for field in dataclasses.fields(result):
+        values = getattr(result, field.name)
+        if isinstance(values, np.ndarray) and values.dtype == np.float64:
+            assert np.isnan(values[4]).all()
+    assert not result.interpolated[4].any()
+    assert result.extrapolated[4].all()
+    assert np.isnan(monotone_optical_depth(result)[4]).all()
+    layer = layer_optical_depth(result, 0.0, 600.0)
+    assert np.isnan(layer.optical_depth_standard_error[4])
+    assert np.isfinite(np.delete(layer.optical_depth_standard_error, 4)).all()
+
+
+@pytest.mark.parametrize("profiles", [0, 1, 9])
+def test_nothing_at_all_gives_nothing(profiles):
+    missing = np.full((profiles, 60), np.nan)
+    result = smooth(missing, missing, ALTITUDE, station_altitude=0.0)
+    assert result.no_data.all()
+    assert np.isnan(result.optical_depth).all()
+    assert np.isnan(gradient_bound(result.system, np.ones((profiles, 60)))).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "weight"),
+    [(1e300, 2500.0), (np.inf, 2500.0), (0.1, 1e300), (0.1, np.inf), (0.1, 1e-300), (1e7, 2500.0)],
+)
+@pytest.mark.parametrize("profiles", [3, 20])
+def test_one_impossible_estimate_is_contained(value, weight, profiles):
+    depth, information, truth = plain(profiles, np.random.default_rng(22))
+    depth[0, 30], information[0, 30] = value, weight
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    assert np.isfinite(result.optical_depth).all()
+    assert np.isfinite(result.extinction_standard_error).all()
+    error = np.abs(result.optical_depth - truth)
+    assert error[1:].max() < 0.06
+    assert np.abs(np.delete(error[0], np.arange(24, 37))).max() < 0.1
+
+
+@pytest.mark.parametrize("heights", [1, 2, 3, 4])
+@pytest.mark.parametrize("profiles", [1, 9])
+def test_few_heights_are_solved(heights, profiles):
+    depth, information, truth = plain(
+        profiles, np.random.default_rng(23), altitude=ALTITUDE[:heights]
+    )
+    result = smooth(depth, information, ALTITUDE[:heights], station_altitude=0.0)
+    assert (np.abs(result.optical_depth - truth) < 0.1).all()
+    assert (result.optical_depth_standard_error > 0.0).all()
+    assert (result.optical_depth_standard_error < 0.03).all()
+    if heights == 1:
+        np.testing.assert_allclose(result.optical_depth, depth, rtol=1e-9)
+        np.testing.assert_allclose(result.optical_depth_standard_error, 0.02, rtol=1e-6)
+
+
+@given(seed=st.integers(0, 2**32 - 1), profiles=st.integers(1, 12), heights=st.integers(1, 30))
+@settings(max_examples=60, deadline=None)
+def test_any_pattern_of_estimates_is_solved_or_withheld(seed, profiles, heights):
+    rng = np.random.default_rng(seed)
+    shape = (profiles, heights)
+    depth = rng.normal(size=shape) * 10.0 ** rng.uniform(-6.0, 5.0, shape)
+    information = 10.0 ** (rng.uniform(-9.0, 9.0) + rng.uniform(-2.0, 2.0, shape))
+    information[rng.random(shape) < rng.random()] = rng.choice([0.0, np.nan])
+    result = smooth(depth, information, ALTITUDE[:heights], station_altitude=0.0)
+    there = np.isfinite(information) & (information > 0.0)
+    within = np.cumsum(there[:, ::-1], axis=1)[:, ::-1] > 0
+    total = (np.where(there, information, 0.0) * ALTITUDE[:heights] ** 2).sum(axis=1)
+    within[total < 1e-4 * np.median(total[there.any(axis=1)] if there.any() else 0.0)] = False
+    for values in (result.optical_depth, result.extinction):
+        np.testing.assert_array_equal(np.isfinite(values), within)
+    for values in (result.optical_depth_standard_error, result.extinction_standard_error):
+        np.testing.assert_array_equal(np.isfinite(values), within)
+        assert (values[within] > 0.0).all()
+    np.testing.assert_array_equal(result.interpolated, within & ~there)
+
+
+def test_profile_that_says_nearly_nothing_is_withheld():
+    depth, information, _ = plain(9, np.random.default_rng(24))
+    information[3] *= 1e-5
+    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    np.testing.assert_array_equal(np.flatnonzero(result.no_data), [3])
+    assert np.isnan(result.optical_depth[3]).all()
+
+
+# Blocks -------------------------------------------------------------------------------------
+
+
+def results_equal(one, other, rows=slice(None)):
+    for field in dataclasses.fields(one):
+        if field.name != "system":
+            first, second = getattr(one, field.name)[rows], getattr(other, field.name)
+            np.testing.assert_array_equal(first, second, err_msg=field.name)
+
+
+def test_whole_blocks_give_the_same_bits_in_any_company():
+    scene = clear(3000.0)
+    rng = np.random.default_rng(30)
+    found = estimates(scene, 61, rng, 0.5)
+    block = np.repeat([7, -3, 12, 5], [20, 33, 1, 7])
+    options = {"station_altitude": 0.0}
+    together = smooth(
+        found.optical_depth, found.information, scene.altitude,
+        residuals=found.residuals, block=block, **options,
+    )  # fmt: skip
+    bound = gradient_bound(together.system, found.slope)
+    layer = layer_optical_depth(together, 600.0, 1500.0)
+    for rows in (slice(0, 20), slice(20, 53), slice(53, 61), slice(20, 61)):
+        alone = smooth(
+            found.optical_depth[rows].copy(), found.information[rows].copy(), scene.altitude,
+            residuals=take(found.residuals, rows), block=block[rows], **options,
+        )  # fmt: skip
+        results_equal(together, alone, rows)
+        np.testing.assert_array_equal(bound[rows], gradient_bound(alone.system, found.slope[rows]))
+        other = layer_optical_depth(alone, 600.0, 1500.0)
+        np.testing.assert_array_equal(
+            layer.optical_depth_standard_error[rows], other.optical_depth_standard_error
+        )
+
+
+def test_blocks_may_be_interleaved():
+    depth, information, _ = plain(30, np.random.default_rng(31))
+    block = np.arange(30) % 2
+    mixed = smooth(depth, information, ALTITUDE, station_altitude=0.0, block=block)
+    for label in (0, 1):
+        rows = block == label
+        alone = smooth(depth[rows], information[rows], ALTITUDE, station_altitude=0.0)
+        results_equal(mixed, alone, rows)
+
+
+@pytest.mark.parametrize("profiles", [3, 12])
+def test_kind_of_array_does_not_matter(profiles):
+    depth, information, _ = plain(profiles, np.random.default_rng(32))
+    depth, information = depth.astype(np.float32), information.astype(np.float32)
+    expected = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    depth.flags.writeable = False
+    for other in (
+        depth.astype(">f8"),
+        np.asfortranarray(depth),
+        np.repeat(depth, 2, axis=1)[:, ::2],
+        np.ma.masked_invalid(depth),
+    ):
+        results_equal(expected, smooth(other, information, ALTITUDE, station_altitude=0.0))
+    assert expected.optical_depth.dtype == np.float64
+
+
+def test_unit_of_the_noise_scales_the_errors_only():
+    depth, information, _ = plain(12, np.random.default_rng(33))
+    base = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    scaled = smooth(1e3 * depth, 1e-6 * information, ALTITUDE, station_altitude=0.0)
+    np.testing.assert_allclose(scaled.optical_depth, 1e3 * base.optical_depth, rtol=1e-9)
+    np.testing.assert_allclose(
+        scaled.extinction_standard_error, 1e3 * base.extinction_standard_error, rtol=1e-7
+    )
+
+
+# Residuals and flags ------------------------------------------------------------------------
+
+
+def test_coherent_residuals_in_noise_are_no_correlation_of_the_air():
+    """The far half is noise, and all of it off along each ray, as by a background."""
+    rng = np.random.default_rng(41)
+    shape = (30, 8, 60)
+    noise = np.where(np.arange(60) < 30, 1e-4, 0.04)
+    variance = np.full((30, 60), 0.03**2)
+    residual = np.sqrt(noise + variance[0]) * rng.normal(size=shape)
+    residual += 0.5 * np.sqrt(noise) * (noise > 1e-3) * rng.normal(size=(30, 8, 1))
+    weight = np.broadcast_to(1.0 / (noise + variance[0]), shape)
+    moments = residual_moments(residual, weight, np.zeros(shape), variance, np.ones((30, 60)))
+    rho, _ = _correlation.fit(moments.lag_products, moments.lag_norms)
+    assert rho < 0.1
+
+
+def test_lag_sums_are_those_of_the_definition():
+    rng = np.random.default_rng(40)
+    shape = (3, 5, 12)
+    residual, leverage = rng.normal(size=shape), rng.uniform(0.0, 0.9, shape)
+    weight = np.where(rng.random(shape) < 0.2, 0.0, rng.uniform(1.0, 9.0, shape))
+    weight[0, 0, 0], residual[1, 1, 1] = np.nan, np.nan
+    variance = rng.uniform(0.01, 0.1, (3, 12))
+    found = residual_moments(residual, weight, leverage, variance, np.full((3, 12), 0.5))
+    used = (np.nan_to_num(weight) > 0.0) & np.isfinite(residual)
+    u = np.where(used, residual * np.sqrt(weight), 0.0)
+    c = np.where(used, np.sqrt(weight * variance[:, None] * (1.0 - leverage)), 0.0)
+    for lag in (1, 2, 3):
+        joint = c[..., lag:] * c[..., :-lag]
+        product = (joint * u[..., lag:] * u[..., :-lag]).sum(axis=(1, 2))
+        norm = (joint**2).sum(axis=(1, 2))
+        np.testing.assert_allclose(found.lag_products[:, lag - 1], product, rtol=1e-12)
+        np.testing.assert_allclose(found.lag_norms[:, lag - 1], norm, rtol=1e-12)
+    np.testing.assert_array_equal(found.degrees_of_freedom, np.maximum(used.sum(axis=1) - 2, 0))
+
+
+@pytest.mark.parametrize(
+    ("ratios", "expected"),
+    [
+        ((0.03, 0.0, 0.0), (0.0, 1.0)),
+        ((-0.2, 0.0, 0.0), (0.0, 1.0)),
+        ((0.08, 0.5, 0.5), (0.08, 1.0)),
+        ((0.8, 0.64, 0.512), (0.8, 1.0)),
+        ((0.56, 0.392, 0.2744), (0.7, 0.8)),
+        ((1.0, 1.0, 1.0), (0.97, 1.05)),
+        ((0.0, 0.0, np.nan), (0.0, 1.0)),
+    ],
+)
+def test_correlation_and_amplitude_follow_from_three_lags(ratios, expected):
+    norms = np.array([[2.0, 3.0, 4.0], [1.0, 1.0, 1.0]])
+    if np.isnan(ratios[2]):
+        norms[:] = 0.0
+    products = np.nan_to_num(np.array(ratios)) * norms
+    found = _correlation.fit(products, norms)
+    assert found == pytest.approx(expected, abs=0.011)
+
+
+def moments_of(profiles, *, ratio=0.0, share=1.0, freedom=10.0):
+    """Residual moments of the shape of `plain`, with given lag ratios."""
+    lags = np.array([ratio, ratio**2, ratio**3])
+    shape = (profiles, ALTITUDE.size)
+    return _correlation.ResidualMoments(
+        np.tile(lags, (profiles, 1)),
+        np.ones((profiles, 3)),
+        np.full(shape, share),
+        np.full(shape, freedom),
+        np.zeros(profiles, dtype=np.bool_),
+    )
+
+
+@pytest.mark.parametrize(("freedom", "factor"), [(10.0, 1.0), (0.2, 1.0), (0.0, 4.1 / 2.1)])
+def test_noise_known_from_few_residuals_widens_the_errors(freedom, factor):
+    depth, information, _ = plain(12, np.random.default_rng(41))
+    known = smooth(depth, information, ALTITUDE, station_altitude=0.0, gate_pass=False)
+    moments = moments_of(12, freedom=freedom)
+    found = smooth(
+        depth, information, ALTITUDE, station_altitude=0.0, residuals=moments, gate_pass=False
+    )
+    number = 15.0 * 12.0 * freedom
+    factor = number / (number - 2.0) if number > 4.1 else factor
+    share = (found.optical_depth_standard_error / known.optical_depth_standard_error)[:, 20]
+    np.testing.assert_allclose(share**2, factor, rtol=1e-9)
+    assert found.no_residual.all() == (freedom == 0.0)
+
+
+def test_correlated_noise_has_wider_errors_and_a_flag():
+    depth, information, _ = plain(12, np.random.default_rng(42))
+    results = [
+        smooth(
+            depth, information, ALTITUDE, station_altitude=0.0, residuals=moments_of(12, ratio=r)
+        )
+        for r in (0.0, 0.6, 0.9)
+    ]
+    errors = [r.optical_depth_standard_error.mean() for r in results]
+    assert errors[0] < errors[1] < errors[2]
+    assert [r.high_correlation.any() for r in results] == [False, False, True]
+    assert results[2].high_correlation.all()
+    np.testing.assert_allclose(results[1].correlation, 0.6, atol=0.01)
+
+
+def test_noise_of_detectors_is_taken_as_uncorrelated():
+    depth, information, _ = plain(12, np.random.default_rng(43))
+    plainly = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    found = smooth(
+        depth, information, ALTITUDE, station_altitude=0.0,
+        residuals=moments_of(12, ratio=0.8, share=0.0, freedom=1e9),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.optical_depth, plainly.optical_depth, rtol=1e-12)
+
+
+def test_profile_with_more_structure_than_smoothing_is_for_is_flagged():
+    rng = np.random.default_rng(44)
+    steps = np.cumsum(rng.uniform(0.0, 1.0, ALTITUDE.size))
+    rough = steps + 0.003 * rng.normal(size=(20, ALTITUDE.size))
+    result = smooth(rough, np.full(rough.shape, 1e5), ALTITUDE, station_altitude=0.0)
+    assert result.undersmoothed.all()
+    depth, information, _ = plain(20, rng)
+    assert not smooth(depth, information, ALTITUDE, station_altitude=0.0).undersmoothed.any()
+
+
+def test_data_share_is_the_reply_to_the_answer_where_that_is_significant():
+    depth = np.where(ALTITUDE > 1500.0, (ALTITUDE - 1500.0) * 2e-3, 0.0) + 1e-5 * ALTITUDE
+    noisy = depth + 0.3 * np.random.default_rng(45).normal(size=(40, 60))
+    result = smooth(noisy, np.full(noisy.shape, 0.3**-2.0), ALTITUDE, station_altitude=0.0)
+    reply = respond(result.system, result.optical_depth)
+    there = np.isfinite(result.data_share)
+    np.testing.assert_allclose(
+        result.data_share[there], (reply / result.optical_depth)[there], rtol=1e-9
+    )
+    told = np.abs(result.optical_depth) > result.optical_depth_standard_error
+    np.testing.assert_array_equal(there, told)
+    outside = (result.data_share < 0.9) | (result.data_share > 1.1)
+    np.testing.assert_array_equal(result.prior_dominated, outside | result.saturated[:, None])
+
+
+# Refusals -----------------------------------------------------------------------------------
+
+
+GOOD = {
+    "optical_depth": np.zeros((4, 60)),
+    "information": np.ones((4, 60)),
+    "altitude": ALTITUDE,
+    "station_altitude": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"optical_depth": np.zeros(60)}, "optical_depth"),
+        ({"optical_depth": np.zeros((4, 59))}, "optical_depth"),
+        ({"optical_depth": np.full((4, 60), "a")}, "optical_depth"),
+        ({"information": np.ones((3, 60))}, "information"),
+        ({"information": -np.ones((4, 60))}, "information"),
+        ({"altitude": ALTITUDE[::-1]}, "altitude"),
+        ({"altitude": ALTITUDE**1.1}, "altitude"),
+        ({"altitude": ALTITUDE.reshape(6, 10)}, "altitude"),
+        ({"altitude": np.where(np.arange(60) == 5, np.nan, ALTITUDE)}, "altitude"),
+        ({"station_altitude": 150.0}, "altitude"),
+        ({"station_altitude": np.nan}, "station_altitude"),
+        ({"block": np.zeros(3, dtype=int)}, "block"),
+        ({"block": np.zeros(4)}, "block"),
+        ({"residuals": moments_of(3)}, "residuals.lag_products"),
+    ],
+)
+def test_impossible_arguments_are_refused(change, field):
+    with pytest.raises(RetrievalInputError) as caught:
+        smooth(**(GOOD | change))
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("bottom", "top", "field"),
+    [
+        (-200.0, 600.0, "bottom"),
+        (600.0, 9000.0, "top"),
+        (600.0, 610.0, "top"),
+        (900.0, 600.0, "top"),
+    ],
+)
+def test_impossible_layers_are_refused(bottom, top, field):
+    result = smooth(**GOOD)
+    with pytest.raises(RetrievalInputError) as caught:
+        layer_optical_depth(result, bottom, top)
+    assert caught.value.field == field
+
+
+def test_other_impossible_arguments_are_refused():
+    system = smooth(**GOOD).system
+    with pytest.raises(RetrievalInputError, match="profiles"):
+        respond(system, np.zeros((3, 60)))
+    with pytest.raises(RetrievalInputError, match="largest_gradient"):
+        gradient_bound(system, np.zeros(60), largest_gradient=-1.0)
+    with pytest.raises(RetrievalInputError, match="leverage"):
+        residual_moments(*np.zeros((2, 1, 2, 3)), np.zeros((1, 2, 4)), np.zeros(1), np.zeros(1))

@@ -1,0 +1,133 @@
+"""The choice of smoothness against dense likelihoods, and its rules."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.banded_matrices import dense
+
+from lidarops.retrieve.multiangle.vertical import _banded
+from lidarops.retrieve.multiangle.vertical._correlation import precision
+from lidarops.retrieve.multiangle.vertical._smoothing_choice import (
+    GRID,
+    PER_DECADE,
+    Scores,
+    choose,
+    score,
+)
+
+HEIGHTS = 25
+ALTITUDE = 100.0 + 30.0 * np.arange(HEIGHTS)
+
+
+def block(profiles, correlation, rng):
+    information = rng.uniform(20.0, 80.0, (profiles, HEIGHTS))
+    truth = 2e-4 * ALTITUDE + 0.05 * np.sin(ALTITUDE / 200.0)
+    estimates = truth + rng.normal(size=(profiles, HEIGHTS)) / np.sqrt(information)
+    bands = precision(information, np.ones_like(information), correlation)
+    unit = information.mean() * ALTITUDE[-1] ** 3
+    return bands, estimates, _banded.penalty(ALTITUDE, 0.0), unit
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6])
+def test_likelihood_is_the_restricted_one_of_the_marginal_distribution(correlation):
+    """Gauss: the estimates are a straight line, an integrated random walk and noise."""
+    bands, estimates, stiffness, unit = block(3, correlation, np.random.default_rng(0))
+    found = score(bands, estimates, stiffness, unit).likelihood
+    prior = np.linalg.pinv(dense(stiffness), rcond=1e-11, hermitian=True)
+    line = ALTITUDE[:, np.newaxis]
+    expected = np.zeros(GRID.size)
+    for t in range(3):
+        noise = np.linalg.inv(dense(bands[:, t]))
+        for i, smoothing in enumerate(GRID):
+            covariance = noise + prior / (smoothing * unit)
+            inverse = np.linalg.inv(covariance)
+            inner = line.T @ inverse @ line
+            rest = inverse - inverse @ line @ np.linalg.inv(inner) @ line.T @ inverse
+            expected[i] += (
+                np.linalg.slogdet(covariance)[1]
+                + np.linalg.slogdet(inner)[1]
+                + estimates[t] @ rest @ estimates[t]
+            )
+    difference = found - expected
+    np.testing.assert_allclose(difference, difference.mean(), atol=1e-5)
+
+
+def test_risk_estimates_the_true_error_without_bias():
+    rng = np.random.default_rng(1)
+    information = np.full((64, HEIGHTS), 50.0)
+    truth = 0.05 * np.sin(ALTITUDE / 100.0)
+    bands = precision(information, np.ones_like(information), 0.5)
+    covariance = np.linalg.inv(dense(bands[:, 0]))
+    stiffness, unit = _banded.penalty(ALTITUDE, 0.0), 50.0 * ALTITUDE[-1] ** 3
+    noise = rng.multivariate_normal(np.zeros(HEIGHTS), covariance, size=64)
+    found = score(bands, truth + noise, stiffness, unit)
+    weight = dense(bands[:, 0])
+    for i in range(0, GRID.size, 6):
+        smoother = np.linalg.inv(weight + GRID[i] * unit * dense(stiffness)) @ weight
+        error = (truth + noise) @ smoother.T - truth
+        loss = np.einsum("ti,ij,tj->", error, weight, error)
+        expected = loss + 64 * HEIGHTS
+        assert found.risk[i] == pytest.approx(expected, rel=0.07)
+        assert found.freedom[i] == pytest.approx(np.trace(smoother), rel=1e-6)
+
+
+@pytest.mark.parametrize(("profiles", "heights", "every"), [(130, 400, 3), (130, 25, 1)])
+def test_long_block_is_scored_on_every_nth_profile(profiles, heights, every):
+    estimates = np.random.default_rng(3).normal(size=(profiles, heights))
+    bands = precision(np.ones_like(estimates), np.zeros_like(estimates), 0.0)
+    stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1), 0.0)
+    chosen = np.ascontiguousarray(bands[:, ::every])
+    part = score(chosen, estimates[::every].copy(), stiffness, 1e8)
+    whole = score(bands, estimates, stiffness, 1e8)
+    np.testing.assert_array_equal(whole.likelihood, part.likelihood)
+    assert whole.profiles == profiles
+
+
+def test_profile_unlike_the_others_has_no_say_in_the_risk():
+    bands, estimates, stiffness, unit = block(20, 0.0, np.random.default_rng(2))
+    clean = score(bands[:, 1:], estimates[1:], stiffness, unit)
+    estimates[0] += 30.0 * (-1.0) ** np.arange(HEIGHTS)
+    np.testing.assert_allclose(score(bands, estimates, stiffness, unit).risk, clean.risk, rtol=1e-9)
+
+
+def scores(likely, risky, profiles=300):
+    """Parabolas with their minima at given indices, and degrees of freedom from 20 down to 1."""
+    index = np.arange(GRID.size)
+    freedom = np.geomspace(20.0, 1.0, GRID.size)
+    return Scores((index - likely) ** 2.0, (index - risky) ** 2.0, freedom, profiles)
+
+
+def test_likelihood_is_followed_where_the_risk_agrees():
+    assert choose(scores(30, 29)).smoothing == GRID[30]
+    assert choose(scores(30, 35)).smoothing == GRID[30]
+
+
+def test_risk_is_followed_where_it_asks_for_more_freedom_up_to_a_decade():
+    assert choose(scores(30, 25)).smoothing == GRID[25]
+    assert choose(scores(30, 5)).smoothing == GRID[30 - PER_DECADE]
+
+
+def test_two_degrees_of_freedom_are_left():
+    choice = choose(scores(66, 66))
+    assert choice.saturated
+    assert 2.0 <= choice.effective_degrees_of_freedom < 2.1
+    assert not choose(scores(30, 30)).saturated
+
+
+def test_small_block_is_averaged_by_likelihood():
+    choice = choose(scores(30, 5, profiles=7))
+    assert choice.share.sum() == pytest.approx(1.0)
+    weight = np.exp(-0.5 * (np.arange(GRID.size) - 30.0) ** 2)
+    where = np.searchsorted(GRID, choice.smoothing)
+    expected = weight[where] / weight[where].sum()
+    np.testing.assert_allclose(choice.share, expected, rtol=1e-12)
+    assert weight[where].sum() / weight.sum() > 1.0 - 1e-4
+    assert choice.mean_smoothing == pytest.approx(GRID[30], rel=1e-6)
+
+
+def test_data_that_never_reach_two_degrees_of_freedom_are_saturated():
+    low = Scores(np.arange(GRID.size)[::-1] * 1.0, np.zeros(GRID.size), np.ones(GRID.size), 50)
+    choice = choose(low)
+    assert choice.saturated
+    assert choice.smoothing == GRID[0]

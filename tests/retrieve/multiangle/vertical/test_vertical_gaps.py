@@ -1,0 +1,136 @@
+"""Stated errors where samples are missing here and there: neighbours that come from other rays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.oracle_multiangle import ANGLES, clear, cloud, rms, signals
+
+from lidarops.retrieve.multiangle.optical_depth import solve
+from lidarops.retrieve.multiangle.vertical import _correlation, gaps
+
+STEEP = np.linspace(0.0, 30.0, 6)
+
+
+def errors_with_gaps(atmosphere, angles, correlation, missing, **noise):
+    """Return errors and stated errors of the optical depth and of extinction, many blocks."""
+    rng = np.random.default_rng(77)
+    found = []
+    for _ in range(24):
+        signal, variance, tau = signals(
+            rng, 16, angles, atmosphere, correlation=correlation, **noise
+        )
+        signal[rng.random(signal.shape) < missing] = np.nan
+        one = solve(signal, angles, atmosphere[0], variance=variance)
+        assert np.array_equal(np.isnan(one.extinction), np.isnan(one.extinction_standard_error))
+        found.append(
+            (
+                one.optical_depth - tau,
+                one.optical_depth_standard_error,
+                one.extinction - atmosphere[1],
+                one.extinction_standard_error,
+            )
+        )
+    return np.stack(found, axis=1)
+
+
+# Errors of extinction are stated too wide without any gap, so that only too small ones count.
+@pytest.mark.parametrize(("correlation", "missing"), [(0.7, 0.3), (0.9, 0.1), (0.9, 0.3)], ids=str)
+def test_stated_errors_of_a_cloud_hold_with_gaps(correlation, missing):
+    depth, stated, extinction, of_extinction = errors_with_gaps(
+        cloud(), STEEP, correlation, missing, ratio=1e7, inhomogeneity=0.144
+    )
+    assert 0.9 < rms(depth / stated) < 1.1
+    assert rms(extinction / of_extinction) < 1.1
+
+
+def test_stated_errors_of_clear_air_hold_with_gaps():
+    depth, stated, extinction, of_extinction = errors_with_gaps(
+        clear(120), ANGLES, 0.9, 0.3, ratio=3000.0, inhomogeneity=0.03
+    )
+    assert 0.9 < rms(depth / stated) < 1.1
+    assert rms(extinction / of_extinction) < 1.1
+
+
+@pytest.mark.parametrize("hole", [(1, 60, 61), (3, 30, 60)], ids=["one sample", "half a ray"])
+def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
+    """Undoubted estimates must not share more of their noise than all of it."""
+    rng, atmosphere = np.random.default_rng(1), clear(120)
+    deviations = []
+    for correlation in (0.97, 0.99):
+        for _ in range(8):
+            signal, variance, _ = signals(
+                rng, 16, ANGLES, atmosphere, ratio=3000.0, inhomogeneity=0.03,
+                correlation=correlation,
+            )  # fmt: skip
+            ray, first, past = hole
+            signal[:, [1, ray], first:past] = np.nan
+            one = solve(signal, ANGLES, atmosphere[0], variance=variance)
+            valued = np.isfinite(one.extinction)
+            assert np.all(one.extinction_standard_error[valued] > 0.0)
+            assert np.all(one.optical_depth_standard_error[np.isfinite(one.optical_depth)] > 0.0)
+            deviations.append(
+                ((one.extinction - atmosphere[1]) / one.extinction_standard_error)[valued]
+            )
+    assert np.mean(np.abs(np.concatenate(deviations)) > 4.0) < 5e-4
+
+
+def noise_with_gaps(rng, correlation, rays=8, heights=60):
+    """Return information, share and true covariance of means over rays, a third missing.
+
+    Rays whose noise is all shared along height, of variance 1.
+    """
+    there = rng.random((heights, rays)) > 1.0 / 3.0
+    there[:, 0] |= ~there.any(axis=1)
+    weight = there / there.sum(axis=1, keepdims=True)
+    apart = np.abs(np.subtract.outer(np.arange(heights), np.arange(heights)))
+    covariance = (weight @ weight.T) * correlation**apart
+    information = there.sum(axis=1).astype(np.float64)
+    return information, information / rays, covariance
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.7, 0.9, 0.95])
+def test_precision_with_gaps_tells_how_certain_a_mean_is(correlation):
+    """Of a constant, the precision states a variance that the weights that follow from it have."""
+    rng, ratios = np.random.default_rng(3), []
+    for _ in range(100):
+        information, share, covariance = noise_with_gaps(rng, correlation)
+        bands = gaps.precision(information[None], share[None], correlation)[:, 0]
+        dense = np.diag(bands[0])
+        for step in (1, 2):
+            dense += np.diag(bands[step, :-step], step) + np.diag(bands[step, :-step], -step)
+        assert np.linalg.eigvalsh(dense).min() > 0.0
+        weight = dense.sum(axis=0)
+        stated = 1.0 / weight.sum()
+        ratios.append((weight @ covariance @ weight) * stated**2 / stated)
+    assert np.sqrt(np.mean(ratios)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_precision_of_even_noise_is_that_without_gaps():
+    information, share = np.full((2, 30), 5.0), np.full((2, 30), 0.8)
+    plain = _correlation.precision(information, share, 0.9)
+    found = gaps.precision(information, share, 0.9)
+    np.testing.assert_allclose(found, plain, rtol=1e-12)
+
+
+def test_no_number_is_demanded_of_heights_that_share_nothing():
+    information = np.tile([4.0, 0.0, 9.0], (1, 5))
+    share = np.where(np.arange(15) % 2 == 0, 0.0, 1e-300)[np.newaxis]
+    found = gaps.precision(information, share, 0.9)
+    np.testing.assert_array_equal(found[0], information)
+    assert not found[1:].any()
+
+
+def test_only_samples_missing_between_others_are_gaps():
+    signal = np.ones((6, 2, 5))
+    signal[1, 0, 2] = np.nan
+    signal[2, 1, :2] = np.nan
+    signal[3, 1, 3:] = np.nan
+    signal[4, 1] = np.nan
+    signal[5, 0, 2] = -1.0
+    variance = np.full(signal.shape, 0.1)
+    there = signal > 0.0
+    found = gaps.between(there, signal, variance)
+    np.testing.assert_array_equal(found, [False, True, False, False, False, False])
+    variance[0, 1, 3], there[0, 1, 3] = np.nan, False
+    assert gaps.between(there, signal, variance)[0]

@@ -1,0 +1,333 @@
+"""Cycles of rays: the closed form against linear algebra and exact arithmetic."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.oracle_network import homogeneous, optical_depths, triangle
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.network import _multiplier, geometry
+from lidarops.retrieve.network.cycles import (
+    solve_cycle,
+    substitute,
+    systematic_error,
+    values_and_variances,
+)
+
+
+def rows(rng, count, k, depth=0.3, spread=0.3, signs=None):
+    """Draw exact rows of any field: signal, signal, integral, and the answer."""
+    reciprocal = np.exp(rng.normal(0.0, spread, (count, k)))
+    depths = rng.uniform(0.05, depth, (count, k))
+    if signs is None:
+        signs = np.ones(k)
+    starts = np.exp(rng.normal(0.0, 1.0, (count, k)))
+    following = np.roll(reciprocal, -1, axis=1)
+    ends = starts * reciprocal / following * np.exp(-2 * signs * depths)
+    return starts, ends, starts * reciprocal - ends * following, reciprocal, signs * depths
+
+
+def matrices(starts, ends):
+    count, k = starts.shape
+    out = np.zeros((count, k, k))
+    for j in range(k):
+        out[:, j, j] = starts[:, j]
+        out[:, j, (j + 1) % k] = -ends[:, j]
+    return out
+
+
+# Algebra ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [2, 3, 5, 12, 40])
+def test_closed_form_agrees_with_linear_algebra(k):
+    starts, ends, integrals, reciprocal, _ = rows(np.random.default_rng(k), 200, k)
+    result = solve_cycle(starts, ends, integrals)
+    dense = np.linalg.solve(matrices(starts, ends), integrals[..., np.newaxis])[:, 0, 0]
+    np.testing.assert_allclose(result.value, dense, rtol=1e-14)
+    np.testing.assert_allclose(result.value, reciprocal[:, 0], rtol=2e-14)
+    everywhere = substitute(starts, ends, integrals, result.value)
+    np.testing.assert_allclose(everywhere, reciprocal, rtol=1e-13)
+
+
+@pytest.mark.parametrize("k", [3, 7])
+@pytest.mark.parametrize(("multiplier", "unbiased"), [(1.0, False), (0.6, False), (0.3, True)])
+def test_sensitivities_agree_with_exact_derivatives(k, multiplier, unbiased):
+    rng = np.random.default_rng(5)
+    starts, ends, integrals, _, _ = rows(rng, 4, k, signs=rng.choice([1.0, 1.0, -1.0], k))
+    result = solve_cycle(starts, ends, integrals, multiplier=multiplier, unbiased=unbiased)
+
+    def value(logs, n):
+        a, e, b = (
+            [
+                mp.mpf(float(x)) * mp.e**y
+                for x, y in zip(part[n], logs[i * k : i * k + k], strict=True)
+            ]
+            for i, part in enumerate((starts, ends, integrals))
+        )
+        lam, numerator, product, determinant = mp.mpf(multiplier), mp.mpf(0), mp.mpf(1), mp.mpf(1)
+        for j in range(k):
+            numerator += lam**j * product * b[j] / a[j]
+            product *= e[j] / a[j]
+            if unbiased and j < k - 1:
+                determinant -= (lam**j - lam ** (j + 1)) * product
+        return numerator / (determinant - lam ** (k - 1) * product)
+
+    with mp.workdps(30):
+        for n in range(4):
+            assert float(result.value[n]) == pytest.approx(float(value([0] * 3 * k, n)), rel=1e-13)
+            for i in range(3):
+                for j in range(k):
+                    at = [mp.mpf(0)] * (3 * k)
+                    step = mp.mpf(10) ** -10
+                    at[i * k + j] = step
+                    upper = value(at, n)
+                    at[i * k + j] = -step
+                    slope = float((upper - value(at, n)) / (2 * step))
+                    scale = np.abs(result.sensitivities[n]).max()
+                    assert abs(result.sensitivities[n, j, i] - slope) < 1e-12 * scale
+
+
+def test_variance_is_that_of_independent_relative_errors():
+    rng = np.random.default_rng(8)
+    starts, ends, integrals, _, _ = rows(rng, 1, 3, depth=0.6)
+    relative = np.full((3, 3), 1e-8) * rng.uniform(0.5, 2.0, (3, 3))
+    result = solve_cycle(starts, ends, integrals, relative_variance=relative)
+    draws = 1 + np.sqrt(relative) * rng.standard_normal((200_000, 3, 3))
+    scattered = solve_cycle(starts * draws[..., 0], ends * draws[..., 1], integrals * draws[..., 2])
+    assert np.sqrt(result.variance[0]) == pytest.approx(np.std(scattered.value), rel=0.01)
+    value, variance = values_and_variances(starts, ends, integrals, relative)
+    assert value[0] == result.value[0]
+    assert variance[0] == pytest.approx(result.variance[0], rel=1e-14)
+
+
+def test_result_does_not_depend_on_the_other_cycles():
+    starts, ends, integrals, _, _ = rows(np.random.default_rng(2), 257, 3)
+    variance = np.random.default_rng(3).uniform(0, 1e-3, (257, 3, 3))
+    whole = solve_cycle(starts, ends, integrals, relative_variance=variance)
+    for part in (slice(0, 1), slice(100, 157), slice(256, 257)):
+        piece = solve_cycle(
+            starts[part], ends[part], integrals[part], relative_variance=variance[part]
+        )
+        assert np.array_equal(piece.value, whole.value[part])
+        assert np.array_equal(piece.variance, whole.variance[part])
+
+
+# The lambda family --------------------------------------------------------------------------
+
+
+def test_three_rays_give_the_equation_of_the_paper():
+    starts, ends, b, _, _ = rows(np.random.default_rng(4), 50, 3)
+    lam = 0.8
+    (a11, a22, a33), (a12, a23, a31) = starts.T, ends.T
+    numerator = a22 * a33 * b[:, 0] + lam * a12 * a33 * b[:, 1] + lam**2 * a12 * a23 * b[:, 2]
+    expected = numerator / (a11 * a22 * a33 - lam**2 * a12 * a23 * a31)
+    result = solve_cycle(starts, ends, b, multiplier=lam)
+    np.testing.assert_allclose(result.value, expected, rtol=1e-13)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(3, 8), st.floats(0.0, 0.99), st.integers(0, 2**31))
+def test_bias_formula_is_exact_in_any_field(k, multiplier, seed):
+    rng = np.random.default_rng(seed)
+    signs = rng.choice([1.0, -1.0], k)
+    starts, ends, integrals, reciprocal, depths = rows(rng, 20, k, 0.8, 0.7, signs)
+    result = solve_cycle(starts, ends, integrals, multiplier=multiplier)
+    predicted = systematic_error(depths, multiplier)
+    measured = (reciprocal[:, 0] - result.value) / reciprocal[:, 0]
+    np.testing.assert_array_equal(np.isnan(predicted), result.pole)
+    good = ~result.pole & (np.abs(measured) < 1e3)
+    np.testing.assert_allclose(measured[good], predicted[good], rtol=1e-8, atol=1e-11)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(3, 8), st.floats(0.0, 1.0), st.integers(0, 2**31))
+def test_unbiased_estimate_is_exact_in_homogeneous_air(k, multiplier, seed):
+    rng = np.random.default_rng(seed)
+    signs = rng.choice([1.0, -1.0], k)
+    signs[0] = 1.0
+    starts, ends, integrals, _, depths = rows(rng, 20, k, 0.5, 0.0, signs)
+    result = solve_cycle(starts, ends, integrals, multiplier=multiplier, unbiased=True)
+    good = ~result.pole & (np.abs(depths.sum(axis=1)) > 0.05)
+    well = good & (np.abs(result.sensitivities).max(axis=(1, 2)) < 1e4)
+    np.testing.assert_allclose(result.value[well], 1.0, rtol=1e-9)
+
+
+def test_values_of_the_papers_second_figure():
+    table = {
+        200.0: [0.220, 0.462, 0.976, 0.447, 0.209, 0.091, 0.037],
+        300.0: [0.082, 0.170, 0.370, 0.897, 0.417, 0.150, 0.050],
+        400.0: [0.034, 0.071, 0.154, 0.370, 0.903, 0.255, 0.068],
+    }
+    signed = [0.148, 0.240, 0.427, 0.905, 0.417, 0.150, 0.050]
+    for l13, row in table.items():
+        for angle, absolute in zip(range(15, 76, 10), row, strict=True):
+            lengths = corrected_lengths(angle, l13)
+            folded = np.abs(lengths) * [1.0, 1.0, -1.0] * 2e-3
+            assert systematic_error(folded, 0.8) == pytest.approx(absolute, abs=6e-4)
+    for angle, expected in zip(range(15, 76, 10), signed, strict=True):
+        net = triangle(float(angle))
+        walk = geometry.cycle(net)
+        depths = optical_depths(net, walk, homogeneous())
+        assert systematic_error(depths, 0.8) == pytest.approx(expected, abs=6e-4)
+
+
+def corrected_lengths(second, l13, l23=500.0, first=120.0, third=90.0):
+    """Equation 19 with its third label and denominator put right."""
+    a1, a2, a3 = np.radians([first, second, third])
+    l12 = (l13 + l23) * np.sin(a2) / np.sin(a1 - a2) - l13 * np.sin(a3) / np.sin(a1 - a3)
+    far = l23 * np.sin(a3) / np.sin(a3 - a2) - (l13 + l23) * np.sin(a1) / np.sin(a1 - a2)
+    l13_ = l23 * np.sin(a2) / np.sin(a3 - a2) - l13 * np.sin(a1) / np.sin(a1 - a3)
+    return np.array([l12, far, l13_])
+
+
+@pytest.mark.parametrize("angle", [50.0, 60.0, 75.0])
+def test_equation_19_with_its_misprints_corrected_is_the_geometry(angle):
+    net = triangle(angle)
+    walk = geometry.cycle(net)
+    lengths = walk.end_range - walk.start_range
+    np.testing.assert_allclose(lengths * [1, 1, -1], corrected_lengths(angle, 300.0), rtol=1e-12)
+
+
+# The best multiplier ------------------------------------------------------------------------
+
+
+def paper_rows(angle=60.0, extinction=2e-3, relative=0.05):
+    net = triangle(angle)
+    walk = geometry.cycle(net)
+    depths = optical_depths(net, walk, homogeneous(extinction))[np.newaxis]
+    starts = np.ones((1, 3))
+    ends = np.exp(-2 * depths)
+    integrals = (starts - ends) / extinction
+    # Of 7 gates at a vertex, and of all gates of 5 m between.
+    variance = np.zeros((1, 3, 3, 3))
+    variance[..., 0, 0] = variance[..., 1, 1] = relative**2 / 7
+    variance[..., 2, 2] = relative**2 / 40
+    return starts, ends, integrals, variance, depths, np.array([1 / extinction])
+
+
+def total_error(multiplier, data):
+    starts, ends, integrals, variance, _, scale = data
+    value, gradient = _multiplier.sensitivities(starts, ends, integrals, np.array([multiplier]))
+    random = np.einsum("nja,njab,njb->n", gradient, variance, gradient)
+    return float(np.sqrt((value - scale) ** 2 + random)[0] / scale[0])
+
+
+@pytest.mark.parametrize("relative", [0.003, 0.01, 0.02, 0.05])
+@pytest.mark.parametrize("angle", [55.0, 60.0, 70.0])
+def test_closed_multiplier_is_within_1_percent_of_the_best(relative, angle):
+    data = paper_rows(angle, relative=relative)
+    closed = _multiplier.optimal(*data, np.array([False]))[0]
+    grid = min(total_error(x, data) for x in np.linspace(0.0, 1.0, 2001))
+    assert total_error(closed, data) <= 1.01 * grid
+    assert 0.5 < closed < 1.0
+
+
+def test_grid_takes_over_where_noise_is_loud():
+    data = paper_rows(relative=0.2)
+    chosen = _multiplier.optimal(*data, np.array([True]))[0]
+    grid = min(total_error(x, data) for x in np.linspace(0.0, 1.0, 2001))
+    assert chosen in _multiplier.GRID
+    assert total_error(chosen, data) <= 1.02 * grid
+
+
+def test_slope_of_sensitivities_agrees_with_finite_differences():
+    for k in (3, 6):
+        starts, ends, integrals, _, _ = rows(np.random.default_rng(k), 5, k)
+        at = [
+            _multiplier.sensitivities(starts, ends, integrals, np.full(5, 1.0 - x))[1]
+            for x in (0.0, 1e-6, 2e-6)
+        ]
+        slope = (3 * at[0] - 4 * at[1] + at[2]) / 2e-6
+        exact = _multiplier._slope_at_one(starts, ends, integrals)
+        np.testing.assert_allclose(slope, exact, rtol=1e-7, atol=1e-8 * np.abs(exact).max())
+
+
+# What is refused and flagged ----------------------------------------------------------------
+
+
+def test_pole_is_refused():
+    # Walked towards the lidars: Q = e^0.6, and 0.9^2 Q > 1.
+    ends = np.exp([[0.2, 0.2, 0.2]])
+    starts = np.ones((1, 3))
+    integrals = starts - ends
+    result = solve_cycle(starts, ends, integrals, multiplier=0.9)
+    assert np.isnan(result.value[0])
+    assert result.pole[0]
+    assert result.far_start[0]
+    assert result.not_finite[0]
+    exact = solve_cycle(starts, ends, integrals)
+    assert exact.value[0] == pytest.approx(1.0, rel=1e-13)
+    assert exact.far_start[0]
+    assert not exact.pole[0]
+
+
+def test_singular_cycle_is_flagged_at_once():
+    starts, ends = np.ones((1, 3)), np.array([[0.8, 1.0, 1.25]])
+    result = solve_cycle(starts, ends, starts - ends, relative_variance=np.full((3, 3), 1e-4))
+    assert result.attenuation[0] == 1.0
+    assert result.ill_conditioned[0]
+    assert result.not_finite[0] or result.uncertain[0]
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
+@pytest.mark.parametrize("place", [0, 1])
+def test_no_plain_number_comes_out_of_a_bad_signal(bad, place):
+    starts, ends, integrals, _, _ = rows(np.random.default_rng(1), 1, 3)
+    (starts, ends)[place][0, 1] = bad
+    for multiplier in (1.0, 0.5):
+        result = solve_cycle(starts, ends, integrals, multiplier=multiplier)
+        assert result.flagged[0]
+        assert result.signal_not_positive[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        ((np.ones(3), np.ones(4), np.ones(3)), "start, end and integral"),
+        ((np.ones(1), np.ones(1), np.ones(1)), "start"),
+        ((1.0, 1.0, 1.0), "start"),
+        ((["a"], ["b"], ["c"]), "start"),
+    ],
+)
+def test_wrong_rows_are_refused_by_name(arguments, field):
+    with pytest.raises(RetrievalInputError) as raised:
+        solve_cycle(*arguments)
+    assert raised.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("settings_", "field"),
+    [
+        ({"multiplier": 1.5}, "multiplier"),
+        ({"multiplier": np.nan}, "multiplier"),
+        ({"multiplier": [0.5, 0.6, 0.7]}, "multiplier"),
+        ({"relative_variance": -np.ones((3, 3))}, "relative_variance"),
+        ({"relative_variance": np.ones((4, 3))}, "relative_variance"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(settings_, field):
+    with pytest.raises(RetrievalInputError) as raised:
+        solve_cycle(np.ones((2, 3)), np.full((2, 3), 0.8), np.ones((2, 3)), **settings_)
+    assert raised.value.field == field
+
+
+def test_first_value_of_another_shape_is_refused():
+    with pytest.raises(RetrievalInputError) as raised:
+        substitute(np.ones((2, 3)), np.full((2, 3), 0.8), np.ones((2, 3)), np.ones(3))
+    assert raised.value.field == "first"
+
+
+def test_wrong_depths_are_refused_by_name():
+    for depths, multiplier, field in (
+        (0.1, 0.5, "optical_depth"),
+        ([0.1, 0.2, 0.3], -0.5, "multiplier"),
+        (np.ones((2, 3)), [0.5, 0.6, 0.7], "optical_depth and multiplier"),
+    ):
+        with pytest.raises(RetrievalInputError) as raised:
+            systematic_error(depths, multiplier)
+        assert raised.value.field == field

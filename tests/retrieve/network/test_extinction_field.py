@@ -1,0 +1,667 @@
+"""Networks of lidars, from signals to extinction: accuracy, flags and extreme cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.oracle_network import (
+    FIELDS,
+    QUIET,
+    at_vertices,
+    fan,
+    gradient,
+    grid,
+    homogeneous,
+    noisy,
+    optical_depths,
+    plume,
+    relative_errors,
+    root_mean_square,
+    signals,
+    three_by_two,
+    triangle,
+    with_noise,
+    without_noise,
+)
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.network import extinction_field, geometry
+from lidarops.retrieve.network.cycles import systematic_error
+from lidarops.retrieve.network.extinction_field import solve
+
+# Without noise ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [1.0, 5.0, 15.0])
+@pytest.mark.parametrize("extinction", [2e-4, 2e-3, 6e-2])
+@pytest.mark.parametrize("method", ["cycle", "unbiased", "slope", "klett", "network"])
+def test_homogeneous_triangle_is_exact_at_any_step(step, extinction, method):
+    result = (
+        without_noise(triangle(), homogeneous(extinction), step=step, method=method, prior="none")
+        if method == "network"
+        else without_noise(triangle(), homogeneous(extinction), step=step, method=method)
+    )
+    # Of an optical depth of 24, a cycle tells the vertex behind the first to 6 digits only.
+    reported = slice(0, 1 if extinction > 0.05 and method == "cycle" else 2)
+    np.testing.assert_allclose(result.extinction[reported], extinction, rtol=1e-10)
+    assert np.isnan(result.extinction[2])
+
+
+@pytest.mark.parametrize(("step", "bound"), [(15.0, 2e-2), (7.5, 5e-3), (3.75, 1e-3)])
+def test_gradient_converges_with_the_step(step, bound):
+    net = triangle()
+    result = without_noise(net, gradient, step=step)
+    np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=bound)
+
+
+def test_plume_converges_with_the_step():
+    net = triangle()
+    errors = [
+        np.max(
+            np.abs(without_noise(net, plume, step=s).extinction / at_vertices(net, plume) - 1)[:2]
+        )
+        for s in (7.5, 3.75, 1.0)
+    ]
+    assert errors[0] > 3 * errors[1] > 9 * errors[2]
+    assert errors[2] < 1e-3
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.5, 2.0])
+@pytest.mark.parametrize("name", FIELDS)
+def test_bias_of_the_multiplier_is_as_predicted_for_any_exponent(exponent, name):
+    net, field = triangle(), FIELDS[name]
+    walk = geometry.cycle(net)
+    exact = without_noise(net, field, step=1.0, exponent=exponent)
+    for multiplier in (0.0, 0.5, 0.9):
+        biased = without_noise(
+            net, field, step=1.0, exponent=exponent, method="multiplier", multiplier=multiplier
+        )
+        vertex = walk.vertex[0]
+        measured = 1.0 - exact.extinction[vertex] / biased.extinction[vertex]
+        predicted = systematic_error(exponent * optical_depths(net, walk, field), multiplier)
+        assert measured == pytest.approx(float(predicted), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_larger_networks_agree_with_the_truth(name):
+    net, field = three_by_two(), FIELDS[name]
+    for prior, bound in (("none", 3e-3), ("block", 3e-3)):
+        result = without_noise(net, field, step=1.0, method="network", prior=prior)
+        near = net.near_vertex
+        np.testing.assert_allclose(
+            result.extinction[near], at_vertices(net, field)[near], rtol=bound
+        )
+
+
+def test_network_without_prior_is_the_closed_form_on_a_triangle():
+    net = triangle()
+    both = [
+        with_noise(net, gradient, 0.01, 50, method=method, **more)
+        for method, more in (("cycle", {}), ("network", {"prior": "none"}))
+    ]
+    settled = ~both[1].flags.unsettled[:, 0] & np.isfinite(both[0].extinction[:, 0])
+    assert settled.mean() > 0.9
+    for vertex in (0, 1):
+        np.testing.assert_allclose(
+            both[1].extinction[settled, vertex], both[0].extinction[settled, vertex], rtol=5e-3
+        )
+        np.testing.assert_allclose(
+            both[1].extinction_standard_error[settled, vertex],
+            both[0].extinction_standard_error[settled, vertex],
+            rtol=0.02,
+        )
+
+
+def test_constants_of_lidars_cancel():
+    net = triangle()
+    r = grid(net)
+    power = signals(net, r, gradient)
+    gains = np.array([3e4, 1e-7, 2.0])[:, None]
+    for method in ("cycle", "network"):
+        first = solve(power, r, net, method=method, variance=1e-6 * power**2,
+                      full_overlap_range=100.0)  # fmt: skip
+        second = solve(gains * power, r, net, method=method, variance=1e-6 * (gains * power) ** 2,
+                       full_overlap_range=100.0)  # fmt: skip
+        np.testing.assert_allclose(second.extinction, first.extinction, rtol=1e-9)
+
+
+def test_error_of_the_overlap_does_not_cancel():
+    net = triangle()
+    r = grid(net)
+    power = signals(net, r, homogeneous())
+    truth = without_noise(net, homogeneous()).extinction[0]
+    changes = []
+    for error in (0.01, 0.03, 0.10):
+        wrong = power.copy()
+        wrong[0, r < 620] *= 1 + error
+        result = solve(wrong, r, net, method="cycle", variance=QUIET * wrong**2,
+                       full_overlap_range=100.0)  # fmt: skip
+        changes.append(truth / result.extinction[0] - 1)
+    np.testing.assert_allclose(changes, [-0.049, -0.135, -0.34], atol=0.025)
+
+
+def test_overlap_function_is_divided_out():
+    net = triangle()
+    r = grid(net)
+    overlap = 1.0 - np.exp(-r / 300.0)
+    power = signals(net, r, gradient)
+    expected = without_noise(net, gradient).extinction
+    result = solve(power * overlap, r, net, method="cycle", variance=QUIET * power**2,
+                   overlap=overlap)  # fmt: skip
+    np.testing.assert_allclose(result.extinction, expected, rtol=1e-10)
+
+
+def test_exponent_may_differ_from_ray_to_ray():
+    net = triangle()
+    r, exponent = grid(net, 1.0), np.array([0.7, 1.0, 1.5])
+    power = np.stack([signals(net, r, gradient, m)[i] for i, m in enumerate(exponent)])
+    result = solve(power, r, net, method="cycle", variance=QUIET * power**2,
+                   full_overlap_range=100.0, exponent=exponent)  # fmt: skip
+    np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=1e-3)
+
+
+# With noise ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "relative", "bound", "exact"),
+    [("homogeneous", 0.10, 0.08, 0.3), ("plume", 0.05, 0.08, 0.1), ("gradient", 0.05, 0.08, 0.15)],
+)
+def test_network_is_far_better_than_the_exact_triangle(name, relative, bound, exact):
+    net, field = triangle(), FIELDS[name]
+    truth = at_vertices(net, field)
+    result = with_noise(net, field, relative)
+    assert root_mean_square(relative_errors(result, truth))[0] <= bound
+    assert result.flags.flagged[:, 0].mean() < 0.02
+    closed = with_noise(net, field, relative, method="cycle")
+    assert root_mean_square(relative_errors(closed, truth))[0] > exact
+    # And what it says of its error is true.
+    score = (result.extinction[:, :2] - truth[:2]) / result.extinction_standard_error[:, :2]
+    assert np.mean(np.abs(score) < 3) >= 0.98
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_three_lidars_with_two_rays(name):
+    net, field = three_by_two(), FIELDS[name]
+    near, truth = net.near_vertex, at_vertices(net, field)
+    result = with_noise(net, field, 0.05, 300)
+    assert np.median(root_mean_square(relative_errors(result, truth))[near]) <= 0.08
+    assert 0.7 < np.mean(result.reduced_chi_square) < 1.3
+    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
+    assert np.mean(np.abs(score) < 3) >= 0.98
+    assert usable[:, near].mean() > 0.9
+
+
+@pytest.mark.parametrize("relative", [0.02, 0.10])
+def test_values_stay_within_3_errors_while_a_plume_moves(relative):
+    net = triangle()
+    r = grid(net)
+    fields = [lambda x, y, z, e=e: plume(x, y, z, e) for e in np.linspace(-200.0, 100.0, 100)]
+    clean = np.array([signals(net, r, f) for f in fields])
+    truth = np.array([at_vertices(net, f) for f in fields])
+    level = clean[:, :, 100:101]
+    deviation = np.hypot(relative * clean, 0.01 * level)
+    power = clean + deviation * np.random.default_rng(2).standard_normal(clean.shape)
+    result = solve(power, r, net, variance=deviation**2, full_overlap_range=100.0,
+                   blocks=np.arange(100) // 50)  # fmt: skip
+    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
+    assert np.mean(np.abs(score) < 3) >= 0.98
+    assert usable[50:, 0].mean() > 0.9
+    # Two rays reach behind the plume of the first block: they tell of it, but not how large.
+    assert np.all(result.degrees_of_freedom[:50] < 0)
+    assert result.flags.flagged[:50].all()
+
+
+def test_long_chains_are_not_biased():
+    # 4 x 3 rays: rows that are linear in 1 / extinction have scores that spread by 2.5.
+    net = fan(
+        [-450.0, -150.0, 150.0, 450.0],
+        [(42, 55, 68), (62, 78, 94), (86, 102, 118), (112, 125, 138)],
+        farthest=900.0,
+    )
+    assert net.vertices > 20
+    result = with_noise(net, homogeneous(1e-3), 0.01, 60, prior="none")
+    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    error = (result.extinction - 1e-3) / result.extinction_standard_error
+    assert usable[:, net.near_vertex].mean() > 0.5
+    assert np.std(error[usable]) < 1.3
+    assert 0.8 < np.mean(result.reduced_chi_square) < 1.2
+
+
+def test_prior_that_the_rays_contradict_is_weakened_or_given_up():
+    # A plume over 60 vertices is no gradient: the prior would shift them all by 2 errors.
+    net = fan(
+        np.linspace(-600, 600, 5),
+        [(40, 52, 64), (55, 68, 81), (75, 90, 105), (99, 112, 125), (116, 128, 140)],
+        farthest=1400.0,
+    )
+    truth = at_vertices(net, plume)
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.05, 50, additive=0.002)
+    settings = {"variance": variance, "full_overlap_range": 100.0}
+    result = solve(power, r, net, **settings)
+    assert np.all(result.prior_deviation > 0.2)
+    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
+    assert np.mean(np.abs(score) < 3) >= 0.98
+    assert abs(np.mean(score)) < 0.5
+    # In homogeneous air it stands.
+    power, variance = noisy(net, r, signals(net, r, homogeneous(1e-3)), 0.05, 20, additive=0.002)
+    settings["variance"] = variance
+    calm = solve(power, r, net, **settings)
+    assert np.all(calm.prior_deviation < 0.05)
+    alone = solve(power, r, net, prior="none", **settings)
+    errors = [root_mean_square(relative_errors(x, 1e-3)) for x in (calm, alone)]
+    assert np.nanmedian(errors[0]) < 0.7 * np.nanmedian(errors[1])
+
+
+def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
+    """Each profile tells little without the prior; all together tell that it is wrong."""
+
+    def steep(x, y, z):
+        return 1e-3 * np.exp(-z / 350.0)
+
+    net = fan([-600.0, -200.0, 200.0, 600.0], [(40, 55), (60, 85), (95, 120), (125, 140)],
+              farthest=1500.0)  # fmt: skip
+    result = with_noise(net, steep, 0.2, 100, seed=11)
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    score = (result.extinction - at_vertices(net, steep)) / result.extinction_standard_error
+    assert np.mean((np.abs(score) > 4.0) & kept) < 0.02
+    weaker = (result.prior_deviation > 0.015) | np.isinf(result.prior_deviation)
+    assert weaker.all()
+
+
+def scores_where_far_vertices_fade(scale, relative, net):
+    """Return the result and errors over stated ones where the field falls off with height."""
+    r = grid(net)
+
+    def field(_, __, z):
+        return 1.5e-3 * np.exp(-(z - 500.0) / scale)
+
+    power, variance = noisy(net, r, signals(net, r, field), relative, 40, 0, relative / 3.0)
+    result = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    score = (result.extinction - at_vertices(net, field)) / result.extinction_standard_error
+    return result, score
+
+
+@pytest.mark.parametrize(
+    ("scale", "relative", "net"),
+    [(200.0, 0.06, triangle()), (175.0, 0.03, three_by_two()), (150.0, 0.03, three_by_two()),
+     (100.0, 0.03, three_by_two())],
+)  # fmt: skip
+def test_a_prior_that_nothing_tests_is_not_reported_as_a_measurement(scale, relative, net):
+    """All values were without a flag, half of them off by more than 4 errors."""
+    result, score = scores_where_far_vertices_fade(scale, relative, net)
+    assert np.median(result.degrees_of_freedom) < 0
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    assert np.mean((np.abs(score) > 4.0)[:, net.near_vertex] & kept[:, net.near_vertex]) < 0.01
+
+
+def test_a_field_that_too_few_rays_see_is_told_with_wide_errors():
+    net = three_by_two()
+    result, score = scores_where_far_vertices_fade(500.0, 0.1, net)
+    assert np.median(result.degrees_of_freedom) < 0
+    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    assert kept.sum() > 40
+    assert np.all(np.abs(score[kept]) < 4.0)
+    stated = result.extinction_standard_error / result.extinction
+    assert np.median(stated[kept]) > 0.15
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_rays_that_profiles_lack_cost_no_more_than_what_they_saw(name):
+    net, field = three_by_two(), FIELDS[name]
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field), 0.02, 50, seed=2)
+    lost = np.random.default_rng(2).random((50, net.rays, 1)) < 0.25
+    found = [
+        solve(one, r, net, variance=variance, full_overlap_range=100.0)
+        for one in (power, np.where(lost, np.nan, power))
+    ]
+    kept = [np.isfinite(one.extinction) & ~one.flags.flagged for one in found]
+    # Of a vertex that two rays see, at best (3 / 4)^2 are without a flag.
+    assert kept[1].sum() > 0.4 * kept[0].sum()
+    score = (found[1].extinction - at_vertices(net, field)) / found[1].extinction_standard_error
+    assert np.all(np.abs(score[kept[1]]) < 4.0)
+
+
+def test_average_signals_before_not_solutions_afterwards():
+    net = triangle()
+    r = grid(net)
+    clean = signals(net, r, homogeneous())
+    power, variance = noisy(net, r, clean, 0.1, 2000, seed=6)
+    groups = power.reshape(20, 100, *clean.shape)
+    before = solve(groups.mean(axis=1), r, net, method="cycle", variance=variance / 100,
+                   full_overlap_range=100.0)  # fmt: skip
+    after = solve(power, r, net, method="cycle", variance=variance, full_overlap_range=100.0)
+    error = root_mean_square(2e-3 / before.extinction[:, 0] - 1)
+    means = np.nanmean((2e-3 / after.extinction[:, 0]).reshape(20, 100), axis=1)
+    assert error < 0.1
+    assert root_mean_square(means - 1) > 2 * error
+
+
+def test_averages_leave_out_rays_with_gaps():
+    rng = np.random.default_rng(1)
+    power = rng.uniform(1.0, 2.0, (5, 2, 8))
+    power[1, 0, 3] = np.nan
+    power[:, 1, 6:] = np.nan
+    labels = ["b", "a", "a", "b", "a"]
+    mean, variance = extinction_field.average(power, labels, variance=np.full((2, 8), 0.3))
+    assert mean.shape == (2, 2, 8)
+    np.testing.assert_allclose(mean[0, 0], power[[2, 4], 0].mean(axis=0), rtol=1e-14)
+    np.testing.assert_allclose(mean[0, 1, :6], power[[1, 2, 4], 1, :6].mean(axis=0), rtol=1e-14)
+    assert np.isnan(mean[:, 1, 6:]).all()
+    np.testing.assert_allclose(variance[:, 0, 0], [0.15, 0.15], rtol=1e-14)
+    assert extinction_field.average(power, labels)[1] is None
+    # A gate of unknown variance is a gap: one profile must not take it from the mean of all.
+    noise = np.full(power.shape, 0.3)
+    noise[[2, 0], [0, 1], [5, 2]] = np.nan, np.inf
+    noise[:, 1, 5] = np.nan
+    mean, variance = extinction_field.average(power, labels, variance=noise)
+    np.testing.assert_allclose(mean[0, 0], power[4, 0], rtol=1e-14)
+    np.testing.assert_allclose(variance[0, 0], 0.3, rtol=1e-14)
+    np.testing.assert_allclose(mean[1, 1, :6], power[3, 1, :6], rtol=1e-14)
+    np.testing.assert_allclose(variance[:, 1, :5], [[0.1] * 5, [0.3] * 5], rtol=1e-14)
+    assert np.isnan(variance[:, 1, 5]).all()
+    with pytest.raises(RetrievalInputError, match="power"):
+        extinction_field.average(power[0], labels)
+    with pytest.raises(RetrievalInputError, match="groups") as raised:
+        extinction_field.average(power, labels[:2])
+    assert raised.value.field == "groups"
+
+
+def test_unknown_noise_is_told_by_the_signal():
+    net = triangle()
+    r = grid(net)
+    clean = signals(net, r, homogeneous())
+    rng = np.random.default_rng(3)
+    power = clean * (1 + 0.03 * rng.standard_normal((200, *clean.shape)))
+    settings = {"full_overlap_range": 100.0, "method": "unbiased"}
+    told = solve(power, r, net, variance=(0.03 * clean) ** 2, **settings)
+    found = solve(power, r, net, **settings)
+    ratio = found.extinction_standard_error[:, 0] / told.extinction_standard_error[:, 0]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
+
+
+# Shapes, blocks and batches -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["network", "multiplier", "unbiased", "slope", "klett"])
+def test_blocks_do_not_know_of_each_other(method):
+    net = triangle()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 60)
+    labels = np.repeat(["a", "b", "c"], [20, 10, 30])
+    settings = {"method": method, "full_overlap_range": 100.0}
+    whole = solve(power, r, net, variance=variance, blocks=labels, **settings)
+    shuffled = np.random.default_rng(0).permutation(60)
+    for part in (slice(0, 20), slice(20, 60), slice(20, 30)):
+        piece = solve(power[part], r, net, variance=variance, blocks=labels[part], **settings)
+        for name in ("extinction", "extinction_standard_error", "prior_deviation", "multiplier"):
+            a, b = getattr(whole, name)[part], getattr(piece, name)
+            assert np.array_equal(a, b, equal_nan=True), name
+    mixed = solve(power[shuffled], r, net, variance=variance, blocks=labels[shuffled], **settings)
+    np.testing.assert_allclose(mixed.extinction, whole.extinction[shuffled], rtol=1e-9)
+
+
+def test_odd_arrays_are_taken_and_shapes_kept():
+    net = triangle()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 6)
+    expected = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    cube = power.reshape(2, 3, *power.shape[1:])
+    swapped = np.asfortranarray(cube).astype(">f8")
+    swapped.setflags(write=False)
+    result = solve(swapped, r, net, variance=variance, full_overlap_range=[100.0] * 3)
+    assert result.extinction.shape == (2, 3, 3)
+    assert result.flags.flagged.shape == (2, 3, 3)
+    assert result.reduced_chi_square.shape == (2, 3)
+    assert np.array_equal(result.extinction.reshape(6, 3), expected.extinction, equal_nan=True)
+    turned = solve(power[..., ::-1], r[::-1], net, variance=variance[..., ::-1],
+                   full_overlap_range=100.0)  # fmt: skip
+    assert np.array_equal(turned.extinction, expected.extinction, equal_nan=True)
+    rows = solve(power, np.tile(r, (3, 1)), net, variance=np.tile(variance, (6, 1, 1)),
+                 full_overlap_range=100.0)  # fmt: skip
+    assert np.array_equal(rows.extinction, expected.extinction, equal_nan=True)
+    single = solve(power.astype(np.float32), r, net, variance=variance, full_overlap_range=100.0)
+    np.testing.assert_allclose(single.extinction[:, 0], expected.extinction[:, 0], rtol=1e-3)
+    one = solve(power[0], r, net, variance=variance, full_overlap_range=100.0)
+    assert one.extinction.shape == (3,)
+    none = solve(power[:0], r, net, variance=variance, full_overlap_range=100.0)
+    assert none.extinction.shape == (0, 3)
+
+
+def test_rays_may_have_ranges_of_their_own():
+    net = triangle()
+    fine, coarse = grid(net, 3.75), grid(net, 7.5)
+    ranges = np.full((3, fine.size), np.nan)
+    ranges[0], ranges[1] = fine, fine
+    ranges[2, : coarse.size] = coarse
+    power = signals(net, fine, gradient)
+    power[2, : coarse.size] = signals(net, coarse, gradient)[2]
+    power[2, coarse.size :] = np.nan
+    result = solve(power, ranges, net, method="cycle", variance=1e-12 * power**2,
+                   full_overlap_range=100.0)  # fmt: skip
+    np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=5e-3)
+
+
+def test_vertices_without_full_overlap_are_not_measured():
+    net = three_by_two()
+    result = with_noise(net, homogeneous(), 0.02, 5)
+    assert not result.flags.not_measured.any()
+    r = grid(net)
+    power = signals(net, r, homogeneous())
+    far = solve(power, r, net, variance=1e-6 * power**2, full_overlap_range=650.0)
+    assert far.flags.not_measured.any()
+    assert np.isnan(far.extinction[far.flags.not_measured]).all()
+    assert np.isfinite(far.extinction[~far.flags.not_measured & far.near_vertex]).any()
+
+
+def apart(one, other):
+    """Return by how many of its standard errors the one differs from the other."""
+    return np.abs(one.extinction - other.extinction) / one.extinction_standard_error
+
+
+def test_weak_signals_are_left_out_and_told():
+    net = triangle()
+    r = grid(net)
+    clean = signals(net, r, homogeneous(4e-3))
+    power, variance = noisy(net, r, clean, 0.02, 50, additive=0.2)
+    result = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    assert result.flags.weak_signal.any()
+    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    score = ((result.extinction - 4e-3) / result.extinction_standard_error)[usable]
+    assert score.size == 0 or np.mean(np.abs(score) < 3) > 0.97
+
+
+@pytest.mark.parametrize("factor", [30.0, 1e2, 1e4, 1e8, np.inf, np.nan])
+def test_one_loud_profile_costs_the_others_nothing(factor):
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.05, 50, seed=4)
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[3] *= factor
+    heard = power.copy()
+    if np.isfinite(factor):
+        rng = np.random.default_rng(0)
+        heard[3] += np.sqrt(told[3] - variance) * rng.standard_normal(heard[3].shape)
+    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    found = solve(heard, r, net, variance=told, full_overlap_range=100.0)
+    others, kept = np.arange(50) != 3, np.isfinite(clean.extinction)
+    np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])
+    assert np.all(apart(found, clean)[others][kept[others]] < 0.05)
+    ratio = found.extinction_standard_error / clean.extinction_standard_error
+    np.testing.assert_allclose(ratio[others][kept[others]], 1.0, rtol=0.02)
+    mine = np.isfinite(found.extinction[3]) & ~found.flags.flagged[3]
+    if factor > 50.0 or np.isnan(factor):
+        assert not mine.any()
+        told = found.flags.weak_signal | found.flags.signal_not_positive | found.flags.outlying
+        told |= found.flags.signal_missing
+        assert told[3, net.near_vertex].all()
+    score = (found.extinction - 2e-3) / found.extinction_standard_error
+    assert np.all(np.abs(score[3][mine]) < 4.0)
+
+
+def between(net, r):
+    """Return the gate of each ray in the middle of its last two vertices."""
+    last = [net.on_ray(ray)[1][-2:] for ray in range(net.rays)]
+    return np.searchsorted(r, np.mean(last, axis=1))
+
+
+@pytest.mark.parametrize("factor", [np.nan, np.inf, 1e12])
+def test_a_gate_of_unknown_variance_leaves_the_other_profiles_as_they_are(factor):
+    """One gate, between vertices, took its rays from the mean: the prior then went untested."""
+    net = three_by_two()
+    r = grid(net)
+    clean = signals(net, r, lambda _, __, z: 1.5e-3 * np.exp(-(z - 500.0) / 250.0))
+    power, variance = noisy(net, r, clean, 0.05, 60)
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[7, np.arange(net.rays), between(net, r)] *= factor
+    settings = {"full_overlap_range": 100.0}
+    found = solve(power, r, net, variance=told, **settings)
+    whole = solve(power, r, net, variance=variance, **settings)
+    others = np.arange(60) != 7
+    np.testing.assert_array_equal(found.prior_deviation, whole.prior_deviation)
+    np.testing.assert_array_equal(found.flags.flagged[others], whole.flags.flagged[others])
+    kept = ~whole.flags.flagged & np.isfinite(whole.extinction)
+    assert np.all(apart(found, whole)[others][kept[others]] < 0.05)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_gate_of_unknown_variance_costs_what_one_without_signal_does(bad):
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.01, 50, seed=4)
+    ray = int(np.argmax(np.bincount(net.crossings.ray)))
+    gate = between(net, r)[ray]
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[7, ray, gate] = bad
+    lost = power.copy()
+    lost[7, ray, gate] = np.nan
+    found = solve(power, r, net, variance=told, full_overlap_range=100.0)
+    other = solve(lost, r, net, variance=variance, full_overlap_range=100.0)
+    for one in ("extinction", "extinction_standard_error", "degrees_of_freedom"):
+        np.testing.assert_allclose(getattr(found, one)[7], getattr(other, one)[7], rtol=1e-9)
+    vertices = net.on_ray(ray)[0]
+    assert found.flags.signal_missing[7, vertices[-1]]
+    assert not found.flags.signal_missing[7, vertices[0]]
+    assert np.delete(found.flags.signal_missing, 7, axis=0).sum() == 0
+
+
+def test_a_ray_without_noise_is_left_out_and_told():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
+    told = np.broadcast_to(variance, power.shape).copy()
+    told[3, 0] = 0.0
+    found = solve(power, r, net, variance=told, full_overlap_range=100.0)
+    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    mine = np.zeros_like(found.flags.weak_signal)
+    mine[3, net.on_ray(0)[0]] = True
+    np.testing.assert_array_equal(found.flags.weak_signal, mine)
+    assert found.degrees_of_freedom[3] < clean.degrees_of_freedom[3]
+    wider = found.extinction_standard_error[3] > 1.5 * clean.extinction_standard_error[3]
+    assert wider[net.near_vertex].any()
+
+
+def test_a_profile_of_more_energy_is_not_loud():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.05, 50, seed=4)
+    scale = np.where(np.arange(50) == 3, 20.0, 1.0)[:, np.newaxis, np.newaxis]
+    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    found = solve(scale * power, r, net, variance=scale**2 * variance, full_overlap_range=100.0)
+    assert not found.flags.weak_signal.any()
+    np.testing.assert_allclose(found.extinction, clean.extinction, rtol=1e-9)
+
+
+def test_visibility_follows_from_extinction():
+    result = without_noise(triangle(), homogeneous(), contrast=0.02)
+    assert result.visibility.visibility[0] == pytest.approx(np.log(50) / 2e-3, rel=1e-10)
+    assert result.visibility.contrast == 0.02
+    assert np.isnan(result.visibility.visibility[2])
+
+
+# Checks -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        ({"method": "magic"}, "method"),
+        ({"prior": "flat"}, "prior"),
+        ({"full_overlap_range": None}, "overlap"),
+        ({"full_overlap_range": -1.0}, "full_overlap_range"),
+        ({"full_overlap_range": [1.0, 2.0]}, "full_overlap_range"),
+        ({"overlap": np.ones(4)}, "overlap"),
+        ({"overlap": -np.ones(100)}, "overlap"),
+        ({"exponent": 0.0}, "exponent"),
+        ({"exponent": [1.0, 1.0]}, "exponent"),
+        ({"blocks": [1, 2]}, "blocks"),
+        ({"blocks": [0.5] * 4}, "blocks"),
+        ({"variance": -1.0}, "variance"),
+        ({"variance": np.ones((4, 2, 100))}, "variance"),
+        ({"gates": 2}, "gates"),
+        ({"gates": 7.5}, "gates"),
+        ({"multiplier": 0.5}, "multiplier"),
+        ({"multiplier": 1.5, "method": "unbiased"}, "multiplier"),
+        ({"start": 0}, "start"),
+        ({"start": 5, "method": "cycle"}, "start"),
+        ({"contrast": 2.0}, "contrast"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(settings, field):
+    net = triangle()
+    r = np.linspace(100.0, 1200.0, 100)
+    with pytest.raises(RetrievalInputError) as raised:
+        solve(np.ones((4, 3, 100)), r, net, **{"full_overlap_range": 100.0, **settings})
+    assert raised.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("power", "range_", "field"),
+    [
+        (np.ones((4, 2, 100)), np.linspace(100.0, 1200.0, 100), "power"),
+        (np.ones(100), np.linspace(100.0, 1200.0, 100), "power"),
+        (np.ones((4, 3, 100)), np.linspace(0.1, 1.2, 100), "range"),
+        (np.ones((4, 3, 100)), np.ones((2, 100)), "range"),
+        (np.ones((4, 3, 100)), np.full((3, 100), np.nan), "range"),
+        (np.full((4, 3, 100), "x"), np.linspace(100.0, 1200.0, 100), "power"),
+    ],
+)
+def test_wrong_arrays_are_refused_by_name(power, range_, field):
+    with pytest.raises(RetrievalInputError) as raised:
+        solve(power, range_, triangle(), full_overlap_range=100.0)
+    assert raised.value.field == field
+
+
+def test_cycle_that_cannot_be_measured_is_refused():
+    net = triangle()
+    r = np.arange(100.0, 900.0, 5.0)
+    power = signals(net, r, homogeneous())
+    with pytest.raises(RetrievalInputError, match="cannot measure"):
+        solve(power, r, net, method="cycle", full_overlap_range=100.0)
+
+
+@pytest.mark.parametrize("method", ["network", "slope", "klett"])
+def test_signals_that_reach_no_vertex_give_nothing(method):
+    net = triangle()
+    r = np.arange(100.0, 400.0, 5.0)
+    power = np.tile(1 / r**2, (4, 3, 1))
+    result = solve(power, r, net, method=method, full_overlap_range=100.0)
+    assert np.isnan(result.extinction).all()
+    assert result.flags.not_measured.all()
+
+
+def test_rays_that_do_not_meet_are_refused():
+    net = fan([0.0, 100.0], [(60.0,), (60.0,)])
+    r = np.arange(100.0, 400.0, 5.0)
+    with pytest.raises(RetrievalInputError, match="do not meet"):
+        solve(np.ones((2, r.size)), r, net, full_overlap_range=100.0)
+
+
+def test_methods_are_told_in_the_result():
+    for method in extinction_field.Method:
+        assert without_noise(triangle(), homogeneous(), method=method.value).method is method

@@ -1,0 +1,589 @@
+"""The solution of a network: its parts against numpy, scipy and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import integrate, optimize
+from support.oracle_network import (
+    at_vertices,
+    gradient,
+    grid,
+    homogeneous,
+    noisy,
+    signals,
+    three_by_two,
+    triangle,
+)
+
+from lidarops.retrieve.network import _condensed_signals, _empirical_prior, _joint_solution
+
+# Linear algebra -----------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 30), st.integers(0, 2**31))
+def test_cholesky_agrees_with_numpy(size, seed):
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((size, size + 3))
+    matrix, side = root @ root.T, rng.standard_normal(size)
+    factor, solution = matrix.copy(), side.copy()
+    assert _joint_solution.factorise(factor, size)
+    np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix), rtol=1e-8, atol=1e-10)
+    _joint_solution.substitute(factor, size, solution)
+    np.testing.assert_allclose(matrix @ solution, side, atol=1e-6)
+
+
+def test_singular_matrix_is_told():
+    assert not _joint_solution.factorise(np.ones((3, 3)), 3)
+    assert not _joint_solution.factorise(np.full((2, 2), np.nan), 2)
+    assert not _joint_solution.factorise(-np.eye(2), 2)
+
+
+# Values at vertices and integrals between them ------------------------------------------------
+
+
+def condensed(net, power, variance, exponent=1.0, gates=7, step=5.0):
+    r = grid(net, step)
+    layout = _condensed_signals.lay_out(
+        net, np.tile(r, (net.rays, 1)), None, np.full(net.rays, 100.0), gates
+    )
+    data = _condensed_signals.condense(
+        np.atleast_3d(power).reshape(-1, net.rays, r.size), variance[np.newaxis],
+        np.zeros(power.size // (net.rays * r.size), dtype=np.intp),
+        np.full(net.rays, exponent), layout, relative=False, screened=False,
+    )  # fmt: skip
+    return layout, data
+
+
+def test_value_at_a_vertex_is_that_of_a_line_through_logarithms():
+    net = triangle()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 1)
+    layout, data = condensed(net, power, 1e-30 * variance)
+    for c, (ray, where) in enumerate(
+        zip(layout.crossings.ray, layout.crossings.range, strict=True)
+    ):
+        near = np.argsort(np.abs(r - where))[:7]
+        line = np.polyfit(r[near] - where, np.log(power[0, ray, near] * r[near] ** 2), 1)
+        first = layout.first_crossing[ray]
+        start = layout.crossings.range[first]
+        near = np.argsort(np.abs(r - start))[:7]
+        base = np.polyfit(r[near] - start, np.log(power[0, ray, near] * r[near] ** 2), 1)
+        assert data.log_value[0, c] == pytest.approx(line[1] - base[1], abs=1e-10)
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.8])
+def test_integral_agrees_with_quadrature_of_the_interpolated_signal(exponent):
+    net = triangle()
+    r = grid(net, 10.0)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 1)
+    layout, data = condensed(net, power, 1e-30 * variance, exponent, step=10.0)
+    for ray in range(3):
+        c = layout.first_crossing[ray]
+        low, high = layout.crossings.range[c : c + 2]
+        logs = exponent * np.log(power[0, ray] * r**2)
+        near = np.argsort(np.abs(r - low))[:7]
+        scale = np.polyfit(r[near] - low, logs[near], 1)[1]
+        inner = r[(r > low) & (r < high)]
+        expected = integrate.quad(
+            lambda x, logs=logs, scale=scale: np.exp(np.interp(x, r, logs) - scale),
+            low, high, points=inner, limit=200,
+        )[0]  # fmt: skip
+        assert data.integral[0, c] == pytest.approx(2 * exponent * expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.6])
+def test_covariance_agrees_with_finite_differences(exponent):
+    net = three_by_two()
+    r = grid(net, 8.0)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.03, 1)
+    layout, data = condensed(net, power, variance, exponent, step=8.0)
+    relative = variance / power[0] ** 2
+    step = 1e-6
+    for ray in (0, 5):
+        first, last = layout.first_crossing[ray], layout.first_crossing[ray + 1]
+        count = last - first
+        slopes = np.zeros((2 * count - 1, r.size))
+        quiet = np.zeros_like(variance)
+        shifted = np.repeat(power, 2 * r.size, axis=0)
+        for g in range(r.size):
+            shifted[2 * g, ray, g] *= 1 + step
+            shifted[2 * g + 1, ray, g] *= 1 - step
+        _, moved = condensed(net, shifted, quiet, exponent, step=8.0)
+        # Scaled to 1 at the first vertex, integrals lose what they share with it: put it back.
+        scale = np.exp(first_value(layout, ray, shifted, r, exponent))
+        values = moved.log_value[:, first:last] + np.log(scale)[:, None]
+        sums = moved.integral[:, first : last - 1] * scale[:, None]
+        window = slice(layout.window[first], layout.window[first] + 7)
+        mend = 0.5 * exponent * relative[ray, window] @ layout.weights[first]
+        centre = np.exp(first_value(layout, ray, power, r, exponent) + mend)
+        slopes[:count] = (values[::2] - values[1::2]).T / (2 * step)
+        slopes[count:] = (sums[::2] - sums[1::2]).T / (2 * step) / centre
+        expected = (slopes * relative[ray]) @ slopes.T
+        packed = data.covariance[0, layout.offset[ray] : layout.offset[ray + 1]]
+        measured = packed.reshape(expected.shape)
+        size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        np.testing.assert_allclose(measured / size, expected / size, atol=1e-5)
+
+
+def first_value(layout, ray, power, r, exponent):
+    c = layout.first_crossing[ray]
+    window = slice(layout.window[c], layout.window[c] + layout.weights.shape[1])
+    logs = exponent * np.log(power[:, ray, window] * r[window] ** 2)
+    return logs @ layout.weights[c]
+
+
+# Least squares ------------------------------------------------------------------------------
+
+
+class Oracle:
+    """The network's objective in dense numpy: no elimination, no packing."""
+
+    def __init__(self, layout, data, profile, net):
+        self.layout, self.net = layout, net
+        self.vertex = layout.crossings.vertex
+        self.ray = layout.crossings.ray
+        self.values = data.log_value[profile]
+        self.integrals = data.integral[profile]
+        self.packed = data.covariance[profile]
+        self.size = self.vertex.size
+
+    def beyond(self):
+        out = np.zeros(self.size)
+        for c in range(self.size - 2, -1, -1):
+            if self.ray[c] == self.ray[c + 1]:
+                out[c] = out[c + 1] + self.integrals[c]
+        return out
+
+    def residual(self, constants, logarithms):
+        weight = np.exp(constants[self.ray]) + self.beyond()
+        return self.values - np.log(weight) - logarithms[self.vertex]
+
+    def covariance(self, constants):
+        weight = np.exp(constants[self.ray]) + self.beyond()
+        out = np.zeros((self.size, self.size))
+        for ray in range(self.net.rays):
+            first, last = self.layout.first_crossing[ray : ray + 2]
+            n = last - first
+            turn = np.zeros((n, 2 * n - 1))
+            turn[:, :n] = np.eye(n)
+            for i in range(n):
+                turn[i, n + i :] = -1.0 / weight[first + i]
+            packed = self.packed[self.layout.offset[ray] : self.layout.offset[ray + 1]]
+            out[first:last, first:last] = turn @ packed.reshape(2 * n - 1, -1) @ turn.T
+        return out
+
+
+def case(profiles=3, relative=0.01, net=None):
+    net = net or three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), relative, profiles, additive=0.002)
+    layout, data = condensed(net, power, variance)
+    problem = _empirical_prior._Problem(
+        data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex
+    )
+    return net, layout, data, problem
+
+
+@pytest.mark.parametrize("deviation", [np.inf, 0.05])
+def test_solution_is_the_least_squares_one(deviation):
+    net, layout, data, problem = case()
+    result = problem.solve(deviation, 60)
+    assert np.all(result.status == _joint_solution.SOLVED)
+    for n in range(3):
+        oracle = Oracle(layout, data, n, net)
+        root = np.linalg.cholesky(oracle.covariance(problem.constants[n]))
+        prior = np.zeros((0, net.vertices))
+        if np.isfinite(deviation):
+            precision, _ = _empirical_prior._free_level(problem.gradient, deviation)
+            values, vectors = np.linalg.eigh(precision)
+            prior = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+        def objective(x, oracle=oracle, root=root, prior=prior):
+            gap = oracle.residual(x[: net.rays], x[net.rays :])
+            return np.concatenate([np.linalg.solve(root, gap), prior @ x[net.rays :]])
+
+        start = np.concatenate([problem.constants[n] + 0.05, result.logarithm[n] - 0.02])
+        best = optimize.least_squares(objective, start, xtol=1e-15, ftol=1e-15, gtol=1e-12)
+        # Without prior, the kernel holds the level by a hundredth of its information.
+        bound = 1e-6 if np.isfinite(deviation) else 2e-3
+        np.testing.assert_allclose(best.x[net.rays :], result.logarithm[n], atol=bound)
+        covariance = np.linalg.inv(best.jac.T @ best.jac)[net.rays :, net.rays :]
+        np.testing.assert_allclose(np.diag(covariance), result.believed[n], rtol=0.02)
+        if np.isfinite(deviation):
+            # A field that deviates by twice the prior's standard deviation.
+            doubt = covariance @ precision @ covariance
+            stated = np.diag(covariance + 3.0 * doubt)
+            np.testing.assert_allclose(stated, result.variance[n], rtol=0.02)
+            # What fields move the solution by that the prior rules out.
+            moved = problem.bends @ precision @ covariance
+            np.testing.assert_allclose(np.sum(moved**2, axis=0), result.missed[n], rtol=0.02)
+            assert 2 * best.cost == pytest.approx(result.prior_chi_square[n], rel=1e-5)
+        else:
+            np.testing.assert_array_equal(result.variance[n], result.believed[n])
+            np.testing.assert_array_equal(result.missed[n], 0.0)
+            assert 2 * best.cost == pytest.approx(result.chi_square[n], rel=0.02)
+    assert result.degrees_of_freedom[0] == layout.crossings.ray.size - net.rays - net.vertices
+
+
+def test_rays_that_contradict_tell_so_when_their_constants_run_away():
+    """With nothing told beforehand, the constant of a ray that is off goes where it counts for
+    nothing, and the equations of the rays become singular."""
+    _, layout, data, problem = case(2)
+    data.log_value[0, layout.first_crossing[0] + 1] -= 3.0
+    found = problem.solve(np.inf, 60)
+    assert np.isnan(found.chi_square[0])
+    assert found.prior_chi_square[0] > 50.0 * found.prior_degrees_of_freedom[0]
+    assert found.prior_chi_square[1] == found.chi_square[1]
+
+
+def test_likelihood_is_that_of_the_dense_linear_model():
+    net, layout, data, problem = case(1)
+    problem.solve(0.05, 60)
+    fixed = problem.constants.copy()
+    oracle = Oracle(layout, data, 0, net)
+    noise = oracle.covariance(fixed[0])
+    weight = np.exp(fixed[0][oracle.ray]) + oracle.beyond()
+    design = np.zeros((oracle.size, net.rays + 1))
+    design[np.arange(oracle.size), oracle.ray] = np.exp(fixed[0][oracle.ray]) / weight
+    design[:, -1] = 1.0
+    target = oracle.values - np.log(weight)
+    choose = np.eye(net.vertices)[oracle.vertex]
+
+    def dense(deviation):
+        field = _empirical_prior.GRADIENT**2 * problem.gradient + deviation**2 * np.eye(
+            net.vertices
+        )
+        total = noise + choose @ field @ choose.T
+        inverse = np.linalg.inv(total)
+        information = design.T @ inverse @ design
+        rest = target - design @ np.linalg.solve(information, design.T @ inverse @ target)
+        return (
+            np.linalg.slogdet(total)[1] + np.linalg.slogdet(information)[1] + rest @ inverse @ rest
+        )
+
+    def measured(deviation):
+        problem.constants[:] = fixed
+        problem.solve(deviation, 1)
+        return problem.likelihood
+
+    for deviation in (0.01, 0.1, 0.5):
+        difference = dense(deviation) - dense(0.05)
+        assert measured(deviation) - measured(0.05) == pytest.approx(difference, abs=1e-4)
+
+
+def test_standard_errors_are_the_scatter_of_solutions():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.005, 400, additive=5e-4)
+    layout, data = condensed(net, power, variance)
+    problem = _empirical_prior._Problem(
+        data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex
+    )
+    result = problem.solve(np.inf, 30)
+    truth = np.log(at_vertices(net, homogeneous()))
+    score = (result.logarithm - truth) / np.sqrt(result.variance)
+    np.testing.assert_allclose(score[:, net.near_vertex].std(axis=0), 1.0, atol=0.15)
+    assert np.mean(result.chi_square / result.degrees_of_freedom) == pytest.approx(1.0, abs=0.15)
+
+
+def test_solution_does_not_depend_on_the_other_profiles():
+    _, layout, data, problem = case(7)
+    exponent, position = np.ones(6), problem_position()
+    whole = problem.solve(0.05, 10)
+    for mine in ([0], [3, 4], [6, 1]):
+        part = _empirical_prior._Problem(
+            data.take(np.array(mine)), layout, layout.crossings.vertex, exponent, position
+        ).solve(0.05, 10)
+        assert np.array_equal(part.logarithm, whole.logarithm[mine])
+        assert np.array_equal(part.variance, whole.variance[mine])
+
+
+def problem_position():
+    return three_by_two().vertex
+
+
+def test_vertices_that_only_lost_rays_saw_are_missing():
+    net = three_by_two()
+    r = grid(net)
+    power = signals(net, r, homogeneous())[np.newaxis].copy()
+    power[0, 0, :] = np.nan
+    power[0, 4, :] = np.nan
+    layout, data = condensed(net, power, 1e-8 * np.nan_to_num(power[0]) ** 2 + 1e-60)
+    problem = _empirical_prior._Problem(
+        data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex
+    )
+    seen = np.zeros(net.vertices, dtype=bool)
+    for ray in (1, 2, 3, 5):
+        seen[net.on_ray(ray)[0]] = True
+    result = problem.solve(0.05, 10)
+    assert np.array_equal(np.isfinite(result.logarithm[0]), seen)
+    np.testing.assert_allclose(np.exp(result.logarithm[0, seen]), 2e-3, rtol=0.02)
+
+
+@pytest.mark.parametrize("deviation", [np.inf, 0.1])
+@pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
+def test_a_ray_of_singular_covariance_is_left_out(deviation, bad):
+    _, layout, data, problem = case(3)
+    clean = problem.afresh(deviation)
+    without = data.take(np.arange(3))
+    without.usable[1, : layout.first_crossing[1]] = 0
+    data.covariance[1, : layout.offset[1]] = bad
+    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    found, expected = (
+        _empirical_prior._Problem(one, *where).afresh(deviation) for one in (data, without)
+    )
+    assert np.all(found.status == _joint_solution.SOLVED)
+    np.testing.assert_array_equal(found.degrees_of_freedom, expected.degrees_of_freedom)
+    assert np.array_equal(np.isfinite(found.logarithm), np.isfinite(expected.logarithm))
+    np.testing.assert_allclose(found.logarithm, expected.logarithm, rtol=1e-4)
+    np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-2)
+    for one in ("logarithm", "variance", "chi_square", "prior_chi_square"):
+        mine, others = getattr(found, one)[[0, 2]], getattr(clean, one)[[0, 2]]
+        np.testing.assert_array_equal(mine, others)
+
+
+def test_a_profile_of_singular_covariances_is_not_determined():
+    _, layout, data, _ = case(3)
+    data.covariance[1] = 0.0
+    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    for deviation in (np.inf, 0.1):
+        found = _empirical_prior._Problem(data, *where).afresh(deviation)
+        assert found.status.tolist() == [
+            _joint_solution.SOLVED, _joint_solution.UNDETERMINED, _joint_solution.SOLVED
+        ]  # fmt: skip
+        assert np.isnan(found.logarithm[1]).all()
+
+
+def test_prior_with_an_only_vertex_is_finite():
+    precision, norm = _empirical_prior._free_level(
+        _empirical_prior._gradient(np.zeros((1, 3))), 0.1
+    )
+    assert np.isfinite(precision).all()
+    assert np.isfinite(norm)
+
+
+def steep(x, y, z):
+    """Fall off with height by more than the prior's gradient has it, in thin air."""
+    return 1e-5 * np.exp(-(z - 500.0) / 250.0 + 0.0 * x)
+
+
+@pytest.mark.parametrize(("field", "told"), [(homogeneous(1e-3), False), (steep, True)])
+def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told):
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field), 0.15, 50, additive=0.0)
+    layout, data = condensed(net, power, variance)
+    where = (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    problem, mean = (
+        _empirical_prior._Problem(data, *where),
+        _empirical_prior._mean_problem(data, *where),
+    )
+    sharp = problem.afresh(_empirical_prior.DEVIATIONS[0])
+    # Profiles fit by themselves, the steep ones hardly worse.
+    assert np.median(sharp.prior_chi_square / sharp.prior_degrees_of_freedom) < 2.0
+    assert _empirical_prior._unlikely(_empirical_prior._told(mean, sharp, 1.0)) == told
+
+
+def uneven(net):
+    """Return air that is another at every vertex."""
+    size = 0.2 * np.sin(7.0 * np.arange(net.vertices))
+
+    def field(x, y, z):
+        apart = [(x - v[0]) ** 2 + (z - v[2]) ** 2 for v in net.vertex]
+        bumps = [u * np.exp(-a / (2.0 * 40.0**2)) for u, a in zip(size, apart, strict=True)]
+        return 2e-3 * np.exp(np.sum(bumps, axis=0))
+
+    return field
+
+
+def fifty(field, relative, lost=0.0):
+    """Return profiles, some without some of their rays, and what a problem asks besides."""
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field(net)), relative, 50, additive=0.0)
+    gone = np.random.default_rng(2).random((50, net.rays, 1)) < lost
+    layout, data = condensed(net, np.where(gone, np.nan, power), variance)
+    return data, (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+
+
+def test_a_field_that_the_mean_tells_to_vary_is_not_told_to_be_even():
+    data, where = fifty(uneven, 0.05)
+    least = _empirical_prior._least(_empirical_prior._mean_problem(data, *where), 1.0)
+    assert 0.03 < least < 0.4
+    problem = _empirical_prior._Problem(data, *where)
+    assert _empirical_prior._likeliest(problem, 1.0, least).deviation[0] >= least
+
+
+class Unsettled(_empirical_prior._Problem):
+    """A mean whose solution without prior, or any, still moves in the last pass."""
+
+    always = False
+
+    def afresh(self, deviation, strength=1.0):
+        found = super().afresh(deviation, strength)
+        if not (self.always or np.isinf(deviation)):
+            return found
+        return replace(found, status=np.full_like(found.status, _joint_solution.UNSETTLED))
+
+
+def test_a_prior_under_which_the_mean_does_not_settle_is_rejected():
+    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
+    mean = Unsettled(_empirical_prior._pooled(data, where[0]), *where)
+    result = _empirical_prior._Problem(data, *where).afresh(0.1)
+    assert not _empirical_prior._unlikely(_empirical_prior._told(mean, result, 1.0))
+    mean.always = True
+    assert _empirical_prior._unlikely(_empirical_prior._told(mean, result, 1.0))
+    told = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: mean)
+    assert np.all(np.isinf(told.deviation))
+
+
+def test_a_mean_that_is_not_determined_speaks_against_no_prior():
+    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
+    mean = _empirical_prior._Problem(_empirical_prior._pooled(data, where[0]), *where)
+    mean.data.log_value[:] = np.nan
+    assert mean.afresh(np.inf).status[0] == _joint_solution.UNDETERMINED
+    told = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: mean)
+    unasked = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: None)
+    assert np.isfinite(told.deviation[0])
+    np.testing.assert_array_equal(told.logarithm, unasked.logarithm)
+    # The field may deviate by as much as the weakest prior has it, and bend.
+    more = unasked.variance - unasked.believed
+    wide = unasked.believed + (4.0**2 - 1.0) / (2.0**2 - 1.0) * more + unasked.missed
+    np.testing.assert_allclose(told.variance, wide, rtol=1e-12)
+
+
+def test_what_the_mean_leaves_open_is_told_with_the_weakest_prior(monkeypatch):
+    data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
+    result = _empirical_prior._Problem(data, *where).afresh(0.1)
+    mean = _empirical_prior._mean_problem(data, *where)
+    told, free = mean.afresh(0.1), mean.afresh(np.inf)
+    free.variance[0, 2] = np.nan
+    for other in ("of_noise", "of_field"):
+        monkeypatch.setattr(_empirical_prior._block_errors, other, lambda *_: 0.0)
+    factor = np.ones(result.variance.shape[1])
+    for strength, wanted in ((1.0, 5.0), (2.0, 1.0), (4.0, 1.0)):
+        factor[2] = wanted
+        found = _empirical_prior._widened(result, strength, told, free)
+        expected = result.believed + factor * (result.variance - result.believed)
+        np.testing.assert_allclose(found.variance, expected, rtol=1e-12)
+
+
+def asked(freedoms, whole=None):
+    """Return whether rays test a prior: of profiles, and of the freedom and errors of their mean.
+
+    The last of four vertices is seen by no ray."""
+    data = SimpleNamespace(usable=np.array([[1, 1, 1, 0]], dtype=np.uint8))
+    problem = SimpleNamespace(geometry=(None, None, np.arange(4)), data=data)
+    status = np.full(len(freedoms), _joint_solution.SOLVED)
+    alone = SimpleNamespace(status=status, degrees_of_freedom=np.array(freedoms, dtype=float))
+    if whole is None:
+        return _empirical_prior._tests(problem, alone, None)
+    freedom, errors = whole
+    variance = np.array([[*np.square(errors), np.nan]])
+    mean = SimpleNamespace(degrees_of_freedom=np.array([float(freedom)]), variance=variance)
+    return _empirical_prior._tests(problem, alone, mean)
+
+
+@pytest.mark.parametrize(
+    ("whole", "told"),
+    [((0, [0.1, 0.5, 0.9]), True), ((0, [0.1, 0.5, 1.1]), False), ((0, [0.1, np.nan, 0.1]), False),
+     ((1, [0.1, 0.5, 1.1]), True), ((-1, [0.1, 0.1, 0.1]), False)],
+)  # fmt: skip
+def test_as_many_equations_as_unknowns_test_a_prior_where_they_tell_all_vertices(whole, told):
+    assert asked([-1.0] * 10, whole) == told
+
+
+@pytest.mark.parametrize(("most", "told"), [(0.7, True), (0.8, False)])
+def test_a_quarter_of_the_profiles_is_enough_to_test_a_prior(most, told):
+    number = round(50 * most)
+    assert asked([-1.0] * number + [2.0] * (50 - number)) == told
+    assert asked([-1.0] * number + [2.0] * (50 - number), (-1, [0.1, 0.1, 0.1])) == told
+
+
+def test_a_mean_that_does_not_settle_tells_no_least_deviation(monkeypatch):
+    data, where = fifty(lambda _: homogeneous(2e-3), 0.1)
+    pooled = _empirical_prior._pooled(fifty(uneven, 0.1)[0], where[0])
+    for other in ("_unlikely", "_apart"):
+        monkeypatch.setattr(_empirical_prior, other, lambda *_: False)
+    asked = [
+        _empirical_prior._solve_block(
+            _empirical_prior._Problem(data, *where), lambda mean=mean: mean
+        ).deviation[0]
+        for mean in (Unsettled(pooled, *where), _empirical_prior._Problem(pooled, *where))
+    ]
+    assert asked[0] < asked[1] < np.inf
+
+
+# Profiles that lack rays --------------------------------------------------------------------
+
+
+def test_the_mean_of_profiles_is_made_ray_by_ray():
+    data, (layout, *rest) = fifty(lambda _: homogeneous(), 0.05, lost=0.25)
+    assert data.usable.all(axis=1).sum() < 20
+    mean = _empirical_prior._pooled(data, layout)
+    assert mean.usable.all()
+    for ray in range(6):
+        mine = slice(layout.first_crossing[ray], layout.first_crossing[ray + 1])
+        packed = slice(layout.offset[ray], layout.offset[ray + 1])
+        seen = data.usable[:, mine].all(axis=1)
+        np.testing.assert_allclose(mean.log_value[0, mine], data.log_value[seen, mine].mean(axis=0))
+        np.testing.assert_allclose(mean.integral[0, mine], data.integral[seen, mine].mean(axis=0))
+        expected = data.covariance[seen, packed].mean(axis=0) / seen.sum()
+        np.testing.assert_allclose(mean.covariance[0, packed], expected)
+    whole = _empirical_prior._Problem(mean, layout, *rest).afresh(np.inf)
+    assert whole.status[0] == _joint_solution.SOLVED
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e12, 20.0])
+def test_a_mean_leaves_out_a_ray_that_is_far_louder_than_most(bad):
+    data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
+    quiet = data.take(np.arange(50))
+    quiet.usable[7, : layout.first_crossing[1]] = 0
+    expected = _empirical_prior._pooled(quiet, layout)
+    # The variance of the ray's first integral alone.
+    count = layout.first_crossing[1]
+    data.covariance[7, 2 * count * count] *= bad
+    found = _empirical_prior._pooled(data, layout)
+    for one in ("log_value", "integral", "covariance", "usable", "slope"):
+        np.testing.assert_array_equal(getattr(found, one), getattr(expected, one))
+
+
+def test_a_mean_of_which_hardly_a_profile_is_known_lacks_the_ray():
+    data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
+    data.covariance[7:, : layout.offset[1]] = np.nan
+    found = _empirical_prior._pooled(data, layout)
+    assert not found.usable[0, : layout.first_crossing[1]].any()
+    assert found.usable[0, layout.first_crossing[1] :].all()
+
+
+def test_a_mean_of_what_nobody_sees_is_none():
+    data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
+    data.usable[7:] = 0
+    assert _empirical_prior._pooled(data, layout) is None
+    # A value at a ray's first vertex alone is none.
+    data, _ = fifty(lambda _: homogeneous(), 0.05)
+    data.usable[:] = 0
+    data.usable[:, layout.first_crossing[:-1]] = 1
+    assert _empirical_prior._pooled(data, layout) is None
+
+
+@pytest.mark.parametrize(
+    ("reach", "depth"),
+    [
+        ([3] * 50, 3),
+        ([3] * 45 + [2] * 5, 3),
+        ([3] * 9 + [2] * 41, 2),
+        ([3] * 7, 0),
+        ([1] * 50, 0),
+        ([], 0),
+    ],
+)
+def test_a_mean_takes_as_much_of_a_ray_as_most_values_see(reach, depth):
+    assert _empirical_prior._depth(np.array(reach, dtype=np.intp)) == depth

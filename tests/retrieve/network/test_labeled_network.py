@@ -1,0 +1,165 @@
+"""Networks over xarray: values, errors of both kinds, and a reason for all that is missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.made_network import EXTINCTION, beam, network, product, without
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.air.labeled import Definition
+from lidarops.retrieve.network import labeled
+from lidarops.retrieve.network.labeled import Settings, retrieve
+
+PLAIN = Settings(block_intervals=72, visibility=Definition(wavelength=532e-9))
+
+
+def solved(beams, **changes):
+    return retrieve(beams, network(), replace(PLAIN, **changes))
+
+
+def test_homogeneous_air_is_found_within_the_errors():
+    found = product(intervals=40)
+    whole = np.hypot(found["extinction_standard_error"], found["extinction_systematic_error"])
+    score = (found["extinction"] - EXTINCTION) / whole
+    assert found.sizes == {"time": 40, "vertex": 3, "nv": 2, "ray": 3}
+    assert (found["quality_flag"] == 0).all()
+    assert (abs(score) < 3).mean() > 0.97
+    assert float(abs(found["extinction"] / EXTINCTION - 1).mean()) < 0.02
+    np.testing.assert_allclose(
+        found["visibility_in_air"], -np.log(0.05) / found["extinction"], rtol=1e-12
+    )
+    assert (found["visibility_in_air_lower"] < found["visibility_in_air"]).all()
+    assert (found["visibility_in_air_upper"] > found["visibility_in_air"]).all()
+
+
+def test_the_interval_of_visibility_is_that_of_all_errors_turned_over():
+    found = product()
+    whole = np.hypot(found["extinction_standard_error"], found["extinction_systematic_error"])
+    for end, value in (
+        ("lower", found["extinction"] + whole),
+        ("upper", found["extinction"] - whole),
+    ):
+        np.testing.assert_allclose(
+            found[f"visibility_in_air_{end}"], -np.log(0.05) / value, rtol=1e-9
+        )
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["exponent_relative_error", "overlap_relative_error", "lidar_ratio_relative_error"],
+)
+def test_a_larger_declared_error_is_a_larger_systematic_one(setting):
+    beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
+    less, more = (solved(beams, **{setting: value}) for value in (0.0, 0.05))
+    assert (more["extinction_systematic_error"] > less["extinction_systematic_error"]).mean() > 0.9
+    np.testing.assert_array_equal(more["extinction"], less["extinction"])
+    np.testing.assert_array_equal(
+        more["extinction_standard_error"], less["extinction_standard_error"]
+    )
+
+
+def test_an_error_of_the_overlap_is_covered_by_what_is_declared():
+    declared = 0.03
+    beams = [beam(number) for number in range(3)]
+    plain = solved(beams, overlap_relative_error=declared)
+    reach = 3000.0
+    error = 1.0 + declared * np.clip(
+        1.0 - (beams[0].averages["range"] - 1588) / (reach - 1588), 0, 1
+    )
+    net = beams[0].averages["power"] - 0.1
+    wrong = replace(beams[0], averages=beams[0].averages.assign(power=net * error + 0.1))
+    moved = abs(solved([wrong, *beams[1:]])["extinction"] - plain["extinction"])
+    assert float(moved.max()) > 0.5 * declared * EXTINCTION
+    assert (moved <= 1.1 * plain["extinction_systematic_error"]).all()
+
+
+def test_signal_left_in_the_background_is_told():
+    short = beam(0).averages.isel(range=slice(560))
+    tail = (0.9 * 4200.0, 4200.0)
+    beams = [
+        replace(beam(n), averages=beam(n).averages.isel(range=slice(560)), background_range=tail)
+        for n in range(3)
+    ]
+    found = solved(beams)
+    assert short.sizes["range"] == 560
+    assert (found["quality_flag"] & int(Quality.BACKGROUND_UNCERTAIN)).all()
+    whole = np.hypot(found["extinction_standard_error"], found["extinction_systematic_error"])
+    assert (abs(found["extinction"] - EXTINCTION) < 3 * whole).mean() > 0.9
+
+
+def test_a_beam_that_is_missing_leaves_a_reason():
+    beams = [beam(number) for number in range(3)]
+    found = solved([without(beams[0], slice(2, 4)), *beams[1:]])
+    lost = np.isnan(found["extinction"].values)
+    bits = found["quality_flag"].values
+    on_beam = np.isfinite(found["ray_range"].values[0])
+    assert (bits[2:4, on_beam] & int(Quality.rejecting())).all()
+    assert (bits[2:4] & int(Quality.PRIOR_DOMINATED)).all()
+    assert (bits[[0, 1, 4, 5]] == 0).all()
+    assert ((bits & int(Quality.rejecting())) != 0)[lost].all()
+
+
+def test_intervals_are_joined_by_the_clock():
+    beams = [beam(number) for number in range(3)]
+    late = replace(
+        beams[2], averages=beams[2].averages.isel(time=slice(1, 4)), interval=np.arange(101, 104)
+    )
+    found = solved([*beams[:2], late])
+    whole = solved(beams)
+    assert found.sizes["time"] == 6
+    np.testing.assert_array_equal(found["time"], whole["time"])
+    # Two beams do not determine three points: what remains rests on the prior, and says so.
+    doubted = (found["quality_flag"].values != 0).all(axis=1)
+    np.testing.assert_array_equal(doubted, [True, False, False, False, True, True])
+
+
+def test_pile_up_is_kept_where_the_signal_is_used():
+    beams = [beam(number) for number in range(3)]
+    for far, told in ((2000.0, True), (300.0, False)):
+        near = beams[1].averages["range"] < far
+        bits = beams[1].averages["quality"] | (near * np.int32(Quality.PILE_UP))
+        piled = replace(beams[1], averages=beams[1].averages.assign(quality=bits))
+        found = solved([beams[0], piled, beams[2]])
+        assert bool((found["quality_flag"] & int(Quality.PILE_UP)).any()) is told
+
+
+def test_visibility_goes_by_the_definition():
+    koschmieder = product(visibility=Definition(wavelength=532e-9, contrast=0.02))
+    np.testing.assert_allclose(
+        koschmieder["visibility_in_air"] * koschmieder["extinction"], -np.log(0.02)
+    )
+    angstrom = product(
+        visibility=Definition(
+            wavelength=1064e-9, law="angstrom", angstrom_exponent=1.3, exponent_standard_error=0.2
+        )
+    )
+    factor = (1064 / 550) ** 1.3
+    np.testing.assert_allclose(
+        angstrom["visibility_in_air"] * angstrom["extinction"] * factor, -np.log(0.05)
+    )
+    assert "angstrom" in angstrom.attrs["steps"]
+    # The law's own error widens the interval, not the random error.
+    ratio = angstrom["visibility_in_air_standard_error"] / angstrom["visibility_in_air"]
+    np.testing.assert_allclose(
+        ratio, angstrom["extinction_standard_error"] / angstrom["extinction"]
+    )
+    width = angstrom["visibility_in_air_upper"] / angstrom["visibility_in_air_lower"]
+    assert (width > 1 + 2 * 0.2 * np.log(1064 / 550)).all()
+
+
+def test_beams_are_as_many_as_rays():
+    with pytest.raises(RetrievalInputError, match="beams"):
+        retrieve([beam(0)], network(), PLAIN)
+
+
+def test_bins_that_are_not_used_do_not_matter(monkeypatch):
+    beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
+    cut = solved(beams)
+    monkeypatch.setattr(labeled, "BEYOND", 10**6)
+    xr.testing.assert_identical(cut, solved(beams))
+    assert beams[0].averages.sizes["range"] > 700

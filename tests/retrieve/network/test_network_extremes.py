@@ -1,0 +1,224 @@
+"""Networks of lidars: what is flagged, and extreme cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.oracle_network import (
+    at_vertices,
+    fan,
+    gradient,
+    grid,
+    homogeneous,
+    noisy,
+    relative_errors,
+    root_mean_square,
+    signals,
+    triangle,
+    with_noise,
+    without_noise,
+)
+
+from lidarops.retrieve.network import _beam_signals, geometry
+from lidarops.retrieve.network.extinction_field import solve
+
+# Flags --------------------------------------------------------------------------------------
+
+
+def pooled(relative):
+    """Return errors and flags of exact triangles of all conditions."""
+    errors, flags = [], []
+    for angle in (48.0, 50.0, 53.0, 57.0, 62.0, 66.0, 70.0):
+        net = triangle(angle)
+        for field in (homogeneous(), gradient):
+            start = int(geometry.cycle(net).vertex[0])
+            r = grid(net)
+            power, variance = noisy(
+                net, r, signals(net, r, field), relative, 150, int(angle), additive=1e-4
+            )
+            result = solve(
+                power, r, net, method="cycle", variance=variance, full_overlap_range=100.0
+            )
+            error = relative_errors(result, at_vertices(net, field))[:, start]
+            errors.append(np.where(np.isnan(error), 3.0, np.abs(error)))
+            flags.append(result.flags.flagged[:, start])
+    return np.concatenate(errors), np.concatenate(flags)
+
+
+@pytest.mark.parametrize("relative", [0.01, 0.03, 0.06])
+def test_flags_find_what_is_wrong_and_leave_what_is_right(relative):
+    error, flagged = pooled(relative)
+    assert flagged[error > 0.5].mean() >= 0.95
+    if relative <= 0.03:
+        assert flagged[error < 0.1].mean() <= 0.10
+    assert error[~flagged].max() <= 0.8
+
+
+# Extreme cases ------------------------------------------------------------------------------
+
+
+def test_extreme_a_degenerate_triangle_is_flagged_always():
+    net = triangle(46.1024, tolerance=1e-6)
+    result = with_noise(net, homogeneous(), 0.01, 200, method="cycle")
+    start = geometry.cycle(net).vertex[0]
+    assert result.flags.ill_conditioned[:, start].mean() > 0.97
+    assert result.flags.flagged[:, start].mean() > 0.97
+
+
+def test_extreme_b_nearly_degenerate_triangle_is_flagged():
+    net = triangle(47.0)
+    result = with_noise(net, homogeneous(), 0.01, 300, method="cycle")
+    assert result.flags.flagged[:, geometry.cycle(net).vertex[0]].mean() > 0.95
+
+
+def test_extreme_c_far_start_is_flagged_and_harmless_only_when_exact():
+    net = triangle(30.0)
+    upper = int(np.argmax(net.vertex[:, 2]))
+    middle = [v for v in range(3) if geometry.cycle(net, start=v).far_start]
+    assert upper in middle
+    start = middle[0]
+    exact = with_noise(net, homogeneous(), 0.01, 200, method="cycle", start=start)
+    assert exact.flags.far_start[:, start].all()
+    assert root_mean_square(relative_errors(exact, 2e-3))[start] < 0.35
+    single = with_noise(net, homogeneous(), 0.01, 200, method="multiplier", multiplier=0.0,
+                        start=start)  # fmt: skip
+    assert single.flags.flagged[:, start].all()
+    assert not single.flags.not_positive[:, geometry.cycle(net).vertex[0]].any()
+
+
+def test_extreme_d_clear_air_is_flagged():
+    net = triangle()
+    result = with_noise(net, homogeneous(2e-5), 0.005, 200, method="cycle")
+    assert result.flags.flagged[:, 0].mean() > 0.95
+    network = with_noise(net, homogeneous(2e-5), 0.005, 200)
+    usable = ~network.flags.flagged[:, 0]
+    score = (network.extinction[:, 0] - 2e-5) / network.extinction_standard_error[:, 0]
+    assert not usable.any() or np.mean(np.abs(score[usable]) < 3) >= 0.98
+
+
+def test_extreme_e_thick_air_needs_its_near_vertex_only():
+    exact = without_noise(triangle(), homogeneous(2e-2))
+    single = without_noise(triangle(), homogeneous(2e-2), method="multiplier", multiplier=0.0)
+    assert exact.extinction[0] == pytest.approx(2e-2, rel=1e-10)
+    assert single.extinction[0] == pytest.approx(2e-2, rel=4e-4)
+
+
+def test_extreme_g_steep_power_law():
+    net = triangle()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous(), 2.0), 0.01, 200, additive=0.0)
+    result = solve(power, r, net, method="cycle", variance=variance, exponent=2.0,
+                   full_overlap_range=100.0)  # fmt: skip
+    assert root_mean_square(relative_errors(result, 2e-3))[0] < 0.06
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf, -np.inf])
+@pytest.mark.parametrize("method", ["network", "cycle", "multiplier", "unbiased", "slope", "klett"])
+def test_extreme_h_no_plain_number_comes_out_of_a_bad_signal(bad, method):
+    net = triangle()
+    r = grid(net)
+    clean = signals(net, r, homogeneous())
+    power, variance = noisy(net, r, clean, 0.005, 12)
+    power[3, 0, np.searchsorted(r, 700.0)] = bad
+    power[5, :, :] = bad
+    whole = solve(power, r, net, method=method, variance=variance, full_overlap_range=100.0)
+    assert np.isnan(whole.extinction[5]).all()
+    assert whole.flags.not_finite[5].all()
+    lost = whole.flags.signal_missing if not np.isfinite(bad) else whole.flags.signal_not_positive
+    assert lost[[3, 5], 1].all()
+    assert whole.flags.flagged[3, 1]
+    # The others are as good as without it.
+    assert np.isfinite(whole.extinction[[0, 1, 2, 4], 0]).all()
+    assert not lost[[0, 1, 2, 4]].any()
+
+
+def test_extreme_i_too_few_rays_without_prior_are_not_determined():
+    net = fan([-500.0, 500.0], [(45.0, 55.0), (135.0,)])
+    assert net.vertices == 2
+    result = with_noise(net, homogeneous(), 0.01, 20, prior="none")
+    assert np.isnan(result.extinction).all()
+    assert result.flags.not_finite.all()
+
+
+def test_extreme_j_pole_is_refused():
+    net = triangle(30.0)
+    # Walked against the attenuation, through the far vertex.
+    forward = geometry.cycle(net)
+    order = forward.vertex[[0, 2, 1]]
+    backward = geometry.Cycle(
+        forward.ray[::-1].copy(), order.copy(), forward.end_range[::-1].copy(),
+        forward.start_range[::-1].copy(),
+    )  # fmt: skip
+    result = without_noise(
+        net, homogeneous(8e-3), method="multiplier", multiplier=0.95, cycle=backward
+    )
+    refused = result.flags.pole
+    assert refused.any()
+    assert np.isnan(result.extinction[refused]).all()
+
+
+@pytest.mark.parametrize("method", ["cycle", "multiplier"])
+@pytest.mark.parametrize("relative", [0.01, 0.03])
+def test_a_vertex_reached_against_strong_attenuation_is_flagged(method, relative):
+    net, field = triangle(60.0), homogeneous(0.02)
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, field), relative, 200, 7, additive=0.0)
+    result = solve(power, r, net, method=method, variance=variance, full_overlap_range=100.0)
+    error = relative_errors(result, at_vertices(net, field))
+    stated = result.extinction_standard_error / result.extinction
+    start = int(geometry.cycle(net).vertex[0])
+    other = [v for v in np.flatnonzero(result.near_vertex) if v != start]
+    # Values are there, and many are off by more than their linear error tells.
+    assert (np.abs(error[:, other]) > 4.0 * stated[:, other]).mean() > 0.1
+    assert result.flags.ill_conditioned[:, other].mean() > 0.6
+    assert result.flags.flagged[:, other].all()
+    assert not result.flags.flagged[:, start].any()
+
+
+@pytest.mark.parametrize("factor", [8.0, 20.0])
+def test_one_loud_profile_costs_the_others_nothing_where_signals_tell_the_noise(factor):
+    """Its noise was taken for that of its whole block, and for a part of its own only."""
+    net = triangle()
+    r = grid(net)
+    clean = signals(net, r, homogeneous(2e-3))
+    calm, _ = noisy(net, r, clean, 0.01, 50, 4, 0.0)
+    power = calm.copy()
+    power[7] += (factor - 1.0) * (calm[7] - clean)
+    settings = {"full_overlap_range": 100.0, "prior": "none"}
+    quiet, found = solve(calm, r, net, **settings), solve(power, r, net, **settings)
+    others = np.arange(50) != 7
+    near = found.near_vertex
+    np.testing.assert_allclose(
+        found.extinction_standard_error[others][:, near],
+        quiet.extinction_standard_error[others][:, near], rtol=0.05,
+    )  # fmt: skip
+    own = found.extinction_standard_error[7, near] / found.extinction[7, near]
+    usual = quiet.extinction_standard_error[7, near] / quiet.extinction[7, near]
+    told = np.isfinite(own)
+    assert np.all(found.flags.flagged[7, near] | (own > 0.5 * factor * usual))
+    assert not (
+        told
+        & ~found.flags.flagged[7, near]
+        & (
+            np.abs(found.extinction[7, near] - 2e-3)
+            > 4.0 * found.extinction_standard_error[7, near]
+        )
+    ).any()
+
+
+def test_noise_of_calm_profiles_is_pooled_as_ever():
+    power, _ = noisy(
+        triangle(),
+        grid(triangle()),
+        signals(triangle(), grid(triangle()), homogeneous(2e-3)),
+        0.02,
+        12,
+        5,
+        0.0,
+    )
+    block = np.repeat([0, 1], 6)
+    members = [np.flatnonzero(block == b) for b in range(2)]
+    rows, row = _beam_signals._estimated(power, members, block)
+    np.testing.assert_array_equal(row, block)
+    assert rows.shape == (2, *power.shape[1:])
+    np.testing.assert_allclose(np.sqrt(np.median(rows, axis=2)), 0.02, rtol=0.1)

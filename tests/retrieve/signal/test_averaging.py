@@ -1,0 +1,217 @@
+"""Averages: weights, gaps, variances that average down and such that do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.signal import averaging
+
+
+def by_hand(values, variance, shared, weights):
+    """Return the averages of one bin, by the formulas of the docstring."""
+    good = np.isfinite(values) & (weights > 0)
+    w = weights[good]
+    if not good.any():
+        return np.nan, np.nan, np.nan, 0
+    total = w.sum()
+    return (
+        (w * values[good]).sum() / total,
+        (w**2 * variance[good]).sum() / total**2,
+        ((w * np.sqrt(shared[good])).sum() / total) ** 2,
+        int(good.sum()),
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 5))
+@settings(max_examples=60, deadline=None)
+def test_mean_follows_its_formulas(seed, length, bins):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(2, length, bins))
+    values[rng.random(values.shape) < 0.2] = np.nan
+    variance, shared = rng.random(values.shape), rng.random(values.shape)
+    weights = rng.integers(0, 4, (2, length)).astype(float)
+    groups = rng.integers(-1, 3, length)
+    result = averaging.mean(
+        values, variance, groups=groups, weights=weights, shared_variance=shared
+    )
+    for k, g, i in np.ndindex(2, max(int(groups.max()), 0) + 1, bins):
+        inside = groups == g
+        expected = by_hand(
+            values[k, inside, i], variance[k, inside, i], shared[k, inside, i], weights[k, inside]
+        )
+        found = (
+            result.values[k, g, i],
+            result.variance[k, g, i],
+            result.shared_variance[k, g, i],
+            result.count[k, g, i],
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_noise_averages_down_and_shared_errors_do_not():
+    """The standard error of a mean is its scatter over many realisations."""
+    rng = np.random.default_rng(1)
+    shots = np.array([100.0, 200.0, 600.0, 100.0])
+    noise = 3.0 / np.sqrt(shots)
+    dark = rng.normal(0.0, 0.5, (4000, 1, 1))
+    profiles = 7.0 + dark + rng.normal(size=(4000, 4, 3)) * noise[:, np.newaxis]
+    result = averaging.mean(
+        profiles, noise[:, np.newaxis] ** 2, weights=shots, shared_variance=0.25
+    )
+    off = result.values - 7.0
+    assert np.var(off) == pytest.approx(result.standard_error[0, 0, 0] ** 2, rel=0.05)
+    assert result.variance[0, 0, 0] == pytest.approx(9.0 / shots.sum(), rel=1e-12)
+    assert result.shared_variance[0, 0, 0] == pytest.approx(0.25, rel=1e-12)
+    assert np.var(off - dark) == pytest.approx(9.0 / shots.sum(), rel=0.05)
+
+
+def test_gaps_keep_the_mean_unbiased_and_its_variance_honest():
+    rng = np.random.default_rng(2)
+    profiles = rng.normal(5.0, 1.0, (3000, 8, 4))
+    profiles[:, :5, 1] = np.nan
+    profiles[:, :, 2] = np.inf
+    profiles[:, 1:, 3] = np.nan
+    result = averaging.mean(profiles, 1.0)
+    np.testing.assert_array_equal(result.count[0, 0], [8, 3, 0, 1])
+    np.testing.assert_allclose(result.variance[0, 0, [0, 1, 3]], [1 / 8, 1 / 3, 1.0])
+    assert np.isnan(result.values[:, 0, 2]).all()
+    assert np.isnan(result.variance[:, 0, 2]).all()
+    for i in (0, 1, 3):
+        spread = np.sqrt(result.variance[0, 0, i])
+        assert result.values[..., i].mean() == pytest.approx(5.0, abs=4 * spread / np.sqrt(3000))
+        assert result.values[..., i].std() == pytest.approx(spread, rel=0.06)
+
+
+def test_least_count_turns_thin_means_into_gaps():
+    profiles = np.ones((5, 2))
+    profiles[:3, 1] = np.nan
+    result = averaging.mean(profiles, 1.0, least_count=3)
+    np.testing.assert_array_equal(result.values, [[1.0, np.nan]])
+    np.testing.assert_array_equal(result.count, [[5, 2]])
+    assert np.isnan(result.shared_variance[0, 1])
+
+
+def test_a_variance_that_is_not_known_stays_so():
+    variance = np.ones((4, 2))
+    variance[1, 0] = np.nan
+    result = averaging.mean(np.ones((4, 2)), variance)
+    np.testing.assert_array_equal(result.values, [[1.0, 1.0]])
+    np.testing.assert_array_equal(np.isnan(result.variance), [[True, False]])
+
+
+@pytest.mark.parametrize("dtype", ["<f4", "<f8", ">f8"])
+def test_no_bit_depends_on_the_chunks(dtype):
+    rng = np.random.default_rng(3)
+    profiles = rng.normal(1e6, 1.0, (6, 50, 33)).astype(dtype)
+    profiles[rng.random(profiles.shape) < 0.1] = np.nan
+    variance = rng.random(profiles.shape)
+    groups = np.repeat(np.arange(5), 10)
+    whole = averaging.mean(profiles, variance, groups=groups)
+    for rows, bins in (
+        (slice(0, 1), slice(None)),
+        (slice(2, 5), slice(7, 8)),
+        (slice(5, 6), slice(1, 32, 3)),
+    ):
+        part = averaging.mean(profiles[rows, :, bins], variance[rows, :, bins], groups=groups)
+        np.testing.assert_array_equal(whole.values[rows, :, bins], part.values)
+        np.testing.assert_array_equal(whole.variance[rows, :, bins], part.variance)
+    for g in range(5):
+        inside = groups == g
+        alone = averaging.mean(profiles[:, inside], variance[:, inside])
+        np.testing.assert_array_equal(whole.values[:, g : g + 1], alone.values)
+
+
+def test_any_axis_can_be_time():
+    rng = np.random.default_rng(4)
+    profiles = rng.normal(size=(5, 3, 4))
+    shots = np.arange(1.0, 6.0)
+    first = averaging.mean(profiles, 1.0, weights=shots, axis=0)
+    moved = averaging.mean(np.moveaxis(profiles, 0, 1), 1.0, weights=shots)
+    np.testing.assert_array_equal(first.values[0], moved.values[:, 0])
+    last = averaging.mean(np.moveaxis(profiles, 0, -1), 1.0, weights=shots, axis=-1)
+    np.testing.assert_allclose(last.values[..., 0], moved.values[:, 0], rtol=1e-14)
+    assert last.count.shape == (3, 4, 1)
+
+
+def test_no_profiles_give_gaps():
+    result = averaging.mean(np.empty((0, 4)), 1.0)
+    np.testing.assert_array_equal(result.count, np.zeros((1, 4)))
+    assert np.isnan(result.values).all()
+    dark = averaging.mean(np.ones((3, 4)), 1.0, weights=[0.0, 0.0, np.nan])
+    assert np.isnan(dark.values).all()
+
+
+def test_times_are_sorted_into_bins():
+    edges = np.array([0.0, 10.0, 30.0])
+    groups = averaging.time_groups([-1.0, 0.0, 9.9, 10.0, 29.0, 30.0, np.nan], edges)
+    np.testing.assert_array_equal(groups, [-1, 0, 0, 1, 1, -1, -1])
+    moments = np.array(["2024-01-01T00:05", "2024-01-01T00:15", "NaT"], "M8[s]")
+    bounds = np.array(["2024-01-01T00:00", "2024-01-01T00:10", "2024-01-01T00:20"], "M8[s]")
+    np.testing.assert_array_equal(averaging.time_groups(moments, bounds), [0, 1, -1])
+
+
+@given(hnp.arrays(np.float64, (2, 23), elements=st.floats(-1e6, 1e6)), st.integers(1, 23))
+@settings(max_examples=50, deadline=None)
+def test_range_mean_of_full_bins_is_that_of_numpy(values, factor):
+    result = averaging.range_mean(values, 2.0, factor, shared_variance=0.5)
+    number = 23 // factor
+    blocks = values[:, : number * factor].reshape(2, number, factor)
+    np.testing.assert_allclose(result.values, blocks.mean(axis=-1), rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(result.variance, 2.0 / factor)
+    np.testing.assert_allclose(result.shared_variance, 0.5)
+
+
+def test_range_mean_needs_all_bins_unless_told_otherwise():
+    values = np.array([1.0, 2.0, np.nan, 4.0, 5.0, 6.0, 7.0])
+    strict = averaging.range_mean(values, 1.0, 2)
+    np.testing.assert_array_equal(strict.values, [1.5, np.nan, 5.5])
+    loose = averaging.range_mean(values, 1.0, 2, least_count=1)
+    np.testing.assert_array_equal(loose.values, [1.5, 4.0, 5.5])
+    np.testing.assert_array_equal(loose.count, [2, 1, 2])
+    np.testing.assert_array_equal(loose.variance, [0.5, 1.0, 0.5])
+
+
+def test_range_mean_of_a_background_error_does_not_average_down():
+    rng = np.random.default_rng(5)
+    offset = rng.normal(0.0, 0.3, (5000, 1))
+    profiles = offset + rng.normal(0.0, 1.0, (5000, 16))
+    result = averaging.range_mean(profiles, 1.0, 16, shared_variance=0.09)
+    assert np.var(result.values) == pytest.approx(result.standard_error[0, 0] ** 2, rel=0.08)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"profiles": np.ones(3), "axis": -2}, "axis"),
+        ({"variance": -1.0}, "variance"),
+        ({"variance": np.ones((3, 3))}, "variance"),
+        ({"shared_variance": [-1.0, 0.0]}, "shared_variance"),
+        ({"weights": -np.ones(4)}, "weights"),
+        ({"weights": np.ones(3)}, "weights"),
+        ({"groups": np.zeros(4)}, "groups"),
+        ({"groups": [0, 1]}, "groups"),
+        ({"least_count": 0}, "least_count"),
+        ({"profiles": np.array([["a", "b"]])}, "profiles"),
+    ],
+)
+def test_impossible_arguments_are_refused(change, field):
+    arguments = {"profiles": np.ones((4, 2)), "variance": 1.0} | change
+    with pytest.raises(RetrievalInputError) as error:
+        averaging.mean(arguments.pop("profiles"), arguments.pop("variance"), **arguments)
+    assert error.value.field == field
+
+
+def test_impossible_cuts_are_refused():
+    for factor in (0, 5, 1.5):
+        with pytest.raises(RetrievalInputError, match="factor"):
+            averaging.range_mean(np.ones((2, 4)), 1.0, factor)
+    for edges in ([0.0, 0.0], [1.0], [2.0, 1.0], [0.0, np.nan]):
+        with pytest.raises(RetrievalInputError, match="edges"):
+            averaging.time_groups([0.0], edges)
+    with pytest.raises(RetrievalInputError, match="edges"):
+        averaging.time_groups(np.array(["2024-01-01"], "M8[s]"), [0.0, 1.0])

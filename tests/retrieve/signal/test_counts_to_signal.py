@@ -1,0 +1,527 @@
+"""Counts to signals: by hand, by Monte Carlo, and against plain numpy and exact sums."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from support import oracle_signal
+
+from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
+from lidarops.retrieve.homogeneous import path_fit
+from lidarops.retrieve.signal import _signal_kernels as kernels
+from lidarops.retrieve.signal import counts_to_signal
+
+RANGE = (np.arange(400) + 0.5) * 7.5
+SHOTS = np.array([600])
+
+
+def test_analog_voltage_of_known_counts() -> None:
+    counts = np.full((1, 400), 123_456, np.int32)
+    result = counts_to_signal.analog(counts, SHOTS, RANGE, adc_bits=12, input_range=np.array([0.5]))
+    assert result.power == pytest.approx(123_456 * 500.0 / (600 * 4096))
+    assert not result.quality.any()
+
+
+def test_full_scale_and_integer_extremes_are_masked() -> None:
+    counts = np.full((1, 400), 1000, np.int32)
+    counts[0, :4] = [600 * 4095, 600 * 4000, 2**31 - 1, -(2**31)]
+    result = counts_to_signal.analog(
+        counts, SHOTS, RANGE, adc_bits=12, input_range=np.array([0.5]), noise_variance=1e-4
+    )
+    assert result.quality[0, 0] == Quality.SATURATED
+    assert result.quality[0, 1] == 0
+    assert result.quality[0, 2] & Quality.INPUT_MISSING
+    assert result.quality[0, 3] & Quality.INPUT_MISSING
+    assert np.isnan(result.power[0, [0, 2, 3]]).all()
+    assert np.isfinite(result.power[0, [1, 4]]).all()
+
+
+def test_a_mean_of_shots_of_which_some_were_clipped_is_masked() -> None:
+    rng = np.random.default_rng(8)
+    shots, top, spread = 400, 4095.0, 200.0
+    level = np.full(1200, 2000.0)
+    level[:400], level[400:800] = 3600.0, 3200.0
+    counts = np.zeros((1, level.size), np.int32)
+    for _ in range(shots):
+        shot = level + rng.normal(0.0, spread, level.size)
+        counts[0] += np.rint(np.clip(shot, 0.0, top)).astype(np.int32)
+    result = counts_to_signal.analog(
+        counts,
+        np.array([shots]),
+        7.5 * np.arange(1.0, level.size + 1),
+        adc_bits=12,
+        input_range=np.array([0.5]),
+    )
+    # 2.5, 4.5 and 10 deviations of a shot below full scale.
+    for part, clipped in ((slice(420), True), (slice(420, 780), False), (slice(820, None), False)):
+        saturated = (result.quality[0, part] & Quality.SATURATED) != 0
+        assert saturated.mean() > 0.9 if clipped else not saturated.any()
+    step = 500.0 / 4096.0
+    bias = np.nanmean(result.power[0, 420:780]) / step - 3200.0
+    assert abs(bias) < 4.0 * spread / np.sqrt(shots * 360)
+
+
+@pytest.mark.parametrize("shots", [20, 600])
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.1, 0.2, 0.3, 0.4, 0.5, 1.0])
+def test_rounding_of_each_shot_is_covered_at_every_level(noise: float, shots: int) -> None:
+    rng = np.random.default_rng(round(1e3 * noise) + shots)
+    level = 100.0 + np.linspace(0.0, 1.0, 41)[:, np.newaxis]
+    sums = np.zeros((41, 400))
+    for _ in range(shots):
+        sums += np.rint(level + noise * rng.standard_normal(sums.shape))
+    found = counts_to_signal.analog(
+        sums.astype(np.int32), np.full(41, shots), RANGE, adc_bits=12, input_range=np.full(41, 0.5)
+    )
+    step = 500.0 / 4096.0
+    error = np.sqrt(found.variance)
+    assert np.abs((found.power - level * step) / error).max() < 5.0
+    if noise >= 0.5:
+        ideal = step * np.sqrt((noise**2 + 1.0 / 12.0) / shots)
+        assert np.median(error) == pytest.approx(ideal, rel=0.1)
+    if noise == 0.0:
+        assert error == pytest.approx(step * np.sqrt((1.0 + 1.0 / shots) / 12.0))
+
+
+def test_the_stated_noise_is_raised_by_rounding_and_that_of_the_dark_signal_is_not() -> None:
+    settings = {"adc_bits": 12, "input_range": np.array([0.5])}
+    step = 500.0 / 4096.0
+    counts = np.full((1, 400), 60_200, np.int32)
+    quiet = counts_to_signal.analog(counts, SHOTS, RANGE, noise_variance=0.0, **settings)
+    assert quiet.variance == pytest.approx(step**2 * (1.0 + 1.0 / 600.0) / 12.0)
+    loud = counts_to_signal.analog(counts, SHOTS, RANGE, noise_variance=step**2 / 600.0, **settings)
+    assert loud.variance == pytest.approx(step**2 / 600.0)
+    dark = {"dark": np.zeros(400), "dark_variance": np.full(400, 7.0)}
+    both = counts_to_signal.analog(counts, SHOTS, RANGE, noise_variance=0.0, **dark, **settings)
+    assert both.variance == pytest.approx(quiet.variance + 7.0)
+
+
+def test_no_shots_is_missing_input_not_infinity() -> None:
+    counts = np.full((2, 400), 1000, np.int32)
+    result = counts_to_signal.photon(counts, np.array([0, 600]), RANGE, bin_width=7.5)
+    assert (result.quality[0] & Quality.INPUT_MISSING).all()
+    assert np.isnan(result.power[0]).all()
+    assert np.isfinite(result.power[1]).all()
+
+
+@given(rate=st.floats(0.01, 100.0), dead_time=st.floats(1e-9, 4e-9))
+def test_dead_time_is_undone(rate: float, dead_time: float) -> None:
+    assume(abs(rate * dead_time * 1e6 - 0.1) > 1e-6)
+    # A non-paralysable counter shows r / (1 + r tau); counts are scaled so that rounding is nil.
+    shots = np.array([10_000_000])
+    measured = rate / (1.0 + rate * dead_time * 1e6)
+    counts = np.full((1, 400), round(measured * shots[0] * 0.05), np.int32)
+    result = counts_to_signal.photon(counts, shots, RANGE, bin_width=7.5, dead_time=dead_time)
+    assert result.power == pytest.approx(rate, rel=2e-4)
+    assert bool((result.quality & Quality.PILE_UP).any()) is (rate * dead_time * 1e6 > 0.1)
+
+
+def test_photon_variance_matches_the_scatter_of_poisson_counts() -> None:
+    rng = np.random.default_rng(3)
+    truth = 0.2 + 40.0 * (750.0 / RANGE) ** 2
+    truth[:80] = truth[80]
+    counts = rng.poisson(truth * 30.0, (4000, 400)).astype(np.int32)
+    result = counts_to_signal.photon(counts, np.full(4000, 600), RANGE, bin_width=7.5)
+    ratio = result.power.var(axis=0) / result.variance.mean(axis=0)
+    # 4000 draws: 2.2 % a bin; smoothing over 10 % of range biases the variance by 1-3 %.
+    assert np.abs(ratio[120:] - 1.0).max() < 0.12
+    assert ratio[120:].mean() == pytest.approx(1.0, abs=0.02)
+
+
+def test_zero_counts_do_not_claim_certainty() -> None:
+    counts = np.zeros((2, 400), np.int32)
+    counts[0, 7] = 1
+    result = counts_to_signal.photon(counts, np.full(2, 600), RANGE, bin_width=7.5)
+    assert (result.variance[0] > 0).all()
+    assert not result.quality[0].any()
+    # Not a single count in a profile: the recorder was off.
+    assert (result.quality[1] == Quality.INPUT_MISSING).all()
+    assert np.isnan(result.power[1]).all()
+
+
+def test_paralysed_counters_are_masked() -> None:
+    counts = np.full((1, 400), 200 * 30, np.int32)  # 200 MHz
+    result = counts_to_signal.photon(counts, SHOTS, RANGE, bin_width=7.5, dead_time=4e-9)
+    assert (result.quality & Quality.SATURATED).all()
+    assert np.isnan(result.power).all()
+
+
+def test_noise_of_an_analog_signal_is_found() -> None:
+    rng = np.random.default_rng(5)
+    far = (np.arange(2000) + 60.5) * 7.5
+    light = 0.5 + 300.0 * (450.0 / far) ** 2
+    truth = 0.02 + 0.01 * light
+    profiles = light + rng.normal(0, 1, (400, 2000)) * np.sqrt(truth)
+    variance = counts_to_signal.difference_variance(profiles, far)
+    # At the first bins the smoothing window has no near half.
+    assert (variance.mean(axis=0) / truth)[40:] == pytest.approx(1.0, abs=0.08)
+    assert (variance.std(axis=0) / truth)[40:].max() < 0.15
+
+
+def test_constant_noise_does_not_follow_the_light() -> None:
+    rng = np.random.default_rng(6)
+    far = (np.arange(2000) + 60.5) * 7.5
+    profiles = 300.0 * (450.0 / far) ** 2 + rng.normal(0, 0.3, (400, 2000))
+    variance = counts_to_signal.difference_variance(profiles, far)
+    assert np.median(variance, axis=0) / 0.09 == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_signal_without_noise_has_a_finite_variance() -> None:
+    variance = counts_to_signal.difference_variance(np.zeros((2, 400)), RANGE)
+    assert (variance == 0).all()
+    gappy = np.full((1, 400), np.nan)
+    gappy[0, :3] = 1.0
+    assert np.isnan(counts_to_signal.difference_variance(gappy, RANGE)).all()
+
+
+@pytest.mark.parametrize("section", [(750, 4500), (1500, 7500)])
+def test_estimated_noise_serves_a_retrieval_as_well_as_known_noise(
+    section: tuple[int, int],
+) -> None:
+    rng = np.random.default_rng(5)
+    distance = (np.arange(2000) + 0.5) * 7.5
+    shape = np.exp(-2 * 2e-4 * distance) * (1500.0 / distance) ** 2
+    profiles = 0.1 + 0.15 * shape + rng.normal(0, 0.007, (2000, 2000))
+    inside = (distance >= section[0]) & (distance < section[1])
+    variance = counts_to_signal.difference_variance(profiles, distance)[:, inside]
+    found = path_fit.solve(profiles[:, inside], distance[inside], weights=1.0 / variance)
+    good = found.quality == 0
+    score = (found.extinction - 2e-4) / found.extinction_standard_error
+    assert good.mean() > 0.995
+    # 2000 draws: the spread is known to 1.6 percent.
+    assert score[good].std() == pytest.approx(1.0, abs=0.05)
+    assert abs(score[good].mean()) < 0.1
+
+
+def test_smoothing_keeps_constants_and_passes_over_nan() -> None:
+    values = np.full((2, 400), 3.0)
+    values[0, 50:60] = np.nan
+    assert counts_to_signal.smooth(values, RANGE) == pytest.approx(3.0)
+    assert np.isnan(counts_to_signal.smooth(np.full((1, 400), np.nan), RANGE)).all()
+
+
+def _analog(counts, shots, range=RANGE, **settings):  # noqa: A002
+    volts = np.full(np.shape(shots), 0.5)
+    return counts_to_signal.analog(counts, shots, range, adc_bits=12, input_range=volts, **settings)
+
+
+def _photon(counts, shots, range=RANGE, **settings):  # noqa: A002
+    return counts_to_signal.photon(counts, shots, range, bin_width=7.5, **settings)
+
+
+def _assert_same_bits(one, other) -> None:
+    np.testing.assert_array_equal(one.power, other.power)
+    np.testing.assert_array_equal(one.variance, other.variance)
+    np.testing.assert_array_equal(one.quality, other.quality)
+
+
+def _damaged(counts, rng):
+    """Strike out bins, stretches of bins and whole profiles."""
+    counts = np.asarray(counts, np.int32)
+    counts[0, rng.integers(0, counts.shape[1], 9)] = 2**31 - 1
+    counts[1, 7:60] = -(2**31)
+    counts[2] = 0
+    counts[3] = 2**31 - 1
+    counts[4, rng.random(counts.shape[1]) < 0.6] = -(2**31) + 1
+    return counts
+
+
+def _light(range):  # noqa: A002
+    return (1000.0 / (range + 50.0)) ** 2 * np.exp(-2e-4 * range)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 7), dead_time=st.sampled_from([None, 3e-9])
+)
+def test_bits_depend_neither_on_neighbours_nor_on_order(seed, cut, dead_time) -> None:
+    rng = np.random.default_rng(seed)
+    counts = _damaged(rng.poisson(600 * 0.05 * (1 + 20 * _light(RANGE)), (7, 400)), rng)
+    shots = rng.integers(0, 4, 7) * 300
+    order = rng.permutation(7)
+    for convert in (_analog, lambda *all: _photon(*all, dead_time=dead_time)):
+        whole = convert(counts, shots, RANGE)
+        for rows in (slice(0, cut), slice(cut, 7), order):
+            part = convert(counts[rows], shots[rows], RANGE)
+            _assert_same_bits(
+                part,
+                counts_to_signal.Signal(
+                    whole.power[rows], whole.variance[rows], whole.quality[rows]
+                ),
+            )
+
+
+def _assert_agree(result, expected) -> None:
+    np.testing.assert_array_equal(result.power, expected.power)
+    np.testing.assert_array_equal(result.quality, expected.quality)
+    np.testing.assert_allclose(result.variance, expected.variance, rtol=1e-9, atol=0.0)
+
+
+@pytest.mark.parametrize("bins", [1, 2, 3, 4, 16, 17, 31, 33, 50, 1000, 4096])
+@pytest.mark.parametrize("offset", [0.0, -37.5, 450.0])
+def test_analog_agrees_with_plain_numpy(bins: int, offset: float) -> None:
+    rng = np.random.default_rng(bins)
+    distance = (np.arange(bins) + 0.5) * 7.5 + offset
+    volts = 2.0 + 60.0 * _light(np.abs(distance)) + rng.normal(0, 0.15, (8, bins))
+    counts = _damaged(np.minimum(volts * 600 * 4096 / 500, 600 * 4095), rng)
+    shots = np.array([600, 600, 600, 600, 600, 600, 0, 599])
+    volt = np.full(8, 0.5)
+    settings = {"adc_bits": 12, "full_overlap_range": 200.0}
+    for chosen in (settings, settings | {"dark": rng.normal(0, 0.1, bins)}):
+        _assert_agree(
+            counts_to_signal.analog(counts, shots, distance, input_range=volt, **chosen),
+            oracle_signal.analog(counts, shots, distance, input_range=volt, **chosen),
+        )
+    known = settings | {"noise_variance": 1e-3, "dark_variance": rng.random(bins) * 1e-2}
+    _assert_agree(
+        counts_to_signal.analog(counts, shots, distance, input_range=volt, **known),
+        oracle_signal.analog(counts, shots, distance, input_range=volt, **known),
+    )
+
+
+@pytest.mark.parametrize("bins", [1, 16, 17, 33, 1000, 4096])
+@pytest.mark.parametrize("dead_time", [None, 0.0, 2e-9, 4e-9])
+def test_photon_agrees_with_plain_numpy(bins: int, dead_time: float | None) -> None:
+    rng = np.random.default_rng(bins)
+    distance = (np.arange(bins) + 0.5) * 7.5 - 20.0
+    rate = 0.3 + 150.0 * _light(np.abs(distance))
+    counts = _damaged(rng.poisson(30.0 * rate / (1.0 + rate * 3e-3), (8, bins)), rng)
+    counts[5, 1:90:7] = -3
+    shots = np.array([600, 600, 600, 600, 600, 600, 0, 599])
+    settings = {"bin_width": 7.5, "dead_time": dead_time, "full_overlap_range": 200.0}
+    _assert_agree(
+        counts_to_signal.photon(counts, shots, distance, **settings),
+        oracle_signal.photon(counts, shots, distance, **settings),
+    )
+
+
+@pytest.mark.parametrize("decades", [0, 6, 9])
+def test_near_range_does_not_take_the_digits_of_the_far_range(decades: int) -> None:
+    rng = np.random.default_rng(decades)
+    distance = (np.arange(4096) + 0.5) * 7.5
+    values = rng.normal(1.0, 1.0, 4096) * 10.0 ** np.linspace(decades, 0.0, 4096)
+    values[:30] *= 10.0**decades
+    first, past = oracle_signal.windows(distance, 0.1)
+    inside = [values[a:b] for a, b in zip(first, past, strict=True)]
+    exact = np.array([math.fsum(window) / window.size for window in inside])
+    size = np.array([math.fsum(np.abs(window)) / window.size for window in inside])
+    error = np.abs(counts_to_signal.smooth(values, distance) - exact)
+    whole = (4096 / kernels.BLOCK) ** 2 * 2.0**-106 * np.abs(values).sum() / (past - first)
+    assert (error <= (kernels.BLOCK + 3) * 2.0**-53 * size + whole).all()
+    if decades > 0:
+        # What differences of one running sum, as in the oracle, would lose.
+        lost = np.abs(oracle_signal.smooth(values, distance) - exact)
+        assert lost.max() > 1e-10 * size[np.argmax(lost)]
+
+
+def test_noise_of_light_that_stands_still_has_no_slope() -> None:
+    # 18 bins: every window with a difference holds all of them, so that one mean is fitted.
+    power = np.random.default_rng(2).normal(5.0, 1.0, (20, 18))
+    variance = counts_to_signal.difference_variance(power, RANGE[:18])
+    assert (np.ptp(variance, axis=-1) == 0.0).all()
+
+
+def test_windows_never_leave_the_profile() -> None:
+    values = np.arange(400.0)
+    for window in (1e300, 1e308):
+        # Both ends as far from the bin as the nearer end of the profile, or 16 bins.
+        average = counts_to_signal.smooth(values, RANGE * 1e-300, window=window)
+        np.testing.assert_allclose(average[16:-16], values[16:-16])
+        assert average[0] == np.mean(values[:17])
+        assert average[-1] == np.mean(values[-17:])
+
+
+def test_windows_do_not_reach_over_bins_that_were_left_on_disk() -> None:
+    distance = (np.arange(4000) + 0.5) * 7.5
+    counts = np.random.default_rng(9).poisson(1e5 * np.exp(-distance / 900.0) + 20.0, (3, 4000))
+    counts, shots = counts.astype(np.int32), np.full(3, 600)
+    settings = {"bin_width": 7.5, "dead_time": 3e-9}
+    parts = [slice(0, 700), slice(2400, 2900), slice(3500, 4000)]
+    kept = np.r_[tuple(parts)]
+    found = counts_to_signal.photon(counts[:, kept], shots, distance[kept], **settings)
+    whole = counts_to_signal.photon(counts, shots, distance, **settings)
+    np.testing.assert_array_equal(found.power, whole.power[:, kept])
+    place = 0
+    for part in parts:
+        here = slice(place, place + part.stop - part.start)
+        alone = counts_to_signal.photon(counts[:, part], shots, distance[part], **settings)
+        np.testing.assert_allclose(found.variance[:, here], alone.variance, rtol=1e-12)
+        place = here.stop
+    # Light falls by nine decades over the gap: a window over it would take that for noise.
+    np.testing.assert_allclose(found.variance, whole.variance[:, kept], rtol=0.2)
+
+
+def test_every_layout_of_the_input_gives_the_same_bits() -> None:
+    rng = np.random.default_rng(4)
+    counts = rng.poisson(300, (6, 400)).astype(np.int32)
+    shots = np.full(6, 600)
+    frozen = counts.copy()
+    frozen.setflags(write=False)
+    unaligned = np.zeros(counts.nbytes + 1, np.uint8)[1:].view(np.int32).reshape(counts.shape)
+    unaligned[:] = counts
+    spread = np.zeros((12, 800), np.int32)
+    spread[::2, ::2] = counts
+    forms = [
+        frozen,
+        unaligned,
+        spread[::2, ::2],
+        np.asfortranarray(counts),
+        counts.astype(">i4"),
+        counts.astype(np.uint16),
+        counts.astype(np.int64),
+        np.ma.masked_array(counts),
+    ]
+    for convert in (_analog, _photon):
+        plain = convert(counts, shots)
+        for form in forms:
+            _assert_same_bits(convert(form, shots.astype(">i2"), RANGE.astype(">f8")), plain)
+    power = _analog(counts, shots).power
+    for values in (power.astype(">f8"), np.asfortranarray(power), power[::-1][::-1]):
+        np.testing.assert_array_equal(
+            counts_to_signal.smooth(values, RANGE), counts_to_signal.smooth(power, RANGE)
+        )
+    # Else users would wait for the compiler again and again.
+    assert len(kernels.voltage_profiles.signatures) == 1
+    assert len(kernels.photon_profiles.signatures) == 1
+    assert len(kernels.noise_profiles.signatures) == 1
+    assert len(kernels.smooth_profiles.signatures) == 1
+
+
+def test_leading_axes_are_kept() -> None:
+    counts = np.random.default_rng(9).poisson(300, (2, 3, 400)).astype(np.int32)
+    for convert in (_analog, _photon):
+        result = convert(counts, np.full((2, 3), 600))
+        assert result.power.shape == result.variance.shape == result.quality.shape == (2, 3, 400)
+        alone = convert(counts[1, 2], np.array(600))
+        np.testing.assert_array_equal(alone.variance, result.variance[1, 2])
+        assert convert(counts[:0], np.zeros((0, 3))).power.shape == (0, 3, 400)
+
+
+def test_each_profile_may_have_a_dark_signal_of_its_own() -> None:
+    rng = np.random.default_rng(10)
+    counts = rng.poisson(3000, (2, 3, 400)).astype(np.int32)
+    dark, spread = rng.random((2, 3, 400)) * 1e-3, rng.random((2, 3, 400))
+    for known in ({}, {"noise_variance": 1e-3}):
+        shots = np.full((2, 3), 600)
+        whole = _analog(counts, shots, dark=dark, dark_variance=spread, **known)
+        one = _analog(
+            counts[1, 2], np.array(600), dark=dark[1, 2], dark_variance=spread[1, 2], **known
+        )
+        _assert_same_bits(
+            one,
+            counts_to_signal.Signal(whole.power[1, 2], whole.variance[1, 2], whole.quality[1, 2]),
+        )
+    np.testing.assert_array_equal(whole.variance, np.maximum(1e-3 + spread, whole.variance.min()))
+
+
+def test_nothing_is_missing_without_a_flag() -> None:
+    counts = np.full((2, 400), 1000, np.int32)
+    dark = np.zeros(400)
+    dark[5] = np.nan
+    volts = np.array([0.5, np.nan])
+    result = counts_to_signal.analog(
+        counts, np.full(2, 600), RANGE, adc_bits=12, input_range=volts, dark=dark
+    )
+    np.testing.assert_array_equal(np.isnan(result.power), result.quality != 0)
+    assert (np.flatnonzero(result.quality[0]) == [5]).all()
+    assert (result.quality[1] & Quality.INPUT_MISSING).all()
+    masked = np.ma.masked_array(counts, np.arange(400) == np.zeros((2, 1)))
+    assert (_photon(masked, np.full(2, 600)).quality[:, 0] == Quality.INPUT_MISSING).all()
+
+
+def test_range_correction_carries_both_variances() -> None:
+    counts = np.full((1, 400), 900, np.int32)
+    raw = counts_to_signal.photon(counts, SHOTS, RANGE, bin_width=7.5)
+    result = counts_to_signal.range_corrected(
+        raw, RANGE, background=np.array([40.0]), background_variance=np.array([0.25])
+    )
+    # 30 MHz less 40 MHz: negative, and not clipped.
+    assert result.power[0] == pytest.approx(-10.0 * RANGE**2)
+    assert result.variance[0] == pytest.approx((raw.variance[0] + 0.25) * RANGE**4)
+
+
+def test_range_correction_in_float32_is_that_of_float64_rounded() -> None:
+    counts = np.random.default_rng(1).poisson(900, (3, 400)).astype(np.int32)
+    raw = _photon(counts, np.full(3, 600))
+    levels = {"background": np.array([1.0, 2.0, np.nan]), "background_variance": 0.1}
+    double = counts_to_signal.range_corrected(raw, RANGE, **levels)
+    single = counts_to_signal.range_corrected(raw, RANGE, **levels, dtype=np.float32)
+    assert single.power.dtype == single.variance.dtype == np.float32
+    np.testing.assert_array_equal(single.power, double.power.astype(np.float32))
+    np.testing.assert_array_equal(single.variance, double.variance.astype(np.float32))
+    assert np.isnan(double.power[2]).all()
+    # From float32 too, as products hold it.
+    from_single = counts_to_signal.Signal(
+        raw.power.astype(np.float32), raw.variance.astype(np.float32), raw.quality
+    )
+    again = counts_to_signal.range_corrected(from_single, RANGE, **levels)
+    np.testing.assert_allclose(again.power[:2], double.power[:2], rtol=1e-5)
+    with pytest.raises(RetrievalInputError, match="float32 or float64"):
+        counts_to_signal.range_corrected(raw, RANGE, **levels, dtype=np.float16)
+
+
+_COUNTS = np.ones((1, 400), np.int32)
+
+
+@pytest.mark.parametrize(
+    ("field", "call"),
+    [
+        ("counts", lambda: _photon(_COUNTS.astype(float), SHOTS)),
+        ("counts", lambda: _photon(_COUNTS.astype(np.int64) << 40, SHOTS)),
+        ("counts", lambda: _photon(_COUNTS, np.array([600, 600]))),
+        ("range", lambda: _photon(_COUNTS, SHOTS, np.where(RANGE > 99, RANGE, np.nan))),
+        ("range", lambda: _photon(_COUNTS, SHOTS, np.full(400, 7.5))),
+        ("range", lambda: _photon(_COUNTS, SHOTS, RANGE[np.newaxis])),
+        ("dark", lambda: _analog(_COUNTS, SHOTS, dark=np.zeros(399))),
+        ("dark_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=1.0, dark_variance=[1.0])),
+        ("power", lambda: counts_to_signal.difference_variance(np.zeros(399), RANGE)),
+        ("values", lambda: counts_to_signal.smooth(np.zeros(399), RANGE)),
+        ("window", lambda: counts_to_signal.smooth(np.zeros(400), RANGE, window=np.nan)),
+        ("window", lambda: counts_to_signal.smooth(np.zeros(400), RANGE, window=-1.0)),
+        ("counts", lambda: _analog(_COUNTS > 0, SHOTS)),
+        ("counts", lambda: _photon(_COUNTS > 0, SHOTS)),
+        ("bin_width", lambda: counts_to_signal.photon(_COUNTS, SHOTS, RANGE, bin_width=0.0)),
+        ("dead_time", lambda: _photon(_COUNTS, SHOTS, dead_time=-4e-9)),
+        ("noise_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=np.nan)),
+        ("full_overlap_range", lambda: _photon(_COUNTS, SHOTS, full_overlap_range=np.nan)),
+        (
+            "background",
+            lambda: counts_to_signal.range_corrected(
+                _photon(_COUNTS, SHOTS), RANGE, background=[1.0, 2.0], background_variance=0.0
+            ),
+        ),
+        (
+            "input_range",
+            lambda: counts_to_signal.analog(
+                _COUNTS, SHOTS, RANGE, adc_bits=12, input_range=np.ones(2)
+            ),
+        ),
+    ],
+)
+def test_what_cannot_be_right_is_refused(field, call) -> None:
+    with pytest.raises(RetrievalInputError) as refused:
+        call()
+    assert refused.value.field == field
+
+
+def test_shapes_that_do_not_fit_are_named() -> None:
+    with pytest.raises(RetrievalInputError, match="counts"):
+        counts_to_signal.photon(np.zeros((1, 399), np.int32), SHOTS, RANGE, bin_width=7.5)
+
+
+@pytest.mark.parametrize("offset", [-40.0, 0.0, 3.0, 40.0])
+def test_an_offset_of_the_electronics_makes_no_noise(offset):
+    """Shot noise follows the light and not the voltage, whatever the zero is."""
+    rng = np.random.default_rng(5)
+    distance = 7.5 * np.arange(20, 4020)
+    light = 60.0 * (1500.0 / distance) ** 2 + 0.02
+    variance = 1e-4 + 2e-3 * light
+    power = light + offset + rng.normal(0.0, np.sqrt(variance), (20, distance.size))
+    found = counts_to_signal.difference_variance(power, distance)
+    for low, high in ((1000, 2000), (3000, 5000), (8000, 12_000), (20_000, 28_000)):
+        part = (distance > low) & (distance < high)
+        ratio = np.mean(found[:, part] / variance[part])
+        assert 0.93 < ratio < 1.07

@@ -1,0 +1,320 @@
+"""Gluing: the line against an independent solver, bias and errors against simulations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from lidarops.errors import RetrievalInputError
+from lidarops.raw import licel
+from lidarops.retrieve.signal import gluing, lag
+from lidarops.retrieve.signal.counts_to_signal import difference_variance, smooth
+from lidarops.retrieve.signal.gluing import glue
+
+RANGE = (np.arange(800) + 0.5) * 15.0
+SLOPE = 12.0
+EXPOSURE = 60.0
+"""Microseconds a bin was open."""
+ANALOG_NOISE = 0.02
+"""mV."""
+
+
+def truth(brightness=2e8):
+    """Return a count rate in MHz that falls through both limits."""
+    return brightness * np.exp(-RANGE / 5000.0) / (RANGE + 300.0) ** 2
+
+
+def measured(rng, count, *, rate=None, offset=0.0, noise=ANALOG_NOISE):
+    """Return analog, photon counting and their variances, as they are, not as they came out."""
+    rate = truth() if rate is None else rate
+    analog = rate / SLOPE - offset + rng.normal(0.0, noise, (count, rate.size))
+    photon = rng.poisson(rate * EXPOSURE, (count, rate.size)) / EXPOSURE
+    return (
+        analog,
+        photon,
+        {
+            "analog_variance": np.full(rate.shape, noise**2),
+            "photon_variance": rate / EXPOSURE,
+        },
+    )
+
+
+def window(result, k):
+    return (result.start[k] <= RANGE) & (result.stop[k] >= RANGE)
+
+
+def test_the_line_minimises_its_misfit():
+    """Four fixed passes end where a general minimiser does."""
+    rng = np.random.default_rng(1)
+    for noise in (0.01, 0.1, 0.3):
+        analog, photon, variances = measured(rng, 3, noise=noise, offset=0.05)
+        found = glue(analog, photon, RANGE, **variances, least_snr=1.0)
+        for k in range(3):
+            inside = window(found, k)
+            x, y = analog[k, inside], photon[k, inside]
+            v = variances["photon_variance"][inside]
+
+            def misfit(line, x=x, y=y, v=v, noise=noise):
+                return (y - line[0] * x - line[1]) / np.sqrt(v + (line[0] * noise) ** 2)
+
+            best = optimize.least_squares(misfit, [SLOPE, 0.0], xtol=1e-14, ftol=1e-14)
+            assert abs(found.slope[k] - best.x[0]) < 0.02 * found.slope_standard_error[k]
+            assert abs(found.intercept[k] - best.x[1]) < 0.02 * found.intercept_standard_error[k]
+            assert found.chi2[k] == pytest.approx(2.0 * best.cost, rel=1e-6)
+            assert found.degrees_of_freedom[k] == inside.sum() - 2
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.05])
+@pytest.mark.parametrize("hand_over", ["blend", "switch"])
+def test_slope_and_glued_signal_are_unbiased(noise, hand_over):
+    rng = np.random.default_rng(2)
+    count = 1500
+    analog, photon, variances = measured(rng, count, noise=noise, offset=0.05)
+    found = glue(analog, photon, RANGE, **variances, hand_over=hand_over)
+    assert not found.no_window.any()
+    assert found.poor_fit.mean() < 0.01
+    off = (found.slope - SLOPE) / found.slope_standard_error
+    assert abs(off.mean()) < 4.0 / np.sqrt(count)
+    assert off.std() == pytest.approx(1.0, abs=0.07)
+    shift = (found.intercept - SLOPE * 0.05) / found.intercept_standard_error
+    assert abs(shift.mean()) < 4.0 / np.sqrt(count)
+    assert shift.std() == pytest.approx(1.0, abs=0.07)
+    error = (found.power - truth()) / np.sqrt(found.variance + found.systematic_variance)
+    # The line and the noise of the window it came from are not independent of each other.
+    near, far = found.start.min() - 30.0 > RANGE, found.stop.max() + 30.0 < RANGE
+    for bins in (near, far):
+        assert abs(error[:, bins].mean()) < 0.05
+        assert error[:, bins].std() == pytest.approx(1.0, abs=0.05)
+    middle = ~near & ~far
+    assert abs(error[:, middle].mean()) < 0.05
+    assert 0.8 < error[:, middle].std() < 1.1
+
+
+def test_ordinary_regression_would_be_biased():
+    """What the errors in both variables are for."""
+    rng = np.random.default_rng(3)
+    analog, photon, variances = measured(rng, 400, noise=0.15)
+    found = glue(analog, photon, RANGE, **variances, least_snr=2.0)
+    inside = window(found, 0)
+    slopes = [np.polyfit(x[inside], y[inside], 1)[0] for x, y in zip(analog, photon, strict=True)]
+    standard = found.slope.std() / np.sqrt(400)
+    assert np.mean(slopes) < SLOPE - 15.0 * standard
+    assert abs(found.slope.mean() - SLOPE) < 0.2 * found.slope.std()
+
+
+def test_a_window_sought_in_single_bins_would_bias():
+    """What the smoothing before the search is for: its ends do not follow the noise."""
+    rng = np.random.default_rng(4)
+    analog, photon, variances = measured(rng, 2000)
+    found = glue(analog, photon, RANGE, **variances)
+    ends = np.searchsorted(RANGE, found.stop)
+    rows = np.arange(2000)
+    sigma = np.sqrt(variances["photon_variance"])
+    last = (photon[rows, ends] - truth()[ends]) / sigma[ends]
+    assert abs(last.mean()) < 0.5
+    naive = np.array([np.flatnonzero((p < 0.5) & (RANGE > 500.0))[0] - 1 for p in photon])
+    beyond = (photon[rows, naive + 1] - truth()[naive + 1]) / sigma[naive + 1]
+    assert beyond.mean() < -1.0
+
+
+def test_a_block_shares_one_line_that_knows_more():
+    rng = np.random.default_rng(5)
+    analog, photon, variances = measured(rng, 12)
+    block = np.array([7, 7, 3, 3, 3, 7, 3, 7, 3, 3, 7, 7])
+    alone = glue(analog, photon, RANGE, **variances)
+    pooled = glue(analog, photon, RANGE, **variances, block=block)
+    for label in (3, 7):
+        same = block == label
+        assert np.unique(pooled.slope[same]).size == 1
+        assert np.unique(pooled.start[same]).size == 1
+        separate = glue(analog[same], photon[same], RANGE, **variances, block=np.zeros(6, int))
+        np.testing.assert_array_equal(separate.power, pooled.power[same])
+    np.testing.assert_allclose(
+        pooled.slope_standard_error, alone.slope_standard_error / np.sqrt(6), rtol=0.1
+    )
+    assert (np.abs(pooled.slope - SLOPE) < 4.0 * pooled.slope_standard_error).all()
+
+
+def test_common_shot_noise_is_accounted_for():
+    rng = np.random.default_rng(6)
+    count, rho = 1500, 0.6
+    rate = truth()
+    sx, sy = ANALOG_NOISE, np.sqrt(rate / EXPOSURE)
+    first, second = rng.normal(size=(2, count, RANGE.size))
+    analog = rate / SLOPE + sx * first
+    photon = rate + sy * (rho * first + np.sqrt(1 - rho**2) * second)
+    variances = {"analog_variance": sx**2, "photon_variance": sy**2}
+    told = glue(analog, photon, RANGE, **variances, correlation=rho)
+    off = (told.slope - SLOPE) / told.slope_standard_error
+    assert abs(off.mean()) < 4.0 / np.sqrt(count)
+    assert off.std() == pytest.approx(1.0, abs=0.07)
+    assert np.mean(told.chi2 / told.degrees_of_freedom) == pytest.approx(1.0, abs=0.02)
+    not_told = glue(analog, photon, RANGE, **variances)
+    assert np.mean(not_told.chi2 / not_told.degrees_of_freedom) < 0.8
+    middle = window(told, 0)
+    error = (told.power - rate)[:, middle] / np.sqrt(told.variance[:, middle])
+    assert error.std() == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_window_lies_where_both_are_linear():
+    rate = truth()
+    analog = rate / SLOPE
+    found = glue(analog, rate, RANGE, analog_variance=1e-8, photon_variance=rate / 1e6)
+    inside = (found.start <= RANGE) & (found.stop >= RANGE)
+    assert rate[inside].max() <= 20.5
+    assert rate[inside].min() >= 0.45
+    assert rate[found.start > RANGE].min() >= 19.0
+    noisy = glue(analog, rate, RANGE, analog_variance=0.01, photon_variance=rate / 1e6)
+    inside = (noisy.start <= RANGE) & (noisy.stop >= RANGE)
+    assert (analog[inside] / 0.1).min() == pytest.approx(10.0, rel=0.05)
+    bright = glue(
+        analog, rate, RANGE, analog_variance=1e-8, photon_variance=rate / 1e6,
+        photon_background=15.0,
+    )  # fmt: skip
+    inside = (bright.start <= RANGE) & (bright.stop >= RANGE)
+    assert rate[inside].max() <= 5.2
+
+
+def test_too_short_a_fall_is_no_window():
+    """Where 8 bins pass but hold no line, their slope would be that of their noise."""
+    rng = np.random.default_rng(10)
+    analog, photon, variances = measured(rng, 300, noise=0.15)
+    found = glue(analog, photon, RANGE, **variances)
+    assert found.no_window.all()
+    assert np.isnan(found.power).all()
+
+
+def test_what_has_no_window_is_not_glued():
+    rate = truth()
+    rows = np.stack([rate, rate, 1e4 + rate, rate * 1e-6])
+    analog = rows / SLOPE
+    analog[1] = np.nan
+    found = glue(analog, rows, RANGE, analog_variance=1e-8, photon_variance=1e-4)
+    np.testing.assert_array_equal(found.no_window, [False, True, True, True])
+    assert np.isnan(found.power[1:]).all()
+    assert np.isnan(found.variance[1:]).all()
+    assert np.isnan(found.start[1:]).all()
+    assert np.isfinite(found.power[0]).all()
+    hot = glue(analog[0], rows[0], RANGE, analog_variance=1e-8, photon_variance=1e-4,
+               photon_background=111.0)  # fmt: skip
+    assert hot.no_window
+
+
+def test_channels_that_see_different_light_are_told():
+    rng = np.random.default_rng(7)
+    analog, photon, variances = measured(rng, 4)
+    fine = glue(analog, photon, RANGE, **variances)
+    assert not fine.poor_fit.any()
+    dead = glue(analog, photon / (1.0 + 0.02 * photon), RANGE, **variances)
+    assert dead.poor_fit.all()
+    upside_down = glue(1.0 - analog, photon, RANGE, **variances, least_snr=0.0)
+    assert upside_down.poor_fit.all()
+    assert np.isnan(upside_down.power).all()
+
+
+def test_gaps_are_filled_by_the_other_channel_only_where_both_are_linear():
+    rng = np.random.default_rng(8)
+    analog, photon, variances = measured(rng, 1)
+    clean = glue(analog, photon, RANGE, **variances)
+    first, last = np.searchsorted(RANGE, [clean.start[0], clean.stop[0]])
+    middle = (first + last) // 2
+    analog[0, [5, middle, 790]] = np.nan
+    photon[0, [6, middle + 1, 791]] = np.nan
+    found = glue(analog, photon, RANGE, **variances)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.power[0])), [5, 791])
+    assert found.power[0, middle] == photon[0, middle]
+    assert found.systematic_variance[0, middle] == 0.0
+    assert found.systematic_variance[0, 10] > 0.0
+    assert found.power[0, 790] == photon[0, 790]
+
+
+def test_no_bit_depends_on_batch_or_layout():
+    rng = np.random.default_rng(9)
+    analog, photon, variances = measured(rng, 12)
+    whole = glue(analog.reshape(3, 4, -1), photon.reshape(3, 4, -1), RANGE, **variances)
+    for k in (0, 5, 11):
+        alone = glue(analog[k], photon[k], RANGE, **variances)
+        np.testing.assert_array_equal(alone.power, whole.power.reshape(12, -1)[k])
+    turned = glue(
+        np.asfortranarray(analog[:, ::-1].astype(">f8")),
+        photon[:, ::-1],
+        RANGE[::-1],
+        analog_variance=variances["analog_variance"][::-1],
+        photon_variance=variances["photon_variance"][::-1],
+    )
+    np.testing.assert_array_equal(turned.power[:, ::-1], whole.power.reshape(12, -1))
+    empty = glue(np.empty((0, 800)), np.empty((0, 800)), RANGE, **variances)
+    assert empty.power.shape == (0, 800)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"analog": np.ones(3)}, "analog"),
+        ({"photon_counting": np.ones((2, 800))}, "photon_counting"),
+        ({"range": RANGE / 1000.0}, "range"),
+        ({"analog_variance": -1.0}, "analog_variance"),
+        ({"photon_variance": np.ones(3)}, "photon_variance"),
+        ({"count_rate_window": (20.0, 0.5)}, "count_rate_window"),
+        ({"count_rate_window": (0.0, 0.5)}, "count_rate_window"),
+        ({"least_snr": np.nan}, "least_snr"),
+        ({"photon_background": [1.0, 2.0]}, "photon_background"),
+        ({"block": 1.5}, "block"),
+        ({"block": [1, 2]}, "block"),
+        ({"correlation": 1.0}, "correlation"),
+        ({"hand_over": "step"}, "hand_over"),
+    ],
+)
+def test_impossible_arguments_are_refused(change, field):
+    arguments = {
+        "analog": np.ones(800),
+        "photon_counting": np.ones(800),
+        "range": RANGE,
+        "analog_variance": 1.0,
+        "photon_variance": 1.0,
+    } | change
+    with pytest.raises(RetrievalInputError) as error:
+        glue(**arguments)
+    assert error.value.field == field
+
+
+def test_limits_are_those_of_the_field():
+    assert gluing.COUNT_RATES == (0.5, 20.0)
+    assert gluing.LEAST_SNR == 10.0
+
+
+@pytest.mark.parametrize("wavelength", ["355", "532"])
+def test_a_real_station_is_glued_once_its_lag_is_gone(data_root, wavelength):
+    """Sao Paulo: with the lag of its recorders the slope wanders and the line does not fit."""
+    folder = data_root / "saopaulo" / "20170928"
+    names = [f"analog_{wavelength}o", f"photon_{wavelength}o"]
+    files, darks = (sorted((folder / kind).iterdir()) for kind in ("signals", "dark"))
+    analog, photon = licel.read_physical(files, names, dtype=np.float64)[1].values()
+    dark = licel.read_physical(darks, names[:1], dtype=np.float64)[1][names[0]]
+    range_ = (np.arange(4000) + 0.5) * 7.5
+    clean = analog - dark.mean(axis=0)
+    sky = photon[:, 3500:3950].mean(axis=1)
+    found = lag.estimate(analog, photon)
+    results = []
+    for bins in (0.0, found.lag):
+        moved, _ = lag.shift(clean, bins)
+        results.append(
+            glue(
+                moved - moved[:, 3500:3950].mean(axis=1, keepdims=True),
+                photon - sky[:, np.newaxis],
+                range_,
+                analog_variance=difference_variance(clean, range_),
+                photon_variance=smooth(photon, range_) / (600 * 0.05),
+                photon_background=sky,
+            )
+        )
+    before, after = results
+    assert not after.no_window.any()
+    assert not after.poor_fit.any()
+    assert before.poor_fit.sum() > 8
+    assert (after.chi2 / after.degrees_of_freedom).mean() < 0.5
+    assert after.slope.std() / after.slope.mean() < 0.02
+    assert after.slope.std() < 0.6 * before.slope.std()
+    far = range_ > after.stop.max()
+    np.testing.assert_array_equal(after.power[:, far], (photon - sky[:, np.newaxis])[:, far])

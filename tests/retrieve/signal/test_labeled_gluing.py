@@ -1,0 +1,246 @@
+"""Gluing of labelled channels: a truth that both record is given back within its errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidarops.flags import Quality
+from lidarops.retrieve.signal import labeled_gluing
+
+DIMS = ("time", "range")
+BIN = 7.5
+distance = BIN * (np.arange(2000) + 0.5)
+RATIO = 20.0
+"""MHz a mV."""
+SHOTS = 600
+DEAD_TIME = 4e-3
+"""Microseconds."""
+FULL_SCALE = 100.0
+
+
+def truth(constant=4e8, sky=0.2):
+    """Count rate in MHz of aerosol-free air over a sky."""
+    return constant * np.exp(-distance / 8000.0) / (distance + 60.0) ** 2 + sky
+
+
+def channel(power, variance, bits, unit, offset=0.0):
+    variance = np.broadcast_to(variance, power.shape).copy()
+    return xr.Dataset(
+        {
+            "power": (DIMS, np.where(bits != 0, np.nan, power), {"units": unit}),
+            "variance": (DIMS, variance, {"units": f"{unit}2"}),
+            "quality": (DIMS, np.broadcast_to(bits, power.shape).astype(np.int32)),
+        },
+        coords={"range": ("range", distance + offset, {"units": "m"})},
+    )
+
+
+def recorded(rate, *, profiles=6, lag=0.0, noise=0.02, dark=2.0, seed=0, common=False):
+    """Record a count rate with both recorders; `common`: of the same photoelectrons."""
+    rng = np.random.default_rng(seed)
+    exposure = SHOTS * BIN / 150.0
+    measured = rate / (1.0 + rate * DEAD_TIME)
+    counts = rng.poisson(np.broadcast_to(measured * exposure, (profiles, distance.size)))
+    seen = np.minimum(counts / exposure, 0.9 / DEAD_TIME)
+    corrected = seen / (1.0 - seen * DEAD_TIME)
+    light = corrected if common else np.broadcast_to(rate, corrected.shape)
+    index = np.arange(distance.size)
+    shifted = np.stack([np.interp(index - lag, index, row) for row in light])
+    voltage = shifted / RATIO + dark + noise * rng.standard_normal(shifted.shape)
+    paralysed = measured * DEAD_TIME > 0.5
+    return (
+        channel(
+            voltage,
+            noise**2,
+            np.where(voltage > FULL_SCALE, int(Quality.SATURATED), 0),
+            "mV",
+        ),
+        channel(
+            corrected,
+            rate * (1.0 + rate * DEAD_TIME) / exposure,
+            np.where(paralysed, int(Quality.SATURATED), 0),
+            "MHz",
+        ),
+    )
+
+
+@pytest.mark.parametrize("lag", [0.0, 7.0, -4.0, 3.4])
+def test_the_truth_comes_back_within_its_errors(lag):
+    rate = truth()
+    found = labeled_gluing.glue(*recorded(rate, profiles=60, lag=lag), lag=lag)
+    score = ((found["power"] - rate) / np.sqrt(found["variance"])).to_numpy()
+    bottom, top = (float(found[f"glue_{end}"].mean()) for end in ("bottom", "top"))
+    near = (distance > 500.0) & (distance < bottom - 300.0)
+    far = (distance > top + 300.0) & (distance < 0.9 * distance[-1])
+    assert np.isfinite(score[:, near | far]).all()
+    # All near bins of a profile share the error of its line: 60 values, not 60 x 400.
+    assert np.sqrt(np.mean(score[:, near] ** 2)) < 1.3
+    assert abs(score[:, near].mean(axis=1).mean()) < 3.0 / np.sqrt(60.0) + 0.1
+    assert 0.95 < np.sqrt(np.mean(score[:, far] ** 2)) < 1.05
+    assert not found["quality"].to_numpy()[:, near | far].any()
+    slope = (found["glue_slope"] - RATIO) / found["glue_slope_standard_error"]
+    assert 0.7 < float(np.sqrt((slope**2).mean())) < 1.4
+    units = {name: found[name].attrs.get("units") for name in found if name != "quality"}
+    assert units == {
+        "power": "MHz",
+        "variance": "MHz2",
+        "glue_slope": "MHz mV-1",
+        "glue_slope_standard_error": "MHz mV-1",
+        "glue_bottom": "m",
+        "glue_top": "m",
+    }
+
+
+def test_the_background_of_photon_counting_is_left():
+    rate = truth(sky=3.0)
+    found = labeled_gluing.glue(*recorded(rate, profiles=30))
+    tail = found["power"].to_numpy()[:, -200:].mean()
+    assert tail == pytest.approx(rate[-200:].mean(), abs=0.01)
+
+
+def test_near_bins_are_analog_and_far_ones_photon_counting():
+    analog, photon = recorded(truth())
+    found = labeled_gluing.glue(analog, photon)
+    far = distance > float(found["glue_top"].max())
+    np.testing.assert_allclose(
+        found["power"].to_numpy()[:, far], photon["power"].to_numpy()[:, far], rtol=1e-12
+    )
+    spoiled = photon.copy(deep=True)
+    near = float(found["glue_bottom"].min())
+    # What photon counting says below the window plays no part.
+    spoiled["power"][:, distance < 0.5 * near] = 1e3
+    again = labeled_gluing.glue(analog, spoiled)
+    np.testing.assert_array_equal(
+        again["power"].to_numpy()[:, distance < 0.4 * near],
+        found["power"].to_numpy()[:, distance < 0.4 * near],
+    )
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        # Too weak for analog, too bright for counting, sky at the limit of counting.
+        lambda: recorded(truth(constant=2e4)),
+        lambda: recorded(truth(sky=60.0)),
+        lambda: recorded(truth(), noise=30.0),
+    ],
+)
+def test_no_gluing_where_no_range_is_linear_in_both(make):
+    found = labeled_gluing.glue(*make())
+    quality = found["quality"].to_numpy()
+    assert (quality & int(Quality.NO_GLUING) != 0).all()
+    assert np.isnan(found["power"]).all()
+
+
+def test_channels_that_see_different_light_are_not_joined():
+    analog, photon = recorded(truth())
+    # A bend within the window, as by a dead time that is not undone.
+    photon["power"] = photon["power"] / (1.0 + 0.03 * photon["power"])
+    found = labeled_gluing.glue(analog, photon)
+    assert (found["quality"] & int(Quality.NO_GLUING) != 0).all()
+    assert np.isnan(found["power"]).all()
+
+
+def test_every_missing_value_carries_a_bit_of_the_part_it_is_made_of():
+    analog, photon = recorded(truth(constant=2e9), profiles=4)
+    analog["power"][0] = np.nan
+    analog["quality"][0] = int(Quality.INPUT_MISSING)
+    photon["power"][1] = np.nan
+    photon["quality"][1] = int(Quality.INPUT_MISSING)
+    photon["quality"][2, -30:] |= int(Quality.PILE_UP)
+    analog["quality"][2, -30:] |= int(Quality.INCOMPLETE_OVERLAP)
+    analog["quality"][2, :30] |= int(Quality.INCOMPLETE_OVERLAP)
+    analog["power"][3, 40] = np.nan
+    analog["quality"][3, 40] = int(Quality.INPUT_MISSING)
+    found = labeled_gluing.glue(analog, photon)
+    power, quality = found["power"].to_numpy(), found["quality"].to_numpy()
+    assert (quality[np.isnan(power)] != 0).all()
+    assert (quality[:2] & int(Quality.NO_GLUING) != 0).all()
+    assert np.isnan(power[:2]).all()
+    assert (quality[2, -30:] == int(Quality.PILE_UP)).all()
+    assert (quality[2, :30] & int(Quality.INCOMPLETE_OVERLAP) != 0).all()
+    assert quality[3, 40] == int(Quality.INPUT_MISSING)
+    # Analog is saturated nearest to the lidar, photon counting farther on; there analog serves.
+    saturated = (quality[2] & int(Quality.SATURATED)) != 0
+    counted_out = (photon["quality"].to_numpy()[2] & int(Quality.SATURATED)) != 0
+    assert saturated.any()
+    assert saturated.sum() < counted_out.sum()
+    np.testing.assert_array_equal(
+        saturated, (analog["quality"].to_numpy()[2] & int(Quality.SATURATED)) != 0
+    )
+
+
+def test_bits_move_with_the_lag_and_ends_without_source_are_missing():
+    analog, photon = recorded(truth(), lag=5.0)
+    analog["power"][:, 105] = np.nan
+    analog["quality"][:, 105] = int(Quality.INPUT_MISSING)
+    found = labeled_gluing.glue(analog, photon, lag=5.0)
+    hit = (found["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
+    assert np.flatnonzero(hit).tolist() == [100]
+    between = labeled_gluing.glue(analog, photon, lag=4.5)
+    hit = (between["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
+    assert np.flatnonzero(hit).tolist() == [100, 101]
+    ahead = labeled_gluing.glue(analog, photon, lag=-3.0)
+    hit = (ahead["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
+    assert np.flatnonzero(hit).tolist() == [0, 1, 2, 108]
+
+
+def test_bins_behind_the_lidar_are_missing():
+    analog, photon = recorded(truth())
+    moved = [part.assign_coords(range=part["range"] - 45.0) for part in (analog, photon)]
+    found = labeled_gluing.glue(*moved)
+    behind = moved[1]["range"].to_numpy() <= 0
+    assert behind.sum() == 6
+    assert np.isnan(found["power"].to_numpy()[:, behind]).all()
+    assert (found["quality"].to_numpy()[:, behind] & int(Quality.INPUT_MISSING) != 0).all()
+    seen = found["power"].to_numpy()[:, ~behind]
+    assert np.isfinite(seen[:, 60:]).all()
+    np.testing.assert_array_equal(np.isnan(seen), found["quality"].to_numpy()[:, ~behind] != 0)
+
+
+def test_parts_of_unequal_length_are_joined_over_the_shorter():
+    analog, photon = recorded(truth())
+    found = labeled_gluing.glue(analog, photon.isel(range=slice(1500)))
+    assert found.sizes["range"] == 1500
+    np.testing.assert_array_equal(found["range"], distance[:1500])
+
+
+@pytest.mark.parametrize("chunks", [{"time": 1, "range": 300}, {"time": 4, "range": -1}])
+def test_any_chunks_give_the_same_bits(chunks):
+    analog, photon = recorded(truth())
+    whole = labeled_gluing.glue(analog, photon, lag=1.5)
+    lazy = labeled_gluing.glue(analog.chunk(chunks), photon.chunk({"time": 3}), lag=1.5)
+    assert all(array.chunks for array in lazy.data_vars.values())
+    xr.testing.assert_identical(lazy.compute(), whole)
+
+
+class TestLag:
+    @pytest.mark.parametrize("lag", [0.0, 7.0, -4.0, 2.5])
+    def test_estimate_finds_it_in_noise_that_both_share(self, lag):
+        rate = truth()
+        analog, photon = recorded(rate, profiles=40, lag=lag, noise=1e-3, common=True)
+        assert labeled_gluing.estimate_lag(analog, photon) == pytest.approx(lag, abs=0.15)
+
+    def test_estimate_falls_back_on_what_the_ranges_say(self):
+        analog, photon = recorded(truth(), lag=7.0)
+        assert labeled_gluing.estimate_lag(analog, photon) == 0.0
+        farther = analog.assign_coords(range=analog["range"] - 3 * BIN)
+        assert labeled_gluing.estimate_lag(farther, photon) == pytest.approx(3.0)
+
+    def test_told_lag_is_the_difference_of_equal_ranges(self):
+        analog, photon = recorded(truth())
+        farther = analog.assign_coords(range=analog["range"] - 5.5 * BIN)
+        assert labeled_gluing.told_lag(farther, photon) == pytest.approx(5.5)
+        lag = labeled_gluing.told_lag(farther, photon)
+        # The analog bin that the lag leads to has the range of the photon counting one.
+        index = 100 + lag
+        told = np.interp(index, np.arange(distance.size), farther["range"])
+        assert told == pytest.approx(distance[100])
+
+    def test_a_wrong_lag_of_a_falling_signal_shows(self):
+        analog, photon = recorded(truth(), lag=7.0, profiles=20)
+        right = labeled_gluing.glue(analog, photon, lag=7.0)["glue_slope"]
+        wrong = labeled_gluing.glue(analog, photon)["glue_slope"]
+        assert abs(float(wrong.mean() - right.mean())) > 0.01 * RATIO

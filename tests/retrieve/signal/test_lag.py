@@ -1,0 +1,240 @@
+"""Lags: shared photoelectrons, noise without a common cause, a real station; and the shift."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidarops.errors import RetrievalInputError
+from lidarops.raw import licel
+from lidarops.retrieve.signal import lag
+from lidarops.simulate.photoelectrons import release, seen_from
+
+BINS = 1500
+
+
+def recorded(rng, true_lag, *, profiles=12, gain_noise=0.5, electronics=2.0):
+    """Return analog and photon counting that share photoelectrons, analog late by `true_lag`."""
+    distance = 7.5 * (np.arange(BINS + 40) + 60.0)
+    rate = 4.0 + 3e7 * np.exp(-distance / 4000.0) / distance**2
+    analog, photon = np.empty((2, profiles, BINS))
+    for k in range(profiles):
+        electrons = release(rate * rng.uniform(0.95, 1.05), shots=400, bin_width=7.5, random=rng)
+        early, late = (max(-true_lag, 0.0), max(true_lag, 0.0))
+        seen = seen_from(electrons, early, BINS, random=rng).number
+        photon[k] = seen_from(electrons, late, BINS, random=rng).number
+        spread = np.sqrt(gain_noise**2 * seen + electronics**2)
+        analog[k] = 0.01 * (seen + spread * rng.normal(size=BINS)) + 3.0
+    return analog, photon
+
+
+@pytest.mark.parametrize("true_lag", [0.0, 3.0, 8.6, -5.25, 9.5, 29.0])
+def test_a_known_lag_comes_back(true_lag):
+    rng = np.random.default_rng(1)
+    found = lag.estimate(*recorded(rng, true_lag))
+    assert found.found
+    assert found.confidence > 0.9999
+    assert abs(found.lag - true_lag) < 3.0 * found.standard_error
+    assert found.standard_error < 0.1
+    assert found.lags[np.argmax(found.correlation)] in (np.floor(true_lag), np.ceil(true_lag))
+
+
+def test_the_standard_error_covers_the_scatter():
+    rng = np.random.default_rng(2)
+    off, errors = [], []
+    for _ in range(60):
+        found = lag.estimate(*recorded(rng, 8.3, profiles=3, electronics=10.0))
+        off.append(found.lag - 8.3)
+        errors.append(found.standard_error)
+    off, errors = np.array(off), np.array(errors)
+    assert abs(off.mean()) < 4.0 * off.std() / np.sqrt(60) + 0.01
+    assert np.sqrt(np.mean((off / errors) ** 2)) < 1.1
+    assert errors.mean() < 4.0 * off.std()
+
+
+def test_one_profile_will_do():
+    rng = np.random.default_rng(3)
+    found = lag.estimate(*recorded(rng, 6.4, profiles=1), mask=np.arange(BINS) > 200)
+    assert found.found
+    assert abs(found.lag - 6.4) < 3.0 * found.standard_error
+
+
+def test_noise_without_a_common_cause_has_no_lag():
+    rng = np.random.default_rng(4)
+    analog, photon = rng.normal(size=(2, 1500, 3, 500))
+    found = lag.estimate(analog, photon)
+    assert found.found.sum() <= 6
+    # The confidence is uniform where there is nothing to find.
+    assert found.confidence.mean() == pytest.approx(0.5, abs=0.05)
+    assert (found.confidence > 0.9).mean() == pytest.approx(0.1, abs=0.035)
+
+
+def test_profiles_of_different_times_have_no_lag():
+    rng = np.random.default_rng(5)
+    analog, photon = recorded(rng, 8.6)
+    assert not lag.estimate(analog[1:], photon[:-1]).found
+
+
+def test_a_lag_beyond_those_tried_is_not_found():
+    rng = np.random.default_rng(6)
+    analog, photon = recorded(rng, 12.0)
+    assert not lag.estimate(analog, photon, largest_lag=6).found
+    found = lag.estimate(analog, photon, largest_lag=11)
+    assert not found.found
+
+
+def test_gaps_dead_channels_and_spikes_do_not_fool():
+    rng = np.random.default_rng(7)
+    analog, photon = recorded(rng, 8.6)
+    analog[rng.random(analog.shape) < 0.05] = np.nan
+    photon[3] = np.nan
+    analog[:, 700] = 1e6 * rng.normal(size=12)
+    photon[:, 705] = 1e6 * rng.normal(size=12)
+    found = lag.estimate(analog, photon)
+    assert found.found
+    assert abs(found.lag - 8.6) < 3.0 * found.standard_error
+    for dead in (np.full(photon.shape, np.nan), np.zeros(photon.shape)):
+        nothing = lag.estimate(analog, dead)
+        assert np.isnan(nothing.lag)
+        assert np.isnan(nothing.standard_error)
+        assert nothing.confidence == 0.0
+        assert not nothing.found
+
+
+def test_channels_are_independent_of_each_other():
+    rng = np.random.default_rng(8)
+    pairs = [recorded(rng, shift, profiles=4) for shift in (2.5, 7.0)]
+    both = lag.estimate(*(np.stack(signals) for signals in zip(*pairs, strict=True)))
+    for k, pair in enumerate(pairs):
+        alone = lag.estimate(*(signal.astype(">f8") for signal in pair))
+        assert both.lag[k] == alone.lag
+        assert both.standard_error[k] == alone.standard_error
+        np.testing.assert_array_equal(both.correlation[k], alone.correlation)
+
+
+def test_a_real_station(data_root):
+    """Sao Paulo 532 nm: headers say 0."""
+    files = sorted((data_root / "saopaulo" / "20170928" / "signals").iterdir())
+    names = ["analog_532o", "photon_532o"]
+    headers, values = licel.read_physical(files, names, dtype=np.float64)
+    assert {d.bin_shift for d in headers[0].channels if d.name in names} == {0.0}
+    found = lag.estimate(*(values[name] for name in names))
+    assert found.found
+    assert abs(found.lag - 8.6) < 0.2
+    assert found.standard_error < 0.2
+    for part in (slice(0, 8), slice(8, 16)):
+        again = lag.estimate(*(values[name][part] for name in names))
+        assert again.found
+        assert abs(again.lag - found.lag) < 0.05
+    assert not lag.estimate(values[names[0]][1:], values[names[1]][:-1]).found
+
+
+# The shift ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_whole_shift_moves_bins(interpolation):
+    values = np.arange(10.0) ** 2
+    variance = np.arange(10.0) + 1.0
+    moved, noise = lag.shift(values, 3, variance=variance, interpolation=interpolation)
+    np.testing.assert_array_equal(moved[:7], values[3:])
+    np.testing.assert_array_equal(noise[:7], variance[3:])
+    assert np.isnan(moved[7:]).all()
+    assert np.isnan(noise[7:]).all()
+    back, _ = lag.shift(values, -2.0, interpolation=interpolation)
+    np.testing.assert_array_equal(back[2:], values[:-2])
+    assert np.isnan(back[:2]).all()
+
+
+@pytest.mark.parametrize(("interpolation", "degree"), [("linear", 1), ("cubic", 3)])
+def test_a_part_of_a_bin_is_exact_on_polynomials(interpolation, degree):
+    index = np.arange(40.0)
+    coefficients = [0.5, -0.02, 0.001, -1e-5][: degree + 1]
+    values = np.polynomial.Polynomial(coefficients)(index)
+    for amount in (0.3, 8.6, -4.75):
+        moved, _ = lag.shift(values, amount, interpolation=interpolation)
+        expected = np.polynomial.Polynomial(coefficients)(index + amount)
+        inside = np.isfinite(moved)
+        assert inside.sum() >= 40 - abs(amount) - degree
+        np.testing.assert_allclose(moved[inside], expected[inside], rtol=1e-11)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_variance_follows_the_noise(interpolation):
+    rng = np.random.default_rng(9)
+    sigma = np.linspace(1.0, 3.0, 30)
+    values = sigma * rng.normal(size=(20000, 30))
+    moved, noise = lag.shift(values, 2.4, variance=sigma**2, interpolation=interpolation)
+    inside = np.isfinite(moved[0])
+    np.testing.assert_allclose(moved[:, inside].var(axis=0), noise[0, inside], rtol=0.06)
+
+
+def test_gaps_stay_gaps_and_spread_only_where_they_are_used():
+    values = np.arange(12.0)
+    values[5] = np.nan
+    whole, _ = lag.shift(values, 2)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(whole)), [3, 10, 11])
+    part, noise = lag.shift(values, 2.5, variance=1.0)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(part)), [2, 3, 9, 10, 11])
+    np.testing.assert_array_equal(np.isnan(noise), np.isnan(part))
+    far, _ = lag.shift(values, 1e9)
+    assert np.isnan(far).all()
+
+
+def test_each_profile_may_have_its_own_lag():
+    rng = np.random.default_rng(10)
+    values = rng.normal(size=(2, 3, 50)).astype(np.float32)
+    lags = np.array([[0.0, 1.5, -2.0], [8.6, 3.0, 0.25]])
+    moved, noise = lag.shift(values, lags)
+    assert np.isnan(noise).all()
+    for k in np.ndindex(2, 3):
+        np.testing.assert_array_equal(moved[k], lag.shift(values[k], lags[k])[0])
+    np.testing.assert_array_equal(lag.shift(values, 0.0)[0], values)
+
+
+def test_a_found_lag_aligns():
+    """Shifted by its lag, the analog signal has none left."""
+    rng = np.random.default_rng(11)
+    analog, photon = recorded(rng, 8.6)
+    found = lag.estimate(analog, photon)
+    moved, _ = lag.shift(analog, found.lag)
+    left = lag.estimate(moved, photon)
+    assert left.found
+    assert abs(left.lag) < 3.0 * left.standard_error
+    assert abs(left.lag) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"analog": np.ones(500)}, "analog"),
+        ({"analog": np.ones((2, 200)), "photon_counting": np.ones((2, 200))}, "analog"),
+        ({"photon_counting": np.ones((3, 500))}, "photon_counting"),
+        ({"largest_lag": 3}, "largest_lag"),
+        ({"largest_lag": 10.5}, "largest_lag"),
+        ({"mask": np.ones(500)}, "mask"),
+        ({"mask": np.ones(7, dtype=bool)}, "mask"),
+    ],
+)
+def test_impossible_arguments_are_refused(change, field):
+    arguments = {"analog": np.ones((2, 500)), "photon_counting": np.ones((2, 500))} | change
+    with pytest.raises(RetrievalInputError) as error:
+        lag.estimate(**arguments)
+    assert error.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"profile": 1.0}, "profile"),
+        ({"lag": np.nan}, "lag"),
+        ({"lag": [1.0, 2.0, 3.0]}, "lag"),
+        ({"variance": np.ones(3)}, "variance"),
+        ({"interpolation": "spline"}, "interpolation"),
+    ],
+)
+def test_impossible_shifts_are_refused(change, field):
+    arguments = {"profile": np.ones((2, 20)), "lag": 1.0} | change
+    with pytest.raises(RetrievalInputError) as error:
+        lag.shift(arguments.pop("profile"), arguments.pop("lag"), **arguments)
+    assert error.value.field == field

@@ -1,0 +1,232 @@
+"""What the ledger can be asked: history of runs, checksums; and the command line over it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from support.small_archive import DAY, Archive
+from typer.testing import CliRunner
+
+from lidarops.catalog import lock as lock_module
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+from lidarops.catalog.verify import verify
+from lidarops.cli import app
+from lidarops.run.archive import reprocess
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """A small archive, processed once."""
+    made_here = Archive(tmp_path, days=2)
+    reprocess(made_here.write())
+    return made_here
+
+
+def _mismatches(archive: Archive) -> set[tuple[str, str]]:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        return {(found.what, found.path) for found in verify(campaign, store)}
+
+
+def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> None:
+    assert _mismatches(archive) == set()
+    product = next((archive.folder / "out/products").rglob("*.nc"))
+    product.write_bytes(product.read_bytes()[:-1] + b"?")
+    archive.flip("raw/rich/h00")
+    archive.flip("overlap.csv", -7)
+    (archive.folder / "raw/poor/h11").unlink()
+    (archive.folder / "raw/poor/h10").rename(archive.folder / "raw/poor/h-moved")
+    name = str(product.relative_to(archive.folder / "out/products"))
+    told = {("product", name), ("signal", "rich/h00"), ("overlap", "overlap.csv")}
+    lost = {("signal", "poor/h11"), ("signal", "poor/h10")}
+    assert _mismatches(archive) == told | lost
+    # Once the catalog has seen the move, the content is known to be there.
+    CliRunner().invoke(app, ["catalog", str(archive.file)])
+    assert _mismatches(archive) == told | {("signal", "poor/h11")}
+
+
+def test_the_command_line_tells_what_the_ledger_knows(archive: Archive) -> None:
+    runner, file = CliRunner(), str(archive.file)
+    told = runner.invoke(app, ["runs", file, "--json"])
+    assert told.exit_code == 0
+    (run,) = json.loads(told.stdout)
+    assert (run["status"], run["scenes"], run["products"]) == ("finished", 4, 12)
+    assert {"digest", "retrieve", "write"} <= set(run["seconds"])
+    assert run["id"] in runner.invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
+    assert runner.invoke(app, ["verify", file]).exit_code == 0
+    archive.flip("raw/rich/h00")
+    wrong = runner.invoke(app, ["verify", file, "--json"])
+    assert wrong.exit_code == 1
+    (mismatch,) = json.loads(wrong.stdout)["mismatches"]
+    assert mismatch["path"] == "rich/h00"
+    assert runner.invoke(app, ["verify", file, "--products-only"]).exit_code == 0
+
+
+def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> None:
+    runner, file = CliRunner(), str(archive.file)
+    nothing = runner.invoke(app, ["reprocess", file, "--json"])
+    # Its elastic retrievals have nothing to rest on, and every run says so.
+    assert nothing.exit_code == 1
+    told = json.loads(nothing.stdout)
+    assert told["run"] is None
+    assert told["empty_scenes"] == ["rich_20260301T000000", "rich_20260302T000000"]
+    assert not (archive.folder / "out/report").exists()
+    archive.flip("raw/poor/h10")
+    planned = runner.invoke(app, ["plan", file, "--stale", "--json"])
+    told = json.loads(planned.stdout)
+    (scene,) = told["scenes"]
+    times = scene["estimated_cpu_seconds"]
+    assert 0 < times["to_be_made"] <= times["everything"]
+    assert told["estimated_cpu_seconds"]["to_be_made"]["scenes"] == times["to_be_made"]
+    assert {stale["reason"] for stale in scene["stale"]} == {"changed: signal poor/h10"}
+    log = archive.folder / "log.jsonl"
+    words = ["--log-json", "--log-level", "info", "--log-file", str(log), "--json"]
+    done = runner.invoke(app, ["reprocess", file, *words])
+    assert done.exit_code == 1, done.output
+    assert len(json.loads(done.stdout)["products"]) == 2
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert any("changed: signal poor/h10" in line["message"] for line in lines)
+    (ended,) = [line for line in lines if line.get("granules") == 3]
+    assert ended["scene"] == "poor_20260302T000000"
+
+
+@pytest.mark.parametrize("command", ["runs", "verify"])
+def test_what_asks_the_ledger_makes_none(command: str, archive: Archive) -> None:
+    """A wrong folder has nothing that is wrong, which is not the same as all being well."""
+    elsewhere = archive.folder / "elsewhere"
+    asked = CliRunner().invoke(app, [command, str(archive.file), "--out", str(elsewhere)])
+    assert asked.exit_code == 1
+    assert "there is no catalog yet" in asked.output
+    assert not elsewhere.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--product", "luck"], 2, "homogeneous"),
+        (["--instrument", "luck"], 2, "poor"),
+        (["--station", "luck"], 2, "coast"),
+        (["--since", "2026-03-02", "--until", "2026-03-01"], 2, "earlier"),
+        (["--since", "2026-03-02", "--until", "2026-03-02"], 2, "earlier"),
+        (["--memory-limit", "foo"], 2, "2GiB"),
+        (["--memory-limit", "2"], 2, "2GiB"),
+        (["--log-level", "luck"], 2, "warning"),
+        (["--catalog", "luck"], 2, "postgresql"),
+        (["--catalog", "luck://host/name"], 2, "postgresql"),
+        (["--archive", "luck"], 2, "luck"),
+        (["--archive", "luck://bucket"], 2, "luck"),
+        (["--cluster", "luck"], 2, "kubernetes"),
+        (["--scheduler", "luck"], 2, "tls://head:8786"),
+        (["--cluster", "slurm", "--memory-limit", "2GiB"], 2, "memory_limit"),
+        (["--scheduler", "tcp://head:8786", "--memory-limit", "2GiB"], 2, "memory_limit"),
+    ],
+)
+def test_wrong_use_names_the_choices(
+    archive: Archive, words: list[str], code: int, said: str
+) -> None:
+    result = CliRunner().invoke(app, ["reprocess", str(archive.file), *words])
+    assert result.exit_code == code
+    assert said in result.output
+
+
+@pytest.mark.parametrize("command", ["catalog", "plan", "verify"])
+def test_an_archive_that_is_away_is_wrong_use_only_where_it_is_given(
+    archive: Archive, command: str
+) -> None:
+    def code(*words: str) -> int:
+        return CliRunner().invoke(app, [command, str(archive.file), *words]).exit_code
+
+    (archive.folder / "raw").rename(archive.folder / "away")
+    assert code() == 1
+    assert code("--archive", str(archive.folder / "raw")) == 2
+    assert code("--archive", str(archive.folder / "away")) == 0
+
+
+def test_a_plan_waits_for_another_run_as_long_as_asked(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def planned(*words: str) -> Result:
+        return CliRunner().invoke(app, ["plan", str(archive.file), "--stale", *words])
+
+    campaign = archive.write()
+    archive.raw("poor/h13", DAY + 603, seed=1)
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as held:
+        held.acquire()
+        refused = planned()
+        assert refused.exit_code == 1
+        assert "--wait" in refused.output
+        monkeypatch.setattr(lock_module.time, "sleep", lambda _: held.release())
+        waited = planned("--wait", "30")
+    assert waited.exit_code == 0, waited.output
+    assert "poor_20260302T000000" in waited.output
+
+
+def test_a_size_of_memory_is_read_before_the_archive(tmp_path: Path) -> None:
+    fresh = Archive(tmp_path, days=1)
+    words = ["reprocess", str(fresh.file), "--workers", "2", "--memory-limit", "foo"]
+    assert CliRunner().invoke(app, words).exit_code == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_selection_without_any_scene_is_told_from_one_whose_products_are_fresh(
+    archive: Archive,
+) -> None:
+    def said(*words: str) -> str:
+        return CliRunner().invoke(app, ["reprocess", str(archive.file), *words]).output
+
+    none = "no scene of the archive is asked for"
+    assert none in said("--since", "2026-04-01")
+    assert none in said("--until", "2026-03-01", "--instrument", "poor")
+    kind = ["--product", "homogeneous"]
+    for words in (["--since", "2026-03-02"], kind, [*kind, "--instrument", "poor"]):
+        fresh = said(*words)
+        assert "is fresh" in fresh
+        assert none not in fresh
+
+
+def test_a_product_is_made_again_from_raw_files_that_were_moved(
+    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made(product: Path, *words: str) -> tuple[int, str]:
+        done = CliRunner().invoke(app, ["reproduce", str(product), *words])
+        return done.exit_code, done.output
+
+    monkeypatch.delenv("LIDAROPS_CATALOG", raising=False)
+    product = sorted((archive.folder / "out/products").rglob("poor/signal/**/*.nc"))[-1]
+    raw = archive.folder / "raw" / "poor"
+    (raw / "h10").rename(raw / "h-moved")
+    code, said = made(product)
+    assert code == 1
+    assert "input poor/h10: missing" in said
+    assert "--catalog" in said
+    # Another file takes the name of one that is an input.
+    (raw / "h11").rename(raw / "h-too")
+    (raw / "h00").rename(raw / "h11")
+    before = product.stat().st_mtime_ns
+    CliRunner().invoke(app, ["reprocess", str(archive.file)])
+    assert product.stat().st_mtime_ns == before
+    code, said = made(product)
+    assert code == 0, said
+    # Not one is left under its name.
+    (raw / "h12").rename(raw / "h-last")
+    (raw / "h11").rename(raw / "h-first")
+    CliRunner().invoke(app, ["catalog", str(archive.file)])
+    assert made(product)[0] == 0
+    elsewhere = Path(shutil.copy(product, tmp_path.parent / f"{tmp_path.name}.nc"))
+    catalog = f"sqlite:///{archive.folder}/out/catalog.sqlite"
+    for place in (str(archive.folder / "raw"), f"file://{archive.folder}/raw"):
+        assert made(elsewhere, "--archive", place)[0] == 1
+        assert made(elsewhere, "--archive", place, "--catalog", catalog)[0] == 0
+    (raw / "h-last").unlink()
+    code, said = made(product)
+    assert code == 1
+    assert "input poor/h12: missing" in said
+    assert "h10" not in said
+    nothing = made(product, "--catalog", f"sqlite:///{archive.folder}/none.sqlite")
+    assert nothing[0] == 1
+    assert "there is no catalog yet" in nothing[1]

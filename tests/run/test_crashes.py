@@ -1,0 +1,191 @@
+"""Killed at any point, out of space, without permission: nothing partial, nothing wrong."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from support import crash_archive
+
+from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError
+from lidarops.run.archive import Options, bring_up_to_date, reprocess
+
+KILLS = int(os.environ.get("LIDAROPS_TEST_KILLS", "30"))
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_kills_at_random_points_do_no_damage(tmp_path: Path) -> None:
+    calm = tmp_path / "calm"
+    whole_campaign = crash_archive.make(calm)
+    reprocess(whole_campaign)
+    whole = crash_archive.products(calm)
+    rng = random.Random(20261121)
+    kills = rounds = 0
+    landed = {"serial": 0, "cluster": 0, "flow": 0}
+    while kills < KILLS:
+        folder = tmp_path / f"round{rounds}"
+        campaign = crash_archive.make(folder)
+        mode = ("serial", "cluster", "flow")[rounds % 3]
+        rounds += 1
+        # A flow has its own server to start, which takes longer than the archive.
+        for _ in range(3 if mode == "flow" else 8):
+            process = crash_archive.start(folder, mode)
+            began = time.monotonic()
+            # Wait for the start-up to pass, then strike anywhere within the work.
+            while process.poll() is None and not (folder / "out/products").exists():
+                time.sleep(0.01)
+            if (folder / "out/products").exists():
+                time.sleep(rng.uniform(0.0, 3.0))
+            if process.poll() is not None:
+                break
+            _kill(process)
+            kills += 1
+            landed[mode] += 1
+            assert time.monotonic() > began
+            assert crash_archive.wrong_rows(folder) == []
+            assert crash_archive.visible_partial(folder, whole) == []
+        result = bring_up_to_date(campaign)
+        assert not result.troubled
+        assert crash_archive.products(folder) == whole
+        assert crash_archive.wrong_rows(folder) == []
+        assert bring_up_to_date(campaign).record is None
+    assert min(landed.values()) >= min(3, KILLS // 10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_run_that_is_asked_to_stop_ends_its_scene_and_tells(tmp_path: Path, number: int) -> None:
+    campaign = crash_archive.make(tmp_path)
+    process = crash_archive.start(tmp_path, "serial")
+    while not list((tmp_path / "out").rglob("*.nc")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(number)
+    process.wait(timeout=120)
+    assert process.returncode == 128 + number
+    assert crash_archive.wrong_rows(tmp_path) == []
+    assert not [name for name in crash_archive.products(tmp_path) if name.endswith(".tmp")]
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        (run,) = store.runs()
+        assert run.status is RunStatus.INTERRUPTED
+        assert 0 < run.scenes < crash_archive.SCENES
+        assert lock.holder() is None
+    assert not bring_up_to_date(campaign).troubled
+
+
+def test_temporary_files_of_a_killed_run_are_cleared_away(tmp_path: Path) -> None:
+    campaign = crash_archive.make(tmp_path, scenes=2)
+    reprocess(campaign)
+    product = next((tmp_path / "out/products").rglob("*.nc"))
+    left = product.with_name(f".{product.name}.123-abcd.tmp")
+    left.write_bytes(b"half of a product")
+    assert reprocess(campaign) is None
+    assert left.exists(), "a run with nothing to do touches nothing"
+    product.unlink()
+    reprocess(campaign)
+    assert not left.exists()
+    assert product.exists()
+
+
+_FULL = """
+import errno, os, sys
+sys.path.insert(0, {here!r})
+real = os.{name}
+left = {after}
+def failing(*given):
+    global left
+    left -= 1
+    if left < 0:
+        raise OSError(errno.ENOSPC, "No space left on device")
+    return real(*given)
+os.{name} = failing
+import crash_runs
+from contextlib import suppress
+from pathlib import Path
+sys.exit(crash_runs.run(Path({folder!r}), "serial"))
+"""
+
+
+@pytest.mark.parametrize(("name", "after"), [("fsync", 3), ("replace", 2), ("fsync", 0)])
+def test_a_disk_that_fills_up_is_told_and_the_next_run_recovers(
+    tmp_path: Path, name: str, after: int
+) -> None:
+    calm = tmp_path / "calm"
+    reprocess(crash_archive.make(calm, scenes=8))
+    folder = tmp_path / "full"
+    campaign = crash_archive.make(folder, scenes=8)
+    here = str(crash_archive.RUNNER.parent)
+    code = _FULL.format(here=here, name=name, after=after, folder=str(folder))
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert process.returncode == 1, process.stderr.decode()
+    assert crash_archive.wrong_rows(folder) == []
+    assert crash_archive.visible_partial(folder, crash_archive.products(calm)) == []
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert all("No space left" in error for error in store.failures().values())
+        assert store.failures()
+        assert store.runs()[0].status is RunStatus.STOPPED
+        assert store.runs()[0].scenes < 8
+    assert not bring_up_to_date(campaign).troubled
+    assert crash_archive.products(folder) == crash_archive.products(calm)
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Path:
+    """A file system of 400 kB, where this user may mount one."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
+    try:
+        mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
+    except OSError:
+        mounted = False
+    if not mounted:
+        pytest.skip("no right to mount a file system")
+    yield place
+    subprocess.run(["umount", str(place)], check=False)
+
+
+def test_a_full_file_system_is_told_and_nothing_is_damaged(tmp_path: Path, tiny_disk: Path) -> None:
+    campaign = crash_archive.make(tmp_path, scenes=8).model_copy(update={"output": str(tiny_disk)})
+    # Whichever needs the space first: a product, which fails its scene, or the catalog.
+    with suppress(CatalogError):
+        assert bring_up_to_date(campaign).troubled
+    for path in (tiny_disk / "products").rglob("*"):
+        assert path.is_dir() or path.suffix == ".nc", path
+    subprocess.run(["mount", "-o", "remount,size=60m", str(tiny_disk)], check=True)
+    assert not bring_up_to_date(campaign).troubled
+    assert len(list((tiny_disk / "products").rglob("*.nc"))) == 24
+
+
+def test_a_target_that_cannot_be_written_is_told(tmp_path: Path, tiny_disk: Path) -> None:
+    campaign = crash_archive.make(tmp_path, scenes=2).model_copy(update={"output": str(tiny_disk)})
+    subprocess.run(["mount", "-o", "remount,ro", str(tiny_disk)], check=True)
+    with pytest.raises(CatalogError, match=r"read-only|unable to open"):
+        bring_up_to_date(campaign)
+    subprocess.run(["mount", "-o", "remount,rw,size=60m", str(tiny_disk)], check=True)
+    assert not bring_up_to_date(campaign).troubled
+
+
+def test_a_second_run_is_refused_with_the_name_of_the_first(tmp_path: Path) -> None:
+    campaign = crash_archive.make(tmp_path, scenes=1)
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        assert lock.acquire() is False
+        with pytest.raises(CatalogError, match=f"process {os.getpid()}"):
+            bring_up_to_date(campaign)
+    assert bring_up_to_date(campaign, options=Options(wait=5.0)).record is not None

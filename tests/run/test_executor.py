@@ -1,0 +1,292 @@
+"""Many scenes: on workers as in one process, none stopping the others, each entered as it ends."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from distributed import Client, Nanny
+from distributed.core import Status
+from distributed.deploy.spec import SpecCluster
+from support.poison import Poison
+from support.small_archive import Archive, made
+
+from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+from lidarops.errors import SceneError
+from lidarops.process.scene import Job, failed
+from lidarops.run import executor
+from lidarops.run.archive import Options, Selection, bring_up_to_date, prepare, reprocess
+from lidarops.run.executor import (
+    Ended,
+    Stop,
+    alone,
+    carry_out,
+    local_client,
+    make_jobs,
+    process_all,
+)
+from lidarops.run.session import Session
+from lidarops.run.staleness import Judge
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    """Two workers on this machine."""
+    with local_client(2) as started:
+        yield started
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """A small archive."""
+    return Archive(tmp_path, days=2)
+
+
+def test_workers_make_the_bytes_that_one_process_makes(archive: Archive, client: Client) -> None:
+    campaign = archive.write()
+    alone = reprocess(campaign.model_copy(update={"output": str(archive.folder / "alone")}))
+    together = reprocess(campaign, client=client)
+    assert made(alone) == made(together)
+    assert archive.contents("alone/products") == archive.contents("out/products")
+
+
+def test_a_signal_while_workers_start_leaves_no_cluster_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Python would close it at its end, in tracebacks, after its processes were gone."""
+    start = Nanny.instantiate
+
+    async def interrupted(nanny: Nanny) -> Any:
+        os.kill(os.getpid(), signal.SIGINT)
+        return await start(nanny)
+
+    monkeypatch.setattr(Nanny, "instantiate", interrupted)
+    others = set(SpecCluster._instances)
+    with Stop() as stop:
+        with stop.idle(), local_client(1):
+            raise AssertionError
+        assert stop.signal == signal.SIGINT
+    left = set(SpecCluster._instances) - others
+    assert not [each for each in left if each.status is not Status.closed]
+
+
+def test_a_file_that_vanishes_after_the_scan_is_refused_as_such(archive: Archive) -> None:
+    campaign = archive.write()
+    jobs = make_jobs(campaign, prepare(campaign, instruments=["poor"]))
+    (archive.folder / "raw/poor/h10").unlink()
+    refused = [granule for outcome in process_all(jobs) for granule in outcome.refused]
+    (granule,) = refused
+    assert granule.path == "poor/h10"
+    assert granule.reason == "vanished after it was catalogued (run lidarops catalog again)"
+
+
+def test_a_scene_that_kills_its_worker_is_refused_by_name(
+    archive: Archive, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = logging.getLogger("distributed.scheduler").level
+    # dask hands its records to nobody else.
+    monkeypatch.setattr(logging.getLogger("distributed"), "handlers", [caplog.handler])
+    campaign = archive.write()
+    scene = "rich_20260302T000000"
+    # A cluster of its own, as dask may lose workers that it restarts while they start.
+    with local_client(2) as client:
+        client.register_plugin(Poison(scene))
+        result = bring_up_to_date(campaign, client=client)
+    assert set(result.failures) == {scene}
+    assert "died 3 times" in result.failures[scene]
+    assert "its worker died" in caplog.text
+    # Only that of `lidarops`: the scene was tried again, and had not failed yet.
+    assert "marked as failed" not in caplog.text
+    assert logging.getLogger("distributed.scheduler").level == before
+    others = {outcome.scene for outcome in result.record.scenes if not outcome.error}
+    assert others == {"rich_20260301T000000", "poor_20260301T000000", "poor_20260302T000000"}
+    assert bring_up_to_date(campaign).record is None
+    forced = Selection(instruments=("rich",))
+    healed = bring_up_to_date(campaign, selection=forced, options=Options(force=True))
+    assert not healed.failures
+
+
+@pytest.mark.parametrize("crashed", [1, 4], ids=["one", "all"])
+def test_scenes_that_took_their_process_down_are_tried_in_another(
+    archive: Archive, crashed: int
+) -> None:
+    campaign = archive.write()
+    scenes = {scene.id for scene in prepare(campaign).scenes[:crashed]}
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        judge = Judge(campaign, store)
+        session = Session(campaign, store, lock, judge)
+        session.begin()
+        for judged in judge.days(sorted(judge.signatures())).judgements:
+            if judged.scene.id in scenes:
+                session.take(judged, note=True)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        again = Judge(campaign, store)
+        found = again.days(sorted(again.signatures())).judgements
+        assert {each.scene.id for each in found if each.suspect} == scenes
+    result = bring_up_to_date(campaign)
+    assert [scene.error for scene in result.record.scenes] == [""] * 4
+    assert result.status is RunStatus.FINISHED
+    assert bring_up_to_date(campaign).record is None
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert [run.status.value for run in store.runs()] == ["finished", "died"]
+
+
+def test_scenes_are_taken_one_by_one_and_never_many_ahead(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut = prepare(archive.write())
+    jobs = executor.make_jobs(archive.write(), cut) * 50
+    taken = 0
+
+    def counted() -> Iterator[Job]:
+        nonlocal taken
+        for job in jobs:
+            taken += 1
+            yield job
+
+    monkeypatch.setattr(executor, "attempt", lambda job: (failed(job, "no"), True))
+    ended: list[Ended] = []
+    for each in carry_out(counted()):
+        ended.append(each)
+        assert taken == len(ended)
+    assert len(ended) == len(jobs)
+
+
+def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
+    archive: Archive, client: Client
+) -> None:
+    cut = prepare(archive.write())
+    jobs = executor.make_jobs(archive.write(), cut) * 4
+    at_hand = most = done = 0
+
+    def took(_job: Job) -> None:
+        nonlocal at_hand, most
+        at_hand += 1
+        most = max(most, at_hand)
+
+    for _ in carry_out(jobs, client=client, taken=took):
+        at_hand -= 1
+        done += 1
+    assert done == len(jobs)
+    assert most <= executor.LEAST_AHEAD + 1
+
+
+def test_workers_that_are_gone_for_good_are_not_waited_for(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = archive.write()
+    jobs = executor.make_jobs(campaign, prepare(campaign))
+    with local_client(1) as client:
+        # Not before, as the first worker may well take longer to start.
+        monkeypatch.setattr(executor, "PATIENCE", 1.0)
+        monkeypatch.setattr(executor, "RECOUNT", 0.5)
+        client.retire_workers()
+        with pytest.raises(SceneError, match="workers on this machine are gone"):
+            list(carry_out(jobs, client=client))
+        with pytest.raises(SceneError, match="workers on this machine are gone"):
+            list(alone(jobs, client=client, stop=Stop()))
+
+
+class Growing:
+    """A cluster that has its workers after a while, and ends no scene before eight have begun."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self.open = False
+        self.begun: list[Callable[[], None]] = []
+
+    def nthreads(self) -> dict[str, int]:
+        self.asked += 1
+        assert self.asked < 60, "no scene was handed on to the workers that came"
+        return {} if self.asked == 1 else {"worker": 4}
+
+    def begin(self, end: Callable[[], None]) -> None:
+        self.begun.append(end)
+        self.open = self.open or len(self.begun) == 8
+        while self.open and self.begun:
+            self.begun.pop()()
+
+
+class Begun:
+    """A scene in the hands of a cluster."""
+
+    def __init__(self, cluster: Growing, _job: Job) -> None:
+        self.cluster = cluster
+
+    def add_done_callback(self, told: Callable[[Begun], None]) -> None:
+        self.cluster.begin(lambda: told(self))
+
+    def release(self) -> None:
+        """Have nothing to give back."""
+
+
+def test_workers_that_come_later_get_scenes_before_one_has_ended(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(executor, "RECOUNT", 0.0)
+    monkeypatch.setattr(executor, "_submitted", Begun)
+    monkeypatch.setattr(
+        executor, "_ended", lambda _, job: Ended(job, failed(job, "no"), final=True)
+    )
+    jobs = executor.make_jobs(archive.write(), prepare(archive.write())) * 4
+    assert len(list(carry_out(jobs, client=Growing()))) == len(jobs)
+
+
+def test_a_worker_with_other_code_is_named_and_makes_nothing(
+    archive: Archive, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(executor, "code_version", lambda: "newer")
+    campaign = archive.write()
+    ended = list(carry_out(executor.make_jobs(campaign, prepare(campaign))[:1], client=client))
+    assert [each.final for each in ended] == [False]
+    assert "the worker has other code of lidarops" in ended[0].outcome.error
+    assert not (archive.folder / "out" / "products").exists()
+
+
+def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> None:
+    campaign = archive.write()
+    stop = Stop()
+    ended = []
+    for each in carry_out(executor.make_jobs(campaign, prepare(campaign)), stop=stop):
+        ended.append(each)
+        stop.now("enough")
+    assert len(ended) == 1
+
+
+def test_every_scene_is_entered_as_it_ends(archive: Archive) -> None:
+    campaign = archive.write()
+    entered = []
+
+    def look(_outcome: object) -> None:
+        with Store(campaign.catalog_url, campaign.name) as store:
+            entered.append((len({row["scene"] for row in store.products()}), store.runs()[0]))
+
+    reprocess(campaign, options=Options(progress=look))
+    assert [number for number, _ in entered] == [1, 2, 3, 4]
+    assert [run.scenes for _, run in entered] == [1, 2, 3, 4]
+    assert {run.status.value for _, run in entered} == {"running"}
+    assert {"digest", "retrieve", "write"} <= set(entered[-1][1].seconds)
+
+
+def test_a_scene_that_may_kill_waits_for_a_worker_that_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waited: list[float] = []
+    counted = iter([{}, {}, {"tcp://worker": 1}])
+
+    class Cluster:
+        def nthreads(self) -> dict[str, int]:
+            return next(counted)
+
+    monkeypatch.setattr(executor.time, "sleep", waited.append)
+    executor._Staff(Cluster()).ready(Stop())
+    assert not list(counted)
+    assert waited[-1] == executor.FIRM

@@ -1,0 +1,602 @@
+"""Only what is stale is made again: every kind of change, and exactly what depends on it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import quick
+from support.small_archive import DAY, Archive, made
+from typer.testing import CliRunner
+
+from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.rows import day_of
+from lidarops.catalog.scan import scan
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.process.scene import Job
+from lidarops.records import ProductKind, SceneOutcome
+from lidarops.run import executor
+from lidarops.run.archive import (
+    Options,
+    Selection,
+    assess,
+    bring_up_to_date,
+    remove_orphans,
+    reprocess,
+)
+from lidarops.run.staleness import DaysJudged, Judge
+
+RICH = ("signal analog", "signal photon", "homogeneous photon", "elastic analog")
+
+
+def _all(days: range, products: tuple[str, ...] = RICH) -> set[str]:
+    return {f"rich {day} {product}" for day in days for product in products}
+
+
+def _poor(days: range) -> set[str]:
+    return {f"poor {day} signal {channel}" for day in days for channel in ("analog", "photon")}
+
+
+EVERYTHING = _all(range(1, 5)) | _poor(range(1, 5))
+
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+
+def test_a_run_that_is_forced_makes_everything(archive: Archive) -> None:
+    assert made(reprocess(archive.write(), options=Options(force=True))) == EVERYTHING
+
+
+def test_a_run_with_nothing_to_do_writes_nothing(archive: Archive) -> None:
+    before = archive.contents()
+    stamps = {path: path.stat().st_mtime_ns for path in (archive.folder / "out").rglob("*")}
+    assert reprocess(archive.write()) is None
+    assert archive.contents() == before
+    after = {path: path.stat().st_mtime_ns for path in (archive.folder / "out").rglob("*")}
+    folders = {path for path in after if path.is_dir() or path.suffix == ".nc"}
+    assert {path: after[path] for path in folders} == {path: stamps[path] for path in folders}
+
+
+def _dead_time(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["facts"][1]["channels"]["photon_532o"]["dead_time"] = 5e-9
+
+
+def _lidar_ratio(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+
+
+def _sections(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 825]]
+
+
+def _closed_period(archive: Archive) -> None:
+    """A calibration that is valid from the last day on."""
+    facts = archive.told["instruments"]["rich"]["facts"]
+    facts[1]["valid_to"] = "2026-03-04T00:00:00Z"
+    facts.append({**facts[1], "valid_from": "2026-03-04T00:00:00Z", "azimuth": 12.0})
+    del facts[2]["valid_to"]
+
+
+def _new_overlap(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["facts"][0]["full_overlap_range"] = 500.0
+
+
+def _title(archive: Archive) -> None:
+    archive.told["title"] = "Another title"
+
+
+def _name(archive: Archive) -> None:
+    archive.told["instruments"]["poor"]["name"] = "Poor lidar"
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda a: a.flip("raw/rich/h11"), _all(range(2, 3))),
+        (lambda a: a.flip("raw/poor/h30"), _poor(range(4, 5))),
+        # Taken on the first day: it serves that day and the next, and analog channels only.
+        (
+            lambda a: a.flip("raw/rich/d0", -(4 * 1500 + 60)),
+            _all(range(1, 3), ("signal analog", "elastic analog")),
+        ),
+        (lambda a: a.flip("air.csv", -2), _all(range(1, 3), ("elastic analog",))),
+        (lambda a: a.flip("overlap.csv", -7), _all(range(1, 5))),
+        (_lidar_ratio, _all(range(1, 5), ("elastic analog",))),
+        (_sections, _all(range(1, 5), ("homogeneous photon",))),
+        (_dead_time, _all(range(3, 5), ("signal photon", "homogeneous photon"))),
+        (_closed_period, _all(range(4, 5))),
+        (_new_overlap, _all(range(1, 3))),
+        (_title, EVERYTHING),
+        (_name, _poor(range(1, 5))),
+    ],
+    ids=[
+        "raw", "raw of another", "dark", "molecular", "overlap", "lidar ratio", "sections",
+        "dead time of a period", "new period", "overlap range", "title", "name",
+    ],
+)  # fmt: skip
+def test_exactly_what_depends_on_a_change_is_made_again(
+    archive: Archive, change: Callable[[Archive], None], expected: set[str]
+) -> None:
+    change(archive)
+    campaign = archive.write()
+    judged = {
+        f"{each.scene.instrument} {each.scene.start.day} {stale.kind.value} {stale.channel[:6]}"
+        for each in assess(campaign)
+        for stale in each.stale
+    }
+    assert judged == expected
+    assert made(reprocess(campaign)) == expected
+    assert reprocess(campaign) is None
+
+
+def test_what_is_made_bit_by_bit_is_what_is_made_at_once(archive: Archive, tmp_path: Path) -> None:
+    for change in (_lidar_ratio, _sections, _dead_time):
+        change(archive)
+        reprocess(archive.write())
+    other = Archive(tmp_path / "other")
+    other.told = archive.told
+    reprocess(other.write())
+    assert archive.contents("out/products") == other.contents("out/products")
+
+
+def test_touched_and_moved_files_make_nothing_stale(archive: Archive) -> None:
+    raw = archive.folder / "raw"
+    os.utime(raw / "rich" / "h00", ns=(1, 1))
+    (raw / "rich" / "h01").rename(raw / "rich" / "h-renamed")
+    result = bring_up_to_date(archive.write())
+    assert result.record is None
+    assert (result.summary.moved, result.summary.added, result.summary.vanished) == (1, 0, 0)
+    assert result.summary.changed == 0
+    before = archive.contents()
+    assert reprocess(archive.write()) is None
+    assert archive.contents() == before
+
+
+def test_a_lost_catalog_row_is_judged_by_content(archive: Archive) -> None:
+    rich = archive.folder / "raw" / "rich"
+    # As when one of two disks is not mounted for one run.
+    rich.rename(archive.folder / "away")
+    result = bring_up_to_date(archive.write())
+    assert result.record is None
+    assert len(result.orphans) == len(_all(range(1, 5)))
+    (archive.folder / "away").rename(rich)
+    assert reprocess(archive.write()) is None
+
+
+def test_products_that_are_damaged_or_lost_are_made_again(archive: Archive) -> None:
+    before = archive.contents("out/products")
+    first, second, third = sorted((archive.folder / "out/products").rglob("*.nc"))[:3]
+    first.unlink()
+    second.write_bytes(second.read_bytes()[:-1])
+    os.utime(third)
+    record = reprocess(archive.write())
+    assert len(made(record)) == 2
+    assert archive.contents("out/products") == before
+    assert reprocess(archive.write()) is None
+
+
+def test_new_files_join_their_scene_and_lost_ones_leave_it(archive: Archive) -> None:
+    archive.raw("rich/h09", 610, seed=77)
+    (archive.folder / "raw/poor/h10").unlink()
+    reasons = {
+        (each.scene.instrument, stale.reason)
+        for each in assess(archive.write())
+        for stale in each.stale
+    }
+    assert ("rich", "new: signal rich/h09") in reasons
+    assert ("poor", "gone: signal poor/h10") in reasons
+    assert made(reprocess(archive.write())) == _all(range(1, 2)) | _poor(range(2, 3))
+
+
+def test_products_of_vanished_inputs_are_told_and_kept_until_asked(archive: Archive) -> None:
+    for path in (archive.folder / "raw/poor").glob("h1*"):
+        path.unlink()
+    campaign = archive.write()
+    before = archive.contents("out/products")
+    for _ in range(2):
+        result = bring_up_to_date(campaign)
+        assert result.record is None
+        assert len(result.orphans) == 2
+        assert archive.contents("out/products") == before
+    assert remove_orphans(campaign, result) == 2
+    assert set(before) - set(archive.contents("out/products")) == {
+        orphan.path for orphan in result.orphans
+    }
+    assert bring_up_to_date(campaign).orphans == ()
+
+
+def test_a_selection_makes_its_part_and_leaves_the_rest_stale(archive: Archive) -> None:
+    _title(archive)
+    campaign = archive.write()
+    parts = [
+        (Selection(instruments=("poor",)), _poor(range(1, 5))),
+        (Selection(kinds=(ProductKind.ELASTIC,)), _all(range(1, 5), ("elastic analog",))),
+    ]
+    for selection, expected in parts:
+        assert made(reprocess(campaign, selection=selection)) == expected
+        assert reprocess(campaign, selection=selection) is None
+    rest = made(reprocess(campaign))
+    assert rest == EVERYTHING - parts[0][1] - parts[1][1]
+    assert reprocess(campaign) is None
+
+
+def _planned(archive: Archive, *options: str) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["plan", str(archive.file), "--json", *options])
+    assert result.exit_code == 0
+    return dict(json.loads(result.stdout))
+
+
+def test_the_plan_of_a_selection_is_of_its_products(archive: Archive) -> None:
+    archive.write()
+    whole = _planned(archive)["estimated_cpu_seconds"]["everything"]
+    told = _planned(archive, "--product", "homogeneous")
+    for scene in told["scenes"]:
+        rich = scene["scene"].startswith("rich")
+        assert (scene["fresh"], len(scene["stale"])) == (int(rich), 0)
+        names = {step["name"] for step in scene["steps"]}
+        assert ("homogeneous" in names) == bool(names) == rich
+        assert not names & {"signal", "background", "elastic", "reference"}
+        assert {left["name"] for left in scene["left_out"]} >= {"homogeneous"} - names
+    some = told["estimated_cpu_seconds"]["everything"]
+    assert 0 < some["scenes"] < whole["scenes"]
+    assert some["start"] < whole["start"], "elastic code is not loaded"
+    nothing = _planned(archive, "--product", "homogeneous", "--instrument", "poor")
+    assert {scene["fresh"] for scene in nothing["scenes"]} == {0}
+    assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
+
+
+def _gates_told(told: dict[str, Any]) -> list[str]:
+    steps = [step for scene in told["scenes"] for step in scene["steps"]]
+    return [step.get("no_effect", "") for step in steps if step["name"] == "range_gate"]
+
+
+def test_a_plan_tells_a_gate_of_no_effect(archive: Archive) -> None:
+    archive.write()
+    assert _gates_told(_planned(archive)) == ["signal needs all bins"] * 4
+    assert _gates_told(_planned(archive, "--product", "homogeneous")) == [""] * 4
+    shown = CliRunner().invoke(app, ["plan", str(archive.file)], env={"COLUMNS": "300"})
+    assert shown.stdout.count("no effect: signal needs all bins") == 4
+
+
+def test_a_kind_that_nothing_is_asked_for_is_wrong_use(archive: Archive) -> None:
+    archive.write()
+    for command in ("plan", "reprocess"):
+        refused = CliRunner().invoke(app, [command, str(archive.file), "--product", "visibility"])
+        assert refused.exit_code == 2
+        assert "asked for: signal, homogeneous, elastic" in refused.stderr
+
+
+def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(
+    archive: Archive, tmp_path: Path
+) -> None:
+    archive.write()
+    for kinds in ([], ["--product", "signal"], ["--product", "homogeneous"]):
+        told = _planned(archive, "--out", str(tmp_path / "new"), *kinds)
+        assert {scene["fresh"] for scene in told["scenes"]} == {0}
+        times = told["estimated_cpu_seconds"]
+        assert times["to_be_made"] == times["everything"]
+        assert times["everything"]["all"] > 0
+
+
+def test_a_selection_without_a_scene_is_told_to_people_and_programs(archive: Archive) -> None:
+    archive.write()
+    said = "no scene of the archive is asked for"
+    for command in ("plan", "reprocess"):
+        for options, none in ((["--since", "2030-01-01"], True), (["--station", "coast"], False)):
+            line = [command, str(archive.file), *options]
+            assert (said in CliRunner().invoke(app, line).stdout) is none
+            told = json.loads(CliRunner().invoke(app, [*line, "--json"]).stdout)
+            assert told["no_scene_asked_for"] is none
+
+
+def test_force_makes_what_is_fresh(archive: Archive) -> None:
+    before = archive.contents("out/products")
+    selection = Selection(stations=("coast",), instruments=("poor",))
+    record = reprocess(archive.write(), selection=selection, options=Options(force=True))
+    assert made(record) == _poor(range(1, 5))
+    assert archive.contents("out/products") == before
+
+
+def test_refused_files_are_told_by_a_run_with_nothing_to_do(archive: Archive) -> None:
+    (archive.folder / "raw/rich/h-broken").write_bytes(b"broken")
+    archive.raw("poor/h-twin", 600, seed=1)
+    first = bring_up_to_date(archive.write())
+    assert first.troubled
+    before = archive.contents()
+    again = bring_up_to_date(archive.write())
+    assert again.record is None
+    assert again.troubled
+    assert (again.summary.refused, list(again.set_aside)) == (1, ["poor/h00"])
+    assert archive.contents() == before
+
+
+def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
+    archive: Archive,
+) -> None:
+    campaign = archive.write()
+    record = reprocess(campaign, options=Options(force=True))
+    assert record is not None
+    usable = {each.path: each.usable for scene in record.scenes for each in scene.products}
+    with Store(campaign.catalog_url, campaign.name) as store:
+        rows = {row["path"]: row for row in store.products()}
+        assert {path: row["usable"] for path, row in rows.items()} == usable
+        assert store.empty() == [scene.scene for scene in record.scenes if scene.empty]
+    poorest = next(path for path, row in rows.items() if row["kind"] == "elastic")
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        connection.execute("update product set usable = 0 where kind = 'elastic'")
+        connection.execute("update product set usable = 1 where path = ?", (poorest,))
+    scenes = {row["scene"] for path, row in rows.items() if row["kind"] == "elastic"}
+    again = bring_up_to_date(campaign)
+    assert again.record is None
+    assert set(again.empty) == scenes - {rows[poorest]["scene"]}
+    assert again.troubled
+
+
+def test_the_run_in_which_a_scene_comes_to_nothing_says_so(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nothing(job: Job) -> tuple[SceneOutcome, bool]:
+        outcome, final = quick.attempt(job)
+        return replace(
+            outcome, products=tuple(replace(each, usable=0) for each in outcome.products)
+        ), final
+
+    monkeypatch.setattr(executor, "attempt", nothing)
+    archive.write()
+    command = ["reprocess", str(archive.file), "--instrument", "rich", "--force"]
+    command += ["--until", "2026-03-02"]
+    shown = CliRunner().invoke(app, [*command, "--product", "homogeneous"])
+    assert (shown.exit_code, "left nothing to use" in shown.stdout) == (0, False)
+    shown = CliRunner().invoke(app, command)
+    assert shown.exit_code == 1
+    assert shown.stdout.count("left nothing to use") == 1
+    assert "earlier runs" not in shown.stdout
+    told = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
+    assert told["empty_scenes"] == ["rich_20260301T000000"]
+
+
+def test_products_that_nothing_asks_for_are_not_told_as_empty(archive: Archive) -> None:
+    archive.write()
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        connection.execute("update product set usable = 0 where kind = 'elastic'")
+    assert bring_up_to_date(archive.write()).empty
+    del archive.told["instruments"]["rich"]["products"]["elastic"]
+    for _ in range(2):
+        result = bring_up_to_date(archive.write())
+        assert result.orphans
+        assert not result.empty
+        assert not result.troubled
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_wait_for_a_cluster_at_once(archive: Archive, number: int) -> None:
+    ended = []
+
+    @contextmanager
+    def cluster() -> Iterator[Any]:
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(60.0)
+            yield None
+        finally:
+            ended.append(True)
+
+    before = archive.contents("out/products")
+    next((archive.folder / "out/products").rglob("*poor*signal*.nc")).unlink()
+    began = time.monotonic()
+    result = bring_up_to_date(archive.write(), options=Options(cluster=cluster))
+    assert time.monotonic() - began < 30.0
+    assert ended == [True]
+    assert (result.signal, result.status) == (number, RunStatus.INTERRUPTED)
+    assert result.troubled
+    assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        assert lock.holder() is None
+        assert (store.runs()[0].status, store.runs()[0].scenes) == (RunStatus.INTERRUPTED, 0)
+        assert store.failures() == {}
+    assert len(made(reprocess(campaign))) == 1
+    assert archive.contents("out/products") == before
+
+
+def test_a_cluster_is_started_only_where_something_is_stale(archive: Archive) -> None:
+    started = []
+
+    @contextmanager
+    def cluster() -> Iterator[Any]:
+        started.append(True)
+        yield client
+
+    with executor.local_client(1) as client:
+        options = Options(cluster=cluster)
+        assert reprocess(archive.write(), options=options) is None
+        assert not started
+        next((archive.folder / "out/products").rglob("*poor*signal*.nc")).unlink()
+        assert len(made(reprocess(archive.write(), options=options))) == 1
+        assert started == [True]
+
+
+def test_a_scene_that_cannot_but_fail_is_not_tried_until_something_changes(
+    archive: Archive,
+) -> None:
+    (archive.folder / "air.csv").write_text("altitude,pressure\n0,1013\n")
+    first = bring_up_to_date(archive.write())
+    assert sum(bool(scene.error) for scene in first.record.scenes) == 2
+    before = archive.contents()
+    again = bring_up_to_date(archive.write())
+    assert again.record is None
+    assert len(again.failures) == 2
+    assert "air.csv" in next(iter(again.failures.values()))
+    assert again.troubled
+    assert archive.contents() == before
+    from support.small_archive import SOUNDING
+
+    (archive.folder / "air.csv").write_text(SOUNDING)
+    healed = bring_up_to_date(archive.write())
+    assert not healed.troubled
+    assert healed.status is RunStatus.FINISHED
+
+
+def test_replaced_versions_are_kept_where_the_campaign_says_so(archive: Archive) -> None:
+    archive.told["superseded"] = "keep"
+    assert reprocess(archive.write()) is None
+    before = archive.contents("out/products")
+    _lidar_ratio(archive)
+    campaign = archive.write()
+    reprocess(campaign)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        old = store.superseded()
+    assert {version.path: version.sha256 for version in old} == {
+        path: sha256 for path, sha256 in before.items() if "elastic" in path
+    }
+    kept = archive.contents("out/superseded")
+    assert sorted(kept.values()) == sorted(version.sha256 for version in old)
+    # Forced, to the same bytes: nothing is replaced, so nothing more is kept.
+    reprocess(campaign, options=Options(force=True))
+    assert archive.contents("out/superseded") == kept
+
+
+def test_a_day_of_more_is_a_day_of_work(archive: Archive) -> None:
+    for k in range(3):
+        archive.raw(f"rich/h9{k}", 9 * DAY + k, seed=k)
+    assert made(reprocess(archive.write())) == _all(range(10, 11))
+
+
+def _judged_anew(archive: Archive) -> dict[int, tuple[str, int, int]]:
+    """Signature, barren scenes and granules set aside of the days on which all is fresh."""
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        judge = Judge(campaign, store)
+        signatures = judge.signatures()
+        found = [judge.days(batch) for batch in judge.batches(signatures)]
+    return {
+        day: (signatures[day].whole, *told)
+        for each in found
+        for day, told in each.told.items()
+        if day not in each.open
+    }
+
+
+def _verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
+    """What the ledger holds of the days that look as they did then."""
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        now = Judge(campaign, store).signatures()
+        known = store.verdicts()
+    return {day: told for day, told in known.items() if day in now and told[0] == now[day].whole}
+
+
+def _unreadable_later(archive: Archive) -> None:
+    """Add a file whose header is good, and what follows it is not there."""
+    path = archive.raw("rich/h19", 2 * DAY + 620, seed=7)
+    header = path.read_bytes()
+    path.write_bytes(header[:400] + bytes(len(header) - 400))
+
+
+def _failing(archive: Archive) -> None:
+    (archive.folder / "air.csv").write_text("altitude,pressure\n0,1013\n")
+
+
+def _twin(archive: Archive) -> None:
+    archive.raw("poor/h-twin", 600, seed=1)
+
+
+def _vanished(archive: Archive) -> None:
+    for path in (archive.folder / "raw/poor").glob("h1*"):
+        path.unlink()
+
+
+def _nothing_asked(archive: Archive) -> None:
+    archive.told["instruments"]["poor"]["products"] = {}
+    _title(archive)
+
+
+def _dark(archive: Archive) -> None:
+    archive.flip("raw/rich/d0")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [_title, _sections, _lidar_ratio, _dark, _twin, _vanished, _failing, _unreadable_later,
+     _nothing_asked],
+)  # fmt: skip
+def test_days_are_settled_as_another_look_would_settle_them(
+    archive: Archive, change: Callable[[Archive], object]
+) -> None:
+    assert _verdicts(archive)
+    change(archive)
+    reprocess(archive.write())
+    assert _verdicts(archive) == _judged_anew(archive)
+    reprocess(archive.write(), options=Options(force=True))
+    assert _verdicts(archive) == _judged_anew(archive)
+
+
+def test_only_days_on_which_something_failed_are_looked_at_again(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[int] = []
+    days = Judge.days
+
+    def counting(judge: Judge, wanted: Sequence[int]) -> DaysJudged:
+        looked.extend(wanted)
+        return days(judge, wanted)
+
+    monkeypatch.setattr(Judge, "days", counting)
+    _title(archive)
+    reprocess(archive.write())
+    every = sorted(_verdicts(archive))
+    assert looked == every
+    looked.clear()
+    _failing(archive)
+    record = reprocess(archive.write())
+    failed = {day_of(scene.start) for scene in record.scenes if scene.error}
+    assert len(failed) == 2
+    assert looked == [*every, *sorted(failed)]
+
+
+def _elsewhere(archive: Archive) -> None:
+    """Another sounding."""
+    from support.small_archive import SOUNDING
+
+    (archive.folder / "air.csv").write_text(SOUNDING.replace("288.15", "287.15"))
+
+
+def _without_dark(archive: Archive) -> None:
+    (archive.folder / "raw/rich/d0").unlink()
+
+
+def _joined(archive: Archive) -> None:
+    """A file that another process enters in the catalog."""
+    campaign = archive.write()
+    archive.raw("rich/h08", 620, seed=44)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan(campaign, store)
+
+
+@pytest.mark.parametrize("change", [_elsewhere, _without_dark, _joined])
+def test_what_changes_behind_a_scene_leaves_its_day_to_be_looked_at(
+    archive: Archive, change: Callable[[Archive], None]
+) -> None:
+    _title(archive)
+
+    def once(outcome: SceneOutcome) -> None:
+        if outcome.instrument == "rich" and not changed:
+            changed.append(outcome.start.day)
+            change(archive)
+
+    changed: list[int] = []
+    reprocess(archive.write(), options=Options(progress=once))
+    assert changed == [1]
+    assert _verdicts(archive).items() <= _judged_anew(archive).items()
+    assert f"rich {changed[0]} elastic analog" in made(reprocess(archive.write()))

@@ -1,0 +1,505 @@
+"""What a run tells, forgets and removes of files and scenes that are gone or were never used."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import sqlite3
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import NoReturn
+
+import pytest
+from support.small_archive import DAY, Archive
+from typer.testing import CliRunner
+
+from lidarops.catalog.ledger import Run, RunStatus
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import Store
+from lidarops.cli import app
+from lidarops.errors import CatalogError
+from lidarops.plan.product_dependence import part, wanted
+from lidarops.records import ProductKind
+from lidarops.reports import gallery, run_record
+from lidarops.run import archive as pipeline
+from lidarops.run import session
+from lidarops.run.archive import (
+    Options,
+    Selection,
+    bring_up_to_date,
+    remove_orphans,
+    report_run,
+    reprocess,
+)
+
+FIRST = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+
+# Told ----------------------------------------------------------------------------------------
+
+
+def _told(archive: Archive) -> dict[str, object]:
+    """What the command tells programs; one that exits with 1 gives a reason."""
+    result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
+    told = json.loads(result.stdout)
+    reasons = ("failed_scenes", "empty_scenes", "refused_files", "files_set_aside", "barren_scenes")
+    nowhere = any(each["nowhere"] for each in told["not_in_files"])
+    assert result.exit_code == int(nowhere or any(told[name] for name in reasons))
+    return dict(told)
+
+
+def test_a_file_that_is_used_in_no_scene_is_named_by_every_run(archive: Archive) -> None:
+    archive.raw("poor/h-twin", 600, seed=1)
+    archive.write()
+    for _ in range(3):
+        told = _told(archive)["files_set_aside"]
+        assert list(told) == ["poor/h00"]
+        assert "poor/h-twin" in told["poor/h00"]
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file)])
+    assert "poor/h-twin" in shown.stdout
+    assert shown.exit_code == 1
+
+
+def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -> None:
+    archive.told["instruments"]["poor"]["products"] = {
+        "homogeneous": {"channels": ["photon_355o"], "sections": [[750, 840]]}
+    }
+    archive.write()
+    for _ in range(2):
+        told = _told(archive)["barren_scenes"]
+        assert len(told) == 4
+        assert all("photon_355o" in why for why in told.values())
+
+
+def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None:
+    """Of a kind that gives nothing no product can tell, and the plans of the others do not."""
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 1500]]
+    archive.told["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+    record = reprocess(archive.write())
+    assert record is not None
+    assert {scene.instrument for scene in record.scenes} == {"rich"}
+    for scene in record.scenes:
+        assert scene.plan is not None
+        assert scene.plan.hash == part(scene.plan, wanted(scene.plan)).hash
+        told = [left.reason for left in scene.left_out if left.rule == "section_level"]
+        assert len(told) == 1
+        assert "climbs by 750 m" in told[0]
+        every = (*scene.plan.left_out, *scene.left_out)
+        assert len(set(every)) == len(every)
+    # One for all, as there may be many scenes.
+    assert len({id(scene.left_out) for scene in record.scenes}) < len(record.scenes)
+    page = report_run(archive.write(), record).page
+    assert "climbs by 750 m" in page.read_text()
+    assert "climbs by 750 m" in (page.parent / "run.json").read_text()
+
+
+def test_a_report_names_scenes_that_can_give_nothing(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "MOST_BARREN", 3)
+    archive.told["instruments"]["poor"]["products"] = {
+        "homogeneous": {"channels": ["photon_532o"], "sections": [[50_000, 60_000]]}
+    }
+    record = reprocess(archive.write(), options=Options(force=True))
+    assert record is not None
+    assert list(record.barren) == [f"poor_2026030{day}T000000" for day in (1, 2, 3)]
+    assert record.more_barren == 1
+    assert record.failed
+    page = report_run(archive.write(), record).page.read_text()
+    assert "section 50000-60000 m does not lie inside the bins" in page
+    assert "poor_20260303T000000" in page
+    assert "1 more can give none" in page
+    assert "4 scenes can give no product" in page
+
+
+def _misspelt_product(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["products"]["homogeneous"]["channels"].append("photon_999o")
+
+
+def _misspelt_facts(archive: Archive) -> None:
+    facts = archive.told["instruments"]["rich"]["facts"][1]
+    facts["channels"] = {"photon_533o": facts["channels"]["photon_532o"]}
+
+
+@pytest.mark.parametrize(
+    ("misspell", "channel", "asked"),
+    [
+        (_misspelt_product, "photon_999o", "homogeneous"),
+        (_misspelt_facts, "photon_533o", "facts from 2026-03-03T00:00:00Z"),
+    ],
+)
+def test_a_channel_that_no_file_holds_is_named_by_every_run(
+    archive: Archive, misspell: Callable[[Archive], None], channel: str, asked: str
+) -> None:
+    assert _told(archive)["not_in_files"] == []
+    misspell(archive)
+    found = bring_up_to_date(archive.write(), options=Options(force=True))
+    assert found.record is not None
+    assert found.record.failed
+    page = report_run(archive.write(), found.record).page.read_text()
+    assert page.count(channel) >= 2
+    assert "Asked for, and not in the files" in page
+    for _ in range(2):
+        (told,) = _told(archive)["not_in_files"]
+        assert (told["channel"], told["asked"], told["nowhere"]) == (channel, asked, True)
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file)], env={"COLUMNS": "200"})
+    assert channel in shown.stdout
+    assert shown.exit_code == 1
+    # Asked for another lidar alone, or for a time that these facts do not reach.
+    other = CliRunner().invoke(app, ["reprocess", str(archive.file), "--instrument", "poor"])
+    assert other.exit_code == 0
+    early = ["reprocess", str(archive.file), "--until", "2026-03-02"]
+    assert CliRunner().invoke(app, early).exit_code == int(asked == "homogeneous")
+
+
+def test_a_channel_that_came_with_a_new_laser_is_told_and_no_trouble(archive: Archive) -> None:
+    for path in (archive.folder / "raw/rich").glob("h3*"):
+        path.write_bytes(path.read_bytes().replace(b"00532.o", b"00533.o"))
+    archive.told["instruments"]["rich"]["facts"][1]["channels"]["photon_533o"] = {"dead_time": 3e-9}
+    archive.write()
+    told = _told(archive)
+    assert any("photon_533o" in path for path in told["products"])
+    files = {(each["channel"], each["asked"][:5]): each for each in told["not_in_files"]}
+    assert files["photon_533o", "facts"]["files"] == 3
+    assert files["photon_533o", "facts"]["of"] == 6
+    assert files["photon_532o", "homog"]["files"] == 3
+    assert files["photon_532o", "homog"]["of"] == 12
+    assert not any(each["nowhere"] for each in files.values())
+
+
+def test_of_very_many_days_some_are_told_and_the_rest_counted(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for day in range(4):
+        archive.raw(f"poor/h-twin{day}", day * DAY + 600, seed=1)
+    campaign = archive.write()
+    assert len(bring_up_to_date(campaign).set_aside) == 4
+    monkeypatch.setattr(pipeline, "AGAIN", 3)
+    again = bring_up_to_date(campaign)
+    assert (len(again.set_aside), again.untold, again.troubled) == (3, 1, True)
+
+
+# Forgotten -----------------------------------------------------------------------------------
+
+
+def _fail(archive: Archive, scenes: str, *, unmade: bool = False) -> None:
+    """Let scenes have failed for good."""
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        connection.execute(
+            "update scene set error = 'bad', final = 1 where scene like ?", (scenes,)
+        )
+        if unmade:
+            connection.execute(
+                "delete from product_input where product in"
+                " (select path from product where scene like ?)",
+                (scenes,),
+            )
+            connection.execute("delete from product where scene like ?", (scenes,))
+
+
+def test_failures_are_forgotten_on_days_with_others_between(archive: Archive) -> None:
+    _fail(archive, "poor_%")
+    for day in (0, 2):
+        for path in (archive.folder / "raw/poor").glob(f"h{day}*"):
+            path.unlink()
+    campaign = archive.write()
+    assert set(bring_up_to_date(campaign).failures) == {
+        "poor_20260302T000000",
+        "poor_20260304T000000",
+    }
+
+
+def test_failures_are_forgotten_with_the_last_trace_of_their_day(archive: Archive) -> None:
+    archive.told["instruments"]["rich"]["dark_files"] = "none/d*"
+    reprocess(archive.write())
+    _fail(archive, "%_20260304T%", unmade=True)
+    assert len(bring_up_to_date(archive.write()).failures) == 2
+    for path in (archive.folder / "raw").glob("*/h3*"):
+        path.unlink()
+    for _ in range(2):
+        found = bring_up_to_date(archive.write())
+        assert not found.failures
+        assert not found.troubled
+
+
+# Removed -------------------------------------------------------------------------------------
+
+
+def _without(archive: Archive, instrument: str) -> None:
+    for path in (archive.folder / "raw" / instrument).glob("h*"):
+        path.unlink()
+
+
+def test_what_is_not_asked_for_is_not_orphaned(archive: Archive) -> None:
+    _without(archive, "rich")
+    _without(archive, "poor")
+    archive.raw("other", 0, seed=1)
+    campaign = archive.write()
+    day = FIRST.replace(day=2)
+    parts = [
+        (Selection(instruments=("poor",)), 8),
+        (Selection(stations=("coast",)), 24),
+        (Selection(kinds=(ProductKind.ELASTIC,)), 4),
+        (Selection(since=day, until=day.replace(day=4)), 12),
+        (Selection(until=day), 6),
+    ]
+    for selection, number in parts:
+        assert len(bring_up_to_date(campaign, selection=selection).orphans) == number
+
+
+def _leave_over(archive: Archive) -> None:
+    """Leave products over, of scenes that are there and of those that are gone."""
+    del archive.told["instruments"]["rich"]["products"]["homogeneous"]
+    _without(archive, "poor")
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "number"),
+    [
+        (FIRST.replace(hour=12), None, 8 + 4),
+        (FIRST.replace(hour=12), FIRST.replace(hour=13), 2 + 1),
+        (FIRST.replace(day=2), FIRST.replace(day=2, hour=1), 2 + 1),
+        (FIRST.replace(day=4, hour=23), None, 2 + 1),
+        (FIRST.replace(day=5), None, 0),
+    ],
+)
+def test_what_is_left_over_is_told_of_the_scenes_that_are_asked_for(
+    archive: Archive, since: datetime, until: datetime | None, number: int
+) -> None:
+    _leave_over(archive)
+    campaign = archive.write()
+    found = bring_up_to_date(campaign, selection=Selection(since=since, until=until))
+    assert len(found.orphans) == number
+
+
+def test_a_product_that_another_run_made_again_is_not_removed(archive: Archive) -> None:
+    kept = {path: path.read_bytes() for path in (archive.folder / "raw/poor").glob("h1*")}
+    for path in kept:
+        path.unlink()
+    campaign = archive.write()
+    before = archive.contents("out/products")
+    found = bring_up_to_date(campaign)
+    assert len(found.orphans) == 2
+    for path, content in kept.items():
+        path.write_bytes(content)
+    assert reprocess(campaign, options=Options(force=True))
+    assert remove_orphans(campaign, found) == 0
+    assert archive.contents("out/products") == before
+    assert reprocess(campaign) is None
+
+
+def _vanish(archive: Archive, instrument: str, day: int) -> None:
+    for path in (archive.folder / "raw" / instrument).glob(f"h{day}*"):
+        path.unlink()
+
+
+def _empty(archive: Archive) -> None:
+    _without(archive, "rich")
+    _without(archive, "poor")
+    (archive.folder / "raw/rich/d0").unlink()
+
+
+@pytest.mark.parametrize("command", ["catalog", "plan", "reprocess"])
+def test_an_archive_that_holds_nothing_any_more_fails_and_is_not_forgotten(
+    archive: Archive, command: str
+) -> None:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        known = store.granules()
+    _empty(archive)
+    before = archive.contents("out/products")
+    options = ["--remove-orphans"] if command == "reprocess" else []
+    result = CliRunner().invoke(app, [command, str(archive.file), *options])
+    assert result.exit_code == 1
+    for words in ("nothing is forgotten", "mounted", "on purpose", campaign.catalog_url):
+        assert words in result.stderr
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert store.granules() == known
+    assert archive.contents("out/products") == before
+    # As the message says.
+    other = ["--catalog", f"sqlite:///{archive.folder}/other.sqlite"]
+    assert CliRunner().invoke(app, [command, str(archive.file), *other]).exit_code == 0
+
+
+def test_products_without_a_raw_file_are_a_trouble_until_they_are_removed(
+    archive: Archive,
+) -> None:
+    _without(archive, "poor")
+    campaign = archive.write()
+    for _ in range(2):
+        found = bring_up_to_date(campaign)
+        assert found.troubled
+        assert set(found.lost) == {each.path for each in found.orphans}
+        assert len(found.lost) == 8
+    command = ["reprocess", str(archive.file)]
+    # Also where the scenes that are asked for are all gone.
+    for options in ([], ["--instrument", "poor"]):
+        shown = CliRunner().invoke(app, [*command, *options])
+        assert shown.exit_code == 1
+        assert "--remove-orphans" in shown.stdout
+        assert "no raw file" in shown.stdout
+    assert CliRunner().invoke(app, [*command, "--instrument", "rich"]).exit_code == 0
+    assert CliRunner().invoke(app, [*command, "--remove-orphans"]).exit_code == 0
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert not bring_up_to_date(campaign).orphans
+
+
+@pytest.mark.parametrize("how", ["truncated", "unreadable"])
+def test_products_whose_files_cannot_be_used_any_more_are_kept(archive: Archive, how: str) -> None:
+    campaign = archive.write()
+    before = archive.contents("out/products")
+    for path in (archive.folder / "raw/poor").glob("h2*"):
+        if how == "truncated":
+            path.write_bytes(path.read_bytes()[:-100])
+        else:
+            path.unlink()
+            path.symlink_to("nowhere")
+    for _ in range(2):
+        found = bring_up_to_date(campaign)
+        (orphan,) = {(each.reason, each.asked, each.lost) for each in found.orphans}
+        assert orphan == ("its raw files are refused, or stand in no scene", True, False)
+        assert len(found.orphans) == 2
+        assert found.troubled
+        assert not found.lost
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
+    assert shown.exit_code == 1
+    assert archive.contents("out/products") == before
+
+
+def test_products_of_scenes_that_are_cut_in_another_way_are_not_told_as_lost(
+    archive: Archive,
+) -> None:
+    archive.told["scenes"] = {"window": "6h"}
+    found = bring_up_to_date(archive.write())
+    assert {each.reason for each in found.orphans} == {"its files are cut into other scenes now"}
+    assert len(found.orphans) == 24
+    assert not found.troubled
+
+
+def test_nothing_is_removed_for_an_archive_that_is_not_there(archive: Archive) -> None:
+    _empty(archive)
+    with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
+        # As a catalog was left by what forgot the files of such an archive.
+        connection.execute("delete from granule")
+    campaign = archive.write()
+    found = bring_up_to_date(campaign)
+    before = archive.contents("out/products")
+    assert len(found.orphans) == len(before) == 24
+    with pytest.raises(CatalogError, match="no raw file"):
+        remove_orphans(campaign, found)
+    assert archive.contents("out/products") == before
+
+
+# The page ------------------------------------------------------------------------------------
+
+
+def _full(*_: object, **__: object) -> NoReturn:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _stopped(*_: object, **__: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("fails", "code"), [(_full, 1), (_stopped, 130)])
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_page_that_cannot_be_built_hides_nothing_and_is_asked_for_by_the_next_run(
+    archive: Archive,
+    monkeypatch: pytest.MonkeyPatch,
+    fails: Callable[..., NoReturn],
+    code: int,
+    *,
+    as_json: bool,
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    _vanish(archive, "poor", 1)
+    archive.write()
+    command = ["reprocess", str(archive.file), *(["--json"] if as_json else [])]
+    with monkeypatch.context() as patch:
+        patch.setattr(gallery, "fill", fails)
+        failed = CliRunner().invoke(app, command)
+    assert failed.exit_code == code
+    (folder,) = (archive.folder / "out/report").glob("*")
+    if fails is _full:
+        assert f"lidarops report {folder}" in failed.stderr
+    if as_json:
+        told = json.loads(failed.stdout)
+        assert (told["report"], len(told["products"]), len(told["orphans"])) == (None, 2, 2)
+    else:
+        assert "poor_20260301T000000" in failed.stdout
+        assert "poor_20260302T000000" in failed.stdout
+        assert "report:" not in failed.stdout
+    shown = CliRunner().invoke(app, command)
+    if as_json:
+        assert json.loads(shown.stdout)["unreported"].endswith(f": lidarops report {folder}")
+    else:
+        assert f"lidarops report {folder}" in shown.stdout
+    assert CliRunner().invoke(app, ["report", str(folder)]).exit_code == 0
+    shown = CliRunner().invoke(app, command)
+    assert str(folder) not in shown.stdout
+
+
+def test_a_run_whose_record_could_not_be_kept_says_how_to_get_another(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    archive.write()
+    command = ["reprocess", str(archive.file)]
+    with monkeypatch.context() as patch:
+        patch.setattr(run_record, "write_atomically", _full)
+        failed = CliRunner().invoke(app, command)
+    assert failed.exit_code == 1
+    assert "poor_20260301T000000" in failed.stdout
+    assert "--force" in failed.stderr
+    assert "--force" in CliRunner().invoke(app, command).stdout
+    assert CliRunner().invoke(app, [*command, "--force"]).exit_code == 0
+    shown = CliRunner().invoke(app, command)
+    assert (shown.exit_code, "--force" in shown.stdout) == (0, False)
+
+
+def test_what_cannot_be_removed_does_not_hide_what_was_made(archive: Archive) -> None:
+    archive.raw("poor/h09", 630, seed=9)
+    _vanish(archive, "poor", 1)
+    archive.write()
+
+    def held(*_: object, **__: object) -> NoReturn:
+        raise CatalogError("is held")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "remove_orphans", held)
+        failed = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
+    assert failed.exit_code == 1
+    assert "is held" in failed.stderr
+    assert "poor_20260301T000000" in failed.stdout
+    (page,) = (archive.folder / "out/report").glob("*/index.html")
+    assert "report:" in failed.stdout
+    assert page.exists()
+
+
+# Runs and scans ------------------------------------------------------------------------------
+
+
+def test_a_run_whose_process_is_gone_is_told_as_died(archive: Archive) -> None:
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store:
+        with Lock(store) as lock:
+            lock.acquire()
+            begun = Run("x", FIRST.replace(year=2030), None, RunStatus.RUNNING, "me", "0", "0")
+            store.begin_run(begun, lock.token)
+            assert store.runs()[0].status is RunStatus.RUNNING
+        assert [run.status for run in store.runs()] == [RunStatus.DIED, RunStatus.FINISHED]
+
+
+def test_a_file_that_was_there_before_is_not_told_as_moved(archive: Archive) -> None:
+    content = (archive.folder / "raw/poor/h00").read_bytes()
+    (archive.folder / "raw/poor/h-copy").write_bytes(content)
+    campaign = archive.write()
+    assert pipeline.update_catalog(campaign).added == 1
+    (archive.folder / "raw/poor/h00").unlink()
+    archive.raw("poor/h-new", 900, seed=77)
+    summary = pipeline.update_catalog(campaign)
+    assert (summary.added, summary.moved, summary.vanished) == (1, 0, 1)

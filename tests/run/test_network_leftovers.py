@@ -1,0 +1,226 @@
+"""What is told of lidars that serve a network alone, and kept of one that has lost some of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from support import raw_archives
+from typer.testing import CliRunner
+
+from lidarops.campaign.model import Campaign, load
+from lidarops.cli import app
+from lidarops.run.archive import bring_up_to_date, remove_orphans, reprocess
+
+PLACES = {
+    "west": (47.25, 11.3, 70.0),
+    "east": (47.25, 11.353, 310.0),
+    "north": (47.2811, 11.3265, 190.0),
+}
+GONE = "the campaign does not ask for it any more"
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+
+def _tree() -> dict[str, Any]:
+    return {
+        "name": "net",
+        "title": "Net",
+        "archive": "raw",
+        "output": "out",
+        "stations": {
+            name: {"name": name, "latitude": place[0], "longitude": place[1], "altitude": 600}
+            for name, place in PLACES.items()
+        },
+        "instruments": {
+            f"{name}-lidar": {
+                "station": name,
+                "files": f"{name}/h*",
+                "facts": [{"full_overlap_range": 150, "zenith_angle": 90, "azimuth": azimuth}],
+            }
+            for name, (_, _, azimuth) in PLACES.items()
+        },
+        "networks": {
+            "valley": {
+                "instruments": [f"{name}-lidar" for name in PLACES],
+                "visibility": {"channel": "photon_532o"},
+            }
+        },
+    }
+
+
+class Net:
+    """Three lidars whose level beams meet, and that are asked for nothing themselves."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.file = folder / "net.yaml"
+        self.told = _tree()
+        for seed, name in enumerate(PLACES):
+            self.raw(f"{name}/h0", seed)
+
+    def raw(self, name: str, seed: int) -> None:
+        raw_archives.write(
+            self.folder / "raw" / name, raw_archives.content(600, bins=2000, seed=seed)
+        )
+
+    def write(self) -> Campaign:
+        self.file.write_text(yaml.safe_dump(self.told))
+        return load(self.file)
+
+    def lose(self, *stations: str) -> None:
+        """Take away files, as where a disk is not mounted."""
+        for name in stations:
+            (self.folder / "raw" / name).rename(self.folder / name)
+
+    def find(self, *stations: str) -> None:
+        for name in stations:
+            (self.folder / name).rename(self.folder / "raw" / name)
+
+    @property
+    def products(self) -> list[str]:
+        return [str(path) for path in (self.folder / "out/products").rglob("*.nc")]
+
+    def command(self, *options: str) -> tuple[int, dict[str, Any]]:
+        result = CliRunner().invoke(app, ["reprocess", str(self.file), "--json", *options])
+        return result.exit_code, json.loads(result.stdout)
+
+
+@pytest.fixture
+def net(tmp_path: Path) -> Net:
+    made = Net(tmp_path)
+    made.write()
+    return made
+
+
+# Barren --------------------------------------------------------------------------------------
+
+
+def test_lidars_that_serve_a_network_alone_are_no_trouble(net: Net) -> None:
+    for made in (1, 0):
+        result = bring_up_to_date(net.write())
+        assert (result.record is not None) == bool(made)
+        assert not result.barren
+        assert not result.troubled
+    code, told = net.command()
+    assert (code, told["barren_scenes"]) == (0, {})
+    shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"]).stdout
+    assert "used by network valley" in shown
+
+
+def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
+    net.told["instruments"]["west-lidar"]["products"] = {"signal": {}}
+    net.write()
+    for kind, some in (("visibility", True), ("signal", False)):
+        line = ["plan", str(net.file), "--json", "--product", kind, "--instrument", "valley"]
+        (scene,) = json.loads(CliRunner().invoke(app, line).stdout)["scenes"]
+        assert bool(scene["steps"]) is some
+        assert (scene["estimated_cpu_seconds"]["everything"] > 0) is some
+        assert (len(scene["stale"]), scene["fresh"]) == (int(some), 0)
+
+
+def test_a_lidar_without_its_network_is_told(net: Net) -> None:
+    net.lose("east", "north")
+    barren = bring_up_to_date(net.write()).barren
+    assert list(barren) == ["west-lidar_20260301T000000"]
+    assert "no other instrument has files" in barren["west-lidar_20260301T000000"]
+
+
+def test_a_network_that_can_give_nothing_is_told_once(net: Net) -> None:
+    net.lose("east")
+    assert list(bring_up_to_date(net.write()).barren) == ["valley_20260301T000000"]
+
+
+@pytest.mark.parametrize("why", ["asked", "alone"])
+def test_a_lidar_that_can_give_nothing_is_told_beside_a_network(net: Net, why: str) -> None:
+    lidar = net.told["instruments"]["west-lidar"]
+    if why == "asked":
+        lidar["products"] = {"signal": {"channels": ["photon_355o"]}}
+    else:
+        net.told["instruments"]["other"] = {**lidar, "files": "other/h*"}
+        net.raw("other/h0", 9)
+    (name,) = bring_up_to_date(net.write()).barren
+    assert name == ("west-lidar" if why == "asked" else "other") + "_20260301T000000"
+
+
+# Orphans -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("lost", "said"),
+    [
+        (["east"], "east-lidar: no granule in the window"),
+        (["east", "north"], "no raw file of east-lidar and north-lidar is left"),
+    ],
+)
+def test_a_product_whose_network_lost_members_is_kept(net: Net, lost: list[str], said: str) -> None:
+    assert reprocess(net.write())
+    (path,) = net.products
+    net.lose(*lost)
+    code, told = net.command("--remove-orphans")
+    (reason,) = told["kept_products"].values()
+    assert said in reason
+    assert (code, told["orphans"], told["removed"], net.products) == (1, {}, 0, [path])
+    assert "could not be made again" in CliRunner().invoke(app, ["reprocess", str(net.file)]).stdout
+    net.find(*lost)
+    again = bring_up_to_date(net.write())
+    assert (again.record, again.orphans, again.troubled) == (None, (), False)
+
+
+def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:
+    net.told["instruments"]["other"] = {
+        **net.told["instruments"]["west-lidar"], "files": "other/h*", "products": {"signal": {}},
+    }  # fmt: skip
+    net.raw("other/h0", 9)
+    assert reprocess(net.write())
+    net.lose(*PLACES)
+    _, told = net.command("--remove-orphans")
+    assert list(told["orphans"].values()) == ["no raw file of its scene is left"]
+    assert (told["kept_products"], told["removed"]) == ({}, 1)
+    assert len(net.products) == 2
+
+
+def _no_longer_meeting(net: Net) -> None:
+    net.told["networks"]["valley"]["visibility"]["smallest_angle"] = 85
+
+
+def _another_channel(net: Net) -> None:
+    net.told["networks"]["valley"]["visibility"]["channel"] = "analog_532o"
+
+
+def _no_network(net: Net) -> None:
+    del net.told["networks"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_no_longer_meeting, "no beam meets others"),
+        (_another_channel, GONE),
+        (_no_network, GONE),
+    ],
+)
+def test_a_product_that_the_campaign_made_impossible_is_removed(
+    net: Net, change: Any, said: str
+) -> None:
+    assert reprocess(net.write())
+    (path,) = net.products
+    change(net)
+    net.write()
+    _, told = net.command("--remove-orphans")
+    (reason,) = told["orphans"].values()
+    assert said in reason
+    assert (told["kept_products"], told["removed"]) == ({}, 1)
+    assert path not in net.products
+
+
+def test_a_kept_product_that_is_removed_by_hand_is_forgotten(net: Net) -> None:
+    assert reprocess(net.write())
+    net.lose("east")
+    found = bring_up_to_date(net.write())
+    Path(net.products[0]).unlink()
+    assert remove_orphans(net.write(), found) == 0
+    assert not bring_up_to_date(net.write()).orphans

@@ -1,0 +1,292 @@
+"""Work that is spread over processes comes to the same, in the same order, whatever dies."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from itertools import count, islice
+from pathlib import Path
+
+import pytest
+
+from lidarops.errors import CatalogError
+from lidarops.system import processes
+from lidarops.system.processes import Processes, one_ahead
+
+
+def product(kept: int, item: int) -> int:
+    return kept * item
+
+
+def process(kept: int, item: int) -> int:
+    return os.getpid()
+
+
+def deadly(kept: int, item: int) -> int:
+    """Take down any process but the first."""
+    if multiprocessing.parent_process() is not None and item == 5:
+        os._exit(9)
+    return kept * item
+
+
+def failing(kept: int, item: int) -> int:
+    if item == 5:
+        raise CatalogError("is away", file="archive", remedy="wait")
+    return item
+
+
+def doubled(items: range) -> list[tuple[int, int]]:
+    return [(item, 2 * item) for item in items]
+
+
+@pytest.fixture
+def no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a process is started")
+
+    monkeypatch.setattr(processes, "ProcessPoolExecutor", refuse)
+
+
+class TestEach:
+    @pytest.mark.parametrize("number", [1, 2])
+    def test_keeps_the_order(self, number: int) -> None:
+        with Processes(number, 2) as pool:
+            assert list(pool.each(product, range(40), at_a_time=3)) == doubled(range(40))
+            others = {found for _, found in pool.each(process, range(40), at_a_time=3)}
+            assert list(pool.each(product, [], at_a_time=3)) == []
+        assert (os.getpid() not in others) == (number > 1)
+
+    def test_takes_items_as_they_are_needed(self) -> None:
+        taken = count()
+        with Processes(2, 2) as pool:
+            found = pool.each(product, taken, at_a_time=1)
+            assert list(islice(found, 30)) == doubled(range(30))
+        assert next(taken) < 100
+
+    @pytest.mark.usefixtures("no_process")
+    def test_starts_no_process_for_few_items(self) -> None:
+        with Processes(2, 2) as pool:
+            found = pool.each(product, range(9), at_a_time=3, fewest=10)
+            assert list(found) == doubled(range(9))
+
+    @pytest.mark.usefixtures("no_process")
+    def test_a_daemon_that_may_start_no_process_does_it_itself(self, monkeypatch) -> None:
+        monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
+        with Processes(2, 2) as pool:
+            assert list(pool.each(product, range(9), at_a_time=3)) == doubled(range(9))
+            assert pool.later(product, 7)() == 14
+
+    def test_loses_nothing_with_a_process(self, caplog: pytest.LogCaptureFixture) -> None:
+        with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
+            last = pool.later(product, 7)
+            assert list(pool.each(deadly, range(40), at_a_time=2)) == doubled(range(40))
+            assert last() == 14
+            assert {found for _, found in pool.each(process, range(4), at_a_time=1)} == {
+                os.getpid()
+            }
+        assert caplog.text.count("a process was lost") == 1
+
+    def test_leaves_none_behind_where_one_is_lost(self, monkeypatch) -> None:
+        before = Future.set_exception
+
+        def slowly(future: Future, error: BaseException) -> None:
+            before(future, error)
+            # What waited for it goes on meanwhile.
+            time.sleep(0.02)
+
+        monkeypatch.setattr(Future, "set_exception", slowly)
+        others = multiprocessing.active_children()
+        with Processes(2, 2) as pool:
+            assert list(pool.each(deadly, range(40), at_a_time=2)) == doubled(range(40))
+        left = [child for child in multiprocessing.active_children() if child not in others]
+        for child in left:
+            child.join(60)
+        alive = [child for child in left if child.is_alive()]
+        for child in alive:
+            child.kill()
+        assert not alive
+
+    @pytest.mark.parametrize(
+        "error", [BlockingIOError("no more processes"), EOFError("unexpected EOF")]
+    )
+    def test_goes_on_here_where_none_can_be_started(
+        self, monkeypatch, caplog, error: Exception
+    ) -> None:
+        def unstartable(*_: object, **__: object) -> None:
+            raise error
+
+        # Whichever is used.
+        for method in ("spawn", "forkserver"):
+            monkeypatch.setattr(multiprocessing.get_context(method), "Process", unstartable)
+        with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
+            assert list(pool.each(product, range(9), at_a_time=2)) == doubled(range(9))
+        assert caplog.text.count("a process was lost") == 1
+
+    @pytest.mark.parametrize("number", [1, 2])
+    def test_raises_what_a_task_raises(self, number: int) -> None:
+        with Processes(number, 2) as pool:
+            found = pool.each(failing, range(40), at_a_time=1)
+            assert list(islice(found, 5)) == [(item, item) for item in range(5)]
+            with pytest.raises(CatalogError, match=r"archive: is away \(wait\)"):
+                next(found)
+            # That was no loss of a process.
+            others = {one for _, one in pool.each(process, [1, 2], at_a_time=1)}
+        assert (os.getpid() not in others) == (number > 1)
+
+    def test_leaves_no_process_where_who_asks_gives_up(self) -> None:
+        with pytest.raises(KeyboardInterrupt), Processes(2, 2) as pool:
+            _interrupted(pool)
+        assert not multiprocessing.active_children()
+
+
+def _interrupted(pool: Processes[int]) -> None:
+    for item, _ in pool.each(product, count(), at_a_time=1):
+        if item == 20:
+            raise KeyboardInterrupt
+
+
+AHEAD = """
+import multiprocessing, os, signal, sys, time
+from lidarops.system import processes
+from lidarops.system.processes import Processes, load_ahead, start_method
+
+def seen(kept, item):
+    held = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    return "colorsys" in sys.modules, os.getpid(), os.environ.get("OMP_NUM_THREADS"), held
+
+def variable(kept, name):
+    return os.environ.get(name)
+
+if __name__ == "__main__":
+    assert start_method() == "spawn"
+    load_ahead(["colorsys", "no_such_module"])
+    load_ahead(["wave"])
+    assert start_method() == "forkserver"
+    assert "OMP_NUM_THREADS" not in os.environ
+    with Processes(2, 2) as pool:
+        found = dict(pool.each(seen, range(6), at_a_time=1))
+    assert all(loaded for loaded, *_ in found.values()), found
+    assert "colorsys" not in sys.modules
+    assert os.getpid() not in {pid for _, pid, *_ in found.values()}
+    assert {threads for _, _, threads, _ in found.values()} == {"1"}
+    # Ctrl-C reaches all processes of a terminal, and what is loaded is still of use.
+    assert {held for _, _, _, held in found.values()} == {True}
+    # It may date products, or open a store.
+    os.environ["LIDAROPS_SEEN"] = "later"
+    with Processes(2, 2) as pool:
+        assert pool.later(variable, "LIDAROPS_SEEN")() == "later"
+    del os.environ["LIDAROPS_SEEN"]
+    assert start_method() == "forkserver"
+    with Processes(2, 2) as pool:
+        print(pool.later(seen, 1)()[1], flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+WORKERS = """
+import os
+from lidarops.run.executor import local_client
+from lidarops.system.processes import load_ahead, start_method
+
+if __name__ == "__main__":
+    load_ahead(["distributed.nanny"])
+    with local_client(2) as client:
+        parents = set(client.run(os.getppid).values())
+    import netCDF4
+    assert len(parents) == 1, parents
+    assert os.getpid() not in parents
+    assert start_method() == "forkserver"
+"""
+
+
+class TestOneAhead:
+    def test_gives_all_in_order(self) -> None:
+        assert list(one_ahead(range(9))) == list(range(9))
+        assert list(one_ahead([])) == []
+
+    def test_finds_the_next_one_meanwhile_and_no_more(self) -> None:
+        begun = [threading.Event() for _ in range(4)]
+
+        def found() -> Iterator[int]:
+            for number, event in enumerate(begun):
+                event.set()
+                yield number
+
+        items = one_ahead(found())
+        assert next(items) == 0
+        assert begun[1].wait(10)
+        items.close()
+        assert not begun[2].is_set()
+
+    def test_raises_in_the_place_of_an_item(self) -> None:
+        def found() -> Iterator[int]:
+            yield 1
+            raise CatalogError("is away", file="archive", remedy="wait")
+
+        items = one_ahead(found())
+        assert next(items) == 1
+        with pytest.raises(CatalogError, match="is away"):
+            next(items)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks are not safe elsewhere")
+class TestLoadAhead:
+    def test_processes_have_the_modules_and_end_with_the_first_one(self, tmp_path: Path) -> None:
+        script = tmp_path / "ahead.py"
+        script.write_text(AHEAD)
+        environment = {key: os.environ[key] for key in os.environ if key != "OMP_NUM_THREADS"}
+        done = subprocess.run(
+            [sys.executable, str(script)],
+            capture_output=True, text=True, env=environment, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        assert _ends(int(done.stdout))
+
+    def test_serves_workers_and_whoever_comes_after_them(self, tmp_path: Path) -> None:
+        script = tmp_path / "workers.py"
+        script.write_text(WORKERS)
+        done = subprocess.run(
+            [sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 0, done.stderr
+
+
+def _ends(pid: int) -> bool:
+    for _ in range(200):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+class TestLater:
+    @pytest.mark.parametrize("number", [1, 2])
+    def test_gives_what_it_came_to(self, number: int) -> None:
+        with Processes(number, 3) as pool:
+            begun = [pool.later(product, item) for item in range(9)]
+            assert [found() for found in begun] == [3 * item for item in range(9)]
+
+
+def test_what_was_there_is_not_swept_and_is_afterwards():
+    assert gc.get_freeze_count() == 0
+    with processes.unswept():
+        frozen = gc.get_freeze_count()
+        assert frozen > 1000
+        with processes.unswept():
+            assert gc.get_freeze_count() <= frozen
+        # The inner one has nothing to thaw.
+        assert gc.get_freeze_count() > 1000
+    assert gc.get_freeze_count() == 0
+    with pytest.raises(ValueError, match="inside"), processes.unswept():
+        raise ValueError("inside")
+    assert gc.get_freeze_count() == 0

@@ -1,0 +1,96 @@
+"""Scans of archives behind a URL: what cannot be listed ends them, what cannot be read does not."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support import factories, raw_archives
+
+from lidarops.campaign.model import Campaign
+from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.sources import Source
+from lidarops.catalog.store import Store
+from lidarops.errors import CatalogError
+from lidarops.records import Status
+from lidarops.system.stores import RemoteStore
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *args: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def campaign(tmp_path: Path) -> Iterator[Campaign]:
+    """A campaign over two files that a web server offers with a plain index."""
+    pytest.importorskip("aiohttp")
+    for minute in range(2):
+        path = tmp_path / "raw" / "coast" / f"h{minute}"
+        raw_archives.write(path, raw_archives.content(minute))
+    handler = functools.partial(_Quiet, directory=str(tmp_path / "raw"))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        yield factories.campaign().model_copy(
+            update={"archive": url, "output": str(tmp_path / "out")}
+        )
+        server.shutdown()
+
+
+def test_a_web_server_is_scanned_like_a_folder(campaign: Campaign, tmp_path: Path) -> None:
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert scan(campaign, store) == ScanSummary(2, 2, 0, 0, 0, 0)
+        remote = store.granules()
+    there = campaign.model_copy(update={"archive": str(tmp_path / "raw"), "name": "folder"})
+    with Store(campaign.catalog_url, "folder") as store:
+        scan(there, store)
+        local = store.granules()
+    assert [(g.path, g.size, g.start) for g in remote] == [(g.path, g.size, g.start) for g in local]
+    digests = [
+        [Source.of(each.archive).digest(granule.path) for granule in local]
+        for each in (campaign, there)
+    ]
+    assert digests[0] == digests[1]
+
+
+def test_a_server_that_is_away_ends_the_scan_and_spoils_nothing(campaign: Campaign) -> None:
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan(campaign, store)
+        before = store.granules()
+        away = campaign.model_copy(update={"archive": "http://127.0.0.1:1"})
+        with pytest.raises(CatalogError, match="cannot be listed"):
+            scan(away, store)
+        assert store.granules() == before
+
+
+@pytest.mark.parametrize(
+    ("error", "refused"), [(PermissionError("denied"), 1), (ConnectionResetError("cut"), None)]
+)
+def test_a_file_that_is_denied_is_refused_and_a_lost_connection_is_not_its_fault(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch, error: OSError, refused: int | None
+) -> None:
+    head = RemoteStore.head
+
+    def failing(self: RemoteStore, path: str, size: int) -> bytes:
+        if path == "coast/h1":
+            with self._told(CatalogError, f"{path} cannot be read"):
+                raise error
+        return head(self, path, size)
+
+    monkeypatch.setattr(RemoteStore, "head", failing)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        if refused is None:
+            with pytest.raises(CatalogError, match="cut"):
+                scan(campaign, store)
+            assert store.granules() == []
+            return
+        assert scan(campaign, store).refused == refused
+        monkeypatch.undo()
+        # It is looked at again, though nothing of it has changed.
+        assert scan(campaign, store).refused == 0
+        assert len(store.granules(status=Status.GOOD)) == 2

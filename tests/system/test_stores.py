@@ -1,0 +1,207 @@
+"""Raw files from and products to object stores: S3 (a server on loopback), HTTP, other URLs."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import http.server
+import threading
+from pathlib import Path
+
+import pytest
+from support.s3server import KEYS, free_port
+
+from lidarops.errors import CatalogError, ProductError
+from lidarops.system.stores import RemoteStore, without_keys
+
+
+@pytest.fixture(params=["s3", "memory", "file"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty place of each kind."""
+    name = tmp_path.name
+    if request.param == "s3":
+        return f"{request.getfixturevalue('s3')}/{name}"
+    return f"memory://{name}" if request.param == "memory" else f"file://{tmp_path}/store"
+
+
+def products(root: Path, **content: bytes) -> dict[str, str]:
+    digests = {}
+    for name, data in content.items():
+        path = root / "coast" / f"{name}.nc"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+        digests[f"coast/{name}.nc"] = hashlib.sha256(data).hexdigest()
+    return digests
+
+
+def test_publish_sends_what_is_missing_or_changed_and_nothing_else(
+    tmp_path: Path, url: str
+) -> None:
+    root, journal = tmp_path / "products", tmp_path / "journal"
+    made = products(root, a=b"one", b=b"two")
+    store = RemoteStore(url)
+    assert store.publish(root, made, journal).uploaded == tuple(made)
+    assert store.publish(root, made, journal).uploaded == ()
+    # Of the same size, within the same second: times and sizes cannot tell.
+    made |= products(root, a=b"ONE", c=b"three")
+    again = store.publish(root, made, journal)
+    assert again.uploaded == ("coast/a.nc", "coast/c.nc")
+    assert again.unchanged == 1
+    assert {each.path: store.head(each.path, 9) for each in store.files()} == {
+        "coast/a.nc": b"ONE",
+        "coast/b.nc": b"two",
+        "coast/c.nc": b"three",
+    }
+
+
+def test_publish_leaves_strangers_alone_and_counts_them(tmp_path: Path, url: str) -> None:
+    made = products(tmp_path / "products", a=b"one", b=b"two")
+    store = RemoteStore(url)
+    store.publish(tmp_path / "products", made, tmp_path / "journal")
+    made.pop("coast/b.nc")
+    assert store.publish(tmp_path / "products", made, tmp_path / "journal").others == 1
+    assert len(list(store.files())) == 2
+
+
+def test_publish_heals_a_store_that_lost_or_cut_an_object(tmp_path: Path, url: str) -> None:
+    import fsspec
+
+    root, journal = tmp_path / "products", tmp_path / "journal"
+    made = products(root, a=b"one", b=b"two", c=b"three")
+    store = RemoteStore(url)
+    store.publish(root, made, journal)
+    fs, prefix = fsspec.core.url_to_fs(url)
+    fs.rm_file(f"{prefix}/coast/a.nc")
+    fs.pipe_file(f"{prefix}/coast/b.nc", b"t")
+    assert store.publish(root, made, journal).uploaded == ("coast/a.nc", "coast/b.nc")
+
+
+def test_publish_after_a_crash_in_the_journal(tmp_path: Path, url: str) -> None:
+    root, journal = tmp_path / "products", tmp_path / "journal"
+    made = products(root, a=b"one", b=b"two")
+    store = RemoteStore(url)
+    store.publish(root, made, journal)
+    journal.write_text(journal.read_text()[:-4])
+    assert store.publish(root, made, journal).uploaded == ("coast/b.nc",)
+    assert store.publish(root, made, journal).uploaded == ()
+
+
+def test_publish_refuses_a_product_that_is_not_the_ledgers(tmp_path: Path, url: str) -> None:
+    made = products(tmp_path, a=b"one")
+    (tmp_path / "coast" / "a.nc").write_bytes(b"eno")
+    with pytest.raises(ProductError, match="not what the ledger says"):
+        RemoteStore(url).publish(tmp_path, made, tmp_path / "journal")
+    with pytest.raises(CatalogError, match="cannot be listed"):
+        list(RemoteStore(url).files())
+
+
+def test_publish_of_many_parts(tmp_path: Path, s3: str) -> None:
+    # Above twice the part size S3 assembles an object of parts.
+    data = bytes(range(256)) * 4096 * 120
+    made = products(tmp_path / "products", big=data)
+    store = RemoteStore(f"{s3}/{tmp_path.name}")
+    store.publish(tmp_path / "products", made, tmp_path / "journal")
+    store.fetch(list(made), tmp_path / "back")
+    assert (tmp_path / "back" / "coast" / "big.nc").read_bytes() == data
+
+
+def test_a_failed_upload_leaves_the_old_object(
+    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import fsspec
+
+    root, journal = tmp_path / "products", tmp_path / "journal"
+    store = RemoteStore(url)
+    store.publish(root, products(root, a=b"one"), journal)
+    fs, _ = fsspec.core.url_to_fs(url)
+
+    def broken(*args, **kwargs):
+        raise ConnectionResetError("cut")
+
+    for name in ("put", "mv"):
+        monkeypatch.setattr(fs, name, broken)
+    changed = products(root, a=b"another")
+    with pytest.raises(ProductError, match="cannot be written"):
+        store.publish(root, changed, journal)
+    assert [(each.path, each.size) for each in store.files()] == [("coast/a.nc", 3)]
+    monkeypatch.undo()
+    assert store.publish(root, changed, journal).uploaded == ("coast/a.nc",)
+
+
+def test_fetch_leaves_out_what_the_store_lacks(tmp_path: Path, url: str) -> None:
+    made = products(tmp_path / "products", a=b"one", b=b"two")
+    store = RemoteStore(url)
+    store.publish(tmp_path / "products", made, tmp_path / "journal")
+    store.fetch(["coast/a.nc", "coast/gone.nc", "coast/b.nc"], tmp_path / "back")
+    found = sorted(path.name for path in (tmp_path / "back").rglob("*") if path.is_file())
+    assert found == ["a.nc", "b.nc"]
+    assert (tmp_path / "back" / "coast" / "b.nc").read_bytes() == b"two"
+
+
+def test_http_is_read_and_never_written(tmp_path: Path) -> None:
+    pytest.importorskip("aiohttp")
+    made = products(tmp_path / "served", a=b"one", b=b"two!")
+    handler = functools.partial(QuietHandler, directory=str(tmp_path / "served"))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            store = RemoteStore(f"http://127.0.0.1:{server.server_port}")
+            assert [(f.path, f.size) for f in store.files()] == [
+                ("coast/a.nc", 3),
+                ("coast/b.nc", 4),
+            ]
+            store.fetch([*made, "coast/gone.nc"], tmp_path / "back")
+            assert (tmp_path / "back" / "coast" / "b.nc").read_bytes() == b"two!"
+            assert not (tmp_path / "back" / "coast" / "gone.nc").exists()
+            with pytest.raises(ProductError, match="read-only"):
+                store.publish(tmp_path / "served", made, tmp_path / "journal")
+        finally:
+            server.shutdown()
+
+
+class QuietHandler(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *args: object) -> None:
+        """Say nothing."""
+
+
+@pytest.mark.parametrize("unknown", ["nothing://bucket", "s3x://bucket/a"])
+def test_unknown_url(unknown: str) -> None:
+    with pytest.raises(CatalogError, match="cannot be opened"):
+        RemoteStore(unknown)
+
+
+def test_a_store_that_does_not_answer_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    s3fs = pytest.importorskip("s3fs")
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")
+    monkeypatch.setattr(s3fs.S3FileSystem, "retries", 1)
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    s3fs.S3FileSystem.clear_instance_cache()
+    store = RemoteStore("s3://archive/nowhere")
+    with pytest.raises(CatalogError, match="cannot be listed"):
+        list(store.files())
+    with pytest.raises(CatalogError, match="cannot be read"):
+        store.fetch(["a"], tmp_path)
+    with pytest.raises(ProductError, match="cannot be listed"):
+        store.publish(tmp_path, products(tmp_path, a=b"1"), tmp_path / "journal")
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("s3://key:secret@bucket/a", "s3://bucket/a"),
+        ("s3://key:se/c@ret@bucket/a", "s3://bucket/a"),
+        ("https://token@host:8080/a", "https://host:8080/a"),
+        ("simplecache::s3://key:secret@bucket", "simplecache::s3://bucket"),
+        ("s3://bucket/a@b", "s3://bucket/a@b"),
+        ("file:///folder/a@b", "file:///folder/a@b"),
+        ("abfs://container@account.dfs.core.windows.net/a",) * 2,
+        ("no address at all", "no address at all"),
+    ],
+)
+def test_keys_are_left_out_of_what_is_told(url: str, told: str) -> None:
+    assert without_keys(url) == told
