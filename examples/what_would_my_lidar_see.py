@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarops import open_archive
 from lidarops.campaign.model import Campaign
-from lidarops.simulate.campaign import SimulatedCampaign, simulate
+from lidarops.simulate.campaign import SimulatedCampaign, simulate_campaign
 
 Array = NDArray[np.float64]
 
@@ -150,7 +150,7 @@ def draw(result: SimulatedCampaign, signals: xr.Dataset, figure: Path) -> None:
 def main(figure: str) -> None:
     """Simulate, read, draw."""
     with tempfile.TemporaryDirectory() as folder:
-        result = simulate(campaign(Path(folder)))
+        result = simulate_campaign(campaign(Path(folder)))
         draw(result, open_archive(folder).load(), Path(figure))
 
 

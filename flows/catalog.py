@@ -14,7 +14,7 @@ from prefect.artifacts import create_table_artifact
 
 from flows import usage
 from flows.reprocess import Seconds, Workers
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.records import Status
@@ -50,7 +50,7 @@ def catalog(
     -------
     ScanSummary
     """
-    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     summary = update_catalog(settings, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.granules(status=Status.REFUSED)
@@ -76,7 +76,7 @@ def main(
     # Within the flow all of this would be told after the start of a server, in tracebacks.
     with usage.told():
         catalog.validate_parameters({"campaign": campaign, "wait": wait})
-        settings = load(campaign, archive=archive, output=out, catalog=url)
+        settings = load_campaign(campaign, archive=archive, output=out, catalog=url)
         selection.refuse_nowhere(settings, archive=archive)
     with usage.told():
         summary = catalog(campaign, archive, out, wait, catalog=url)

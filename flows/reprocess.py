@@ -39,7 +39,7 @@ from prefect.utilities.annotations import quote
 from pydantic import Field
 
 from flows import WITH_FAILURES, usage
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.campaign.product_settings import Instant
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.store import Store
@@ -50,7 +50,7 @@ from lidarops.run import clusters
 from lidarops.run import selection as asked
 from lidarops.run.archive import Options, Result, Selection, bring_up_to_date, report_run
 from lidarops.run.options import unreported
-from lidarops.run.publication import publish as publish_products
+from lidarops.run.publication import publish_products
 
 _T = TypeVar("_T")
 
@@ -123,7 +123,7 @@ def process_task(
     if isinstance(cluster, clusters.Local):
         options = replace(options, workers=cluster.workers, memory=cluster.memory)
     else:
-        options = replace(options, cluster=partial(clusters.client, cluster))
+        options = replace(options, cluster=partial(clusters.connect_client, cluster))
     result = bring_up_to_date(campaign, selection=selection, options=options)
     progress.end()
     if result.status is not RunStatus.FINISHED:
@@ -210,7 +210,7 @@ def reprocess(
     since, until : datetime, optional
         Only scenes that touch this interval.
     scheduler, cluster : str, optional
-        As on the command line: `lidarops.run.clusters.choose`.
+        As on the command line: `lidarops.run.clusters.choose_cluster`.
     wait : float
         s to wait for another run on the same archive.
     publish : str, optional
@@ -231,10 +231,10 @@ def reprocess(
     Both come as the data of a state of its own name, `flows.WITH_FAILURES`, where something is
     refused or failed; who calls the flow gets the data.
     """
-    chosen = clusters.choose(
+    chosen = clusters.choose_cluster(
         workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
     )
-    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
     # First, as copy and report may fail.
@@ -371,10 +371,12 @@ def main(
     # Within the flow all of this would be told after the start of a server, in tracebacks.
     with usage.told():
         valid = reprocess.validate_parameters(given)
-        settings = load(campaign, archive=archive, output=out, catalog=catalog)
+        settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
         of_selection = ("instruments", "stations", "products", "since", "until")
         asked.refuse_unknown(settings, _selection(*(valid[name] for name in of_selection)))
-        clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit)
+        clusters.choose_cluster(
+            workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
+        )
         asked.refuse_nowhere(settings, archive=archive)
     with usage.told():
         result, built = reprocess(**given)

@@ -17,7 +17,7 @@ from lidarops.aggregate.means_variables import (
     INTERVALS,
     Budget,
     averaged,
-    budget,
+    budget_of,
     systematic,
 )
 from lidarops.errors import ProductError
@@ -75,7 +75,7 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
 def _sample(product: xr.Dataset, kind: ProductKind, row: Row, wanted: NDArray[np.bool_]) -> Sample:
     values = numbers(product, row.name)
     errors = numbers(product, f"{row.name}_standard_error")
-    found = budget(kind, row.name)
+    found = budget_of(kind, row.name)
     random, shared = (errors, ()) if found is None else _divided(product, found, errors)
     judged = row.dims == product[QUALITY_FLAG].dims
     return Sample(

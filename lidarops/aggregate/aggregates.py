@@ -10,11 +10,11 @@ from pathlib import Path
 from lidarops.aggregate.facts import (
     EVERYTHING,
     Facts,
+    ProductSelection,
     Refused,
-    Selection,
     groups,
-    product_paths,
-    scan,
+    list_products,
+    read_product_facts,
     told_grids,
 )
 from lidarops.aggregate.index import write_index
@@ -31,7 +31,7 @@ Progress = Callable[[int], None]
 class Wanted:
     """What is asked for besides the views, which are always made."""
 
-    selection: Selection = EVERYTHING
+    selection: ProductSelection = EVERYTHING
     period: Period | None = None
     """Of means; None for none."""
     weights: Weights = Weights.PLAIN
@@ -56,7 +56,7 @@ class Made:
     """What is to be known, one sentence each."""
 
 
-def make(root: Path, wanted: Wanted, *, progress: Progress = lambda _done: None) -> Made:
+def make_aggregates(root: Path, wanted: Wanted, *, progress: Progress = lambda _done: None) -> Made:
     """Make the aggregates of an output; what fails is named, and the rest goes on.
 
     Parameters
@@ -102,10 +102,10 @@ def make(root: Path, wanted: Wanted, *, progress: Progress = lambda _done: None)
     return made
 
 
-def _products(root: Path, wanted: Selection, made: Made, progress: Progress) -> list[Facts]:
+def _products(root: Path, wanted: ProductSelection, made: Made, progress: Progress) -> list[Facts]:
     products = []
-    for path in product_paths(root):
-        for found in scan(root, [path], wanted):
+    for path in list_products(root):
+        for found in read_product_facts(root, [path], wanted):
             if isinstance(found, Refused):
                 made.refused.append(found)
             else:
@@ -114,7 +114,7 @@ def _products(root: Path, wanted: Selection, made: Made, progress: Progress) -> 
     return products
 
 
-def _refuse_unknown(root: Path, wanted: Selection) -> None:
+def _refuse_unknown(root: Path, wanted: ProductSelection) -> None:
     """Refuse what no product is of, and name what there is."""
     there = _products(root, EVERYTHING, Made(root), lambda _done: None)
     for name in ("channel", "station", "instrument"):
@@ -155,7 +155,7 @@ def _means(made: Made, products: Sequence[Facts], period: Period, weights: Weigh
     made.refused += done.refused
 
 
-def _stac(made: Made, products: Sequence[Facts], selection: Selection) -> None:
+def _stac(made: Made, products: Sequence[Facts], selection: ProductSelection) -> None:
     if selection != EVERYTHING:
         raise ProductError("the STAC catalog is of all products", remedy="run without a selection")
     made.stac = write_stac(made.root, products)

@@ -99,7 +99,7 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
+class ProductSelection:
     """Which products are wanted; None and empty mean all."""
 
     kind: ProductKind | None = None
@@ -130,10 +130,10 @@ class Selection:
         )
 
 
-EVERYTHING: Final = Selection()
+EVERYTHING: Final = ProductSelection()
 
 
-def product_paths(root: Path) -> list[str]:
+def list_products(root: Path) -> list[str]:
     """List the NetCDF files under a folder of output, or of products.
 
     Parameters
@@ -192,8 +192,8 @@ def within(root: Path, path: str) -> Path:
     return found
 
 
-def scan(
-    root: Path, paths: Iterable[str], selection: Selection = EVERYTHING
+def read_product_facts(
+    root: Path, paths: Iterable[str], selection: ProductSelection = EVERYTHING
 ) -> Iterator[Facts | Refused]:
     """Read the facts of the products that are wanted, and go on where one cannot be read.
 
@@ -201,7 +201,7 @@ def scan(
     ----------
     root : path
     paths : iterable of str
-        From `product_paths`.
+        From `list_products`.
     selection : Selection
 
     Yields
@@ -217,7 +217,7 @@ def scan(
             yield Refused(path, error.problem)
 
 
-def _is_wanted(file: Path, selection: Selection) -> bool:
+def _is_wanted(file: Path, selection: ProductSelection) -> bool:
     """Look at the attributes of a product, which is faster than to read its facts."""
     if selection == EVERYTHING:
         return True

@@ -18,7 +18,7 @@ from uuid import UUID
 import pandas as pd
 
 from lidarops.aggregate._optional_packages import need
-from lidarops.aggregate.facts import FOLDER, Facts, Selection
+from lidarops.aggregate.facts import FOLDER, Facts, ProductSelection
 from lidarops.aggregate.selection import select
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
@@ -193,7 +193,7 @@ def find_products(
     return found
 
 
-def find(index: Path, wanted: Selection) -> Found:
+def find_in_index(index: Path, wanted: ProductSelection) -> Found:
     """Return the paths of the products of an index that are wanted.
 
     Raises
@@ -211,7 +211,7 @@ def _root(index: Path) -> Path:
     return index.resolve().parents[1]
 
 
-def _read(index: Path, wanted: Selection, columns: list[str] | None) -> Any:
+def _read(index: Path, wanted: ProductSelection, columns: list[str] | None) -> Any:
     arrow, parquet = need("pyarrow"), need("pyarrow.parquet")
     try:
         metadata = parquet.read_schema(index).metadata or {}
@@ -226,7 +226,7 @@ def _read(index: Path, wanted: Selection, columns: list[str] | None) -> Any:
         raise ProductError(f"cannot be read as an index: {error}", file=index) from error
 
 
-def _filters(wanted: Selection) -> list[tuple[str, str, Any]] | None:
+def _filters(wanted: ProductSelection) -> list[tuple[str, str, Any]] | None:
     names = ("channel", "station", "instrument")
     told = [(name, "==", getattr(wanted, name)) for name in names if getattr(wanted, name)]
     if wanted.kind is not None:

@@ -19,15 +19,15 @@ from lidarops.aggregate.means_file import (
     Frame,
     Lineage,
     Periods,
-    encode,
+    encode_means,
+    means_provenance,
     means_version,
-    prov_json,
     read_frame,
 )
 from lidarops.aggregate.means_variables import About, Period, Weights, systematic
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.records import ProductKind
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
@@ -240,9 +240,9 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
         lineage = Lineage(tuple(year.inputs.values()), period, weights, start, stop)
         about = About(lineage.id, period, weights, start, stop, len(year.inputs), means_version())
         periods = Periods(bounds.astype(np.float64), year.records)
-        dataset = encode(frame, periods, year.shared or {}, about, prov_json(lineage))
+        dataset = encode_means(frame, periods, year.shared or {}, about, means_provenance(lineage))
         path = _path(group, period, weights, number)
-        done = write(dataset, root / path)
+        done = write_product(dataset, root / path)
         yield MeansFile(path, done.sha256, done.size, len(keys), len(year.inputs))
 
 

@@ -105,7 +105,7 @@ class Periods:
     """One a period: variable -> values without time."""
 
 
-def encode(
+def encode_means(
     frame: Frame, periods: Periods, shared: Mapping[str, Any], about: About, provenance: str
 ) -> xr.Dataset:
     """Make the dataset of a file of means.
@@ -118,12 +118,12 @@ def encode(
         Global attributes that the products have alike.
     about : About
     provenance : str
-        From `prov_json`.
+        From `means_provenance`.
 
     Returns
     -------
     xr.Dataset
-        Encoded, as `lidarops.netcdf.write.write` takes it.
+        Encoded, as `lidarops.netcdf.write.write_product` takes it.
     """
     found = layout(frame.kind, about.period, about.weights)
     texts = {rows.PROVENANCE.name: _text(rows.PROVENANCE, provenance, frame.mode)}
@@ -208,7 +208,7 @@ class Lineage:
         return str(uuid5(NAMESPACE_URL, NAMESPACE + _canonical(content)))
 
 
-def prov_json(lineage: Lineage) -> str:
+def means_provenance(lineage: Lineage) -> str:
     """Write the provenance of means as W3C PROV-JSON (`provo2013`).
 
     Parameters

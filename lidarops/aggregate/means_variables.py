@@ -152,13 +152,13 @@ _ALL_SHARED: Final = (
 
 def error_comment(kind: ProductKind, name: str) -> str:
     """Say how the standard error of a mean was found."""
-    found = budget(kind, name)
+    found = budget_of(kind, name)
     if found is None:
         return _INDEPENDENT
     return _PARTLY if found.random else _ALL_SHARED
 
 
-def budget(kind: ProductKind, name: str) -> Budget | None:
+def budget_of(kind: ProductKind, name: str) -> Budget | None:
     """Return how the error of a quantity divides; None where it is new in every profile."""
     row = LAYOUTS[kind].row(name)
     independent = row.error_kind in (None, ErrorKind.RANDOM)

@@ -15,17 +15,17 @@ from lidarops.aggregate.facts import (
     UNSHARED,
     Facts,
     Group,
+    ProductSelection,
     Refused,
-    Selection,
     coordinate_names,
     groups,
-    product_paths,
+    list_products,
     read_facts,
+    read_product_facts,
     refuse_duplicates,
-    scan,
     within,
 )
-from lidarops.aggregate.index import INDEX, Found, find
+from lidarops.aggregate.index import INDEX, Found, find_in_index
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.aggregate.selection import select
 from lidarops.aggregate.usable import CARE, masked, with_usable
@@ -111,27 +111,27 @@ def _choices(found: Iterable[Group]) -> str:
     )
 
 
-def _found(source: Paths, selection: Selection) -> tuple[Path, list[Facts]]:
+def _found(source: Paths, selection: ProductSelection) -> tuple[Path, list[Facts]]:
     """Return the products that are asked for, and the folder that their paths start from."""
     if not isinstance(source, str | os.PathLike):
         files = [Path(each) for each in source]
         return _of_files(files, selection)
     path = Path(source)
     if path.name == INDEX:
-        return _indexed(find(path, selection))
+        return _indexed(find_in_index(path, selection))
     if path.is_dir():
-        return path, _strictly(scan(path, product_paths(path), selection))
+        return path, _strictly(read_product_facts(path, list_products(path), selection))
     return _of_files([path], selection)
 
 
-def _of_files(files: Sequence[Path], selection: Selection) -> tuple[Path, list[Facts]]:
+def _of_files(files: Sequence[Path], selection: ProductSelection) -> tuple[Path, list[Facts]]:
     # Each in its own folder: nothing here joins two paths.
     missing = [file for file in files if not file.is_file()]
     if missing:
         raise ProductError("is no file", file=missing[0])
     root = Path(os.path.commonpath([file.resolve().parent for file in files])) if files else Path()
     names = [file.resolve().relative_to(root).as_posix() for file in files]
-    return root, _strictly(scan(root, names, selection))
+    return root, _strictly(read_product_facts(root, names, selection))
 
 
 def _strictly(scanned: Iterator[Facts | Refused]) -> list[Facts]:

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from typing import TypeVar
 
-from lidarops.aggregate.facts import Selection
+from lidarops.aggregate.facts import ProductSelection
 from lidarops.errors import RetrievalInputError
 from lidarops.records import ProductKind
 
@@ -18,7 +18,7 @@ def select(
     instrument: str | None,
     since: datetime | str | None,
     until: datetime | str | None,
-) -> Selection:
+) -> ProductSelection:
     """Check what is asked for.
 
     Raises
@@ -26,7 +26,7 @@ def select(
     RetrievalInputError
         If the kind is unknown or a time is no ISO 8601.
     """
-    return Selection(
+    return ProductSelection(
         None if kind is None else choice(ProductKind, kind, "kind"),
         channel,
         station,

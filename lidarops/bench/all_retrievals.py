@@ -23,12 +23,12 @@ from lidarops.bench.accuracy import (
 )
 from lidarops.bench.accuracy.elastic import Elastic
 from lidarops.bench.accuracy.multiangle_scores import MultiAngle
-from lidarops.bench.accuracy.multiangle_scores import measure as measure_scans
+from lidarops.bench.accuracy.multiangle_scores import measure_multiangle as measure_scans
 from lidarops.bench.accuracy.network_scores import MultiPosition
 from lidarops.bench.harness.terms import RESULT, Effort, Finding
 from lidarops.bench.harness.timing import Machine, least_times, machine
 from lidarops.bench.overview import Baseline, Work
-from lidarops.reports.benchmark_page import Part, Report
+from lidarops.reports.benchmark_page import BenchmarkReport, Part
 
 _PROFILES: Final = 500
 _BINS: Final = 4096
@@ -50,7 +50,7 @@ class Everything:
     multiposition: MultiPosition
 
 
-def run(effort: Effort, *, data: Path | None = None) -> Finding:
+def run_all_retrievals(effort: Effort, *, data: Path | None = None) -> Finding:
     """Measure error against run time of every retrieval.
 
     Parameters
@@ -67,10 +67,14 @@ def run(effort: Effort, *, data: Path | None = None) -> Finding:
         Where a published file cannot be read.
     """
     quick, date, progress = effort.quick, effort.date, effort.progress
-    paths = accuracy.measure(quick=quick, date=date, progress=progress)
-    vertical = elastic.measure(quick=quick, date=date, data=data, progress=progress)
+    paths = accuracy.measure_homogeneous(quick=quick, date=date, progress=progress)
+    vertical = elastic.measure_elastic_accuracy(
+        quick=quick, date=date, data=data, progress=progress
+    )
     scans = measure_scans(quick=quick, date=date, progress=progress)
-    networks = network.measure(quick=quick, date=date, repeats=effort.repeats, progress=progress)
+    networks = network.measure_network(
+        quick=quick, date=date, repeats=effort.repeats, progress=progress
+    )
     found = Everything(
         date=date,
         machine=machine(),
@@ -99,15 +103,19 @@ def _baselines() -> Iterator[Baseline]:
     )
 
 
-def _report(found: Everything) -> Report:
+def _report(found: Everything) -> BenchmarkReport:
     chapters = (
-        ("Homogeneous path", "homogeneous", homogeneous_report.accuracy_report(found.homogeneous)),
-        ("Elastic inversion", "elastic", elastic.accuracy_report(found.elastic)),
-        ("Scans", "multiangle", multiangle_report.accuracy_report(found.multiangle)),
-        ("Networks", "multiposition", network_report.accuracy_report(found.multiposition)),
+        (
+            "Homogeneous path",
+            "homogeneous",
+            homogeneous_report.homogeneous_accuracy_report(found.homogeneous),
+        ),
+        ("Elastic inversion", "elastic", elastic.elastic_accuracy_report(found.elastic)),
+        ("Scans", "multiangle", multiangle_report.multiangle_accuracy_report(found.multiangle)),
+        ("Networks", "multiposition", network_report.network_accuracy_report(found.multiposition)),
     )
     told = [_apart(part, title, name) for title, name, report in chapters for part in report.parts]
-    return Report(
+    return BenchmarkReport(
         title="All retrievals: error against run time",
         facts=homogeneous_report.facts(found.date, found.machine),
         parts=(overview.overview(found.works, found.baselines), *told),

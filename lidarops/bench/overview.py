@@ -11,15 +11,15 @@ import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
 from lidarops.bench.accuracy.elastic import Elastic
-from lidarops.bench.accuracy.homogeneous import Accuracy, Measured, outcomes_of
+from lidarops.bench.accuracy.homogeneous import Accuracy, MonteCarloFigure, outcomes_of
 from lidarops.bench.accuracy.multiangle_scores import MultiAngle
 from lidarops.bench.accuracy.network_scores import MultiPosition
-from lidarops.bench.accuracy.peers import peers
+from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.throughput.retrievals import ALL_STEPS
 from lidarops.figures.charts import Chart, Panel, Series, pareto
 from lidarops.figures.wording import percent
 from lidarops.reports.benchmark_page import Part, Table
-from lidarops.retrieve.homogeneous.path_fit import Method
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
 HOMOGENEOUS: Final = "homogeneous path"
 ELASTIC: Final = "elastic inversion"
@@ -29,7 +29,12 @@ NETWORKS: Final = "networks of lidars"
 _LEVELS: Final = (1e2, 1e5)
 """Backgrounds of the elastic retrieval that stand for all, counts a shot."""
 _HELPED: Final = frozenset(
-    {Method.LINEARIZED, Method.KNOWN_BACKGROUND, Method.KNOWN_EXTINCTION, elastic_cases.TOLD}
+    {
+        HomogeneousMethod.LINEARIZED,
+        HomogeneousMethod.KNOWN_BACKGROUND,
+        HomogeneousMethod.KNOWN_EXTINCTION,
+        elastic_cases.TOLD,
+    }
 )
 """Methods that are told more than the profile."""
 _SHOWN: Final = {
@@ -67,9 +72,9 @@ class Work:
     way: str
     ours: bool
     """Whether a method of lidarops; else a peer."""
-    error: Measured
+    error: MonteCarloFigure
     """Root mean square."""
-    coverage: Measured | None
+    coverage: MonteCarloFigure | None
     """Share of truths in the stated 95 percent interval; None where the way states none."""
     nanoseconds: float
     """CPU time of a profile."""
@@ -88,7 +93,7 @@ def works(
 
 
 def _of_paths(found: Accuracy) -> Iterator[Work]:
-    others = peers()
+    others = iterative_peers()
     for way in dict.fromkeys(outcome.way for case in found.cases for outcome in case.outcomes):
         pairs = outcomes_of(found, way)
         scores = [o.scores[_EXTINCTION] for _, o in pairs if _EXTINCTION in o.scores]
@@ -99,14 +104,14 @@ def _of_paths(found: Accuracy) -> Iterator[Work]:
             f"median of {len(pairs)} paths",
             "extinction, RMSE over the Cramér-Rao bound",
             way,
-            way not in others and way != Method.TAIL_MEAN,
+            way not in others and way != HomogeneousMethod.TAIL_MEAN,
             _middle([score.rmse for score in scores]),
             _middle([score.coverage for score in scores]),
             float(np.median([outcome.nanoseconds for _, outcome in pairs])),
         )
 
 
-def _middle(figures: Sequence[Measured]) -> Measured:
+def _middle(figures: Sequence[MonteCarloFigure]) -> MonteCarloFigure:
     ranked = sorted(figures, key=lambda figure: figure.value)
     return ranked[len(ranked) // 2]
 

@@ -35,7 +35,7 @@ _REPEATS: Final = 7
 _Names = TypeVar("_Names", bound=StrEnum)
 
 
-class Case(StrEnum):
+class Benchmark(StrEnum):
     """What is measured."""
 
     ALL = "all"
@@ -49,7 +49,7 @@ class Case(StrEnum):
     READER = "reader"
 
 
-def run(
+def run_benchmark(
     what: str,
     case: str | None,
     files: Sequence[Path],
@@ -79,19 +79,19 @@ def run(
         Where "reader" gets no file, or one that cannot be read.
     """
     kind = _member(Kind, what, "benchmark", STABILITY)
-    usual = Case.ALL if kind is Kind.ACCURACY else Case.HOMOGENEOUS
-    chosen = _member(Case, case or (Case.READER if files else usual), "case")
+    usual = Benchmark.ALL if kind is Kind.ACCURACY else Benchmark.HOMOGENEOUS
+    chosen = _member(Benchmark, case or (Benchmark.READER if files else usual), "case")
     _check(kind, chosen, files, data)
-    ways: dict[Case, Callable[[], Finding]] = {
-        Case.ALL: lambda: all_retrievals.run(effort, data=data),
-        Case.ARCHIVE: lambda: archives.run(kind, effort=effort),
-        Case.COSTS: lambda: cost_calibration.run(kind, effort=effort),
-        Case.ELASTIC: lambda: elastic.run(kind, data=data, effort=effort),
-        Case.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
-        Case.MULTIANGLE: lambda: multiangle_report.run(kind, effort=effort),
-        Case.MULTIPOSITION: lambda: network.run(kind, effort=effort),
-        Case.PIPELINE: lambda: campaigns.run(kind, effort=effort),
-        Case.READER: lambda: _reader(files, effort),
+    ways: dict[Benchmark, Callable[[], Finding]] = {
+        Benchmark.ALL: lambda: all_retrievals.run_all_retrievals(effort, data=data),
+        Benchmark.ARCHIVE: lambda: archives.run_archives(kind, effort=effort),
+        Benchmark.COSTS: lambda: cost_calibration.run_cost_calibration(kind, effort=effort),
+        Benchmark.ELASTIC: lambda: elastic.run_elastic(kind, data=data, effort=effort),
+        Benchmark.HOMOGENEOUS: lambda: _homogeneous(kind, effort),
+        Benchmark.MULTIANGLE: lambda: multiangle_report.run_multiangle(kind, effort=effort),
+        Benchmark.MULTIPOSITION: lambda: network.run_network(kind, effort=effort),
+        Benchmark.PIPELINE: lambda: campaigns.run_campaigns(kind, effort=effort),
+        Benchmark.READER: lambda: _reader(files, effort),
     }
     return ways[chosen]()
 
@@ -103,28 +103,32 @@ def _reader(files: Sequence[Path], effort: Effort) -> Finding:
 
 def _homogeneous(kind: Kind, effort: Effort) -> Finding:
     if kind is Kind.ACCURACY:
-        found = homogeneous.measure(quick=effort.quick, date=effort.date, progress=effort.progress)
-        return Finding(found, homogeneous_report.accuracy_report(found, RESULT))
-    timed = retrievals.measure(
+        found = homogeneous.measure_homogeneous(
+            quick=effort.quick, date=effort.date, progress=effort.progress
+        )
+        return Finding(found, homogeneous_report.homogeneous_accuracy_report(found, RESULT))
+    timed = retrievals.measure_solvers(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
-    return Finding(timed, homogeneous_report.throughput_report(timed, RESULT))
+    return Finding(timed, homogeneous_report.homogeneous_throughput_report(timed, RESULT))
 
 
-def _check(kind: Kind, case: Case, files: Sequence[Path], data: Path | None) -> None:
-    if case is Case.READER and kind is Kind.ACCURACY:
+def _check(kind: Kind, case: Benchmark, files: Sequence[Path], data: Path | None) -> None:
+    if case is Benchmark.READER and kind is Kind.ACCURACY:
         raise CampaignError("the reader has no accuracy benchmark", remedy="choose throughput")
-    if case is Case.ALL and kind is Kind.THROUGHPUT:
+    if case is Benchmark.ALL and kind is Kind.THROUGHPUT:
         raise CampaignError("all retrievals at once have no throughput", remedy="choose a case")
-    if case is not Case.READER and files:
+    if case is not Benchmark.READER and files:
         raise CampaignError(f"the case {case.value!r} takes no files", remedy="leave them out")
-    if data is not None and (case not in {Case.ELASTIC, Case.ALL} or kind is not Kind.ACCURACY):
+    if data is not None and (
+        case not in {Benchmark.ELASTIC, Benchmark.ALL} or kind is not Kind.ACCURACY
+    ):
         raise CampaignError(
             "is for the accuracy of the case 'elastic'", field="data", remedy="leave it out"
         )
 
 
-def write(finding: Finding, folder: Path) -> Path:
+def write_benchmark(finding: Finding, folder: Path) -> Path:
     """Write the figures as JSON and the page of a benchmark; return the page.
 
     Raises
@@ -133,7 +137,7 @@ def write(finding: Finding, folder: Path) -> Path:
         Where the folder cannot be written.
     """
     results.save(finding.result, folder / RESULT)
-    return benchmark_page.build(finding.report, folder)
+    return benchmark_page.build_benchmark_page(finding.report, folder)
 
 
 def _member(names: type[_Names], value: str, what: str, *others: str) -> _Names:

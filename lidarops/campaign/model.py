@@ -31,16 +31,16 @@ from lidarops.campaign.product_settings import (
     Inside,
     Instant,
     Metres,
-    Model,
     MultiAngleSettings,
     NetworkVisibilitySettings,
     Patterns,
     Products,
+    SettingsModel,
     SignalSettings,
     as_interval,
 )
 from lidarops.campaign.simulation import SimulationSettings
-from lidarops.campaign.yaml_errors import duplicates, explain
+from lidarops.campaign.yaml_errors import duplicate_keys, explain_yaml_error
 from lidarops.errors import CampaignError
 
 __all__ = [
@@ -60,7 +60,7 @@ __all__ = [
     "Station",
     "as_settings",
     "channel_facts",
-    "load",
+    "load_campaign",
 ]
 
 ARCHIVE_VARIABLE = "LIDAROPS_ARCHIVE"
@@ -68,7 +68,7 @@ CATALOG_VARIABLE = "LIDAROPS_CATALOG"
 _IDENTIFIERS = "letters, digits and hyphens that begin with a letter or a digit"
 
 
-class Station(Model):
+class Station(SettingsModel):
     """A place where instruments stand."""
 
     name: str
@@ -77,7 +77,7 @@ class Station(Model):
     altitude: float = Field(default=0.0, ge=-500, le=9000, description="m above the geoid")
 
 
-class ChannelFacts(Model):
+class ChannelFacts(SettingsModel):
     """What is known of one channel over a validity period."""
 
     wavelength: float | None = Field(
@@ -100,7 +100,7 @@ class ChannelFacts(Model):
     )
 
 
-class InstrumentFacts(Model):
+class InstrumentFacts(SettingsModel):
     """What is known of an instrument over a validity period."""
 
     valid_from: Instant = datetime.min.replace(tzinfo=UTC)
@@ -124,7 +124,7 @@ class InstrumentFacts(Model):
         return self
 
 
-class Instrument(Model):
+class Instrument(SettingsModel):
     """A lidar, the files it wrote, what is known of it and what is wanted from it."""
 
     station: Identifier
@@ -151,7 +151,7 @@ class Instrument(Model):
         return InstrumentFacts()
 
 
-class Network(Model):
+class Network(SettingsModel):
     """Instruments that look at the same air, and what is wanted from them together."""
 
     name: str = ""
@@ -168,7 +168,7 @@ class Network(Model):
         return self
 
 
-class Metadata(Model):
+class Metadata(SettingsModel):
     """Who made the data: global attributes of every product (ACDD-1.3)."""
 
     institution: str = "unknown institution"
@@ -187,7 +187,7 @@ class Metadata(Model):
     program: str = ""
 
 
-class Scenes(Model):
+class Scenes(SettingsModel):
     """How granules are cut into scenes."""
 
     window: Annotated[Literal["day"] | timedelta, BeforeValidator(as_interval)] = "day"
@@ -201,7 +201,7 @@ class Scenes(Model):
         return self
 
 
-class Campaign(Model):
+class Campaign(SettingsModel):
     """One campaign: stations, instruments, where the raw files are, which products."""
 
     name: Identifier
@@ -281,7 +281,7 @@ class Campaign(Model):
         return Path(self.archive) / "truth.nc"
 
 
-def load(
+def load_campaign(
     path: str | Path,
     *,
     archive: str | Path | None = None,
@@ -332,7 +332,7 @@ def load(
             file=path,
             remedy="look for a date such as 2024-02-30; quote what is no date",
         ) from error
-    if twice := duplicates(tree):
+    if twice := duplicate_keys(tree):
         raise CampaignError(_listed("is not a valid campaign:", twice), file=path)
     if not isinstance(raw, dict):
         raise CampaignError(
@@ -341,7 +341,7 @@ def load(
     try:
         campaign = Campaign.model_validate(raw)
     except ValidationError as error:
-        told = explain(error, tree, Campaign, {IDENTIFIER: _IDENTIFIERS})
+        told = explain_yaml_error(error, tree, Campaign, {IDENTIFIER: _IDENTIFIERS})
         raise CampaignError(_listed("is not a valid campaign:", told), file=path) from error
     base = path.resolve().parent
     if "://" in str(output or campaign.output):

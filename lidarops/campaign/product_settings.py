@@ -57,7 +57,7 @@ Identifier = Annotated[str, Field(pattern=IDENTIFIER, max_length=40)]
 Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-class Model(BaseModel):
+class SettingsModel(BaseModel):
     """Frozen, and refuses what it does not know."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -73,7 +73,7 @@ def _divides_day(interval: timedelta) -> timedelta:
 PartOfDay = Annotated[timedelta, BeforeValidator(as_interval), AfterValidator(_divides_day)]
 
 
-class SignalSettings(Model):
+class SignalSettings(SettingsModel):
     """The ``signal`` product: background-subtracted, range-corrected signals."""
 
     channels: list[str] | Literal["all"] = "all"
@@ -88,7 +88,7 @@ class SignalSettings(Model):
         return self
 
 
-class VisibilitySettings(Model):
+class VisibilitySettings(SettingsModel):
     """How visibility follows from extinction."""
 
     contrast: Annotated[float, Field(gt=0, lt=1)] | Literal["paper"] = Field(
@@ -120,7 +120,7 @@ class VisibilitySettings(Model):
         return math.exp(-3.0) if self.contrast == "paper" else self.contrast
 
 
-class HomogeneousSettings(Model):
+class HomogeneousSettings(SettingsModel):
     """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
 
     channels: list[str] = Field(min_length=1)
@@ -138,7 +138,7 @@ class HomogeneousSettings(Model):
         return self
 
 
-class ReferenceSettings(Model):
+class ReferenceSettings(SettingsModel):
     """Where the air is taken as free of aerosol."""
 
     lowest: Metres = Field(default=3000.0, description="m above the station")
@@ -156,7 +156,7 @@ class ReferenceSettings(Model):
         return self
 
 
-class ElasticSettings(Model):
+class ElasticSettings(SettingsModel):
     """The ``elastic`` product: backscatter and extinction of aerosol, from a lidar ratio."""
 
     channels: list[str] = Field(
@@ -173,7 +173,7 @@ class ElasticSettings(Model):
     )
 
 
-class MultiAngleSettings(Model):
+class MultiAngleSettings(SettingsModel):
     """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
 
     channels: list[str] = Field(min_length=1)
@@ -201,7 +201,7 @@ class MultiAngleSettings(Model):
         return self
 
 
-class Products(Model):
+class Products(SettingsModel):
     """Which products of an instrument are wanted, with which settings."""
 
     signal: SignalSettings | None = None
@@ -210,7 +210,7 @@ class Products(Model):
     multiangle: MultiAngleSettings | None = None
 
 
-class NetworkVisibilitySettings(Model):
+class NetworkVisibilitySettings(SettingsModel):
     """The ``visibility`` product: extinction and visibility where beams of lidars meet."""
 
     channel: str = Field(description="of all instruments; glued_532o joins records")

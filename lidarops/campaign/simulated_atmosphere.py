@@ -17,20 +17,20 @@ from lidarops.campaign.simulation_base import (
     Extinction,
     Length,
     Metres,
-    Model,
     NotNegative,
     Period,
+    SimulationModel,
 )
 
 
-class Aerosol(Model):
+class Aerosol(SimulationModel):
     """Optical properties that aerosol keeps."""
 
     lidar_ratio: float = Field(default=50.0, ge=5, le=150, description="sr")
     angstrom_exponent: float = Field(default=1.3, ge=-1, le=4, description="of extinction")
 
 
-class BoundaryLayer(Model):
+class BoundaryLayer(SimulationModel):
     """Aerosol that is well mixed from the ground to a top that follows the sun."""
 
     aerosol: Aerosol = Aerosol()
@@ -66,7 +66,7 @@ class Cloud(Period):
         return self
 
 
-class Gradient(Model):
+class Gradient(SimulationModel):
     """Aerosol that changes along a horizontal direction.
 
     Its extinction at the origin times exp(distance / scale), towards `azimuth`.
@@ -79,7 +79,7 @@ class Gradient(Model):
     top: Length = Field(default=1e5, description="m above the ground, up to which it reaches")
 
 
-class Plume(Model):
+class Plume(SimulationModel):
     """A Gaussian cloud of aerosol that the wind carries."""
 
     aerosol: Aerosol = Aerosol()
@@ -93,7 +93,7 @@ class Plume(Model):
     wind_north: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
 
 
-class Turbulence(Model):
+class Turbulence(SimulationModel):
     """A log-normal factor on the aerosol, random in space and carried by the wind."""
 
     deviation: float = Field(gt=0, le=3, description="standard deviation of the logarithm")
@@ -103,7 +103,7 @@ class Turbulence(Model):
     wind_north: float = Field(default=0.0, ge=-100, le=100, description="m s-1")
 
 
-class Profile(Model):
+class Profile(SimulationModel):
     """Aerosol extinction at given heights, linear between them and zero above the last."""
 
     aerosol: Aerosol = Aerosol()
@@ -119,7 +119,7 @@ class Profile(Model):
         return self
 
 
-class Sounding(Model):
+class Sounding(SimulationModel):
     """Pressure and temperature of the air, in place of the US Standard Atmosphere."""
 
     altitude: list[float] = Field(min_length=2, description="m above mean sea level, rising")
@@ -139,7 +139,7 @@ class Sounding(Model):
         return self
 
 
-class Homogeneous(Model):
+class Homogeneous(SimulationModel):
     """Aerosol that is the same everywhere, and follows the hour of the day."""
 
     aerosol: Aerosol = Aerosol()
@@ -157,7 +157,7 @@ class Homogeneous(Model):
         return self
 
 
-class AtmosphereSettings(Model):
+class AtmosphereSettings(SimulationModel):
     """The air: molecules, and the sum of what is given here."""
 
     homogeneous: Homogeneous | None = None

@@ -8,7 +8,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.campaign.simulation_base import Azimuth, BinWidth, Instant, Model, Period
+from lidarops.campaign.simulation_base import (
+    Azimuth,
+    BinWidth,
+    Instant,
+    Period,
+    SimulationModel,
+)
 
 DialectName = Literal["licel", "manaus", "saopaulo", "pilar", "golmud"]
 
@@ -91,21 +97,21 @@ _HANDLING = {
 }
 
 
-class Damage(Model):
+class Damage(SimulationModel):
     """One file to be damaged."""
 
     kind: DamageKind
     index: int = Field(ge=0, description="which signal file of the instrument, from 0")
 
 
-class RandomDamage(Model):
+class RandomDamage(SimulationModel):
     """Damage to files that the seed of the simulation chooses."""
 
     fraction: float = Field(gt=0, le=1, description="of the signal files")
     kinds: list[DamageKind] = Field(min_length=1)
 
 
-class Pointing(Model):
+class Pointing(SimulationModel):
     """Where the beam goes: the zenith angles of one cycle, one file each, again and again."""
 
     zenith_angles: list[Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]] = Field(
@@ -136,14 +142,14 @@ class Pointing(Model):
         return (*((zenith, opposite) for zenith in tilted), *sorted(this_side))
 
 
-class ClockJump(Model):
+class ClockJump(SimulationModel):
     """From a moment on the clock of the computer is off by a number of seconds."""
 
     at: Instant = Field(description="true time")
     offset: int = Field(ge=-86400, le=86400, description="s, clock minus true time")
 
 
-class Change(Model):
+class Change(SimulationModel):
     """From a moment on files are taken in another way."""
 
     at: Instant
@@ -152,7 +158,7 @@ class Change(Model):
     shots: int | None = Field(default=None, ge=1, le=999_999)
 
 
-class Acquisition(Model):
+class Acquisition(SimulationModel):
     """How an instrument takes its files."""
 
     interval: float = Field(default=300.0, ge=1, le=86400, description="s from start to start")

@@ -7,10 +7,10 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.campaign.simulation_base import BinWidth, Model, NotNegative
+from lidarops.campaign.simulation_base import BinWidth, NotNegative, SimulationModel
 
 
-class PhotonCounter(Model):
+class PhotonCounter(SimulationModel):
     """The photon-counting output of a detector. Its dead time is a fact of the campaign."""
 
     discriminator_level: int = Field(default=8, ge=1, le=63, description="Licel level")
@@ -19,7 +19,7 @@ class PhotonCounter(Model):
     )
 
 
-class AnalogRecorder(Model):
+class AnalogRecorder(SimulationModel):
     """The analog output of a detector."""
 
     gain: float = Field(gt=0, le=100, description="mV per MHz of photoelectrons")
@@ -61,7 +61,7 @@ class AnalogRecorder(Model):
         return self
 
 
-class Background(Model):
+class Background(SimulationModel):
     """Sky light on a detector."""
 
     night: NotNegative = Field(description="MHz of photoelectrons")
@@ -74,7 +74,7 @@ class Background(Model):
         return self
 
 
-class Optics(Model):
+class Optics(SimulationModel):
     """Laser and telescope, from which the strength of a signal follows."""
 
     energy: float = Field(gt=0, le=100, description="J, of one pulse")
@@ -94,7 +94,7 @@ class Optics(Model):
         return photons * self.efficiency * self.area * 299_792_458.0 / 2.0 * 1e-6 / 1e6 * 1e-6
 
 
-class Detector(Model):
+class Detector(SimulationModel):
     """One detector: one wavelength, read by an analog recorder, a photon counter or both."""
 
     wavelength: int = Field(ge=200, le=3000, description="nm, as in the headers")
@@ -141,7 +141,7 @@ class Detector(Model):
         return self
 
 
-class LaserDrift(Model):
+class LaserDrift(SimulationModel):
     """How the energy of the laser changes: steadily, from file to file, from shot to shot."""
 
     per_hour: float = Field(
@@ -155,7 +155,7 @@ class LaserDrift(Model):
     )
 
 
-class Pulse(Model):
+class Pulse(SimulationModel):
     """Shape of the laser pulse in time; short against a bin where not given.
 
     Time zero is its centroid.

@@ -38,7 +38,7 @@ from lidarops.campaign.simulated_instrument import (
     PhotonCounter,
     Pulse,
 )
-from lidarops.campaign.simulation_base import DiurnalCourse, Instant, Model
+from lidarops.campaign.simulation_base import DiurnalCourse, Instant, SimulationModel
 
 __all__ = [
     "Acquisition",
@@ -74,7 +74,7 @@ _NEEDED = {
 }
 
 
-class _Instrument(Model):
+class _Instrument(SimulationModel):
     acquisition: Acquisition = Acquisition()
     detectors: list[Detector] = Field(min_length=1)
     damage: tuple[Damage, ...] = ()
@@ -214,7 +214,7 @@ SimulatedInstrument = Annotated[
 ]
 
 
-class TruthSettings(Model):
+class TruthSettings(SimulationModel):
     """How much is told of the air on the beams."""
 
     cells: int | None = Field(
@@ -229,7 +229,7 @@ class TruthSettings(Model):
     )
 
 
-class SimulationSettings(Model):
+class SimulationSettings(SimulationModel):
     """Settings of a simulated campaign."""
 
     seed: int = Field(ge=0, lt=2**63)

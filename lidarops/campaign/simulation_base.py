@@ -50,13 +50,13 @@ Azimuth = Annotated[float, Field(ge=0, lt=360, allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 
-class Model(BaseModel):
+class SimulationModel(BaseModel):
     """A part of the settings: frozen, and without keys that nobody knows."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Period(Model):
+class Period(SimulationModel):
     """A time interval, from its start up to its stop."""
 
     start: Instant
@@ -73,7 +73,7 @@ class Period(Model):
         return start < self.stop and stop > self.start
 
 
-class DiurnalCourse(Model):
+class DiurnalCourse(SimulationModel):
     """A quantity that follows the hour of the day (UTC) as a cosine."""
 
     minimum: NotNegative

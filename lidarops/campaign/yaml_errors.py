@@ -15,7 +15,7 @@ _KEY = "[key]"
 """What pydantic puts behind a key of a mapping that is itself wrong."""
 
 
-def duplicates(tree: yaml.Node | None) -> list[str]:
+def duplicate_keys(tree: yaml.Node | None) -> list[str]:
     """Name the keys that stand twice in a mapping: YAML's own reader takes the last one silently.
 
     Parameters
@@ -52,7 +52,7 @@ def duplicates(tree: yaml.Node | None) -> list[str]:
     return [told for _, told in sorted(found)]
 
 
-def explain(
+def explain_yaml_error(
     error: ValidationError, tree: yaml.Node | None, model: type[BaseModel], words: Mapping[str, str]
 ) -> list[str]:
     """Say of every mistake in what line it is, and what would be right there.

@@ -60,7 +60,7 @@ class _Claim:
     scan_key: str
 
 
-def scan(
+def scan_archive(
     campaign: Campaign,
     store: Store,
     *,

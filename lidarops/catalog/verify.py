@@ -23,7 +23,7 @@ class Mismatch:
     problem: str
 
 
-def verify(
+def verify_archive(
     campaign: Campaign,
     store: Store,
     *,

@@ -63,7 +63,7 @@ def aggregate(
 
     Example: lidarops aggregate demo --kind elastic --means month --weights inverse-variance
     """
-    from lidarops.aggregate.aggregates import Wanted, make
+    from lidarops.aggregate.aggregates import Wanted, make_aggregates
     from lidarops.aggregate.means_variables import Period, Weights
     from lidarops.aggregate.selection import choice, select
 
@@ -74,7 +74,7 @@ def aggregate(
         stac,
     )
     with progress_bar("aggregate", None) as advance:
-        made = make(_root(out), wanted, progress=advance)
+        made = make_aggregates(_root(out), wanted, progress=advance)
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:
@@ -85,9 +85,9 @@ def aggregate(
 def _root(out: Path) -> Path:
     if not out.is_file():
         return out
-    from lidarops.campaign.model import load
+    from lidarops.campaign.model import load_campaign
 
-    return Path(load(out).output)
+    return Path(load_campaign(out).output)
 
 
 def _tell(made: Made) -> None:

@@ -150,7 +150,7 @@ def show_plan(
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
     found = assess(settings, selection=wanted, everything=not stale, wait=wait)
-    machine = cost_estimate.load()
+    machine = cost_estimate.load_calibration()
     making, everything = cost_estimate.Tally(machine), cost_estimate.Tally(machine)
     scenes = []
     none = True
@@ -311,10 +311,10 @@ def _loaded(
     *,
     all_steps: bool = False,
 ) -> Campaign:
-    from lidarops.campaign.model import load
+    from lidarops.campaign.model import load_campaign
     from lidarops.run.selection import refuse_nowhere
 
-    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     refuse_nowhere(settings, archive=archive)
     return settings.model_copy(update={"all_steps": all_steps or settings.all_steps})
 
@@ -333,12 +333,14 @@ def _cluster(
         return None
     from lidarops.run import clusters
 
-    chosen = clusters.choose(workers=workers, scheduler=scheduler, cluster=cluster, memory=memory)
+    chosen = clusters.choose_cluster(
+        workers=workers, scheduler=scheduler, cluster=cluster, memory=memory
+    )
     if tls and isinstance(chosen, clusters.Scheduler):
         ca, certificate, key = tls
         files = clusters.Tls(ca=ca, certificate=certificate, key=key)
         chosen = chosen.model_copy(update={"tls": files})
-    return partial(clusters.client, chosen)
+    return partial(clusters.connect_client, chosen)
 
 
 def _selection(

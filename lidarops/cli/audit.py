@@ -40,10 +40,10 @@ def runs(
 
     Example: lidarops runs catalogs/demo.yaml
     """
-    from lidarops.campaign.model import load
+    from lidarops.campaign.model import load_campaign
     from lidarops.catalog.store import Store
 
-    settings = load(campaign, output=out, catalog=catalog)
+    settings = load_campaign(campaign, output=out, catalog=catalog)
     with Store(settings.catalog_url, settings.name, create=False) as store:
         found = store.runs(limit=limit)
     if as_json:
@@ -83,12 +83,12 @@ def verify(
 
     Example: lidarops verify catalogs/demo.yaml
     """
-    from lidarops.campaign.model import load
+    from lidarops.campaign.model import load_campaign
     from lidarops.catalog.store import Store
-    from lidarops.catalog.verify import verify as audit
+    from lidarops.catalog.verify import verify_archive as audit
     from lidarops.run.selection import refuse_nowhere
 
-    settings = load(campaign, archive=archive, output=out, catalog=catalog)
+    settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     if archive and not products_only:
         refuse_nowhere(settings, archive=archive)
     looked = 0

@@ -78,8 +78,8 @@ def bench(
             _refuse({"case": case, "files": files, "data": data, "repeats": repeats})
             finding = _stability(effort)
         else:
-            finding = registry.run(what, case, files or [], effort, data=data)
-    page = None if out is None else registry.write(finding, Path(out))
+            finding = registry.run_benchmark(what, case, files or [], effort, data=data)
+    page = None if out is None else registry.write_benchmark(finding, Path(out))
     if as_json:
         typer.echo(json.dumps(results.plain(finding.result), indent=1))
         leave(failed=_failed(finding))
@@ -107,7 +107,7 @@ def _refuse(given: dict[str, object]) -> None:
 def _stability(effort: Effort) -> Finding:
     from lidarops.bench.stability import study
 
-    return study.run(effort)
+    return study.run_stability(effort)
 
 
 def _failed(finding: Finding) -> bool:

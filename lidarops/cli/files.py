@@ -24,7 +24,9 @@ def report(
     from lidarops.reports import run_page, run_record
 
     folder = run if run.is_dir() else run.parent
-    typer.echo(str(run_page.build(run_record.load(run), folder, workers=workers).page))
+    typer.echo(
+        str(run_page.build_report(run_record.load_run_record(run), folder, workers=workers).page)
+    )
 
 
 @app.command()

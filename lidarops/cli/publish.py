@@ -24,11 +24,11 @@ def publish(
 
     Example: lidarops publish catalogs/demo.yaml s3://bucket/demo
     """
-    from lidarops.campaign.model import load
-    from lidarops.run.publication import publish as copy
+    from lidarops.campaign.model import load_campaign
+    from lidarops.run.publication import publish_products as copy
     from lidarops.system.stores import without_keys
 
-    settings = load(campaign, output=out, catalog=catalog)
+    settings = load_campaign(campaign, output=out, catalog=catalog)
     done = copy(settings, url)
     if as_json:
         typer.echo(json.dumps(asdict(done), indent=2))

@@ -40,9 +40,9 @@ def reproduce(
     """
     from dataclasses import asdict
 
-    from lidarops.run.reproduction import explain
-    from lidarops.run.reproduction import reproduce as make_again
+    from lidarops.run.reproduction import explain_difference
+    from lidarops.run.reproduction import reproduce_product as make_again
 
     result = make_again(product, archive=archive, ancillary=ancillary, catalog=catalog)
-    typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain(result))
+    typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain_difference(result))
     leave(failed=not result.identical)

@@ -23,15 +23,15 @@ def simulate(
     """
     from contextlib import nullcontext
 
-    from lidarops.campaign.model import load
+    from lidarops.campaign.model import load_campaign
     from lidarops.netcdf.write import write_plain
     from lidarops.run.executor import local_client
-    from lidarops.simulate.campaign import carry_out, plan
+    from lidarops.simulate.campaign import plan_simulation, write_simulation
 
-    settings = load(campaign, archive=archive, output=out)
-    planned = plan(settings)
+    settings = load_campaign(campaign, archive=archive, output=out)
+    planned = plan_simulation(settings)
     cluster = nullcontext() if workers == 1 else local_client(workers)
     with progress_bar("simulate", len(planned.paths)) as advance, cluster as client:
-        simulated = carry_out(planned, client=client, progress=advance)
+        simulated = write_simulation(planned, client=client, progress=advance)
     write_plain(simulated.truth, settings.truth_path)
     typer.echo(f"{len(simulated.paths)} raw files and truth.nc in {settings.archive}")

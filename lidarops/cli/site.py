@@ -37,10 +37,10 @@ def site(
 
     Example: lidarops site demo --workers 2
     """
-    from lidarops.site.build import build
+    from lidarops.site.build import build_site
 
     with progress_bar("site", None) as advance:
-        made = build(out, workers=workers, progress=advance)
+        made = build_site(out, workers=workers, progress=advance)
     if as_json:
         typer.echo(
             json.dumps(

@@ -80,7 +80,7 @@ class Ladder:
     """Label and one value for each row."""
 
 
-def draw(chart: Chart | Ladder) -> Figure:
+def draw_chart(chart: Chart | Ladder) -> Figure:
     """Return the figure of a chart; `lidarops.figures.product_figures.render` makes it a file."""
     figure = _chart(chart) if isinstance(chart, Chart) else _ladder(chart)
     panels.title(figure, chart.title)

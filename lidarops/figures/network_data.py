@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.series_data import Estimate, Section, require
+from lidarops.figures.series_data import Section, SeriesEstimate, require
 from lidarops.figures.time_axis import Times
 from lidarops.flags import Quality
 from lidarops.records import SceneOutcome
@@ -132,10 +132,10 @@ def read_vertices(
             time=time,
             flag=flags[:, v],
             estimates={
-                "extinction": Estimate(
+                "extinction": SeriesEstimate(
                     value[:, v], np.hypot(random, systematic)[:, v], known[:, v], "m-1"
                 ),
-                "visibility": Estimate(
+                "visibility": SeriesEstimate(
                     seen[:, v] / 1e3,
                     np.abs(high - low)[:, v] / 2e3,
                     true_sight[:, v] / 1e3,
@@ -167,9 +167,11 @@ def join_vertices(series: Sequence[VertexSeries]) -> list[VertexSeries]:
     return found
 
 
-def _joined(series: Sequence[VertexSeries], quantity: str, order: NDArray[np.intp]) -> Estimate:
+def _joined(
+    series: Sequence[VertexSeries], quantity: str, order: NDArray[np.intp]
+) -> SeriesEstimate:
     parts = [one.estimates[quantity] for one in series]
-    return Estimate(
+    return SeriesEstimate(
         value=np.concatenate([part.value for part in parts])[order],
         standard_error=np.concatenate([part.standard_error for part in parts])[order],
         truth=np.concatenate([part.truth for part in parts])[order],

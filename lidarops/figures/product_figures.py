@@ -224,7 +224,7 @@ def draw_backscatter(rasters: Sequence[Raster], *, title: str = "") -> Figure:
     )
 
 
-def error_budget(profile: Profile, *, title: str = "") -> Figure:
+def error_budget_figure(profile: Profile, *, title: str = "") -> Figure:
     """Draw one mean profile of backscatter, and what its error is made of.
 
     Parameters
@@ -242,7 +242,7 @@ def error_budget(profile: Profile, *, title: str = "") -> Figure:
     moment = str(profile.time.astype("datetime64[s]")).replace("T", " ") + " UTC"
     panels.title(figure, f"{title}, {moment}, lidar ratio {profile.lidar_ratio:g} sr")
     profile_panels.backscatter(left, profile)
-    profile_panels.error_budget(right, profile)
+    profile_panels.error_budget_panels(right, profile)
     for panel in (left, right):
         panels.legend(panel, columns=2)
     bottom, top = (edge / 1e3 for edge in profile.reference)
@@ -472,7 +472,7 @@ def render(figure: Figure) -> Rendered:
     return Rendered(buffer.getvalue(), alt)
 
 
-def draw(_: object, sketch: Sketch) -> Rendered:
+def draw_figure(_: object, sketch: Sketch) -> Rendered:
     """Return what comes of a sketch, in whatever process."""
     return render(sketch.draw(sketch.of, title=sketch.title))
 

@@ -55,7 +55,7 @@ def backscatter(panel: Axes, profile: Profile) -> None:
     panel.set_ylabel("range (km)")
 
 
-def error_budget(panel: Axes, profile: Profile) -> None:
+def error_budget_panels(panel: Axes, profile: Profile) -> None:
     """Draw the error by each cause, and the standard error that they add up to."""
     _against_range(panel, profile)
     r = profile.range / 1e3

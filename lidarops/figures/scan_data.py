@@ -61,7 +61,7 @@ _READ_BYTES: Final = 48_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class ProfileEstimate:
     """One retrieved quantity against altitude, (altitude,)."""
 
     value: Floats
@@ -97,7 +97,7 @@ class ScanProfile:
     """UTC."""
     altitude: Floats
     """(altitude,) m."""
-    estimates: dict[str, Estimate]
+    estimates: dict[str, ProfileEstimate]
     """By each of `QUANTITIES`."""
     flag: NDArray[np.int64]
     """(altitude,) Bits of `Quality`."""
@@ -197,14 +197,14 @@ def _shown(altitude: Floats, reach: float) -> Mask:
     return np.asarray(altitude <= altitude[0] + _BEYOND * max(reach - altitude[0], 0.0))
 
 
-def _estimate(chosen: xr.Dataset, name: str, bits: NDArray[np.int64]) -> Estimate:
+def _estimate(chosen: xr.Dataset, name: str, bits: NDArray[np.int64]) -> ProfileEstimate:
     value = chosen[name].values.astype(np.float64)
     rejected = (bits & _REJECTED) != 0
 
     def kept(suffix: str) -> Floats:
         return np.where(rejected, np.nan, chosen[f"{name}_{suffix}"].values.astype(np.float64))
 
-    return Estimate(
+    return ProfileEstimate(
         value=np.where(rejected, np.nan, value),
         rejected=np.where(rejected, value, np.nan),
         standard_error=kept("standard_error"),

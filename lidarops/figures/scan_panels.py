@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from lidarops.figures.panels import GREY, INK
-from lidarops.figures.scan_data import Estimate, ScanProfile, ScanResiduals
+from lidarops.figures.scan_data import ProfileEstimate, ScanProfile, ScanResiduals
 from lidarops.figures.wording import bit_name, counted
 from lidarops.flags import Quality
 
@@ -137,7 +137,7 @@ def _limits(profile: ScanProfile, quantity: str, scale: float) -> tuple[float, f
     return scale * float(low - margin), scale * float(high + margin)
 
 
-def _reached(estimate: Estimate) -> tuple[float, float]:
+def _reached(estimate: ProfileEstimate) -> tuple[float, float]:
     if not np.isfinite(estimate.value).any():
         return _span(estimate.rejected, 0.0 * estimate.rejected)
     low, high = _span(estimate.value, estimate.standard_error)

@@ -23,7 +23,7 @@ QUANTITIES: Final = ("extinction", "background", "amplitude")
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class SeriesEstimate:
     """One retrieved quantity."""
 
     value: Floats
@@ -47,7 +47,7 @@ class Section:
     """(time,) Middles of profiles, UTC, rising."""
     flag: NDArray[np.int64]
     """(time,) Bits of `Quality`."""
-    estimates: Mapping[str, Estimate]
+    estimates: Mapping[str, SeriesEstimate]
     """By name of the quantity."""
 
     @property
@@ -176,7 +176,7 @@ def read_sections(
     found = []
     for k in np.argsort(bounds[:, 0], kind="stable"):
         estimates = {
-            name: Estimate(
+            name: SeriesEstimate(
                 value=_floats(product, name)[order, k],
                 standard_error=_floats(product, f"{name}_standard_error")[order, k],
                 truth=true[name],
@@ -276,7 +276,7 @@ def thin(section: Section, points: int) -> Section:
         time=good.time[0] + _block_mean(np.asarray(elapsed), starts).astype("timedelta64[ns]"),
         flag=np.zeros(starts.size, dtype=np.int64),
         estimates={
-            name: Estimate(
+            name: SeriesEstimate(
                 value=_block_mean(estimate.value, starts),
                 standard_error=_block_error(estimate.standard_error, starts),
                 truth=_block_mean(estimate.truth, starts),
@@ -294,7 +294,7 @@ def _where(section: Section, keep: NDArray[np.bool_]) -> Section:
         time=section.time[keep],
         flag=section.flag[keep],
         estimates={
-            name: Estimate(
+            name: SeriesEstimate(
                 value=estimate.value[keep],
                 standard_error=estimate.standard_error[keep],
                 truth=estimate.truth[keep],
@@ -329,7 +329,7 @@ def _joined(group: list[Section]) -> Section:
         time=time[order],
         flag=np.concatenate([section.flag for section in group])[order],
         estimates={
-            name: Estimate(
+            name: SeriesEstimate(
                 value=_gathered([s.estimates[name].value for s in group], order),
                 standard_error=_gathered([s.estimates[name].standard_error for s in group], order),
                 truth=_gathered([s.estimates[name].truth for s in group], order),

@@ -14,7 +14,7 @@ import xarray as xr
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.context import Context, product_path
-from lidarops.netcdf.coordinates import Coordinate, locate
+from lidarops.netcdf.coordinates import Coordinate, locate_product
 from lidarops.netcdf.global_attributes import global_attributes
 from lidarops.netcdf.input_checks import (
     Intake,
@@ -65,7 +65,7 @@ def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Data
     """
     _refuse_mismatch(context)
     source = Intake(data, layout)
-    coordinates, extents = locate(source, layout, context)
+    coordinates, extents = locate_product(source, layout, context)
     product = xr.Dataset(
         {
             **_place(coordinates, context.mode),

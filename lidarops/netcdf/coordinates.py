@@ -37,7 +37,9 @@ class Coordinate:
         return self.dims != (self.row.name,)
 
 
-def locate(source: Intake, layout: Layout, context: Context) -> tuple[list[Coordinate], Extents]:
+def locate_product(
+    source: Intake, layout: Layout, context: Context
+) -> tuple[list[Coordinate], Extents]:
     """Return the coordinates of a product in the order of its layout, and what they cover.
 
     Parameters

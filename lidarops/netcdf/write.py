@@ -40,7 +40,7 @@ class Written:
     size: int
 
 
-def write(dataset: xr.Dataset, path: str | Path) -> Written:
+def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     """Write a product.
 
     The file appears under its name when it is complete and on disk, or not at all; what stood

@@ -1,7 +1,7 @@
 """What a campaign asks for, or tells facts of, and the files do not hold.
 
 The rules look at one layout of channels. Of single scenes they are asked by `lidarops.plan.scene_plan`; of
-all files of an archive by `unmet`, as a name that no file has is a slip of the pen, and one that
+all files of an archive by `unavailable`, as a name that no file has is a slip of the pen, and one that
 some have and others lack is a lidar that was changed.
 """
 
@@ -173,7 +173,7 @@ def _lacked(held: Held) -> list[LeftOut]:
     return [left for left in found if left.name != StepName.LAG]
 
 
-def unmet(
+def unavailable(
     campaign: Campaign,
     holdings: Iterable[Holding],
     *,

@@ -362,7 +362,7 @@ def calibration_path() -> Path:
     return Path(folder) / "lidarops" / "costs.json"
 
 
-def save(costs: Costs, path: Path | None = None) -> Path:
+def save_calibration(costs: Costs, path: Path | None = None) -> Path:
     """Keep a calibration.
 
     Raises
@@ -392,7 +392,7 @@ def save(costs: Costs, path: Path | None = None) -> Path:
     return target
 
 
-def load(path: Path | None = None) -> Costs:
+def load_calibration(path: Path | None = None) -> Costs:
     """Return the costs of this machine: calibrated where they are, with a note where not.
 
     A calibration of another processor is not used, as home directories move.

@@ -72,7 +72,7 @@ class RayPlan:
         }
 
 
-def plan(scene: Scene, campaign: Campaign) -> Plan:
+def plan_network(scene: Scene, campaign: Campaign) -> Plan:
     """Decide what runs for a scene of a network.
 
     Parameters
@@ -350,8 +350,8 @@ def meeting_of(
     tolerance: float,
     smallest_angle: float,
 ) -> geometry.Network:
-    """Return where beams meet; see `lidarops.retrieve.network.geometry.network`."""
-    return geometry.network(
+    """Return where beams meet; see `lidarops.retrieve.network.geometry.build_network`."""
+    return geometry.build_network(
         rays_of(rays, scene, campaign),
         tolerance=tolerance,
         nearest=[ray.nearest for ray in rays],
@@ -430,7 +430,7 @@ def _cycle(case: Meeting) -> Decisions:
     if case.reason or method not in {"cycle", "multiplier", "unbiased"}:
         return
     try:
-        geometry.cycle(case.net(case.kept))
+        geometry.build_cycle(case.net(case.kept))
     except RetrievalInputError as error:
         yield case.none(f"method {method}: {error}", float(len(case.kept)))
 

@@ -18,7 +18,7 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.plan.signal_rules import Decisions, Rule, StepName, applied
 from lidarops.records import Granule, LeftOut, Plan, Step
-from lidarops.retrieve.background.detectable_light import Look, look, spaced
+from lidarops.retrieve.background.detectable_light import Look, look_for_light, spaced
 
 GAP: Final = timedelta(minutes=10)
 """Longest time between profiles that are looked at where the first ones show nothing."""
@@ -88,7 +88,7 @@ _BITS: Final[Mapping[str, Quality]] = {
 }
 
 
-def refine(plan: Plan, granules: Sequence[Granule], profiles: Profiles) -> Plan:
+def refine_plan(plan: Plan, granules: Sequence[Granule], profiles: Profiles) -> Plan:
     """Leave out of a plan the sections in which there is nothing to retrieve.
 
     Parameters
@@ -181,7 +181,8 @@ def _looks(
         profiles[name].to_numpy() for name in ("power", "variance", "quality", "range")
     )
     return {
-        (near, far): look(power, variance, quality, distance, near, far) for near, far in sections
+        (near, far): look_for_light(power, variance, quality, distance, near, far)
+        for near, far in sections
     }
 
 

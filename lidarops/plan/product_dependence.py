@@ -55,7 +55,7 @@ def wanted(plan: Plan) -> tuple[Wanted, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def part(plan: Plan, products: Collection[Wanted]) -> Plan:
+def plan_closure(plan: Plan, products: Collection[Wanted]) -> Plan:
     """Return the part of a plan that some of its products need.
 
     Parameters
@@ -102,7 +102,7 @@ def of_kinds(plan: Plan, kinds: Collection[ProductKind]) -> Plan:
         return plan
     products = [product for product in wanted(plan) if product[0] in kinds]
     # What the members of a network share would stay without its product.
-    mine = part(plan, products) if products else replace(plan, steps=(), left_out=())
+    mine = plan_closure(plan, products) if products else replace(plan, steps=(), left_out=())
     told = {*kinds, StepName.READ}
     left_out = tuple(left for left in plan.left_out if left.name in told or left in mine.left_out)
     return replace(mine, left_out=left_out)
@@ -155,7 +155,7 @@ class Settings:
         ----------
         scene : Scene
         plan : Plan
-            The product's, from `part`.
+            The product's, from `plan_closure`.
         channel : str
             Of the product.
         """
@@ -188,7 +188,7 @@ def facts(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str, Any]:
     ----------
     known : InstrumentFacts
     plan : Plan
-        The product's, from `part`.
+        The product's, from `plan_closure`.
     channel : str
         Of the product.
 
@@ -225,7 +225,7 @@ def inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecord, ...]:
     Parameters
     ----------
     plan : Plan
-        From `part`.
+        From `plan_closure`.
     files : iterable of InputRecord
         Of the scene.
     """

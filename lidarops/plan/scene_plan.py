@@ -72,7 +72,7 @@ class _Asked:
     """Those that the instrument is part of -> the channel that they want."""
 
 
-def plan(scene: Scene, campaign: Campaign) -> Plan:
+def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
     """Decide what runs for a scene.
 
     Parameters
@@ -87,7 +87,7 @@ def plan(scene: Scene, campaign: Campaign) -> Plan:
         `left_out` says why.
     """
     if scene.members:
-        return network_plan.plan(scene, campaign)
+        return network_plan.plan_network(scene, campaign)
     instrument = campaign.instruments[scene.instrument]
     # A scene never straddles an edge of a validity period, so its first granule speaks for all.
     facts = instrument.facts_at(scene.granules[0].start or scene.start)

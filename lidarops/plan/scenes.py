@@ -37,7 +37,7 @@ class Cut:
     """Granules of the same instrument and time as another one, refused with that reason."""
 
 
-def cut(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
+def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     """Group the good granules of a campaign into scenes.
 
     Parameters
@@ -137,7 +137,7 @@ def stop_of(scene: str, campaign: Campaign) -> datetime:
     return _window(campaign, [each for each in members if each in campaign.instruments], start)[1]
 
 
-def select(
+def select_scenes(
     scenes: Sequence[Scene],
     *,
     instruments: Sequence[str] = (),

@@ -61,7 +61,7 @@ class Bench:
         return {step.name: step for step in self.plan.steps if step.channel == channel}
 
 
-def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
+def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
     """Carry out the steps of a channel.
 
     Parameters
@@ -103,7 +103,7 @@ def carry_out(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]:
         found[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
     if ProductKind.MULTIANGLE in found:
         settings = steps[StepName.MULTIANGLE].settings
-        found[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve(
+        found[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve_optical_depth(
             found[ProductKind.MULTIANGLE],
             station_altitude=bench.station_altitude,
             method=settings["method"],
@@ -293,7 +293,7 @@ def _absent(
     shots: xr.DataArray, unit: str, absent: Mapping[tuple[float, float], Quality]
 ) -> xr.Dataset:
     """Return sections without values, for which no bin is read."""
-    empty = labeled.nothing(shots, unit=unit, sections=list(absent))
+    empty = labeled.empty_fit(shots, unit=unit, sections=list(absent))
     bits = np.array([int(bit) for bit in absent.values()], dtype=np.int32)
     missing = np.where(shots.to_numpy() > 0, np.int32(0), np.int32(Quality.INPUT_MISSING))
     flags = bits | missing[:, np.newaxis]
@@ -312,7 +312,7 @@ def _retrieved(
         # A signal with its background cannot be divided: where overlap is not full is left out.
         partial = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
         quality = quality | xr.DataArray(partial.astype(np.int32), dims="range")
-    return labeled.homogeneous(
+    return labeled.fit_homogeneous_path(
         conditioned["power"],
         sections=sections,
         variance=conditioned["variance"],
@@ -329,7 +329,7 @@ def _with_visibility(result: xr.Dataset, steps: Mapping[str, Step]) -> xr.Datase
     definition = Definition(
         wavelength=steps[StepName.READ].settings["wavelength"], **settings["visibility"]
     )
-    seen = labeled_visibility.of_extinction(
+    seen = labeled_visibility.visibility_of_extinction(
         result["extinction"],
         result["extinction_standard_error"],
         result["extinction_model_error"],
@@ -341,7 +341,7 @@ def _with_visibility(result: xr.Dataset, steps: Mapping[str, Step]) -> xr.Datase
 def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
     settings = steps[StepName.ELASTIC].settings
     window = steps[StepName.REFERENCE].settings
-    found = labeled_elastic.elastic(
+    found = labeled_elastic.invert_elastic(
         averages,
         molecules=_molecules(steps, bench.ancillaries),
         wavelength=steps[StepName.READ].settings["wavelength"],

@@ -21,7 +21,7 @@ from lidarops.process.channel_steps import Bench
 from lidarops.records import Step
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.network import geometry, labeled
-from lidarops.retrieve.network.labeled import BeamSignals
+from lidarops.retrieve.network.labeled import BeamAverages
 
 Integers = npt.NDArray[np.int64]
 
@@ -40,7 +40,7 @@ class Member:
     """m, of the bins that the plan reckons with."""
 
 
-def carry_out(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.Dataset:
+def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.Dataset:
     """Carry out the steps of a network.
 
     Parameters
@@ -68,10 +68,10 @@ def carry_out(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.Datase
     # Together, so that the beams of one instrument share one reading of its files.
     computed = compute(*(beam.lazy for beam in beams))  # type: ignore[no-untyped-call]
     signals = [beam.signals(data) for beam, data in zip(beams, computed, strict=True)]
-    return labeled.retrieve(
+    return labeled.retrieve_network(
         signals,
         _network(signals, settings, rays),
-        labeled.Settings(
+        labeled.NetworkSettings(
             block_intervals=round(settings["block_seconds"] / seconds),
             visibility=Definition(
                 wavelength=settings["wavelength"],
@@ -87,9 +87,9 @@ def carry_out(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.Datase
 
 
 def _network(
-    signals: Sequence[BeamSignals], settings: Mapping[str, Any], rays: Sequence[RayPlan]
+    signals: Sequence[BeamAverages], settings: Mapping[str, Any], rays: Sequence[RayPlan]
 ) -> geometry.Network:
-    return geometry.network(
+    return geometry.build_network(
         [
             geometry.Ray(*beam.station, azimuth=beam.azimuth, elevation=90.0 - beam.zenith_angle)
             for beam in signals
@@ -117,7 +117,7 @@ class _Beam:
             self._interval = _intervals(archive["time"].to_numpy(), seconds)
             self.lazy = self._source.averages(seconds)
 
-    def signals(self, computed: xr.Dataset) -> BeamSignals:
+    def signals(self, computed: xr.Dataset) -> BeamAverages:
         """Return the averages with what the network needs to know of them."""
         member, bench = self._member, self._member.bench
         averages = computed if self._source is None else self._source.joined(computed)
@@ -126,7 +126,7 @@ class _Beam:
         near, far = (
             planned[StepName.BACKGROUND].settings["range"] if planned else (distance[0], np.inf)
         )
-        return BeamSignals(
+        return BeamAverages(
             averages=averages,
             interval=self._interval,
             instrument=member.instrument,

@@ -27,7 +27,7 @@ from lidarops.netcdf import provenance, write
 from lidarops.netcdf.context import Context, product_path
 from lidarops.plan import network_plan, product_dependence
 from lidarops.plan.availability import glued_channels
-from lidarops.plan.preview import refine
+from lidarops.plan.preview import refine_plan
 from lidarops.plan.signal_rules import StepName, gates
 from lidarops.process import channel_steps, network_steps
 from lidarops.products.layouts import build_product
@@ -88,7 +88,7 @@ class Job:
         return instrument.facts_at(self.scene.granules[0].start or self.scene.start)
 
 
-def process(job: Job) -> SceneOutcome:
+def process_scene(job: Job) -> SceneOutcome:
     """Process one scene: its products, or why there are none.
 
     Parameters
@@ -191,7 +191,7 @@ def _refined(
         looked_at = channel_steps.at_hand(replace(bench, archive=some), [channel])
         return channel_steps.Plain(looked_at, channel).profiles().compute()
 
-    plan = refine(job.plan, scene.granules, profiles)
+    plan = refine_plan(job.plan, scene.granules, profiles)
     return replace(job, plan=plan), replace(bench, plan=plan)
 
 
@@ -324,7 +324,7 @@ def _channel_products(
     clock: _Clock,
 ) -> Iterator[ProductRecord]:
     layout = _layout(job, scene, name)
-    computed = channel_steps.carry_out(bench, name)
+    computed = channel_steps.process_channel(bench, name)
     clock.lap("retrieve")
     for kind, data in computed.items():
         colour = bench.steps(name)[StepName.READ].settings["wavelength"]
@@ -334,7 +334,7 @@ def _channel_products(
 
 def _written(job: Job, context: Context, data: xr.Dataset, clock: _Clock) -> ProductRecord:
     path = product_path(context)
-    written = write.write(build_product(data, context), job.campaign.products_root / path)
+    written = write.write_product(build_product(data, context), job.campaign.products_root / path)
     clock.lap("write")
     return _record(context.kind, context.channel, path, written, data)
 
@@ -360,7 +360,7 @@ def _network_product(
         )
         station = job.campaign.stations[planned.station]
         members.append(network_steps.Member(planned.instrument, station, bench, grid))
-    data = network_steps.carry_out(members, joint)
+    data = network_steps.process_network(members, joint)
     clock.lap("retrieve")
     first = next(m for m in job.scene.members if m.instrument == members[0].instrument)
     layout = network_plan.channel_of(first, asked.channel)
@@ -385,7 +385,7 @@ def _context(
 ) -> Context:
     campaign = job.campaign
     # What the product does not depend on must not stand in it.
-    mine = product_dependence.part(job.plan, [(kind, channel.name)])
+    mine = product_dependence.plan_closure(job.plan, [(kind, channel.name)])
     return Context(
         kind=kind,
         channel=channel.name,

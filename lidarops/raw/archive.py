@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.licel import Dataset, RawFile, channel_names, header_digest, to_physical
-from lidarops.raw.model import Columns, Position, Stretches, build
+from lidarops.raw.model import Columns, Position, Stretches, build_raw_dataset
 from lidarops.records import Granule
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
@@ -122,7 +122,7 @@ def open_archive(
         dtype = np.int32 if scales is None else np.float32
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
 
-    return build(columns, signal, scaled=mask_and_scale)
+    return build_raw_dataset(columns, signal, scaled=mask_and_scale)
 
 
 def _read_headers(

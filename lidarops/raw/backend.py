@@ -20,7 +20,7 @@ from xarray.core import indexing
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.licel import Dataset, RawFile, channel_names, read_header, to_physical
-from lidarops.raw.model import Columns, Position, build
+from lidarops.raw.model import Columns, Position, build_raw_dataset
 
 _FIRST_LINES = re.compile(rb"[^\r\n]{1,1022}\r\n[^\r\n]{0,1022}\d/\d{4} +\d{1,2}:\d\d:\d\d")
 
@@ -80,7 +80,7 @@ class LicelBackendEntrypoint(BackendEntrypoint):
             )
             return indexing.LazilyIndexedArray(_LazyCounts(array))
 
-        opened = build(columns, signal, scaled=mask_and_scale)
+        opened = build_raw_dataset(columns, signal, scaled=mask_and_scale)
         unwanted = [drop_variables] if isinstance(drop_variables, str) else drop_variables or ()
         opened = opened.drop_vars(list(unwanted), errors="ignore")
         opened.encoding["engine"] = "licel"

@@ -38,7 +38,13 @@ from lidarops.raw.licel_header import (
     Laser,
     parse_header,
 )
-from lidarops.raw.licel_write import encode, format_header, new_dataset, new_header, write
+from lidarops.raw.licel_write import (
+    encode,
+    format_header,
+    new_dataset,
+    new_header,
+    write,
+)
 from lidarops.records import ChannelLayout
 
 __all__ = [

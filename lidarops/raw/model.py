@@ -236,7 +236,7 @@ Signal = Callable[[int, Dataset], Any]
 """Channel number, its dataset in the first file -> array (time, range), lazy or not."""
 
 
-def build(columns: Columns, signal: Signal, *, scaled: bool) -> xr.Dataset:
+def build_raw_dataset(columns: Columns, signal: Signal, *, scaled: bool) -> xr.Dataset:
     """Return the Dataset of the files in `columns`.
 
     Parameters

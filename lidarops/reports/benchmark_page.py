@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lidarops.errors import CatalogError
 from lidarops.figures import product_figures
-from lidarops.figures.charts import Chart, Ladder, draw
+from lidarops.figures.charts import Chart, Ladder, draw_chart
 from lidarops.figures.wording import visible
 from lidarops.reports.run_record import write_atomically
 
@@ -44,7 +44,7 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class BenchmarkReport:
     """What a benchmark has to say."""
 
     title: str
@@ -56,7 +56,7 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ChartFile:
     """A chart as a file beside the page."""
 
     file: str
@@ -64,7 +64,7 @@ class Picture:
     alt: str
 
 
-def build(report: Report, folder: Path) -> Path:
+def build_benchmark_page(report: BenchmarkReport, folder: Path) -> Path:
     """Write the page of a benchmark and its charts.
 
     Parameters
@@ -99,13 +99,13 @@ def build(report: Report, folder: Path) -> Path:
     return folder / INDEX
 
 
-def _pictures(charts: Sequence[Chart | Ladder], folder: Path) -> list[Picture]:
+def _pictures(charts: Sequence[Chart | Ladder], folder: Path) -> list[ChartFile]:
     pictures = []
     for chart in charts:
-        drawn = product_figures.render(draw(chart))
+        drawn = product_figures.render(draw_chart(chart))
         name = f"{chart.name}.png"
         write_atomically(folder / name, drawn.png)
-        pictures.append(Picture(name, chart.caption, drawn.alt))
+        pictures.append(ChartFile(name, chart.caption, drawn.alt))
     return pictures
 
 

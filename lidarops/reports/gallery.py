@@ -68,7 +68,7 @@ Drawing = Callable[[], product_figures.Rendered]
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class Figure:
     """One figure of the report."""
 
     file: str
@@ -99,8 +99,8 @@ class Problem:
 class Gallery:
     """What was made of the products of a run."""
 
-    pictures: list[Picture] = field(default_factory=list)
-    flags: Picture | None = None
+    pictures: list[Figure] = field(default_factory=list)
+    flags: Figure | None = None
     compared: list[Compared] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     undrawn: list[str] = field(default_factory=list)
@@ -186,7 +186,9 @@ class _Sources:
 
     def draw(self, draw: Callable[..., Any], of: object, title: str) -> Drawing:
         """Begin a figure, in another process where there is one."""
-        return self.readers.later(product_figures.draw, product_figures.Sketch(draw, of, title))
+        return self.readers.later(
+            product_figures.draw_figure, product_figures.Sketch(draw, of, title)
+        )
 
     def _read(self, paths: list[str], readings: list[Reading[Found]]) -> Iterator[Found]:
         for path, found in zip(paths, self.readers.each(readings), strict=True):
@@ -210,7 +212,7 @@ class _Album:
     """Keeps figures as files in the order they come in, some of them while they are drawn."""
 
     def __init__(self, folder: Path, ahead: int) -> None:
-        self.pictures: list[Picture] = []
+        self.pictures: list[Figure] = []
         self._folder = folder
         # What a figure is made from is held until it is done.
         self._ahead = ahead
@@ -224,7 +226,7 @@ class _Album:
         self._waiting.append((instrument, drawn))
         self._keep(self._ahead)
 
-    def finish(self) -> list[Picture]:
+    def finish(self) -> list[Figure]:
         self._keep(0)
         return self.pictures
 
@@ -234,7 +236,7 @@ class _Album:
             name = _unique(drawn.name, self._taken)
             rendered = drawn.figure()
             write_atomically(self._folder / name, rendered.png)
-            self.pictures.append(Picture(name, instrument, drawn.caption, rendered.alt))
+            self.pictures.append(Figure(name, instrument, drawn.caption, rendered.alt))
 
 
 def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
@@ -270,7 +272,7 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
             name = f"{flags.name}.png"
             rendered = flags.figure()
             write_atomically(folder / name, rendered.png)
-            gallery.flags = Picture(name, "", flags.caption, rendered.alt)
+            gallery.flags = Figure(name, "", flags.caption, rendered.alt)
     return gallery
 
 
@@ -423,7 +425,7 @@ def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
             f"profile_{group.instrument}_{group.channel}",
             f"The profile of a scene with most unflagged gates, and its error budget:"
             f" {group.label}.",
-            sources.draw(product_figures.error_budget, profile, group.label),
+            sources.draw(product_figures.error_budget_figure, profile, group.label),
         )
 
 

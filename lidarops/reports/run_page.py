@@ -18,7 +18,7 @@ from lidarops.errors import CatalogError
 from lidarops.figures.wording import duration, lacking, percent, size, visible
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
-from lidarops.reports.gallery import Compared, Gallery, Picture
+from lidarops.reports.gallery import Compared, Figure, Gallery
 from lidarops.reports.run_record import FILE_NAME, write_atomically
 
 INDEX: Final = "index.html"
@@ -57,7 +57,7 @@ class SceneRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class RunReport:
     """Files of a report."""
 
     page: Path
@@ -65,9 +65,9 @@ class Report:
     """Its first figure of products; None where none can be drawn."""
 
 
-def build(
+def build_report(
     record: RunRecord, folder: Path, *, figures: int = gallery.FIGURES, workers: int = 1
-) -> Report:
+) -> RunReport:
     """Write the report of a run.
 
     Parameters
@@ -105,7 +105,7 @@ def build(
             remedy=f"make space or choose a folder you can write to, then lidarops report {folder}",
         ) from error
     pictures = filled.pictures
-    return Report(target, folder / pictures[0].file if pictures else None)
+    return RunReport(target, folder / pictures[0].file if pictures else None)
 
 
 def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:
@@ -219,7 +219,7 @@ def _href(record: RunRecord, product: str, folder: Path) -> str:
     return quote(os.fsencode(Path(relative).as_posix()))
 
 
-def _by_instrument(pictures: Sequence[Picture]) -> list[tuple[str, list[Picture]]]:
+def _by_instrument(pictures: Sequence[Figure]) -> list[tuple[str, list[Figure]]]:
     ordered = sorted(pictures, key=lambda picture: picture.instrument)
     return [
         (name, list(found)) for name, found in groupby(ordered, lambda picture: picture.instrument)

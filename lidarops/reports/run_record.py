@@ -39,7 +39,7 @@ class _MismatchError(Exception):
         super().__init__(place, expected)
 
 
-def save(record: RunRecord, folder: Path) -> Path:
+def save_run_record(record: RunRecord, folder: Path) -> Path:
     """Write a run record to ``run.json`` in `folder`, in one atomic step.
 
     Parameters
@@ -52,7 +52,7 @@ def save(record: RunRecord, folder: Path) -> Path:
     Returns
     -------
     Path
-        The file. `load` gives back an equal record; tuples within settings become lists.
+        The file. `load_run_record` gives back an equal record; tuples within settings become lists.
 
     Raises
     ------
@@ -82,8 +82,8 @@ def save(record: RunRecord, folder: Path) -> Path:
     return target
 
 
-def load(path: str | Path) -> RunRecord:
-    """Read a run record that `save` wrote.
+def load_run_record(path: str | Path) -> RunRecord:
+    """Read a run record that `save_run_record` wrote.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _plain(value: object) -> object:
         return [_plain(item) for item in value]
     if isinstance(value, datetime):
         return value.isoformat()
-    # Settings are plain already: a number that is not finite in them is refused by `save`,
+    # Settings are plain already: a number that is not finite in them is refused by `save_run_record`,
     # because text in its place could not be told from text when it is read.
     return dict(value) if isinstance(value, Mapping) else value
 

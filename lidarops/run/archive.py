@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, SceneError
-from lidarops.plan.scenes import Cut, cut, select
+from lidarops.plan.scenes import Cut, cut_scenes, select_scenes
 from lidarops.process.scene import Job, failed
 from lidarops.records import Granule, RunRecord, Unmet
 from lidarops.reports import run_page, run_record
 from lidarops.run import selection as asked
-from lidarops.run.executor import Ended, Stop, alone, carry_out, local_client, size
+from lidarops.run.executor import Ended, Stop, alone, local_client, process_jobs, read_bytes
 from lidarops.run.leftovers import Orphan
 from lidarops.run.options import Options, Result
 from lidarops.run.session import Session
@@ -171,7 +171,7 @@ def update_catalog(
     wait: float = 0.0,
     workers: int = 1,
 ) -> ScanSummary:
-    """Bring the catalog up to date with the archive; see `lidarops.catalog.scan.scan`."""
+    """Bring the catalog up to date with the archive; see `lidarops.catalog.scan.scan_archive`."""
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         return _scan(campaign, store, lock, progress, workers)
 
@@ -186,7 +186,9 @@ def _scan(
     write = _Writer(lock)
     while True:
         try:
-            return scan(campaign, store, progress=progress, before_write=write, workers=workers)
+            return scan_archive(
+                campaign, store, progress=progress, before_write=write, workers=workers
+            )
         except _OvertakenError:
             continue
 
@@ -254,7 +256,7 @@ class _Work:
         self._failing = 0
 
     def carry_out(self, client: Client | None) -> Result:
-        self._summary = scan(
+        self._summary = scan_archive(
             self._campaign, self._store, before_write=self._write, workers=self._options.workers
         )
         self._judge = self._new_judge()
@@ -278,7 +280,7 @@ class _Work:
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
-        unmet = asked.unmet(self._campaign, self._store, self._selection)
+        unmet = asked.unmet_requests(self._campaign, self._store, self._selection)
         run = self._conclude(status, unmet)
         found = self._found
         self._look_again(clean[:AGAIN])
@@ -327,7 +329,7 @@ class _Work:
             taken = partial(self._take, note=used is None)
             if first is not None:
                 others = chain([first], jobs)
-                self._enter(carry_out(others, client=used, stop=stop, taken=taken), stop)
+                self._enter(process_jobs(others, client=used, stop=stop, taken=taken), stop)
             if self._suspects and not stop:
                 if used is None:
                     own = partial(local_client, 1, memory=options.memory)
@@ -396,7 +398,7 @@ class _Work:
             suspect = {each.scene.id for each in stale if each.suspect}
             self._suspects += [job for job in jobs if job.scene.id in suspect]
             # The largest scene last would keep one worker busy while the others idle.
-            for job in sorted(jobs, key=size, reverse=True):
+            for job in sorted(jobs, key=read_bytes, reverse=True):
                 if job.scene.id not in suspect:
                     yield job
 
@@ -561,8 +563,8 @@ def prepare(
     """
     update_catalog(campaign)
     with Store(campaign.catalog_url, campaign.name) as store:
-        everything = cut(campaign, store.granules())
-    chosen = select(everything.scenes, instruments=instruments, since=since, until=until)
+        everything = cut_scenes(campaign, store.granules())
+    chosen = select_scenes(everything.scenes, instruments=instruments, since=since, until=until)
     if not chosen:
         raise SceneError(
             f"holds {len(everything.scenes)} scenes, none of which is asked for"
@@ -574,7 +576,7 @@ def prepare(
     return Cut(chosen, everything.set_aside)
 
 
-def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_page.Report:
+def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_page.RunReport:
     """Keep the record of a run and build its page.
 
     Parameters
@@ -590,5 +592,5 @@ def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_p
     Report
     """
     folder = campaign.report_root / run.id
-    run_record.save(run, folder)
-    return run_page.build(run, folder, workers=workers)
+    run_record.save_run_record(run, folder)
+    return run_page.build_report(run, folder, workers=workers)

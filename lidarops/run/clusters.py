@@ -16,7 +16,7 @@ import dask.config
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from lidarops.campaign.yaml_errors import duplicates
+from lidarops.campaign.yaml_errors import duplicate_keys
 from lidarops.errors import LidarOpsError
 from lidarops.run import kubernetes
 from lidarops.run.executor import TRIMMING, local_client
@@ -108,7 +108,7 @@ _ADAPTER: TypeAdapter[Cluster] = TypeAdapter(Annotated[Cluster, Field(discrimina
 _KINDS = ("local", "slurm", "kubernetes")
 
 
-def choose(
+def choose_cluster(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -172,7 +172,7 @@ def _described(cluster: str) -> dict[str, Any]:
         return {"kind": cluster}
     try:
         text = Path(cluster).read_text(encoding="utf-8")
-        twice = duplicates(yaml.compose(text, Loader=yaml.SafeLoader))
+        twice = duplicate_keys(yaml.compose(text, Loader=yaml.SafeLoader))
         raw = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ClusterError(
@@ -213,13 +213,13 @@ def _validated(settings: dict[str, Any], file: str | None) -> Cluster:
 
 
 @contextmanager
-def client(cluster: Cluster) -> Iterator[Client]:
+def connect_client(cluster: Cluster) -> Iterator[Client]:
     """Start or reach a cluster; what was started ends with the context.
 
     Parameters
     ----------
     cluster : Cluster
-        From `choose`, or made by hand.
+        From `choose_cluster`, or made by hand.
 
     Yields
     ------

@@ -25,7 +25,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
 from lidarops.netcdf.provenance import code_version
-from lidarops.plan.scene_plan import plan
+from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import Cut
 from lidarops.process.scene import Job, attempt, failed
 from lidarops.records import RunRecord, SceneOutcome
@@ -144,7 +144,10 @@ class Stop:
 
 def make_jobs(campaign: Campaign, cut: Cut, *, profiles_per_chunk: int | None = None) -> list[Job]:
     """Plan every scene."""
-    return [Job(campaign, scene, plan(scene, campaign), profiles_per_chunk) for scene in cut.scenes]
+    return [
+        Job(campaign, scene, plan_scene(scene, campaign), profiles_per_chunk)
+        for scene in cut.scenes
+    ]
 
 
 def run(
@@ -162,7 +165,7 @@ def run(
     ----------
     campaign : Campaign
     cut : Cut
-        The scenes, from `lidarops.plan.scenes.cut` (and `select`).
+        The scenes, from `lidarops.plan.scenes.cut_scenes` (and `select`).
     workers : int
         Processes; 1 runs in this one, more start a dask cluster on this machine.
     client : distributed.Client, optional
@@ -200,7 +203,7 @@ def conclude(
         for outcome in outcomes:
             scene = scenes[outcome.scene]
             # What staleness compares is the plan before any file was looked at.
-            judged = judge.judgement(scene, plan(scene, campaign))
+            judged = judge.judgement(scene, plan_scene(scene, campaign))
             session.end(judged, outcome, final=False)
         return session.finish(RunStatus.FINISHED, cut.set_aside)
 
@@ -230,14 +233,16 @@ def process_all(
     """
     outcomes: list[SceneOutcome] = []
     with cluster_of(min(workers, len(jobs)), client) as used, Stop() as stop:
-        for ended in carry_out(sorted(jobs, key=size, reverse=True), client=used, stop=stop):
+        for ended in process_jobs(
+            sorted(jobs, key=read_bytes, reverse=True), client=used, stop=stop
+        ):
             outcomes.append(ended.outcome)
             if progress:
                 progress(ended.outcome)
     return outcomes
 
 
-def size(job: Job) -> int:
+def read_bytes(job: Job) -> int:
     """Return the bytes that a job reads."""
     return sum(granule.size for granule in job.scene.granules)
 
@@ -305,7 +310,7 @@ def _await_workers(client: Client, workers: int) -> None:
         _LOG.warning("%d of %d workers have started within %.0f s", there, workers, PATIENCE)
 
 
-def carry_out(
+def process_jobs(
     jobs: Iterable[Job],
     *,
     client: Client | None = None,

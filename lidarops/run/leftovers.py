@@ -84,7 +84,7 @@ class Fates:
         return {granule.path for granule in (*self._refused(), *self._found.set_aside)}
 
 
-def barren(planned: Iterable[Planned], campaign: Campaign) -> dict[str, str]:
+def scenes_without_product(planned: Iterable[Planned], campaign: Campaign) -> dict[str, str]:
     """Return the scenes that can give no product and serve none of a network, and why.
 
     Parameters
@@ -119,7 +119,7 @@ def _of_networks_alone(scene: Scene, campaign: Campaign) -> list[str]:
     ]
 
 
-def orphans(
+def orphaned_products(
     planned: Sequence[Planned],
     made: Iterable[Made],
     campaign: Campaign,

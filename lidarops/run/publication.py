@@ -10,7 +10,7 @@ from lidarops.catalog.store import Store
 from lidarops.system.stores import Published, RemoteStore
 
 
-def publish(campaign: Campaign, url: str) -> Published:
+def publish_products(campaign: Campaign, url: str) -> Published:
     """Bring a store up to date with the products in the ledger of a campaign.
 
     Parameters

@@ -27,7 +27,7 @@ from lidarops.netcdf.provenance import (
     package_versions,
     read_provenance,
 )
-from lidarops.process.scene import Job, process
+from lidarops.process.scene import Job, process_scene
 from lidarops.raw import licel
 from lidarops.records import Granule, InputRecord, LeftOut, Plan, Role, Scene, Status, Step
 from lidarops.system.stores import RemoteStore, is_url
@@ -163,7 +163,7 @@ def _epoch(file: Path) -> str:
     return str(round(made.timestamp()))
 
 
-def reproduce(
+def reproduce_product(
     product: str | Path,
     *,
     archive: str | Path | None = None,
@@ -373,7 +373,7 @@ def _made_again(told: _Told, root: Path, folder: Path, out: Path) -> Iterator[Di
     """Give what differs between a product and what is made of its inputs now."""
     channel, kind = (str(told.about[f"lidarops:{key}"]) for key in ("channel", "kind"))
     with _dated(told.epoch):
-        outcome = process(
+        outcome = process_scene(
             Job(_campaign(told, root, folder, out), _scene(told, root), told.plan, only=channel)
         )
     if outcome.error:
@@ -418,7 +418,7 @@ def _campaign(told: _Told, root: Path, folder: Path, out: Path) -> Campaign:
         )
     except (KeyError, TypeError, ValidationError) as error:
         raise _untold(told.file, str(error)) from error
-    campaign._folder = str(folder)  # noqa: SLF001 - as `lidarops.campaign.model.load` sets it
+    campaign._folder = str(folder)  # noqa: SLF001 - as `lidarops.campaign.model.load_campaign` sets it
     return campaign
 
 
@@ -582,7 +582,7 @@ def _values(before: np.ndarray[Any, Any], after: np.ndarray[Any, Any]) -> str:
     return f"{count} of {before.size} values differ, by {most:.3g} at most"
 
 
-def explain(result: Reproduction) -> str:
+def explain_difference(result: Reproduction) -> str:
     """Return what came of it in words, one line a difference."""
     if result.identical:
         return f"{result.product}: identical, every byte"

@@ -8,7 +8,7 @@ from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.plan import availability
-from lidarops.plan.scenes import cut
+from lidarops.plan.scenes import cut_scenes
 from lidarops.records import ProductKind, Unmet
 from lidarops.run.staleness import Selection
 
@@ -98,12 +98,12 @@ def none(campaign: Campaign, selection: Selection) -> bool:
         days = selection.days(sorted({each.day for each in store.day_sums()}))
         # No scene is longer than a day, and the first one that is asked for answers.
         return not any(
-            selection.scenes(cut(campaign, store.granules_of(day, day, dark_days=0)).scenes)
+            selection.scenes(cut_scenes(campaign, store.granules_of(day, day, dark_days=0)).scenes)
             for day in days
         )
 
 
-def unmet(campaign: Campaign, store: Store, selection: Selection) -> tuple[Unmet, ...]:
+def unmet_requests(campaign: Campaign, store: Store, selection: Selection) -> tuple[Unmet, ...]:
     """Return what is asked for, or told facts of, and not in the files.
 
     Parameters
@@ -126,7 +126,7 @@ def unmet(campaign: Campaign, store: Store, selection: Selection) -> tuple[Unmet
         if (not selection.instruments or name in selection.instruments)
         and (not selection.stations or _station(campaign, name) in selection.stations)
     }
-    return availability.unmet(
+    return availability.unavailable(
         campaign,
         store.holdings(availability.edges(campaign)),
         instruments=chosen,

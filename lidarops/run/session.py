@@ -63,7 +63,7 @@ class Session:
         self._named = 0
         self.settled: set[str] = set()
         """Scenes of which another look would find every product fresh."""
-        self._tally = cost_estimate.Tally(cost_estimate.load())
+        self._tally = cost_estimate.Tally(cost_estimate.load_calibration())
         self.started = started or datetime.now(UTC)
         self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
 

@@ -25,8 +25,15 @@ from lidarops.catalog.store import Store
 from lidarops.netcdf.provenance import code_version
 from lidarops.plan import product_dependence
 from lidarops.plan.product_dependence import Wanted
-from lidarops.plan.scene_plan import plan
-from lidarops.plan.scenes import DARK_REACH, Cut, cut, instrument_and_start, select, stop_of
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import (
+    DARK_REACH,
+    Cut,
+    cut_scenes,
+    instrument_and_start,
+    select_scenes,
+    stop_of,
+)
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
 from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
@@ -82,7 +89,7 @@ class Selection:
         """Return those of the scenes that are asked for."""
         return tuple(
             scene
-            for scene in select(scenes, since=self.since, until=self.until)
+            for scene in select_scenes(scenes, since=self.since, until=self.until)
             if (not self.instruments or scene.instrument in self.instruments)
             and (not self.stations or scene.station in self.stations)
         )
@@ -122,7 +129,7 @@ class Judgement:
 
     def needed(self) -> Plan:
         """Return the part of the plan that the stale products need."""
-        return product_dependence.part(
+        return product_dependence.plan_closure(
             self.plan, [(each.kind, each.channel) for each in self.stale]
         )
 
@@ -274,14 +281,14 @@ class Judge:
         touched: dict[str, int] = {}
         everything = [self._scene(scene, made, tried, touched) for scene in found.scenes]
         planned = [(each.scene, each.plan) for each in everything]
-        barren = leftovers.barren(planned, self._campaign)
+        barren = leftovers.scenes_without_product(planned, self._campaign)
         everything = [
             replace(each, barren=barren[each.scene.id]) if each.scene.id in barren else each
             for each in everything
         ]
         chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
         fates = leftovers.Fates(found, self._store.refused, self._signals)
-        orphans = leftovers.orphans(
+        orphans = leftovers.orphaned_products(
             planned, made.values(), self._campaign, self._other_files, fates.of
         )
         orphaned = {known.day for known, _ in orphans}
@@ -313,7 +320,7 @@ class Judge:
 
     def _cut(self, first: int, last: int, days: set[int]) -> Cut:
         granules = self._store.granules_of(first, last, dark_days=DARK_DAYS)
-        return cut(
+        return cut_scenes(
             self._campaign,
             [
                 granule
@@ -331,7 +338,7 @@ class Judge:
         tried: Mapping[str, Tried],
         touched: dict[str, int],
     ) -> Judgement:
-        whole = plan(scene, self._campaign)
+        whole = plan_scene(scene, self._campaign)
         judged = self.judgement(scene, whole)
         last = tried.get(scene.id)
         stale = []
@@ -384,7 +391,7 @@ class Judge:
         self, scene: Scene, whole: Plan, product: Wanted, files: Sequence[InputRecord]
     ) -> tuple[Dependence, tuple[InputRecord, ...]]:
         """Return what a product depends on, and those of the files that it was made from."""
-        mine = product_dependence.part(whole, [product])
+        mine = product_dependence.plan_closure(whole, [product])
         used = product_dependence.inputs(mine, files)
         settings = self._settings.of(scene, mine, product[1])
         found = Dependence(
@@ -419,7 +426,7 @@ class Judge:
         )
         for stale in judged.stale:
             product = (stale.kind, stale.channel)
-            used = product_dependence.inputs(product_dependence.part(whole, [product]), now)
+            used = product_dependence.inputs(product_dependence.plan_closure(whole, [product]), now)
             if product not in made:
                 return False
             if made[product].inputs_hash != product_dependence.digest_of_inputs(used):
@@ -438,7 +445,7 @@ class Judge:
         if self._force or known is None:
             return "forced" if self._force else "not made yet"
         was = known.depends_on
-        mine = product_dependence.part(whole, [product])
+        mine = product_dependence.plan_closure(whole, [product])
         settings = product_dependence.digest(self._settings.of(scene, mine, product[1]))
         if (was.code_version, was.plan_hash, was.settings_hash) != (
             code_version(),

@@ -48,7 +48,7 @@ class SimulatedCampaign:
     size: int
     """Bytes of the files."""
     truth: xr.Dataset
-    """What a perfect retrieval would find; see `simulate`."""
+    """What a perfect retrieval would find; see `simulate_campaign`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class _Written:
     truths: tuple[tuple[int, FileTruth], ...]
 
 
-def simulate(
+def simulate_campaign(
     campaign: Campaign, *, client: Client | None = None, progress: Progress | None = None
 ) -> SimulatedCampaign:
     """Write the raw files of a simulated campaign into its archive.
@@ -134,16 +134,16 @@ def simulate(
     its instrument and its number alone, never on order, batches or workers. Memory holds the
     names of the files and their truth.
     """
-    return carry_out(plan(campaign), client=client, progress=progress)
+    return write_simulation(plan_simulation(campaign), client=client, progress=progress)
 
 
-def plan(campaign: Campaign) -> SimulationPlan:
-    """Return which files `simulate` would write, after checking that it can.
+def plan_simulation(campaign: Campaign) -> SimulationPlan:
+    """Return which files `simulate_campaign` would write, after checking that it can.
 
     Raises
     ------
     CampaignError
-        As `simulate`, but for what is in the archive.
+        As `simulate_campaign`, but for what is in the archive.
     """
     if "://" in campaign.archive:
         raise CampaignError(
@@ -160,10 +160,10 @@ def plan(campaign: Campaign) -> SimulationPlan:
     return SimulationPlan(campaign, tuple(sites), orders, _paths(sites, orders))
 
 
-def carry_out(
+def write_simulation(
     planned: SimulationPlan, *, client: Client | None = None, progress: Progress | None = None
 ) -> SimulatedCampaign:
-    """Write the files of a plan; see `simulate`."""
+    """Write the files of a plan; see `simulate_campaign`."""
     archive = Path(planned.campaign.archive)
     _refuse_strangers(archive, planned.sites, frozenset(planned.paths))
     for folder in {path.rpartition("/")[0] for path in planned.paths}:

@@ -189,7 +189,7 @@ class TruthTable:
         return self._channels[key]
 
     def dataset(self, campaign: str) -> xr.Dataset:
-        """Return the truth as a dataset; see `lidarops.simulate.campaign.simulate`."""
+        """Return the truth as a dataset; see `lidarops.simulate.campaign.simulate_campaign`."""
         handling = {"": ""} | {kind.value: kind.handling.value for kind in DamageKind}
         extinction = self._facts["extinction"]
         told = [handling[str(kind)] for kind in self._damage]

@@ -74,7 +74,7 @@ _Outcome = tuple[Entry | Problem, bool]
 """What became of a product, and whether its page was made now."""
 
 
-def build(
+def build_site(
     output: str | Path, *, workers: int = 1, progress: Callable[[int], None] | None = None
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.
@@ -240,11 +240,11 @@ def _drawn(opened: xr.Dataset, kind: str) -> tuple[product_gallery.Gallery, str]
     """Draw a product; where it is not what its kind says, as one of no known kind."""
     style = pages.style("thumb.css")
     try:
-        return product_gallery.draw(opened, kind, style), ""
+        return product_gallery.draw_gallery(opened, kind, style), ""
     except _UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        return product_gallery.draw(opened, "", style), problem
+        return product_gallery.draw_gallery(opened, "", style), problem
     except _UNREADABLE:
         return product_gallery.nothing("it cannot be drawn", style), problem
 

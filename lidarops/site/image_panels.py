@@ -102,7 +102,7 @@ def _colours(found: Grid) -> NDArray[np.int64]:
     return np.where(np.isfinite(found.mean), steps, BLANK)
 
 
-def draw(raster: Raster, *, along: str, label: str, key: str) -> tuple[Sheet, str]:
+def draw_image(raster: Raster, *, along: str, label: str, key: str) -> tuple[Sheet, str]:
     """Draw a raster, with the background beneath where it has one.
 
     Parameters

@@ -24,7 +24,7 @@ _RING: Final = "M-5 0a5 5 0 1 0 10 0a5 5 0 1 0-10 0"
 _TRIANGLE: Final = "M-5 4h10l-5-9z"
 
 
-def draw(network: NetworkMap) -> tuple[Sheet, str]:
+def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
     """Draw beams and vertices to one scale, with the median visibility at each vertex.
 
     Parameters

@@ -61,7 +61,7 @@ class Gallery:
 _Parts = tuple[list[Drawn], Sheet, str]
 
 
-def draw(product: xr.Dataset, kind: str, style: str) -> Gallery:
+def draw_gallery(product: xr.Dataset, kind: str, style: str) -> Gallery:
     """Draw the figures of a product.
 
     Parameters
@@ -101,7 +101,7 @@ def _signal(product: xr.Dataset) -> _Parts:
 
 
 def _image(raster: Raster, what: str, label: str, along: str) -> _Parts:
-    sheet, words = image_panels.draw(raster, along=along, label=label, key="f1")
+    sheet, words = image_panels.draw_image(raster, along=along, label=label, key="f1")
     sky = ", and the background below" if np.isfinite(raster.background).any() else ""
     caption = f"{what} against time and {along}{sky}"
     return [_finish(sheet, caption, words, "f1")], image_panels.thumbnail(raster, *THUMB), caption
@@ -113,7 +113,7 @@ def _elastic(product: xr.Dataset) -> _Parts:
     drawn, thumbnail, alt = _image(raster, "Attenuated backscatter", label, "range")
     profile = clearest_profile(product)
     if profile is not None:
-        sheet, words = profile_panels.budget(profile, "f2")
+        sheet, words = profile_panels.error_budget_panels(profile, "f2")
         moment = _moment(profile.time)
         caption = f"Profile of {moment}, the one with most unflagged gates, and its error budget"
         drawn.append(_finish(sheet, caption, words, "f2"))
@@ -125,7 +125,7 @@ def _multiangle(product: xr.Dataset) -> _Parts:
     drawn, thumbnail, alt = _image(raster, "Extinction", "extinction (km⁻¹)", "altitude")
     profile = clearest_cycle(product)
     if profile is not None:
-        sheet, words = profile_panels.scan(profile, "f2")
+        sheet, words = profile_panels.scan_panels(profile, "f2")
         caption = f"Cycle of {_moment(profile.time)}, the one with most unflagged values"
         drawn.append(_finish(sheet, caption, words, "f2"))
     return drawn, thumbnail, alt
@@ -169,7 +169,7 @@ def _visibility(product: xr.Dataset) -> _Parts:
     )
     called = "Visibility and extinction where beams meet"
     drawn, thumbnail, alt = _stacks(read_vertices(product), quantities, called)
-    sheet, words = network_map.draw(read_map(product))
+    sheet, words = network_map.draw_network_map(read_map(product))
     plan = _finish(sheet, "Beams and the vertices in which they meet", words, "map")
     return [*drawn, plan], thumbnail, alt
 
@@ -217,7 +217,7 @@ def _stack(
         beyond = series_panels.values(sheet, panel, axis, lines, f"{key}-{name}")
         if beyond:
             words.append(f"{beyond} values of {name} lie beyond the axis")
-    series_panels.legend(sheet, 14, drawn[0][2])
+    series_panels.series_legend(sheet, 14, drawn[0][2])
     return sheet, "; ".join(words)
 
 
@@ -256,7 +256,7 @@ def _any(product: xr.Dataset) -> _Parts:
     sheet.frame(panel, label)
     series_panels.time_ticks(sheet, axis, [panel])
     series_panels.values(sheet, panel, axis, lines, "f1")
-    series_panels.legend(sheet, 14, lines)
+    series_panels.series_legend(sheet, 14, lines)
     caption = f"{words[:1].upper()}{words[1:]} against time"
     if table.shape[1] > len(lines):
         caption += f", {len(lines)} of {table.shape[1]} series"

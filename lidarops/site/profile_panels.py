@@ -67,7 +67,7 @@ def _decades(values: Sequence[Floats]) -> tuple[float, float]:
     return max(0.7 * float(np.percentile(whole, 2.0)), 1e-5 * high), high
 
 
-def budget(profile: Profile, key: str) -> tuple[Sheet, str]:
+def error_budget_panels(profile: Profile, key: str) -> tuple[Sheet, str]:
     """Draw backscatter of one profile with its standard error, and what the error is made of."""
     sheet = Sheet(height=_HEIGHT)
     y = profile.range / 1e3
@@ -112,7 +112,7 @@ def _positive(values: Floats) -> Floats:
     return np.where(values > 0, values, np.nan)
 
 
-def scan(profile: ScanProfile, key: str) -> tuple[Sheet, str]:
+def scan_panels(profile: ScanProfile, key: str) -> tuple[Sheet, str]:
     """Draw optical depth and extinction of one cycle of a scan against altitude."""
     sheet = Sheet(height=_HEIGHT)
     y = profile.altitude / 1e3

@@ -138,7 +138,7 @@ def _rejected(sheet: Sheet, panel: Panel, axis: TimeAxis, line: Line) -> None:
     sheet.path("".join(f"M{a:.1f} {foot:.1f}v-8" for a in lost.tolist()), "off")
 
 
-def legend(sheet: Sheet, y: float, lines: Sequence[Line], x: float = LEFT + 110) -> None:
+def series_legend(sheet: Sheet, y: float, lines: Sequence[Line], x: float = LEFT + 110) -> None:
     """Name the series, and how flagged values are drawn."""
     rows = [
         (f"M-9 0H9{svg.MARKS[index](0.0, 0.0)}", f"mark line c{index}", line.label)

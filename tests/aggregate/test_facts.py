@@ -14,12 +14,12 @@ from support.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.facts import (
     Facts,
+    ProductSelection,
     Refused,
-    Selection,
     groups,
-    product_paths,
+    list_products,
     read_facts,
-    scan,
+    read_product_facts,
     told_grids,
     within,
 )
@@ -80,7 +80,7 @@ def test_a_damaged_file_and_a_foreign_file_are_named_and_the_rest_goes_on(tmp_pa
     (tmp_path / damaged).write_bytes(content[: len(content) // 2])
     write_plain(xr.Dataset({"a": ("x", np.arange(3.0))}), tmp_path / "products/foreign.nc")
     (tmp_path / "products/text.nc").write_text("no NetCDF")
-    found = {each.path: each for each in scan(tmp_path, product_paths(tmp_path))}
+    found = {each.path: each for each in read_product_facts(tmp_path, list_products(tmp_path))}
     assert isinstance(found.pop(good), Facts)
     assert set(found) == {damaged, "products/foreign.nc", "products/text.nc"}
     assert all(isinstance(each, Refused) and each.reason for each in found.values())
@@ -92,12 +92,12 @@ def test_hidden_files_and_aggregates_are_not_listed(tmp_path: Path):
         target = tmp_path / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(b"")
-    assert product_paths(tmp_path) == [path]
+    assert list_products(tmp_path) == [path]
 
 
 def test_a_missing_folder_is_refused(tmp_path: Path):
     with pytest.raises(ProductError, match="is no folder"):
-        product_paths(tmp_path / "nothing")
+        list_products(tmp_path / "nothing")
 
 
 @given(st.lists(st.sampled_from(["a", "..", ".", "b.nc", ""]), max_size=6), st.booleans())
@@ -117,7 +117,7 @@ def test_a_link_to_the_outside_is_refused(tmp_path: Path):
     root = tmp_path / "out"
     (root / "products").mkdir(parents=True)
     (root / "products/link.nc").symlink_to(tmp_path / "elsewhere" / outside)
-    (found,) = scan(root, product_paths(root))
+    (found,) = read_product_facts(root, list_products(root))
     assert isinstance(found, Refused)
     assert "leads out of" in found.reason
 
@@ -126,10 +126,10 @@ def test_a_selection_admits_what_overlaps_in_time(tmp_path: Path):
     for day in range(4):
         add_day(tmp_path, day)
     add_day(tmp_path, 1, ProductKind.SIGNAL)
-    wanted = Selection(
+    wanted = ProductSelection(
         ProductKind.HOMOGENEOUS,
         since=datetime(2026, 3, 2, 10, 30, tzinfo=UTC),
         until=datetime(2026, 3, 3, 10, 10, tzinfo=UTC),
     )
-    found = list(scan(tmp_path, product_paths(tmp_path), wanted))
+    found = list(read_product_facts(tmp_path, list_products(tmp_path), wanted))
     assert [each.start.day for each in found if isinstance(each, Facts)] == [2, 3]

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from support.aggregate_archive import add_day, facts_of
 
-from lidarops.aggregate.facts import Facts, Selection
-from lidarops.aggregate.index import INDEX, find, find_products, write_index
+from lidarops.aggregate.facts import Facts, ProductSelection
+from lidarops.aggregate.index import INDEX, find_in_index, find_products, write_index
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.records import ProductKind
 
@@ -88,7 +88,7 @@ def test_a_query_finds_what_overlaps_and_nothing_else(archive: tuple[Path, list[
     index, products = archive
     since, until = "2018-02-03T12:00", datetime(2018, 5, 1, tzinfo=UTC)
     found = find_products(index, kind="elastic", channel="photon_532o", since=since, until=until)
-    wanted = Selection(
+    wanted = ProductSelection(
         ProductKind.ELASTIC,
         "photon_532o",
         since=datetime(2018, 2, 3, 12, tzinfo=UTC),
@@ -147,7 +147,7 @@ def test_the_index_of_real_files_is_found_again(tmp_path: Path):
         add_day(tmp_path, day)
     index = tmp_path / write_index(tmp_path, facts_of(tmp_path))
     assert index.name == INDEX
-    found = find(index, Selection(since=datetime(2026, 3, 2, tzinfo=UTC)))
+    found = find_in_index(index, ProductSelection(since=datetime(2026, 3, 2, tzinfo=UTC)))
     assert found.root == tmp_path.resolve()
     assert [path[-11:-3] for path in found.paths] == ["2T000000", "3T000000"]
 

@@ -30,7 +30,7 @@ from lidarops.flags import Quality
 from lidarops.netcdf.variables import ErrorKind
 from lidarops.products.layouts import LAYOUTS
 from lidarops.records import DetectionMode, ProductKind
-from lidarops.retrieve.air.labeled import Definition, of_extinction
+from lidarops.retrieve.air.labeled import Definition, visibility_of_extinction
 from lidarops.retrieve.air.visibility import WavelengthLaw
 
 
@@ -210,14 +210,16 @@ def test_many_profiles_do_not_hide_what_the_model_does_to_visibility(
         data["extinction_standard_error"] = xr.full_like(data.extinction, random)
         data["extinction_model_error"] = xr.full_like(data.extinction, declared)
         data["quality_flag"] = xr.zeros_like(data.quality_flag)
-        seen = of_extinction(
+        seen = visibility_of_extinction(
             data.extinction, data.extinction_standard_error, data.extinction_model_error, definition
         )
         return data.assign(seen.data_vars)
 
     add_day(tmp_path, 0, profiles=100, change=off)
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
-    one = of_extinction(*(xr.DataArray(value) for value in (true, random, declared)), definition)
+    one = visibility_of_extinction(
+        *(xr.DataArray(value) for value in (true, random, declared)), definition
+    )
     bias = np.abs(means.visibility_in_air - one.visibility_in_air)
     error, apart = (means[f"visibility_in_air_{of}_error"] for of in ("standard", "systematic"))
     assert (error < 0.02 * means.visibility_in_air).all()

@@ -7,7 +7,7 @@ import pytest
 from support.angle_scenes import clear, estimates
 
 from lidarops.aggregate._sums import Sample, Sums
-from lidarops.aggregate.means_variables import budget
+from lidarops.aggregate.means_variables import budget_of
 from lidarops.records import ProductKind
 from lidarops.retrieve.multiangle.vertical import smooth_profile
 
@@ -23,7 +23,7 @@ def test_means_of_one_sky_stay_within_their_errors(name: str):
     sums, shares = None, []
     for days in range(1, 6):
         found = estimates(scene, CYCLES, rng, 0.6)
-        smooth = smooth_profile.smooth(
+        smooth = smooth_profile.smooth_optical_depth(
             found.optical_depth,
             found.information,
             scene.altitude,
@@ -31,7 +31,7 @@ def test_means_of_one_sky_stay_within_their_errors(name: str):
             residuals=found.residuals,
         )
         errors = getattr(smooth, f"{name}_standard_error")
-        divided = budget(ProductKind.MULTIANGLE, name)
+        divided = budget_of(ProductKind.MULTIANGLE, name)
         random, shared = (errors, ()) if divided is None else (np.zeros_like(errors), (errors,))
         usable = ~(smooth.extrapolated | smooth.prior_dominated)
         day = Sample(getattr(smooth, name), errors, random, shared, None, usable)

@@ -14,12 +14,12 @@ from lidarops.bench.accuracy import (
     multiangle_scores,
     network,
 )
-from lidarops.bench.accuracy.homogeneous import Measured
-from lidarops.bench.accuracy.multiangle_scores import Size
+from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
+from lidarops.bench.accuracy.multiangle_scores import StudySize
 from lidarops.bench.harness import results
 from lidarops.bench.harness.terms import Effort
 
-SMALL = Size(blocks=2, profiles=4, slow=1, published=20, random=4)
+SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20, random=4)
 
 
 @pytest.fixture(scope="module")
@@ -27,18 +27,20 @@ def finding():
     """Return the finding of few profiles, and how often it told of progress."""
     steps = []
     small = {
-        (homogeneous, "measure"): partial(homogeneous.measure, profiles=64),
-        (elastic, "measure"): partial(elastic.measure, draws=4),
-        (all_retrievals, "measure_scans"): partial(multiangle_scores.measure, size=SMALL),
-        (network, "measure"): partial(network.measure, profiles=25, peer_profiles=4),
+        (homogeneous, "measure"): partial(homogeneous.measure_homogeneous, profiles=64),
+        (elastic, "measure"): partial(elastic.measure_elastic_accuracy, draws=4),
+        (all_retrievals, "measure_scans"): partial(
+            multiangle_scores.measure_multiangle, size=SMALL
+        ),
+        (network, "measure"): partial(network.measure_network, profiles=25, peer_profiles=4),
     }
     with pytest.MonkeyPatch.context() as patch:
         for (module, name), measure in small.items():
             patch.setattr(module, name, measure)
         scenes = (multiangle_cases.clear(3000.0, gates=25), multiangle_cases.cloud())
-        patch.setattr(multiangle_cases, "scenes", lambda: scenes)
+        patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
         effort = Effort(quick=True, repeats=1, date="2024-01-01", progress=steps.append)
-        found = registry.run("accuracy", None, [], effort)
+        found = registry.run_benchmark("accuracy", None, [], effort)
     assert len(steps) > 40
     return found
 
@@ -80,7 +82,7 @@ def test_the_short_table_shows_the_best_and_nothing_that_is_told_more(finding):
 
 def test_of_ways_that_are_as_good_the_short_table_shows_the_fastest():
     def work(way: str, error: float, nanoseconds: float) -> overview.Work:
-        measured = Measured(error, 0.01)
+        measured = MonteCarloFigure(error, 0.01)
         return overview.Work(
             "paths", "all", "extinction", way, ours=True, error=measured, coverage=None,
             nanoseconds=nanoseconds,
@@ -92,7 +94,7 @@ def test_of_ways_that_are_as_good_the_short_table_shows_the_fastest():
 
 
 def test_page_and_figures_are_written_once_each(finding, tmp_path):
-    page = registry.write(finding, tmp_path)
+    page = registry.write_benchmark(finding, tmp_path)
     text = page.read_text(encoding="utf-8")
     titles = [part.title for part in finding.report.parts]
     charts = [chart.name for part in finding.report.parts for chart in part.charts]

@@ -18,8 +18,8 @@ from lidarops.campaign.ancillary_files import (
     overlap_profile,
 )
 from lidarops.errors import AncillaryError
-from lidarops.plan.scene_plan import plan
-from lidarops.plan.scenes import cut
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import us_standard
 
@@ -224,8 +224,8 @@ def test_a_plan_tells_what_is_read_once_and_recorded(tmp_path: Path) -> None:
         facts=[{"molecular_profile": "air.csv", "overlap_profile": "o.csv", "zenith_angle": 0}],
         products={"elastic": {"channels": ["analog_532o", "photon_532o"]}},
     )
-    scene = cut(campaign, (factories.granule(0),)).scenes[0]
-    found = Ancillaries.read(tmp_path, plan(scene, campaign))
+    scene = cut_scenes(campaign, (factories.granule(0),)).scenes[0]
+    found = Ancillaries.read(tmp_path, plan_scene(scene, campaign))
     assert list(found.profiles) == ["air.csv"]
     assert list(found.overlaps) == ["o.csv"]
     assert [(each.path, each.role) for each in found.inputs] == [
@@ -235,4 +235,4 @@ def test_a_plan_tells_what_is_read_once_and_recorded(tmp_path: Path) -> None:
     for each in found.inputs:
         assert each.sha256 == hashlib.sha256((tmp_path / each.path).read_bytes()).hexdigest()
     bare = factories.campaign()
-    assert Ancillaries.read(tmp_path, plan(scene, bare)) == Ancillaries({}, {}, ())
+    assert Ancillaries.read(tmp_path, plan_scene(scene, bare)) == Ancillaries({}, {}, ())

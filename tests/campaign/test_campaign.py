@@ -11,7 +11,7 @@ import yaml
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from lidarops.campaign.model import Campaign, ElasticSettings, load
+from lidarops.campaign.model import Campaign, ElasticSettings, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
 
@@ -38,12 +38,12 @@ def _write(folder: Path, text: str) -> Path:
 def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("LIDAROPS_ARCHIVE", raising=False)
     path = _write(tmp_path, MINIMAL)
-    assert load(path).archive == str(tmp_path / "raw")
-    assert load(path, output="/elsewhere").products_root == Path("/elsewhere/products")
+    assert load_campaign(path).archive == str(tmp_path / "raw")
+    assert load_campaign(path, output="/elsewhere").products_root == Path("/elsewhere/products")
     monkeypatch.setenv("LIDAROPS_ARCHIVE", "/archive")
-    assert load(path).archive == "/archive"
-    assert load(path, archive="/given").archive == "/given"
-    assert load(path, archive="memory://raw").archive == "memory://raw"
+    assert load_campaign(path).archive == "/archive"
+    assert load_campaign(path, archive="/given").archive == "/given"
+    assert load_campaign(path, archive="memory://raw").archive == "memory://raw"
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, expected: str) -> None:
     path = _write(tmp_path, MINIMAL.replace(old, new))
     with pytest.raises(CampaignError, match=expected) as caught:
-        load(path)
+        load_campaign(path)
     assert str(path) in str(caught.value)
 
 
@@ -86,7 +86,7 @@ simulation:
 def test_a_wrong_key_of_one_of_several_kinds_is_told_with_those_of_its_kind(tmp_path: Path) -> None:
     path = _write(tmp_path, MINIMAL + SIMULATED)
     with pytest.raises(CampaignError) as caught:
-        load(path)
+        load_campaign(path)
     (told,) = [line for line in str(caught.value).splitlines() if "aquisition" in line]
     assert told.strip().startswith("line 18: ")
     assert "known: acquisition, " in told
@@ -100,16 +100,16 @@ networks: {}
 metadata: {license: x, comment: y}
 """
     path = _write(tmp_path, MINIMAL + anchored)
-    assert load(path).metadata.comment == "y"
+    assert load_campaign(path).metadata.comment == "y"
     merged = MINIMAL.replace('"h*"', '"h*"\n    <<: *a\n    <<: *b').replace(
         "instruments:", "x: [&a {name: A}, &b {header_position: ignore}]\ninstruments:"
     )
     with pytest.raises(CampaignError) as caught:
-        load(_write(tmp_path, merged))
+        load_campaign(_write(tmp_path, merged))
     assert "stands twice" not in str(caught.value)
     loop = MINIMAL + "metadata: &a {comment: x, program: *a}\n"
     with pytest.raises(CampaignError, match="program"):
-        load(_write(tmp_path, loop))
+        load_campaign(_write(tmp_path, loop))
 
 
 def test_a_url_of_the_command_line_is_no_folder(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_url_of_the_command_line_is_no_folder(tmp_path: Path) -> None:
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CampaignError, match=r"none\.yaml"):
-        load(tmp_path / "none.yaml")
+        load_campaign(tmp_path / "none.yaml")
 
 
 def _with_facts(*facts: dict[str, object]) -> Campaign:
@@ -262,9 +262,11 @@ def test_the_folder_is_that_of_the_campaign_file(
 ) -> None:
     _write(tmp_path, MINIMAL)
     monkeypatch.chdir(tmp_path)
-    assert load("campaign.yaml").folder == tmp_path.resolve()
-    assert load(tmp_path / "campaign.yaml", output="/elsewhere").folder == tmp_path.resolve()
-    assert load("campaign.yaml").model_copy().folder == tmp_path.resolve()
+    assert load_campaign("campaign.yaml").folder == tmp_path.resolve()
+    assert (
+        load_campaign(tmp_path / "campaign.yaml", output="/elsewhere").folder == tmp_path.resolve()
+    )
+    assert load_campaign("campaign.yaml").model_copy().folder == tmp_path.resolve()
 
 
 @pytest.mark.parametrize("wrong_use", [False, True])
@@ -276,5 +278,5 @@ def test_an_error_tells_the_same_in_other_processes(*, wrong_use: bool) -> None:
 
 
 def test_the_folder_goes_with_a_campaign_to_other_processes(tmp_path: Path) -> None:
-    campaign = load(_write(tmp_path, MINIMAL))
+    campaign = load_campaign(_write(tmp_path, MINIMAL))
     assert pickle.loads(pickle.dumps(campaign)).folder == campaign.folder

@@ -18,7 +18,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog import headers
 from lidarops.catalog import scan as scan_module
 from lidarops.catalog.rows import GranuleRow, row_of
-from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.schema import GRANULE, LAYOUT
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
@@ -68,7 +68,7 @@ def _fill(campaign: Campaign, count: int = 5) -> Path:
 
 def test_granules_say_what_the_headers_say(campaign: Campaign, store: Store) -> None:
     _fill(campaign)
-    assert scan(campaign, store) == ScanSummary(6, 6, 0, 0, 0, 0)
+    assert scan_archive(campaign, store) == ScanSummary(6, 6, 0, 0, 0, 0)
     granules = store.granules()
     assert [granule.role for granule in granules].count(Role.DARK) == 1
     first = next(granule for granule in granules if granule.path == "coast/h0")
@@ -81,15 +81,15 @@ def test_granules_say_what_the_headers_say(campaign: Campaign, store: Store) -> 
 
 def test_only_what_changed_is_opened(campaign: Campaign, store: Store, opened: list[str]) -> None:
     root = _fill(campaign)
-    scan(campaign, store)
+    scan_archive(campaign, store)
     opened.clear()
-    assert scan(campaign, store) == ScanSummary(6, 0, 0, 6, 0, 0)
+    assert scan_archive(campaign, store) == ScanSummary(6, 0, 0, 6, 0, 0)
     assert opened == []
     raw_archives.write(root / "coast" / "h1", raw_archives.content(1, seed=9))
     os.utime(root / "coast" / "h1", ns=(1, 1))
     raw_archives.write(root / "coast" / "h9", raw_archives.content(9))
     (root / "coast" / "h2").unlink()
-    assert scan(campaign, store) == ScanSummary(6, 1, 1, 4, 1, 0)
+    assert scan_archive(campaign, store) == ScanSummary(6, 1, 1, 4, 1, 0)
     assert sorted(opened) == ["coast/h1", "coast/h9"]
     assert "coast/h2" not in {granule.path for granule in store.granules()}
 
@@ -99,27 +99,27 @@ def test_an_archive_without_any_of_its_files_is_refused_and_nothing_is_forgotten
     campaign: Campaign, store: Store, tmp_path: Path, *, others: bool
 ) -> None:
     root = _fill(campaign)
-    scan(campaign, store)
+    scan_archive(campaign, store)
     known = store.granules()
     root.rename(tmp_path / "away")
     root.mkdir()
     if others:
         raw_archives.write(root / "elsewhere" / "h0", raw_archives.content(0))
     with pytest.raises(CatalogError, match="knows 6: nothing is forgotten") as caught:
-        scan(campaign, store)
+        scan_archive(campaign, store)
     assert not caught.value.wrong_use
     assert store.granules() == known
     with Store(campaign.catalog_url, "other") as shared:
         other = campaign.model_copy(update={"name": "other"})
-        assert scan(other, shared) == ScanSummary(0, 0, 0, 0, 0, 0)
+        assert scan_archive(other, shared) == ScanSummary(0, 0, 0, 0, 0, 0)
 
 
 def test_a_changed_fact_of_the_campaign_rescans(campaign: Campaign, store: Store) -> None:
     _fill(campaign)
-    scan(campaign, store)
+    scan_archive(campaign, store)
     told = factories.campaign(facts=[{"zenith_angle": 85.0}])
     told = told.model_copy(update={"archive": campaign.archive, "output": campaign.output})
-    assert scan(told, store).changed == 6
+    assert scan_archive(told, store).changed == 6
     assert {granule.zenith_angle for granule in store.granules()} == {85.0}
 
 
@@ -135,7 +135,7 @@ def test_damaged_files_are_refused_with_a_reason(campaign: Campaign, store: Stor
     }
     for name, data in damaged.items():
         raw_archives.write(root / "coast" / name, data)
-    summary = scan(campaign, store)
+    summary = scan_archive(campaign, store)
     assert summary.refused == len(damaged)
     refused = {granule.path: granule.reason for granule in store.granules(status=Status.REFUSED)}
     assert set(refused) == {f"coast/{name}" for name in damaged}
@@ -149,14 +149,14 @@ def test_an_unreadable_file_does_not_abort(campaign: Campaign, store: Store) -> 
     (root / "coast" / "h-link").symlink_to("nowhere")
     (root / "coast" / "h-loop").symlink_to("h-loop")
     os.mkfifo(root / "coast" / "h-pipe")
-    assert scan(campaign, store) == ScanSummary(9, 9, 0, 0, 0, 3)
+    assert scan_archive(campaign, store) == ScanSummary(9, 9, 0, 0, 0, 3)
     assert len(store.granules(status=Status.GOOD)) == 6
 
 
 def test_a_file_of_two_instruments_is_refused(campaign: Campaign, store: Store) -> None:
     _fill(campaign)
     both = {**campaign.instruments, "other": campaign.instruments["lidar"]}
-    scan(campaign.model_copy(update={"instruments": both}), store)
+    scan_archive(campaign.model_copy(update={"instruments": both}), store)
     refused = store.granules(status=Status.REFUSED)
     assert len(refused) == 6
     assert "lidar and other" in refused[0].reason
@@ -165,14 +165,14 @@ def test_a_file_of_two_instruments_is_refused(campaign: Campaign, store: Store) 
 def test_swapped_coordinates_are_noted(campaign: Campaign, store: Store) -> None:
     root = Path(campaign.archive)
     raw_archives.write(root / "coast" / "h0", raw_archives.content(0, position=(30.7, 46.4)))
-    scan(campaign, store)
+    scan_archive(campaign, store)
     assert "swapped" in store.granules()[0].notes[-1]
     told = {
         "lidar": campaign.instruments["lidar"].model_copy(
             update={"header_position": "latitude_first"}
         )
     }
-    scan(campaign.model_copy(update={"instruments": told}), store)
+    scan_archive(campaign.model_copy(update={"instruments": told}), store)
     assert store.granules()[0].notes == ()
     assert store.granules()[0].latitude == 46.4
 
@@ -183,8 +183,8 @@ def test_an_archive_behind_a_url(campaign: Campaign, store: Store) -> None:
     memory.pipe("/lidar-archive/coast/h1", raw_archives.content(1)[:-50])
     remote = campaign.model_copy(update={"archive": "memory://lidar-archive"})
     try:
-        assert scan(remote, store) == ScanSummary(2, 2, 0, 0, 0, 1)
-        assert scan(remote, store).unchanged == 2
+        assert scan_archive(remote, store) == ScanSummary(2, 2, 0, 0, 0, 1)
+        assert scan_archive(remote, store).unchanged == 2
         assert [granule.path for granule in store.granules()] == ["coast/h1", "coast/h0"]
     finally:
         memory.rm("/lidar-archive", recursive=True)
@@ -192,7 +192,7 @@ def test_an_archive_behind_a_url(campaign: Campaign, store: Store) -> None:
 
 def test_an_absent_archive_is_named(campaign: Campaign, store: Store) -> None:
     with pytest.raises(CatalogError, match="LIDAROPS_ARCHIVE"):
-        scan(campaign.model_copy(update={"archive": "/nowhere"}), store)
+        scan_archive(campaign.model_copy(update={"archive": "/nowhere"}), store)
 
 
 def test_a_broken_database_is_named(tmp_path: Path) -> None:
@@ -232,11 +232,11 @@ def test_a_name_that_is_no_text_is_refused_and_the_rest_goes_on(
             file.write(raw_archives.content(9))
     except OSError:
         pytest.skip("the file system takes no such name")
-    assert scan(campaign, store) == ScanSummary(7, 7, 0, 0, 0, 1)
+    assert scan_archive(campaign, store) == ScanSummary(7, 7, 0, 0, 0, 1)
     (refused,) = store.granules(status=Status.REFUSED)
     assert refused.path == "coast/h\\udcff"
     assert "not UTF-8" in refused.reason
-    assert scan(campaign, store) == ScanSummary(7, 0, 0, 7, 0, 1)
+    assert scan_archive(campaign, store) == ScanSummary(7, 0, 0, 7, 0, 1)
 
 
 class TestManyFiles:
@@ -259,8 +259,8 @@ class TestManyFiles:
             Store(f"{url}/one.sqlite", campaign.name) as one,
             Store(f"{url}/two.sqlite", campaign.name) as two,
         ):
-            first = scan(campaign, one)
-            assert scan(campaign, two, workers=2) == first
+            first = scan_archive(campaign, one)
+            assert scan_archive(campaign, two, workers=2) == first
             assert (first.files, first.refused) == (22, 3)
             assert _rows(two) == _rows(one)
             digests = {each.path: f"{k:064x}" for k, each in enumerate(one.granules())}
@@ -273,8 +273,8 @@ class TestManyFiles:
             for k in range(8, 16):
                 raw_archives.write(root / "coast" / f"h{k}", raw_archives.content(k + 100))
             (root / "coast" / "h9").write_bytes(b"nonsense")
-            second = scan(campaign, one)
-            assert scan(campaign, two, workers=2) == second
+            second = scan_archive(campaign, one)
+            assert scan_archive(campaign, two, workers=2) == second
             assert (second.changed, second.moved, second.vanished) == (8, 1, 1)
             assert _rows(two) == _rows(one)
 
@@ -283,7 +283,7 @@ class TestManyFiles:
     ) -> None:
         _fill(campaign, 20)
         monkeypatch.setattr(scan_module, "read_row", _deadly)
-        assert scan(campaign, store, workers=2) == ScanSummary(21, 21, 0, 0, 0, 0)
+        assert scan_archive(campaign, store, workers=2) == ScanSummary(21, 21, 0, 0, 0, 0)
         assert len(store.granules(status=Status.GOOD)) == 21
         assert "a process was lost" in caplog.text
 
@@ -292,7 +292,7 @@ class TestManyFiles:
     ) -> None:
         _fill(campaign, 20)
         with pytest.raises(InterruptedError):
-            scan(campaign, store, workers=2, before_write=_forbid)
+            scan_archive(campaign, store, workers=2, before_write=_forbid)
         assert not multiprocessing.active_children()
         assert store.count() == 0
 
@@ -300,11 +300,11 @@ class TestManyFiles:
         self, campaign: Campaign, store: Store, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         root = _fill(campaign, 20)
-        scan(campaign, store)
+        scan_archive(campaign, store)
         monkeypatch.setattr(processes, "ProcessPoolExecutor", None)
         for k in range(20, 23):
             raw_archives.write(root / "coast" / f"h{k}", raw_archives.content(k))
-        assert scan(campaign, store, workers=2).added == 3
+        assert scan_archive(campaign, store, workers=2).added == 3
 
 
 def _rows(store: Store) -> list[tuple[object, ...]]:

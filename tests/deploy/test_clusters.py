@@ -23,14 +23,18 @@ from lidarops.run import clusters, kubernetes
 
 
 def test_choices_of_the_command_line(tmp_path: Path) -> None:
-    assert clusters.choose() == clusters.Local(workers=1)
-    assert clusters.choose(workers=3) == clusters.Local(workers=3)
-    assert clusters.choose(scheduler="tls://head:8786").kind == "scheduler"
-    assert clusters.choose(cluster="slurm") == clusters.Slurm()
-    assert clusters.choose(cluster="kubernetes", workers=9) == clusters.Kubernetes(workers=9)
+    assert clusters.choose_cluster() == clusters.Local(workers=1)
+    assert clusters.choose_cluster(workers=3) == clusters.Local(workers=3)
+    assert clusters.choose_cluster(scheduler="tls://head:8786").kind == "scheduler"
+    assert clusters.choose_cluster(cluster="slurm") == clusters.Slurm()
+    assert clusters.choose_cluster(cluster="kubernetes", workers=9) == clusters.Kubernetes(
+        workers=9
+    )
     described = tmp_path / "cluster.yaml"
     described.write_text("{kind: slurm, queue: long, memory: 3 GiB}")
-    assert clusters.choose(cluster=str(described)) == clusters.Slurm(queue="long", memory="3 GiB")
+    assert clusters.choose_cluster(cluster=str(described)) == clusters.Slurm(
+        queue="long", memory="3 GiB"
+    )
 
 
 @pytest.mark.parametrize(
@@ -54,7 +58,7 @@ def test_a_wrong_description_is_told_with_file_and_field(
     described = tmp_path / "cluster.yaml"
     described.write_text(text)
     with pytest.raises(clusters.ClusterError, match=r"cluster\.yaml") as caught:
-        clusters.choose(cluster=str(described))
+        clusters.choose_cluster(cluster=str(described))
     assert told in str(caught.value)
 
 
@@ -70,15 +74,15 @@ def test_a_wrong_description_is_told_with_file_and_field(
 )
 def test_a_choice_that_cannot_be_meant_is_wrong_use(choice: dict[str, Any], told: str) -> None:
     with pytest.raises(clusters.ClusterError, match=told) as caught:
-        clusters.choose(**choice)
+        clusters.choose_cluster(**choice)
     assert caught.value.wrong_use
 
 
 def test_a_limit_of_memory_is_of_workers_here(tmp_path: Path) -> None:
-    assert clusters.choose(memory="2GiB") == clusters.Local(memory="2GiB")
+    assert clusters.choose_cluster(memory="2GiB") == clusters.Local(memory="2GiB")
     described = tmp_path / "cluster.yaml"
     described.write_text("{kind: local, workers: 3, memory: 1GiB}")
-    chosen = clusters.choose(cluster=str(described), memory="2GiB")
+    chosen = clusters.choose_cluster(cluster=str(described), memory="2GiB")
     assert chosen == clusters.Local(workers=3, memory="2GiB")
 
 
@@ -88,7 +92,7 @@ def where() -> tuple[int, str | None]:
 
 def test_local_workers_are_processes_of_one_thread_on_loopback() -> None:
     chosen = clusters.Local(workers=2, memory="600MiB")
-    with clusters.client(chosen) as client:
+    with clusters.connect_client(chosen) as client:
         about = client.scheduler_info()["workers"]
         assert {each["nthreads"] for each in about.values()} == {1}
         assert {each["memory_limit"] for each in about.values()} == {600 * 2**20}
@@ -102,7 +106,7 @@ def test_a_scheduler_that_is_absent_is_told() -> None:
     address = f"tcp://127.0.0.1:{servers.free_port()}"
     with (
         pytest.raises(clusters.ClusterError, match="no scheduler cluster") as caught,
-        clusters.client(clusters.Scheduler(address=address, wait=1.0)),
+        clusters.connect_client(clusters.Scheduler(address=address, wait=1.0)),
     ):
         raise AssertionError("the client was given")
     # It may come back.
@@ -204,7 +208,7 @@ def encrypted(tmp_path: Path) -> Iterator[tuple[str, clusters.Tls]]:
 
 def test_tls_keeps_strangers_out(encrypted: tuple[str, clusters.Tls], tmp_path: Path) -> None:
     address, tls = encrypted
-    with clusters.client(clusters.Scheduler(address=address, tls=tls)) as client:
+    with clusters.connect_client(clusters.Scheduler(address=address, tls=tls)) as client:
         assert client.submit(sum, [1, 2]).result() == 3
         assert all(
             each.startswith("tls://127.0.0.1") for each in client.scheduler_info()["workers"]
@@ -212,7 +216,7 @@ def test_tls_keeps_strangers_out(encrypted: tuple[str, clusters.Tls], tmp_path: 
     told = dask.config.merge(dask.config.config, dask.config.collect_env(dask_settings(tmp_path)))
     with (
         dask.config.set(told),
-        clusters.client(clusters.Scheduler(address=address)) as client,
+        clusters.connect_client(clusters.Scheduler(address=address)) as client,
     ):
         assert client.submit(sum, [2, 2]).result() == 4
     strangers = tmp_path / "strangers"
@@ -222,7 +226,7 @@ def test_tls_keeps_strangers_out(encrypted: tuple[str, clusters.Tls], tmp_path: 
     for stranger in (plain, other):
         with (
             pytest.raises(clusters.ClusterError, match="no scheduler cluster"),
-            clusters.client(stranger),
+            clusters.connect_client(stranger),
         ):
             raise AssertionError("a stranger was let in")
 
@@ -274,6 +278,6 @@ def test_kubernetes_that_refuses_is_told(api: str, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(FakeApi, "status", 403)
     with (
         pytest.raises(clusters.ClusterError, match=r"403 .*forbidden: user"),
-        clusters.client(clusters.Kubernetes(api=api)),
+        clusters.connect_client(clusters.Kubernetes(api=api)),
     ):
         raise AssertionError("the client was given")

@@ -244,7 +244,7 @@ def test_image_pins_what_the_tests_run_with(repository: Path) -> None:
 
 
 def test_slurm_files(repository: Path) -> None:
-    shipped = clusters.choose(cluster=str(repository / "deploy" / "slurm" / "cluster.yaml"))
+    shipped = clusters.choose_cluster(cluster=str(repository / "deploy" / "slurm" / "cluster.yaml"))
     assert shipped.kind == "slurm"
     script = repository / "deploy" / "slurm" / "reprocess.sbatch"
     subprocess.run(["bash", "-n", str(script)], check=True)

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from support import raw_archives, servers
 
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.records import SceneOutcome
 from lidarops.run import clusters
 from lidarops.run.archive import prepare
@@ -118,7 +118,7 @@ def jobs() -> list[str]:
 def test_a_cancelled_worker_loses_nothing(slurm: Path, tmp_path: Path) -> None:
     campaign = tmp_path / "campaign.yaml"
     campaign.write_text(yaml.safe_dump(many_scenes(tmp_path)))
-    settings = load(campaign)
+    settings = load_campaign(campaign)
     cut = prepare(settings)
     expected = digests(process_all(make_jobs(settings, cut)))
     assert len(expected) == 24
@@ -143,7 +143,7 @@ def test_a_cancelled_worker_loses_nothing(slurm: Path, tmp_path: Path) -> None:
             said("scancel", "--signal=KILL", running[0])
             said("scancel", running[0])
 
-    with clusters.client(clusters.choose(cluster=str(described))) as client:
+    with clusters.connect_client(clusters.choose_cluster(cluster=str(described))) as client:
         assert client.scheduler.address.startswith("tls://127.0.0.1:")
         client.wait_for_workers(2, timeout=120)
         outcomes = process_all(make_jobs(settings, cut), client=client, progress=cancel_one)

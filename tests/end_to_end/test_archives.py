@@ -14,7 +14,7 @@ import xarray as xr
 from support import factories, raw_archives
 from typer.testing import CliRunner
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import SceneError
@@ -25,7 +25,7 @@ from lidarops.run.executor import run
 
 
 def _campaign(repository: Path, archive: Path, out: Path) -> Campaign:
-    return load(repository / "catalogs/demo.yaml", archive=archive, output=out)
+    return load_campaign(repository / "catalogs/demo.yaml", archive=archive, output=out)
 
 
 @pytest.fixture(scope="session")

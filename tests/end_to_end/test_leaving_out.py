@@ -16,21 +16,21 @@ from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.flags import Quality
 from lidarops.plan import product_dependence
-from lidarops.plan.preview import GAP, WITHOUT, refine
+from lidarops.plan.preview import GAP, WITHOUT, refine_plan
 from lidarops.plan.rule_table import RULES
-from lidarops.plan.scene_plan import CHANNEL, GATE, PRODUCTS, plan
-from lidarops.plan.scenes import cut
+from lidarops.plan.scene_plan import CHANNEL, GATE, PRODUCTS, plan_scene
+from lidarops.plan.scenes import cut_scenes
 from lidarops.plan.signal_rules import gates, idle_gate
 from lidarops.process import channel_steps
 from lidarops.process import scene as processing
-from lidarops.process.scene import Job, process
+from lidarops.process.scene import Job, process_scene
 from lidarops.raw.licel import RawFile
 from lidarops.records import Plan, ProductKind, Role, RunRecord, Step
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
 from lidarops.run.archive import Options, prepare, reprocess
 from lidarops.run.executor import run
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}
 HOMOGENEOUS = {"homogeneous": SECTIONS}
@@ -38,7 +38,7 @@ HOMOGENEOUS = {"homogeneous": SECTIONS}
 
 def planned(*granules: Any, all_steps: bool = False, **changes: Any) -> Plan:
     campaign = factories.campaign(**changes).model_copy(update={"all_steps": all_steps})
-    return plan(cut(campaign, granules or (factories.granule(0),)).scenes[0], campaign)
+    return plan_scene(cut_scenes(campaign, granules or (factories.granule(0),)).scenes[0], campaign)
 
 
 def decided(made: Plan, rule: str) -> tuple[list[str], list[str]]:
@@ -236,7 +236,7 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
         rays["ray_azimuth"].to_numpy(),
     )
     signal = rays["signal"].to_numpy()
-    return rays.sizes["ray"], _block.make_rays(signal, np.ones(signal.shape), scan).sides
+    return rays.sizes["ray"], _block.make_beam_block(signal, np.ones(signal.shape), scan).sides
 
 
 def test_angles_that_cannot_be_leave_the_plan_to_the_retrieval():
@@ -325,7 +325,7 @@ def test_a_gate_that_keeps_no_bin_from_being_read_says_so(products, why):
     assert ("photon_532o" in gates(made.steps)) == (not why)
     assert not any(idle_gate(step, made.steps) for step in made.steps if step is not gate)
     # The product of sections tells the same of itself, whatever else is made.
-    alone = product_dependence.part(made, [(ProductKind.HOMOGENEOUS, "photon_532o")])
+    alone = product_dependence.plan_closure(made, [(ProductKind.HOMOGENEOUS, "photon_532o")])
     assert gate in alone.steps
     assert not idle_gate(gate, alone.steps)
 
@@ -373,7 +373,7 @@ def sky(light, *, saturated=()):
 
 def looked(profiles, count=600):
     granules = [factories.granule(float(k)) for k in range(count)]
-    return refine(planned(*granules, products=HOMOGENEOUS), granules, profiles)
+    return refine_plan(planned(*granules, products=HOMOGENEOUS), granules, profiles)
 
 
 def absent(made):
@@ -421,7 +421,7 @@ def test_sections_that_are_always_saturated_are_left_out():
 def test_a_refined_plan_stays_as_it_is():
     made = looked(sky(lambda _: 0.0)[0])
     granules = [factories.granule(float(k)) for k in range(600)]
-    assert refine(made, granules, sky(lambda _: 1.0)[0]) == made
+    assert refine_plan(made, granules, sky(lambda _: 1.0)[0]) == made
 
 
 # Files ----------------------------------------------------------------------------------------
@@ -454,11 +454,11 @@ def test_the_gate_changes_no_bit_of_a_section(tmp_path, far, offset):
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, far]]}}
     campaign = archive(tmp_path, facts=[facts], products=products)
     scene = prepare(campaign).scenes[0]
-    made = plan(scene, campaign)
+    made = plan_scene(scene, campaign)
     values, read = [], []
     for dropped in (["look"], ["look", "range_gate"]):
         steps = tuple(step for step in made.steps if step.name not in dropped)
-        outcome = process(Job(campaign, scene, replace(made, steps=steps)))
+        outcome = process_scene(Job(campaign, scene, replace(made, steps=steps)))
         values.append(xr.load_dataset(campaign.products_root / outcome.products[0].path))
         read.append(outcome.bytes_read)
     assert read[0] < read[1]
@@ -472,7 +472,7 @@ def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeyp
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, 1500]]}}
     campaign = archive(tmp_path, products=products)
     scene = prepare(campaign).scenes[0]
-    made = plan(scene, campaign)
+    made = plan_scene(scene, campaign)
     absent = {WITHOUT: [[700.0, 1500.0, "LOW_SIGNAL"]]}
     told = [
         replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
@@ -487,7 +487,7 @@ def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeyp
         return found
 
     monkeypatch.setattr(processing, "open_archive", without_shots)
-    (product,) = process(Job(campaign, scene, replace(made, steps=tuple(told)))).products
+    (product,) = process_scene(Job(campaign, scene, replace(made, steps=tuple(told)))).products
     flags = xr.load_dataset(campaign.products_root / product.path)["quality_flag"].to_numpy()
     bits = flags[:, 0] & int(Quality.LOW_SIGNAL | Quality.INPUT_MISSING)
     low = int(Quality.LOW_SIGNAL)
@@ -500,10 +500,10 @@ def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
 ):
     campaign = archive(tmp_path)
     scene = prepare(campaign).scenes[0]
-    job = Job(campaign, scene, plan(scene, campaign))
-    usual = [product.sha256 for product in process(job).products]
+    job = Job(campaign, scene, plan_scene(scene, campaign))
+    usual = [product.sha256 for product in process_scene(job).products]
     monkeypatch.setattr(channel_steps, "AT_ONCE", bytes_at_once)
-    assert [product.sha256 for product in process(job).products] == usual
+    assert [product.sha256 for product in process_scene(job).products] == usual
 
 
 def test_a_changed_time_has_a_file_read_again(tmp_path, monkeypatch):
@@ -512,7 +512,7 @@ def test_a_changed_time_has_a_file_read_again(tmp_path, monkeypatch):
     size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
     scene = prepare(campaign).scenes[0]
     stale = replace(scene, granules=tuple(replace(g, mtime_ns=1) for g in scene.granules))
-    found = process(Job(campaign, stale, plan(stale, campaign)))
+    found = process_scene(Job(campaign, stale, plan_scene(stale, campaign)))
     assert found.inputs == one.inputs
     assert found.bytes_read > size
     seen: list[str] = []
@@ -520,7 +520,7 @@ def test_a_changed_time_has_a_file_read_again(tmp_path, monkeypatch):
     monkeypatch.setattr(
         RawFile, "read_header", lambda file: seen.append(Path(file.path).name) or read(file)
     )
-    process(Job(campaign, stale, plan(stale, campaign)))
+    process_scene(Job(campaign, stale, plan_scene(stale, campaign)))
     assert set(seen) == {"h0", "h1", "h2", "h3"}
 
 
@@ -581,7 +581,7 @@ _MAIN = {
 @pytest.mark.slow
 def test_what_is_left_out_loses_and_changes_nothing_good(tmp_path):
     campaign = mixed_campaign.write(tmp_path, profiles=40)
-    simulate(campaign)
+    simulate_campaign(campaign)
     reprocess(campaign)
     planned_run = reprocess(campaign, options=Options(force=True))
     everything = campaign.model_copy(

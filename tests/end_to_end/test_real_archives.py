@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality
-from lidarops.plan.scene_plan import plan
+from lidarops.plan.scene_plan import plan_scene
 from lidarops.records import Role, RunRecord
 from lidarops.run.archive import prepare, report_run
 from lidarops.run.executor import run
@@ -21,7 +21,7 @@ CAMPAIGNS = Path(__file__).parent / "campaigns"
 
 
 def _reprocess(name: str, data_root: Path, out: Path) -> RunRecord:
-    campaign = load(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=out)
+    campaign = load_campaign(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=out)
     # What a plan would leave out has to be flagged by what is found.
     campaign = campaign.model_copy(update={"all_steps": True})
     with warnings.catch_warnings():
@@ -134,9 +134,9 @@ def test_saopaulo_is_not_homogeneous(saopaulo: RunRecord) -> None:
 def test_sections_of_a_vertical_path_are_left_out(
     data_root: Path, tmp_path: Path, name: str
 ) -> None:
-    campaign = load(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=tmp_path)
+    campaign = load_campaign(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=tmp_path)
     (scene,) = prepare(campaign).scenes
-    planned = plan(scene, campaign)
+    planned = plan_scene(scene, campaign)
     assert not [step for step in planned.steps if step.name == "homogeneous"]
     left = [item for item in planned.left_out if item.rule == "section_level"]
     assert left

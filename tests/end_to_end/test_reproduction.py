@@ -17,16 +17,16 @@ from support import network_campaigns as networks
 from support import scan_campaign as scans
 from typer.testing import CliRunner
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.provenance import read_provenance
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.records import ProductKind
 from lidarops.run.archive import prepare
 from lidarops.run.executor import make_jobs, process_all
-from lidarops.run.reproduction import Reproduction, explain, reproduce
-from lidarops.simulate.campaign import simulate
+from lidarops.run.reproduction import Reproduction, explain_difference, reproduce_product
+from lidarops.simulate.campaign import simulate_campaign
 
 SOUNDING = "altitude [m],pressure [hPa],temperature [K]\n" + "".join(
     f"{km * 1000},{1013.25 * (1 - 0.0065 * km * 1000 / 288.15) ** 5.256:.4f},{288.15 - 6.5 * km}\n"
@@ -63,8 +63,8 @@ def campaign(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Camp
     (folder / "overlap.csv").write_text(OVERLAP, encoding="utf-8")
     path = folder / "again.yaml"
     path.write_text(yaml.safe_dump(tree(repository)), encoding="utf-8")
-    told = load(path)
-    simulate(told)
+    told = load_campaign(path)
+    simulate_campaign(told)
     outcomes = process_all(make_jobs(told, prepare(told)))
     assert not [outcome.error for outcome in outcomes if outcome.error]
     return told
@@ -90,10 +90,10 @@ def moved(campaign: Campaign, tmp_path: Path) -> Campaign:
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_is_made_again_to_the_last_byte(kind: ProductKind, campaign: Campaign):
     # Raw files and soundings are found by themselves, in folders above the product.
-    result = reproduce(of_kind(campaign, kind))
-    assert result.identical, explain(result)
+    result = reproduce_product(of_kind(campaign, kind))
+    assert result.identical, explain_difference(result)
     assert result.differences == ()
-    assert "identical" in explain(result)
+    assert "identical" in explain_difference(result)
 
 
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
@@ -101,15 +101,15 @@ def test_the_product_of_a_network_is_made_again(six_beams: bool, tmp_path: Path)
     told, _ = networks.written(tmp_path, networks.tree(networks.HOMOGENEOUS, six_beams=six_beams))
     process_all([job for job in make_jobs(told, prepare(told)) if job.scene.members])
     product = of_kind(told, ProductKind.VISIBILITY)
-    result = reproduce(product)
-    assert result.identical, explain(result)
+    result = reproduce_product(product)
+    assert result.identical, explain_difference(result)
     with xr.open_dataset(product) as opened:
         paths = json.loads(opened["provenance"].item())["entity"].values()
     changed = Path(told.archive) / max(str(each.get("lidarops:path", "")) for each in paths)
     content = bytearray(changed.read_bytes())
     content[-3] ^= 1
     changed.write_bytes(content)
-    assert len(names(reproduce(product), "input")) == 1
+    assert len(names(reproduce_product(product), "input")) == 1
 
 
 def test_products_that_were_dated_by_the_environment_are_dated_so_again(
@@ -120,10 +120,10 @@ def test_products_that_were_dated_by_the_environment_are_dated_so_again(
     process_all([job for job in make_jobs(dated, prepare(dated)) if "coast" in job.scene.id][:1])
     product = of_kind(dated, ProductKind.HOMOGENEOUS)
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
-    assert reproduce(product, archive=campaign.archive).identical
+    assert reproduce_product(product, archive=campaign.archive).identical
     # And the other way: what was not dated so must not be.
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    assert reproduce(of_kind(campaign, ProductKind.HOMOGENEOUS)).identical
+    assert reproduce_product(of_kind(campaign, ProductKind.HOMOGENEOUS)).identical
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -144,10 +144,10 @@ def test_a_changed_byte_and_a_missing_file_are_told_by_name(
     content[-3] ^= 1
     (raw / changed).write_bytes(content)
     (raw / missing).unlink()
-    result = reproduce(product, archive=raw, ancillary=tmp_path)
+    result = reproduce_product(product, archive=raw, ancillary=tmp_path)
     assert not result.identical
     assert sorted(names(result, "input")) == [changed, missing]
-    text = explain(result)
+    text = explain_difference(result)
     assert f"input {changed}: changed" in text
     assert f"input {missing}: missing" in text
 
@@ -155,7 +155,7 @@ def test_a_changed_byte_and_a_missing_file_are_told_by_name(
 def test_a_changed_sounding_is_told(moved: Campaign, tmp_path: Path):
     (tmp_path / "air.csv").write_text(SOUNDING.replace("288.15", "289.15"), encoding="utf-8")
     product = of_kind(moved, ProductKind.ELASTIC)
-    result = reproduce(product, archive=moved.archive, ancillary=tmp_path)
+    result = reproduce_product(product, archive=moved.archive, ancillary=tmp_path)
     assert names(result, "input") == ["air.csv"]
 
 
@@ -178,7 +178,7 @@ def test_other_software_is_told_where_the_bytes_differ(
     for module in ("lidarops.run.reproduction", "lidarops.netcdf.provenance"):
         monkeypatch.setattr(f"{module}.code_version", lambda: "0" * 16)
         monkeypatch.setattr(f"{module}.package_versions", lambda: {"numpy": "0.1"})
-    result = reproduce(of_kind(campaign, ProductKind.HOMOGENEOUS))
+    result = reproduce_product(of_kind(campaign, ProductKind.HOMOGENEOUS))
     assert not result.identical
     assert names(result, "code") == ["lidarops"]
     assert "numpy" in names(result, "package")
@@ -192,10 +192,10 @@ def test_a_tampered_value_is_found(campaign: Campaign, tmp_path: Path):
         file.set_auto_maskandscale(False)
         file["background"][0, 0] = 42.0
         file.title = "Another title"
-    result = reproduce(copied, archive=campaign.archive)
+    result = reproduce_product(copied, archive=campaign.archive)
     assert names(result, "variable") == ["background"]
     assert names(result, "attribute") == [":title"]
-    assert "1 of" in explain(result)
+    assert "1 of" in explain_difference(result)
 
 
 def test_the_same_content_in_other_bytes_is_told(campaign: Campaign, tmp_path: Path):
@@ -204,7 +204,7 @@ def test_the_same_content_in_other_bytes_is_told(campaign: Campaign, tmp_path: P
     copied.write_bytes(copied.read_bytes() + b"\0")
     with h5py.File(copied):
         pass
-    result = reproduce(copied, archive=campaign.archive)
+    result = reproduce_product(copied, archive=campaign.archive)
     assert names(result, "bytes") == ["same.nc"]
 
 
@@ -225,20 +225,20 @@ def test_a_product_that_tells_too_little_is_refused(campaign: Campaign, tmp_path
             opened["provenance"].attrs,
         )
     )
-    write(product, tmp_path / "old.nc")
+    write_product(product, tmp_path / "old.nc")
     with pytest.raises(ProductError, match="does not tell enough"):
-        reproduce(tmp_path / "old.nc", archive=campaign.archive)
+        reproduce_product(tmp_path / "old.nc", archive=campaign.archive)
 
 
 def test_inputs_that_are_nowhere_are_asked_for(campaign: Campaign, tmp_path: Path):
     lost = shutil.copy(of_kind(campaign, ProductKind.SIGNAL), tmp_path / "deep.nc")
     with pytest.raises(ProductError, match="--archive"):
-        reproduce(lost)
+        reproduce_product(lost)
 
 
 def test_raw_files_may_lie_behind_a_url(campaign: Campaign):
     product = of_kind(campaign, ProductKind.MULTIANGLE)
-    assert reproduce(product, archive=f"file://{campaign.archive}").identical
+    assert reproduce_product(product, archive=f"file://{campaign.archive}").identical
 
 
 def test_a_store_that_cannot_be_reached_lacks_nothing(campaign: Campaign) -> None:
@@ -246,7 +246,7 @@ def test_a_store_that_cannot_be_reached_lacks_nothing(campaign: Campaign) -> Non
     pytest.importorskip("aiohttp")
     product = of_kind(campaign, ProductKind.HOMOGENEOUS)
     with pytest.raises(CatalogError, match=r"^http://127\.0\.0\.1:1/: cannot be read") as caught:
-        reproduce(product, archive="http://127.0.0.1:1/")
+        reproduce_product(product, archive="http://127.0.0.1:1/")
     assert not caught.value.wrong_use
 
 
@@ -254,7 +254,7 @@ def test_what_a_store_lacks_is_told_with_its_url(campaign: Campaign, moved: Camp
     (gone, *_) = sorted(Path(moved.archive).glob("coast/h*"))
     gone.unlink()
     product = of_kind(campaign, ProductKind.HOMOGENEOUS)
-    result = reproduce(product, archive=f"file://{moved.archive}")
+    result = reproduce_product(product, archive=f"file://{moved.archive}")
     (lost,) = result.differences
     assert lost.name == f"coast/{gone.name}"
     assert lost.problem.startswith(f"missing from file://{moved.archive}: ")
@@ -305,5 +305,5 @@ def test_a_product_that_names_raw_files_elsewhere_is_refused(
     raw["lidarops:path"] = escape.format(outside=outside)
     monkeypatch.setattr("lidarops.run.reproduction.read_provenance", lambda _: told)
     with pytest.raises(ProductError, match="outside its archive"):
-        reproduce(product, archive=campaign.archive, catalog=campaign.catalog_url)
+        reproduce_product(product, archive=campaign.archive, catalog=campaign.catalog_url)
     assert outside.read_bytes() == b"of somebody else"

@@ -12,10 +12,10 @@ import xarray as xr
 import yaml
 from support.scan_campaign import ALTITUDE, TREE
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.run.archive import prepare
 from lidarops.run.executor import make_jobs, process_all
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 
 def campaign(folder: Path, **simulation: Any) -> tuple[Campaign, xr.Dataset]:
@@ -23,8 +23,8 @@ def campaign(folder: Path, **simulation: Any) -> tuple[Campaign, xr.Dataset]:
     tree = TREE | {"simulation": TREE["simulation"] | simulation}
     path = folder / "scans.yaml"
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
-    told = load(path)
-    return told, simulate(told).truth
+    told = load_campaign(path)
+    return told, simulate_campaign(told).truth
 
 
 def scores(told: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarray[Any, Any]:

@@ -19,7 +19,7 @@ from lidarops.figures import product_figures
 from lidarops.figures.profile_data import CAUSES, clearest_profile
 from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind, RunRecord
 from lidarops.reports import gallery
@@ -30,7 +30,7 @@ QUANTITY = "attenuated_backscatter"
 
 def stored(path: Path, data: xr.Dataset) -> xr.Dataset:
     """Build and write a product, and read it back as a report does."""
-    write(build_product(data, context(ProductKind.ELASTIC)), path)
+    write_product(build_product(data, context(ProductKind.ELASTIC)), path)
     with xr.open_dataset(path, decode_timedelta=False) as opened:
         return opened.load()
 
@@ -175,7 +175,7 @@ class TestClearestProfile:
 class TestErrorBudget:
     def test_curves_hold_the_profile_in_inverse_megametres(self, product):
         profile = clearest_profile(product)
-        figure = product_figures.error_budget(profile, title="lidar")
+        figure = product_figures.error_budget_figure(profile, title="lidar")
         left, right = figure.axes
         (value,) = lines(left, "particles, $\\pm$1 standard error")
         np.testing.assert_allclose(value.get_xdata(), MEGA * profile.backscatter)
@@ -196,7 +196,7 @@ class TestErrorBudget:
             assert "sr$^{-1}$" in panel.get_xlabel()
 
     def test_words_say_what_is_seen(self, product):
-        figure = product_figures.error_budget(clearest_profile(product), title="lidar")
+        figure = product_figures.error_budget_figure(clearest_profile(product), title="lidar")
         words = product_figures.alt_text(figure)
         assert words.startswith("lidar: backscatter of particles")
         assert "0.2" in words
@@ -209,7 +209,7 @@ class TestErrorBudget:
     def test_equal_profiles_give_equal_bytes(self, product):
         first, second = (
             product_figures.render(
-                product_figures.error_budget(clearest_profile(product), title=r"$\broken{")
+                product_figures.error_budget_figure(clearest_profile(product), title=r"$\broken{")
             )
             for _ in range(2)
         )

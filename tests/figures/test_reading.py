@@ -67,11 +67,11 @@ def files(folder: Path) -> dict[str, bytes]:
 
 class TestFigures:
     def test_are_the_same_whoever_reads(self, many, tmp_path, monkeypatch):
-        run_page.build(many, tmp_path / "one")
+        run_page.build_report(many, tmp_path / "one")
         alone = gallery.fill(many, tmp_path / "one")
         monkeypatch.setattr(reading, "FEWEST", 1)
         monkeypatch.setattr(reading, "_AT_A_TIME", 2)
-        run_page.build(many, tmp_path / "two", workers=2)
+        run_page.build_report(many, tmp_path / "two", workers=2)
         together = gallery.fill(many, tmp_path / "two", workers=2)
         assert files(tmp_path / "one") == files(tmp_path / "two")
         assert together == alone

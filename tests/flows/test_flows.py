@@ -31,7 +31,7 @@ from flows import WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
 from flows.maintenance import reap_runs
 from flows.reprocess import process_task, reprocess
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
@@ -312,7 +312,7 @@ def test_a_night_tells_the_channels_that_no_file_holds(
     told["instruments"]["lidar"]["products"]["homogeneous"]["channels"].append("photon_999o")
     campaign_file.write_text(yaml.safe_dump(told))
     (campaign_file.parent / "raw" / "coast" / "h9").unlink()
-    campaign = load(campaign_file)
+    campaign = load_campaign(campaign_file)
     result = bring_up_to_date(campaign)
     assert result.troubled
     monkeypatch.setattr(flows.reprocess, "get_run_logger", lambda: logging.getLogger("night"))
@@ -343,7 +343,7 @@ def test_a_run_that_gives_up_is_tried_again_and_one_that_is_stopped_is_not(
         monkeypatch.setattr(flows.reprocess, name, lambda *_, **__: None)
     monkeypatch.setattr(flows.reprocess, "bring_up_to_date", given_up)
     with pytest.raises(error) as raised:
-        process_task.fn(load(campaign_file), Selection(), Local(), full=False, wait=0.0)
+        process_task.fn(load_campaign(campaign_file), Selection(), Local(), full=False, wait=0.0)
     assert ("nowhere.csv" in str(raised.value)) == again
     monkeypatch.setitem(runtime.deployment.FIELDS, "id", lambda: str(uuid4()))
     assert process_task.retry_condition_fn is not None

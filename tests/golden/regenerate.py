@@ -12,7 +12,7 @@ import xarray as xr
 from golden.cdl import dump
 from support.made_products import MAKERS, PLACED, context
 
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product
 
 FOLDER = Path(__file__).parent
@@ -39,7 +39,7 @@ def texts(folder: Path) -> Iterator[tuple[str, str]]:
     for kind in MAKERS:
         for beam, angles in ({"several_beams": {}} if kind in PLACED else BEAMS).items():
             path = folder / f"{kind}_{beam}.nc"
-            write(build_product(plain(MAKERS[kind](**angles)), context(kind)), path)
+            write_product(build_product(plain(MAKERS[kind](**angles)), context(kind)), path)
             yield f"{path.stem}.cdl", dump(path)
 
 

@@ -557,7 +557,7 @@ def test_a_scan_goes_from_profiles_to_a_product():
     starts = np.datetime64("2026-03-01T10:00:00", "ns") + np.arange(12) * np.timedelta64(60, "s")
     ends = starts + np.timedelta64(60, "s")
     dims = ("time", "range")
-    found = labeled.scan(
+    found = labeled.retrieve_scan(
         xr.Dataset(
             {
                 "power": (dims, power + noise),

@@ -14,7 +14,7 @@ from compliance_checker.runner import CheckSuite, ComplianceChecker
 from support.made_products import MAKERS, context, homogeneous
 
 from lidarops.flags import Quality
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import LAYOUTS, build_product
 from lidarops.records import DetectionMode, ProductKind
 
@@ -78,7 +78,7 @@ def permitted(kind: ProductKind, data: xr.Dataset) -> set[str]:
 def test_products_comply(kind: ProductKind, shape: str, tmp_path: Path):
     path = tmp_path / "product.nc"
     data = MAKERS[kind](**SHAPES[shape])
-    write(build_product(data, context(kind)), path)
+    write_product(build_product(data, context(kind)), path)
     assert findings(path) == (set(), permitted(kind, data))
 
 
@@ -87,7 +87,7 @@ def test_a_product_of_nothing_but_missing_values_complies(kind: ProductKind, tmp
     path = tmp_path / "product.nc"
     of = context(kind, mode=DetectionMode.ANALOG, wavelength=float("nan"))
     data = missing(kind)
-    write(build_product(data, of), path)
+    write_product(build_product(data, of), path)
     assert findings(path) == (set(), permitted(kind, data))
     with xr.open_dataset(path) as product:
         main = "signal" if kind is ProductKind.SIGNAL else "extinction"
@@ -100,5 +100,5 @@ def test_the_checker_would_find_a_fault(tmp_path: Path):
     product["extinction"].attrs["units"] = "kg"
     product["extinction"].attrs["standard_name"] = "altitude"
     path = tmp_path / "product.nc"
-    write(product, path)
+    write_product(product, path)
     assert any("extinction" in said for said in findings(path)[0])

@@ -25,7 +25,7 @@ from lidarops.netcdf.provenance import (
     prov_json,
     read_provenance,
 )
-from lidarops.netcdf.write import write, write_plain
+from lidarops.netcdf.write import write_plain, write_product
 from lidarops.products.layouts import build_product
 from lidarops.records import InputRecord, LeftOut, ProductKind, Role
 
@@ -43,7 +43,7 @@ RELATIONS = {
 def test_provenance_reads_back_from_a_product(tmp_path: Path):
     path = tmp_path / "product.nc"
     product = build_product(homogeneous(), context())
-    write(product, path)
+    write_product(product, path)
     document = read_provenance(path)
     assert document == json.loads(prov_json(provenance()))
     assert document["entity"]["lidarops:product"]["lidarops:id"] == product.attrs["id"]

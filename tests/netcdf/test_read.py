@@ -18,7 +18,7 @@ from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.netcdf import read
 from lidarops.netcdf.read import open_product, profiles_in
-from lidarops.netcdf.write import BULK_BYTES, write
+from lidarops.netcdf.write import BULK_BYTES, write_product
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 
@@ -47,7 +47,7 @@ def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     both = data["signal"].dims
     data = data.assign(signal=(both, values), quality_flag=(both, flags.astype(np.int32)))
     path = tmp_path_factory.mktemp("products") / "chunked.nc"
-    write(build_product(data, context(ProductKind.SIGNAL)), path)
+    write_product(build_product(data, context(ProductKind.SIGNAL)), path)
     with h5py.File(path) as file:
         assert file["signal"].id.get_num_chunks() == 3
     return path
@@ -56,7 +56,7 @@ def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("kind", MAKERS)
 def test_every_variable_of_every_kind_is_as_xarray_has_it(kind: ProductKind, tmp_path: Path):
     path = tmp_path / "product.nc"
-    write(build_product(MAKERS[kind](), context(kind)), path)
+    write_product(build_product(MAKERS[kind](), context(kind)), path)
     known = by_xarray(path)
     with open_product(path, map(str, known.variables)) as found:
         assert set(found.variables) == set(known.variables)

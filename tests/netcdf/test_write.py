@@ -25,7 +25,13 @@ from support.made_products import MAKERS, context, homogeneous, signal
 
 from lidarops.errors import ProductError
 from lidarops.netcdf import write as writer
-from lidarops.netcdf.write import BULK_BYTES, CHUNK_BYTES, chunk_sizes, write, write_plain
+from lidarops.netcdf.write import (
+    BULK_BYTES,
+    CHUNK_BYTES,
+    chunk_sizes,
+    write_plain,
+    write_product,
+)
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 
@@ -55,7 +61,7 @@ def truth() -> xr.Dataset:
 
 def test_what_is_written_is_what_is_read(product: xr.Dataset, tmp_path: Path):
     path = tmp_path / "new" / "folder" / "product.nc"
-    written = write(product, path)
+    written = write_product(product, path)
     assert written.size == path.stat().st_size
     assert written.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     with xr.open_dataset(path, decode_cf=False) as stored:
@@ -103,7 +109,7 @@ def assert_stored(path: Path, expected: xr.Dataset) -> None:
 def test_large_variables_are_read_as_they_were_by_every_library(tmp_path: Path):
     product = of_noise()
     path = tmp_path / "product.nc"
-    write(product, path)
+    write_product(product, path)
     assert_stored(path, product)
     with xr.open_dataset(path, decode_cf=False) as stored:
         xr.testing.assert_equal(stored, product)
@@ -115,7 +121,7 @@ def test_large_variables_are_read_as_they_were_by_every_library(tmp_path: Path):
 @pytest.mark.skipif(shutil.which("nccopy") is None, reason="needs the netCDF utilities")
 def test_tools_of_another_netcdf_read_large_variables(tmp_path: Path):
     product = of_noise()
-    write(product, tmp_path / "product.nc")
+    write_product(product, tmp_path / "product.nc")
     nccopy = [shutil.which("nccopy"), "-k", "classic"]
     subprocess.run([*nccopy, tmp_path / "product.nc", tmp_path / "classic.nc"], check=True)
     with scipy.io.netcdf_file(tmp_path / "classic.nc", mmap=False) as file:
@@ -129,16 +135,16 @@ def test_files_are_hardly_larger_than_netcdf_makes_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     product = of_noise()
-    written = write(product, tmp_path / "product.nc")
+    written = write_product(product, tmp_path / "product.nc")
     monkeypatch.setattr(writer, "BULK_BYTES", math.inf)
-    assert written.size <= 1.05 * write(product, tmp_path / "plain.nc").size
+    assert written.size <= 1.05 * write_product(product, tmp_path / "plain.nc").size
     assert_stored(tmp_path / "plain.nc", product)
 
 
 def test_a_file_may_be_continued(tmp_path: Path):
     product = of_noise()
     path = tmp_path / "product.nc"
-    write(product, path)
+    write_product(product, path)
     with netCDF4.Dataset(path, "a") as file:
         file["time"][299:310] = 0.0
         assert file["signal"].shape == (310, 2000)
@@ -169,9 +175,9 @@ def test_arrays_of_any_type_layout_and_size_are_kept(
     dataset = xr.Dataset({"x": (dims, values, fill_value), "y": 1.0})
     dataset.encoding["unlimited_dims"] = data.draw(st.sampled_from([(), ("time",), ("range",)]))
     path = tmp_path_factory.mktemp("any") / "any.nc"
-    write(dataset, path)
+    write_product(dataset, path)
     assert_stored(path, dataset)
-    assert write(dataset, path) == write(dataset.copy(deep=True), path)
+    assert write_product(dataset, path) == write_product(dataset.copy(deep=True), path)
 
 
 @pytest.mark.parametrize("name", ["time", "range", "сигнал", "x"])
@@ -185,7 +191,7 @@ def test_large_variables_may_have_any_name(name: str, tmp_path: Path):
     dataset = xr.Dataset(variables)
     dataset.encoding["unlimited_dims"] = ("time",)
     write_plain(dataset, tmp_path / "any.nc")
-    write(dataset, tmp_path / "any.nc")
+    write_product(dataset, tmp_path / "any.nc")
     assert_stored(tmp_path / "any.nc", dataset)
 
 
@@ -201,7 +207,7 @@ def test_what_is_defined_is_written_once(
     monkeypatch.setattr(
         writer._DefinedAtOnce, "end_definitions", lambda file: ends.append("end") or written(file)
     )
-    write(product, tmp_path / "product.nc")
+    write_product(product, tmp_path / "product.nc")
     # Otherwise netCDF4 has another way, and this one would be in vain.
     assert ends.count("kept") > len(product.variables)
     assert ends.count("end") == 1
@@ -211,7 +217,7 @@ def test_what_is_defined_is_written_once(
 def test_xarray_decodes_times_flags_bounds_and_coordinates(kind: ProductKind, tmp_path: Path):
     data = MAKERS[kind](zenith=0.0)
     path = tmp_path / "product.nc"
-    write(build_product(data, context(kind)), path)
+    write_product(build_product(data, context(kind)), path)
     with xr.open_dataset(path, decode_coords="all") as stored:
         np.testing.assert_array_equal(stored["time"], data["time"])
         np.testing.assert_array_equal(stored["quality_flag"], data["quality_flag"])
@@ -221,7 +227,7 @@ def test_xarray_decodes_times_flags_bounds_and_coordinates(kind: ProductKind, tm
 
 def test_files_are_classic_with_one_unlimited_dimension(product: xr.Dataset, tmp_path: Path):
     path = tmp_path / "product.nc"
-    write(product, path)
+    write_product(product, path)
     with netCDF4.Dataset(path) as file:
         assert file.data_model == "NETCDF4_CLASSIC"
         assert [name for name, dim in file.dimensions.items() if dim.isunlimited()] == ["time"]
@@ -233,7 +239,7 @@ def test_every_variable_has_the_declared_chunks_and_filters(
     profiles: int, bins: int, tmp_path: Path
 ):
     path = tmp_path / "product.nc"
-    write(build_product(signal(profiles, bins), context(ProductKind.SIGNAL)), path)
+    write_product(build_product(signal(profiles, bins), context(ProductKind.SIGNAL)), path)
     with netCDF4.Dataset(path) as file:
         for name, variable in file.variables.items():
             if not variable.dimensions:
@@ -342,7 +348,7 @@ def test_a_failure_leaves_what_was_there(
     failure: Exception, product: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     path = tmp_path / "product.nc"
-    write(product, path)
+    write_product(product, path)
     before = path.read_bytes()
 
     def fail(_: Path) -> None:
@@ -351,7 +357,7 @@ def test_a_failure_leaves_what_was_there(
 
     monkeypatch.setattr(writer, "_settle", fail)
     with pytest.raises(ProductError, match="disk has space") as caught:
-        write(product, path)
+        write_product(product, path)
     assert caught.value.file == str(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -365,7 +371,7 @@ def test_an_interrupt_leaves_nothing(
 
     monkeypatch.setattr(writer, "_settle", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        write(product, tmp_path / "product.nc")
+        write_product(product, tmp_path / "product.nc")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -419,10 +425,10 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path):
 def test_a_folder_that_cannot_be_is_an_error(product: xr.Dataset, tmp_path: Path):
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(ProductError, match="folder can be written"):
-        write(product, tmp_path / "file" / "product.nc")
+        write_product(product, tmp_path / "file" / "product.nc")
     (tmp_path / "taken.nc").mkdir()
     with pytest.raises(ProductError, match=r"taken\.nc"):
-        write(product, tmp_path / "taken.nc")
+        write_product(product, tmp_path / "taken.nc")
     assert {path.name for path in tmp_path.iterdir()} == {"file", "taken.nc"}
 
 
@@ -431,7 +437,7 @@ def test_a_folder_without_permission_is_an_error(product: xr.Dataset, tmp_path: 
     tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
     try:
         with pytest.raises(ProductError, match="folder can be written"):
-            write(product, tmp_path / "product.nc")
+            write_product(product, tmp_path / "product.nc")
     finally:
         tmp_path.chmod(stat.S_IRWXU)
 
@@ -439,13 +445,13 @@ def test_a_folder_without_permission_is_an_error(product: xr.Dataset, tmp_path: 
 def test_products_have_the_permissions_that_the_user_wants(product: xr.Dataset, tmp_path: Path):
     before = os.umask(0o022)
     try:
-        write(product, tmp_path / "product.nc")
+        write_product(product, tmp_path / "product.nc")
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "product.nc").stat().st_mode) == 0o644
 
 
-@pytest.mark.parametrize("function", [write, write_plain])
+@pytest.mark.parametrize("function", [write_product, write_plain])
 def test_dask_arrays_are_refused(function, product: xr.Dataset, tmp_path: Path):
     lazy = product.assign(extinction=product["extinction"].chunk())
     with pytest.raises(ProductError, match="load the dataset") as caught:
@@ -467,7 +473,7 @@ def test_dask_arrays_are_refused(function, product: xr.Dataset, tmp_path: Path):
 )
 def test_what_netcdf_cannot_hold_is_refused(values, problem, tmp_path: Path):
     with pytest.raises(ProductError, match=problem):
-        write(xr.Dataset({"x": ("n", values)}), tmp_path / "product.nc")
+        write_product(xr.Dataset({"x": ("n", values)}), tmp_path / "product.nc")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -12,7 +12,7 @@ from support import factories
 
 from lidarops.catalog.rows import row_of
 from lidarops.catalog.store import Store
-from lidarops.plan.availability import edges, lacks_any, names_any, unmet
+from lidarops.plan.availability import edges, lacks_any, names_any, unavailable
 from lidarops.records import Granule, ProductKind, Role, Unmet
 
 DAY = 1440
@@ -32,7 +32,7 @@ def _found(
     campaign = factories.campaign(facts=facts, products=products or {"signal": {}})
     with Store(f"sqlite:///{folder}/catalog.sqlite", campaign.name) as store:
         store.replace([row_of(granule, campaign.name, "key") for granule in granules])
-        found = list(unmet(campaign, store.holdings(edges(campaign)), **asked))
+        found = list(unavailable(campaign, store.holdings(edges(campaign)), **asked))
         # The quick look finds whatever the long one finds.
         assert lacks_any(campaign, store.layouts()) or not found
         return found

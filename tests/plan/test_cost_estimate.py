@@ -15,8 +15,8 @@ from support import factories
 from lidarops.errors import CatalogError
 from lidarops.plan import cost_estimate
 from lidarops.plan.cost_estimate import DEFAULTS, Costs, Tally, Term, amounts
-from lidarops.plan.scene_plan import plan
-from lidarops.plan.scenes import cut
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import cut_scenes
 from lidarops.records import ChannelLayout, Plan, Role, Scene
 from lidarops.reports import gallery
 
@@ -33,8 +33,8 @@ def planned(
         factories.granule(-30.0 - k, path=f"dark/{k}", role=Role.DARK) for k in range(dark)
     ]
     campaign = factories.campaign(products=LEVEL if products is None else products)
-    scene = cut(campaign, granules).scenes[0]
-    return scene, plan(scene, campaign)
+    scene = cut_scenes(campaign, granules).scenes[0]
+    return scene, plan_scene(scene, campaign)
 
 
 def of(**changes: Any) -> dict[Term, float]:
@@ -132,18 +132,18 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_calibration_comes_back(cache: Path):
     seconds = {term: 0.1 * number for number, term in enumerate(Term)}
-    kept = cost_estimate.save(
+    kept = cost_estimate.save_calibration(
         Costs(seconds, processor=cost_estimate.processor(), date="2026-01-02")
     )
     assert kept == cache
-    found = cost_estimate.load()
+    found = cost_estimate.load_calibration()
     assert found.seconds == seconds
     assert found.words == "calibrated on this machine on 2026-01-02"
     assert [path.name for path in cache.parent.iterdir()] == [cache.name]
 
 
 def test_without_a_calibration_the_note_says_so(cache: Path):
-    found = cost_estimate.load()
+    found = cost_estimate.load_calibration()
     assert found.seconds == DEFAULTS
     assert found.words.startswith("not calibrated on this machine")
 
@@ -159,9 +159,11 @@ def test_without_a_calibration_the_note_says_so(cache: Path):
     ],
 )
 def test_a_strange_calibration_is_not_used_and_told(cache: Path, change: Any, said: str):
-    cost_estimate.save(Costs(DEFAULTS, processor=cost_estimate.processor(), date="2026-01-02"))
+    cost_estimate.save_calibration(
+        Costs(DEFAULTS, processor=cost_estimate.processor(), date="2026-01-02")
+    )
     cache.write_text(json.dumps({**json.loads(cache.read_text()), **change}))
-    found = cost_estimate.load()
+    found = cost_estimate.load_calibration()
     assert found.seconds == DEFAULTS
     assert "not calibrated" in found.note
     assert said in found.note
@@ -181,11 +183,11 @@ def homeless(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("homeless")
 def test_without_a_home_there_is_no_calibration():
-    found = cost_estimate.load()
+    found = cost_estimate.load_calibration()
     assert found.seconds == DEFAULTS
     assert "XDG_CACHE_HOME" in found.words
     with pytest.raises(CatalogError, match="XDG_CACHE_HOME"):
-        cost_estimate.save(Costs(DEFAULTS))
+        cost_estimate.save_calibration(Costs(DEFAULTS))
 
 
 def test_all_terms_have_defaults():

@@ -15,8 +15,8 @@ from support.factories import ANALOG, DAY, PHOTON, granule
 from lidarops.campaign.model import Campaign
 from lidarops.plan.network_plan import apart
 from lidarops.plan.rule_table import RULES
-from lidarops.plan.scene_plan import plan
-from lidarops.plan.scenes import cut
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Granule, Plan, Scene
 
 PLACES = {
@@ -76,12 +76,12 @@ def granules(minutes: float = 0.0, **changes: Any) -> list[Granule]:
 
 
 def networks(told: Campaign, given_: list[Granule]) -> list[Scene]:
-    return [scene for scene in cut(told, given_).scenes if scene.members]
+    return [scene for scene in cut_scenes(told, given_).scenes if scene.members]
 
 
 def planned(told: Campaign, given_: list[Granule] | None = None) -> Plan:
     (scene,) = networks(told, granules() if given_ is None else given_)
-    return plan(scene, told)
+    return plan_scene(scene, told)
 
 
 def reasons(found: Plan) -> str:
@@ -147,7 +147,7 @@ class TestCampaign:
 class TestScenes:
     def test_members_keep_scenes_of_their_own(self):
         told = campaign()
-        found = cut(told, granules()).scenes
+        found = cut_scenes(told, granules()).scenes
         assert [scene.instrument for scene in found] == [*sorted(MEMBERS), "valley"]
         scene = found[-1]
         assert scene.id == "valley_20260301T000000"
@@ -165,7 +165,7 @@ class TestScenes:
         first, second = networks(told, [*granules(10), *granules(721)])
         assert first.stop == noon == second.start
         assert [len(member.granules) for member in first.members] == [1, 1, 1]
-        near = [ray["nearest"] for ray in plan(second, told).steps[-1].settings["rays"]]
+        near = [ray["nearest"] for ray in plan_scene(second, told).steps[-1].settings["rays"]]
         assert near == [150.0, 300.0, 150.0]
 
     def test_one_lidar_alone_is_no_network(self):
@@ -188,8 +188,8 @@ class TestScenes:
         assert networks(told, shuffled) == networks(told, granules() + granules(10) + granules(20))
 
     def test_without_a_network_nothing_changes(self):
-        with_one = [s for s in cut(campaign(), granules()).scenes if not s.members]
-        assert with_one == list(cut(campaign(networks={}), granules()).scenes)
+        with_one = [s for s in cut_scenes(campaign(), granules()).scenes if not s.members]
+        assert with_one == list(cut_scenes(campaign(networks={}), granules()).scenes)
 
 
 class TestPlans:
@@ -209,13 +209,13 @@ class TestPlans:
 
     def test_members_are_not_read_for_themselves(self):
         told = campaign()
-        alone = next(s for s in cut(told, granules()).scenes if s.instrument == "west-lidar")
-        found = plan(alone, told)
+        alone = next(s for s in cut_scenes(told, granules()).scenes if s.instrument == "west-lidar")
+        found = plan_scene(alone, told)
         assert found.steps == ()
         left_out = {left.channel: left.reason for left in found.left_out}
         assert left_out["photon_532o"] == "used by network valley alone"
         assert left_out["analog_532o"] == "no product of the campaign asks for this channel"
-        joined = plan(alone, campaign({"channel": "glued_532o"}))
+        joined = plan_scene(alone, campaign({"channel": "glued_532o"}))
         assert {left.reason for left in joined.left_out} == {"used by network valley alone"}
 
     def test_it_is_plain_data(self):

@@ -11,15 +11,15 @@ import pytest
 from support import factories
 
 from lidarops.plan import product_dependence
-from lidarops.plan.scene_plan import plan
-from lidarops.plan.scenes import cut
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, Role, Scene
-from lidarops.retrieve.signal.dark import profile as dark_profile
+from lidarops.retrieve.signal.dark import dark_profile
 
 
 def _scene(*granules: object) -> Scene:
     members = granules or (factories.granule(0),)
-    return cut(factories.campaign(), members).scenes[0]  # type: ignore[arg-type]
+    return cut_scenes(factories.campaign(), members).scenes[0]  # type: ignore[arg-type]
 
 
 def _steps(result: Plan, channel: str) -> dict[str, dict[str, object]]:
@@ -31,7 +31,7 @@ def _left_out(result: Plan, channel: str) -> dict[str, str]:
 
 
 def test_photon_channel() -> None:
-    result = plan(_scene(), factories.campaign())
+    result = plan_scene(_scene(), factories.campaign())
     steps = _steps(result, "photon_532o")
     assert list(steps) == [
         "read",
@@ -48,7 +48,7 @@ def test_photon_channel() -> None:
 
 
 def test_a_channel_that_nobody_wants_is_not_read() -> None:
-    result = plan(_scene(), factories.campaign())
+    result = plan_scene(_scene(), factories.campaign())
     assert not _steps(result, "analog_532o")
     assert "no product" in _left_out(result, "analog_532o")["read"]
 
@@ -58,7 +58,7 @@ def test_a_channel_of_which_every_product_is_left_out_is_not_read() -> None:
         "homogeneous": {"channels": ["analog_532o"], "sections": [[14_000, 16_000]]},
         "signal": {"channels": ["photon_532o"]},
     }
-    result = plan(_scene(), factories.campaign(products=wanted))
+    result = plan_scene(_scene(), factories.campaign(products=wanted))
     assert {step.channel for step in result.steps} == {"photon_532o"}
     left_out = _left_out(result, "analog_532o")
     assert set(left_out) == {"signal", "homogeneous", "elastic", "multiangle", "read"}
@@ -78,8 +78,8 @@ def test_a_channel_of_which_every_product_is_left_out_is_not_read() -> None:
     ],
 )
 def test_steps_of_a_plan_are_those_that_its_products_need(products: dict[str, object]) -> None:
-    result = plan(_scene(), factories.campaign(products=products))
-    needed = product_dependence.part(result, product_dependence.wanted(result))
+    result = plan_scene(_scene(), factories.campaign(products=products))
+    needed = product_dependence.plan_closure(result, product_dependence.wanted(result))
     assert [(s.channel, s.name, s.settings) for s in result.steps] == [
         (s.channel, s.name, s.settings) for s in needed.steps
     ]
@@ -94,27 +94,27 @@ def test_dark_only_where_there_are_dark_files(*, with_dark: bool) -> None:
     granules = [factories.granule(0)]
     if with_dark:
         granules.append(factories.granule(-30, path="dark/d", role=Role.DARK))
-    result = plan(_scene(*granules), campaign)
+    result = plan_scene(_scene(*granules), campaign)
     assert ("dark" in _steps(result, "analog_532o")) is with_dark
     assert ("dark" in _left_out(result, "analog_532o")) is not with_dark
 
 
 def test_unknown_dead_time_is_said() -> None:
-    result = plan(_scene(), factories.campaign(facts=[{}]))
+    result = plan_scene(_scene(), factories.campaign(facts=[{}]))
     assert "dead_time" in _left_out(result, "photon_532o")["dead_time"]
     assert "full_overlap_range" in _left_out(result, "photon_532o")["overlap"]
 
 
 def test_a_channel_that_the_files_lack_is_named() -> None:
     wanted = {"homogeneous": {"channels": ["photon_999x"], "sections": [[500, 900]]}}
-    reason = _left_out(plan(_scene(), factories.campaign(products=wanted)), "photon_999x")
+    reason = _left_out(plan_scene(_scene(), factories.campaign(products=wanted)), "photon_999x")
     assert "photon_532o" in reason["homogeneous"]
 
 
 @pytest.mark.parametrize("section", [[14_000, 16_000], [1000, 1030]])
 def test_a_section_outside_the_bins_is_left_out(section: list[float]) -> None:
     wanted = {"homogeneous": {"channels": ["photon_532o"], "sections": [section, [750, 4500]]}}
-    result = plan(_scene(), factories.campaign(products=wanted))
+    result = plan_scene(_scene(), factories.campaign(products=wanted))
     assert f"{section[0]}-{section[1]}" in _left_out(result, "photon_532o")["homogeneous"]
     assert _steps(result, "photon_532o")["homogeneous"]["sections"] == [[750.0, 4500.0]]
 
@@ -122,23 +122,23 @@ def test_a_section_outside_the_bins_is_left_out(section: list[float]) -> None:
 def test_an_implausible_wavelength_needs_the_campaign() -> None:
     odd = tuple(replace(channel, wavelength=math.nan) for channel in factories.granule().layout)
     scene = _scene(factories.granule(0, layout=odd))
-    assert "wavelength" in _left_out(plan(scene, factories.campaign()), "photon_532o")["read"]
+    assert "wavelength" in _left_out(plan_scene(scene, factories.campaign()), "photon_532o")["read"]
     told = factories.campaign(facts=[{"channels": {"photon_532o": {"wavelength": 532e-9}}}])
-    assert _steps(plan(scene, told), "photon_532o")["read"]["wavelength"] == 532e-9
+    assert _steps(plan_scene(scene, told), "photon_532o")["read"]["wavelength"] == 532e-9
 
 
 def test_the_hash_follows_every_setting() -> None:
-    base = plan(_scene(), factories.campaign())
-    assert plan(_scene(), factories.campaign()).hash == base.hash
+    base = plan_scene(_scene(), factories.campaign())
+    assert plan_scene(_scene(), factories.campaign()).hash == base.hash
     other = factories.campaign(facts=[{"channels": {"photon_532o": {"dead_time": 5e-9}}}])
-    assert plan(_scene(), other).hash != base.hash
+    assert plan_scene(_scene(), other).hash != base.hash
     assert json.loads(json.dumps(base.as_dict()))["scene"] == base.scene
 
 
 @pytest.mark.parametrize("background", [[14_990, 16_000], [20_000, 30_000], [100, 101]])
 def test_a_background_without_bins_leaves_the_signal_out(background: list[float]) -> None:
     wanted = {"signal": {"channels": ["photon_532o"], "background_range": background}}
-    result = plan(_scene(), factories.campaign(products=wanted))
+    result = plan_scene(_scene(), factories.campaign(products=wanted))
     assert "background_range" in _left_out(result, "photon_532o")["signal"]
     assert "signal" not in _steps(result, "photon_532o")
 
@@ -151,7 +151,7 @@ def _elastic(*granules: object, facts: dict[str, object] | None = None, **settin
     told: dict[str, object] = {"zenith_angle": 0.0} if facts is None else facts
     wanted = {"elastic": {"channels": ["photon_532o"], **settings}}
     campaign = factories.campaign(products=wanted, facts=[told])
-    return plan(_scene(*granules), campaign)
+    return plan_scene(_scene(*granules), campaign)
 
 
 def test_elastic_steps_in_their_order() -> None:
@@ -183,7 +183,7 @@ def test_elastic_steps_in_their_order() -> None:
     reasons = {step.name: step.reason for step in result.steps}
     assert "US Standard Atmosphere 1976" in reasons["molecular"]
     assert all(reasons.values())
-    unwanted = plan(_scene(), factories.campaign())
+    unwanted = plan_scene(_scene(), factories.campaign())
     assert "does not ask" in _left_out(unwanted, "photon_532o")["elastic"]
 
 
@@ -287,7 +287,7 @@ class TestDark:
             factories.granule(minute, path=f"dark/d{minute}", role=Role.DARK) for minute in minutes
         ]
         campaign = factories.campaign(products={"signal": {"channels": ["analog_532o"]}})
-        result = plan(_scene(*granules), campaign)
+        result = plan_scene(_scene(*granules), campaign)
         self.reason = next(step.reason for step in result.steps if step.name == "dark")
         return _steps(result, "analog_532o")["dark"]
 
@@ -348,7 +348,7 @@ class TestDark:
 
     def test_photon_counting_needs_none(self) -> None:
         dark = factories.granule(0, path="dark/d", role=Role.DARK)
-        result = plan(_scene(factories.granule(60), dark), factories.campaign())
+        result = plan_scene(_scene(factories.granule(60), dark), factories.campaign())
         assert "photon background" in _left_out(result, "photon_532o")["dark"]
 
 
@@ -366,7 +366,7 @@ class TestGlued:
             **(facts or {}),
         }
         wanted = products or {"elastic": {"channels": ["glued_532o"]}}
-        return plan(_scene(*granules), factories.campaign(products=wanted, facts=[told]))
+        return plan_scene(_scene(*granules), factories.campaign(products=wanted, facts=[told]))
 
     def test_both_parts_are_read_and_joined(self) -> None:
         result = self._plan()

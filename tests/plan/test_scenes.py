@@ -10,13 +10,13 @@ import pytest
 from support import factories
 
 from lidarops.errors import SceneError
-from lidarops.plan.scenes import cut, select, stop_of
+from lidarops.plan.scenes import cut_scenes, select_scenes, stop_of
 from lidarops.records import Role, Status
 
 
 def test_one_scene_for_each_utc_day() -> None:
     granules = [factories.granule(minutes) for minutes in (0, 1439, 1440, 2000)]
-    scenes = cut(factories.campaign(), granules).scenes
+    scenes = cut_scenes(factories.campaign(), granules).scenes
     assert [len(scene.granules) for scene in scenes] == [2, 2]
     assert [scene.id for scene in scenes] == ["lidar_20260301T000000", "lidar_20260302T000000"]
     assert scenes[0].stop - scenes[0].start == timedelta(days=1)
@@ -28,7 +28,7 @@ def test_a_window_divides_the_day() -> None:
         update={"scenes": campaign.scenes.model_copy(update={"window": timedelta(hours=6)})}
     )
     granules = [factories.granule(60 * hour) for hour in range(24)]
-    scenes = cut(campaign, granules).scenes
+    scenes = cut_scenes(campaign, granules).scenes
     assert [scene.start.hour for scene in scenes] == [0, 6, 12, 18]
     assert all(len(scene.granules) == 6 for scene in scenes)
 
@@ -41,7 +41,7 @@ def test_a_scene_ends_where_the_facts_change() -> None:
             {"valid_from": noon.isoformat(), "channels": {"photon_532o": {"dead_time": 9e-9}}},
         ]
     )
-    scenes = cut(campaign, [factories.granule(60 * hour) for hour in range(24)]).scenes
+    scenes = cut_scenes(campaign, [factories.granule(60 * hour) for hour in range(24)]).scenes
     assert [(scene.start, scene.stop) for scene in scenes] == [
         (factories.DAY, noon),
         (noon, factories.DAY + timedelta(days=1)),
@@ -58,30 +58,30 @@ def test_the_end_of_a_scene_is_known_by_its_name() -> None:
     for window in windows:
         scenes = campaign.scenes.model_copy(update={"window": window})
         other = campaign.model_copy(update={"scenes": scenes})
-        found = cut(other, [factories.granule(20 * k) for k in range(72)]).scenes
+        found = cut_scenes(other, [factories.granule(20 * k) for k in range(72)]).scenes
         assert [stop_of(scene.id, other) for scene in found] == [scene.stop for scene in found]
     assert stop_of("gone_20260301T000000", campaign) == factories.DAY + timedelta(days=1)
 
 
 def test_any_order_of_files_gives_the_same_scenes() -> None:
     granules = [factories.granule(7 * k) for k in range(400)]
-    expected = cut(factories.campaign(), granules)
+    expected = cut_scenes(factories.campaign(), granules)
     shuffled = granules.copy()
     random.Random(1).shuffle(shuffled)
-    assert cut(factories.campaign(), shuffled) == expected
+    assert cut_scenes(factories.campaign(), shuffled) == expected
 
 
 def test_other_grids_make_other_scenes() -> None:
     coarse = tuple(replace(channel, bin_width=15.0) for channel in factories.granule().layout)
     granules = [factories.granule(k, **({"layout": coarse} if k == 3 else {})) for k in range(6)]
-    scenes = cut(factories.campaign(), granules).scenes
+    scenes = cut_scenes(factories.campaign(), granules).scenes
     assert sorted(len(scene.granules) for scene in scenes) == [1, 5]
     assert len({scene.id for scene in scenes}) == 2
 
 
 def test_two_files_of_one_time_are_not_counted_twice() -> None:
     twin = factories.granule(5, path="coast/z-copy")
-    result = cut(factories.campaign(), [factories.granule(5), twin, factories.granule(6)])
+    result = cut_scenes(factories.campaign(), [factories.granule(5), twin, factories.granule(6)])
     assert len(result.scenes[0].granules) == 2
     assert [aside.path for aside in result.set_aside] == ["coast/z-copy"]
     assert result.set_aside[0].status is Status.REFUSED
@@ -91,18 +91,23 @@ def test_two_files_of_one_time_are_not_counted_twice() -> None:
 def test_dark_files_serve_scenes_within_a_day() -> None:
     near = factories.granule(-60, path="dark/near", role=Role.DARK)
     far = factories.granule(-60 * 48, path="dark/far", role=Role.DARK)
-    scene = cut(factories.campaign(), [factories.granule(0), near, far]).scenes[0]
+    scene = cut_scenes(factories.campaign(), [factories.granule(0), near, far]).scenes[0]
     assert [granule.path for granule in scene.dark] == ["dark/near"]
 
 
 def test_refused_granules_are_passed_over() -> None:
     refused = factories.granule(1, status=Status.REFUSED, reason="truncated", start=None)
-    assert len(cut(factories.campaign(), [factories.granule(0), refused]).scenes[0].granules) == 1
+    assert (
+        len(cut_scenes(factories.campaign(), [factories.granule(0), refused]).scenes[0].granules)
+        == 1
+    )
 
 
 def test_selection_names_the_instruments_there_are() -> None:
-    scenes = cut(factories.campaign(), [factories.granule(0), factories.granule(1500)]).scenes
-    assert len(select(scenes, since=factories.DAY + timedelta(days=1))) == 1
-    assert len(select(scenes, until=factories.DAY + timedelta(hours=1))) == 1
+    scenes = cut_scenes(
+        factories.campaign(), [factories.granule(0), factories.granule(1500)]
+    ).scenes
+    assert len(select_scenes(scenes, since=factories.DAY + timedelta(days=1))) == 1
+    assert len(select_scenes(scenes, until=factories.DAY + timedelta(hours=1))) == 1
     with pytest.raises(SceneError, match="lidar"):
-        select(scenes, instruments=["radar"])
+        select_scenes(scenes, instruments=["radar"])

@@ -17,8 +17,8 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, Metadata
 from lidarops.flags import Quality
 from lidarops.netcdf.build import Context
-from lidarops.plan.scene_plan import plan
-from lidarops.plan.scenes import cut
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import cut_scenes
 from lidarops.process import channel_steps
 from lidarops.products.layouts import build_product
 from lidarops.records import DetectionMode, Plan, ProductKind, Provenance, Role
@@ -132,14 +132,16 @@ def planned(settings: Campaign, *, dark: bool = False, bins: int = 1200) -> Plan
         granules.append(
             factories.granule(-30, path="dark/d", role=Role.DARK, layout=layout, size=7)
         )
-    return plan(cut(settings, granules).scenes[0], settings)
+    return plan_scene(cut_scenes(settings, granules).scenes[0], settings)
 
 
 def carried(products, raw=None, *, channel="photon_532o", dark=None, ancillaries=None, **facts):
     raw = archive() if raw is None else raw
     made = planned(campaign(products, **facts), dark=dark is not None, bins=raw.sizes["range"])
     files = NONE if ancillaries is None else ancillaries
-    return channel_steps.carry_out(channel_steps.Bench(made, raw, dark, files, STATION), channel)
+    return channel_steps.process_channel(
+        channel_steps.Bench(made, raw, dark, files, STATION), channel
+    )
 
 
 def read(folder: Path, **files: str) -> Ancillaries:

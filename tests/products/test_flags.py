@@ -14,7 +14,7 @@ from support.made_products import MAKERS, context
 
 from lidarops.flags import Quality, Severity
 from lidarops.netcdf.variables import sum_up
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import LAYOUTS, build_product
 from lidarops.records import ProductKind
 from lidarops.retrieve.multiangle import labeled
@@ -147,7 +147,7 @@ def test_any_bits_come_back_from_a_file_by_mask_and_meaning(
     shape = results["quality_flag"].shape
     results["quality_flag"] = (results["quality_flag"].dims, np.resize(values, shape))
     path = tmp_path / "flags.nc"
-    write(build_product(results, context(kind)), path)
+    write_product(build_product(results, context(kind)), path)
     with netCDF4.Dataset(path) as file:
         variable = file["quality_flag"]
         stored = variable[...].ravel()

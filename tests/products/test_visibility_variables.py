@@ -13,7 +13,7 @@ from test_compliance import findings, permitted
 
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import LAYOUTS, build_product
 from lidarops.records import ProductKind
 
@@ -29,7 +29,7 @@ def data() -> xr.Dataset:
 def test_it_complies(intervals: int, tmp_path: Path):
     found = made(intervals)
     path = tmp_path / "product.nc"
-    write(build_product(found, context(KIND)), path)
+    write_product(build_product(found, context(KIND)), path)
     assert findings(path) == (set(), permitted(KIND, found))
 
 
@@ -40,13 +40,13 @@ def test_nothing_but_missing_values_complies(data: xr.Dataset, tmp_path: Path):
         if variable.dtype.kind == "f" and name != "ray_range":
             variable[...] = np.nan
     path = tmp_path / "product.nc"
-    write(build_product(lost, context(KIND)), path)
+    write_product(build_product(lost, context(KIND)), path)
     assert findings(path) == (set(), permitted(KIND, lost))
 
 
 def test_each_vertex_is_a_time_series(data: xr.Dataset, tmp_path: Path):
     path = tmp_path / "product.nc"
-    write(build_product(data, context(KIND)), path)
+    write_product(build_product(data, context(KIND)), path)
     with xr.open_dataset(path) as found:
         assert found.attrs["featureType"] == "timeSeries"
         roles = [name for name, v in found.variables.items() if "cf_role" in v.attrs]

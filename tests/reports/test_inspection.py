@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import LidarOpsError
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 from lidarops.reports.inspection import describe, tables
@@ -22,7 +22,7 @@ from lidarops.reports.inspection import describe, tables
 def test_products_tell_verdicts_bits_and_extremes(kind: ProductKind, tmp_path: Path):
     data = MAKERS[kind]()
     path = tmp_path / "product.nc"
-    write(build_product(data, context(kind)), path)
+    write_product(build_product(data, context(kind)), path)
     shown = CliRunner().invoke(app, ["inspect", str(path), "--json"])
     assert shown.exit_code == 0
     told = json.loads(shown.output)

@@ -75,7 +75,7 @@ class Page(HTMLParser):
 
 def built(run, folder: Path, **options) -> Page:
     """Build a page and check what must hold of any page."""
-    path = run_page.build(run, folder, **options).page
+    path = run_page.build_report(run, folder, **options).page
     assert path == folder / "index.html"
     found = Page(path)
     assert found.tags.count("h1") == 1
@@ -95,7 +95,7 @@ def built(run, folder: Path, **options) -> Page:
 class TestSimulatedRun:
     def test_holds_every_section_and_figure_and_is_the_same_again(self, simulated, tmp_path):
         found = built(simulated, tmp_path / "report")
-        again = run_page.build(simulated, tmp_path / "report-again").page.parent
+        again = run_page.build_report(simulated, tmp_path / "report-again").page.parent
         for path in found.folder.iterdir():
             assert path.read_bytes() == (again / path.name).read_bytes()
         for words in (
@@ -177,7 +177,7 @@ class TestSimulatedRun:
 
     def test_run_record_is_linked_where_it_stands(self, simulated, tmp_path):
         assert "run.json" not in built(simulated, tmp_path / "report", figures=0).links
-        record.save(simulated, tmp_path / "report")
+        record.save_run_record(simulated, tmp_path / "report")
         assert "run.json" in built(simulated, tmp_path / "report", figures=0).links
 
 
@@ -235,7 +235,7 @@ class TestUnusableFiles:
     def test_folder_that_cannot_be_written(self, simulated, tmp_path):
         (tmp_path / "file").write_text("in the way")
         with pytest.raises(CatalogError, match="file"):
-            run_page.build(simulated, tmp_path / "file")
+            run_page.build_report(simulated, tmp_path / "file")
 
 
 class TestDegenerateRuns:
@@ -245,7 +245,7 @@ class TestDegenerateRuns:
         assert found.sources == []
         assert "truth" not in found.ids
         assert run_page.summary_rows(run_record(tmp_path)) == []
-        assert run_page.build(run_record(tmp_path), tmp_path / "q").quicklook is None
+        assert run_page.build_report(run_record(tmp_path), tmp_path / "q").quicklook is None
 
     def test_failures_only(self, tmp_path):
         scenes = [
@@ -508,7 +508,7 @@ def test_long_reasons_fold(tmp_path):
 
 
 def test_quicklook_is_the_first_picture(simulated, tmp_path):
-    report = run_page.build(simulated, tmp_path / "q")
+    report = run_page.build_report(simulated, tmp_path / "q")
     path = report.quicklook
     assert path.name == next(name for name in Page(report.page).sources if "flags" not in name)
     with Image.open(path) as image:

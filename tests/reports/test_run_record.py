@@ -30,7 +30,7 @@ from lidarops.records import (
     Step,
     Unmet,
 )
-from lidarops.reports.run_record import FILE_NAME, load, save
+from lidarops.reports.run_record import FILE_NAME, load_run_record, save_run_record
 
 # Names of files are bytes on disk: those that are not UTF-8 come as lone surrogates.
 text = st.text(st.characters(codec=None), max_size=6)
@@ -138,10 +138,10 @@ records = st.builds(
 )
 def test_record_comes_back_equal(record, tmp_path_factory):
     folder = tmp_path_factory.getbasetemp() / "there-and-back"
-    path = save(record, folder)
-    back = load(path)
+    path = save_run_record(record, folder)
+    back = load_run_record(path)
     assert back == record
-    assert load(folder) == back
+    assert load_run_record(folder) == back
     json.loads(path.read_text(), parse_constant=pytest.fail)
 
 
@@ -156,7 +156,7 @@ def test_types_survive(tmp_path):
     record = fab.run_record(
         tmp_path, [fab.outcome("s", refused=(granule,))], refused=(granule, granule)
     )
-    back = load(save(record, tmp_path))
+    back = load_run_record(save_run_record(record, tmp_path))
     found = back.scenes[0].refused[0]
     assert math.isnan(found.layout[0].wavelength)
     assert found.layout[0].bin_width == -math.inf
@@ -171,7 +171,9 @@ def test_types_survive(tmp_path):
 
 def test_tuples_within_settings_keep_the_hash(tmp_path):
     plan = Plan("s", (Step("homogeneous", "c", {"sections": ((1, 2), (3, 4))}, "why"),), ())
-    back = load(save(fab.run_record(tmp_path, [fab.outcome("s", plan=plan)]), tmp_path))
+    back = load_run_record(
+        save_run_record(fab.run_record(tmp_path, [fab.outcome("s", plan=plan)]), tmp_path)
+    )
     assert back.scenes[0].plan.hash == plan.hash
     assert back.scenes[0].plan.steps[0].settings == {"sections": [[1, 2], [3, 4]]}
 
@@ -181,29 +183,29 @@ def test_settings_that_are_no_json_are_refused(tmp_path, value):
     plan = Plan("s", (Step("a", "c", {"x": [value]}, "why"),), ())
     record = fab.run_record(tmp_path, [fab.outcome("s", plan=plan)])
     with pytest.raises(CatalogError, match="settings"):
-        save(record, tmp_path / "run")
+        save_run_record(record, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 def test_save_replaces_whole_and_leaves_nothing_else(tmp_path):
-    save(fab.run_record(tmp_path, [fab.outcome("s" * 5000)]), tmp_path)
+    save_run_record(fab.run_record(tmp_path, [fab.outcome("s" * 5000)]), tmp_path)
     small = fab.run_record(tmp_path)
-    save(small, tmp_path)
-    assert load(tmp_path) == small
+    save_run_record(small, tmp_path)
+    assert load_run_record(tmp_path) == small
     assert [path.name for path in tmp_path.iterdir()] == [FILE_NAME]
 
 
 def test_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(CatalogError, match="cannot be written"):
-        save(fab.run_record(tmp_path), tmp_path / "file" / "run")
+        save_run_record(fab.run_record(tmp_path), tmp_path / "file" / "run")
 
 
 def _tree(tmp_path: Path) -> tuple[Path, dict]:
     scene = fab.outcome(
         "s", products=(ProductRecord("p", ProductKind.SIGNAL, "c", "", 1, 2, {}, 2),)
     )
-    path = save(fab.run_record(tmp_path, [scene]), tmp_path)
+    path = save_run_record(fab.run_record(tmp_path, [scene]), tmp_path)
     return path, json.loads(path.read_text())
 
 
@@ -239,7 +241,7 @@ def test_damaged_field_is_named(tmp_path, keys, value, field):
     _set(tree["record"], keys, value)
     path.write_text(json.dumps(tree))
     with pytest.raises(CatalogError, match=field) as caught:
-        load(tmp_path)
+        load_run_record(tmp_path)
     assert caught.value.file == str(path)
 
 
@@ -249,7 +251,7 @@ def test_missing_field_is_named(tmp_path, name):
     del tree["record"][name]
     path.write_text(json.dumps(tree))
     with pytest.raises(CatalogError, match=f"record.{name}: expected this field"):
-        load(path)
+        load_run_record(path)
 
 
 @pytest.mark.parametrize(
@@ -266,7 +268,7 @@ def test_what_is_no_run_record_is_refused(tmp_path, content):
     path = tmp_path / FILE_NAME
     path.write_bytes(content)
     with pytest.raises(LidarOpsError, match=FILE_NAME):
-        load(tmp_path)
+        load_run_record(tmp_path)
 
 
 def test_truncated_anywhere_is_refused(tmp_path):
@@ -275,11 +277,11 @@ def test_truncated_anywhere_is_refused(tmp_path):
     for size in range(0, len(whole_file) - 1, 97):
         path.write_bytes(whole_file[:size])
         with pytest.raises(CatalogError):
-            load(path)
+            load_run_record(path)
 
 
 @pytest.mark.parametrize("name", ["nothing", "folder"])
 def test_missing_file(tmp_path, name):
     (tmp_path / "folder").mkdir()
     with pytest.raises(CatalogError, match=name):
-        load(tmp_path / name)
+        load_run_record(tmp_path / name)

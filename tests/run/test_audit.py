@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from lidarops.catalog import lock as lock_module
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
-from lidarops.catalog.verify import verify
+from lidarops.catalog.verify import verify_archive
 from lidarops.cli import app
 from lidarops.run.archive import reprocess
 
@@ -30,7 +30,7 @@ def archive(tmp_path: Path) -> Archive:
 def _mismatches(archive: Archive) -> set[tuple[str, str]]:
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
-        return {(found.what, found.path) for found in verify(campaign, store)}
+        return {(found.what, found.path) for found in verify_archive(campaign, store)}
 
 
 def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> None:

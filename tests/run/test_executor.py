@@ -27,10 +27,10 @@ from lidarops.run.executor import (
     Ended,
     Stop,
     alone,
-    carry_out,
     local_client,
     make_jobs,
     process_all,
+    process_jobs,
 )
 from lidarops.run.session import Session
 from lidarops.run.staleness import Judge
@@ -154,7 +154,7 @@ def test_scenes_are_taken_one_by_one_and_never_many_ahead(
 
     monkeypatch.setattr(executor, "attempt", lambda job: (failed(job, "no"), True))
     ended: list[Ended] = []
-    for each in carry_out(counted()):
+    for each in process_jobs(counted()):
         ended.append(each)
         assert taken == len(ended)
     assert len(ended) == len(jobs)
@@ -172,7 +172,7 @@ def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
         at_hand += 1
         most = max(most, at_hand)
 
-    for _ in carry_out(jobs, client=client, taken=took):
+    for _ in process_jobs(jobs, client=client, taken=took):
         at_hand -= 1
         done += 1
     assert done == len(jobs)
@@ -190,7 +190,7 @@ def test_workers_that_are_gone_for_good_are_not_waited_for(
         monkeypatch.setattr(executor, "RECOUNT", 0.5)
         client.retire_workers()
         with pytest.raises(SceneError, match="workers on this machine are gone"):
-            list(carry_out(jobs, client=client))
+            list(process_jobs(jobs, client=client))
         with pytest.raises(SceneError, match="workers on this machine are gone"):
             list(alone(jobs, client=client, stop=Stop()))
 
@@ -237,7 +237,7 @@ def test_workers_that_come_later_get_scenes_before_one_has_ended(
         executor, "_ended", lambda _, job: Ended(job, failed(job, "no"), final=True)
     )
     jobs = executor.make_jobs(archive.write(), prepare(archive.write())) * 4
-    assert len(list(carry_out(jobs, client=Growing()))) == len(jobs)
+    assert len(list(process_jobs(jobs, client=Growing()))) == len(jobs)
 
 
 def test_a_worker_with_other_code_is_named_and_makes_nothing(
@@ -245,7 +245,7 @@ def test_a_worker_with_other_code_is_named_and_makes_nothing(
 ) -> None:
     monkeypatch.setattr(executor, "code_version", lambda: "newer")
     campaign = archive.write()
-    ended = list(carry_out(executor.make_jobs(campaign, prepare(campaign))[:1], client=client))
+    ended = list(process_jobs(executor.make_jobs(campaign, prepare(campaign))[:1], client=client))
     assert [each.final for each in ended] == [False]
     assert "the worker has other code of lidarops" in ended[0].outcome.error
     assert not (archive.folder / "out" / "products").exists()
@@ -255,7 +255,7 @@ def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> No
     campaign = archive.write()
     stop = Stop()
     ended = []
-    for each in carry_out(executor.make_jobs(campaign, prepare(campaign)), stop=stop):
+    for each in process_jobs(executor.make_jobs(campaign, prepare(campaign)), stop=stop):
         ended.append(each)
         stop.now("enough")
     assert len(ended) == 1

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import day_of
-from lidarops.catalog.scan import scan
+from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.process.scene import Job
@@ -581,7 +581,7 @@ def _joined(archive: Archive) -> None:
     campaign = archive.write()
     archive.raw("rich/h08", 620, seed=44)
     with Store(campaign.catalog_url, campaign.name) as store:
-        scan(campaign, store)
+        scan_archive(campaign, store)
 
 
 @pytest.mark.parametrize("change", [_elsewhere, _without_dark, _joined])

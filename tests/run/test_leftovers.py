@@ -19,7 +19,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.plan.product_dependence import part, wanted
+from lidarops.plan.product_dependence import plan_closure, wanted
 from lidarops.records import ProductKind
 from lidarops.reports import gallery, run_record
 from lidarops.run import archive as pipeline
@@ -84,7 +84,7 @@ def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None
     assert {scene.instrument for scene in record.scenes} == {"rich"}
     for scene in record.scenes:
         assert scene.plan is not None
-        assert scene.plan.hash == part(scene.plan, wanted(scene.plan)).hash
+        assert scene.plan.hash == plan_closure(scene.plan, wanted(scene.plan)).hash
         told = [left.reason for left in scene.left_out if left.rule == "section_level"]
         assert len(told) == 1
         assert "climbs by 750 m" in told[0]

@@ -11,7 +11,7 @@ import yaml
 from support import raw_archives
 from typer.testing import CliRunner
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.run.archive import bring_up_to_date, remove_orphans, reprocess
 
@@ -69,7 +69,7 @@ class Net:
 
     def write(self) -> Campaign:
         self.file.write_text(yaml.safe_dump(self.told))
-        return load(self.file)
+        return load_campaign(self.file)
 
     def lose(self, *stations: str) -> None:
         """Take away files, as where a disk is not mounted."""

@@ -11,10 +11,10 @@ import yaml
 from support import factories, raw_archives
 from typer.testing import CliRunner
 
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.cli import app
 from lidarops.run.archive import reprocess
-from lidarops.run.publication import publish
+from lidarops.run.publication import publish_products
 from lidarops.system.stores import RemoteStore
 
 
@@ -47,8 +47,8 @@ def test_raw_from_s3_and_products_to_s3(tmp_path: Path, campaign_file: Path, s3:
     raw = tmp_path / "raw"
     for path in raw.rglob("h*"):
         fs.put_file(str(path), f"{prefix}/raw/{path.relative_to(raw)}")
-    on_disk = load(campaign_file, output=tmp_path / "disk")
-    in_store = load(campaign_file, archive=f"{url}/raw", output=tmp_path / "store")
+    on_disk = load_campaign(campaign_file, output=tmp_path / "disk")
+    in_store = load_campaign(campaign_file, archive=f"{url}/raw", output=tmp_path / "store")
     assert reprocess(on_disk) is not None
     record = reprocess(in_store)
     assert record is not None
@@ -57,20 +57,20 @@ def test_raw_from_s3_and_products_to_s3(tmp_path: Path, campaign_file: Path, s3:
     # The name of the archive stands in no product.
     assert digests(in_store.products_root) == expected
 
-    done = publish(in_store, f"{url}/products")
+    done = publish_products(in_store, f"{url}/products")
     assert sorted(done.uploaded) == sorted(expected)
     store = RemoteStore(f"{url}/products")
     store.fetch(list(expected), tmp_path / "fetched")
     assert digests(tmp_path / "fetched") == expected
     assert reprocess(in_store) is None
-    again = publish(in_store, f"{url}/products")
+    again = publish_products(in_store, f"{url}/products")
     assert (again.uploaded, again.unchanged, again.others) == ((), 2, 0)
 
 
 def test_the_command_line_publishes_and_says_what_it_did(
     tmp_path: Path, campaign_file: Path
 ) -> None:
-    campaign = load(campaign_file)
+    campaign = load_campaign(campaign_file)
     assert reprocess(campaign) is not None
     runner, store = CliRunner(), tmp_path / "store"
     words = ["publish", str(campaign_file), store.as_uri()]
@@ -103,7 +103,7 @@ def test_publishing_before_any_run_is_refused(tmp_path: Path, campaign_file: Pat
 def test_a_product_that_vanished_is_told_before_and_after_it_was_sent(
     tmp_path: Path, campaign_file: Path
 ) -> None:
-    campaign = load(campaign_file)
+    campaign = load_campaign(campaign_file)
     assert reprocess(campaign) is not None
     words = ["publish", str(campaign_file), (tmp_path / "store").as_uri()]
     product = next(campaign.products_root.rglob("*.nc"))
@@ -118,7 +118,7 @@ def test_a_product_that_vanished_is_told_before_and_after_it_was_sent(
 
 
 def test_keys_in_the_url_are_not_told(campaign_file: Path) -> None:
-    campaign = load(campaign_file)
+    campaign = load_campaign(campaign_file)
     assert reprocess(campaign) is not None
     place = f"bucket/{campaign_file.parent.name}"
     done = CliRunner().invoke(app, ["publish", str(campaign_file), f"memory://key:sec/ret@{place}"])

@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.raw import licel
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 
 @pytest.fixture(scope="module")
 def demo(repository, tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    campaign = load(repository / "catalogs/demo.yaml", archive=folder, output=folder / "out")
-    return campaign, simulate(campaign)
+    campaign = load_campaign(
+        repository / "catalogs/demo.yaml", archive=folder, output=folder / "out"
+    )
+    return campaign, simulate_campaign(campaign)
 
 
 def test_the_demo_is_small(demo):

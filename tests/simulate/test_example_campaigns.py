@@ -7,23 +7,23 @@ import math
 import numpy as np
 import pytest
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
 from lidarops.retrieve.network import geometry
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 
 def _short(repository, tmp_path, name, **settings):
-    campaign = load(repository / f"catalogs/{name}.yaml", archive=tmp_path / "raw")
+    campaign = load_campaign(repository / f"catalogs/{name}.yaml", archive=tmp_path / "raw")
     simulation = campaign.simulation.model_copy(update=settings)
     return campaign.model_copy(update={"simulation": simulation})
 
 
 def test_a_scan_comes_over_the_zenith(repository, tmp_path):
     campaign = _short(repository, tmp_path, "scan", duration=40 * 60)
-    result = simulate(campaign)
+    result = simulate_campaign(campaign)
     west, east = [90, 85, 80, 75, 70, 60, 45, 30], [0, 30, 45, 60, 70, 75, 80, 85, 90]
     cycle = [(zenith, 270) for zenith in west] + [(zenith, 90) for zenith in east]
     expected = [cycle[index % 17] for index in range(40)]
@@ -41,7 +41,7 @@ def test_a_scan_comes_over_the_zenith(repository, tmp_path):
 
 
 def test_both_sides_of_a_layered_sky_are_alike(repository, tmp_path):
-    result = simulate(_short(repository, tmp_path, "scan", duration=17 * 60))
+    result = simulate_campaign(_short(repository, tmp_path, "scan", duration=17 * 60))
     truth = result.truth
     depth = truth["profile_optical_depth_plain_scanner"].isel(wavelength_plain_scanner=0).values
     rows = truth["profile_granule_plain_scanner"].values
@@ -60,7 +60,7 @@ def test_both_sides_of_a_layered_sky_are_alike(repository, tmp_path):
 
 def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
     campaign = _short(repository, tmp_path, "network")
-    result = simulate(campaign)
+    result = simulate_campaign(campaign)
     truth = result.truth
     directions = {"west": 70, "east": 310, "north": 190}
     for name, azimuth in directions.items():
@@ -78,7 +78,7 @@ def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
     # Each beam crosses the two others, where both lidars see the same air.
     names = list(directions)
     places = [campaign.stations[name] for name in names]
-    net = geometry.network(
+    net = geometry.build_network(
         [
             geometry.Ray(at.latitude, at.longitude, at.altitude, azimuth, 0.0)
             for at, azimuth in zip(places, directions.values(), strict=True)
@@ -107,7 +107,7 @@ def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
 
 def test_an_archive_of_four_stations(repository, tmp_path):
     campaign = _short(repository, tmp_path, "archive", duration=1800)
-    result = simulate(campaign)
+    result = simulate_campaign(campaign)
     refused = dict(zip(result.truth["path"].values, result.truth["refused"].values, strict=True))
     sites = {"manaus": "Manaus", "saopaulo": "Sao Paul", "pilar": "LidarPi", "golmud": "Golmud"}
     seen = set()
@@ -136,9 +136,9 @@ def test_an_archive_of_four_stations(repository, tmp_path):
     ],
 )
 def test_what_a_network_cannot_be_is_told(repository, tmp_path, change, said):
-    campaign = load(repository / "catalogs/network.yaml", archive=tmp_path / "raw")
+    campaign = load_campaign(repository / "catalogs/network.yaml", archive=tmp_path / "raw")
     tree = campaign.model_dump()
     change(tree)
     with pytest.raises(CampaignError, match=said):
-        simulate(Campaign.model_validate(tree))
+        simulate_campaign(Campaign.model_validate(tree))
     assert not (tmp_path / "raw").exists()

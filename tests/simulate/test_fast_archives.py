@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarops.raw import licel
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 
 def _simulated(tree):
@@ -28,7 +28,7 @@ def test_fast_files_agree_with_the_truth_within_their_noise(small):
         tree["simulation"]["duration"] = 2400
         del _simulated(tree)["hill-lidar"]
 
-    result = simulate(small(fast))
+    result = simulate_campaign(small(fast))
     truth = result.truth
     distance = (np.arange(600) + 0.5) * 7.5
     beyond = distance >= 300
@@ -61,7 +61,7 @@ def test_fast_truth_is_the_truth_of_its_own_air(small):
         hill["acquisition"]["interval"] = 60
         hill["boundary_layer"] = {"height": {"minimum": 100, "maximum": 3000, "hour_of_maximum": 6}}
 
-    result = simulate(small(fast))
+    result = simulate_campaign(small(fast))
     truth = result.truth
     profiles = truth["profile_extinction_hill_lidar"].values[:, 0]
     # The air changes every ten minutes, and the truth with it.
@@ -89,8 +89,8 @@ def test_a_thin_layer_is_not_missed_by_coarse_truth(small):
         period = {"start": "2024-12-31", "stop": "2025-01-02"}
         hill["atmosphere"] = {"clouds": [{"extinction": 0.01, "base": 3000, "top": 3030, **period}]}
 
-    coarse = simulate(small(cloud, lambda t: t["simulation"].update(truth={"cells": 8})))
-    fine = simulate(
+    coarse = simulate_campaign(small(cloud, lambda t: t["simulation"].update(truth={"cells": 8})))
+    fine = simulate_campaign(
         small(cloud, lambda t: t["simulation"].update(truth={"cells": 800}), archive="fine")
     )
     depths = {}
@@ -109,10 +109,12 @@ def test_a_thin_layer_is_not_missed_by_coarse_truth(small):
 
 
 def test_profiles_of_long_campaigns_are_told_now_and_then(small):
-    result = simulate(small(lambda t: t["simulation"].update(truth={"profiles": 2})))
+    result = simulate_campaign(small(lambda t: t["simulation"].update(truth={"profiles": 2})))
     assert result.truth.sizes["profile_hill_lidar"] == 2
     assert list(result.truth["profile_granule_hill_lidar"].values) == [20, 22]
-    none = simulate(small(lambda t: t["simulation"].update(truth={"cells": 0}), archive="none"))
+    none = simulate_campaign(
+        small(lambda t: t["simulation"].update(truth={"cells": 0}), archive="none")
+    )
     assert "profile_hill_lidar" not in none.truth.sizes
 
 
@@ -124,7 +126,7 @@ def test_lasers_and_dark_offsets_drift_and_the_truth_says_so(small):
         coast["laser"] = {"per_hour": -0.1, "jitter": 0.02}
         coast["detectors"][0]["analog"]["dark_drift"] = 0.5
 
-    truth = simulate(small(drifting)).truth
+    truth = simulate_campaign(small(drifting)).truth
     energy = truth["energy"].values
     hours = (np.arange(120) + 0.5) / 60
     assert energy == pytest.approx(1 - 0.1 * hours, abs=0.1)

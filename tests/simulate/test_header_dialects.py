@@ -7,14 +7,14 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from lidarops.catalog.scan import scan
+from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
-from lidarops.plan.scenes import cut
+from lidarops.plan.scenes import cut_scenes
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
 from lidarops.records import Status
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 DIALECTS = ["licel", "manaus", "saopaulo", "pilar", "golmud"]
 
@@ -45,7 +45,7 @@ def _headers(result):
 
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_every_dialect_says_the_same(small, dialect):
-    result = simulate(small(_speaking(dialect)))
+    result = simulate_campaign(small(_speaking(dialect)))
     headers = _headers(result)
     assert len(headers) == 4
     for number, header in enumerate(headers):
@@ -98,7 +98,7 @@ def test_every_dialect_says_the_same(small, dialect):
     ],
 )
 def test_lines_are_those_of_the_station(small, dialect, site, zenith, lasers, dataset):
-    result = simulate(small(_speaking(dialect)))
+    result = simulate_campaign(small(_speaking(dialect)))
     lines = (result.archive / result.paths[0]).read_bytes().split(b"\r\n")
     times = b"31/12/2024 23:50:00 31/12/2024 23:51:00 0900 -046.7 -023.6"
     line = b" " + b" ".join([site, times, zenith])
@@ -108,20 +108,22 @@ def test_lines_are_those_of_the_station(small, dialect, site, zenith, lasers, da
 
 
 def test_manaus_names_files_by_tens_of_seconds(small):
-    result = simulate(small(_speaking("manaus")))
+    result = simulate_campaign(small(_speaking("manaus")))
     assert result.paths[:2] == ("hill/v24C3123.510", "hill/v24C3123.560")
     with pytest.raises(CampaignError, match="two files"):
-        simulate(small(_speaking("manaus", interval=4, shots=20), archive="often"))
+        simulate_campaign(small(_speaking("manaus", interval=4, shots=20), archive="often"))
 
 
 def test_positions_may_come_the_other_way_round_or_without_signs(small):
     def turned(tree):
         tree["instruments"]["hill-lidar"]["header_position"] = "latitude_first"
 
-    headers = _headers(simulate(small(_speaking("pilar"), turned, archive="turned")))
+    headers = _headers(simulate_campaign(small(_speaking("pilar"), turned, archive="turned")))
     assert headers[0].position("latitude_first") == (-23.6, -46.7)
     assert headers[0].position() == (-46.7, -23.6)
-    unsigned = _headers(simulate(small(_speaking("pilar", signs_lost=True), archive="unsigned")))
+    unsigned = _headers(
+        simulate_campaign(small(_speaking("pilar", signs_lost=True), archive="unsigned"))
+    )
     assert unsigned[0].position() == (23.6, 46.7)
 
 
@@ -131,7 +133,7 @@ def test_bins_and_shots_may_change_within_a_day(small):
         {"at": "2025-01-01T00:00:00Z", "bin_width": 15},
     ]
     campaign = small(_speaking("pilar", changes=changes))
-    headers = _headers(simulate(campaign))
+    headers = _headers(simulate_campaign(campaign))
     found = [
         (h.channels[0].shots, h.channels[0].bins, h.channels[0].bin_width, (h.stop - h.start))
         for h in headers
@@ -144,8 +146,8 @@ def test_bins_and_shots_may_change_within_a_day(small):
         (300, 400, 15, half),
     ]
     store = Store(campaign.catalog_url, campaign.name)
-    scan(campaign, store)
-    scenes = cut(campaign, store.granules()).scenes
+    scan_archive(campaign, store)
+    scenes = cut_scenes(campaign, store.granules()).scenes
     store.close()
     # A scene has one layout and one day.
     assert sorted(len(scene.granules) for scene in scenes) == [1, 1, 2]
@@ -161,7 +163,10 @@ def test_files_of_a_gap_are_missing_and_the_others_are_the_same(small):
             {"start": "2024-12-31T23:53:30Z", "stop": "2024-12-31T23:57:00Z"}
         ]
 
-    whole, part = simulate(small(coast, archive="whole")), simulate(small(gap, archive="part"))
+    whole, part = (
+        simulate_campaign(small(coast, archive="whole")),
+        simulate_campaign(small(gap, archive="part")),
+    )
     missing = set(whole.paths) - set(part.paths)
     # Of the files that start at 53, 54, 55 and 56 minutes; names have the time of the stop.
     assert missing == {f"coast/h24C3123.{minute}0000" for minute in (54, 55, 56, 57)}
@@ -179,7 +184,7 @@ def test_a_clock_that_jumps_back_leaves_no_file_behind(small):
         ]
 
     campaign = small(summer_time)
-    result = simulate(campaign)
+    result = simulate_campaign(campaign)
     assert len(set(result.paths)) == 123
     headers = [
         licel.read_header(result.archive / str(path)) for path in result.truth["path"].values
@@ -191,15 +196,15 @@ def test_a_clock_that_jumps_back_leaves_no_file_behind(small):
         assert np.datetime64(true) == middle
     # The hour that the clock lived through twice is used once.
     store = Store(campaign.catalog_url, campaign.name)
-    scan(campaign, store)
+    scan_archive(campaign, store)
     granules = store.granules()
     store.close()
     assert all(granule.status is Status.GOOD for granule in granules)
-    assert len(cut(campaign, granules).set_aside) == 60
+    assert len(cut_scenes(campaign, granules).set_aside) == 60
 
 
 def test_a_year_may_end_within_an_archive(small):
-    result = simulate(small())
+    result = simulate_campaign(small())
     coast = [path for path in result.paths if path.startswith("coast/h")]
     assert coast[0].startswith("coast/h24C31")
     assert coast[-1].startswith("coast/h25101")
@@ -217,7 +222,7 @@ def test_line_ends_inside_the_data_end_nothing(small):
             "day": 129,
         }
 
-    result = simulate(small(bright))
+    result = simulate_campaign(small(bright))
     held = 0
     for path in result.paths:
         header = licel.read_header(result.archive / path)

@@ -15,7 +15,7 @@ from lidarops.retrieve.air.molecular import us_standard
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.analog import Digitiser, digitise_fast, slow_baseline
 from lidarops.simulate.atmosphere import Air
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.counting import count_fast, counter_moments
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.sun import solar_elevation
@@ -152,4 +152,4 @@ def test_what_a_raw_file_cannot_hold_is_named_before_anything_is_written(old, ne
 def test_an_archive_that_cannot_be_made_is_named(tmp_path, small):
     (tmp_path / "raw").write_text("a file")
     with pytest.raises(CatalogError, match="cannot be made"):
-        simulate(small(archive="raw/deeper"))
+        simulate_campaign(small(archive="raw/deeper"))

@@ -10,16 +10,16 @@ import pytest
 import xarray as xr
 
 from lidarops.campaign.simulation import DamageKind, Handling
-from lidarops.catalog.scan import scan
+from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality
-from lidarops.plan.scenes import cut
+from lidarops.plan.scenes import cut_scenes
 from lidarops.raw import licel
 from lidarops.records import Role, Status
 from lidarops.run.archive import prepare
 from lidarops.run.executor import run
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 KINDS = list(DamageKind)
 ALL_DAMAGE = [{"kind": kind.value, "index": 2 * i} for i, kind in enumerate(KINDS)]
@@ -43,12 +43,12 @@ def _without_damage(tree):
 @pytest.fixture
 def damaged(small):
     campaign = small(_all_kinds, archive="damaged")
-    return campaign, simulate(campaign)
+    return campaign, simulate_campaign(campaign)
 
 
 def _granules(campaign):
     store = Store(campaign.catalog_url, campaign.name)
-    scan(campaign, store)
+    scan_archive(campaign, store)
     found = store.granules()
     store.close()
     return found
@@ -68,7 +68,7 @@ def test_the_catalog_refuses_what_must_be_refused_and_nothing_else(damaged):
 
 def test_the_copy_of_a_file_is_set_aside(damaged):
     campaign, result = damaged
-    aside = cut(campaign, _granules(campaign)).set_aside
+    aside = cut_scenes(campaign, _granules(campaign)).set_aside
     truth = result.truth
     expected = truth["path"].values[truth["handling"].values == Handling.SET_ASIDE]
     assert [granule.path for granule in aside] == list(expected)
@@ -90,7 +90,7 @@ def test_what_must_be_flagged_is_flagged_by_the_retrieval(small):
         }
 
     campaign = small(retrieved)
-    truth = simulate(campaign).truth
+    truth = simulate_campaign(campaign).truth
     record = run(campaign, prepare(campaign))
     assert not any(scene.error for scene in record.scenes)
     flags = {}
@@ -136,7 +136,7 @@ def test_random_damage_is_found_too(small):
         del tree["simulation"]["instruments"]["hill-lidar"]
 
     campaign = small(chance)
-    truth = simulate(campaign).truth
+    truth = simulate_campaign(campaign).truth
     kinds = Counter(truth["damage"].values)
     assert 15 < 120 - kinds[""] < 60
     assert len(kinds) > 10
@@ -145,7 +145,7 @@ def test_random_damage_is_found_too(small):
 
 
 def test_damage_is_what_it_is_called(small, damaged):
-    clean = simulate(small(_without_damage, archive="clean"))
+    clean = simulate_campaign(small(_without_damage, archive="clean"))
     _, result = damaged
     paths = [path for path in result.truth["path"].values if not path.endswith(".copy")]
     for number, kind in enumerate(KINDS):
@@ -323,7 +323,7 @@ def test_a_vertical_sign_on_a_level_path_is_refused(small):
             del facts["zenith_angle"]
 
     with pytest.raises(CampaignError, match="does not look up"):
-        simulate(small(level))
+        simulate_campaign(small(level))
 
 
 def test_a_refused_file_says_which_one_it_is(damaged):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarops.raw.archive import open_archive
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 BIN = 7.5
 
@@ -38,7 +38,7 @@ def test_lag_shows_in_the_noise(small, lag):
             # An analog recorder that starts before the laser shows everything later.
             facts["channels"]["analog_532o"] = {"range_offset": -lag * BIN}
 
-    result = simulate(small(late, archive=f"lag{lag}"))
+    result = simulate_campaign(small(late, archive=f"lag{lag}"))
     archive = open_archive([str(result.archive / path) for path in result.paths])
     found, correlation = lag_of(
         archive["analog_532o"].to_numpy().astype(float),

@@ -9,7 +9,7 @@ from scipy.stats import expon, norm, uniform
 from lidarops.campaign.simulation import Pulse
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate.atmosphere import Path
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.echo import echo
 from lidarops.simulate.signal import backscatter_signal
 
@@ -115,7 +115,7 @@ def test_the_base_of_a_cloud_is_blurred_by_the_pulse(small):
         }  # fmt: skip
 
     def rise(campaign):
-        result = simulate(campaign)
+        result = simulate_campaign(campaign)
         raw = (result.archive / str(result.truth["path"].values[0])).read_bytes()
         body = raw.partition(b"\r\n\r\n")[2]
         counts = np.frombuffer(body, "<i4", 800, 800 * 4 + 2)  # the photon counter

@@ -13,7 +13,7 @@ from support.small_campaign import FAST, SLOW
 from lidarops.errors import CampaignError
 from lidarops.raw import licel
 from lidarops.records import Role
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.site import random_stream
 
 
@@ -41,25 +41,25 @@ def _simulated(tree):
 
 def test_the_same_seed_gives_the_same_bytes(small):
     one, two = small(archive="one"), small(archive="two")
-    first, second = simulate(one), simulate(two)
+    first, second = simulate_campaign(one), simulate_campaign(two)
     assert _contents(first.archive) == _contents(second.archive)
     assert first.paths == second.paths
     assert first.truth.identical(second.truth)
-    other = simulate(small(lambda t: t["simulation"].update(seed=8), archive="three"))
+    other = simulate_campaign(small(lambda t: t["simulation"].update(seed=8), archive="three"))
     changed, before = _contents(other.archive), _contents(first.archive)
     assert changed.keys() == before.keys()
     assert all(changed[name] != before[name] for name in changed)
 
 
 def test_a_file_does_not_depend_on_the_others(small):
-    whole = _contents(simulate(small(archive="whole")).archive)
+    whole = _contents(simulate_campaign(small(archive="whole")).archive)
 
     def shorter(tree):
         tree["simulation"]["duration"] = 600
         del _simulated(tree)["hill-lidar"]
         _simulated(tree)["coast-lidar"]["damage"] = [{"kind": "garbage", "index": 3}]
 
-    part = _contents(simulate(small(shorter, archive="part")).archive)
+    part = _contents(simulate_campaign(small(shorter, archive="part")).archive)
     different = {name for name in part if part[name] != whole.get(name)}
     # The damaged file, and the dark file after the end, which now is at another time.
     assert different == {"coast/h24C3123.540000", "coast/dark/d2510100.010000"}
@@ -78,12 +78,12 @@ def test_streams_of_different_files_differ():
 
 def test_simulating_again_changes_nothing(small):
     campaign = small()
-    before = _contents(simulate(campaign).archive)
-    assert _contents(simulate(campaign).archive) == before
+    before = _contents(simulate_campaign(campaign).archive)
+    assert _contents(simulate_campaign(campaign).archive) == before
 
 
 def test_files_are_named_and_headed_as_licel_does(small):
-    result = simulate(small())
+    result = simulate_campaign(small())
     assert sorted(_contents(result.archive)) == sorted(result.paths)
     assert result.size == sum(map(len, _contents(result.archive).values()))
     assert len(result.paths) == 3 + 20 + 4
@@ -107,7 +107,7 @@ def test_files_are_named_and_headed_as_licel_does(small):
 
 
 def test_the_truth_has_its_schema(small):
-    truth = simulate(small()).truth
+    truth = simulate_campaign(small()).truth
     profiles = {"profile_hill_lidar": 4, "wavelength_hill_lidar": 2, "range_hill_lidar": 200}
     assert dict(truth.sizes) == {"granule": 24} | profiles
     assert list(truth["path"].values[:1]) == ["coast/h24C3123.510000"]
@@ -138,7 +138,7 @@ def _expected(truth, index, channel, distance):
 
 
 def test_files_agree_with_the_truth_within_their_noise(small):
-    result = simulate(small())
+    result = simulate_campaign(small())
     truth = result.truth
     distance = (np.arange(600) + 0.5) * 7.5
     beyond = distance >= 300
@@ -171,7 +171,7 @@ def test_files_agree_with_the_truth_within_their_noise(small):
 
 
 def test_dark_files_hold_offset_and_noise_only(small):
-    result = simulate(small())
+    result = simulate_campaign(small())
     dark = [path for path in result.paths if "/dark/" in path]
     assert len(dark) == 3
     for path in dark:
@@ -187,7 +187,10 @@ def test_a_trigger_delay_of_the_facts_shifts_a_channel(small):
         for facts in tree["instruments"]["coast-lidar"]["facts"]:
             facts["channels"]["analog_532o"] = {"range_offset": -75.0}
 
-    plain, moved = simulate(small(archive="plain")), simulate(small(delayed, archive="moved"))
+    plain, moved = (
+        simulate_campaign(small(archive="plain")),
+        simulate_campaign(small(delayed, archive="moved")),
+    )
     path = plain.truth["path"].values[0]
     _, before = _signals(plain.archive, path)
     _, after = _signals(moved.archive, path)
@@ -212,7 +215,7 @@ def test_a_blinding_signal_saturates_but_does_not_crash(small):
         for facts in tree["instruments"]["coast-lidar"]["facts"]:
             facts["full_overlap_range"] = 0
 
-    result = simulate(small(blind))
+    result = simulate_campaign(small(blind))
     header, values = _signals(result.archive, str(result.truth["path"].values[0]))
     analog = header.channels[0]
     assert values["analog_532o"][0] == pytest.approx(analog.full_scale * analog.scale)
@@ -221,7 +224,7 @@ def test_a_blinding_signal_saturates_but_does_not_crash(small):
 
 def test_progress_counts_every_file(small):
     steps = []
-    result = simulate(small(), progress=steps.append)
+    result = simulate_campaign(small(), progress=steps.append)
     assert sum(steps) == len(result.paths)
 
 
@@ -232,10 +235,10 @@ def test_strangers_in_the_archive_are_not_mixed_in(small):
     stranger.write_bytes(b"a real measurement")
     (stranger.parent / "readme").write_text("not matched by any pattern")
     with pytest.raises(CampaignError, match="h24C3122"):
-        simulate(campaign)
+        simulate_campaign(campaign)
     assert _contents(campaign.archive).keys() == {"coast/h24C3122.000000", "coast/readme"}
     stranger.unlink()
-    assert simulate(campaign).paths
+    assert simulate_campaign(campaign).paths
 
 
 def _drop_dead_time(tree):
@@ -263,5 +266,5 @@ def test_a_simulation_that_contradicts_the_campaign_is_refused_before_it_writes(
 ):
     campaign = small(change)
     with pytest.raises(CampaignError, match=said):
-        simulate(campaign)
+        simulate_campaign(campaign)
     assert not Path(campaign.archive).exists()

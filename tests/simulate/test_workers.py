@@ -12,7 +12,7 @@ from lidarops.cli import app
 from lidarops.errors import CampaignError
 from lidarops.run.executor import local_client
 from lidarops.simulate import campaign as module
-from lidarops.simulate.campaign import plan, simulate
+from lidarops.simulate.campaign import plan_simulation, simulate_campaign
 from lidarops.simulate.files import Simulator
 
 
@@ -33,12 +33,14 @@ def _scenery(tree):
 
 def test_two_processes_write_what_one_writes(small, monkeypatch):
     alone = small(_scenery, archive="alone")
-    first = simulate(alone)
+    first = simulate_campaign(alone)
     expected = _contents(first.archive)
     monkeypatch.setattr(module, "_BATCH", 3)
     steps = []
     with local_client(2) as client:
-        second = simulate(small(_scenery, archive="shared"), client=client, progress=steps.append)
+        second = simulate_campaign(
+            small(_scenery, archive="shared"), client=client, progress=steps.append
+        )
         assert _contents(second.archive) == expected
         assert second.truth.identical(first.truth)
         assert second.paths == first.paths
@@ -53,12 +55,12 @@ def test_two_processes_write_what_one_writes(small, monkeypatch):
             tree["simulation"]["instruments"]["coast-lidar"]["acquisition"]["dialect"] = "pilar"
 
         with pytest.raises(ValueError, match="Latin-1"):
-            simulate(small(unwritable, archive="bad"), client=client)
+            simulate_campaign(small(unwritable, archive="bad"), client=client)
 
 
 def test_any_order_gives_the_same_files(small):
     campaign = small(_scenery)
-    simulate(campaign)
+    simulate_campaign(campaign)
     written = _contents(campaign.archive)
     for site in module._sites(campaign):
         simulator = Simulator(site)
@@ -71,14 +73,14 @@ def test_any_order_gives_the_same_files(small):
 
 def test_the_files_are_known_before(small):
     campaign = small(_scenery)
-    assert plan(campaign).paths == simulate(campaign).paths
+    assert plan_simulation(campaign).paths == simulate_campaign(campaign).paths
     with pytest.raises(CampaignError, match="no simulation"):
-        plan(small(lambda tree: tree.pop("simulation")))
+        plan_simulation(small(lambda tree: tree.pop("simulation")))
 
 
 def test_the_command_line_writes_the_same_with_workers(small, tmp_path):
     campaign = small(_scenery, archive="called")
-    expected = _contents(simulate(campaign).archive)
+    expected = _contents(simulate_campaign(campaign).archive)
     file = tmp_path / "small.yaml"
     file.write_text(yaml.safe_dump(campaign.model_dump(mode="json", exclude_defaults=True)))
     for workers in ("1", "2"):

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from support.site_archive import CHROMIUM, add_unknown, browser, small_archive
 
-from lidarops.site.build import build
+from lidarops.site.build import build_site
 
 AXE = Path(__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
 KINDS = ("signal", "homogeneous", "elastic", "multiangle")
@@ -41,7 +41,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = small_archive(tmp_path_factory.mktemp("browsed") / "out")
     add_unknown(output)
     (output / "products" / "damaged.nc").write_bytes(b"CDF")
-    build(output)
+    build_site(output)
     return output / "site"
 
 

@@ -23,7 +23,7 @@ from lidarops.cli import app
 from lidarops.errors import CatalogError, ProductError
 from lidarops.records import ProductKind
 from lidarops.site import paths
-from lidarops.site.build import build
+from lidarops.site.build import build_site
 from lidarops.site.product_entry import Grade
 
 FIRST_PAGE = 300_000
@@ -58,7 +58,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def site(archive: Path) -> Path:
-    made = build(archive)
+    made = build_site(archive)
     assert made.products == made.made == 17
     assert [problem.path for problem in made.problems] == ["odesa/wind.nc"]
     return archive / "site"
@@ -188,7 +188,7 @@ def test_equal_archives_give_equal_bytes_for_any_number_of_workers(
 ) -> None:
     other = _copy(archive, tmp_path / "elsewhere")
     # In another order of making, too.
-    build(other, workers=2)
+    build_site(other, workers=2)
     assert contents(other / "site") == contents(site)
 
 
@@ -196,10 +196,10 @@ def test_what_is_unchanged_is_kept_and_what_vanished_is_removed(
     archive: Path, tmp_path: Path
 ) -> None:
     output = _copy(archive, tmp_path / "out")
-    build(output)
+    build_site(output)
     whole = contents(output / "site")
     pages = {path: path.stat().st_mtime_ns for path in (output / "site/product").rglob("*.html")}
-    again = build(output)
+    again = build_site(output)
     assert again.made == 0
     assert contents(output / "site") == whole
     assert pages == {path: path.stat().st_mtime_ns for path in pages}
@@ -209,7 +209,7 @@ def test_what_is_unchanged_is_kept_and_what_vanished_is_removed(
     changed = add(output, ProductKind.SIGNAL, 1, title="Another title")
     gone = next((output / "products").rglob("*homogeneous*2027*.nc"))
     gone.unlink()
-    third = build(output)
+    third = build_site(output)
     assert third.made == 2
     assert third.products == 16
     assert "Another title" in (
@@ -218,7 +218,7 @@ def test_what_is_unchanged_is_kept_and_what_vanished_is_removed(
     assert not list((output / "site").rglob("*2027*"))
 
     fresh = _copy(output, tmp_path / "fresh")
-    build(fresh)
+    build_site(fresh)
     assert contents(fresh / "site") == contents(output / "site")
 
 
@@ -254,7 +254,7 @@ def test_damaged_provenance_is_named(tmp_path: Path) -> None:
         file["provenance"][...] = (
             b"{" * file["provenance"].shape[0] if file["provenance"].ndim else "{"
         )
-    made = build(output)
+    made = build_site(output)
     assert made.products == 1
     assert "provenance" in made.problems[0].reason
 
@@ -266,7 +266,7 @@ def test_text_of_files_is_text_on_pages(tmp_path: Path) -> None:
         output, "k", platform=evil, lidarops_channel=evil, lidarops_kind=evil, title=evil,
         lidarops_station="../../../up", lidarops_instrument=evil, lidarops_campaign=evil,
     )  # fmt: skip
-    build(output)
+    build_site(output)
     site = output / "site"
     for name, content in contents(site).items():
         if name.endswith((".html", ".svg")):
@@ -284,7 +284,7 @@ def test_links_out_of_the_products_are_not_followed(tmp_path: Path) -> None:
     outside = tmp_path / "outside.nc"
     shutil.copy(kept, outside)
     (output / "products" / "link.nc").symlink_to(outside)
-    made = build(output)
+    made = build_site(output)
     assert made.products == 1
     assert made.problems[0].path == "link.nc"
     assert "leads out" in made.problems[0].reason
@@ -296,21 +296,21 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (output / "site").mkdir()
     (output / "site" / "thesis.txt").write_text("mine")
     with pytest.raises(CatalogError, match="no site of lidarops"):
-        build(output)
+        build_site(output)
     assert contents(output / "site") == {"thesis.txt": b"mine"}
     with pytest.raises(ProductError, match="products"):
-        build(tmp_path / "nothing")
+        build_site(tmp_path / "nothing")
 
 
 def test_pages_do_not_leave_the_site_through_a_link(tmp_path: Path) -> None:
     output = tmp_path / "out"
     add(output, ProductKind.SIGNAL)
-    build(output)
+    build_site(output)
     shutil.rmtree(output / "site/product")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (output / "site/product").symlink_to(elsewhere)
-    made = build(output)
+    made = build_site(output)
     assert made.problems
     assert not list(elsewhere.iterdir())
 
@@ -318,20 +318,20 @@ def test_pages_do_not_leave_the_site_through_a_link(tmp_path: Path) -> None:
 def test_manifest_that_was_edited_only_costs_time(tmp_path: Path) -> None:
     output = tmp_path / "out"
     add(output, ProductKind.SIGNAL)
-    build(output)
+    build_site(output)
     manifest = output / "site/manifest.json"
     whole = contents(output / "site")
     document: dict[str, Any] = json.loads(manifest.read_text())
     document["products"][0]["page"] = "../../../etc/passwd"
     for text in (json.dumps(document), "{", json.dumps({"format": "other"}), "[]"):
         manifest.write_text(text)
-        assert build(output).made == 1
+        assert build_site(output).made == 1
         assert contents(output / "site") == whole
 
 
 def test_an_archive_without_products_has_a_site(tmp_path: Path) -> None:
     (tmp_path / "products").mkdir()
-    made = build(tmp_path)
+    made = build_site(tmp_path)
     assert made.products == 0
     assert "There is no product" in made.index.read_text(encoding="utf-8")
 

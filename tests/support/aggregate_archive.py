@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidarops.aggregate.facts import Facts, product_paths, scan
+from lidarops.aggregate.facts import Facts, list_products, read_product_facts
 from lidarops.netcdf.context import product_path
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 from support.made_products import MAKERS, SCENE, START, context, provenance
@@ -49,12 +49,12 @@ def add_day(
         **(of or {}),
     )
     path = f"{folder}/{product_path(about)}".removeprefix("/")
-    write(build_product(data, about), root / path)
+    write_product(build_product(data, about), root / path)
     return path
 
 
 def facts_of(root: Path) -> list[Facts]:
     """The facts of all products of an archive, none of which is refused."""
-    found = list(scan(root, product_paths(root)))
+    found = list(read_product_facts(root, list_products(root)))
     assert all(isinstance(each, Facts) for each in found), found
     return [each for each in found if isinstance(each, Facts)]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from support import raw_archives
 
 RUNNER = Path(__file__).with_name("crash_runs.py")
@@ -38,7 +38,7 @@ def make(folder: Path, *, scenes: int = SCENES) -> Campaign:
         },
     }  # fmt: skip
     (folder / "campaign.yaml").write_text(yaml.safe_dump(told))
-    return load(folder / "campaign.yaml")
+    return load_campaign(folder / "campaign.yaml")
 
 
 def start(folder: Path, mode: str, **environment: str) -> subprocess.Popen[bytes]:

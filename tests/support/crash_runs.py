@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.run.archive import Options, bring_up_to_date
 
 
@@ -16,7 +16,7 @@ def run(folder: Path, mode: str) -> int:
 
         found, _ = reprocess(str(folder / "campaign.yaml"), wait=60.0)
         return int(found.troubled)
-    campaign = load(folder / "campaign.yaml")
+    campaign = load_campaign(folder / "campaign.yaml")
     workers = 2 if mode == "cluster" else 1
     result = bring_up_to_date(campaign, options=Options(workers=workers, wait=60.0))
     return 128 + result.signal if result.signal else int(result.troubled)

@@ -11,7 +11,11 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.network import geometry
-from lidarops.retrieve.network.labeled import BeamSignals, Settings, retrieve
+from lidarops.retrieve.network.labeled import (
+    BeamAverages,
+    NetworkSettings,
+    retrieve_network,
+)
 
 STATIONS = ((47.25, 11.3, 600.0), (47.25, 11.353, 600.0), (47.2811, 11.3265, 600.0))
 AZIMUTHS = (70.0, 310.0, 190.0)
@@ -22,7 +26,7 @@ START = np.datetime64("2025-06-01T20:00:00", "ns")
 
 def network() -> geometry.Network:
     """The rays of the lidars."""
-    return geometry.network(
+    return geometry.build_network(
         [
             geometry.Ray(*station, azimuth=azimuth, elevation=0.0)
             for station, azimuth in zip(STATIONS, AZIMUTHS, strict=True)
@@ -34,7 +38,7 @@ def network() -> geometry.Network:
 
 def beam(
     number: int, *, intervals: int = 6, noise: float = 0.002, seed: int = 0, **changes: Any
-) -> BeamSignals:
+) -> BeamAverages:
     """One beam in homogeneous air over a background of 0.1 MHz."""
     random = np.random.default_rng((seed, number))
     clean = 1e7 * (1.0 + number) * EXTINCTION * np.exp(-2 * EXTINCTION * RANGE) / RANGE**2
@@ -69,17 +73,17 @@ def beam(
         "zenith_angle": 90.0,
         "azimuth": AZIMUTHS[number],
     }
-    return BeamSignals(**(told | changes))
+    return BeamAverages(**(told | changes))
 
 
 def product(intervals: int = 6, **settings: Any) -> xr.Dataset:
     """The product of all three."""
     told = {"block_intervals": 72, "visibility": Definition(wavelength=532e-9)} | settings
     beams = [beam(number, intervals=intervals) for number in range(3)]
-    return retrieve(beams, network(), Settings(**told))
+    return retrieve_network(beams, network(), NetworkSettings(**told))
 
 
-def without(found: BeamSignals, rows: slice) -> BeamSignals:
+def without(found: BeamAverages, rows: slice) -> BeamAverages:
     """The beam with bins of some intervals flagged as missing."""
     bits = found.averages["quality"].copy()
     bits[rows] = int(Quality.INPUT_MISSING)

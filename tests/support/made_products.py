@@ -104,7 +104,7 @@ def clock(profiles: int, zenith: Any = 90.0, azimuth: Any = None) -> dict[str, A
 
 
 def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset:
-    """A labelled homogeneous retrieval, as `lidarops.retrieve.homogeneous.labeled.homogeneous` gives it."""
+    """A labelled homogeneous retrieval, as `lidarops.retrieve.homogeneous.labeled.fit_homogeneous_path` gives it."""
     rng = np.random.default_rng(1)
     shape = (profiles, sections)
     dims = ("time", "section")
@@ -161,7 +161,7 @@ def signal(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
 
 
 def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
-    """An elastic retrieval, as `lidarops.retrieve.elastic.labeled.elastic` gives it."""
+    """An elastic retrieval, as `lidarops.retrieve.elastic.labeled.invert_elastic` gives it."""
     rng = np.random.default_rng(3)
     dims = ("time", "range")
     shape = (profiles, bins)
@@ -215,7 +215,7 @@ def multiangle(
     *,
     layers: bool = True,
 ) -> xr.Dataset:
-    """A multi-angle retrieval, as `lidarops.retrieve.multiangle.labeled.retrieve` gives it."""
+    """A multi-angle retrieval, as `lidarops.retrieve.multiangle.labeled.retrieve_optical_depth` gives it."""
     rng = np.random.default_rng(4)
     angles = np.atleast_1d(np.float64(zenith))
     dims = ("time", "altitude")
@@ -290,7 +290,7 @@ def with_layers(data: xr.Dataset) -> xr.Dataset:
 def visibility(
     profiles: int = 5, vertices: int = 3, zenith: Any = 90.0, azimuth: Any = None
 ) -> xr.Dataset:
-    """A retrieval of a network, as `lidarops.retrieve.network.labeled.retrieve` gives it."""
+    """A retrieval of a network, as `lidarops.retrieve.network.labeled.retrieve_network` gives it."""
     rng = np.random.default_rng(5)
     rays = max(3, np.size(zenith))
     pair = ("time", "vertex")

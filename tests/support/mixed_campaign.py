@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 
 SECTIONS = [[450, 1500], [600, 2400], [900, 3000]]
 _PHOTON: dict[str, Any] = {"photon": {}}
@@ -185,4 +185,4 @@ def write(folder: Path, **size: int) -> Campaign:
     """Write the campaign file and read it."""
     path = folder / "mixed.yaml"
     path.write_text(yaml.safe_dump(tree(**size)))
-    return load(path)
+    return load_campaign(path)

@@ -9,8 +9,8 @@ import numpy as np
 import xarray as xr
 import yaml
 
-from lidarops.campaign.model import Campaign, load
-from lidarops.simulate.campaign import simulate
+from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.simulate.campaign import simulate_campaign
 
 HAZE = {"lidar_ratio": 55}
 HOMOGENEOUS: dict[str, Any] = {
@@ -134,8 +134,8 @@ def written(folder: Path, told: dict[str, Any]) -> tuple[Campaign, xr.Dataset]:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "net.yaml"
     path.write_text(yaml.safe_dump(told), encoding="utf-8")
-    campaign = load(path)
-    return campaign, simulate(campaign).truth
+    campaign = load_campaign(path)
+    return campaign, simulate_campaign(campaign).truth
 
 
 def truth_at(product: xr.Dataset, truth: xr.Dataset, instruments: list[str]) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidarops.retrieve.network import geometry
-from lidarops.retrieve.network.extinction_field import solve
+from lidarops.retrieve.network.extinction_field import retrieve_network
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
 
@@ -98,7 +98,7 @@ QUIET = 1e-12
 def without_noise(net, field, *, step=5.0, method="cycle", **settings):
     r = grid(net, step)
     power = signals(net, r, field, settings.get("exponent", 1.0))
-    return solve(
+    return retrieve_network(
         power, r, net, method=method, variance=QUIET * power**2, full_overlap_range=100.0,
         **settings,
     )  # fmt: skip
@@ -109,7 +109,7 @@ def with_noise(net, field, relative, profiles=500, *, seed=1, step=5.0, **settin
     power, variance = noisy(net, r, signals(net, r, field), relative, profiles, seed)
     if settings.get("method", "network") in {"network", "multiplier"}:
         settings.setdefault("blocks", np.arange(profiles) // 50)
-    return solve(power, r, net, variance=variance, full_overlap_range=100.0, **settings)
+    return retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0, **settings)
 
 
 def relative_errors(result, truth):

@@ -24,7 +24,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     settings = product_dependence.Settings(job.campaign)
     products = []
     for kind, channel in product_dependence.wanted(job.plan):
-        mine = product_dependence.part(job.plan, [(kind, channel)])
+        mine = product_dependence.plan_closure(job.plan, [(kind, channel)])
         used = sorted(record.sha256 for record in product_dependence.inputs(mine, inputs))
         told = [mine.as_dict(), settings.of(job.scene, mine, channel), used]
         content = json.dumps(told, sort_keys=True).encode()

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.netcdf.build import product_path
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 from support.made_products import MAKERS, START, context, provenance
@@ -42,7 +42,7 @@ def add(output: Path, kind: ProductKind, days: int = 0, **changes: Any) -> Path:
     data = data.assign_coords(time=data["time"] + shift)
     data["time_bnds"] = (("time", "nv"), data["time_bnds"].values + shift)
     path = output / "products" / product_path(whole)
-    write(build_product(data, whole), path)
+    write_product(build_product(data, whole), path)
     return path
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.records import RunRecord
 from support import raw_archives
 
@@ -86,7 +86,7 @@ class Archive:
     def write(self) -> Campaign:
         """Write the campaign file and load it."""
         self.file.write_text(yaml.safe_dump(self.told))
-        return load(self.file)
+        return load_campaign(self.file)
 
     def flip(self, name: str, place: int = -40) -> None:
         """Change one byte of a file."""

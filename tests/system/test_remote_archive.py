@@ -12,7 +12,7 @@ import pytest
 from support import factories, raw_archives
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.scan import ScanSummary, scan
+from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
@@ -44,11 +44,11 @@ def campaign(tmp_path: Path) -> Iterator[Campaign]:
 
 def test_a_web_server_is_scanned_like_a_folder(campaign: Campaign, tmp_path: Path) -> None:
     with Store(campaign.catalog_url, campaign.name) as store:
-        assert scan(campaign, store) == ScanSummary(2, 2, 0, 0, 0, 0)
+        assert scan_archive(campaign, store) == ScanSummary(2, 2, 0, 0, 0, 0)
         remote = store.granules()
     there = campaign.model_copy(update={"archive": str(tmp_path / "raw"), "name": "folder"})
     with Store(campaign.catalog_url, "folder") as store:
-        scan(there, store)
+        scan_archive(there, store)
         local = store.granules()
     assert [(g.path, g.size, g.start) for g in remote] == [(g.path, g.size, g.start) for g in local]
     digests = [
@@ -60,11 +60,11 @@ def test_a_web_server_is_scanned_like_a_folder(campaign: Campaign, tmp_path: Pat
 
 def test_a_server_that_is_away_ends_the_scan_and_spoils_nothing(campaign: Campaign) -> None:
     with Store(campaign.catalog_url, campaign.name) as store:
-        scan(campaign, store)
+        scan_archive(campaign, store)
         before = store.granules()
         away = campaign.model_copy(update={"archive": "http://127.0.0.1:1"})
         with pytest.raises(CatalogError, match="cannot be listed"):
-            scan(away, store)
+            scan_archive(away, store)
         assert store.granules() == before
 
 
@@ -86,11 +86,11 @@ def test_a_file_that_is_denied_is_refused_and_a_lost_connection_is_not_its_fault
     with Store(campaign.catalog_url, campaign.name) as store:
         if refused is None:
             with pytest.raises(CatalogError, match="cut"):
-                scan(campaign, store)
+                scan_archive(campaign, store)
             assert store.granules() == []
             return
-        assert scan(campaign, store).refused == refused
+        assert scan_archive(campaign, store).refused == refused
         monkeypatch.undo()
         # It is looked at again, though nothing of it has changed.
-        assert scan(campaign, store).refused == 0
+        assert scan_archive(campaign, store).refused == 0
         assert len(store.granules(status=Status.GOOD)) == 2

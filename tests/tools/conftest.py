@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from support.made_products import MAKERS, context
 
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 
@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ProductKind, str
     def path(kind: ProductKind, beam: str) -> Path:
         file = folder / f"{kind}_{beam}.nc"
         if not file.exists():
-            write(build_product(MAKERS[kind](**BEAMS[beam]), context(kind)), file)
+            write_product(build_product(MAKERS[kind](**BEAMS[beam]), context(kind)), file)
         return file
 
     return path

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.netcdf.write import write
+from lidarops.netcdf.write import write_product
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_xarray_opens_many_days_at_once(product: Path, tmp_path: Path):
     for name in ("time", "time_bnds"):
         later[name] = later[name].copy(data=later[name].values + 86400.0)
     later.encoding["unlimited_dims"] = {"time"}
-    write(later, tmp_path / "later.nc")
+    write_product(later, tmp_path / "later.nc")
     with xr.open_mfdataset(
         [product, tmp_path / "later.nc"],
         data_vars="minimal",

@@ -11,11 +11,16 @@ from typing import Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.accuracy.elastic_cases import Array, Found, Inverted, Sky
+from lidarops.bench.accuracy.elastic_cases import (
+    Array,
+    BackgroundEstimates,
+    Inverted,
+    SimulatedSky,
+)
 from lidarops.bench.accuracy.homogeneous import (
     BackgroundScore,
     InversionScore,
-    Measured,
+    MonteCarloFigure,
     background_score,
     inversion_score,
 )
@@ -26,10 +31,10 @@ from lidarops.bench.accuracy.homogeneous_report import (
 )
 from lidarops.bench.harness.terms import RESULT, Effort, Finding, Kind
 from lidarops.bench.harness.timing import Machine, machine
-from lidarops.bench.throughput.retrievals import Cost, elastic_costs, measure_elastic
+from lidarops.bench.throughput.retrievals import StepCost, elastic_costs, measure_elastic
 from lidarops.figures.charts import Chart, Panel, Series
 from lidarops.figures.wording import percent
-from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
@@ -76,7 +81,7 @@ class ClosedLoop:
 
 
 @dataclass(frozen=True, slots=True)
-class PublishedScore:
+class PublishedProfileScore:
     """One way or chain on one published file."""
 
     way: str
@@ -99,12 +104,12 @@ class Elastic:
     machine: Machine
     levels: tuple[Level, ...]
     closed: tuple[ClosedLoop, ...]
-    costs: tuple[Cost, ...]
-    published: tuple[PublishedScore, ...]
+    costs: tuple[StepCost, ...]
+    published: tuple[PublishedProfileScore, ...]
     """Empty where no folder was given."""
 
 
-def measure(
+def measure_elastic_accuracy(
     *,
     quick: bool = False,
     date: str = "",
@@ -123,7 +128,7 @@ def measure(
     draws : int, optional
         Profiles of each level, at least 2.
     data : Path, optional
-        Folder of the published files; see `lidarops.bench.accuracy.elastic_cases.published`.
+        Folder of the published files; see `lidarops.bench.accuracy.elastic_cases.published_profiles`.
     progress : callable
         Is given 1 after each level.
 
@@ -136,24 +141,24 @@ def measure(
     count = draws or (QUICK_DRAWS if quick else DRAWS)
     levels = []
     for seed, level in enumerate(elastic_cases.LEVELS):
-        levels.append(_level(elastic_cases.simulated(), level, count, seed))
+        levels.append(_level(elastic_cases.simulated_sky(), level, count, seed))
         progress(1)
     return Elastic(
         date,
         machine(),
         tuple(levels),
-        tuple(_closed(elastic_cases.simulated(), level) for level in (None, *CLOSED_LEVELS)),
+        tuple(_closed(elastic_cases.simulated_sky(), level) for level in (None, *CLOSED_LEVELS)),
         tuple(elastic_costs(min(count, _BATCH), _QUICK_REPEATS if quick else _REPEATS)),
         published,
     )
 
 
-def _level(sky: Sky, level: float, draws: int, seed: int) -> Level:
+def _level(sky: SimulatedSky, level: float, draws: int, seed: int) -> Level:
     sizes, few = enumerate(_sizes(draws)), draws / FEW
     blocks = [_block(sky, level, size, (seed, k), every=k * BLOCK < few) for k, size in sizes]
     found = {
         name: _join([block[0][name] for block in blocks if name in block[0]])
-        for name in elastic_cases.ways()
+        for name in elastic_cases.background_methods()
     }
     errors = {
         name: np.concatenate([block[1][name] for block in blocks], axis=1)
@@ -182,13 +187,13 @@ def _sizes(draws: int) -> list[int]:
 
 
 def _block(
-    sky: Sky, level: float, draws: int, seed: tuple[int, int], *, every: bool
-) -> tuple[dict[str, Found], dict[str, Array]]:
+    sky: SimulatedSky, level: float, draws: int, seed: tuple[int, int], *, every: bool
+) -> tuple[dict[str, BackgroundEstimates], dict[str, Array]]:
     """Return backgrounds by way, and errors and standard errors of backscatter by chain."""
     counts = sky.counts(level, draws, *seed)
     found = {
         name: way(counts, sky)
-        for name, way in elastic_cases.ways().items()
+        for name, way in elastic_cases.background_methods().items()
         if every or name != elastic_cases.HOMOGENEOUS
     }
     errors = {}
@@ -197,7 +202,7 @@ def _block(
     return found, errors
 
 
-def _errors(solved: Inverted, sky: Sky) -> Array:
+def _errors(solved: Inverted, sky: SimulatedSky) -> Array:
     """Return (error or standard error, profile, compared bin)."""
     near = sky.compared
     return np.stack(
@@ -205,12 +210,12 @@ def _errors(solved: Inverted, sky: Sky) -> Array:
     )
 
 
-def _scale(sky: Sky) -> float:
+def _scale(sky: SimulatedSky) -> float:
     return float(sky.backscatter[sky.compared].mean())
 
 
-def _join(parts: list[Found]) -> Found:
-    return Found(
+def _join(parts: list[BackgroundEstimates]) -> BackgroundEstimates:
+    return BackgroundEstimates(
         np.concatenate([part.background for part in parts]),
         np.concatenate([part.standard_error for part in parts]),
         np.concatenate([part.rejected for part in parts]),
@@ -220,11 +225,15 @@ def _join(parts: list[Found]) -> Found:
 # Without noise, and published files -----------------------------------------------------------
 
 
-def _closed(sky: Sky, level: float | None) -> ClosedLoop:
+def _closed(sky: SimulatedSky, level: float | None) -> ClosedLoop:
     counts = (sky.signal + (level or 0.0))[np.newaxis]
-    known = Found(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.bool_))
+    known = BackgroundEstimates(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.bool_))
     # A window that is told, so that what is left is numerics and no choice.
-    found = known if level is None else elastic_cases.ways()[elastic_cases.TOLD](counts, sky)
+    found = (
+        known
+        if level is None
+        else elastic_cases.background_methods()[elastic_cases.TOLD](counts, sky)
+    )
     solved = elastic_cases.particles_of(
         elastic_cases.cleared(counts, sky, found), sky, elastic_cases.GIVEN
     )
@@ -238,13 +247,15 @@ def _closed(sky: Sky, level: float | None) -> ClosedLoop:
     )
 
 
-def _published(folder: Path) -> tuple[PublishedScore, ...]:
-    sky, files = elastic_cases.published(folder)
+def _published(folder: Path) -> tuple[PublishedProfileScore, ...]:
+    sky, files = elastic_cases.published_profiles(folder)
     return tuple(score for file in files for score in _file_scores(file, sky))
 
 
-def _file_scores(file: elastic_cases.Published, sky: Sky) -> list[PublishedScore]:
-    found = {name: way(file.counts, sky) for name, way in elastic_cases.ways().items()}
+def _file_scores(file: elastic_cases.Published, sky: SimulatedSky) -> list[PublishedProfileScore]:
+    found = {
+        name: way(file.counts, sky) for name, way in elastic_cases.background_methods().items()
+    }
     solved = {}
     for name, chain in elastic_cases.chains().items():
         inverted = elastic_cases.invert(file.counts, sky, found[chain.way], chain)
@@ -257,7 +268,7 @@ def _file_scores(file: elastic_cases.Published, sky: Sky) -> list[PublishedScore
     for name, (way, inversion) in rows.items():
         off = float(found[way].background[0]) - file.background
         scores.append(
-            PublishedScore(
+            PublishedProfileScore(
                 way=name,
                 level=file.level,
                 background=off,
@@ -275,7 +286,7 @@ _DRAWN: Final = (elastic_cases.KNOWN_SHAPE, elastic_cases.TOLD, elastic_cases.TA
 _NONE: Final = "-"
 
 
-def run(kind: Kind, *, data: Path | None, effort: Effort) -> Finding:
+def run_elastic(kind: Kind, *, data: Path | None, effort: Effort) -> Finding:
     """Run a benchmark of the elastic retrieval.
 
     Parameters
@@ -293,20 +304,22 @@ def run(kind: Kind, *, data: Path | None, effort: Effort) -> Finding:
         Where a published file cannot be read.
     """
     if kind is Kind.ACCURACY:
-        found = measure(quick=effort.quick, date=effort.date, data=data, progress=effort.progress)
-        return Finding(found, accuracy_report(found, RESULT))
+        found = measure_elastic_accuracy(
+            quick=effort.quick, date=effort.date, data=data, progress=effort.progress
+        )
+        return Finding(found, elastic_accuracy_report(found, RESULT))
     timed = measure_elastic(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
     return Finding(timed, elastic_throughput_report(timed, RESULT))
 
 
-def accuracy_report(found: Elastic, data: str = "") -> Report:
+def elastic_accuracy_report(found: Elastic, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
     parts = [_backgrounds(found), _inversions(found), _without_noise(found.closed)]
     if found.published:
         parts.append(_files(found.published))
-    return Report(
+    return BenchmarkReport(
         title="Elastic inversion: error against the level of the background",
         facts=facts(found.date, found.machine),
         parts=(*parts, cost_part(found.costs, elastic_cases.RANGE.size)),
@@ -315,7 +328,7 @@ def accuracy_report(found: Elastic, data: str = "") -> Report:
 
 
 def _backgrounds(found: Elastic) -> Part:
-    names = list(elastic_cases.ways())
+    names = list(elastic_cases.background_methods())
     return Part(
         title="Background",
         text="Simulated as the EARLINET elastic intercomparison is: 532 nm, aerosol below 6 km "
@@ -364,7 +377,7 @@ class _Drawn:
 
     level: float
     rmse: float
-    bias: Measured
+    bias: MonteCarloFigure
     stated: float
 
     @property
@@ -486,8 +499,8 @@ def _inversion_chart(found: Elastic) -> Chart:
     )
 
 
-def _percents(figure: Measured) -> Measured:
-    return Measured(100.0 * figure.value, 100.0 * figure.error)
+def _percents(figure: MonteCarloFigure) -> MonteCarloFigure:
+    return MonteCarloFigure(100.0 * figure.value, 100.0 * figure.error)
 
 
 def _inversion_table(found: Elastic, name: str) -> Table:
@@ -552,7 +565,7 @@ def _without_noise(closed: tuple[ClosedLoop, ...]) -> Part:
     )
 
 
-def _files(published: tuple[PublishedScore, ...]) -> Part:
+def _files(published: tuple[PublishedProfileScore, ...]) -> Part:
     backgrounds = tuple(
         (
             _decade(one.level),
@@ -562,7 +575,7 @@ def _files(published: tuple[PublishedScore, ...]) -> Part:
             f"{one.truth_error:.2g}",
         )
         for one in published
-        if one.way in elastic_cases.ways()
+        if one.way in elastic_cases.background_methods()
     )
     inversions = tuple(
         (_decade(one.level), one.way, *_inversion_cells(one.inversion))
@@ -596,7 +609,7 @@ def _decade(level: float) -> str:
     return f"1e{round(math.log10(level))}"
 
 
-def _signed(figure: Measured) -> str:
+def _signed(figure: MonteCarloFigure) -> str:
     """Return a figure with its error in the last digits."""
     if not figure.error > 0.0:
         return f"{figure.value:+.3g}"

@@ -53,7 +53,7 @@ _FIRST_TRUE_BIN: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Sky:
+class SimulatedSky:
     """One set of air, particles and noise-free signal."""
 
     range: Array
@@ -98,10 +98,10 @@ class Sky:
         return np.asarray(rng.poisson(mean) / SHOTS)
 
 
-def _sky(air: MolecularProfile, signal: Array, backscatter: Array) -> Sky:
+def _sky(air: MolecularProfile, signal: Array, backscatter: Array) -> SimulatedSky:
     molecular = air.backscatter(RANGE, WAVELENGTH)
     extinction = air.extinction(RANGE, WAVELENGTH)
-    return Sky(
+    return SimulatedSky(
         range=RANGE,
         molecular_backscatter=molecular,
         molecular_extinction=extinction,
@@ -125,7 +125,7 @@ def particles(height: npt.ArrayLike) -> Array:
 
 
 @cache
-def simulated() -> Sky:
+def simulated_sky() -> SimulatedSky:
     """Return the simulated set.
 
     The optical depth is integrated by Gauss quadrature of 8 nodes from bin to bin, not by the
@@ -148,7 +148,7 @@ def simulated() -> Sky:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class BackgroundEstimates:
     """Backgrounds in counts, one a profile."""
 
     background: Array
@@ -157,7 +157,7 @@ class Found:
     """A quality bit that says not to use the value."""
 
 
-Way = Callable[[Array, Sky], Found]
+Way = Callable[[Array, SimulatedSky], BackgroundEstimates]
 """From counts (profile, range) and the set they stem from to backgrounds."""
 
 KNOWN_SHAPE: Final = "known_shape"
@@ -166,7 +166,7 @@ TAIL_MEAN: Final = "tail_mean"
 HOMOGENEOUS: Final = "homogeneous"
 
 
-def ways() -> dict[str, Way]:
+def background_methods() -> dict[str, Way]:
     """Return the ways to find the background by name.
 
     `homogeneous` and `cubic` solve for a path along which nothing changes, which a vertical one
@@ -181,29 +181,31 @@ def ways() -> dict[str, Way]:
     }
 
 
-def _known_shape(counts: Array, sky: Sky) -> Found:
-    found = known_shape.solve(counts, sky.range, sky.shape, exposure=SHOTS)
+def _known_shape(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+    found = known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS)
     return _found(found.background, found.background_standard_error, found.quality)
 
 
-def _told(counts: Array, sky: Sky) -> Found:
-    found = known_shape.solve(counts, sky.range, sky.shape, exposure=SHOTS, start=CLEAN_FROM)
+def _told(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+    found = known_shape.fit_known_shape(
+        counts, sky.range, sky.shape, exposure=SHOTS, start=CLEAN_FROM
+    )
     return _found(found.background, found.background_standard_error, found.quality)
 
 
-def _tail_mean(counts: Array, sky: Sky) -> Found:
+def _tail_mean(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     found = cubic_and_tail.tail_mean(counts, sky.range)
     return _found(found.background, found.background_standard_error, found.quality)
 
 
-def _homogeneous(counts: Array, sky: Sky) -> Found:
+def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
     variance = path_fit.mean_profile_variance(counts[:, far], SHOTS)
-    found = path_fit.solve(counts[:, far], sky.range[far], variance=variance)
+    found = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
     return _found(found.background, found.background_standard_error, found.quality)
 
 
-def _cubic(counts: Array, sky: Sky) -> Found:
+def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
     found = cubic_and_tail.cubic(
         counts[:, far], sky.range[far], statistics=cubic_and_tail.Statistics.POISSON, shots=SHOTS
@@ -211,11 +213,11 @@ def _cubic(counts: Array, sky: Sky) -> Found:
     return _found(found.background, found.background_standard_error, found.quality)
 
 
-def _found(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> Found:
-    return Found(value, error, (quality & Quality.rejecting()) != 0)
+def _found(value: Array, error: Array, quality: npt.NDArray[np.int32]) -> BackgroundEstimates:
+    return BackgroundEstimates(value, error, (quality & Quality.rejecting()) != 0)
 
 
-def least_error(sky: Sky, level: float) -> float:
+def least_error(sky: SimulatedSky, level: float) -> float:
     r"""Return the Cramér-Rao bound of the background's standard error from 6 km on, in counts.
 
     .. math:: \left[ (J^T V^{-1} J)^{-1} \right]_{00}^{1/2}, \quad J = [1, \varphi], \quad
@@ -251,21 +253,21 @@ def variance(counts: Array) -> Array:
     return np.maximum(counts, 1.0 / SHOTS) / SHOTS
 
 
-def cleared(counts: Array, sky: Sky, found: Found) -> Array:
+def cleared(counts: Array, sky: SimulatedSky, found: BackgroundEstimates) -> Array:
     """Return counts without background; NaN where the inversion is not to use them."""
     return np.where(sky.inverted, counts - found.background[:, np.newaxis], np.nan)
 
 
-def screened(power: Array, noise: Array, sky: Sky) -> layers.Layers:
+def screened(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
     """Return the clouds, none of which are there."""
-    return layers.screen(power, sky.range, noise, molecular_attenuated=sky.shape)
+    return layers.find_layers(power, sky.range, noise, molecular_attenuated=sky.shape)
 
 
 def chosen_window(
-    power: Array, noise: Array, sky: Sky, exclude: npt.NDArray[np.bool_] | None = None
+    power: Array, noise: Array, sky: SimulatedSky, exclude: npt.NDArray[np.bool_] | None = None
 ) -> reference_window.ReferenceWindow:
     """Return the reference windows out of `CANDIDATES`."""
-    return reference_window.choose(
+    return reference_window.choose_reference(
         power,
         sky.range,
         noise,
@@ -277,7 +279,7 @@ def chosen_window(
 
 def particles_of(
     power: Array,
-    sky: Sky,
+    sky: SimulatedSky,
     edges: tuple[npt.ArrayLike, npt.ArrayLike],
     *,
     noise: Array | None = None,
@@ -285,7 +287,7 @@ def particles_of(
     reference_error: npt.ArrayLike = 0.0,
 ) -> inversion.ElasticResult:
     """Invert with the true lidar ratio and air."""
-    return inversion.solve(
+    return inversion.invert_elastic(
         power,
         sky.range,
         molecular_backscatter=sky.molecular_backscatter,
@@ -308,7 +310,7 @@ class Chain:
     """The reference window, instead of `GIVEN`."""
     carried: float = 0.0
     """What the particles that the noise hides in a chosen window may add to it: standard errors
-    of the window, stated as error of the reference (`lidarops.retrieve.elastic.reference_window.choose`)."""
+    of the window, stated as error of the reference (`lidarops.retrieve.elastic.reference_window.choose_reference`)."""
 
 
 def chains() -> dict[str, Chain]:
@@ -321,7 +323,7 @@ def chains() -> dict[str, Chain]:
     }
 
 
-def invert(counts: Array, sky: Sky, found: Found, chain: Chain) -> Inverted:
+def invert(counts: Array, sky: SimulatedSky, found: BackgroundEstimates, chain: Chain) -> Inverted:
     """Return the particles.
 
     Parameters
@@ -356,7 +358,7 @@ def invert(counts: Array, sky: Sky, found: Found, chain: Chain) -> Inverted:
 # Peers ----------------------------------------------------------------------------------------
 
 
-def lstsq_backgrounds(counts: Array, sky: Sky) -> Array:
+def lstsq_backgrounds(counts: Array, sky: SimulatedSky) -> Array:
     """Return backgrounds by `numpy.linalg.lstsq`, one weighted fit from 6 km on a profile."""
     far = sky.range >= CLEAN_FROM
     shape = sky.shape[far] / sky.shape[far][0]
@@ -369,7 +371,7 @@ def lstsq_backgrounds(counts: Array, sky: Sky) -> Array:
     return found
 
 
-def klett_python(power: Array, sky: Sky) -> Array:
+def klett_python(power: Array, sky: SimulatedSky) -> Array:
     """Return the backscatter of particles by loops over profiles and bins, without errors.
 
     fernald1984, backward and forward from the middle of `GIVEN`, by trapezoids.
@@ -406,7 +408,7 @@ def _klett(
     return [q / (ratio - 2.0 * i) - b for q, i, b in zip(corrected, integral, air, strict=True)]
 
 
-def klett_numpy(power: Array, sky: Sky) -> Array:
+def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
     """Return the same as `klett_python` by cumulative sums, profile by profile."""
     inside = np.flatnonzero((sky.range >= GIVEN[0]) & (sky.range <= GIVEN[1]))
     start = inside[inside.size // 2]
@@ -445,7 +447,7 @@ class Published:
     """Standard error of that truth, counts."""
 
 
-def published(folder: Path) -> tuple[Sky, list[Published]]:
+def published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]]:
     """Read the files of the EARLINET elastic intercomparison at 532 nm.
 
     Parameters
@@ -490,7 +492,7 @@ def _level(file: Path) -> float:
     return float(f"1e{found[1]}")
 
 
-def _published_sky(folder: Path) -> Sky:
+def _published_sky(folder: Path) -> SimulatedSky:
     table = folder / "molecular_profile_hPa.csv"
     try:
         columns = np.loadtxt(table, delimiter=",", unpack=True, ndmin=2)
@@ -508,9 +510,9 @@ def _published_sky(folder: Path) -> Sky:
     return replace(sky, backscatter=particles_of(power, sky, GIVEN).backscatter)
 
 
-def _published(file: Path, level: float, sky: Sky) -> Published:
+def _published(file: Path, level: float, sky: SimulatedSky) -> Published:
     counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
-    truth = known_shape.solve(
+    truth = known_shape.fit_known_shape(
         counts,
         sky.range,
         sky.signal,

@@ -25,10 +25,10 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     methods,
     scenarios,
 )
-from lidarops.bench.accuracy.peers import peers
+from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.retrieve.background.cubic_and_tail import cubic
-from lidarops.retrieve.homogeneous.path_fit import Method
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
 PROFILES: Final = 10_000
 QUICK_PROFILES: Final = 4_000
@@ -47,7 +47,7 @@ _AVERAGED: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MonteCarloFigure:
     """A figure from random profiles, with its Monte Carlo standard error."""
 
     value: float
@@ -55,21 +55,21 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class PathScore:
     """Errors of one unknown over the profiles that were not rejected."""
 
-    rmse: Measured
+    rmse: MonteCarloFigure
     """Over the Cramér-Rao bound."""
-    bias: Measured
+    bias: MonteCarloFigure
     """Over the Cramér-Rao bound."""
-    coverage: Measured
+    coverage: MonteCarloFigure
     """Share of profiles whose truth is within 1.96 stated standard errors."""
     rmse_of_all: float
     """As `rmse`, over every profile with a value, rejected or not."""
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class SolverOutcome:
     """What one way to solve did with one scenario."""
 
     way: str
@@ -80,7 +80,7 @@ class Outcome:
     """Share of profiles with a quality bit that says not to use the value."""
     nanoseconds: float
     """CPU time a profile, of one run."""
-    scores: Mapping[str, Score]
+    scores: Mapping[str, PathScore]
     """By unknown; without those that the way was given, or rejected throughout."""
     distances: Mapping[str, float]
     """Largest difference from the direct method over the Cramér-Rao bound, by unknown, over the
@@ -88,14 +88,14 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class AccuracyCase:
     """One scenario with what all ways did with it."""
 
     scenario: Scenario
     difficulty: float
     """Least standard error of extinction over extinction + 1 / mean range."""
     least_errors: Mapping[str, float]
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[SolverOutcome, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +108,9 @@ class Offset:
     """m."""
     averaged: int
     """Profiles averaged before they are solved."""
-    lag_1: Measured
+    lag_1: MonteCarloFigure
     """Of the cubic with a lag of one bin, without correction for the noise, in noise units."""
-    compressed: Measured
+    compressed: MonteCarloFigure
     """Of `solve`, in noise units; every profile, flagged or not."""
     scatter: float
     """Standard deviation of the latter."""
@@ -126,11 +126,11 @@ class Accuracy:
 
     date: str
     machine: Machine
-    cases: tuple[Case, ...]
+    cases: tuple[AccuracyCase, ...]
     offsets: tuple[Offset, ...]
 
 
-def measure(
+def measure_homogeneous(
     *,
     quick: bool = False,
     date: str = "",
@@ -151,7 +151,7 @@ def measure(
         Is given 1 after each scenario.
     """
     count = profiles or (QUICK_PROFILES if quick else PROFILES)
-    ways = {**methods(), **peers()}
+    ways = {**methods(), **iterative_peers()}
     cases = []
     for seed, scenario in enumerate(scenarios(quick=quick)):
         cases.append(_case(scenario, ways, scenario.powers(count, seed)))
@@ -199,7 +199,7 @@ def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
     power = louder.powers(count, seed)
     # A variance of 0 is taken for no noise, which leaves its bias in, as published.
     published = cubic(power, louder.range, lag=1, variance=0.0).background
-    found = methods()[Method.COMPRESSED](power, louder)
+    found = methods()[HomogeneousMethod.COMPRESSED](power, louder)
     ours = found.values["background"]
     return Offset(
         start=path.start,
@@ -213,13 +213,13 @@ def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
     )
 
 
-def _case(scenario: Scenario, ways: Mapping[str, Way], power: Any) -> Case:
+def _case(scenario: Scenario, ways: Mapping[str, Way], power: Any) -> AccuracyCase:
     least = least_errors(scenario)
-    converged = ways[Method.DIRECT](power, scenario)
+    converged = ways[HomogeneousMethod.DIRECT](power, scenario)
     outcomes = [
         _outcome(name, way, scenario, power, least, converged) for name, way in ways.items()
     ]
-    return Case(scenario, difficulty(scenario), least, tuple(outcomes))
+    return AccuracyCase(scenario, difficulty(scenario), least, tuple(outcomes))
 
 
 def _outcome(
@@ -229,7 +229,7 @@ def _outcome(
     power: Any,
     least: Mapping[str, float],
     converged: Estimates,
-) -> Outcome:
+) -> SolverOutcome:
     if name.startswith(_SLOW):
         power = power[: max(len(power) // _SLOW_SHARE, 16)]
     way(power[:_WARM], scenario)
@@ -241,7 +241,7 @@ def _outcome(
         for quantity in QUANTITIES
         if (score := _score(found, quantity, scenario.truth[quantity], least[quantity]))
     }
-    return Outcome(
+    return SolverOutcome(
         way=name,
         profiles=len(power),
         flagged=float(found.flagged.mean()),
@@ -254,7 +254,7 @@ def _outcome(
     )
 
 
-def _score(found: Estimates, quantity: str, truth: float, least: float) -> Score | None:
+def _score(found: Estimates, quantity: str, truth: float, least: float) -> PathScore | None:
     error = (found.values[quantity] - truth) / least
     stated = found.standard_errors[quantity] / least
     finite = np.isfinite(error)
@@ -264,10 +264,10 @@ def _score(found: Estimates, quantity: str, truth: float, least: float) -> Score
     squares = error[kept] ** 2
     rmse = float(np.sqrt(squares.mean()))
     inside = np.abs(error[kept]) <= _TWO_SIDED * stated[kept]
-    return Score(
-        rmse=Measured(rmse, mean(squares).error / (2 * rmse)),
+    return PathScore(
+        rmse=MonteCarloFigure(rmse, mean(squares).error / (2 * rmse)),
         bias=mean(error[kept]),
-        coverage=share(inside),
+        coverage=share_inside(inside),
         rmse_of_all=float(np.sqrt(np.mean(error[finite] ** 2))),
     )
 
@@ -279,20 +279,22 @@ def _distance(found: Estimates, converged: Estimates, quantity: str) -> float:
     return float(np.nanmax(between, initial=0.0))
 
 
-def mean(values: Array) -> Measured:
+def mean(values: Array) -> MonteCarloFigure:
     """Return the mean of the finite values with its Monte Carlo error."""
     finite = values[np.isfinite(values)]
-    return Measured(float(finite.mean()), float(finite.std() / np.sqrt(finite.size)))
+    return MonteCarloFigure(float(finite.mean()), float(finite.std() / np.sqrt(finite.size)))
 
 
-def share(inside: npt.NDArray[np.bool_]) -> Measured:
+def share_inside(inside: npt.NDArray[np.bool_]) -> MonteCarloFigure:
     """Return how many of independent profiles are inside, with its Monte Carlo error."""
     # Where all or none are inside, half a profile keeps the error from being zero.
     likely = (inside.sum() + 0.5) / (inside.size + 1)
-    return Measured(float(inside.mean()), float(np.sqrt(likely * (1 - likely) / inside.size)))
+    return MonteCarloFigure(
+        float(inside.mean()), float(np.sqrt(likely * (1 - likely) / inside.size))
+    )
 
 
-def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[Case, Outcome]]:
+def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[AccuracyCase, SolverOutcome]]:
     """Return what one way did, scenario by scenario."""
     return [
         (case, outcome)
@@ -313,16 +315,16 @@ class BackgroundScore:
     """Errors of one way, in counts, over the profiles that it did not reject."""
 
     profiles: int
-    bias: Measured
-    scatter: Measured
-    rmse: Measured
+    bias: MonteCarloFigure
+    scatter: MonteCarloFigure
+    rmse: MonteCarloFigure
     stated: float
     """Median of the stated standard errors."""
-    deviation: Measured
+    deviation: MonteCarloFigure
     """Mean error over its own stated standard error."""
-    spread: Measured
+    spread: MonteCarloFigure
     """Root mean square of the same; 1 where errors are as stated."""
-    coverage: tuple[Measured, Measured]
+    coverage: tuple[MonteCarloFigure, MonteCarloFigure]
     """Share of profiles whose truth is within 1 and 1.96 stated standard errors."""
 
 
@@ -334,15 +336,15 @@ class InversionScore:
     """With any value in these bins."""
     solved: float
     """Share of these bins, of all profiles, that have a value; the others are withheld."""
-    bias: Measured
+    bias: MonteCarloFigure
     """Mean error of a profile."""
     scatter: float
     """Standard deviation of the same."""
-    rmse: Measured
+    rmse: MonteCarloFigure
     """Root mean square error of a bin."""
     stated: float
     """Root mean square of the stated standard errors of a bin."""
-    coverage: tuple[Measured, Measured]
+    coverage: tuple[MonteCarloFigure, MonteCarloFigure]
     """Share of bins whose truth is within 1 and 1.96 stated standard errors."""
 
 
@@ -362,7 +364,7 @@ def background_score(
         return None
     error, stated = error[kept], stated[kept]
     deviation = error / stated
-    inside = [share(np.abs(deviation) <= sigmas) for sigmas in SIGMAS]
+    inside = [share_inside(np.abs(deviation) <= sigmas) for sigmas in SIGMAS]
     return BackgroundScore(
         profiles=int(kept.sum()),
         bias=mean(error),
@@ -408,6 +410,6 @@ def inversion_score(error: Array, stated: Array, scale: float) -> InversionScore
     )
 
 
-def _root(square: Measured) -> Measured:
+def _root(square: MonteCarloFigure) -> MonteCarloFigure:
     value = float(np.sqrt(square.value))
-    return Measured(value, square.error / (2.0 * value) if value > 0 else 0.0)
+    return MonteCarloFigure(value, square.error / (2.0 * value) if value > 0 else 0.0)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import path_fit
-from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, Method
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, HomogeneousResult
 
 Array = npt.NDArray[np.float64]
 
@@ -173,35 +173,39 @@ Way = Callable[[Any, Scenario], Estimates]
 """From powers (profile, range) and the scenario they stem from to estimates."""
 
 
-def arguments(method: Method, scenario: Scenario) -> dict[str, float]:
+def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str, float]:
     """Return what a method of `solve` needs besides the power.
 
     What is known is known exactly, the prior of "linearized" is 20 percent low.
     """
     match method:
-        case Method.LINEARIZED:
+        case HomogeneousMethod.LINEARIZED:
             return {"extinction": WRONG_PRIOR * scenario.extinction}
-        case Method.KNOWN_EXTINCTION:
+        case HomogeneousMethod.KNOWN_EXTINCTION:
             return {"extinction": scenario.extinction}
-        case Method.KNOWN_BACKGROUND:
+        case HomogeneousMethod.KNOWN_BACKGROUND:
             return {"background": scenario.background}
         case _:
             return {}
 
 
 def methods() -> dict[str, Way]:
-    """Return every method of `lidarops.retrieve.homogeneous.path_fit.solve` under its own name."""
-    return {str(method): _way(method) for method in Method if method is not Method.AUTO}
+    """Return every method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path` under its own name."""
+    return {
+        str(method): _way(method)
+        for method in HomogeneousMethod
+        if method is not HomogeneousMethod.AUTO
+    }
 
 
-def _way(method: Method) -> Way:
+def _way(method: HomogeneousMethod) -> Way:
     def solve(power: Any, scenario: Scenario) -> Estimates:
-        found = path_fit.solve(
+        found = path_fit.fit_homogeneous_path(
             power,
             scenario.range,
             variance=1.0,
             method=method.value,
-            **arguments(method, scenario),  # type: ignore[arg-type]
+            **method_arguments(method, scenario),  # type: ignore[arg-type]
         )
         return estimates(found)
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from lidarops.bench.accuracy.homogeneous import (
     Accuracy,
-    Case,
-    Measured,
+    AccuracyCase,
+    MonteCarloFigure,
     Offset,
-    Outcome,
+    SolverOutcome,
     outcomes_of,
 )
 from lidarops.bench.accuracy.homogeneous_cases import QUANTITIES
@@ -20,19 +20,25 @@ from lidarops.bench.harness.timing import Machine
 from lidarops.bench.throughput import readers
 from lidarops.bench.throughput.retrievals import (
     READ,
-    Cost,
     ElasticThroughput,
     Setting,
+    SolverThroughput,
     Speed,
-    Throughput,
+    StepCost,
     settings,
 )
 from lidarops.figures.charts import Chart, Ladder, Panel, Series, pareto
 from lidarops.figures.wording import counted, percent
-from lidarops.reports.benchmark_page import Part, Report, Table
-from lidarops.retrieve.homogeneous.path_fit import Method
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
-_HELPED: Final = frozenset({Method.LINEARIZED, Method.KNOWN_BACKGROUND, Method.KNOWN_EXTINCTION})
+_HELPED: Final = frozenset(
+    {
+        HomogeneousMethod.LINEARIZED,
+        HomogeneousMethod.KNOWN_BACKGROUND,
+        HomogeneousMethod.KNOWN_EXTINCTION,
+    }
+)
 """Methods that are told more than the profile."""
 _PUBLISHED: Final = {1e3: 10.6, 4e3: 6.5, 6e3: 1.5, 8e3: 1.2}
 """bobrovsky2024, table 1, less an assumed truth of 37.00, over an assumed noise of 0.1."""
@@ -41,9 +47,9 @@ _GAIN: Final = 0.98
 _UNSOLVED: Final = "-"
 
 
-def accuracy_report(found: Accuracy, data: str = "") -> Report:
+def homogeneous_accuracy_report(found: Accuracy, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Homogeneous path: error against the Cramér-Rao bound",
         facts=facts(found.date, found.machine),
         parts=(_overview(found), _by_difficulty(found), _offsets(found.offsets)),
@@ -51,9 +57,9 @@ def accuracy_report(found: Accuracy, data: str = "") -> Report:
     )
 
 
-def throughput_report(found: Throughput, data: str = "") -> Report:
+def homogeneous_throughput_report(found: SolverThroughput, data: str = "") -> BenchmarkReport:
     """Return the page of the throughput benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Homogeneous path: time per profile",
         facts=facts(found.date, found.machine),
         parts=(_times(found), _threads(found)),
@@ -62,8 +68,8 @@ def throughput_report(found: Throughput, data: str = "") -> Report:
 
 
 def reader_report(
-    found: Sequence[readers.Throughput], date: str, machine: Machine, data: str = ""
-) -> Report:
+    found: Sequence[readers.ReaderThroughput], date: str, machine: Machine, data: str = ""
+) -> BenchmarkReport:
     """Return the page of the reader's benchmark."""
     table = Table(
         title="Throughput, one core, CPU time",
@@ -79,7 +85,7 @@ def reader_report(
         ),
     )
     text = "Raw files to arrays, from the page cache, against floors measured in the same run."
-    return Report(
+    return BenchmarkReport(
         title="Reader: files per second",
         facts=facts(date, machine),
         parts=(Part("Throughput", text, tables=(table,)),),
@@ -252,7 +258,7 @@ def _table(found: Accuracy, way: str) -> Table:
     )
 
 
-def _row(case: Case, outcome: Outcome) -> tuple[str, ...]:
+def _row(case: AccuracyCase, outcome: SolverOutcome) -> tuple[str, ...]:
     cells: list[str] = []
     for quantity in QUANTITIES:
         score = outcome.scores.get(quantity)
@@ -267,7 +273,7 @@ def _spelled(quantity: str) -> str:
     return quantity.replace("_", " ")
 
 
-def _value(figure: Measured) -> str:
+def _value(figure: MonteCarloFigure) -> str:
     return f"{figure.value:.3f}({1e3 * figure.error:.0f})"
 
 
@@ -311,7 +317,7 @@ def _difficulties(found: Accuracy, way: str, quantity: str) -> Series:
         y=tuple(y.value for _, y in points),
         low=tuple(y.value - y.error for _, y in points),
         high=tuple(y.value + y.error for _, y in points),
-        hollow=way in (Method.FAST, Method.DIRECT),
+        hollow=way in (HomogeneousMethod.FAST, HomogeneousMethod.DIRECT),
     )
 
 
@@ -366,7 +372,7 @@ def _offset_panel(offsets: Sequence[Offset]) -> Panel:
     )
 
 
-def _errors(label: str, lengths: tuple[float, ...], errors: Sequence[Measured]) -> Series:
+def _errors(label: str, lengths: tuple[float, ...], errors: Sequence[MonteCarloFigure]) -> Series:
     return Series(
         label,
         lengths,
@@ -411,7 +417,7 @@ def _offset_table(offsets: Sequence[Offset]) -> Table:
 # Throughput ----------------------------------------------------------------------------------
 
 
-def _times(found: Throughput) -> Part:
+def _times(found: SolverThroughput) -> Part:
     by_setting = {setting: _speeds(found, setting) for setting in settings()}
     names = list(dict.fromkeys(speed.way for speed in found.speeds))
     return Part(
@@ -424,7 +430,7 @@ def _times(found: Throughput) -> Part:
     )
 
 
-def _speeds(found: Throughput, setting: Setting) -> dict[str, Speed]:
+def _speeds(found: SolverThroughput, setting: Setting) -> dict[str, Speed]:
     return {speed.way: speed for speed in found.speeds if speed.setting == setting}
 
 
@@ -447,7 +453,7 @@ def _ladder(names: Sequence[str], found: Mapping[Setting, Mapping[str, Speed]]) 
 
 
 def _speed_table(setting: Setting, speeds: Mapping[str, Speed]) -> Table:
-    best = speeds.get(Method.COMPRESSED)
+    best = speeds.get(HomogeneousMethod.COMPRESSED)
     return Table(
         title=setting.label,
         columns=("way", "profiles", "ns each", "reads", "ratio"),
@@ -465,7 +471,7 @@ def _speed_table(setting: Setting, speeds: Mapping[str, Speed]) -> Table:
     )
 
 
-def _threads(found: Throughput) -> Part:
+def _threads(found: SolverThroughput) -> Part:
     return Part(
         title="Two threads",
         text="Time on the wall of one thread over that of two with half of the profiles each. It "
@@ -483,9 +489,9 @@ def _threads(found: Throughput) -> Part:
 # Elastic retrieval ---------------------------------------------------------------------------
 
 
-def elastic_throughput_report(found: ElasticThroughput, data: str = "") -> Report:
+def elastic_throughput_report(found: ElasticThroughput, data: str = "") -> BenchmarkReport:
     """Return the page of the throughput benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Elastic inversion: time per profile",
         facts=facts(found.date, found.machine),
         parts=(cost_part(found.costs, found.bins),),
@@ -493,7 +499,7 @@ def elastic_throughput_report(found: ElasticThroughput, data: str = "") -> Repor
     )
 
 
-def cost_part(costs: tuple[Cost, ...], bins: int) -> Part:
+def cost_part(costs: tuple[StepCost, ...], bins: int) -> Part:
     """Return the chapter of the CPU time of the steps of the elastic retrieval."""
     batches = sorted({cost.batch for cost in costs})
     return Part(
@@ -508,7 +514,7 @@ def cost_part(costs: tuple[Cost, ...], bins: int) -> Part:
     )
 
 
-def _cost_ladder(costs: tuple[Cost, ...], batches: list[int], bins: int) -> Ladder:
+def _cost_ladder(costs: tuple[StepCost, ...], batches: list[int], bins: int) -> Ladder:
     steps = list(dict.fromkeys(cost.step for cost in costs))
     spent = {(cost.batch, cost.step): cost.nanoseconds / 1e3 for cost in costs}
     return Ladder(
@@ -524,7 +530,7 @@ def _cost_ladder(costs: tuple[Cost, ...], batches: list[int], bins: int) -> Ladd
     )
 
 
-def _cost_table(costs: tuple[Cost, ...], batch: int) -> Table:
+def _cost_table(costs: tuple[StepCost, ...], batch: int) -> Table:
     return Table(
         title=f"Calls of {counted(batch, 'profile')}",
         columns=("step", "whose", "profiles", "µs each", "reads"),

@@ -113,7 +113,7 @@ def _fit(power: Any, ratio: Array, depth: Array, unknowns: Array, inverse: Array
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_profiles(
+def fit_levenberg_marquardt(
     power: Any, ratio: Array, depth: Array, start: Array, unknowns: Array, covariance: Array
 ) -> int:
     """Fit background, signal at the start and extinction to profiles of unit variance.

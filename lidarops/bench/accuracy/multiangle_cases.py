@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
     Regularisation,
-    solve,
+    retrieve_optical_depth,
 )
 
 Array = npt.NDArray[np.float64]
@@ -144,7 +144,7 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ScanEstimates:
     """What a way finds, (profile, altitude); NaN where it has no value."""
 
     optical_depth: Array
@@ -158,7 +158,7 @@ class Found:
     """(profile,)"""
 
 
-Way = Callable[[Scan], Found]
+Way = Callable[[Scan], ScanEstimates]
 
 
 def correlated(rng: np.random.Generator, shape: tuple[int, ...], correlation: float) -> Array:
@@ -221,12 +221,12 @@ def cloud(correlation: float = 0.0, *, largest: float = 30.0) -> Scene:
     return Scene(label, angles, height, extinction, flat, NOISELESS, scatter, correlation)
 
 
-def scenes() -> tuple[Scene, ...]:
+def scan_scenes() -> tuple[Scene, ...]:
     """Return the scenes in which all ways are compared."""
     return (clear(3000.0), clear(300.0), cloud(), cloud(0.8))
 
 
-def published(largest: float, rays: int, scatter: float) -> Scene:
+def published_cloud(largest: float, rays: int, scatter: float) -> Scene:
     """Return the cloud as the published experiment sees it: in the middle of its 8 layers.
 
     Parameters
@@ -317,7 +317,7 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
 # Our ways -------------------------------------------------------------------------------------
 
 
-def ways() -> Mapping[str, Way]:
+def scan_methods() -> Mapping[str, Way]:
     """Return what is compared of ours, by name."""
     return {
         TWO_ANGLE: partial(_ours, method=TWO_ANGLE),
@@ -336,7 +336,7 @@ def ways() -> Mapping[str, Way]:
 def retrieve(scan: Scan, method: str, *, robust: bool = True) -> MultiAngleResult:
     """Solve all profiles of a scan as one block."""
     scene = scan.scene
-    return solve(
+    return retrieve_optical_depth(
         scan.signal,
         scene.zenith_angle,
         scene.altitude,
@@ -346,10 +346,10 @@ def retrieve(scan: Scan, method: str, *, robust: bool = True) -> MultiAngleResul
     )
 
 
-def with_prior(scan: Scan, prior: Array) -> Found:
+def with_prior(scan: Scan, prior: Array) -> ScanEstimates:
     """Solve with a given prior of the optical depth."""
     return as_found(
-        solve(
+        retrieve_optical_depth(
             scan.signal,
             scan.scene.zenith_angle,
             scan.scene.altitude,
@@ -360,9 +360,9 @@ def with_prior(scan: Scan, prior: Array) -> Found:
     )
 
 
-def as_found(result: MultiAngleResult) -> Found:
+def as_found(result: MultiAngleResult) -> ScanEstimates:
     """Return what is compared of a result."""
-    return Found(
+    return ScanEstimates(
         optical_depth=result.optical_depth,
         standard_error=result.optical_depth_standard_error,
         extinction=result.extinction,
@@ -372,13 +372,13 @@ def as_found(result: MultiAngleResult) -> Found:
     )
 
 
-def _ours(scan: Scan, *, method: str) -> Found:
+def _ours(scan: Scan, *, method: str) -> ScanEstimates:
     return as_found(retrieve(scan, method))
 
 
-def _mld(scan: Scan, *, regularisation: Regularisation) -> Found:
+def _mld(scan: Scan, *, regularisation: Regularisation) -> ScanEstimates:
     return as_found(
-        solve(
+        retrieve_optical_depth(
             scan.signal,
             scan.scene.zenith_angle,
             scan.scene.altitude,
@@ -392,7 +392,7 @@ def _mld(scan: Scan, *, regularisation: Regularisation) -> Found:
 # Peers ----------------------------------------------------------------------------------------
 
 
-def peers() -> Mapping[str, Way]:
+def scan_peers() -> Mapping[str, Way]:
     """Return what one would write with numpy and scipy, altitude by altitude.
 
     They are told the true scatter, and take samples of more than 3 times their noise.
@@ -408,7 +408,7 @@ _Line = tuple[Array, Array, Array]
 """Slant path, logarithm and weight (the reciprocal standard error) of each ray."""
 
 
-def lstsq(scan: Scan) -> Found:
+def lstsq(scan: Scan) -> ScanEstimates:
     """Fit straight lines by `numpy.linalg.lstsq`."""
 
     def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
@@ -419,7 +419,7 @@ def lstsq(scan: Scan) -> Found:
     return _each(scan, fit, stated=True)
 
 
-def bounded(scan: Scan) -> Found:
+def bounded(scan: Scan) -> ScanEstimates:
     """Fit straight lines with an optical depth that is not negative."""
 
     def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
@@ -430,7 +430,7 @@ def bounded(scan: Scan) -> Found:
     return _each(scan, fit, stated=False)
 
 
-def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> Found:
+def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> ScanEstimates:
     """Differentiate along the slant path, with the strength at the corner of the L-curve.
 
     Parameters
@@ -472,7 +472,7 @@ def _corner(misfit: Array, size: Array) -> int:
 
 def _each(
     scan: Scan, fit: Callable[[Array, Array, Array], tuple[float, float]], *, stated: bool
-) -> Found:
+) -> ScanEstimates:
     profiles, _, gates = scan.signal.shape
     depth, error = np.full((profiles, gates), np.nan), np.full((profiles, gates), np.nan)
     for t in range(profiles):
@@ -480,7 +480,7 @@ def _each(
             line = _line(scan, t, k)
             if line[0].size >= _FEWEST:
                 depth[t, k], error[t, k] = fit(*line)
-    return Found(depth, error if stated else None)
+    return ScanEstimates(depth, error if stated else None)
 
 
 def _line(scan: Scan, t: int, k: int) -> _Line:

@@ -8,27 +8,27 @@ from typing import Final
 
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.bench.accuracy import multiangle_scores as scores
-from lidarops.bench.accuracy.homogeneous import Measured
+from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.accuracy.multiangle_scores import (
     MultiAngle,
     OutlierScore,
-    PublishedScore,
+    PublishedCloudScore,
     SafetyScore,
+    ScanScore,
     SceneScore,
-    Score,
-    measure,
+    measure_multiangle,
 )
 from lidarops.bench.harness.terms import RESULT, Effort, Finding, Kind
-from lidarops.bench.throughput.retrievals import READ, Cost
+from lidarops.bench.throughput.retrievals import READ, StepCost
 from lidarops.bench.throughput.scan_kernels import (
     INPUTS,
     MultiAngleThroughput,
-    measure_throughput,
+    measure_scan_kernels,
 )
 from lidarops.figures.charts import Chart, Ladder, Panel, Series, pareto
 from lidarops.figures.wording import counted, percent
-from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 _NONE: Final = "-"
 _GAIN: Final = 0.98
@@ -41,7 +41,7 @@ _ERRORS: Final = (
 )
 
 
-def run(kind: Kind, *, effort: Effort) -> Finding:
+def run_multiangle(kind: Kind, *, effort: Effort) -> Finding:
     """Run a benchmark of the retrieval from scans.
 
     Parameters
@@ -50,17 +50,17 @@ def run(kind: Kind, *, effort: Effort) -> Finding:
     effort : Effort
     """
     if kind is Kind.ACCURACY:
-        found = measure(quick=effort.quick, date=effort.date, progress=effort.progress)
-        return Finding(found, accuracy_report(found, RESULT))
-    timed = measure_throughput(
+        found = measure_multiangle(quick=effort.quick, date=effort.date, progress=effort.progress)
+        return Finding(found, multiangle_accuracy_report(found, RESULT))
+    timed = measure_scan_kernels(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
-    return Finding(timed, throughput_report(timed, RESULT))
+    return Finding(timed, multiangle_throughput_report(timed, RESULT))
 
 
-def accuracy_report(found: MultiAngle, data: str = "") -> Report:
+def multiangle_accuracy_report(found: MultiAngle, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Scans: error of optical depth and extinction against CPU time",
         facts=facts(found.date, found.machine),
         parts=(
@@ -73,9 +73,9 @@ def accuracy_report(found: MultiAngle, data: str = "") -> Report:
     )
 
 
-def throughput_report(found: MultiAngleThroughput, data: str = "") -> Report:
+def multiangle_throughput_report(found: MultiAngleThroughput, data: str = "") -> BenchmarkReport:
     """Return the page of the throughput benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Scans: time per profile",
         facts=facts(found.date, found.machine),
         parts=(_times(found),),
@@ -128,17 +128,17 @@ def _work_chart(found: Sequence[SceneScore], name: str, quantity: str, unit: str
     )
 
 
-def _drawn(scene: SceneScore) -> list[Score]:
+def _drawn(scene: SceneScore) -> list[ScanScore]:
     return [one for one in scene.scores if one.way != _UNDRAWN]
 
 
-def _rmse(score: Score, name: str) -> Measured:
+def _rmse(score: ScanScore, name: str) -> MonteCarloFigure:
     if name == "extinction":
         return scaled(score.extinction_rmse, _PER_KM)
     return score.rmse
 
 
-def _point(score: Score, name: str) -> Series:
+def _point(score: ScanScore, name: str) -> Series:
     rmse = _rmse(score, name)
     low = max(rmse.value - 2.0 * rmse.error, 0.1 * rmse.value)
     return Series(
@@ -147,7 +147,7 @@ def _point(score: Score, name: str) -> Series:
         (rmse.value,),
         (low,),
         (rmse.value + 2.0 * rmse.error,),
-        hollow=score.way in cases.peers(),
+        hollow=score.way in cases.scan_peers(),
     )
 
 
@@ -175,11 +175,11 @@ def _scene_table(scene: SceneScore) -> Table:
                 f"{one.profiles:,}",
                 f"{one.nanoseconds / 1e6:.3g}",
                 percent(one.solved),
-                told(one.rmse),
-                told(one.bias, sign=True),
-                _NONE if one.top_bias is None else told(one.top_bias, sign=True),
+                with_error(one.rmse),
+                with_error(one.bias, sign=True),
+                _NONE if one.top_bias is None else with_error(one.top_bias, sign=True),
                 *_shares(one.coverage),
-                told(scaled(one.extinction_rmse, _PER_KM)),
+                with_error(scaled(one.extinction_rmse, _PER_KM)),
                 *_shares(one.extinction_coverage),
                 _NONE if one.data_share is None else f"{one.data_share:.2f}",
             )
@@ -193,10 +193,10 @@ def _scene_table(scene: SceneScore) -> Table:
     )
 
 
-def _shares(coverage: tuple[Measured, Measured] | None) -> tuple[str, str]:
+def _shares(coverage: tuple[MonteCarloFigure, MonteCarloFigure] | None) -> tuple[str, str]:
     if coverage is None:
         return _NONE, _NONE
-    low, high = (told(scaled(one, 100.0)) for one in coverage)
+    low, high = (with_error(scaled(one, 100.0)) for one in coverage)
     return f"{low} %", f"{high} %"
 
 
@@ -225,7 +225,7 @@ def _published(found: MultiAngle) -> Part:
 
 
 def _verdict(found: MultiAngle) -> str:
-    def one(way: str, angle: float) -> PublishedScore:
+    def one(way: str, angle: float) -> PublishedCloudScore:
         return next(
             score
             for score in found.published
@@ -250,21 +250,21 @@ def _verdict(found: MultiAngle) -> str:
         "(in a figure, without a number) is that the regularised derivative is stable at 15°, "
         "where two angles, shown for 30° and 10 %, are not acceptable. Of single altitudes, this "
         f"{'is not so' if times > 1.0 else 'is so'}: with 25 % at 15°, mld of order 0 is off by "
-        f"{told(mld.rmse)}, {times:.1f} times the {told(alone.rmse)} of two angles at 30° with "
+        f"{with_error(mld.rmse)}, {times:.1f} times the {with_error(alone.rmse)} of two angles at 30° with "
         f"10 %. Stable it is, as an answer of zero is ({nothing.rmse.value:.2f}): it gains "
         f"{percent(1.0 - mld.rmse.value / plain.rmse.value)} on the straight line, "
-        f"{told(plain.rmse)}, with an error of {mld.top_bias.value:+.2f} at the top and a median "
+        f"{with_error(plain.rmse)}, with an error of {mld.top_bias.value:+.2f} at the top and a median "
         f"of {percent(mld.data_share or 0.0)} of the answer from the data; the rest is the prior, "
         "and so is its error (table of priors). The shape of two-angle profiles is another "
         f"matter: {percent(1.0 - alone.monotone)} of those at 30° decrease somewhere. Errors "
         f"as small as those of two angles at 30° with 10 % it reaches {reached}. With the "
         "altitude below as prior, the second published scheme, it is off by "
-        f"{told(filtered.rmse)} at 15°. What helps there is smoothness over altitude: joint is "
-        f"off by {told(joint.rmse)}, and by {told(alike.rmse)} where layers scatter alike."
+        f"{with_error(filtered.rmse)} at 15°. What helps there is smoothness over altitude: joint is "
+        f"off by {with_error(joint.rmse)}, and by {with_error(alike.rmse)} where layers scatter alike."
     )
 
 
-def _angle_chart(found: Sequence[PublishedScore]) -> Chart:
+def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
     central = [one for one in found if (one.rays, one.share) == scores.CENTRAL]
     ways = (
         scores.NOTHING,
@@ -315,7 +315,7 @@ def _angle_chart(found: Sequence[PublishedScore]) -> Chart:
 
 
 def _published_table(
-    found: Sequence[PublishedScore], angle: float, rays: int, share: float
+    found: Sequence[PublishedCloudScore], angle: float, rays: int, share: float
 ) -> Table:
     chosen = [
         one for one in found if (one.largest_angle, one.rays, one.share) == (angle, rays, share)
@@ -337,9 +337,9 @@ def _published_table(
         rows=tuple(
             (
                 one.way,
-                told(one.rmse),
-                told(one.top_bias, sign=True),
-                told(scaled(one.extinction_rmse, _PER_KM)),
+                with_error(one.rmse),
+                with_error(one.top_bias, sign=True),
+                with_error(scaled(one.extinction_rmse, _PER_KM)),
                 percent(one.negative),
                 percent(one.monotone),
                 percent(one.close.value),
@@ -359,7 +359,7 @@ def _prior_table(found: MultiAngle) -> Table:
         title="mld_prior at 15°, 6 rays, 25 %, with a multiple of the truth as prior",
         columns=("prior / truth", "prior alone", "RMSE", "data share"),
         rows=tuple(
-            (f"{one.factor:g}", f"{one.alone:.2f}", told(one.rmse), f"{one.data_share:.2f}")
+            (f"{one.factor:g}", f"{one.alone:.2f}", with_error(one.rmse), f"{one.data_share:.2f}")
             for one in found.priors
         ),
         note="With the truth as prior, what is left is the share of the noise.",
@@ -371,7 +371,7 @@ def _correlation_table(found: MultiAngle) -> Table:
         title="Layers that scatter alike: 15°, 6 rays, 14.7 %",
         columns=("correlation", "way", "RMSE", "RMSE < 0.5"),
         rows=tuple(
-            (f"{one.correlation:g}", one.way, told(one.rmse), percent(one.close.value))
+            (f"{one.correlation:g}", one.way, with_error(one.rmse), percent(one.close.value))
             for one in found.correlations
         ),
         note="Correlation of the scatter of neighbouring layers. RMSE < 0.5: share of profiles.",
@@ -395,9 +395,9 @@ def _outliers(found: Sequence[OutlierScore]) -> Part:
             rows.append(
                 (
                     f"{way}, {100.0 * one.outliers:.0f} %",
-                    told(one.low_rmse),
+                    with_error(one.low_rmse),
                     f"{one.low_rmse.value / base.low_rmse.value:.2f}",
-                    told(one.rmse),
+                    with_error(one.rmse),
                     f"{one.rmse.value / base.rmse.value:.2f}",
                     *_shares(one.coverage),
                     percent(one.flagged),
@@ -491,8 +491,8 @@ def _flag_table(found: SafetyScore) -> Table:
     )
 
 
-def _rare(share: Measured) -> str:
-    return f"{told(scaled(share, 100.0))} %"
+def _rare(share: MonteCarloFigure) -> str:
+    return f"{with_error(scaled(share, 100.0))} %"
 
 
 # Time -----------------------------------------------------------------------------------------
@@ -563,7 +563,7 @@ def _time_table(found: MultiAngleThroughput, batch: int) -> Table:
     )
 
 
-def _whose(cost: Cost) -> str:
+def _whose(cost: StepCost) -> str:
     if cost.step in {READ, INPUTS}:
         return "floor"
     return "ours" if cost.ours else "peer"
@@ -572,12 +572,12 @@ def _whose(cost: Cost) -> str:
 # Numbers --------------------------------------------------------------------------------------
 
 
-def scaled(figure: Measured, factor: float) -> Measured:
+def scaled(figure: MonteCarloFigure, factor: float) -> MonteCarloFigure:
     """Return a figure in another unit."""
-    return Measured(factor * figure.value, factor * figure.error)
+    return MonteCarloFigure(factor * figure.value, factor * figure.error)
 
 
-def told(figure: Measured, *, sign: bool = False) -> str:
+def with_error(figure: MonteCarloFigure, *, sign: bool = False) -> str:
     """Return a figure with its error in the last digits."""
     plus = "+" if sign else ""
     if not figure.error > 0.0:

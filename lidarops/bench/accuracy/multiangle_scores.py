@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.bench.accuracy import multiangle_cases as cases
-from lidarops.bench.accuracy.homogeneous import SIGMAS, Measured
-from lidarops.bench.accuracy.multiangle_cases import Array, Found, Scan, Scene, Way
+from lidarops.bench.accuracy.homogeneous import SIGMAS, MonteCarloFigure
+from lidarops.bench.accuracy.multiangle_cases import Array, Scan, ScanEstimates, Scene, Way
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleFlags, MultiAngleResult
 
@@ -42,7 +42,7 @@ _SCENE_PROFILES: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Size:
+class StudySize:
     """How much is simulated."""
 
     blocks: int
@@ -57,12 +57,12 @@ class Size:
     """Random scenes, and a quarter of that of calm ones."""
 
 
-QUICK: Final = Size(blocks=6, profiles=24, slow=1, published=100, random=150)
-FULL: Final = Size(blocks=16, profiles=64, slow=2, published=250, random=3000)
+QUICK: Final = StudySize(blocks=6, profiles=24, slow=1, published=100, random=150)
+FULL: Final = StudySize(blocks=16, profiles=64, slow=2, published=250, random=3000)
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class ScanScore:
     """Errors of one way in one scene, at the altitudes that kano_hamilton reaches."""
 
     way: str
@@ -71,19 +71,19 @@ class Score:
     """CPU time a profile."""
     solved: float
     """Share of these values that the way has."""
-    rmse: Measured
+    rmse: MonteCarloFigure
     """Of optical depth."""
-    bias: Measured
+    bias: MonteCarloFigure
     """Mean error of optical depth."""
-    top_bias: Measured | None
+    top_bias: MonteCarloFigure | None
     """Mean error at the highest of the altitudes that all profiles reach; None where the way has
     no value there."""
-    coverage: tuple[Measured, Measured] | None
+    coverage: tuple[MonteCarloFigure, MonteCarloFigure] | None
     """Share of optical depths within 1 and 1.96 stated standard errors; None where the way
     states none."""
-    extinction_rmse: Measured
+    extinction_rmse: MonteCarloFigure
     """m-1, of differences of optical depths, published or not."""
-    extinction_coverage: tuple[Measured, Measured] | None
+    extinction_coverage: tuple[MonteCarloFigure, MonteCarloFigure] | None
     """Of published values."""
     data_share: float | None
     """Median."""
@@ -96,12 +96,12 @@ class SceneScore:
     label: str
     profiles: int
     altitudes: int
-    scores: tuple[Score, ...]
+    scores: tuple[ScanScore, ...]
     """Without ways that have no value."""
 
 
 @dataclass(frozen=True, slots=True)
-class PublishedScore:
+class PublishedCloudScore:
     """One way in the published experiment, over the middles of 8 layers of a cloud."""
 
     way: str
@@ -111,16 +111,16 @@ class PublishedScore:
     share: float
     """Largest error of backscatter over backscatter."""
     profiles: int
-    rmse: Measured
-    top_bias: Measured
+    rmse: MonteCarloFigure
+    top_bias: MonteCarloFigure
     """Mean error at the highest altitude."""
-    extinction_rmse: Measured
+    extinction_rmse: MonteCarloFigure
     """m-1."""
     negative: float
     """Share of optical depths below zero."""
     monotone: float
     """Share of profiles that nowhere decrease."""
-    close: Measured
+    close: MonteCarloFigure
     """Share of profiles with a root mean square error below 0.5."""
     data_share: float | None
     """Median of the values."""
@@ -135,7 +135,7 @@ class PriorScore:
     factor: float
     alone: float
     """Root mean square error of the prior."""
-    rmse: Measured
+    rmse: MonteCarloFigure
     data_share: float
 
 
@@ -145,8 +145,8 @@ class CorrelationScore:
 
     way: str
     correlation: float
-    rmse: Measured
-    close: Measured
+    rmse: MonteCarloFigure
+    close: MonteCarloFigure
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,10 +155,10 @@ class OutlierScore:
 
     way: str
     outliers: float
-    low_rmse: Measured
+    low_rmse: MonteCarloFigure
     """Of optical depth, below 2 km."""
-    rmse: Measured
-    coverage: tuple[Measured, Measured]
+    rmse: MonteCarloFigure
+    coverage: tuple[MonteCarloFigure, MonteCarloFigure]
     flagged: float
     """Share of values with the flag of outliers."""
     ran: float
@@ -172,7 +172,7 @@ class FlagShare:
     flag: str
     values: float
     """Share of all values."""
-    false: Measured | None
+    false: MonteCarloFigure | None
     """Share of these that are false; None where there are none."""
 
 
@@ -187,15 +187,15 @@ class SafetyScore:
     scenes: int
     profiles: int
     values: int
-    random_only: Measured
+    random_only: MonteCarloFigure
     """Share of values off by more than 4 random standard errors."""
-    false: Measured
+    false: MonteCarloFigure
     """Share of values off by more than 4 of random error and gradient bound together."""
-    false_ok: Measured
+    false_ok: MonteCarloFigure
     """The same of the values without a flag that doubts the uncertainty."""
-    false_ok_profiles: Measured
+    false_ok_profiles: MonteCarloFigure
     """Share of profiles with such a value."""
-    within: Measured
+    within: MonteCarloFigure
     """Share of unflagged values within 1.96 of random error and gradient bound together."""
     flagged: float
     """Share of values with such a flag."""
@@ -211,18 +211,18 @@ class MultiAngle:
     date: str
     machine: Machine
     scenes: tuple[SceneScore, ...]
-    published: tuple[PublishedScore, ...]
+    published: tuple[PublishedCloudScore, ...]
     priors: tuple[PriorScore, ...]
     correlations: tuple[CorrelationScore, ...]
     outliers: tuple[OutlierScore, ...]
     safety: tuple[SafetyScore, ...]
 
 
-def measure(
+def measure_multiangle(
     *,
     quick: bool = False,
     date: str = "",
-    size: Size | None = None,
+    size: StudySize | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> MultiAngle:
     """Find optical depth and extinction of simulated scans by every method and by peers.
@@ -240,7 +240,7 @@ def measure(
     """
     size = size or (QUICK if quick else FULL)
     compared = []
-    for number, scene in enumerate(cases.scenes()):
+    for number, scene in enumerate(cases.scan_scenes()):
         compared.append(_compare(scene, size, number))
         progress(1)
     published = tuple(_published(size))
@@ -267,20 +267,20 @@ def _mean(values: Mask | Array) -> float:
     return float(finite.mean()) if finite.size else float("nan")
 
 
-def over_blocks(means: Sequence[float]) -> Measured:
+def over_blocks(means: Sequence[float]) -> MonteCarloFigure:
     """Return the mean of independent blocks with its Monte Carlo error."""
     finite = np.array(means)[np.isfinite(means)]
     error = float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else 0.0
-    return Measured(float(finite.mean()), error)
+    return MonteCarloFigure(float(finite.mean()), error)
 
 
-def root(square: Measured) -> Measured:
+def root(square: MonteCarloFigure) -> MonteCarloFigure:
     """Return the square root of a mean of squares."""
     value = float(np.sqrt(square.value))
-    return Measured(value, square.error / (2.0 * value) if value > 0 else 0.0)
+    return MonteCarloFigure(value, square.error / (2.0 * value) if value > 0 else 0.0)
 
 
-def ratio(part: Array, whole: Array) -> Measured:
+def ratio(part: Array, whole: Array) -> MonteCarloFigure:
     """Return a share with the Monte Carlo error of independent clusters.
 
     Parameters
@@ -290,18 +290,20 @@ def ratio(part: Array, whole: Array) -> Measured:
     """
     total = float(whole.sum())
     if total == 0.0:
-        return Measured(0.0, 0.0)
+        return MonteCarloFigure(0.0, 0.0)
     value = float(part.sum()) / total
     error = float(np.sqrt(np.sum((part - value * whole) ** 2))) / total
     # Where none is found, one more keeps the error from being zero.
-    return Measured(value, max(error, 1.0 / total))
+    return MonteCarloFigure(value, max(error, 1.0 / total))
 
 
 def _any(marks: Sequence[Marks], name: str) -> bool:
     return any(np.isfinite(one[name]) for one in marks)
 
 
-def _coverage(marks: Sequence[Marks], name: str) -> tuple[Measured, Measured] | None:
+def _coverage(
+    marks: Sequence[Marks], name: str
+) -> tuple[MonteCarloFigure, MonteCarloFigure] | None:
     if not _any(marks, f"{name}0"):
         return None
     low, high = (over_blocks([one[f"{name}{k}"] for one in marks]) for k in range(2))
@@ -322,20 +324,20 @@ def _differences(depth: Array, altitude: Array) -> Array:
 # All ways in four scenes ----------------------------------------------------------------------
 
 
-def _compare(scene: Scene, size: Size, number: int) -> SceneScore:
+def _compare(scene: Scene, size: StudySize, number: int) -> SceneScore:
     scans = [scene.draw(size.profiles, number, block) for block in range(size.blocks)]
     within = [
         np.isfinite(cases.retrieve(scan, cases.KANO_HAMILTON).optical_depth) for scan in scans
     ]
-    ours = [_score(name, way, scans, within) for name, way in cases.ways().items()]
+    ours = [_score(name, way, scans, within) for name, way in cases.scan_methods().items()]
     few = [scan.first(size.slow) for scan in scans]
-    others = [_score(name, way, few, within) for name, way in cases.peers().items()]
+    others = [_score(name, way, few, within) for name, way in cases.scan_peers().items()]
     profiles = size.blocks * size.profiles
     scores = tuple(score for score in (*ours, *others) if score is not None)
     return SceneScore(scene.label, profiles, scene.altitude.size, scores)
 
 
-def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -> Score | None:
+def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -> ScanScore | None:
     way(scans[0].first(1))
     marks, times, shares = [], [], []
     for scan, reached in zip(scans, within, strict=True):
@@ -349,7 +351,7 @@ def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -
     if not _any(marks, "extinction_square"):
         return None
     share = float(np.nanmedian(np.concatenate(shares))) if shares else None
-    return Score(
+    return ScanScore(
         way=name,
         profiles=sum(len(scan.signal) for scan in scans),
         nanoseconds=1e9 * float(np.median(times)),
@@ -364,7 +366,7 @@ def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -
     )
 
 
-def _marks(found: Found, scene: Scene, mask: Mask) -> Marks:
+def _marks(found: ScanEstimates, scene: Scene, mask: Mask) -> Marks:
     """Return means over the altitudes of one block that count."""
     error = np.where(mask, found.optical_depth - scene.optical_depth, np.nan)
     slope = _differences(found.optical_depth, scene.altitude) - scene.extinction
@@ -389,40 +391,42 @@ def _marks(found: Found, scene: Scene, mask: Mask) -> Marks:
 # The published experiment ---------------------------------------------------------------------
 
 
-def _published(size: Size) -> Iterator[PublishedScore]:
+def _published(size: StudySize) -> Iterator[PublishedCloudScore]:
     every = set(product((15.0, 30.0), PUBLISHED_RAYS, PUBLISHED_SHARES))
     every |= {(angle, *CENTRAL) for angle in PUBLISHED_ANGLES}
     for number, (angle, rays, share) in enumerate(sorted(every)):
-        scene = cases.published(angle, rays, cases.uniform_deviation(share))
+        scene = cases.published_cloud(angle, rays, cases.uniform_deviation(share))
         scans = [
             cases.uniform_scatter(share, size.published, scene, number, block, 1)
             for block in range(_published_blocks(size))
         ]
-        gaussian = cases.published(angle, rays, 0.1)
+        gaussian = cases.published_cloud(angle, rays, 0.1)
         loud = [
             gaussian.draw(size.published, number, block, 2)
             for block in range(_published_blocks(size))
         ]
         yield _published_score(NOTHING, _nothing, scans, share)
-        yield _published_score(TWO_ANGLE_ALONE, cases.ways()[cases.TWO_ANGLE], loud, share)
-        for name, way in cases.ways().items():
+        yield _published_score(TWO_ANGLE_ALONE, cases.scan_methods()[cases.TWO_ANGLE], loud, share)
+        for name, way in cases.scan_methods().items():
             yield _published_score(name, way, scans, share)
 
 
-def _published_blocks(size: Size) -> int:
+def _published_blocks(size: StudySize) -> int:
     return min(5, size.blocks)
 
 
-def _nothing(scan: Scan) -> Found:
-    return Found(np.zeros((len(scan.signal), scan.scene.altitude.size)))
+def _nothing(scan: Scan) -> ScanEstimates:
+    return ScanEstimates(np.zeros((len(scan.signal), scan.scene.altitude.size)))
 
 
-def _published_score(name: str, way: Way, scans: Sequence[Scan], share: float) -> PublishedScore:
+def _published_score(
+    name: str, way: Way, scans: Sequence[Scan], share: float
+) -> PublishedCloudScore:
     scene = scans[0].scene
     found = [way(scan) for scan in scans]
     depth = np.concatenate([one.optical_depth for one in found])
     marks = [_marks(one, scene, np.ones(one.optical_depth.shape, np.bool_)) for one in found]
-    return PublishedScore(
+    return PublishedCloudScore(
         way=name,
         largest_angle=float(scene.zenith_angle.max()),
         rays=scene.zenith_angle.size,
@@ -449,9 +453,9 @@ def _close(depth: Array, scene: Scene) -> float:
     return float(np.mean(rms < _CLOSE))
 
 
-def _priors(size: Size) -> Iterator[PriorScore]:
+def _priors(size: StudySize) -> Iterator[PriorScore]:
     share = CENTRAL[1]
-    scene = cases.published(15.0, CENTRAL[0], cases.uniform_deviation(share))
+    scene = cases.published_cloud(15.0, CENTRAL[0], cases.uniform_deviation(share))
     truth = scene.optical_depth
     blocks = range(_published_blocks(size))
     scans = [cases.uniform_scatter(share, size.published, scene, block, 3) for block in blocks]
@@ -463,8 +467,8 @@ def _priors(size: Size) -> Iterator[PriorScore]:
         yield PriorScore(factor, alone, root(over_blocks(errors)), data)
 
 
-def _correlations(size: Size) -> Iterator[CorrelationScore]:
-    alone = cases.published(15.0, CENTRAL[0], cases.uniform_deviation(CENTRAL[1]))
+def _correlations(size: StudySize) -> Iterator[CorrelationScore]:
+    alone = cases.published_cloud(15.0, CENTRAL[0], cases.uniform_deviation(CENTRAL[1]))
     for number, correlation in enumerate(CORRELATIONS):
         scans = []
         for block in range(_published_blocks(size)):
@@ -473,7 +477,7 @@ def _correlations(size: Size) -> Iterator[CorrelationScore]:
             air = alone.inhomogeneity * cases.correlated(rng, shape, correlation)
             scans.append(alone.seen(air, rng))
         for name in (cases.KANO_HAMILTON, "mld 0, discrepancy", cases.MLD_PRIOR, cases.JOINT):
-            found = [cases.ways()[name](scan).optical_depth for scan in scans]
+            found = [cases.scan_methods()[name](scan).optical_depth for scan in scans]
             squares = [_mean((one - alone.optical_depth) ** 2) for one in found]
             close = over_blocks([_close(one, alone) for one in found])
             yield CorrelationScore(name, correlation, root(over_blocks(squares)), close)
@@ -482,7 +486,7 @@ def _correlations(size: Size) -> Iterator[CorrelationScore]:
 # Outliers -------------------------------------------------------------------------------------
 
 
-def _outliers(share: float, size: Size) -> Iterator[OutlierScore]:
+def _outliers(share: float, size: StudySize) -> Iterator[OutlierScore]:
     scene = cases.clear(3000.0, outliers=share)
     scans = [scene.draw(size.profiles, round(100 * share), k, 5) for k in range(size.blocks)]
     low = scene.altitude < LOW
@@ -519,7 +523,7 @@ class _Judged:
     """Values with the flag, and false ones of these."""
 
 
-def _safety(size: Size) -> Iterator[SafetyScore]:
+def _safety(size: StudySize) -> Iterator[SafetyScore]:
     judged: dict[tuple[str, str, str], list[_Judged]] = {}
     for calm, count in ((False, size.random), (True, -(-size.random // 4))):
         for seed in range(count):

@@ -15,17 +15,20 @@ import numpy.typing as npt
 
 from lidarops.bench.accuracy import network_cases as known
 from lidarops.bench.accuracy.network_cases import Air, Array, FigurePoint, Place, Signals
-from lidarops.bench.accuracy.network_report import accuracy_report, throughput_report
+from lidarops.bench.accuracy.network_report import (
+    network_accuracy_report,
+    network_throughput_report,
+)
 from lidarops.bench.accuracy.network_scores import (
     CLIPPED,
     READ,
-    Case,
     Comparison,
     Errors,
     MultiPosition,
     MultiPositionThroughput,
-    Rate,
+    NetworkScenario,
     Sight,
+    SolverRate,
     errors_of,
     joined,
     mean_by_block,
@@ -71,7 +74,7 @@ class Chunks:
     size: int
 
 
-def measure(
+def measure_network(
     *,
     quick: bool = False,
     date: str = "",
@@ -132,16 +135,16 @@ def figure() -> tuple[FigurePoint, ...]:
 
 def _case(
     place: Place, air: Air, noise: float, seen: Signals, chunks: Chunks, seed: int
-) -> tuple[Case, list[MultiPositionResult]]:
+) -> tuple[NetworkScenario, list[MultiPositionResult]]:
     """Return the scores of every way, and what the network found."""
     truth, near = seen.truth(chunks.size), seen.network.near_vertex
-    errors: dict[str, list[Errors]] = {way.name: [] for way in known.ways(place)}
+    errors: dict[str, list[Errors]] = {way.name: [] for way in known.network_solvers(place)}
     least = dict.fromkeys((READ, *errors), math.inf)
     network = []
     for chunk in range(chunks.number):
         power, variance = seen.draw(noise, chunks.size, len(seen.network.origin), seed, chunk)
         least[READ] = min(least[READ], _timed(partial(np.max, power))[0])
-        for way in known.ways(place):
+        for way in known.network_solvers(place):
             solve = partial(way, power, variance, seen)
             if chunk == 0:
                 # The first call compiles and fills caches.
@@ -154,7 +157,9 @@ def _case(
         name: score(joined(parts), 1e6 * least[name] / chunks.size, least[name] / least[READ])
         for name, parts in errors.items()
     }
-    return Case(place.name, air.name, noise, chunks.number * chunks.size, scores), network
+    return NetworkScenario(
+        place.name, air.name, noise, chunks.number * chunks.size, scores
+    ), network
 
 
 def _timed(call: Callable[[], _Found]) -> tuple[float, _Found]:
@@ -179,7 +184,7 @@ def _sight(
     extinction: Array, stated: Array, truth: Array, kept: Booleans, contrast: float, noise: float
 ) -> Sight | None:
     constant = sight.koschmieder_constant(contrast)
-    found = sight.from_extinction(extinction, stated, contrast=contrast)
+    found = sight.visibility_from_extinction(extinction, stated, contrast=contrast)
     true = constant / truth
     error = found.visibility - true
     bias, rmse = mean_by_block(error, kept), root_by_block(error, kept)
@@ -230,7 +235,7 @@ def _clipped_rms(errors: Array, kept: Booleans) -> float:
 # Throughput -----------------------------------------------------------------------------------
 
 
-def measure_throughput(
+def measure_network_throughput(
     *,
     quick: bool = False,
     date: str = "",
@@ -253,7 +258,7 @@ def measure_throughput(
     rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
     cycles = cycle_rates(quick=quick, repeats=rounds)
     progress(1)
-    profiles: list[Rate] = []
+    profiles: list[SolverRate] = []
     for place in known.PLACES:
         profiles += _profile_rates(place, rounds)
         progress(1)
@@ -262,7 +267,7 @@ def measure_throughput(
     )
 
 
-def cycle_rates(*, quick: bool, repeats: int) -> list[Rate]:
+def cycle_rates(*, quick: bool, repeats: int) -> list[SolverRate]:
     """Return the CPU time of cycles of 3 and of 12 rays in every way, the read first."""
     rates = []
     for rays, cycles in (_QUICK_CYCLES if quick else _CYCLES).items():
@@ -274,7 +279,7 @@ def cycle_rates(*, quick: bool, repeats: int) -> list[Rate]:
         times = least_times(calls, repeats)
         each = {name: 1e9 * seconds / sizes[name] for name, seconds in times.items()}
         rates += [
-            Rate(name, rays, sizes[name], each[name], each[name] / each[READ], name in OURS)
+            SolverRate(name, rays, sizes[name], each[name], each[name] / each[READ], name in OURS)
             for name in calls
         ]
     return rates
@@ -315,17 +320,17 @@ _CYCLE_WAYS: Final[Mapping[str, tuple[Callable[[known.Rows], object], int]]] = {
 """Each way with the most cycles that it gets."""
 
 
-def _profile_rates(place: Place, repeats: int) -> list[Rate]:
+def _profile_rates(place: Place, repeats: int) -> list[SolverRate]:
     """Return the CPU time of profiles of a network in every way, the read first."""
     net, size = place.network(), _TIMED_PROFILES
     seen = known.signals(net, known.AIRS[0])
     power, variance = seen.draw(known.PEER_NOISE, size, 7)
     calls: dict[str, Callable[[], object]] = {READ: partial(np.max, power)}
-    for way in known.ways(place):
+    for way in known.network_solvers(place):
         calls[way.name] = partial(way, power, variance, seen)
     times = least_times(calls, repeats)
     return [
-        Rate(name, net.rays, size, 1e9 * s / size, s / times[READ], name != READ)
+        SolverRate(name, net.rays, size, 1e9 * s / size, s / times[READ], name != READ)
         for name, s in times.items()
     ]
 
@@ -348,7 +353,7 @@ def _gain(*, quick: bool, repeats: int) -> float:
 # The command ----------------------------------------------------------------------------------
 
 
-def run(kind: Kind, *, effort: Effort) -> Finding:
+def run_network(kind: Kind, *, effort: Effort) -> Finding:
     """Run a benchmark of networks of lidars.
 
     Parameters
@@ -357,11 +362,11 @@ def run(kind: Kind, *, effort: Effort) -> Finding:
     effort : Effort
     """
     if kind is Kind.ACCURACY:
-        found = measure(
+        found = measure_network(
             quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
         )
-        return Finding(found, accuracy_report(found, RESULT))
-    timed = measure_throughput(
+        return Finding(found, network_accuracy_report(found, RESULT))
+    timed = measure_network_throughput(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
-    return Finding(timed, throughput_report(timed, RESULT))
+    return Finding(timed, network_throughput_report(timed, RESULT))

@@ -14,10 +14,10 @@ from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.cycles import systematic_error
 from lidarops.retrieve.network.extinction_field import (
     DEFAULT_GATES,
-    Method,
+    FieldPrior,
     MultiPositionResult,
-    Prior,
-    solve,
+    NetworkMethod,
+    retrieve_network,
 )
 
 Array = npt.NDArray[np.float64]
@@ -204,19 +204,19 @@ def _points(net: geometry.Network, ray: int, distance: Array) -> tuple[Array, Ar
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class NetworkSolver:
     """One way to find extinction at the vertices."""
 
     name: str
-    method: Method
+    method: NetworkMethod
     multiplier: float | None = None
-    prior: Prior = Prior.BLOCK
+    prior: FieldPrior = FieldPrior.BLOCK
 
     def __call__(
         self, power: Array, variance: Array, seen: Signals, *, full_overlap: float = FULL_OVERLAP
     ) -> MultiPositionResult:
         """Solve profiles (profile, ray, range), block by block."""
-        return solve(
+        return retrieve_network(
             power,
             seen.range,
             seen.network,
@@ -229,26 +229,26 @@ class Way:
         )
 
 
-EXACT: Final = Way("cycle, exact", Method.CYCLE)
-BEST: Final = Way("multiplier, best", Method.MULTIPLIER)
+EXACT: Final = NetworkSolver("cycle, exact", NetworkMethod.CYCLE)
+BEST: Final = NetworkSolver("multiplier, best", NetworkMethod.MULTIPLIER)
 PAPER_MULTIPLIER: Final = 0.8
-PAPER: Final = Way("multiplier 0.8", Method.MULTIPLIER, PAPER_MULTIPLIER)
-UNBIASED: Final = Way("unbiased 0.25", Method.UNBIASED, 0.25)
-SLOPE: Final = Way("slope", Method.SLOPE)
-KLETT: Final = Way("Klett, far end", Method.KLETT)
-FREE: Final = Way("network, no prior", Method.NETWORK, prior=Prior.NONE)
-NETWORK: Final = Way("network", Method.NETWORK)
+PAPER: Final = NetworkSolver("multiplier 0.8", NetworkMethod.MULTIPLIER, PAPER_MULTIPLIER)
+UNBIASED: Final = NetworkSolver("unbiased 0.25", NetworkMethod.UNBIASED, 0.25)
+SLOPE: Final = NetworkSolver("slope", NetworkMethod.SLOPE)
+KLETT: Final = NetworkSolver("Klett, far end", NetworkMethod.KLETT)
+FREE: Final = NetworkSolver("network, no prior", NetworkMethod.NETWORK, prior=FieldPrior.NONE)
+NETWORK: Final = NetworkSolver("network", NetworkMethod.NETWORK)
 
 
-def ways(place: Place) -> tuple[Way, ...]:
+def network_solvers(place: Place) -> tuple[NetworkSolver, ...]:
     """Return the ways that a network allows: cycles want one cycle of rays."""
     any_network = (SLOPE, KLETT, FREE, NETWORK)
     if place is not TRIANGLE:
         return any_network
     others = (
-        Way("multiplier 0.95", Method.MULTIPLIER, 0.95),
+        NetworkSolver("multiplier 0.95", NetworkMethod.MULTIPLIER, 0.95),
         PAPER,
-        Way("multiplier 0", Method.MULTIPLIER, 0.0),
+        NetworkSolver("multiplier 0", NetworkMethod.MULTIPLIER, 0.0),
     )
     return (EXACT, BEST, *others, UNBIASED, *any_network)
 
@@ -285,7 +285,7 @@ def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     place = Place("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
     net = place.network()
     lengths = np.array([np.ptp(net.on_ray(ray)[1]) for ray in range(3)])
-    walk = geometry.cycle(net)
+    walk = geometry.build_cycle(net)
     seen = signals(net, AIRS[0], _FIGURE_FIRST_GATE)
     truth = float(seen.extinction[0, walk.vertex[0]])
     depths = truth * lengths * [1.0, 1.0, -1.0]

@@ -9,22 +9,22 @@ from typing import Final
 import numpy as np
 
 from lidarops.bench.accuracy import network_cases as known
-from lidarops.bench.accuracy.homogeneous import Measured
+from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.accuracy.network_cases import FigurePoint, Place
 from lidarops.bench.accuracy.network_scores import (
     READ,
-    Case,
     Comparison,
     MultiPosition,
     MultiPositionThroughput,
-    Rate,
-    Score,
+    NetworkScenario,
+    NetworkScore,
     Sight,
+    SolverRate,
 )
 from lidarops.figures.charts import Chart, Panel, Series
 from lidarops.figures.wording import percent
-from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 _NONE: Final = "-"
 _DRAWN_AIRS: Final = tuple(air.name for air in known.AIRS if air.name != known.THIN)
@@ -34,9 +34,9 @@ _HIGHEST: Final = 2.0
 """Systematic error up to which figure 2 is drawn."""
 
 
-def accuracy_report(found: MultiPosition, data: str = "") -> Report:
+def network_accuracy_report(found: MultiPosition, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Networks of lidars: error of extinction and visibility against run time",
         facts=facts(found.date, found.machine),
         parts=(
@@ -50,9 +50,9 @@ def accuracy_report(found: MultiPosition, data: str = "") -> Report:
     )
 
 
-def throughput_report(found: MultiPositionThroughput, data: str = "") -> Report:
+def network_throughput_report(found: MultiPositionThroughput, data: str = "") -> BenchmarkReport:
     """Return the page of the throughput benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Networks of lidars: time per cycle and per profile",
         facts=facts(found.date, found.machine),
         parts=(_cycles(found.cycles), _profiles(found)),
@@ -84,8 +84,10 @@ def _errors(found: MultiPosition, place: Place) -> Part:
     )
 
 
-def _chart(cases: Sequence[Case], place: Place, comparisons: Sequence[Comparison]) -> Chart:
-    drawn = [way.name for way in known.ways(place) if way.name not in _LEFT_OUT]
+def _chart(
+    cases: Sequence[NetworkScenario], place: Place, comparisons: Sequence[Comparison]
+) -> Chart:
+    drawn = [way.name for way in known.network_solvers(place) if way.name not in _LEFT_OUT]
     return Chart(
         name=f"work-precision-{place.name.replace(' ', '')}",
         title=f"Error of extinction against run time, {place.name}",
@@ -108,7 +110,7 @@ def _chart(cases: Sequence[Case], place: Place, comparisons: Sequence[Comparison
     )
 
 
-def _way_series(cases: Sequence[Case], air: str, way: str) -> Series:
+def _way_series(cases: Sequence[NetworkScenario], air: str, way: str) -> Series:
     points = [
         (case.scores[way].microseconds, rmse.value, rmse.error)
         for case in cases
@@ -134,8 +136,8 @@ def _peer_series(comparisons: Sequence[Comparison]) -> Series:
     )
 
 
-def _first_vertex(cases: Sequence[Case], place: Place) -> Table:
-    names = [way.name for way in known.ways(place)]
+def _first_vertex(cases: Sequence[NetworkScenario], place: Place) -> Table:
+    names = [way.name for way in known.network_solvers(place)]
     return Table(
         title=f"{place.name.capitalize()}: visibility at the first vertex, mean / RMS error in %",
         columns=("air", "noise", *names),
@@ -152,12 +154,12 @@ def _first_vertex(cases: Sequence[Case], place: Place) -> Table:
     )
 
 
-def _bias_and_rmse(score: Score) -> str:
+def _bias_and_rmse(score: NetworkScore) -> str:
     bias, rmse = score.visibility_bias[0], score.visibility_rmse[0]
     return _NONE if bias is None or rmse is None else f"{_percents(bias)} / {_percents(rmse)}"
 
 
-def _network_table(cases: Sequence[Case], place: Place) -> Table:
+def _network_table(cases: Sequence[NetworkScenario], place: Place) -> Table:
     return Table(
         title=f"{place.name.capitalize()}: extinction by the network, all near vertices",
         columns=("air", "noise", *_COLUMNS),
@@ -169,7 +171,7 @@ def _network_table(cases: Sequence[Case], place: Place) -> Table:
     )
 
 
-def _case_table(case: Case) -> Table:
+def _case_table(case: NetworkScenario) -> Table:
     return Table(
         title=f"{case.place.capitalize()}, {case.air}, noise {_noise(case.noise)}",
         columns=("way", *_COLUMNS),
@@ -200,7 +202,7 @@ _NOTE: Final = (
 )
 
 
-def _cells(score: Score) -> tuple[str, ...]:
+def _cells(score: NetworkScore) -> tuple[str, ...]:
     vertices = [rmse.value for rmse in score.visibility_rmse if rmse is not None]
     within = [_NONE] * 3
     if score.within is not None:
@@ -399,7 +401,7 @@ def _peers(comparisons: Sequence[Comparison]) -> Part:
     )  # fmt: skip
 
 
-def _cycles(rates: Sequence[Rate]) -> Part:
+def _cycles(rates: Sequence[SolverRate]) -> Part:
     return Part(
         title="Cycles per second",
         text="Random cycles, one thread, least CPU time of interleaved repeats. Values and "
@@ -456,7 +458,7 @@ def _profiles(found: MultiPositionThroughput) -> Part:
     )
 
 
-def _whose(rate: Rate) -> str:
+def _whose(rate: SolverRate) -> str:
     return "ours" if rate.ours else "floor" if rate.way == READ else "peer"
 
 
@@ -464,13 +466,15 @@ def _noise(noise: float) -> str:
     return f"{100.0 * noise:g} %"
 
 
-def _percents(figure: Measured | None) -> str:
+def _percents(figure: MonteCarloFigure | None) -> str:
     if figure is None:
         return _NONE
-    return bracketed(Measured(100.0 * figure.value, 100.0 * figure.error), sign=True).lstrip("+")
+    return bracketed(
+        MonteCarloFigure(100.0 * figure.value, 100.0 * figure.error), sign=True
+    ).lstrip("+")
 
 
-def bracketed(figure: Measured, *, sign: bool = False) -> str:
+def bracketed(figure: MonteCarloFigure, *, sign: bool = False) -> str:
     """Return a figure with its error in units of the last digit."""
     plus = "+" if sign else ""
     if not figure.error > 0.0:

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.accuracy.homogeneous import SIGMAS, Measured
+from lidarops.bench.accuracy.homogeneous import SIGMAS, MonteCarloFigure
 from lidarops.bench.accuracy.network_cases import BLOCK, Array, FigurePoint
 from lidarops.bench.harness.timing import Machine
 from lidarops.retrieve.network.extinction_field import MultiPositionResult
@@ -25,7 +25,7 @@ READ: Final = "read (np.max)"
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class NetworkScore:
     """Errors of one way at the near vertices, relative to the truth. None where nothing is left.
 
     Monte Carlo errors are those of the scatter from block to block, as profiles of a block share
@@ -34,18 +34,18 @@ class Score:
 
     solved: float
     """Share of values that are not withheld."""
-    flagged: Measured
+    flagged: MonteCarloFigure
     """Share of values with any flag."""
-    bias: Measured | None
+    bias: MonteCarloFigure | None
     """Mean error of extinction."""
-    rmse: Measured | None
+    rmse: MonteCarloFigure | None
     """Root mean square error of extinction."""
-    unflagged_rmse: Measured | None
-    within: tuple[Measured, Measured, Measured] | None
+    unflagged_rmse: MonteCarloFigure | None
+    within: tuple[MonteCarloFigure, MonteCarloFigure, MonteCarloFigure] | None
     """Share of unflagged values within 1, 1.96 and 3 stated standard errors."""
-    visibility_bias: tuple[Measured | None, ...]
+    visibility_bias: tuple[MonteCarloFigure | None, ...]
     """Of visibility at each near vertex, the nearest first."""
-    visibility_rmse: tuple[Measured | None, ...]
+    visibility_rmse: tuple[MonteCarloFigure | None, ...]
     chi_square: float | None
     """Mean reduced chi-square of networks."""
     microseconds: float
@@ -55,14 +55,14 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class NetworkScenario:
     """One network in one air with one noise."""
 
     place: str
     air: str
     noise: float
     profiles: int
-    scores: Mapping[str, Score]
+    scores: Mapping[str, NetworkScore]
     """By way."""
 
 
@@ -76,13 +76,13 @@ class Sight:
     """Visibility times extinction."""
     visibility: float
     """Mean of the truth, m."""
-    bias: Measured
+    bias: MonteCarloFigure
     """m."""
-    rmse: Measured
+    rmse: MonteCarloFigure
     """m."""
-    within_error: Measured
+    within_error: MonteCarloFigure
     """Share of truths within one linear standard error."""
-    within_interval: Measured
+    within_interval: MonteCarloFigure
     """Share of truths from the lower to the upper visibility."""
 
 
@@ -103,7 +103,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True)
-class Rate:
+class SolverRate:
     """CPU time of one way to solve cycles, or profiles of a network."""
 
     way: str
@@ -123,12 +123,12 @@ class MultiPosition:
 
     date: str
     machine: Machine
-    cases: tuple[Case, ...]
+    cases: tuple[NetworkScenario, ...]
     figure: tuple[FigurePoint, ...]
     """Figure 2 of drabenko2021."""
     sights: tuple[Sight, ...]
     comparisons: tuple[Comparison, ...]
-    cycles: tuple[Rate, ...]
+    cycles: tuple[SolverRate, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +137,8 @@ class MultiPositionThroughput:
 
     date: str
     machine: Machine
-    cycles: tuple[Rate, ...]
-    profiles: tuple[Rate, ...]
+    cycles: tuple[SolverRate, ...]
+    profiles: tuple[SolverRate, ...]
     gain: float
     """Time on the wall of one thread over that of two with half of the cycles each."""
 
@@ -193,7 +193,7 @@ def joined(parts: Sequence[Errors]) -> Errors:
     )
 
 
-def mean_by_block(values: npt.NDArray[np.generic], kept: Booleans) -> Measured | None:
+def mean_by_block(values: npt.NDArray[np.generic], kept: Booleans) -> MonteCarloFigure | None:
     """Return the mean of kept values, with the error that their blocks scatter by.
 
     Parameters
@@ -215,14 +215,14 @@ def mean_by_block(values: npt.NDArray[np.generic], kept: Booleans) -> Measured |
         return None
     mean = totals.sum() / count
     scatter = np.sum((totals - mean * counts) ** 2) * blocks / max(blocks - 1, 1)
-    return Measured(float(mean), float(np.sqrt(scatter) / count))
+    return MonteCarloFigure(float(mean), float(np.sqrt(scatter) / count))
 
 
 def _rows(values: npt.NDArray[np.float64]) -> Array:
     return np.asarray(values.reshape(len(values), -1).sum(axis=1))
 
 
-def share_by_block(inside: Booleans, kept: Booleans) -> Measured | None:
+def share_by_block(inside: Booleans, kept: Booleans) -> MonteCarloFigure | None:
     """Return the share of kept values that are inside; the error is never 0."""
     found = mean_by_block(inside, kept)
     if found is None:
@@ -230,19 +230,21 @@ def share_by_block(inside: Booleans, kept: Booleans) -> Measured | None:
     profiles = int(np.count_nonzero(_rows(kept.astype(np.float64))))
     # Where all or none are inside, half a profile keeps the error from being zero.
     likely = (found.value * profiles + 0.5) / (profiles + 1)
-    return Measured(found.value, max(found.error, math.sqrt(likely * (1 - likely) / profiles)))
+    return MonteCarloFigure(
+        found.value, max(found.error, math.sqrt(likely * (1 - likely) / profiles))
+    )
 
 
-def root_by_block(errors: Array, kept: Booleans) -> Measured | None:
+def root_by_block(errors: Array, kept: Booleans) -> MonteCarloFigure | None:
     """Return the root mean square of kept errors, with the error that their blocks scatter by."""
     square = mean_by_block(errors**2, kept)
     if square is None:
         return None
     value = math.sqrt(square.value)
-    return Measured(value, square.error / (2.0 * value) if value > 0 else 0.0)
+    return MonteCarloFigure(value, square.error / (2.0 * value) if value > 0 else 0.0)
 
 
-def score(errors: Errors, microseconds: float, reads: float) -> Score:
+def score(errors: Errors, microseconds: float, reads: float) -> NetworkScore:
     """Return the score of one way in one case."""
     solved = np.isfinite(errors.extinction) & np.isfinite(errors.deviation)
     trusted = solved & ~errors.flagged
@@ -253,9 +255,9 @@ def score(errors: Errors, microseconds: float, reads: float) -> Score:
     )
     columns = range(solved.shape[1])
     fitted = errors.chi_square[np.isfinite(errors.chi_square)]
-    return Score(
+    return NetworkScore(
         solved=float(solved.mean()),
-        flagged=flagged if flagged is not None else Measured(0.0, 0.0),
+        flagged=flagged if flagged is not None else MonteCarloFigure(0.0, 0.0),
         bias=mean_by_block(errors.extinction, solved),
         rmse=root_by_block(errors.extinction, solved),
         unflagged_rmse=root_by_block(errors.extinction, trusted),

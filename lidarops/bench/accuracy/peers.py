@@ -33,7 +33,7 @@ _JAX_ITERATIONS: Final = 8
 _JAX_DAMPING: Final = 1e-6
 
 
-def peers() -> dict[str, Way]:
+def iterative_peers() -> dict[str, Way]:
     """Return the iterative solvers by name; the one in JAX only where that is installed."""
     found: dict[str, Way] = {
         JIT: compiled,
@@ -56,7 +56,9 @@ def compiled(power: Any, scenario: Scenario) -> Estimates:
     ratio, depth = _geometry(scenario)
     unknowns = np.empty((len(power), levenberg_marquardt.UNKNOWNS))
     covariance = np.empty((len(power), levenberg_marquardt.UNKNOWNS, levenberg_marquardt.UNKNOWNS))
-    levenberg_marquardt.solve_profiles(power, ratio, depth, start(scenario), unknowns, covariance)
+    levenberg_marquardt.fit_levenberg_marquardt(
+        power, ratio, depth, start(scenario), unknowns, covariance
+    )
     return _estimates(unknowns, covariance, scenario)
 
 

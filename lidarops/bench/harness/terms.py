@@ -28,7 +28,7 @@ class Finding:
 
     result: object
     """A frozen dataclass, or a list of them."""
-    report: benchmark_page.Report
+    report: benchmark_page.BenchmarkReport
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ _SHOTS: Final = elastic_cases.SHOTS
 
 
 @dataclass(frozen=True, slots=True)
-class Sky:
+class RandomSky:
     """What is there, (range,) each; the retrieval is told of none of it."""
 
     particles: Array
@@ -56,7 +56,7 @@ class Sky:
     """Share of the bins that lie off, each on its own."""
 
 
-def _sky(rng: Random) -> Sky:
+def _sky(rng: Random) -> RandomSky:
     """Return haze in a mixed layer and a layer aloft, none from 6 km on."""
     z = elastic_cases.RANGE
     top, amount = rng.uniform(500.0, 3000.0), np.exp(rng.uniform(np.log(1e-7), np.log(1e-5)))
@@ -64,52 +64,52 @@ def _sky(rng: Random) -> Sky:
     middle, half = rng.uniform(3500.0, 5000.0), rng.uniform(200.0, 900.0)
     aloft = rng.uniform(0.0, 1.0) * amount * np.exp(-0.5 * ((z - middle) / (0.3 * half)) ** 2)
     found = np.where(z < _CLEAN_FROM, mixed + aloft, 0.0)
-    return Sky(found, elastic_cases.LIDAR_RATIO)
+    return RandomSky(found, elastic_cases.LIDAR_RATIO)
 
 
-def _ratio(sky: Sky, rng: Random) -> Sky:
+def _ratio(sky: RandomSky, rng: Random) -> RandomSky:
     deviate = np.clip(rng.normal(), -3.0, 3.0)
     return replace(sky, lidar_ratio=sky.lidar_ratio * (1.0 + _RATIO_ERROR * deviate))
 
 
-def _as_is(sky: Sky, _: Random) -> Sky:
+def _as_is(sky: RandomSky, _: Random) -> RandomSky:
     return sky
 
 
-def _hazy(sky: Sky, rng: Random, *, least: float = 1e-9) -> Sky:
+def _hazy(sky: RandomSky, rng: Random, *, least: float = 1e-9) -> RandomSky:
     haze = np.exp(rng.uniform(np.log(least), np.log(100.0 * least)))
     return replace(sky, particles=sky.particles + haze * np.exp(-elastic_cases.RANGE / 5000.0))
 
 
-def _hazier(sky: Sky, rng: Random) -> Sky:
+def _hazier(sky: RandomSky, rng: Random) -> RandomSky:
     return _hazy(sky, rng, least=1e-8)
 
 
-def _dense(sky: Sky, rng: Random) -> Sky:
+def _dense(sky: RandomSky, rng: Random) -> RandomSky:
     return replace(sky, density=1.0 + _AIR_ERROR * float(np.clip(rng.normal(), -3.0, 3.0)))
 
 
-def _drifting(sky: Sky, rng: Random) -> Sky:
+def _drifting(sky: RandomSky, rng: Random) -> RandomSky:
     return replace(sky, background=rng.uniform(0.0, 3.0))
 
 
-def _clouded(sky: Sky, rng: Random) -> Sky:
+def _clouded(sky: RandomSky, rng: Random) -> RandomSky:
     return replace(sky, cloud=float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))))
 
 
-def _partly_seen(sky: Sky, rng: Random) -> Sky:
+def _partly_seen(sky: RandomSky, rng: Random) -> RandomSky:
     return replace(sky, overlap=rng.uniform(50.0, 300.0))
 
 
-def _holed(sky: Sky, rng: Random) -> Sky:
+def _holed(sky: RandomSky, rng: Random) -> RandomSky:
     return replace(sky, gaps=rng.uniform(0.0, 0.2))
 
 
-def _wild(sky: Sky, rng: Random) -> Sky:
+def _wild(sky: RandomSky, rng: Random) -> RandomSky:
     return replace(sky, wild=rng.uniform(0.0, 0.02))
 
 
-def _bent_ratio(sky: Sky, rng: Random) -> Sky:
+def _bent_ratio(sky: RandomSky, rng: Random) -> RandomSky:
     return replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0])))
 
 
@@ -119,7 +119,7 @@ _ALIKE: Final = (
     " error of the scattering ratio there can cover it"
 )
 _NEAR: Final = "a signal that is too low near the lidar is a signal of less haze"
-FAILURES: Final[tuple[tuple[Failure, Callable[[Sky, Random], Sky]], ...]] = (
+FAILURES: Final[tuple[tuple[Failure, Callable[[RandomSky, Random], RandomSky]], ...]] = (
     (Failure("none", satisfied=True), _as_is),
     (Failure("gaps", satisfied=True), _holed),
     (Failure("lidar ratio off as declared", unseen=_DECLARED), _ratio),
@@ -134,7 +134,7 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Sky, Random], Sky]], ...]] = (
 )
 
 
-def _signal(sky: Sky) -> Array:
+def _signal(sky: RandomSky) -> Array:
     """Return counts of a shot without noise; optical depth by trapezoids of a fifth of a bin."""
     air = MolecularProfile.us_standard()
     r = elastic_cases.RANGE
@@ -164,16 +164,16 @@ class _Found:
     solved: inversion.ElasticResult
 
 
-def _process(counts: Array, noise: Array, base: elastic_cases.Sky) -> _Found:
+def _process(counts: Array, noise: Array, base: elastic_cases.SimulatedSky) -> _Found:
     r = base.range
     with np.errstate(invalid="ignore"):
         rough = np.nanmedian(counts[:, -r.size // 10 :], axis=1)
-    bridged = outlying_bins.bridge(counts, r, noise, background=rough)
+    bridged = outlying_bins.bridge_outliers(counts, r, noise, background=rough)
     counts, noise = np.asarray(bridged.power, dtype=np.float64), bridged.variance
-    found = known_shape.solve(counts, r, base.shape, variance=noise)
+    found = known_shape.fit_known_shape(counts, r, base.shape, variance=noise)
     power = np.where(base.inverted, counts - found.background[:, np.newaxis], np.nan)
-    clouds = layers.screen(power, r, noise, molecular_attenuated=base.shape)
-    window = reference_window.choose(
+    clouds = layers.find_layers(power, r, noise, molecular_attenuated=base.shape)
+    window = reference_window.choose_reference(
         power, r, noise, molecular_attenuated=base.shape,
         candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
     )  # fmt: skip
@@ -189,9 +189,13 @@ def _doubts(found: known_shape.KnownShapeResult, window: reference_window.Refere
 
 
 def _solve(
-    power: Array, noise: Array, base: elastic_cases.Sky, edges: tuple[Array, Array], doubts: Array
+    power: Array,
+    noise: Array,
+    base: elastic_cases.SimulatedSky,
+    edges: tuple[Array, Array],
+    doubts: Array,
 ) -> inversion.ElasticResult:
-    return inversion.solve(
+    return inversion.invert_elastic(
         power, base.range, molecular_backscatter=base.molecular_backscatter,
         molecular_extinction=base.molecular_extinction, lidar_ratio=elastic_cases.LIDAR_RATIO,
         reference=edges, variance=noise, background_standard_error=doubts[0],
@@ -200,7 +204,9 @@ def _solve(
     )  # fmt: skip
 
 
-def visible(mean: Array, noise: Array, base: elastic_cases.Sky, found: _Found) -> Array:
+def visible_departure(
+    mean: Array, noise: Array, base: elastic_cases.SimulatedSky, found: _Found
+) -> Array:
     """Return (profile,) what the model cannot take up of signals without noise.
 
     What is assumed leaves few signs: the bins that give the background and those of the
@@ -225,7 +231,7 @@ def visible(mean: Array, noise: Array, base: elastic_cases.Sky, found: _Found) -
     )
     starts, stops, bottom, top = chosen[first].T
     rows = np.broadcast_to(mean, (first.size, mean.size))
-    fitted = known_shape.solve(
+    fitted = known_shape.fit_known_shape(
         rows, base.range, base.shape, variance=noise, start=starts, stop=stops
     )
     power = np.where(base.inverted, rows - fitted.background[:, np.newaxis], np.nan)
@@ -273,9 +279,9 @@ def _negative(solved: inversion.ElasticResult, power: Array, noise: Array) -> Ar
     return np.asarray(np.sum(deviates**2, axis=1) + np.sum(left**2, axis=1))
 
 
-def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+def judge_elastic(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Invert profiles of one random sky, class by class."""
-    base = elastic_cases.simulated()
+    base = elastic_cases.simulated_sky()
     for number, (failure, change) in enumerate(FAILURES):
         rng = np.random.default_rng((74, cluster, number))
         sky = change(_sky(rng), rng)
@@ -293,7 +299,7 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
         found = _process(counts, noise, base)
         hidden = None
         if not failure.satisfied:
-            hidden = visible(mean / _SHOTS, noise[0], base, found) < VISIBLE
+            hidden = visible_departure(mean / _SHOTS, noise[0], base, found) < VISIBLE
         if sky.wild:
             # The misfit of signals without noise knows nothing of single bins.
             hidden = np.zeros(profiles, dtype=np.bool_)
@@ -307,7 +313,11 @@ def _deviations(rng: Random, shape: tuple[int, ...], share: float) -> Array:
 
 
 def _judged(
-    failure: Failure, sky: Sky, found: _Found, base: elastic_cases.Sky, hidden: Mask | None
+    failure: Failure,
+    sky: RandomSky,
+    found: _Found,
+    base: elastic_cases.SimulatedSky,
+    hidden: Mask | None,
 ) -> Judged:
     r = base.range
     window, clouds, solved = found.window, found.clouds, found.solved

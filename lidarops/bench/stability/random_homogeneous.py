@@ -75,7 +75,7 @@ def between(rng: Random, low: float, high: float, count: int) -> Array:
     return np.exp(rng.uniform(np.log(low), np.log(high), (count, 1)))
 
 
-def scenes(cluster: int, profiles: int) -> tuple[Scenes, Random]:
+def random_paths(cluster: int, profiles: int) -> tuple[Scenes, Random]:
     """Return random paths of one geometry."""
     rng = np.random.default_rng((71, cluster))
     start = float(between(rng, *_STARTS, 1)[0, 0])
@@ -214,19 +214,19 @@ def least_relative_error(paths: Scenes) -> Array:
     return np.asarray(least / scale)
 
 
-def visible(range_: Array, signal: Array) -> Array:
+def visible_misfit(range_: Array, signal: Array) -> Array:
     """Return (profile,) what the model cannot take up of signals, over unit noise.
 
     The norm of what the best fit leaves over of the signals without noise: to first order their
     departure less its projections on what background, amplitude and extinction can change.
     """
-    found = path_fit.solve(signal, range_, variance=1.0)
+    found = path_fit.fit_homogeneous_path(signal, range_, variance=1.0)
     return np.sqrt(found.reduced_chi2 * (found.valid_bins - 3))
 
 
-def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+def judge_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Solve random paths of one geometry, class by class."""
-    paths, rng = scenes(cluster, profiles)
+    paths, rng = random_paths(cluster, profiles)
     with np.errstate(under="ignore", over="ignore", invalid="ignore", divide="ignore"):
         least = least_relative_error(paths)
     bounds = path_fit.HIGHEST_OPTICAL_DEPTH / float(paths.depth[0, -1])
@@ -243,7 +243,7 @@ def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
         noise = None if "not stated" in failure.name else 1.0
         wider = _widening(paths.range.size) if noise is None else 1.0
         could: Mask = within & (wider * least <= _SOLVABLE)
-        hidden = None if violate is _none else visible(paths.range, seen.signal) < VISIBLE
+        hidden = None if violate is _none else visible_misfit(paths.range, seen.signal) < VISIBLE
         yield from _solved(failure, paths, seen, power, (noise, could, hidden))
 
 
@@ -261,7 +261,7 @@ def _solved(
     known: tuple[float | None, Mask, Mask | None],
 ) -> Iterator[tuple[Judged, int]]:
     noise, could, hidden = known
-    found = path_fit.solve(power, paths.range, variance=noise)
+    found = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
     bits = np.asarray(found.quality)
     # Where bins are missing, less can be told than of all of them.
     likely = could if failure.satisfied and failure.name != "gaps" else None

@@ -31,7 +31,7 @@ class Told:
     exponent: float = 1.0
 
 
-def place(rng: Random) -> Place:
+def random_network(rng: Random) -> Place:
     """Return 3 or 4 lidars on a line with 1 or 2 rays each, which meet above it."""
     count = int(rng.integers(3, 5))
     east = np.linspace(-600.0, 600.0, count) + rng.uniform(-150.0, 150.0, count)
@@ -146,7 +146,7 @@ FAILURES: Final[tuple[tuple[Failure, Any, Any], ...]] = (
 )
 
 
-def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+def judge_networks(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Solve blocks of profiles of random networks, class by class."""
     for number, (failure, air_of, damage) in enumerate(FAILURES):
         # What bends do is as large in every layer, and half as many tell it.
@@ -174,14 +174,14 @@ def _tried(
 ) -> tuple[extinction_field.MultiPositionResult, Array] | None:
     """Return what is found and the truth; None where the rays do not meet."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
-    net = place(rng).network()
+    net = random_network(rng).network()
     if net.vertices < 2 or not np.all(np.diff(np.bincount(net.crossings.ray)) == 0):
         return None
     seen = signals(net, air_of(rng))
     power, variance = seen.draw(noise, profiles, int(rng.integers(2**31)))
     told = damage(Told(power, variance), seen, rng)
     try:
-        found = extinction_field.solve(
+        found = extinction_field.retrieve_network(
             told.power, seen.range, net, variance=told.variance, exponent=told.exponent,
             full_overlap_range=_FULL_OVERLAP, blocks=np.arange(profiles) // BLOCK,
         )  # fmt: skip

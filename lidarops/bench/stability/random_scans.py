@@ -102,13 +102,13 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
 )
 
 
-def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+def judge_scans(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Solve random scans of one geometry, class by class."""
     for number, (failure, change, damage) in enumerate(FAILURES):
         rng = np.random.default_rng((72, cluster, number))
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
         scan = damage(scene.draw(profiles, cluster, number, 72), rng)
-        found = optical_depth.solve(
+        found = optical_depth.retrieve_optical_depth(
             scan.signal, scene.zenith_angle, scene.altitude, variance=scan.variance,
             method="joint",
         )  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.accuracy.homogeneous import Measured
+from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.stability.stiff_cases import REJECTING, Array
 
 Mask = npt.NDArray[np.bool_]
@@ -87,7 +87,7 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True)
-class Rate:
+class FalseValueRate:
     """What came of the scenes of one class."""
 
     retrieval: str
@@ -95,27 +95,27 @@ class Rate:
     quantity: str
     scenes: int
     values: int
-    kept: Measured
+    kept: MonteCarloFigure
     """Share of the values that no bit rejects."""
-    false_random: Measured
+    false_random: MonteCarloFigure
     """Of these, off by more than 4 stated standard errors."""
-    false: Measured
+    false: MonteCarloFigure
     """Of these, off by more than 4 of random and systematic error together."""
-    false_undoubted: Measured
+    false_undoubted: MonteCarloFigure
     """The same of the values that the retrieval's own flags do not doubt either."""
-    false_hidden: Measured | None
+    false_hidden: MonteCarloFigure | None
     """Of `false_undoubted`, the part of violations that no test can be relied on to see; None
     where that is not known."""
-    false_seen: Measured
+    false_seen: MonteCarloFigure
     """The rest of it."""
-    false_of_seen: Measured | None
+    false_of_seen: MonteCarloFigure | None
     """That rest as a share of the values alone whose violation could be seen and was not; None
     where that is not known, or there are none."""
-    false_bare: Measured | None
+    false_bare: MonteCarloFigure | None
     """The same of the values without any bit; None where there are none."""
-    fine_of_rejected: Measured
+    fine_of_rejected: MonteCarloFigure
     """Share of the rejected values that are off by less than 2.5."""
-    needless: Measured | None
+    needless: MonteCarloFigure | None
     """Share flagged or withheld of the values that could be determined; None where the model does
     not hold, so that a flag is right, or where nothing is known to be solvable."""
     satisfied: bool
@@ -126,7 +126,7 @@ class Rate:
     unseen: str
 
     @property
-    def judged(self) -> Measured:
+    def judged(self) -> MonteCarloFigure:
         """What has to stay below the target: by random errors alone where the model holds."""
         return self.false_random if self.satisfied else self.false_seen
 
@@ -143,7 +143,7 @@ class Rate:
         return _held(self.needless, self.needless_target)
 
 
-def _held(found: Measured, target: float) -> Verdict:
+def _held(found: MonteCarloFigure, target: float) -> Verdict:
     if found.value <= target:
         return Verdict.MET
     above = found.value - 2.0 * found.error > target
@@ -170,7 +170,7 @@ class Tally:
             if judged.hidden is not None:
                 self.measured.add(key)
 
-    def rates(self, retrieval: str, needless: float | None) -> Iterator[Rate]:
+    def rates(self, retrieval: str, needless: float | None) -> Iterator[FalseValueRate]:
         """Give one rate for each class and quantity.
 
         Parameters
@@ -182,32 +182,34 @@ class Tally:
         for (name, quantity), chunks in self.counts.items():
             column = {one: np.array([chunk[one] for chunk in chunks]) for one in _COUNTS}
             failure = self.failures.get(name, Failure(name))
-            yield Rate(
+            yield FalseValueRate(
                 retrieval=retrieval,
                 failure=name,
                 quantity=quantity,
                 scenes=self.scenes[name, quantity],
                 values=int(column["values"].sum()),
-                kept=share(column["kept"], column["values"]),
-                false_random=share(column["false random"], column["kept"]),
-                false=share(column["false"], column["kept"]),
-                false_undoubted=share(column["false plain"], column["plain"]),
-                false_hidden=share(column["false hidden"], column["plain"])
+                kept=clustered_share(column["kept"], column["values"]),
+                false_random=clustered_share(column["false random"], column["kept"]),
+                false=clustered_share(column["false"], column["kept"]),
+                false_undoubted=clustered_share(column["false plain"], column["plain"]),
+                false_hidden=clustered_share(column["false hidden"], column["plain"])
                 if (name, quantity) in self.measured
                 else None,
-                false_seen=share(column["false plain"] - column["false hidden"], column["plain"]),
-                false_of_seen=share(
+                false_seen=clustered_share(
+                    column["false plain"] - column["false hidden"], column["plain"]
+                ),
+                false_of_seen=clustered_share(
                     column["false plain"] - column["false hidden"],
                     column["plain"] - column["plain hidden"],
                 )
                 if (name, quantity) in self.measured
                 and (column["plain"] > column["plain hidden"]).any()
                 else None,
-                false_bare=share(column["false bare"], column["bare"])
+                false_bare=clustered_share(column["false bare"], column["bare"])
                 if column["bare"].any()
                 else None,
-                fine_of_rejected=share(column["fine rejected"], column["rejected"]),
-                needless=share(column["solvable rejected"], column["solvable"])
+                fine_of_rejected=clustered_share(column["fine rejected"], column["rejected"]),
+                needless=clustered_share(column["solvable rejected"], column["solvable"])
                 if failure.satisfied and column["solvable"].any()
                 else None,
                 satisfied=failure.satisfied,
@@ -236,15 +238,15 @@ def collect(generator: Generator, clusters: int, progress: Callable[[int], objec
     return tally
 
 
-def share(part: Array, whole: Array) -> Measured:
+def clustered_share(part: Array, whole: Array) -> MonteCarloFigure:
     """Return a share with the Monte Carlo error of independent clusters."""
     total = float(whole.sum())
     if total == 0.0:
-        return Measured(0.0, 0.0)
+        return MonteCarloFigure(0.0, 0.0)
     value = float(part.sum()) / total
     error = float(np.sqrt(np.sum((part - value * whole) ** 2))) / total
     # Where none is found, one more keeps the error from being zero.
-    return Measured(value, max(error, 1.0 / total))
+    return MonteCarloFigure(value, max(error, 1.0 / total))
 
 
 def _counted(judged: Judged) -> dict[str, float]:

@@ -73,7 +73,7 @@ def _photon(rng: Random, profiles: int, *, off: float = 0.0, paralyzable: bool =
     rate, shots = _logarithmic(rng, 1e-2, 300.0), int(_logarithmic(rng, 50.0, 1e4))
     dead_time = _DEAD_TIME * (1.0 + off * rng.normal())
     counts = _counts(rng, rate, dead_time, shots, profiles, paralyzable=paralyzable)
-    found = counts_to_signal.photon(
+    found = counts_to_signal.photon_signal(
         counts, np.full(profiles, shots), RANGE[:_BINS], bin_width=_BIN_WIDTH,
         dead_time=_DEAD_TIME,
     )  # fmt: skip
@@ -94,16 +94,18 @@ def _analog(
     for _ in range(shots):
         sampled = np.rint(level + noise * rng.standard_normal(total.shape, dtype=np.float32))
         total += np.clip(sampled, 0.0, 2**_BITS - 1)
-    found = counts_to_signal.analog(
+    found = counts_to_signal.analog_signal(
         total.astype(np.int32), np.full(profiles, shots), RANGE[:_BINS], adc_bits=_BITS,
         input_range=np.full(profiles, 0.5),
     )  # fmt: skip
     return taken(found, level * _STEP, "voltage")
 
 
-def _far(rng: Random, profiles: int) -> tuple[elastic_cases.Sky, Array, Array, Array, float]:
+def _far(
+    rng: Random, profiles: int
+) -> tuple[elastic_cases.SimulatedSky, Array, Array, Array, float]:
     """Return the far range of profiles above a background: mean, counts and their variance."""
-    sky = elastic_cases.simulated()
+    sky = elastic_cases.simulated_sky()
     level = _logarithmic(rng, 1.0, 1e8)
     scale = _logarithmic(rng, 1e-3, 10.0)
     mean = elastic_cases.SHOTS * (scale * sky.signal + level)
@@ -117,7 +119,7 @@ def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Found:
     sky, clean, counts, variance, level = _far(rng, profiles)
     added = haze * rng.uniform(0.2, 1.0) * np.exp(-sky.range / 3000.0)
     shape = sky.shape * (1.0 + added)
-    found = known_shape.solve(counts, sky.range, shape, variance=variance)
+    found = known_shape.fit_known_shape(counts, sky.range, shape, variance=variance)
     bits = found.quality | np.where(
         found.singular, np.int32(Quality.POORLY_DETERMINED), np.int32(0)
     )
@@ -125,7 +127,7 @@ def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Found:
     if haze:
         # What the window that was chosen shows of the wrong shape without noise.
         rows = np.broadcast_to(clean, counts.shape)
-        left = known_shape.solve(
+        left = known_shape.fit_known_shape(
             rows, sky.range, shape, variance=variance, start=found.start, stop=found.stop
         )
         hidden = np.sqrt(left.chi2) < VISIBLE
@@ -194,7 +196,7 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Random, int], Found]], ...]] = (
 )
 
 
-def judged(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+def judge_signals(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
     """Process random counts, class by class."""
     for number, (failure, process) in enumerate(FAILURES):
         rng = np.random.default_rng((75, cluster, number))

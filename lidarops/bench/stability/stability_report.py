@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from lidarops.bench.accuracy.homogeneous import Measured
+from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.harness.timing import Machine
 from lidarops.bench.stability.random_scenes import (
@@ -16,12 +16,12 @@ from lidarops.bench.stability.random_scenes import (
     SATISFIED,
     VIOLATED,
     VISIBLE,
-    Rate,
+    FalseValueRate,
     Verdict,
 )
-from lidarops.bench.stability.stiff_cases import Outcome
+from lidarops.bench.stability.stiff_cases import CaseOutcome
 from lidarops.figures.wording import counted, duration
-from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 _NONE: Final = "-"
 _PASSED: Final = "passed"
@@ -31,7 +31,7 @@ _MENDED: Final = "passed, though listed as a finding"
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class PartCost:
     """CPU time of one part."""
 
     what: str
@@ -44,9 +44,9 @@ class Stability:
 
     date: str
     machine: Machine
-    outcomes: tuple[Outcome, ...]
-    rates: tuple[Rate, ...]
-    spent: tuple[Spent, ...]
+    outcomes: tuple[CaseOutcome, ...]
+    rates: tuple[FalseValueRate, ...]
+    spent: tuple[PartCost, ...]
 
     @property
     def failed(self) -> bool:
@@ -54,9 +54,9 @@ class Stability:
         return any(one.passed == bool(one.finding) for one in self.outcomes)
 
 
-def report(found: Stability, data: str = "") -> Report:
+def stability_report(found: Stability, data: str = "") -> BenchmarkReport:
     """Return the page."""
-    return Report(
+    return BenchmarkReport(
         title="Stability: stiff and extreme cases, and false values without a flag",
         facts=(
             *facts(found.date, found.machine),
@@ -70,14 +70,14 @@ def report(found: Stability, data: str = "") -> Report:
 # Cases ----------------------------------------------------------------------------------------
 
 
-def verdict(outcome: Outcome) -> str:
+def verdict(outcome: CaseOutcome) -> str:
     """Return what a case came to, in a word."""
     if outcome.finding:
         return _MENDED if outcome.passed else _KNOWN
     return _PASSED if outcome.passed else _FAILED
 
 
-def _cases(outcomes: tuple[Outcome, ...]) -> Part:
+def _cases(outcomes: tuple[CaseOutcome, ...]) -> Part:
     names = tuple(dict.fromkeys(one.retrieval for one in outcomes))
     passed = sum(one.passed for one in outcomes)
     return Part(
@@ -91,7 +91,7 @@ def _cases(outcomes: tuple[Outcome, ...]) -> Part:
     )
 
 
-def _overview(outcomes: tuple[Outcome, ...], names: tuple[str, ...]) -> Table:
+def _overview(outcomes: tuple[CaseOutcome, ...], names: tuple[str, ...]) -> Table:
     rows = []
     for name in names:
         words = [verdict(one) for one in outcomes if one.retrieval == name]
@@ -104,7 +104,7 @@ def _overview(outcomes: tuple[Outcome, ...], names: tuple[str, ...]) -> Table:
     )
 
 
-def _unmet(outcomes: tuple[Outcome, ...]) -> Table:
+def _unmet(outcomes: tuple[CaseOutcome, ...]) -> Table:
     return Table(
         title="Cases that do not come out as they should",
         columns=("case", "verdict", "expected", "got", "why"),
@@ -116,7 +116,7 @@ def _unmet(outcomes: tuple[Outcome, ...]) -> Table:
     )
 
 
-def _all_of(outcomes: tuple[Outcome, ...], name: str) -> Table:
+def _all_of(outcomes: tuple[CaseOutcome, ...], name: str) -> Table:
     return Table(
         title=f"All cases: {name}",
         columns=("case", "verdict", "expected", "got"),
@@ -131,7 +131,7 @@ def _all_of(outcomes: tuple[Outcome, ...], name: str) -> Table:
 # Rates ----------------------------------------------------------------------------------------
 
 
-def _rates(rates: tuple[Rate, ...]) -> Iterator[Part]:
+def _rates(rates: tuple[FalseValueRate, ...]) -> Iterator[Part]:
     for name in dict.fromkeys(one.retrieval for one in rates):
         own = [one for one in rates if one.retrieval == name]
         scenes = sum(one.scenes for one in own if one.quantity == own[0].quantity
@@ -148,7 +148,7 @@ def _rates(rates: tuple[Rate, ...]) -> Iterator[Part]:
         )
 
 
-def _told(rates: list[Rate]) -> str:
+def _told(rates: list[FalseValueRate]) -> str:
     """Say which classes miss their targets, and of which so few scenes do not tell."""
     parts = []
     for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNTOLD, "Not told by so few")):
@@ -162,7 +162,7 @@ def _told(rates: list[Rate]) -> str:
     return " ".join(parts) or "All targets are met."
 
 
-def _table(name: str, rates: list[Rate]) -> Table:
+def _table(name: str, rates: list[FalseValueRate]) -> Table:
     ordered = sorted(rates, key=lambda one: (one.quantity, one.failure == ALL))
     return Table(
         title=f"Values off by more than {FALSE:g} stated errors: {name}",
@@ -198,27 +198,27 @@ def _table(name: str, rates: list[Rate]) -> Table:
     )
 
 
-def _row(one: Rate) -> tuple[str, ...]:
+def _row(one: FalseValueRate) -> tuple[str, ...]:
     return (
         one.failure,
         one.quantity,
         f"{one.scenes:,}",
         f"{one.values:,}",
-        told(one.kept),
-        told(one.false_random),
-        told(one.false),
-        told(one.false_undoubted),
-        _NONE if one.false_hidden is None else told(one.false_hidden),
-        _NONE if one.false_of_seen is None else told(one.false_of_seen),
-        _NONE if one.false_bare is None else told(one.false_bare),
-        told(one.fine_of_rejected),
-        _NONE if one.needless is None else told(one.needless),
+        percent_with_error(one.kept),
+        percent_with_error(one.false_random),
+        percent_with_error(one.false),
+        percent_with_error(one.false_undoubted),
+        _NONE if one.false_hidden is None else percent_with_error(one.false_hidden),
+        _NONE if one.false_of_seen is None else percent_with_error(one.false_of_seen),
+        _NONE if one.false_bare is None else percent_with_error(one.false_bare),
+        percent_with_error(one.fine_of_rejected),
+        _NONE if one.needless is None else percent_with_error(one.needless),
         _goal(one),
         f"no: {one.unseen}" if one.unseen else "yes",
     )
 
 
-def _goal(one: Rate) -> str:
+def _goal(one: FalseValueRate) -> str:
     goal = f"{_percent(one.target)} {one.verdict}"
     if one.needless_verdict is None or one.needless_target is None:
         return goal
@@ -229,7 +229,7 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:g} %"
 
 
-def told(share: Measured) -> str:
+def percent_with_error(share: MonteCarloFigure) -> str:
     """Return a share in percent with its Monte Carlo error in the last digits."""
     value, error = 100.0 * share.value, 100.0 * share.error
     if error <= 0.0:

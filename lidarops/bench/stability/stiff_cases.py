@@ -78,7 +78,7 @@ class Expectation(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class StiffCase:
     """One stiff or extreme case."""
 
     name: str
@@ -93,7 +93,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CaseOutcome:
     """What came of a case."""
 
     name: str
@@ -321,16 +321,16 @@ class Honest:
         return float(off.max()), float(np.mean(off > self.errors)), float(np.mean(standing))
 
 
-def evaluate(case: Case) -> Outcome:
+def evaluate(case: StiffCase) -> CaseOutcome:
     """Return what comes of a case; a warning counts as a crash."""
     told = "; ".join(one.told() for one in case.expected)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         passed, got = _tried(case)
-    return Outcome(case.name, case.retrieval.value, told, got, passed, case.finding)
+    return CaseOutcome(case.name, case.retrieval.value, told, got, passed, case.finding)
 
 
-def _tried(case: Case) -> tuple[bool, str]:
+def _tried(case: StiffCase) -> tuple[bool, str]:
     try:
         answer = case.solve(**case.build())
     except LidarOpsError as error:

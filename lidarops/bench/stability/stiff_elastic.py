@@ -16,7 +16,6 @@ from lidarops.bench.stability.stiff_cases import (
     Answer,
     Array,
     Between,
-    Case,
     Honest,
     Missing,
     Near,
@@ -24,12 +23,13 @@ from lidarops.bench.stability.stiff_cases import (
     Refused,
     Retrieval,
     Stands,
+    StiffCase,
 )
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.elastic import inversion, layers, reference_window
 
-_case = partial(Case, retrieval=Retrieval.ELASTIC)
+_case = partial(StiffCase, retrieval=Retrieval.ELASTIC)
 _ANY: Final = Quality(REJECTING)
 _LOST: Final = Quality.UNSTABLE_INVERSION | Quality.NO_REFERENCE
 _SCALE: Final = 2e-5
@@ -37,13 +37,13 @@ _SCALE: Final = 2e-5
 
 
 @cache
-def sky() -> elastic_cases.Sky:
+def sky() -> elastic_cases.SimulatedSky:
     """Return the simulated air, which is made once."""
-    return elastic_cases.simulated()
+    return elastic_cases.simulated_sky()
 
 
-def arguments(draws: int = 1, *, level: float = 1.0, noise: bool = True) -> dict[str, Any]:
-    """Return arguments of `solve` for bins from 400 m to 12 km, the background subtracted."""
+def elastic_arguments(draws: int = 1, *, level: float = 1.0, noise: bool = True) -> dict[str, Any]:
+    """Return arguments of `solve_elastic` for bins from 400 m to 12 km, the background subtracted."""
     air = sky()
     part = (air.range > 400.0) & (air.range < 12e3)
     if noise:
@@ -64,14 +64,14 @@ def arguments(draws: int = 1, *, level: float = 1.0, noise: bool = True) -> dict
 
 
 def truth() -> Array:
-    """Return the backscatter of the particles in the bins of `arguments`."""
+    """Return the backscatter of the particles in the bins of `elastic_arguments`."""
     air = sky()
     return np.asarray(air.backscatter[(air.range > 400.0) & (air.range < 12e3)])
 
 
-def solve(compared: tuple[float, float] = (500.0, 6000.0), **given: Any) -> Answer:
+def solve_elastic(compared: tuple[float, float] = (500.0, 6000.0), **given: Any) -> Answer:
     """Solve, and return the particles between two ranges."""
-    found = inversion.solve(**given)
+    found = inversion.invert_elastic(**given)
     at = np.asarray(given["range"])
     inside = (at >= compared[0]) & (at <= compared[1])
     bits = np.where(found.valid, np.int32(0), np.int32(Quality.UNSTABLE_INVERSION))
@@ -88,28 +88,28 @@ def solve(compared: tuple[float, float] = (500.0, 6000.0), **given: Any) -> Answ
 
 
 def _inside(low: float = 500.0, high: float = 6000.0) -> Array:
-    at = arguments(noise=False)["range"]
+    at = elastic_arguments(noise=False)["range"]
     return np.asarray(truth()[(at >= low) & (at <= high)])
 
 
 def _changed(**more: Any) -> dict[str, Any]:
-    return arguments(50) | more
+    return elastic_arguments(50) | more
 
 
 def _scaled(factor: float) -> dict[str, Any]:
-    given = arguments(50)
+    given = elastic_arguments(50)
     return given | {"power": given["power"] * factor, "variance": given["variance"] * factor**2}
 
 
 def _gapped(width: float, at: float = 3000.0) -> dict[str, Any]:
-    given = arguments(50)
+    given = elastic_arguments(50)
     gap = np.abs(given["range"] - at) < 0.5 * width
     return given | {"power": np.where(gap, np.nan, given["power"])}
 
 
 def _thick(depth: float) -> dict[str, Any]:
     """Return a cloud of an optical depth of 3 km above the ground, looked at from above."""
-    given = arguments(noise=False)
+    given = elastic_arguments(noise=False)
     r = given["range"]
     cloud = np.exp(-0.5 * ((r - 3000.0) / 100.0) ** 2) / (100.0 * np.sqrt(2.0 * np.pi))
     through = depth * special.ndtr((r - 3000.0) / 100.0)
@@ -126,98 +126,98 @@ def _thick(depth: float) -> dict[str, Any]:
 
 
 def _behind(depth: float, low: float, high: float) -> Array:
-    at = arguments(noise=False)["range"]
+    at = elastic_arguments(noise=False)["range"]
     cloud = np.exp(-0.5 * ((at - 3000.0) / 100.0) ** 2) / (100.0 * np.sqrt(2.0 * np.pi))
     whole = truth() + depth * cloud / elastic_cases.LIDAR_RATIO
     return np.asarray(whole[(at >= low) & (at <= high)])
 
 
 def _descending() -> Answer:
-    given = arguments(5)
+    given = elastic_arguments(5)
     turned = dict(given) | {
         name: np.asarray(given[name])[..., ::-1]
         for name in ("power", "range", "variance", "molecular_backscatter", "molecular_extinction")
     }
-    one, other = inversion.solve(**given), inversion.solve(**turned)
+    one, other = inversion.invert_elastic(**given), inversion.invert_elastic(**turned)
     same = np.array_equal(one.backscatter, other.backscatter[..., ::-1], equal_nan=True)
     return Answer({"same bits": float(same)})
 
 
 def _coverage(**given: Any) -> Answer:
     """Return the share of the bins whose 95 % interval holds the truth."""
-    answer = solve(**given)
+    answer = solve_elastic(**given)
     off = np.abs(answer.value("backscatter") - _inside())
     stated = answer.value("backscatter_standard_error")
     return Answer({"coverage": np.mean(off <= 1.96 * stated)}, answer.quality)
 
 
-def _inversion() -> tuple[Case, ...]:
+def _inversion() -> tuple[StiffCase, ...]:
     honest = Honest("backscatter", _inside, most=1e-3)
     # Of 50 profiles of 367 bins, some lie beyond 4 standard errors by chance.
     tight = Honest("backscatter", _inside, valued=0.99, most=1e-3)
     return (
-        _case("no noise", build=lambda: arguments(noise=False), solve=solve,
+        _case("no noise", build=lambda: elastic_arguments(noise=False), solve=solve_elastic,
               expected=(Near("backscatter", _inside, 1e-4 * _SCALE, relative=False), Stands())),
-        _case("noise of counts, background 1", build=lambda: arguments(50), solve=_coverage,
+        _case("noise of counts, background 1", build=lambda: elastic_arguments(50), solve=_coverage,
               expected=(Between("coverage", 0.93, 0.97),)),
-        _case("background 1e7 counts", build=lambda: arguments(50, level=1e7), solve=solve,
+        _case("background 1e7 counts", build=lambda: elastic_arguments(50, level=1e7), solve=solve_elastic,
               expected=(replace(honest, valued=0.1),)),
         *(
-            _case(f"signals times {factor:g}", build=partial(_scaled, factor), solve=solve,
+            _case(f"signals times {factor:g}", build=partial(_scaled, factor), solve=solve_elastic,
                   expected=(tight,))
             for factor in (1e-30, 1e30, 1e-140, 1e140)
         ),
-        _case("all NaN", build=lambda: _changed(power=np.full((2, arguments()["range"].size),
+        _case("all NaN", build=lambda: _changed(power=np.full((2, elastic_arguments()["range"].size),
                                                               np.nan), variance=1.0),
-              solve=solve, expected=(Raised(_LOST), Missing("backscatter"))),
-        _case("zeros", build=lambda: _changed(power=np.zeros((2, arguments()["range"].size)),
+              solve=solve_elastic, expected=(Raised(_LOST), Missing("backscatter"))),
+        _case("zeros", build=lambda: _changed(power=np.zeros((2, elastic_arguments()["range"].size)),
                                               variance=1.0),
-              solve=solve, expected=(Raised(_LOST), Missing("backscatter"))),
-        _case("inverted signal", build=lambda: _changed(power=-arguments(50)["power"]),
-              solve=solve, expected=(Raised(_LOST), Missing("backscatter"))),
-        _case("gap of 100 m", build=partial(_gapped, 100.0), solve=solve, expected=(honest,)),
+              solve=solve_elastic, expected=(Raised(_LOST), Missing("backscatter"))),
+        _case("inverted signal", build=lambda: _changed(power=-elastic_arguments(50)["power"]),
+              solve=solve_elastic, expected=(Raised(_LOST), Missing("backscatter"))),
+        _case("gap of 100 m", build=partial(_gapped, 100.0), solve=solve_elastic, expected=(honest,)),
         _case("gap of 500 m: nothing is known below", build=partial(_gapped, 500.0),
-              solve=partial(solve, (500.0, 2700.0)),
+              solve=partial(solve_elastic, (500.0, 2700.0)),
               expected=(Raised(_LOST), Missing("backscatter"))),
         _case("no bin in the reference window",
-              build=lambda: _gapped(1100.0, 7500.0), solve=solve,
+              build=lambda: _gapped(1100.0, 7500.0), solve=solve_elastic,
               expected=(Raised(_LOST), Missing("backscatter"))),
-        _case("reference in noise alone", solve=solve,
-              build=lambda: arguments(50, level=1e7) | {"reference": (11000.0, 11500.0)},
+        _case("reference in noise alone", solve=solve_elastic,
+              build=lambda: elastic_arguments(50, level=1e7) | {"reference": (11000.0, 11500.0)},
               expected=(honest,)),
         _case("cloud of optical depth 10, from behind", build=partial(_thick, 10.0),
-              solve=partial(solve, (500.0, 2500.0)),
+              solve=partial(solve_elastic, (500.0, 2500.0)),
               expected=(Honest("backscatter", partial(_behind, 10.0, 500.0, 2500.0),
                                most=1e-3),)),
-        _case("lidar ratio 1e-6 sr", build=lambda: _changed(lidar_ratio=1e-6), solve=solve,
+        _case("lidar ratio 1e-6 sr", build=lambda: _changed(lidar_ratio=1e-6), solve=solve_elastic,
               expected=(Stands(),)),
-        _case("lidar ratio 1e4 sr", build=lambda: _changed(lidar_ratio=1e4), solve=solve,
+        _case("lidar ratio 1e4 sr", build=lambda: _changed(lidar_ratio=1e4), solve=solve_elastic,
               expected=(Stands(),)),
-        _case("wrong lidar ratio (60 for 39 sr), its error declared", solve=solve,
+        _case("wrong lidar ratio (60 for 39 sr), its error declared", solve=solve_elastic,
               build=lambda: _changed(lidar_ratio=60.0, lidar_ratio_standard_error=21.0),
               expected=(Honest("backscatter", _inside, most=1e-3, valued=0.5),)),
-        _case("aerosol of 10 % in the reference, declared", solve=solve,
+        _case("aerosol of 10 % in the reference, declared", solve=solve_elastic,
               build=lambda: _changed(reference_relative_error=0.1),
               expected=(tight,)),
         _case("descending ranges", build=dict, solve=_descending,
               expected=(Near("same bits", 1.0, 0.0),)),
-        _case("one bin", solve=partial(solve, (0.0, 1e9)),
+        _case("one bin", solve=partial(solve_elastic, (0.0, 1e9)),
               build=lambda: {"power": [[1.0]], "range": [500.0], "molecular_backscatter": 1e-6,
                              "molecular_extinction": 1e-5, "lidar_ratio": 40.0,
                              "reference": (400.0, 600.0), "variance": 1e-6},
               expected=(Honest("backscatter", 0.0),)),
         _case("denormal signals", build=lambda: _scaled(1.0) | {
-                  "power": arguments(2)["power"] * 1e-318, "variance": None},
-              solve=solve, expected=(Raised(_LOST, 0.5),)),
+                  "power": elastic_arguments(2)["power"] * 1e-318, "variance": None},
+              solve=solve_elastic, expected=(Raised(_LOST, 0.5),)),
     )  # fmt: skip
 
 
-def _refused(name: str, field: str | None, **more: Any) -> Case:
-    return _case(name, build=lambda: arguments() | more, solve=solve,
+def _refused(name: str, field: str | None, **more: Any) -> StiffCase:
+    return _case(name, build=lambda: elastic_arguments() | more, solve=solve_elastic,
                  expected=(Refused(RetrievalInputError, field),))  # fmt: skip
 
 
-def _refusals() -> tuple[Case, ...]:
+def _refusals() -> tuple[StiffCase, ...]:
     return (
         _refused("lidar ratio of zero", "lidar_ratio", lidar_ratio=0.0),
         _refused("lidar ratio NaN", "lidar_ratio", lidar_ratio=np.nan),
@@ -244,9 +244,9 @@ def _refusals() -> tuple[Case, ...]:
 # The reference window -------------------------------------------------------------------------
 
 
-def _chosen(power: Array, variance: Array, air: elastic_cases.Sky) -> Answer:
-    clouds = layers.screen(power, air.range, variance, molecular_attenuated=air.shape)
-    window = reference_window.choose(
+def _chosen(power: Array, variance: Array, air: elastic_cases.SimulatedSky) -> Answer:
+    clouds = layers.find_layers(power, air.range, variance, molecular_attenuated=air.shape)
+    window = reference_window.choose_reference(
         power, air.range, variance, molecular_attenuated=air.shape,
         candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
     )  # fmt: skip
@@ -263,7 +263,7 @@ def _window(level: float, *, haze: float = 0.0) -> Mapping[str, Any]:
     return {"power": power, "variance": elastic_cases.variance(counts), "air": air}
 
 
-def _windows() -> tuple[Case, ...]:
+def _windows() -> tuple[StiffCase, ...]:
     return (
         _case("reference, clear above 6 km", build=lambda: _window(10.0), solve=_chosen,
               expected=(Between("bottom", 5700.0, 12000.0), Stands(0.9))),
@@ -278,6 +278,6 @@ def _windows() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def cases() -> tuple[Case, ...]:
+def stiff_elastic_cases() -> tuple[StiffCase, ...]:
     """Return all of them."""
     return (*_inversion(), *_refusals(), *_windows())

@@ -12,10 +12,10 @@ from lidarops.bench.stability.stiff_cases import (
     Answer,
     Array,
     Between,
-    Case,
     Near,
     Refused,
     Retrieval,
+    StiffCase,
 )
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.errors import LidarOpsError, RetrievalInputError
@@ -24,7 +24,7 @@ from lidarops.simulate import analog, counting, pulse
 from lidarops.simulate import signal as short
 from lidarops.simulate.photoelectrons import release
 
-_case = partial(Case, retrieval=Retrieval.FORWARD)
+_case = partial(StiffCase, retrieval=Retrieval.FORWARD)
 _BIN_TIME: Final = 50e-9
 """s."""
 _DEAD_TIME: Final = 4e-9
@@ -91,7 +91,7 @@ def _near_lidar(**arguments: Any) -> Answer:
                    "signal at 3.75 m": found[0]})  # fmt: skip
 
 
-def _pulses() -> tuple[Case, ...]:
+def _pulses() -> tuple[StiffCase, ...]:
     rectangle = partial(hazy_rectangle, _FROM_100, 100e-9)
     return (
         _case("rectangular pulse of 100 ns without extinction",
@@ -164,7 +164,7 @@ def _digitised(rate: float, noise: float, offset: float = 100.3) -> Answer:
     return Answer({"steps": total.mean() / 100.0, "spread": total.std() / 10.0})
 
 
-def _recorders() -> tuple[Case, ...]:
+def _recorders() -> tuple[StiffCase, ...]:
     counters = (
         (1.0, False, 0.005, 0.03),
         (100.0, False, 0.005, 0.04),
@@ -221,7 +221,7 @@ def _profile(**arguments: Any) -> Answer:
     return Answer({"pressure": found.pressure})
 
 
-def _air() -> tuple[Case, ...]:
+def _air() -> tuple[StiffCase, ...]:
     levels = np.array([0.0, 5000.0, 11000.0])
     warm = np.array([288.15, 255.7, 216.8])
     columns = (
@@ -269,6 +269,6 @@ def _air() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def cases() -> tuple[Case, ...]:
+def stiff_forward_cases() -> tuple[StiffCase, ...]:
     """Return all of them."""
     return (*_pulses(), *_recorders(), *_air())

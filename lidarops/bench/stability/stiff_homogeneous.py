@@ -16,7 +16,6 @@ from lidarops.bench.stability.stiff_cases import (
     Answer,
     Array,
     Between,
-    Case,
     Honest,
     Missing,
     Near,
@@ -24,6 +23,7 @@ from lidarops.bench.stability.stiff_cases import (
     Refused,
     Retrieval,
     Stands,
+    StiffCase,
     Unflagged,
 )
 from lidarops.errors import RetrievalInputError
@@ -31,7 +31,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import path_fit
 
-_case = partial(Case, retrieval=Retrieval.HOMOGENEOUS)
+_case = partial(StiffCase, retrieval=Retrieval.HOMOGENEOUS)
 _DIGITS: Final = 60
 _NEWTON: Final = 400
 """Steps of the oracle's root, which starts far above it."""
@@ -76,7 +76,7 @@ class Path:
         return np.asarray(self.power + noise)
 
     def arguments(self, **changed: Any) -> dict[str, Any]:
-        """Return arguments of `solve` for noisy profiles of unit variance."""
+        """Return arguments of `solve_path` for noisy profiles of unit variance."""
         return {"power": self.noisy(), "range": self.range, "variance": 1.0, **changed}
 
 
@@ -86,9 +86,9 @@ CLEAR: Final = Path()
 # How they are solved --------------------------------------------------------------------------
 
 
-def solve(**arguments: Any) -> Answer:
+def solve_path(**arguments: Any) -> Answer:
     """Solve, and return every value."""
-    found = path_fit.solve(**arguments)
+    found = path_fit.fit_homogeneous_path(**arguments)
     names = ("background", "amplitude", "extinction")
     values = {name: getattr(found, name) for name in names}
     values |= {f"{name}_standard_error": getattr(found, f"{name}_standard_error") for name in names}
@@ -107,7 +107,7 @@ def cubic(**arguments: Any) -> Answer:
 
 def scattered(path: Path, **arguments: Any) -> Answer:
     """Return errors over the Cramér-Rao bound, over all profiles whether rejected or not."""
-    answer = solve(**arguments)
+    answer = solve_path(**arguments)
     error = answer.value("extinction") - path.extinction
     bound = least_errors(path.scenario)["extinction"]
     within = np.abs(error) <= 1.96 * answer.value("extinction_standard_error")
@@ -222,7 +222,7 @@ def _raised(first: int, bins: int, by: float) -> dict[str, Any]:
     return CLEAR.arguments(power=power)
 
 
-def _study() -> tuple[Case, ...]:
+def _study() -> tuple[StiffCase, ...]:
     return (
         _case("S1 cubic, 100 m at 10.5 km, background 700 signals, lag n / 3",
               build=lambda: _exact(_THIN, lag=75), solve=cubic,
@@ -236,8 +236,8 @@ def _study() -> tuple[Case, ...]:
         _case("S1 cubic, the same of float32 powers", build=lambda: _single(_THIN), solve=cubic,
               expected=(Raised(_ANY),)),
         _case("S1 least squares, the same of float32 powers", build=lambda: _single(_THIN),
-              solve=solve, expected=(Honest("background", 7e5), Honest("extinction", 3e-5))),
-        _case("S2 background of 1e8 signals, float32", build=lambda: _single(_DEEP), solve=solve,
+              solve=solve_path, expected=(Honest("background", 7e5), Honest("extinction", 3e-5))),
+        _case("S2 background of 1e8 signals, float32", build=lambda: _single(_DEEP), solve=solve_path,
               expected=(Raised(Quality.NO_SIGNAL), Near("background", 1e11, 1e-7))),
         _case("S2 cubic, the same, float64, lag 1, against 60 digits",
               build=lambda: _exact(_DEEP, lag=1, variance=0.0), solve=cubic,
@@ -246,14 +246,14 @@ def _study() -> tuple[Case, ...]:
         _case("S2 cubic, the same, against the truth", build=lambda: _exact(_DEEP, lag=1),
               solve=cubic, expected=(Honest("background", 1e11), Raised(_ANY))),
         _case("S3 extinction 1e-8 per km", build=lambda: _exact(Path(extinction=1e-11)),
-              solve=solve,
+              solve=solve_path,
               expected=(Near("background", 370.0, 1e-13 * 1000.0, relative=False),
                         Near("extinction", 1e-11, 1e-12, relative=False), Stands())),
         _case("S4 optical depth 40, signal 1e4",
               build=lambda: _STRONG.arguments(power=_STRONG.noisy(4000)),
               solve=partial(scattered, _STRONG),
               expected=(Between("RMSE over bound", 0.95, 1.06), Stands(0.99))),
-        _case("S4 cubic, the same", solve=solve,
+        _case("S4 cubic, the same", solve=solve_path,
               build=lambda: _STRONG.arguments(power=_STRONG.noisy(4000), method="cubic"),
               expected=(Honest("extinction", 5e-3),)),
         _case("S5 cubic, 1 km at 2.5 km: three real roots", solve=cubic,
@@ -265,11 +265,11 @@ def _study() -> tuple[Case, ...]:
               solve=partial(scattered, _WEAK),
               expected=(Near("share beyond 10 bounds", 0.0, 0.0, relative=False),
                         Between("RMSE over bound", 0.95, 1.06))),
-        _case("S7 extinction in m-1", build=lambda: _exact(CLEAR), solve=solve,
+        _case("S7 extinction in m-1", build=lambda: _exact(CLEAR), solve=solve_path,
               expected=(Near("extinction", 3e-5, 1e-9), Stands())),
         *(
             _case(f"S8 background 100 signals, 2.5 km at 10.5 km, {method}",
-                  build=partial(_exact, _SHIFTED, method=method), solve=solve,
+                  build=partial(_exact, _SHIFTED, method=method), solve=solve_path,
                   expected=(Near("extinction", 3e-5, tolerance),))
             for method, tolerance in (("direct", 1e-9), ("compressed", 1e-6), ("fast", 1e-6))
         ),
@@ -278,35 +278,35 @@ def _study() -> tuple[Case, ...]:
               expected=(Near("background", partial(_rooted, _FINE, 1365, np.float32),
                              1e-8 * 1000.0, relative=False),)),
         _case("S11 counts, background 10, signal 1e5, 51 shots",
-              build=lambda: _counted(51, 10.0, 1e5, 4000), solve=solve,
+              build=lambda: _counted(51, 10.0, 1e5, 4000), solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=0.99),)),
         _case("S12 counts of a single shot, background 10, signal 20",
-              build=lambda: _counted(1, 10.0, 20.0, 2000), solve=solve,
+              build=lambda: _counted(1, 10.0, 20.0, 2000), solve=solve_path,
               expected=(Raised(_ANY, 0.99),)),
-        _case("S13 saturated at 60 %", build=lambda: _saturated(masked=False), solve=solve,
+        _case("S13 saturated at 60 %", build=lambda: _saturated(masked=False), solve=solve_path,
               expected=(Raised(_WRONG),)),
-        _case("S13 the same, masked", build=lambda: _saturated(masked=True), solve=solve,
+        _case("S13 the same, masked", build=lambda: _saturated(masked=True), solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=0.99),)),
-        _case("S14 overlap of scale 1 km: a bias that nothing tells", solve=solve,
+        _case("S14 overlap of scale 1 km: a bias that nothing tells", solve=solve_path,
               build=lambda: _overlapped(1000.0),
               expected=(Honest("extinction", 3e-5, errors=6.0, valued=0.9),)),
-        _case("S14 overlap of scale 2 km", build=lambda: _overlapped(2000.0), solve=solve,
+        _case("S14 overlap of scale 2 km", build=lambda: _overlapped(2000.0), solve=solve_path,
               expected=(Raised(_WRONG),)),
         _case("S15 signal 1e5, 1.7 km",
               build=lambda: _STEEP.arguments(power=_STEEP.noisy(4000)),
               solve=partial(scattered, _STEEP),
               expected=(Between("RMSE over bound", 0.95, 1.05), Between("coverage", 0.93, 0.97))),
         _case("S16 inverted signal",
-              build=lambda: CLEAR.arguments(power=740.0 - CLEAR.noisy()), solve=solve,
+              build=lambda: CLEAR.arguments(power=740.0 - CLEAR.noisy()), solve=solve_path,
               expected=(Raised(Quality.NEGATIVE_AMPLITUDE),)),
-        _case("S17 ranges that are not uniform", build=_bent_arguments, solve=solve,
+        _case("S17 ranges that are not uniform", build=_bent_arguments, solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=0.99),)),
-        _case("S17 the same, cubic", build=lambda: _bent_arguments(method="cubic"), solve=solve,
+        _case("S17 the same, cubic", build=lambda: _bent_arguments(method="cubic"), solve=solve_path,
               expected=(Refused(RetrievalInputError, "range"),)),
-        _case("S18 cloud of 200 on 4 bins", build=lambda: _raised(100, 4, 200.0), solve=solve,
+        _case("S18 cloud of 200 on 4 bins", build=lambda: _raised(100, 4, 200.0), solve=solve_path,
               expected=(Between("reduced_chi2", 100.0, np.inf), Raised(_WRONG))),
         _case("one bin 8 standard deviations off", build=lambda: _raised(100, 1, 8.0),
-              solve=solve, expected=(Raised(Quality.OUTLIER, 0.95),
+              solve=solve_path, expected=(Raised(Quality.OUTLIER, 0.95),
                                      Honest("extinction", 3e-5, valued=0.5))),
     )  # fmt: skip
 
@@ -347,8 +347,10 @@ def _mixed() -> dict[str, Any]:
 
 
 def _one_by_one() -> Answer:
-    together = path_fit.solve(**_mixed())
-    apart = [path_fit.solve(**_mixed() | {"power": row}) for row in _mixed()["power"]]
+    together = path_fit.fit_homogeneous_path(**_mixed())
+    apart = [
+        path_fit.fit_homogeneous_path(**_mixed() | {"power": row}) for row in _mixed()["power"]
+    ]
     same = all(
         np.array_equal(
             getattr(together, name), [getattr(one, name) for one in apart], equal_nan=True
@@ -370,7 +372,7 @@ def _long(bins: int, method: str) -> dict[str, Any]:
 def _memory(**arguments: Any) -> Answer:
     """Return the most memory that a solution holds at once."""
     tracemalloc.start()
-    solve(**arguments)
+    solve_path(**arguments)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return Answer({"MB": peak / 1e6})
@@ -380,55 +382,55 @@ def _memory(**arguments: Any) -> Answer:
 _SAME: Final = (Near("change", 0.0, 1e-6, relative=False), Near("same flags", 1.0, 0.0))
 
 
-def _unsolvable() -> tuple[Case, ...]:
+def _unsolvable() -> tuple[StiffCase, ...]:
     no_value = (Missing("extinction"), Missing("extinction_standard_error"))
     return (
         *(
-            _case(f"S10 constant {value:g}", build=partial(_flat, value), solve=solve,
+            _case(f"S10 constant {value:g}", build=partial(_flat, value), solve=solve_path,
                   expected=(Raised(Quality.NO_SIGNAL),
                             Near("background", value, 0.0, relative=False),
                             Near("amplitude", 0.0, 0.0, relative=False), Missing("extinction")))
             for value in (0.0, 370.0, -2.0, 1e30, 1e-310)
         ),
-        _case("S10 all NaN", build=lambda: _flat(np.nan), solve=solve,
+        _case("S10 all NaN", build=lambda: _flat(np.nan), solve=solve_path,
               expected=(Raised(Quality.INPUT_MISSING), Missing("background"), *no_value)),
-        _case("all infinite", build=lambda: _flat(np.inf), solve=solve,
+        _case("all infinite", build=lambda: _flat(np.inf), solve=solve_path,
               expected=(Raised(Quality.INPUT_MISSING), Missing("background"), *no_value)),
-        _case("S10 7 bins", build=lambda: _few(7), solve=solve,
+        _case("S10 7 bins", build=lambda: _few(7), solve=solve_path,
               expected=(Raised(Quality.TOO_FEW_BINS),)),
-        _case("7 of 225 bins valid", build=lambda: _holed(7, 218), solve=solve,
+        _case("7 of 225 bins valid", build=lambda: _holed(7, 218), solve=solve_path,
               expected=(Raised(Quality.TOO_FEW_BINS),)),
-        _case("S10 3 bins", build=lambda: _few(3), solve=solve,
+        _case("S10 3 bins", build=lambda: _few(3), solve=solve_path,
               expected=(Raised(Quality.TOO_FEW_BINS), *no_value)),
         _case("S10 cubic, 3 bins", build=lambda: {"power": replace(CLEAR, bins=3).power,
                                                   "range": replace(CLEAR, bins=3).range},
               solve=cubic, expected=(Raised(Quality.TOO_FEW_BINS),)),
-        _case("one bin", build=lambda: {"power": [[370.0]], "range": [2500.0]}, solve=solve,
+        _case("one bin", build=lambda: {"power": [[370.0]], "range": [2500.0]}, solve=solve_path,
               expected=(Raised(Quality.TOO_FEW_BINS | Quality.NO_SIGNAL), *no_value)),
         _case("no profile", build=lambda: {"power": np.empty((0, 225)), "range": CLEAR.range},
-              solve=solve, expected=(Unflagged(),)),
-        _case("pure noise, 50 000 profiles", build=_noise_alone, solve=solve,
+              solve=solve_path, expected=(Unflagged(),)),
+        _case("pure noise, 50 000 profiles", build=_noise_alone, solve=solve_path,
               expected=(Raised(_ANY, 1.0 - 1e-4),)),
-        _case("gap of 60 bins", build=lambda: _holed(80, 60), solve=solve,
+        _case("gap of 60 bins", build=lambda: _holed(80, 60), solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=0.99),)),
-        _case("30 % of the bins missing", build=_sparse, solve=solve,
+        _case("30 % of the bins missing", build=_sparse, solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=0.99),)),
-        _case("first 20 bins infinite", build=lambda: _holed(0, 20, np.inf), solve=solve,
+        _case("first 20 bins infinite", build=lambda: _holed(0, 20, np.inf), solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=0.99),)),
-        _case("background below zero", solve=solve,
+        _case("background below zero", solve=solve_path,
               build=lambda: CLEAR.arguments(power=CLEAR.noisy() - 372.0),
               expected=(Honest("extinction", 3e-5, valued=0.99),)),
         _case("profiles missing, infinite and zero among good ones", build=dict,
               solve=_one_by_one, expected=(Near("same bits", 1.0, 0.0),)),
         _case("no noise at all, stated so", build=lambda: _exact(CLEAR, variance=0.0),
-              solve=solve, expected=(Honest("extinction", 3e-5), Raised(_ANY))),
+              solve=solve_path, expected=(Honest("extinction", 3e-5), Raised(_ANY))),
         _case("infinite variance in all bins", build=lambda: CLEAR.arguments(variance=np.inf),
-              solve=solve, expected=(Raised(_ANY), *no_value)),
-        _case("a variance of 1e300", build=lambda: CLEAR.arguments(variance=1e300), solve=solve,
+              solve=solve_path, expected=(Raised(_ANY), *no_value)),
+        _case("a variance of 1e300", build=lambda: CLEAR.arguments(variance=1e300), solve=solve_path,
               expected=(Raised(_ANY),)),
-        _case("200 000 bins, direct", build=partial(_long, 200_000, "direct"), solve=solve,
+        _case("200 000 bins, direct", build=partial(_long, 200_000, "direct"), solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=1.0),)),
-        _case("a million bins", build=partial(_long, 1_000_000, "auto"), solve=solve,
+        _case("a million bins", build=partial(_long, 1_000_000, "auto"), solve=solve_path,
               expected=(Honest("extinction", 3e-5, valued=1.0),)),
         *(
             _case(f"memory of {bins} bins, {most} MB at most", solve=_memory,
@@ -436,7 +438,7 @@ def _unsolvable() -> tuple[Case, ...]:
                   expected=(Between("MB", 0.0, float(most)),))
             for bins, most in ((4096, 100), (4097, 100), (1_000_000, 1000))
         ),
-        _case("8 bins", build=lambda: _few(8), solve=solve,
+        _case("8 bins", build=lambda: _few(8), solve=solve_path,
               expected=(Honest("extinction", 3e-5),)),
         *(
             _case(f"signals times {factor:g}", build=partial(_scaled, factor), solve=_rescaled,
@@ -445,14 +447,14 @@ def _unsolvable() -> tuple[Case, ...]:
         ),
         _case("denormal signals", build=lambda: {**_scaled(1.0), "power": CLEAR.noisy() * 1e-312,
                                                  "variance": None},
-              solve=solve, expected=(Honest("extinction", 3e-5),)),
+              solve=solve_path, expected=(Honest("extinction", 3e-5),)),
     )  # fmt: skip
 
 
 def _rescaled(power: Array, range: Array, variance: float) -> Answer:  # noqa: A002
     factor = np.sqrt(variance)
-    one = path_fit.solve(power, range, variance=variance)
-    other = path_fit.solve(power / factor, range, variance=1.0)
+    one = path_fit.fit_homogeneous_path(power, range, variance=variance)
+    other = path_fit.fit_homogeneous_path(power / factor, range, variance=1.0)
     change = max(
         float(np.max(np.abs(one.extinction / other.extinction - 1.0))),
         float(np.max(np.abs(one.background / factor / other.background - 1.0))),
@@ -461,10 +463,10 @@ def _rescaled(power: Array, range: Array, variance: float) -> Answer:  # noqa: A
     return Answer({"change": change, "same flags": alike}, np.asarray(one.quality))
 
 
-def _refusals() -> tuple[Case, ...]:
-    def wrong(name: str, field: str, **changed: Any) -> Case:
+def _refusals() -> tuple[StiffCase, ...]:
+    def wrong(name: str, field: str, **changed: Any) -> StiffCase:
         arguments = {"power": CLEAR.power, "range": CLEAR.range, **changed}
-        return _case(name, build=lambda: arguments, solve=solve,
+        return _case(name, build=lambda: arguments, solve=solve_path,
                      expected=(Refused(RetrievalInputError, field),))  # fmt: skip
 
     r = CLEAR.range
@@ -486,6 +488,6 @@ def _refusals() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def cases() -> tuple[Case, ...]:
+def stiff_homogeneous_cases() -> tuple[StiffCase, ...]:
     """Return all of them."""
     return (*_study(), *_unsolvable(), *_refusals())

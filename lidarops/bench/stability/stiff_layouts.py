@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.bench.stability import stiff_elastic, stiff_networks, stiff_scans
-from lidarops.bench.stability.stiff_cases import Answer, Case, Near, Refused, Retrieval
+from lidarops.bench.stability.stiff_cases import Answer, Near, Refused, Retrieval, StiffCase
 from lidarops.bench.stability.stiff_homogeneous import CLEAR
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -55,13 +55,13 @@ REFUSED: Final[dict[str, Layout]] = {
 
 
 def _homogeneous(array: Any, layout: Layout) -> Mapping[str, Any]:
-    found = path_fit.solve(layout(array), layout(CLEAR.range), variance=1.0)
+    found = path_fit.fit_homogeneous_path(layout(array), layout(CLEAR.range), variance=1.0)
     return {n: getattr(found, n) for n in ("background", "extinction", "quality", "reduced_chi2")}
 
 
 def _signal(array: Any, layout: Layout) -> Mapping[str, Any]:
     distance = 7.5 * np.arange(1, array.shape[-1] + 1, dtype=np.float64)
-    found = counts_to_signal.photon(
+    found = counts_to_signal.photon_signal(
         layout(array), layout(np.full(array.shape[0], 600)), layout(distance), bin_width=7.5,
         dead_time=4e-9,
     )  # fmt: skip
@@ -69,23 +69,23 @@ def _signal(array: Any, layout: Layout) -> Mapping[str, Any]:
 
 
 def _elastic(array: Any, layout: Layout) -> Mapping[str, Any]:
-    given = stiff_elastic.arguments(array.shape[0])
+    given = stiff_elastic.elastic_arguments(array.shape[0])
     changed = {n: layout(np.asarray(given[n])) for n in ("range", "molecular_backscatter")}
-    found = inversion.solve(**given | changed | {"power": layout(array)})
+    found = inversion.invert_elastic(**given | changed | {"power": layout(array)})
     return {n: getattr(found, n) for n in ("backscatter", "backscatter_standard_error", "valid")}
 
 
 def _scans(array: Any, layout: Layout) -> Mapping[str, Any]:
-    given = stiff_scans.arguments(profiles=array.shape[0])
+    given = stiff_scans.scan_arguments(profiles=array.shape[0])
     changed = {n: layout(np.asarray(given[n])) for n in ("zenith_angle", "altitude")}
-    found = optical_depth.solve(**given | changed | {"signal": layout(array)})
+    found = optical_depth.retrieve_optical_depth(**given | changed | {"signal": layout(array)})
     return {n: getattr(found, n) for n in ("optical_depth", "extinction", "quality")}
 
 
 def _network(array: Any, layout: Layout) -> Mapping[str, Any]:
-    given = stiff_networks.arguments()
+    given = stiff_networks.network_arguments()
     changed = {"power": layout(array), "range": layout(given["range"])}
-    found = extinction_field.solve(**given | changed)
+    found = extinction_field.retrieve_network(**given | changed)
     return {n: getattr(found, n) for n in ("extinction", "extinction_standard_error")}
 
 
@@ -99,7 +99,7 @@ def _labeled(array: Any, chunk: int) -> Mapping[str, Any]:
     sections = [(2500.0, 6000.0), (6000.0, 10000.0)]
     if chunk:
         power = power.chunk({"time": chunk, "range": 50})
-    found = labeled.homogeneous(power, sections=sections, variance=1.0).compute()
+    found = labeled.fit_homogeneous_path(power, sections=sections, variance=1.0).compute()
     return {str(name): found[name].to_numpy() for name in found.data_vars}
 
 
@@ -131,9 +131,13 @@ def _counts() -> Any:
 _SOLVED: Final[dict[Retrieval, tuple[Solver, Callable[[], Any], str]]] = {
     Retrieval.HOMOGENEOUS: (_homogeneous, lambda: CLEAR.noisy(20), "power"),
     Retrieval.SIGNAL: (_signal, _counts, "counts"),
-    Retrieval.ELASTIC: (_elastic, lambda: stiff_elastic.arguments(5)["power"], "power"),
-    Retrieval.MULTIANGLE: (_scans, lambda: stiff_scans.arguments()["signal"], "signal"),
-    Retrieval.MULTIPOSITION: (_network, lambda: stiff_networks.arguments()["power"], "power"),
+    Retrieval.ELASTIC: (_elastic, lambda: stiff_elastic.elastic_arguments(5)["power"], "power"),
+    Retrieval.MULTIANGLE: (_scans, lambda: stiff_scans.scan_arguments()["signal"], "signal"),
+    Retrieval.MULTIPOSITION: (
+        _network,
+        lambda: stiff_networks.network_arguments()["power"],
+        "power",
+    ),
 }
 _FLOAT32: Final = {
     Retrieval.HOMOGENEOUS: "extinction",
@@ -143,9 +147,9 @@ _FLOAT32: Final = {
 }
 
 
-def _laid_out(retrieval: Retrieval, name: str, layout: Layout) -> Case:
+def _laid_out(retrieval: Retrieval, name: str, layout: Layout) -> StiffCase:
     solver, array, _ = _SOLVED[retrieval]
-    return Case(
+    return StiffCase(
         f"{retrieval.value}: arrays {name}",
         retrieval,
         dict,
@@ -154,13 +158,13 @@ def _laid_out(retrieval: Retrieval, name: str, layout: Layout) -> Case:
     )
 
 
-def _refused(retrieval: Retrieval, name: str, layout: Layout) -> Case:
+def _refused(retrieval: Retrieval, name: str, layout: Layout) -> StiffCase:
     solver, array, field = _SOLVED[retrieval]
 
     def signals_alone(values: Any) -> Any:
         return layout(values) if np.ndim(values) > 1 else values
 
-    return Case(
+    return StiffCase(
         f"{retrieval.value}: signals as {name}",
         retrieval,
         dict,
@@ -169,9 +173,9 @@ def _refused(retrieval: Retrieval, name: str, layout: Layout) -> Case:
     )
 
 
-def _single(retrieval: Retrieval, quantity: str) -> Case:
+def _single(retrieval: Retrieval, quantity: str) -> StiffCase:
     solver, array, _ = _SOLVED[retrieval]
-    return Case(
+    return StiffCase(
         f"{retrieval.value}: float32",
         retrieval,
         dict,
@@ -192,8 +196,8 @@ def _blocks() -> Answer:
     """Compare profiles one by one with all at once, some of them all NaN."""
     power = CLEAR.noisy(60)
     power[10:30] = np.nan
-    found = path_fit.solve(power, CLEAR.range, variance=1.0)
-    clean = path_fit.solve(CLEAR.noisy(60), CLEAR.range, variance=1.0)
+    found = path_fit.fit_homogeneous_path(power, CLEAR.range, variance=1.0)
+    clean = path_fit.fit_homogeneous_path(CLEAR.noisy(60), CLEAR.range, variance=1.0)
     kept = np.delete(np.arange(60), np.arange(10, 30))
     same = np.array_equal(found.extinction[kept], clean.extinction[kept])
     lost = np.isnan(found.extinction[10:30]).all()
@@ -203,16 +207,16 @@ def _blocks() -> Answer:
 
 def _turned() -> Answer:
     power = CLEAR.noisy(20)
-    one = path_fit.solve(power[:, ::-1], CLEAR.range[::-1], variance=1.0)
-    other = path_fit.solve(power, CLEAR.range, variance=1.0)
+    one = path_fit.fit_homogeneous_path(power[:, ::-1], CLEAR.range[::-1], variance=1.0)
+    other = path_fit.fit_homogeneous_path(power, CLEAR.range, variance=1.0)
     return Answer({"same bits": float(np.array_equal(one.extinction, other.extinction))})
 
 
-def cases() -> tuple[Case, ...]:
+def memory_layout_cases() -> tuple[StiffCase, ...]:
     """Return all of them."""
     same = (Near("same bits", 1.0, 0.0),)
     chunks = tuple(
-        Case(f"dask, chunks of {counted} by 50 bins", Retrieval.HOMOGENEOUS, dict,
+        StiffCase(f"dask, chunks of {counted} by 50 bins", Retrieval.HOMOGENEOUS, dict,
              partial(_alike, _labeled, lambda: CLEAR.noisy(20), size, 0), same)
         for size, counted in ((1, "one profile"), (7, "7 profiles"))
     )  # fmt: skip
@@ -222,7 +226,7 @@ def cases() -> tuple[Case, ...]:
         *(_refused(r, name, way) for r in _SOLVED for name, way in REFUSED.items()),
         *(_single(r, quantity) for r, quantity in _FLOAT32.items()),
         *chunks,
-        Case("whole numbers", Retrieval.HOMOGENEOUS, dict, _whole_numbers, same),
-        Case("blocks of all NaN", Retrieval.HOMOGENEOUS, dict, _blocks, same),
-        Case("descending ranges", Retrieval.HOMOGENEOUS, dict, _turned, same),
+        StiffCase("whole numbers", Retrieval.HOMOGENEOUS, dict, _whole_numbers, same),
+        StiffCase("blocks of all NaN", Retrieval.HOMOGENEOUS, dict, _blocks, same),
+        StiffCase("descending ranges", Retrieval.HOMOGENEOUS, dict, _turned, same),
     )  # fmt: skip

@@ -22,7 +22,6 @@ from lidarops.bench.stability.stiff_cases import (
     Answer,
     Array,
     Between,
-    Case,
     Honest,
     Missing,
     Near,
@@ -30,6 +29,7 @@ from lidarops.bench.stability.stiff_cases import (
     Refused,
     Retrieval,
     Stands,
+    StiffCase,
 )
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -37,7 +37,7 @@ from lidarops.retrieve.air import visibility
 from lidarops.retrieve.network import cycles, extinction_field, geometry
 from lidarops.retrieve.network.extinction_field import MultiPositionResult
 
-_case = partial(Case, retrieval=Retrieval.MULTIPOSITION)
+_case = partial(StiffCase, retrieval=Retrieval.MULTIPOSITION)
 _ANY: Final = Quality(REJECTING)
 FLAGGED: Final = Quality.UNSTABLE_INVERSION
 """Stands for any of the retrieval's own flags that doubt a value."""
@@ -57,9 +57,9 @@ def answered(found: MultiPositionResult) -> Answer:
     )
 
 
-def solve(near: bool = True, **arguments: Any) -> Answer:  # noqa: FBT001, FBT002
+def solve_network(near: bool = True, **arguments: Any) -> Answer:  # noqa: FBT001, FBT002
     """Solve, and return the vertices that are near ones, or all."""
-    found = extinction_field.solve(**arguments)
+    found = extinction_field.retrieve_network(**arguments)
     answer = answered(found)
     if not near:
         return answer
@@ -69,7 +69,7 @@ def solve(near: bool = True, **arguments: Any) -> Answer:  # noqa: FBT001, FBT00
 
 def start_vertex(walk: geometry.Cycle, **arguments: Any) -> Answer:
     """Solve a cycle, and return the vertex at which it starts."""
-    answer = answered(extinction_field.solve(cycle=walk, **arguments))
+    answer = answered(extinction_field.retrieve_network(cycle=walk, **arguments))
     first = int(walk.vertex[0])
     values = {name: answer.value(name)[..., first] for name in answer.values}
     return Answer(values, answer.quality[..., first])
@@ -80,7 +80,7 @@ def homogeneous(extinction: float) -> Air:
     return Air("homogeneous", lambda _: lambda __, up: np.full_like(up, extinction))
 
 
-def arguments(
+def network_arguments(
     place: Place = TRIANGLE,
     air: Air = AIRS[0],
     noise: float = 0.01,
@@ -88,7 +88,7 @@ def arguments(
     additive: float = 0.0,
     **more: Any,
 ) -> dict[str, Any]:
-    """Return arguments of `solve` for profiles with relative noise."""
+    """Return arguments of `solve_network` for profiles with relative noise."""
     seen = signals(place.network(), air)
     power, variance = seen.draw(noise, _PROFILES, 51, additive=additive)
     given: dict[str, Any] = {
@@ -98,31 +98,33 @@ def arguments(
     return given | more
 
 
-def place(elevation: float) -> Place:
+def triangle_with_elevation(elevation: float) -> Place:
     """Return the triangle with another elevation of its second ray."""
     return Place("", (300.0, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
 
 
 def _started(elevation: float, noise: float, **more: Any) -> dict[str, Any]:
     """Return a cycle that starts at the vertex of rays 1 and 2, whichever is nearer."""
-    given = arguments(place(elevation), noise=noise, method="cycle", **more)
+    given = network_arguments(
+        triangle_with_elevation(elevation), noise=noise, method="cycle", **more
+    )
     net = given["network"]
     first = next(
         vertex for vertex in range(net.vertices)
         if all(vertex in net.on_ray(ray)[0] for ray in (0, 2))
     )  # fmt: skip
-    return given | {"walk": geometry.cycle(net, start=first)}
+    return given | {"walk": geometry.build_cycle(net, start=first)}
 
 
 def _bad(value: float) -> dict[str, Any]:
-    given = arguments()
+    given = network_arguments()
     power = given["power"].copy()
     power[:, 0, :] = value
     return given | {"power": power}
 
 
 def _one_gate(value: float) -> dict[str, Any]:
-    given = arguments()
+    given = network_arguments()
     power = given["power"].copy()
     at = int(np.argmin(np.abs(given["range"] - given["network"].on_ray(0)[1][0])))
     power[:, 0, at] = value
@@ -130,26 +132,29 @@ def _one_gate(value: float) -> dict[str, Any]:
 
 
 def _scaled(factor: float) -> Answer:
-    given = arguments(noise=0.05)
+    given = network_arguments(noise=0.05)
     bright = given | {
         "power": given["power"] * factor, "variance": given["variance"] * factor**2
     }  # fmt: skip
-    one, other = solve(**bright), solve(**given)
+    one, other = solve_network(**bright), solve_network(**given)
     change = np.nanmax(np.abs(one.value("extinction") / other.value("extinction") - 1.0))
     alike = np.array_equal(one.quality, other.quality)
     return Answer({"change": change, "same flags": float(alike)})
 
 
 def _gains() -> Answer:
-    given = arguments(noise=0.05)
+    given = network_arguments(noise=0.05)
     gain = np.array([1e-6, 1.0, 1e9])[:, np.newaxis]
     other = given | {"power": given["power"] * gain, "variance": given["variance"] * gain**2}
-    change = solve(**other).value("extinction") / solve(**given).value("extinction") - 1.0
+    change = (
+        solve_network(**other).value("extinction") / solve_network(**given).value("extinction")
+        - 1.0
+    )
     return Answer({"change": np.nanmax(np.abs(change))})
 
 
 def _exponent(method: str) -> dict[str, Any]:
-    given = arguments(noise=0.01)
+    given = network_arguments(noise=0.01)
     # With backscatter ~ extinction^(1/m), homogeneous signals are the same but for a constant.
     return given | {"exponent": 2.0, "method": method}
 
@@ -161,7 +166,7 @@ def _two_lidars() -> dict[str, Any]:
             "full_overlap_range": FULL_OVERLAP, "prior": "none"}  # fmt: skip
 
 
-def _networks() -> tuple[Case, ...]:
+def _networks() -> tuple[StiffCase, ...]:
     honest = Honest("extinction", 2e-3, most=5e-3)
     return (
         _case("A a rays through one point: nothing is determined", solve=start_vertex,
@@ -171,44 +176,44 @@ def _networks() -> tuple[Case, ...]:
               expected=(Raised(_ANY, 0.9), Honest("extinction", 2e-3, most=5e-3))),
         _case("A c below the crossing: the start is the far vertex", solve=start_vertex,
               build=lambda: _started(30.0, 0.01), expected=(Raised(_ANY),)),
-        _case("A c the same, all vertices at once", solve=solve,
-              build=lambda: arguments(place(30.0)), expected=(honest,)),
+        _case("A c the same, all vertices at once", solve=solve_network,
+              build=lambda: network_arguments(triangle_with_elevation(30.0)), expected=(honest,)),
         _case("A d visibility of 150 km, noise 0.5 %, exact cycle",
-              build=lambda: arguments(air=homogeneous(2e-5), noise=0.005, method="cycle"),
-              solve=solve, expected=(Raised(_ANY, 0.99),)),
+              build=lambda: network_arguments(air=homogeneous(2e-5), noise=0.005, method="cycle"),
+              solve=solve_network, expected=(Raised(_ANY, 0.99),)),
         _case("A d the same, network",
-              build=lambda: arguments(air=homogeneous(2e-5), noise=0.005), solve=solve,
+              build=lambda: network_arguments(air=homogeneous(2e-5), noise=0.005), solve=solve_network,
               expected=(Honest("extinction", 2e-5, most=5e-3),)),
         _case("A e extinction of 20 per km, exact cycle",
-              build=lambda: arguments(air=homogeneous(0.02), method="cycle"), solve=solve,
+              build=lambda: network_arguments(air=homogeneous(0.02), method="cycle"), solve=solve_network,
               expected=(Honest("extinction", 0.02, most=5e-3),)),
-        _case("A e the same, network", build=lambda: arguments(air=homogeneous(0.02)),
-              solve=solve, expected=(Honest("extinction", 0.02, most=5e-3),)),
+        _case("A e the same, network", build=lambda: network_arguments(air=homogeneous(0.02)),
+              solve=solve_network, expected=(Honest("extinction", 0.02, most=5e-3),)),
         _case("A f extinction of 60 per km without noise",
-              build=lambda: arguments(air=homogeneous(0.06), noise=1e-9, method="slope"),
-              solve=solve, expected=(Near("extinction", 0.06, 1e-6),)),
+              build=lambda: network_arguments(air=homogeneous(0.06), noise=1e-9, method="slope"),
+              solve=solve_network, expected=(Near("extinction", 0.06, 1e-6),)),
         _case("homogeneous triangle without noise, exact cycle",
-              build=lambda: arguments(noise=1e-12, method="cycle"), solve=solve,
+              build=lambda: network_arguments(noise=1e-12, method="cycle"), solve=solve_network,
               expected=(Near("extinction", 2e-3, 1e-9), Stands())),
-        _case("homogeneous triangle without noise, network", build=lambda: arguments(noise=1e-9),
-              solve=solve, expected=(Near("extinction", 2e-3, 1e-6),)),
+        _case("homogeneous triangle without noise, network", build=lambda: network_arguments(noise=1e-9),
+              solve=solve_network, expected=(Near("extinction", 2e-3, 1e-6),)),
         *(
             _case(f"A g exponent m = 2, {method}", build=partial(_exponent, method),
-                  solve=solve, expected=(honest,))
+                  solve=solve_network, expected=(honest,))
             for method in ("cycle", "network", "unbiased")
         ),
         *(
-            _case(f"A h a ray of {value:g}", build=partial(_bad, value), solve=solve,
+            _case(f"A h a ray of {value:g}", build=partial(_bad, value), solve=solve_network,
                   expected=(Raised(_ANY),))
             for value in (np.nan, 0.0, -1.0, np.inf)
         ),
         *(
-            _case(f"A h one gate of {value:g}", build=partial(_one_gate, value), solve=solve,
+            _case(f"A h one gate of {value:g}", build=partial(_one_gate, value), solve=solve_network,
                   expected=(honest,))
             for value in (np.nan, 0.0, -1e9, np.inf, 1e300)
         ),
         _case("A i one crossing of two rays, without prior", build=_two_lidars,
-              solve=partial(solve, near=False),
+              solve=partial(solve_network, near=False),
               expected=(Missing("extinction"), Raised(_ANY))),
         _case("A j multiplier beyond the pole", solve=start_vertex,
               build=lambda: _started(25.0, 0.01) | {"method": "multiplier", "multiplier": 0.9},
@@ -222,15 +227,15 @@ def _networks() -> tuple[Case, ...]:
         _case("lidars that differ by 1e15 in brightness", build=dict, solve=_gains,
               expected=(Near("change", 0.0, 1e-9, relative=False),)),
         *(
-            _case(f"noise of {100.0 * noise:g} %, {where.name}", solve=solve,
-                  build=partial(arguments, where, noise=noise, additive=0.01),
+            _case(f"noise of {100.0 * noise:g} %, {where.name}", solve=solve_network,
+                  build=partial(network_arguments, where, noise=noise, additive=0.01),
                   expected=(honest,))
             for noise in (0.02, 0.1, 1.0) for where in (TRIANGLE, THREE_BY_TWO)
         ),
-        _case("one profile", solve=solve,
-              build=lambda: arguments() | {n: arguments()[n][0] for n in ("power", "variance")},
+        _case("one profile", solve=solve_network,
+              build=lambda: network_arguments() | {n: network_arguments()[n][0] for n in ("power", "variance")},
               expected=(honest,)),
-        _case("no noise stated", build=lambda: arguments() | {"variance": 0.0}, solve=solve,
+        _case("no noise stated", build=lambda: network_arguments() | {"variance": 0.0}, solve=solve_network,
               expected=(Raised(_ANY),)),
     )  # fmt: skip
 
@@ -263,7 +268,7 @@ def _rows(**more: Any) -> dict[str, Any]:
     return given | more
 
 
-def _closed() -> tuple[Case, ...]:
+def _closed() -> tuple[StiffCase, ...]:
     flat = {"start": [1.0, 1.0, 1.0], "end": [1.0, 1.0, 1.0]}
     return (
         *(
@@ -303,12 +308,12 @@ def _value_of_rows() -> Array:
 
 
 def _seen(**arguments: Any) -> Answer:
-    found = visibility.from_extinction(**arguments)
+    found = visibility.visibility_from_extinction(**arguments)
     return Answer({"visibility": found.visibility, "lower": found.visibility_lower,
                    "upper": found.visibility_upper})  # fmt: skip
 
 
-def _sights() -> tuple[Case, ...]:
+def _sights() -> tuple[StiffCase, ...]:
     constant = float(np.log(20.0))
     return (
         *(
@@ -337,15 +342,15 @@ def _sights() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def _refused(name: str, field: str | None, **more: Any) -> Case:
-    return _case(name, build=lambda: arguments() | more, solve=solve,
+def _refused(name: str, field: str | None, **more: Any) -> StiffCase:
+    return _case(name, build=lambda: network_arguments() | more, solve=solve_network,
                  expected=(Refused(RetrievalInputError, field),))  # fmt: skip
 
 
-def _refusals() -> tuple[Case, ...]:
+def _refusals() -> tuple[StiffCase, ...]:
     return (
-        _refused("range in km", "range", range=arguments()["range"] / 1e3),
-        _refused("one ray too few", None, power=arguments()["power"][:, :2]),
+        _refused("range in km", "range", range=network_arguments()["range"] / 1e3),
+        _refused("one ray too few", None, power=network_arguments()["power"][:, :2]),
         _refused("negative variance", "variance", variance=-1.0),
         _refused("neither overlap nor its range", None, full_overlap_range=None),
         _refused("multiplier of a network", "multiplier", multiplier=0.5),
@@ -355,6 +360,6 @@ def _refusals() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def cases() -> tuple[Case, ...]:
+def stiff_network_cases() -> tuple[StiffCase, ...]:
     """Return all of them."""
     return (*_networks(), *_closed(), *_sights(), *_refusals())

@@ -15,7 +15,6 @@ from lidarops.bench.stability.stiff_cases import (
     Answer,
     Array,
     Between,
-    Case,
     Honest,
     Missing,
     Near,
@@ -23,12 +22,13 @@ from lidarops.bench.stability.stiff_cases import (
     Refused,
     Retrieval,
     Stands,
+    StiffCase,
 )
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import optical_depth
 
-_case = partial(Case, retrieval=Retrieval.MULTIANGLE)
+_case = partial(StiffCase, retrieval=Retrieval.MULTIANGLE)
 _ANY: Final = Quality(REJECTING)
 BITS: Final = {
     "no_data": Quality.NO_LEVERAGE,
@@ -48,9 +48,9 @@ BITS: Final = {
 """As the products spell the flags."""
 
 
-def solve(part: slice = slice(None), **arguments: Any) -> Answer:
+def solve_scan(part: slice = slice(None), **arguments: Any) -> Answer:
     """Solve, and return altitudes of every profile; the gradient error is part of the stated."""
-    found = optical_depth.solve(**arguments)
+    found = optical_depth.retrieve_optical_depth(**arguments)
     bits = np.asarray(found.quality).copy()
     for name, bit in BITS.items():
         bits |= np.where(getattr(found.flags, name), np.int32(bit), np.int32(0))
@@ -85,10 +85,10 @@ def _short() -> Scene:
     return multiangle_cases.clear(3000.0, gates=60)
 
 
-def arguments(
+def scan_arguments(
     scene_of: Any = _short, profiles: int = 16, *seed: int, **more: Any
 ) -> dict[str, Any]:
-    """Return arguments of `solve` for scans of a scene."""
+    """Return arguments of `solve_scan` for scans of a scene."""
     scene, signal, variance = _drawn(scene_of, profiles, *(seed or (41,)))
     given = {
         "signal": signal,
@@ -142,7 +142,9 @@ def _five() -> Scene:
 
 def _blocks_of_constant() -> Answer:
     found = [
-        optical_depth.solve(**arguments(_null_space, 16, seed, largest_gradient=0.0))
+        optical_depth.retrieve_optical_depth(
+            **scan_arguments(_null_space, 16, seed, largest_gradient=0.0)
+        )
         for seed in range(20)
     ]
     return Answer({
@@ -156,7 +158,7 @@ def _varying() -> Scene:
 
 
 def _holes(**more: Any) -> dict[str, Any]:
-    given = arguments()
+    given = scan_arguments()
     signal = given["signal"].copy()
     signal[np.random.default_rng(42).random(signal.shape) < 0.3] = np.nan
     signal[..., 20:26] = np.nan
@@ -165,14 +167,14 @@ def _holes(**more: Any) -> dict[str, Any]:
 
 
 def _one_bad(value: float) -> dict[str, Any]:
-    given = arguments()
+    given = scan_arguments()
     signal = given["signal"].copy()
     signal[3] = value
     return given | {"signal": signal}
 
 
 def _gate(value: float) -> dict[str, Any]:
-    given = arguments()
+    given = scan_arguments()
     signal = given["signal"].copy()
     signal[3, 2, 30] = value
     return given | {"signal": signal}
@@ -181,7 +183,7 @@ def _gate(value: float) -> dict[str, Any]:
 def _others_alike(**given: Any) -> Answer:
     """Return the largest change of the other profiles, in their standard errors."""
     rest = np.delete(np.arange(16), 3)
-    one, clean = solve(**given), solve(**arguments())
+    one, clean = solve_scan(**given), solve_scan(**scan_arguments())
     change = (one.value("optical_depth") - clean.value("optical_depth"))[rest]
     stated = clean.value("optical_depth_standard_error")[rest]
     return Answer({"change": np.nanmax(np.abs(change / stated))})
@@ -189,7 +191,7 @@ def _others_alike(**given: Any) -> Answer:
 
 def _infinite_ray() -> Answer:
     """Compare a scan with two rays along the horizon with the same without them."""
-    given = arguments()
+    given = scan_arguments()
     base, angle = given["signal"], given["zenith_angle"]
     flat = np.repeat(base[:, -1:], 2, axis=1)
     more = given | {
@@ -197,7 +199,7 @@ def _infinite_ray() -> Answer:
         "variance": np.concatenate([given["variance"], flat], axis=1),
         "zenith_angle": np.append(angle, [89.0, 90.0]),
     }
-    one, other = solve(**more), solve(**given)
+    one, other = solve_scan(**more), solve_scan(**given)
     return _compared(one, other)
 
 
@@ -210,33 +212,33 @@ def _compared(one: Answer, other: Answer) -> Answer:
 
 
 def _scaled(factor: float) -> Answer:
-    given = arguments()
+    given = scan_arguments()
     bright = given | {
         "signal": given["signal"] * factor, "variance": given["variance"] * factor**2
     }  # fmt: skip
-    return _compared(solve(**bright), solve(**given))
+    return _compared(solve_scan(**bright), solve_scan(**given))
 
 
 def _permuted() -> Answer:
-    given = arguments()
+    given = scan_arguments()
     order = np.random.default_rng(43).permutation(given["zenith_angle"].size)
     turned = given | {
         "signal": given["signal"][:, order], "variance": given["variance"][:, order],
         "zenith_angle": given["zenith_angle"][order],
     }  # fmt: skip
-    return _compared(solve(**turned), solve(**given))
+    return _compared(solve_scan(**turned), solve_scan(**given))
 
 
 def _floor() -> Answer:
-    given = arguments()
+    given = scan_arguments()
     floor = (1e-6 * given["signal"]) ** 2
-    one = solve(**given | {"variance": np.zeros_like(floor)})
-    return _compared(one, solve(**given | {"variance": floor}))
+    one = solve_scan(**given | {"variance": np.zeros_like(floor)})
+    return _compared(one, solve_scan(**given | {"variance": floor}))
 
 
 def _subset(method: str) -> Answer:
     """Compare rays that are all NaN with the same scan without them."""
-    given = arguments(method=method)
+    given = scan_arguments(method=method)
     signal = given["signal"].copy()
     signal[:, [3, 7]] = np.nan
     keep = np.delete(np.arange(signal.shape[1]), [3, 7])
@@ -244,7 +246,7 @@ def _subset(method: str) -> Answer:
         "signal": given["signal"][:, keep], "variance": given["variance"][:, keep],
         "zenith_angle": given["zenith_angle"][keep],
     }  # fmt: skip
-    return _compared(solve(**given | {"signal": signal}), solve(**less))
+    return _compared(solve_scan(**given | {"signal": signal}), solve_scan(**less))
 
 
 def _exact(span: float, scale: float) -> Answer:
@@ -253,30 +255,30 @@ def _exact(span: float, scale: float) -> Answer:
     height = np.array([1000.0, 2000.0, 3000.0])
     depth = np.array([0.1, 0.2, 0.3])
     signal = scale * np.exp(-2.0 * path[:, np.newaxis] * depth)
-    found = optical_depth.solve(
+    found = optical_depth.retrieve_optical_depth(
         signal, np.degrees(np.arccos(1.0 / path)), height, variance=1e-12 * signal**2,
         method="kano_hamilton",
     )  # fmt: skip
     return Answer({"error times span": np.abs(found.optical_depth - depth) * span})
 
 
-def _listed() -> tuple[Case, ...]:
+def _listed() -> tuple[StiffCase, ...]:
     inside = slice(0, 100)
     alike = (Near("change", 0.0, 1e-9, relative=False), Near("same flags", 1.0, 0.0))
     honest = Honest("optical_depth", _truth, most=1e-3)
     return (
-        _case("a one ray", build=lambda: arguments(_one), solve=solve,
+        _case("a one ray", build=lambda: scan_arguments(_one), solve=solve_scan,
               expected=(Raised(Quality.NO_LEVERAGE), Missing("optical_depth"))),
-        _case("b all rays alike", build=lambda: arguments(_alike), solve=solve,
+        _case("b all rays alike", build=lambda: scan_arguments(_alike), solve=solve_scan,
               expected=(Raised(Quality.NO_LEVERAGE), Missing("optical_depth"))),
-        _case("slant paths from 1 to 1.035", build=lambda: arguments(_narrow), solve=solve,
+        _case("slant paths from 1 to 1.035", build=lambda: scan_arguments(_narrow), solve=solve_scan,
               expected=(Raised(Quality.LOW_LEVERAGE),
                         Honest("optical_depth", partial(_truth, _narrow), most=1e-3))),
-        _case("c slant paths from 1 to 1.001", build=lambda: arguments(_narrowest), solve=solve,
+        _case("c slant paths from 1 to 1.001", build=lambda: scan_arguments(_narrowest), solve=solve_scan,
               expected=(Raised(Quality.LOW_LEVERAGE | Quality.NO_LEVERAGE),
                         Honest("optical_depth", partial(_truth, _narrowest), most=1e-3))),
         _case("c the same, altitude by altitude: a standard error of 14",
-              build=lambda: arguments(_narrowest, method="kano_hamilton"), solve=solve,
+              build=lambda: scan_arguments(_narrowest, method="kano_hamilton"), solve=solve_scan,
               expected=(Raised(Quality.LOW_LEVERAGE),
                         Between("random error at the top", 7.0, 28.0))),
         _case("d rays along the horizon are left out", build=dict, solve=_infinite_ray,
@@ -291,38 +293,38 @@ def _listed() -> tuple[Case, ...]:
                   solve=_others_alike, expected=(Near("change", 0.0, 0.5, relative=False),))
             for value in (1e300, -1e300, np.inf)
         ),
-        _case("e the profile with a gate of 1e300", build=lambda: _gate(1e300), solve=solve,
+        _case("e the profile with a gate of 1e300", build=lambda: _gate(1e300), solve=solve_scan,
               expected=(honest,)),
-        _case("f all signals negative", solve=solve,
-              build=lambda: arguments() | {"signal": -arguments()["signal"]},
+        _case("f all signals negative", solve=solve_scan,
+              build=lambda: scan_arguments() | {"signal": -scan_arguments()["signal"]},
               expected=(Missing("optical_depth"), Missing("extinction"), Raised(_ANY))),
-        _case("all NaN", solve=solve,
-              build=lambda: arguments() | {"signal": np.full_like(arguments()["signal"], np.nan)},
+        _case("all NaN", solve=solve_scan,
+              build=lambda: scan_arguments() | {"signal": np.full_like(scan_arguments()["signal"], np.nan)},
               expected=(Missing("optical_depth"), Raised(Quality.INPUT_MISSING))),
         _case("g 30 % missing, a hole of 6 altitudes, half the rays lost aloft", build=_holes,
-              solve=solve, expected=(Honest("optical_depth", _truth, valued=0.9, most=1e-3),)),
+              solve=solve_scan, expected=(Honest("optical_depth", _truth, valued=0.9, most=1e-3),)),
         *(
             _case(f"g rays that are missing are as if not there, {method}",
                   build=partial(dict, method=method), solve=_subset, expected=alike)
             for method in ("kano_hamilton", "joint")
         ),
-        _case("h optical depth 20 in 600 m", build=lambda: arguments(_thick, 100), solve=solve,
+        _case("h optical depth 20 in 600 m", build=lambda: scan_arguments(_thick, 100), solve=solve_scan,
               expected=(Honest("optical_depth", partial(_truth, _thick), most=5e-3),)),
-        _case("h and nothing beyond its reach", build=lambda: arguments(_thick, 100),
-              solve=partial(solve, slice(30, 60)),
+        _case("h and nothing beyond its reach", build=lambda: scan_arguments(_thick, 100),
+              solve=partial(solve_scan, slice(30, 60)),
               expected=(Missing("optical_depth"), Raised(Quality.EXTRAPOLATED))),
         _case("i constant extinction: smoothness costs nothing, and most blocks say so",
               build=dict, solve=_blocks_of_constant,
               expected=(Near("optical depth at the top", 0.24, 0.01),
                         Between("share saturated", 0.75, 1.0))),
-        _case("j signal over noise 10 at the zenith", build=lambda: arguments(_weak, 64),
-              solve=solve, expected=(Honest("optical_depth", partial(_truth, _weak), most=1e-3),)),
+        _case("j signal over noise 10 at the zenith", build=lambda: scan_arguments(_weak, 64),
+              solve=solve_scan, expected=(Honest("optical_depth", partial(_truth, _weak), most=1e-3),)),
         *(
-            _case(f"k {gates} altitudes", build=partial(_cut, gates), solve=solve,
+            _case(f"k {gates} altitudes", build=partial(_cut, gates), solve=solve_scan,
                   expected=(Honest("optical_depth", partial(_lowest, gates), most=1e-3),))
             for gates in (1, 3)
         ),
-        _case("k, p one profile", build=lambda: arguments(_short, 1), solve=solve,
+        _case("k, p one profile", build=lambda: scan_arguments(_short, 1), solve=solve_scan,
               expected=(Honest("optical_depth", _truth, valued=0.5, most=1e-3),)),
         *(
             _case(f"l signals times {factor:g}", build=partial(dict, factor=factor),
@@ -332,16 +334,16 @@ def _listed() -> tuple[Case, ...]:
         _case("rays in another order", build=dict, solve=_permuted, expected=alike),
         _case("m no noise stated counts as 1e-6 of the signal", build=dict, solve=_floor,
               expected=alike),
-        _case("n rays at 0, 0.01, 7, 7 and 15 degrees", build=lambda: arguments(_five),
-              solve=solve,
+        _case("n rays at 0, 0.01, 7, 7 and 15 degrees", build=lambda: scan_arguments(_five),
+              solve=solve_scan,
               expected=(Honest("optical_depth", partial(_truth, _five), most=1e-3),)),
         *(
-            _case(f"n the same, {method}", build=partial(arguments, _five, method=method),
-                  solve=solve, expected=(Stands(0.5),))
+            _case(f"n the same, {method}", build=partial(scan_arguments, _five, method=method),
+                  solve=solve_scan, expected=(Stands(0.5),))
             for method in ("mld", "two_angle", "kano_hamilton", "auto")
         ),
         _case("o cloud at 15 degrees, extinction varies: withheld",
-              build=lambda: arguments(_varying, 64), solve=partial(solve, inside),
+              build=lambda: scan_arguments(_varying, 64), solve=partial(solve_scan, inside),
               expected=(Missing("extinction"),
                         Raised(Quality.POOR_STRATIFICATION | Quality.EXTRAPOLATED))),
         *(
@@ -362,7 +364,7 @@ def _alike() -> Scene:
 
 
 def _cut(gates: int) -> dict[str, Any]:
-    given = arguments()
+    given = scan_arguments()
     return given | {
         "signal": given["signal"][..., :gates], "variance": given["variance"][..., :gates],
         "altitude": given["altitude"][:gates],
@@ -373,9 +375,9 @@ def _lowest(gates: int) -> Array:
     return _truth()[:gates]
 
 
-def _refusals() -> tuple[Case, ...]:
-    def wrong(name: str, field: str | None, **more: Any) -> Case:
-        return _case(name, build=lambda: arguments() | more, solve=solve,
+def _refusals() -> tuple[StiffCase, ...]:
+    def wrong(name: str, field: str | None, **more: Any) -> StiffCase:
+        return _case(name, build=lambda: scan_arguments() | more, solve=solve_scan,
                      expected=(Refused(RetrievalInputError, field),))  # fmt: skip
 
     height = _short().altitude
@@ -396,6 +398,6 @@ def _refusals() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def cases() -> tuple[Case, ...]:
+def stiff_scan_cases() -> tuple[StiffCase, ...]:
     """Return all of them."""
     return (*_listed(), *_refusals())

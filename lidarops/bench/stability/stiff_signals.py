@@ -11,7 +11,6 @@ from lidarops.bench.stability.stiff_cases import (
     Answer,
     Array,
     Between,
-    Case,
     Honest,
     Missing,
     Near,
@@ -19,6 +18,7 @@ from lidarops.bench.stability.stiff_cases import (
     Refused,
     Retrieval,
     Stands,
+    StiffCase,
 )
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -26,7 +26,7 @@ from lidarops.retrieve.background import cubic_and_tail, known_shape
 from lidarops.retrieve.signal import averaging, counts_to_signal, gluing, lag
 from lidarops.simulate import counting
 
-_case = partial(Case, retrieval=Retrieval.SIGNAL)
+_case = partial(StiffCase, retrieval=Retrieval.SIGNAL)
 RANGE: Final = 7.5 * (np.arange(2000, dtype=np.float64) + 0.5)
 SHOTS: Final = 600
 BIN_TIME: Final = 50e-9
@@ -46,7 +46,7 @@ def analog(counts: Any, **more: Any) -> Answer:
         "adc_bits": _BITS,
         "input_range": np.full(np.shape(counts)[:-1], 0.5),
     }
-    return _told(counts_to_signal.analog(counts, **arguments | more))
+    return _told(counts_to_signal.analog_signal(counts, **arguments | more))
 
 
 def photon(counts: Any, **more: Any) -> Answer:
@@ -57,7 +57,7 @@ def photon(counts: Any, **more: Any) -> Answer:
         "bin_width": 7.5,
         "dead_time": DEAD_TIME,
     }
-    return _told(counts_to_signal.photon(counts, **arguments | more))
+    return _told(counts_to_signal.photon_signal(counts, **arguments | more))
 
 
 def _told(found: counts_to_signal.Signal) -> Answer:
@@ -109,7 +109,7 @@ def _empty(shots: int = SHOTS) -> dict[str, Any]:
     return {"counts": counts, "shots": np.full(3, shots)}
 
 
-def _analog_cases() -> tuple[Case, ...]:
+def _analog_cases() -> tuple[StiffCase, ...]:
     whole = slice(None)
     noisy = partial(_steady, 100.3, 2.0)
     return (
@@ -169,7 +169,7 @@ def _analog_cases() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def _photon_cases() -> tuple[Case, ...]:
+def _photon_cases() -> tuple[StiffCase, ...]:
     return (
         *(
             _case(f"photon counting, {rate:g} MHz", build=partial(_rate_counts, rate),
@@ -222,7 +222,7 @@ def tail(**arguments: Any) -> Answer:
 
 def shaped(**arguments: Any) -> Answer:
     """Fit background and amplitude of a known shape."""
-    found = known_shape.solve(**arguments)
+    found = known_shape.fit_known_shape(**arguments)
     names = ("background", "amplitude")
     values = {name: getattr(found, name) for name in names}
     values |= {f"{name}_standard_error": getattr(found, f"{name}_standard_error") for name in names}
@@ -248,7 +248,7 @@ def _shaped(level: float, scale: float = 1.0, *, noise: float = 1.0, **more: Any
 
 
 def _mean(profiles: Array, variance: Any = 1.0, **more: Any) -> Answer:
-    found = averaging.mean(profiles, np.broadcast_to(variance, profiles.shape), **more)
+    found = averaging.time_mean(profiles, np.broadcast_to(variance, profiles.shape), **more)
     return Answer({"mean": found.values, "mean_standard_error": found.standard_error})
 
 
@@ -279,13 +279,13 @@ def _lag(shift: int | None) -> Answer:
     rng = np.random.default_rng(15)
     common = rng.standard_normal((40, 1200))
     other = rng.standard_normal((40, 1200)) if shift is None else np.roll(common, shift, axis=-1)
-    found = lag.estimate(other + 0.5 * rng.standard_normal(common.shape), common)
+    found = lag.estimate_lag(other + 0.5 * rng.standard_normal(common.shape), common)
     unfound = np.where(found.found, np.int32(0), np.int32(Quality.NO_GLUING))
     values = {"lag": found.lag, "lag_standard_error": found.standard_error}
     return Answer(values, np.atleast_1d(unfound).astype(np.int32))
 
 
-def _rest() -> tuple[Case, ...]:
+def _rest() -> tuple[StiffCase, ...]:
     gapped = np.full((6, 50), np.nan)
     one_left = np.where(np.arange(6)[:, np.newaxis] == 2, 3.0, gapped)
     return (
@@ -346,6 +346,6 @@ def _rest() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
-def cases() -> tuple[Case, ...]:
+def stiff_signal_cases() -> tuple[StiffCase, ...]:
     """Return all of them."""
     return (*_analog_cases(), *_photon_cases(), *_rest())

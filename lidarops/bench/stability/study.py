@@ -25,9 +25,9 @@ from lidarops.bench.stability import (
     stiff_scans,
     stiff_signals,
 )
-from lidarops.bench.stability.random_scenes import Judged, Rate, collect
-from lidarops.bench.stability.stability_report import Spent, Stability
-from lidarops.bench.stability.stiff_cases import Case, Outcome, Retrieval, evaluate
+from lidarops.bench.stability.random_scenes import FalseValueRate, Judged, collect
+from lidarops.bench.stability.stability_report import PartCost, Stability
+from lidarops.bench.stability.stiff_cases import CaseOutcome, Retrieval, StiffCase, evaluate
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,29 +46,29 @@ class Draws:
 
 
 DRAWS: Final = (
-    Draws(Retrieval.HOMOGENEOUS, random_homogeneous.judged, 1000, 400, 15, 1e-3),
-    Draws(Retrieval.SIGNAL, random_signals.judged, 50, 1500, 60, 0.05),
-    Draws(Retrieval.ELASTIC, random_elastic.judged, 20, 1500, 40, 0.05),
-    Draws(Retrieval.MULTIANGLE, random_scans.judged, 8, 2000, 60, 0.13),
-    Draws(Retrieval.MULTIPOSITION, random_networks.judged, 50, 800, 30, 0.05),
+    Draws(Retrieval.HOMOGENEOUS, random_homogeneous.judge_homogeneous, 1000, 400, 15, 1e-3),
+    Draws(Retrieval.SIGNAL, random_signals.judge_signals, 50, 1500, 60, 0.05),
+    Draws(Retrieval.ELASTIC, random_elastic.judge_elastic, 20, 1500, 40, 0.05),
+    Draws(Retrieval.MULTIANGLE, random_scans.judge_scans, 8, 2000, 60, 0.13),
+    Draws(Retrieval.MULTIPOSITION, random_networks.judge_networks, 50, 800, 30, 0.05),
 )
 """Chosen to take some 20 minutes on one core, and less than 2 where little is to be spent."""
 
 
-def cases() -> tuple[Case, ...]:
+def all_cases() -> tuple[StiffCase, ...]:
     """Return all stiff and extreme cases."""
     return (
-        *stiff_homogeneous.cases(),
-        *stiff_signals.cases(),
-        *stiff_elastic.cases(),
-        *stiff_scans.cases(),
-        *stiff_networks.cases(),
-        *stiff_forward.cases(),
-        *stiff_layouts.cases(),
+        *stiff_homogeneous.stiff_homogeneous_cases(),
+        *stiff_signals.stiff_signal_cases(),
+        *stiff_elastic.stiff_elastic_cases(),
+        *stiff_scans.stiff_scan_cases(),
+        *stiff_networks.stiff_network_cases(),
+        *stiff_forward.stiff_forward_cases(),
+        *stiff_layouts.memory_layout_cases(),
     )
 
 
-def measure(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Stability:
+def measure_stability(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Stability:
     """Evaluate all cases and count the false values of random scenes.
 
     Parameters
@@ -78,18 +78,18 @@ def measure(effort: Effort, draws: tuple[Draws, ...] = DRAWS) -> Stability:
     """
     begin = time.process_time()
     outcomes = tuple(_evaluated(effort.progress))
-    spent = [Spent("cases", time.process_time() - begin)]
-    rates: list[Rate] = []
+    spent = [PartCost("cases", time.process_time() - begin)]
+    rates: list[FalseValueRate] = []
     for one in draws:
         begin = time.process_time()
         clusters = one.quick if effort.quick else one.clusters
         tally = collect(partial(_cluster, one), clusters, effort.progress)
         rates += tally.rates(one.retrieval.value, one.needless)
-        spent.append(Spent(one.retrieval.value, time.process_time() - begin))
+        spent.append(PartCost(one.retrieval.value, time.process_time() - begin))
     return Stability(effort.date, machine(), outcomes, tuple(rates), tuple(spent))
 
 
-def run(effort: Effort) -> Finding:
+def run_stability(effort: Effort) -> Finding:
     """Run the benchmark.
 
     Parameters
@@ -101,12 +101,12 @@ def run(effort: Effort) -> Finding:
     Finding
         A `Stability` and its page.
     """
-    found = measure(effort)
-    return Finding(found, stability_report.report(found, RESULT))
+    found = measure_stability(effort)
+    return Finding(found, stability_report.stability_report(found, RESULT))
 
 
-def _evaluated(progress: Callable[[int], object]) -> Iterator[Outcome]:
-    for case in cases():
+def _evaluated(progress: Callable[[int], object]) -> Iterator[CaseOutcome]:
+    for case in all_cases():
         yield evaluate(case)
         progress(1)
 

@@ -19,14 +19,14 @@ from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.harness.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import stand_in_archives
-from lidarops.bench.throughput.campaigns import Size, simulated
+from lidarops.bench.throughput.campaigns import CampaignSize, simulate_campaign
 from lidarops.bench.throughput.stand_in_archives import StandIns
-from lidarops.campaign.model import load
+from lidarops.campaign.model import load_campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
 from lidarops.figures import wording
 from lidarops.figures.charts import Chart, Panel, Series
-from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.run import archive
 from lidarops.run.staleness import Judge
 
@@ -61,7 +61,7 @@ _OF_ROWS: Final = (Pass.SETTLE, Pass.AGAIN, Pass.STALE, Pass.NOTHING)
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class ProcessCost:
     """By a process that did nothing else, once what it needs was imported and compiled."""
 
     cpu: float
@@ -73,13 +73,13 @@ class Spent:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class ArchiveCost:
     """One archive."""
 
     files: int
     read: bool
     """Whether its files can be read; else they are empty and stand for others."""
-    spent: Mapping[Pass, Spent]
+    spent: Mapping[Pass, ProcessCost]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,17 +88,17 @@ class Archives:
 
     date: str
     machine: Machine
-    measured: tuple[Measured, ...]
+    measured: tuple[ArchiveCost, ...]
 
 
-SIZES: Final = tuple(Size(n, _OF_SCENE, _BINS, retrieved=False) for n in (2, 20, 200))
+SIZES: Final = tuple(CampaignSize(n, _OF_SCENE, _BINS, retrieved=False) for n in (2, 20, 200))
 STAND_INS: Final = StandIns(instruments=12, days=290)
-_QUICK: Final = tuple(Size(n, _OF_SCENE, _BINS, retrieved=False) for n in (1, 4))
+_QUICK: Final = tuple(CampaignSize(n, _OF_SCENE, _BINS, retrieved=False) for n in (1, 4))
 _QUICK_STAND_INS: Final = StandIns(instruments=4, days=10)
-_TO_WARM: Final = Size(1, 30, _BINS, retrieved=False)
+_TO_WARM: Final = CampaignSize(1, 30, _BINS, retrieved=False)
 
 
-def run(kind: Kind, *, effort: Effort) -> Finding:
+def run_archives(kind: Kind, *, effort: Effort) -> Finding:
     """Run the benchmark of archives.
 
     Raises
@@ -108,17 +108,17 @@ def run(kind: Kind, *, effort: Effort) -> Finding:
     """
     if kind is not Kind.THROUGHPUT:
         raise CampaignError("an archive has no accuracy benchmark", remedy="choose throughput")
-    found = measure(
+    found = measure_archives(
         _QUICK if effort.quick else SIZES,
         _QUICK_STAND_INS if effort.quick else STAND_INS,
         date=effort.date,
         progress=effort.progress,
     )
-    return Finding(found, report(found, RESULT))
+    return Finding(found, archives_report(found, RESULT))
 
 
-def measure(
-    sizes: Sequence[Size],
+def measure_archives(
+    sizes: Sequence[CampaignSize],
     standing: StandIns,
     *,
     date: str = "",
@@ -140,8 +140,8 @@ def measure(
     measured = []
     for size in sizes:
         with _folders() as (small, large):
-            simulated(_TO_WARM, small)
-            simulated(size, large)
+            simulate_campaign(_TO_WARM, small)
+            simulate_campaign(size, large)
             measured.append(_measured(size.files, _OF_FILES, (small, large), read=True))
         progress(1)
     with _folders() as (small, large):
@@ -164,24 +164,24 @@ def _folders() -> Iterator[tuple[Path, Path]]:
 
 def _measured(
     files: int, ways: Sequence[Pass], folders: tuple[Path, Path], *, read: bool
-) -> Measured:
+) -> ArchiveCost:
     small, large = (folder / CAMPAIGN_FILE for folder in folders)
-    return Measured(files, read, {each: _alone(each, small, large) for each in ways})
+    return ArchiveCost(files, read, {each: _alone(each, small, large) for each in ways})
 
 
-def _alone(each: Pass, small: Path, large: Path) -> Spent:
+def _alone(each: Pass, small: Path, large: Path) -> ProcessCost:
     """Do it in a process of its own, whose memory holds nothing else."""
     apart = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=apart) as one:
         return one.submit(_spent, each, small, large).result()
 
 
-def _spent(each: Pass, small: Path, large: Path) -> Spent:
+def _spent(each: Pass, small: Path, large: Path) -> ProcessCost:
     do = _WAYS[each]
     do(small)
     cpu, wall = time.process_time(), time.perf_counter()
     do(large)
-    return Spent(time.process_time() - cpu, time.perf_counter() - wall, _peak())
+    return ProcessCost(time.process_time() - cpu, time.perf_counter() - wall, _peak())
 
 
 def _peak() -> float:
@@ -194,16 +194,16 @@ def _peak() -> float:
 
 
 def _scan(file: Path) -> None:
-    archive.update_catalog(load(file))
+    archive.update_catalog(load_campaign(file))
 
 
 def _process(file: Path) -> None:
-    if archive.reprocess(load(file)) is None:
+    if archive.reprocess(load_campaign(file)) is None:
         raise CampaignError("the simulated archive gives nothing to do", file=file)
 
 
 def _stale(file: Path) -> None:
-    campaign = load(file)
+    campaign = load_campaign(file)
     with Store(campaign.catalog_url, campaign.name) as store:
         signatures, verdicts = Judge(campaign, store).signatures(), store.verdicts()
     if any(verdicts.get(day, ("",))[0] != now.whole for day, now in signatures.items()):
@@ -211,7 +211,7 @@ def _stale(file: Path) -> None:
 
 
 def _rest(file: Path) -> None:
-    if archive.reprocess(load(file)) is not None:
+    if archive.reprocess(load_campaign(file)) is not None:
         raise CampaignError("the simulated archive does not stay as it is", file=file)
 
 
@@ -228,12 +228,12 @@ _WAYS: Final[Mapping[Pass, Callable[[Path], None]]] = {
 # Page -----------------------------------------------------------------------------------------
 
 
-def growth(first: Measured, last: Measured, each: Pass) -> float:
+def growth(first: ArchiveCost, last: ArchiveCost, each: Pass) -> float:
     """Return what a file takes of the last archive over what one of the first takes."""
     return (last.spent[each].cpu / last.files) / (first.spent[each].cpu / first.files)
 
 
-def report(found: Archives, data: str = "") -> Report:
+def archives_report(found: Archives, data: str = "") -> BenchmarkReport:
     """Return the page of the benchmark."""
     real = [each for each in found.measured if each.read]
     part = Part(
@@ -244,7 +244,7 @@ def report(found: Archives, data: str = "") -> Report:
         charts=(_chart(real),),
         tables=tuple(_table(found.measured, each) for each in Pass),
     )
-    return Report(
+    return BenchmarkReport(
         title="Archives: cost of a file",
         facts=facts(found.date, found.machine),
         parts=(part,),
@@ -252,7 +252,7 @@ def report(found: Archives, data: str = "") -> Report:
     )
 
 
-def _chart(real: Sequence[Measured]) -> Chart:
+def _chart(real: Sequence[ArchiveCost]) -> Chart:
     series = tuple(
         Series(
             each.value,
@@ -271,7 +271,7 @@ def _chart(real: Sequence[Measured]) -> Chart:
     )
 
 
-def _table(measured: Sequence[Measured], each: Pass) -> Table:
+def _table(measured: Sequence[ArchiveCost], each: Pass) -> Table:
     mine = [one for one in measured if each in one.spent]
     rows = []
     for one in mine:

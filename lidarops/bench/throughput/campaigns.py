@@ -20,15 +20,15 @@ from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.harness.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
 from lidarops.bench.harness.timing import Machine, machine
 from lidarops.bench.throughput import orchestration
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.figures.charts import Chart, Panel, Series
 from lidarops.figures.wording import percent
 from lidarops.netcdf.write import write_plain
 from lidarops.records import RunRecord
-from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.run import archive
-from lidarops.simulate.campaign import carry_out, plan
+from lidarops.simulate.campaign import plan_simulation, write_simulation
 
 _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _INTERVAL: Final = 60
@@ -64,7 +64,7 @@ _OF_SCENE: Final = {"digest": Stage.READ, "retrieve": Stage.RETRIEVE, "write": S
 
 
 @dataclass(frozen=True, slots=True)
-class Size:
+class CampaignSize:
     """Of a simulated campaign."""
 
     scenes: int = 2
@@ -83,10 +83,10 @@ class Size:
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class CampaignCost:
     """CPU time of a campaign."""
 
-    size: Size
+    size: CampaignSize
     seconds: Mapping[Stage, float]
 
 
@@ -95,7 +95,7 @@ class Growth:
     """How the CPU time grows with one property of a campaign."""
 
     along: str
-    costs: tuple[Cost, ...]
+    costs: tuple[CampaignCost, ...]
     slopes: Mapping[Stage, tuple[float, float]]
     """Log-log slope and half of its 95 percent interval, of the time beyond that of a run with
     nothing to do."""
@@ -110,24 +110,24 @@ class Pipeline:
     growths: tuple[Growth, ...]
     workers: Mapping[int, float]
     """Seconds on the wall of a run, by number of worker processes."""
-    ways: tuple[orchestration.Way, ...] = ()
+    ways: tuple[orchestration.RunMode, ...] = ()
     """Whole commands, on campaigns of `OF_WAYS`."""
 
 
-_ALONG: Final[Mapping[str, tuple[Size, ...]]] = {
-    "scenes": tuple(Size(scenes=n) for n in (2, 4, 8, 16)),
-    "profiles": tuple(Size(profiles=n) for n in (15, 30, 60, 120)),
-    "bins": tuple(Size(bins=n) for n in (500, 1000, 2000, 4000)),
-    "angles": tuple(Size(angles=n, profiles=120, bins=2000) for n in (5, 9, 17)),
+_ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
+    "scenes": tuple(CampaignSize(scenes=n) for n in (2, 4, 8, 16)),
+    "profiles": tuple(CampaignSize(profiles=n) for n in (15, 30, 60, 120)),
+    "bins": tuple(CampaignSize(bins=n) for n in (500, 1000, 2000, 4000)),
+    "angles": tuple(CampaignSize(angles=n, profiles=120, bins=2000) for n in (5, 9, 17)),
 }
-_QUICK: Final[Mapping[str, tuple[Size, ...]]] = {
+_QUICK: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
 }
-_OF_WORKERS: Final = Size(scenes=16, profiles=60)
-OF_WAYS: Final = (Size(scenes=16), Size(scenes=128))
+_OF_WORKERS: Final = CampaignSize(scenes=16, profiles=60)
+OF_WAYS: Final = (CampaignSize(scenes=16), CampaignSize(scenes=128))
 
 
-def run(kind: Kind, *, effort: Effort) -> Finding:
+def run_campaigns(kind: Kind, *, effort: Effort) -> Finding:
     """Run the benchmark of the pipeline.
 
     Raises
@@ -137,15 +137,15 @@ def run(kind: Kind, *, effort: Effort) -> Finding:
     """
     if kind is not Kind.THROUGHPUT:
         raise CampaignError("the pipeline has no accuracy benchmark", remedy="choose throughput")
-    found = measure(quick=effort.quick, date=effort.date, progress=effort.progress)
-    return Finding(found, report(found, RESULT))
+    found = measure_campaigns(quick=effort.quick, date=effort.date, progress=effort.progress)
+    return Finding(found, campaigns_report(found, RESULT))
 
 
-def measure(
+def measure_campaigns(
     *,
     quick: bool = False,
     date: str = "",
-    along: Mapping[str, Sequence[Size]] | None = None,
+    along: Mapping[str, Sequence[CampaignSize]] | None = None,
     workers: Sequence[int] | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> Pipeline:
@@ -166,7 +166,7 @@ def measure(
     """
     growths = []
     # The first campaign of a process pays for what is compiled and imported.
-    _cost(Size(scenes=1, profiles=15), progress)
+    _cost(CampaignSize(scenes=1, profiles=15), progress)
     for name, sizes in (along or (_QUICK if quick else _ALONG)).items():
         costs = tuple(_cost(size, progress) for size in sizes)
         growths.append(Growth(name, costs, dict(_slopes(name, costs))))
@@ -176,9 +176,9 @@ def measure(
     return Pipeline(date, machine(), tuple(growths), times, ways)
 
 
-def _cost(size: Size, progress: Callable[[int], object]) -> Cost:
+def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        campaign = simulated(size, Path(folder))
+        campaign = simulate_campaign(size, Path(folder))
         seconds = {Stage.SCAN: _timed(lambda: archive.update_catalog(campaign))}
         begin, started = time.process_time(), time.perf_counter()
         record = archive.reprocess(campaign)
@@ -189,7 +189,7 @@ def _cost(size: Size, progress: Callable[[int], object]) -> Cost:
         seconds[Stage.REPORT] = _timed(lambda: archive.report_run(campaign, record))
         seconds[Stage.UNCHANGED] = _timed(lambda: archive.reprocess(campaign))
     progress(1)
-    return Cost(size, seconds)
+    return CampaignCost(size, seconds)
 
 
 def _parts(record: RunRecord, whole: float, lasted: float) -> dict[Stage, float]:
@@ -205,7 +205,7 @@ def _parts(record: RunRecord, whole: float, lasted: float) -> dict[Stage, float]
 
 def _wall(workers: int, progress: Callable[[int], object]) -> float:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        campaign = simulated(_OF_WORKERS, Path(folder))
+        campaign = simulate_campaign(_OF_WORKERS, Path(folder))
         archive.update_catalog(campaign)
         begin = time.perf_counter()
         archive.reprocess(campaign, options=archive.Options(workers=workers))
@@ -214,15 +214,15 @@ def _wall(workers: int, progress: Callable[[int], object]) -> float:
     return seconds
 
 
-def _ways(progress: Callable[[int], object]) -> tuple[orchestration.Way, ...]:
+def _ways(progress: Callable[[int], object]) -> tuple[orchestration.RunMode, ...]:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         files = []
         for size in OF_WAYS:
             place = Path(folder) / str(size.scenes)
             place.mkdir()
-            simulated(size, place)
+            simulate_campaign(size, place)
             files.append(place / CAMPAIGN_FILE)
-        found = orchestration.measure(files)
+        found = orchestration.measure_orchestration(files)
     progress(1)
     return found
 
@@ -233,7 +233,7 @@ def _timed(call: Callable[[], object]) -> float:
     return max(time.process_time() - begin, _SHORTEST)
 
 
-def simulated(size: Size, folder: Path) -> Campaign:
+def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
     """Write the raw files of a campaign of this size.
 
     Returns
@@ -243,13 +243,13 @@ def simulated(size: Size, folder: Path) -> Campaign:
     """
     path = folder / CAMPAIGN_FILE
     path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
-    campaign = load(path)
-    written = carry_out(plan(campaign))
+    campaign = load_campaign(path)
+    written = write_simulation(plan_simulation(campaign))
     write_plain(written.truth, campaign.truth_path)
     return campaign
 
 
-def _settings(size: Size) -> dict[str, Any]:
+def _settings(size: CampaignSize) -> dict[str, Any]:
     scans = size.angles > 0
     channel = "photon_532o"
     products: dict[str, Any] = {"signal": {}}
@@ -285,7 +285,7 @@ def _settings(size: Size) -> dict[str, Any]:
     }
 
 
-def _level(size: Size) -> dict[str, Any]:
+def _level(size: CampaignSize) -> dict[str, Any]:
     return {
         "kind": "horizontal",
         "aerosol_extinction": {"minimum": 5e-5, "maximum": 2e-4, "hour_of_maximum": 18},
@@ -293,7 +293,7 @@ def _level(size: Size) -> dict[str, Any]:
     } | _recorded(size)
 
 
-def _scanning(size: Size) -> dict[str, Any]:
+def _scanning(size: CampaignSize) -> dict[str, Any]:
     angles = np.degrees(np.arccos(1.0 / np.linspace(1.0, 4.0, size.angles)))
     return {
         "kind": "lidar",
@@ -308,7 +308,7 @@ def _scanning(size: Size) -> dict[str, Any]:
     } | _recorded(size)
 
 
-def _recorded(size: Size) -> dict[str, Any]:
+def _recorded(size: CampaignSize) -> dict[str, Any]:
     return {
         "acquisition": {
             "interval": _INTERVAL,
@@ -327,7 +327,9 @@ def _recorded(size: Size) -> dict[str, Any]:
     }
 
 
-def _slopes(along: str, costs: Sequence[Cost]) -> Iterator[tuple[Stage, tuple[float, float]]]:
+def _slopes(
+    along: str, costs: Sequence[CampaignCost]
+) -> Iterator[tuple[Stage, tuple[float, float]]]:
     sizes = [getattr(cost.size, along) for cost in costs]
     for stage in Stage:
         seconds = [cost.seconds[stage] for cost in costs]
@@ -339,9 +341,9 @@ def _slopes(along: str, costs: Sequence[Cost]) -> Iterator[tuple[Stage, tuple[fl
 # Page -----------------------------------------------------------------------------------------
 
 
-def report(found: Pipeline, data: str = "") -> Report:
+def campaigns_report(found: Pipeline, data: str = "") -> BenchmarkReport:
     """Return the page of the benchmark."""
-    return Report(
+    return BenchmarkReport(
         title="Pipeline: cost of a campaign",
         facts=facts(found.date, found.machine),
         parts=tuple(_parts_of_page(found)),

@@ -27,16 +27,16 @@ from scipy.optimize import nnls
 from lidarops.bench.accuracy.homogeneous_report import facts
 from lidarops.bench.harness.terms import CAMPAIGN_FILE, RESULT, Effort, Finding, Kind
 from lidarops.bench.harness.timing import Machine, machine
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.netcdf.write import write_plain
 from lidarops.plan import cost_estimate, product_dependence
 from lidarops.plan.cost_estimate import Costs, Term
-from lidarops.process.scene import Job, process
+from lidarops.process.scene import Job, process_scene
 from lidarops.records import ProductKind, RunRecord
-from lidarops.reports.benchmark_page import Part, Report, Table
+from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 from lidarops.run import archive
-from lidarops.simulate.campaign import carry_out, plan
+from lidarops.simulate.campaign import plan_simulation, write_simulation
 
 _LOG = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ def doubt(found: Calibration) -> str:
     )
 
 
-def run(kind: Kind, *, effort: Effort) -> Finding:
+def run_cost_calibration(kind: Kind, *, effort: Effort) -> Finding:
     """Calibrate this machine, and keep what was found for ``lidarops plan``.
 
     Raises
@@ -113,7 +113,7 @@ def run(kind: Kind, *, effort: Effort) -> Finding:
     found = calibrate(date=effort.date, rounds=rounds, progress=effort.progress)
     if told := doubt(found):
         _LOG.warning(told)
-    return Finding(found, report(found, RESULT))
+    return Finding(found, calibration_report(found, RESULT))
 
 
 def calibrate(
@@ -150,7 +150,7 @@ def calibrate(
         seconds[Term.RUN] = _beside(campaign, Costs(seconds | {Term.RUN: 0.0}))
         progress(1)
     here = machine()
-    kept = cost_estimate.save(Costs(seconds, processor=here.processor, date=date), path)
+    kept = cost_estimate.save_calibration(Costs(seconds, processor=here.processor, date=date), path)
     model = Costs(seconds)
     return Calibration(
         date=date,
@@ -196,7 +196,7 @@ def _scenes(
     for _ in range(rounds):
         for job, spent in zip(jobs, times, strict=True):
             begin = time.process_time()
-            outcome = process(job)
+            outcome = process_scene(job)
             spent.append(time.process_time() - begin)
             if outcome.error:
                 raise CampaignError(f"{job.scene.id}: {outcome.error}", field="simulation")
@@ -221,7 +221,7 @@ def _parts(job: Job) -> Iterator[Job]:
     yield replace(job, scene=replace(job.scene, granules=granules))
     wanted = product_dependence.wanted(job.plan)
     for product in wanted if len(wanted) > 1 else ():
-        yield replace(job, plan=product_dependence.part(job.plan, [product]))
+        yield replace(job, plan=product_dependence.plan_closure(job.plan, [product]))
 
 
 def _report(campaign: Campaign, record: RunRecord) -> dict[Term, float]:
@@ -259,16 +259,16 @@ def _loads(campaign: Campaign) -> dict[Term, float]:
 
 def first_times(path: str) -> None:
     """Write for each kind of product what the first scene and the same again cost, as JSON."""
-    campaign = load(path)
+    campaign = load_campaign(path)
     jobs: dict[str, Job] = {}
     for judged in archive.assess(campaign, force=True):
         for kind, channel in product_dependence.wanted(judged.plan):
-            mine = product_dependence.part(judged.plan, [(kind, channel)])
+            mine = product_dependence.plan_closure(judged.plan, [(kind, channel)])
             jobs.setdefault(kind.value, Job(campaign, judged.scene, mine))
     found = {}
     # What all kinds load counts for the first of them, signals.
     for kind in ProductKind:
-        found[kind.value] = [process(jobs[kind.value]).cpu_seconds for _ in range(2)]
+        found[kind.value] = [process_scene(jobs[kind.value]).cpu_seconds for _ in range(2)]
     sys.stdout.write(json.dumps(found))
 
 
@@ -325,8 +325,8 @@ def _of_children() -> float:
 def _simulated(folder: Path) -> Campaign:
     path = folder / CAMPAIGN_FILE
     path.write_text(yaml.safe_dump(_settings()), encoding="utf-8")
-    campaign = load(path)
-    written = carry_out(plan(campaign))
+    campaign = load_campaign(path)
+    written = write_simulation(plan_simulation(campaign))
     write_plain(written.truth, campaign.truth_path)
     return campaign
 
@@ -485,7 +485,7 @@ def _simulation(lidar: _Lidar) -> dict[str, Any]:
 # Page -----------------------------------------------------------------------------------------
 
 
-def report(found: Calibration, data: str = "") -> Report:
+def calibration_report(found: Calibration, data: str = "") -> BenchmarkReport:
     """Return the page of a calibration."""
     terms = Table(
         title="What things cost",
@@ -517,7 +517,7 @@ def report(found: Calibration, data: str = "") -> Report:
     )
     if told := doubt(found):
         text += f" Do not trust them: {told}."
-    return Report(
+    return BenchmarkReport(
         title="Costs: what the estimates of run times come from",
         facts=facts(found.date, found.machine),
         parts=(Part(title="Costs of this machine", text=text, tables=(terms, scenes)),),

@@ -30,7 +30,7 @@ JOB: Final = 300.0
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class RunMode:
     """How campaigns were run, and what each took with all processes that it started."""
 
     name: str
@@ -53,7 +53,9 @@ class Overhead:
         return self.fixed / job + self.share
 
 
-def measure(campaigns: Sequence[Path], *, ways: Sequence[str] = tuple(WAYS)) -> tuple[Way, ...]:
+def measure_orchestration(
+    campaigns: Sequence[Path], *, ways: Sequence[str] = tuple(WAYS)
+) -> tuple[RunMode, ...]:
     """Run campaigns by every way, each with an output folder of its own.
 
     Parameters
@@ -73,7 +75,9 @@ def measure(campaigns: Sequence[Path], *, ways: Sequence[str] = tuple(WAYS)) -> 
     found = []
     for name in asked:
         taken = [_run(WAYS[name], file, name.replace(", ", "-")) for file in campaigns]
-        found.append(Way(name, tuple(cpu for cpu, _ in taken), tuple(wall for _, wall in taken)))
+        found.append(
+            RunMode(name, tuple(cpu for cpu, _ in taken), tuple(wall for _, wall in taken))
+        )
     return tuple(found)
 
 
@@ -95,17 +99,17 @@ def _children() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def overhead(way: Way, serial: Way) -> Overhead:
+def overhead(way: RunMode, serial: RunMode) -> Overhead:
     """Return the line through the smallest and the largest campaign."""
     extra = [mine - plain for mine, plain in zip(way.cpu, serial.cpu, strict=True)]
     share = (extra[-1] - extra[0]) / (serial.cpu[-1] - serial.cpu[0])
     return Overhead(fixed=extra[0] - share * serial.cpu[0], share=share)
 
 
-def part(ways: Sequence[Way], scenes: Sequence[int]) -> Part:
+def part(ways: Sequence[RunMode], scenes: Sequence[int]) -> Part:
     """Return the part of the page."""
     serial = next(way for way in ways if way.name == SERIAL)
-    told: list[Callable[[Way], str]] = [
+    told: list[Callable[[RunMode], str]] = [
         lambda way: f"{way.cpu[-1]:.1f}",
         lambda way: f"{way.wall[-1]:.1f}",
         lambda way: f"{overhead(way, serial).fixed:.1f}",

@@ -22,7 +22,7 @@ from lidarops.raw.licel import read_header, read_physical, select
 
 
 @dataclass(frozen=True, slots=True)
-class Throughput:
+class ReaderThroughput:
     """How fast one way of reading is."""
 
     name: str
@@ -34,7 +34,7 @@ class Throughput:
     """CPU time as a multiple of that of the floor; 1 for a floor itself."""
 
 
-def reader(paths: Sequence[str | os.PathLike[str]], repeats: int = 7) -> list[Throughput]:
+def reader(paths: Sequence[str | os.PathLike[str]], repeats: int = 7) -> list[ReaderThroughput]:
     """Measure header scan, raw files to float32 and the archive path.
 
     Parameters
@@ -73,7 +73,7 @@ def reader(paths: Sequence[str | os.PathLike[str]], repeats: int = 7) -> list[Th
     timed = [("read bytes (floor)", read, read), ("numpy (floor)", multiply, multiply)]
     timed += [(name, _least(way, repeats), floor) for name, way, floor in ways]
     return [
-        Throughput(name, len(paths) / seconds, size / seconds / 1e6, seconds / floor)
+        ReaderThroughput(name, len(paths) / seconds, size / seconds / 1e6, seconds / floor)
         for name, seconds, floor in timed
     ]
 

@@ -15,10 +15,10 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.bench.accuracy import elastic_cases
-from lidarops.bench.accuracy.homogeneous_cases import Scenario, Way, arguments
-from lidarops.bench.accuracy.peers import peers
+from lidarops.bench.accuracy.homogeneous_cases import Scenario, Way, method_arguments
+from lidarops.bench.accuracy.peers import iterative_peers
 from lidarops.bench.harness.timing import Machine, in_threads, least_times, machine
-from lidarops.retrieve.homogeneous.path_fit import Method, solve
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
 READ: Final = "read (np.max)"
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)
@@ -74,7 +74,7 @@ class Threads:
 
 
 @dataclass(frozen=True, slots=True)
-class Throughput:
+class SolverThroughput:
     """The throughput benchmark of the homogeneous path."""
 
     date: str
@@ -84,15 +84,15 @@ class Throughput:
     threads: tuple[Threads, ...]
 
 
-def measure(
+def measure_solvers(
     *,
     quick: bool = False,
     date: str = "",
     profiles: int | None = None,
     repeats: int | None = None,
     progress: Callable[[int], object] = lambda _: None,
-) -> Throughput:
-    """Time every method of `solve`, and the iterative peers, on one path with noise.
+) -> SolverThroughput:
+    """Time every method of `fit_homogeneous_path`, and the iterative peers, on one path with noise.
 
     Parameters
     ----------
@@ -114,9 +114,9 @@ def measure(
     threads = [
         _threads(way, dtype, count, rounds)
         for way, dtype in product(THREADED, ("float32", "float64"))
-        if way in set(Method)
+        if way in set(HomogeneousMethod)
     ]
-    return Throughput(date, machine(), PATH, tuple(speeds), tuple(threads))
+    return SolverThroughput(date, machine(), PATH, tuple(speeds), tuple(threads))
 
 
 def settings() -> list[Setting]:
@@ -153,21 +153,25 @@ def _speeds(setting: Setting, count: int, repeats: int) -> Iterator[Speed]:
 
 def _ways(setting: Setting) -> Mapping[str, Callable[[Any, Scenario], object]]:
     variance = 1.0 if setting.known_variance else None
-    ours = {str(m): partial(_solve, m, variance) for m in Method if m is not Method.AUTO}
+    ours = {
+        str(m): partial(_solve, m, variance)
+        for m in HomogeneousMethod
+        if m is not HomogeneousMethod.AUTO
+    }
     if setting.missing:
         # The cubic takes no gaps, and says so at once.
-        return {name: way for name, way in ours.items() if name != Method.CUBIC}
-    others: dict[str, Way] = peers() if setting.known_variance else {}
+        return {name: way for name, way in ours.items() if name != HomogeneousMethod.CUBIC}
+    others: dict[str, Way] = iterative_peers() if setting.known_variance else {}
     return {**ours, **others}
 
 
-def _solve(method: Method, variance: float | None, power: Any, path: Scenario) -> object:
-    return solve(
+def _solve(method: HomogeneousMethod, variance: float | None, power: Any, path: Scenario) -> object:
+    return fit_homogeneous_path(
         power,
         path.range,
         variance=variance,
         method=method.value,
-        **arguments(method, path),  # type: ignore[arg-type]
+        **method_arguments(method, path),  # type: ignore[arg-type]
     )
 
 
@@ -192,7 +196,7 @@ def _within(call: Callable[[int], object], tried: int, most: int) -> int:
 
 def _threads(way: str, dtype: str, count: int, repeats: int) -> Threads:
     power = _powers(Setting(dtype, known_variance=True, missing=0.0), count)
-    call = partial(_solve, Method(way), 1.0)
+    call = partial(_solve, HomogeneousMethod(way), 1.0)
     halves = np.array_split(power, 2)
     times = least_times(
         {
@@ -215,7 +219,7 @@ _QUICK_BATCHES: Final = (1, 400)
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class StepCost:
     """CPU time of one step of the elastic retrieval, or of a peer."""
 
     step: str
@@ -239,7 +243,7 @@ class ElasticThroughput:
     bins: int
     level: float
     """Background, counts a shot."""
-    costs: tuple[Cost, ...]
+    costs: tuple[StepCost, ...]
 
 
 def measure_elastic(
@@ -267,14 +271,14 @@ def measure_elastic(
     """
     sizes = batches or (_QUICK_BATCHES if quick else _BATCHES)
     rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
-    costs: list[Cost] = []
+    costs: list[StepCost] = []
     for size in sizes:
         costs += elastic_costs(size, rounds)
         progress(1)
     return ElasticThroughput(date, machine(), elastic_cases.RANGE.size, ELASTIC_LEVEL, tuple(costs))
 
 
-def elastic_costs(batch: int, repeats: int) -> list[Cost]:
+def elastic_costs(batch: int, repeats: int) -> list[StepCost]:
     """Return the CPU time of each step and peer, the read first.
 
     Parameters
@@ -284,14 +288,14 @@ def elastic_costs(batch: int, repeats: int) -> list[Cost]:
     repeats : int
         Counted rounds.
     """
-    steps, others = _steps(elastic_cases.simulated().counts(ELASTIC_LEVEL, batch))
+    steps, others = _steps(elastic_cases.simulated_sky().counts(ELASTIC_LEVEL, batch))
     sizes = {name: _affordable(step, batch) for name, step in (steps | others).items()}
     sizes[READ] = batch
     calls = {name: partial(step, sizes[name]) for name, step in (steps | others).items()}
     times = least_times(calls, repeats)
     read = times[READ] / batch
     return [
-        Cost(
+        StepCost(
             step=name,
             batch=batch,
             profiles=sizes[name],
@@ -309,8 +313,8 @@ _Step = Callable[[int], object]
 
 def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
     """Return our steps, with the read, and the peers."""
-    sky = elastic_cases.simulated()
-    find = elastic_cases.ways()
+    sky = elastic_cases.simulated_sky()
+    find = elastic_cases.background_methods()
     found = find[elastic_cases.KNOWN_SHAPE](counts, sky)
     power, noise = elastic_cases.cleared(counts, sky, found), elastic_cases.variance(counts)
     # The peers take no gaps: they get the bins of incomplete overlap too.

@@ -12,7 +12,7 @@ import numpy as np
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.bench.accuracy.multiangle_cases import Scan
 from lidarops.bench.harness.timing import Machine, least_times, machine
-from lidarops.bench.throughput.retrievals import READ, Cost
+from lidarops.bench.throughput.retrievals import READ, StepCost
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle.vertical import smooth_profile
@@ -38,10 +38,10 @@ class MultiAngleThroughput:
     machine: Machine
     angles: int
     altitudes: int
-    costs: tuple[Cost, ...]
+    costs: tuple[StepCost, ...]
 
 
-def measure_throughput(
+def measure_scan_kernels(
     *,
     quick: bool = False,
     date: str = "",
@@ -65,7 +65,7 @@ def measure_throughput(
         Is given 1 after each batch.
     """
     scene = cases.clear(3000.0)
-    costs: list[Cost] = []
+    costs: list[StepCost] = []
     for batch in batches or (_QUICK_BATCHES if quick else _BATCHES):
         rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
         costs += _costs(scene.draw(batch, batch, 8), rounds)
@@ -74,18 +74,18 @@ def measure_throughput(
     return MultiAngleThroughput(date, machine(), angles, altitudes, tuple(costs))
 
 
-def _costs(scan: Scan, repeats: int) -> Iterator[Cost]:
+def _costs(scan: Scan, repeats: int) -> Iterator[StepCost]:
     batch = len(scan.signal)
     # As a caller holds it: an array, not a view of one row.
     scan = Scan(scan.scene, scan.signal, np.ascontiguousarray(scan.variance))
     few = min(batch, _FEW)
     ours = _kernels(scan)
-    ours |= {name: partial(way, scan) for name, way in cases.ways().items()}
+    ours |= {name: partial(way, scan) for name, way in cases.scan_methods().items()}
     ours |= {
         f"{method}, plain": partial(cases.retrieve, scan, method, robust=False)
         for method in (cases.KANO_HAMILTON, cases.JOINT)
     }
-    others = {name: partial(way, scan.first(few)) for name, way in cases.peers().items()}
+    others = {name: partial(way, scan.first(few)) for name, way in cases.scan_peers().items()}
     reads: dict[str, Callable[[], object]] = {
         READ: lambda: np.max(scan.signal),
         INPUTS: lambda: (np.max(scan.signal), np.max(scan.variance)),
@@ -95,13 +95,13 @@ def _costs(scan: Scan, repeats: int) -> Iterator[Cost]:
     for name, seconds in times.items():
         got = few if name in others else batch
         each = seconds / got
-        yield Cost(name, batch, got, 1e9 * each, each / read, name in ours)
+        yield StepCost(name, batch, got, 1e9 * each, each / read, name in ours)
 
 
 def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:
     scene = scan.scene
     geometry = slant_paths.make_scan(scene.zenith_angle, scene.altitude, None)
-    rays = _block.make_rays(scan.signal, scan.variance, geometry)
+    rays = _block.make_beam_block(scan.signal, scan.variance, geometry)
     fit = _block.regress(rays, inhomogeneity=None, robust=False)
     share = fit.column(kh.SHARE) * fit.inhomogeneity
     residuals = smooth_profile.residual_moments(
@@ -112,7 +112,7 @@ def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:
         np.nan_to_num(share),
     )
     smooth = partial(
-        smooth_profile.smooth,
+        smooth_profile.smooth_optical_depth,
         fit.column(kh.TAU),
         fit.column(kh.INFORMATION),
         scene.altitude,
@@ -120,7 +120,7 @@ def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:
         residuals=residuals,
     )
     return {
-        RAYS: lambda: _block.make_rays(scan.signal, scan.variance, geometry),
+        RAYS: lambda: _block.make_beam_block(scan.signal, scan.variance, geometry),
         REGRESS: lambda: _block.regress(rays, inhomogeneity=None, robust=False),
         SMOOTH: smooth,
     }

@@ -11,15 +11,15 @@ from typing import Any, Final
 
 import yaml
 
-from lidarops.campaign.model import Campaign, load
+from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.ledger import Entry, NewProduct, Run, RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import row_of
 from lidarops.catalog.scan import scan_keys
 from lidarops.catalog.store import Store
 from lidarops.plan import product_dependence
-from lidarops.plan.scene_plan import plan
-from lidarops.plan.scenes import cut
+from lidarops.plan.scene_plan import plan_scene
+from lidarops.plan.scenes import cut_scenes
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
@@ -69,7 +69,7 @@ def enter(standing: StandIns, path: Path) -> Campaign:
     Campaign
     """
     path.write_text(yaml.safe_dump(_settings(standing)), encoding="utf-8")
-    campaign = load(path)
+    campaign = load_campaign(path)
     keys = scan_keys(campaign)
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
@@ -89,7 +89,7 @@ def enter(standing: StandIns, path: Path) -> Campaign:
                     for each in granules
                 ]
             )
-            for scene in cut(campaign, granules).scenes:
+            for scene in cut_scenes(campaign, granules).scenes:
                 store.record(_entry(judge, campaign, scene), _RUN, lock.token)
     return campaign
 
@@ -144,7 +144,7 @@ def _granules(campaign: Campaign, instrument: str, day: int) -> Iterator[Granule
 
 
 def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> Entry:
-    whole = plan(scene, campaign)
+    whole = plan_scene(scene, campaign)
     files = [InputRecord(each.path, Role.SIGNAL, str(each.sha256)) for each in scene.granules]
     products = tuple(
         _product(judge, campaign, scene, wanted, files)
@@ -176,6 +176,6 @@ def _product(
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(_CONTENT)
     content = hashlib.sha256(_CONTENT).hexdigest()
-    depends_on, used = judge.depends_on(scene, plan(scene, campaign), wanted, files)
+    depends_on, used = judge.depends_on(scene, plan_scene(scene, campaign), wanted, files)
     record = ProductRecord(path, kind, channel, content, len(_CONTENT), 1, {}, 1)
     return NewProduct(record, target.stat().st_mtime_ns, depends_on, used)

@@ -45,7 +45,7 @@ class Definition:
         return f"visibility by the contrast {self.contrast:.6g} from extinction {colour}"
 
 
-def of_extinction(
+def visibility_of_extinction(
     extinction: xr.DataArray,
     standard_error: xr.DataArray,
     systematic_error: xr.DataArray,
@@ -117,6 +117,6 @@ def _from(
         exponent=definition.angstrom_exponent,
         exponent_standard_error=spread,
     )
-    return visibility.from_extinction(
+    return visibility.visibility_from_extinction(
         brought.extinction, brought.extinction_standard_error, contrast=definition.contrast
     )

@@ -98,7 +98,7 @@ def koschmieder_constant(contrast: float = MOR_CONTRAST) -> float:
     return -float(np.log(contrast))
 
 
-def from_extinction(
+def visibility_from_extinction(
     extinction: npt.ArrayLike,
     standard_error: npt.ArrayLike | None = None,
     *,

@@ -256,7 +256,7 @@ def _all_alike(variance: Array) -> bool:
 
 
 @_compiled
-def solve_profiles(
+def solve_cubic_profiles(
     power: Any,
     variance: Array,
     known_variance: bool,

@@ -39,7 +39,7 @@ CONSTANT: Final = 12
 COLUMNS: Final = 13
 
 
-class Noise(NamedTuple):
+class ShapeNoise(NamedTuple):
     """What the weights are made of."""
 
     variance: Array
@@ -342,12 +342,12 @@ def fill_pasts(power: Any, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
 
 
 @_compiled
-def fit_profiles(
+def fit_shape(
     power: Any,
     shape: Array,
     range_: Array,
     mask: Array,
-    noise: Noise,
+    noise: ShapeNoise,
     firsts: npt.NDArray[np.intp],
     pasts: npt.NDArray[np.intp],
     limits: Limits,

@@ -138,7 +138,7 @@ def cubic(
         lag,
         noise,
         known_variance=variance is not None,
-        shots=photon_counts.checked(rows, shots, leading) if poisson else None,
+        shots=photon_counts.checked_shots(rows, shots, leading) if poisson else None,
     )[0]
     return BackgroundResult(
         result.background.reshape(leading),
@@ -186,7 +186,7 @@ def solve_cubic(
     if bins >= 3:
         poisson = np.zeros(1) if shots is None else 1.0 / shots
         triples = _cubic_kernel.make_triples(range_, _checked_lag(lag, bins))
-        _cubic_kernel.solve_profiles(
+        _cubic_kernel.solve_cubic_profiles(
             power, variance, known_variance, poisson, triples, gradients, out
         )
     status = out[:, _cubic_kernel.STATUS]
@@ -330,5 +330,5 @@ def _require_uniform(range_: Array) -> None:
         raise RetrievalInputError(
             "is not uniform, as the cubic needs it",
             field="range",
-            remedy="use the method 'direct' of lidarops.retrieve.homogeneous.path_fit.solve",
+            remedy="use the method 'direct' of lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path",
         )

@@ -46,7 +46,7 @@ def spaced(count: int, most: int) -> npt.NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-def look(
+def look_for_light(
     power: npt.ArrayLike,
     variance: npt.ArrayLike,
     quality: npt.ArrayLike,

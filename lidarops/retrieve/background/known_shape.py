@@ -120,7 +120,7 @@ def molecular_shape(
     return shape
 
 
-def solve(
+def fit_known_shape(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     shape: npt.ArrayLike,
@@ -202,7 +202,7 @@ def solve(
     firsts = _firsts(start, start_shares, pasts, grid.values, leading)
     out = np.full((len(rows), _shape_fit.COLUMNS), np.nan)
     limits = _limits(REJECTION)
-    _shape_fit.fit_profiles(
+    _shape_fit.fit_shape(
         rows, shapes, frozen(grid.values), allowed, noise, firsts, pasts, limits, out
     )
     window = np.nan_to_num(out[:, _shape_fit.WINDOW]).astype(np.intp)
@@ -220,7 +220,7 @@ def _noise(
     exposure: npt.ArrayLike | None,
     grid: inputs.RangeGrid,
     leading: tuple[int, ...],
-) -> _shape_fit.Noise:
+) -> _shape_fit.ShapeNoise:
     if variance is not None and exposure is not None:
         raise RetrievalInputError(
             "is given for counts, which tell their own variance",
@@ -232,7 +232,7 @@ def _noise(
         raise RetrievalInputError(
             "is not positive", field="exposure", remedy="mask profiles without shots"
         )
-    return _shape_fit.Noise(
+    return _shape_fit.ShapeNoise(
         frozen(inputs.variance_rows(variance, grid, leading)),
         frozen(np.full(1, np.nan) if counts is None else counts),
         variance is not None or counts is not None,

@@ -18,7 +18,9 @@ WIDEST: Final = 7
 """Bins to either side over which a mean profile is averaged at most."""
 
 
-def checked(power: inputs.Floats, shots: npt.ArrayLike | None, leading: tuple[int, ...]) -> Array:
+def checked_shots(
+    power: inputs.Floats, shots: npt.ArrayLike | None, leading: tuple[int, ...]
+) -> Array:
     """Return the shots of each profile of counts, (profile or 1,).
 
     Raises
@@ -47,7 +49,7 @@ def mean_profile_variance(power: npt.ArrayLike, shots: npt.ArrayLike) -> Array:
         )
     leading = counts.shape[:-1]
     rows = counts.reshape(-1, counts.shape[-1])
-    of_profile = checked(rows, shots, leading)
+    of_profile = checked_shots(rows, shots, leading)
     weight = np.where(np.isfinite(rows), of_profile[:, np.newaxis], 0.0)
     shots_of_bin = weight.sum(axis=0)
     counts_of_bin = np.where(weight > 0, rows * weight, 0.0).sum(axis=0)

@@ -30,7 +30,7 @@ GAIN_AIR, SOURCE_AIR, OWN_AIR = 9, 10, 11
 COLUMN, COLUMN_AIR, RATIO_ERROR, AIR_ERROR = 12, 13, 14, 15
 PATH_ROWS: Final = 16
 
-# What `invert` writes for each bin, and for each profile.
+# What `invert_fernald` writes for each bin, and for each profile.
 BACKSCATTER, ATTENUATED, ATTENUATED_ERROR = 0, 1, 2
 NOISE, BACKGROUND, REFERENCE, LIDAR_RATIO, MOLECULAR = 3, 4, 5, 6, 7
 FIELDS: Final = 8
@@ -392,7 +392,7 @@ def _withhold(
 
 
 @_compiled
-def invert(
+def invert_fernald(
     power: Any,
     variance: Array,
     window: Any,

@@ -154,7 +154,7 @@ def _is_opaque(sums: Array, first: int, length: int, level: float) -> bool:
 
 
 @_compiled
-def detect(
+def detect_rises(
     power: Any,
     variance: Array,
     shape: Array,

@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 
 HUGE: Final = 1e300
 
-# What `compare` writes for each window.
+# What `compare_with_air` writes for each window.
 SCALE, SCALE_ERROR, SLOPE, SLOPE_ERROR, CURVATURE, SCATTER, COUNT, TAKEN_OUT = (
     0,
     1,
@@ -84,7 +84,7 @@ def _fit(
 
 
 @_compiled
-def compare(
+def compare_with_air(
     power: Any,
     variance: Array,
     shape: Array,

@@ -98,7 +98,7 @@ class ElasticResult:
     calibrated: Mask
     """Whether the reference window holds a positive signal, with the leading axes of the power."""
     outlying: Mask
-    """The bin lies off on its own: the value is that of its neighbours (`outlying_bins.bridge`)."""
+    """The bin lies off on its own: the value is that of its neighbours (`outlying_bins.bridge_outliers`)."""
 
     @property
     def backscatter_standard_error(self) -> Array:
@@ -177,7 +177,7 @@ class _Problem:
     """Standard error of the background, relative one of the scattering ratio."""
 
 
-def solve(
+def invert_elastic(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     *,
@@ -301,15 +301,15 @@ def monte_carlo(
     Parameters
     ----------
     power, range, variance
-        As in `solve`, but the variance is needed.
+        As in `invert_elastic`, but the variance is needed.
     molecular_backscatter, molecular_extinction, lidar_ratio
-        As in `solve`.
+        As in `invert_elastic`.
     reference, reference_scattering_ratio
-        As in `solve`.
+        As in `invert_elastic`.
     background_standard_error, lidar_ratio_standard_error
-        As in `solve`.
+        As in `invert_elastic`.
     reference_relative_error, molecular_relative_error
-        As in `solve`.
+        As in `invert_elastic`.
     samples : int
         At least 2; a standard error from n of them is good to 1 / sqrt(2 n).
     seed : int
@@ -318,12 +318,12 @@ def monte_carlo(
     Returns
     -------
     MonteCarlo
-        NaN where `solve` has no value, or where less than 95 percent of the samples have one.
+        NaN where `invert_elastic` has no value, or where less than 95 percent of the samples have one.
 
     Raises
     ------
     RetrievalInputError
-        As in `solve`, and for fewer than 2 samples.
+        As in `invert_elastic`, and for fewer than 2 samples.
     """
     problem = _prepare(
         power,
@@ -439,7 +439,7 @@ def _invert(problem: _Problem, power: inputs.Floats) -> tuple[Array, Array, _fer
     scalars = np.empty((count, _fernald.SCALARS))
     state = np.empty((count, bins), dtype=np.uint8)
     variance = problem.variance if problem.variance is not None else np.zeros((1, bins))
-    _fernald.invert(
+    _fernald.invert_fernald(
         frozen(power),
         frozen(variance),
         frozen(problem.window),

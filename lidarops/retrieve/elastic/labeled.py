@@ -86,7 +86,7 @@ class _Clear:
     uncertain: npt.NDArray[np.bool_]
 
 
-def elastic(
+def invert_elastic(
     averages: xr.Dataset,
     *,
     molecules: MolecularProfile,
@@ -149,7 +149,7 @@ def elastic(
     window = _window(power, distance, variance, air, reference, clouds.mask)
     if not known_shape:
         clear = _left_in_tail(clear, window, air)
-    found = _elastic.solve(
+    found = _elastic.invert_elastic(
         power,
         distance,
         molecular_backscatter=air.backscatter,
@@ -217,7 +217,7 @@ class _Prepared:
         """Replace bins that lie off on their own before backgrounds and windows rest on them."""
         rough = _background.tail_mean(self.raw, self.distance, variance=self.noise).background
         used = np.where((self.quality & _WITHHELD) != 0, np.nan, self.raw)
-        bridged = _lone_bins.bridge(
+        bridged = _lone_bins.bridge_outliers(
             used, self.distance, self.noise, background=np.nan_to_num(rough, nan=0.0)
         )
         self.raw = np.where(bridged.found, bridged.power, self.raw)
@@ -231,7 +231,7 @@ class _Prepared:
 
     def screened(self, power: Array) -> _layers.Layers:
         """Return the clouds of a signal without background."""
-        return _layers.screen(
+        return _layers.find_layers(
             power,
             self.distance,
             self.variance,
@@ -267,7 +267,7 @@ def _without_background(
     background, error = tail.background, tail.background_standard_error
     uncertain = np.zeros(background.shape, dtype=bool)
     if known_shape:
-        fit = _known_shape.solve(raw, r, prepared.air.shape, variance=noise, mask=usable)
+        fit = _known_shape.fit_known_shape(raw, r, prepared.air.shape, variance=noise, mask=usable)
         found = ~fit.singular & np.isfinite(fit.background)
         background = np.where(found, fit.background, background)
         # Noise that neighbouring bins share is larger than their differences tell.
@@ -306,7 +306,7 @@ def _window(
     candidates = _reference.candidate_windows(
         reference.lowest, highest, width, reference.width / STEPS_PER_WINDOW
     )
-    return _reference.choose(
+    return _reference.choose_reference(
         power,
         distance,
         variance,

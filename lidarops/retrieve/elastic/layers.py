@@ -47,7 +47,7 @@ class Layers:
     nothing could be seen there."""
 
 
-def screen(
+def find_layers(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     variance: npt.ArrayLike,
@@ -127,7 +127,7 @@ def screen(
     opaque = np.zeros(rows.shape[0], dtype=np.bool_)
     found = np.full((rows.shape[0], _layer_search.FIELDS), np.nan)
     threshold = -float(ndtri(false_alarm / (grid.size * lengths.size)))
-    _layer_search.detect(
+    _layer_search.detect_rises(
         frozen(rows),
         frozen(noise),
         frozen(shape),

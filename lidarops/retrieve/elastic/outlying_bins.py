@@ -52,7 +52,7 @@ class Bridged:
     """Of the shape of the power: the bins that now have what their neighbours say."""
 
 
-def bridge(
+def bridge_outliers(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     variance: npt.ArrayLike,

@@ -72,7 +72,7 @@ class ReferenceWindow:
 
     @property
     def edges(self) -> tuple[Array, Array]:
-        """Bottom and top, as `lidarops.retrieve.elastic.inversion.solve` takes them."""
+        """Bottom and top, as `lidarops.retrieve.elastic.inversion.invert_elastic` takes them."""
         return self.bottom, self.top
 
 
@@ -113,7 +113,7 @@ def candidate_windows(lowest: float, highest: float, width: float, step: float) 
     return np.stack([bottom, bottom + width], axis=-1)
 
 
-def choose(
+def choose_reference(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     variance: npt.ArrayLike,
@@ -160,7 +160,7 @@ def choose(
     candidates : (candidate, 2) float
         m, bottom and top of each window; see `candidate_windows`.
     exclude : (..., range) bool, optional
-        Bins that no window may hold, as the mask of `lidarops.retrieve.elastic.layers.screen`.
+        Bins that no window may hold, as the mask of `lidarops.retrieve.elastic.layers.find_layers`.
     most_deviation : float
         Standard errors.
     least_signal : float
@@ -191,7 +191,7 @@ def choose(
         )
     windows, edges = _edges(candidates, grid)
     found = np.full((rows.shape[0], windows.shape[0], _window_tests.FIELDS), np.nan)
-    _window_tests.compare(
+    _window_tests.compare_with_air(
         frozen(rows),
         frozen(inputs.variance_rows(variance, grid, leading)),
         frozen(shape),

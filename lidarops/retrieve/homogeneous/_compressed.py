@@ -547,7 +547,7 @@ def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: Co
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_profiles(
+def solve_compressed(
     power: Any,
     root: Any,
     envelope: Any,
@@ -595,7 +595,7 @@ def solve_profiles(
 
 
 def weight_roots(tables: Tables, weights: Array, like: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the square roots of the weights as `solve_profiles` wants them."""
+    """Return the square roots of the weights as `solve_compressed` wants them."""
     padded = np.zeros(tables.envelope.size, like.dtype)
     padded[: weights.size] = np.sqrt(weights)
     return padded

@@ -1,4 +1,4 @@
-"""The compressed solver behind `lidarops.retrieve.homogeneous.path_fit.solve`: who takes which profile."""
+"""The compressed solver behind `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`: who takes which profile."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _compressed, _methods
 from lidarops.retrieve.homogeneous._fit_quality import common_limits
 from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
-from lidarops.retrieve.homogeneous._problem import Array, Flat, Problem
+from lidarops.retrieve.homogeneous._problem import Array, Flat, PathProblem
 
 FEWEST_BINS: Final = 32
 """Below, the direct fit is as fast, and a basis of 11 shapes is most of the profile."""
@@ -25,26 +25,26 @@ table are too coarse for them."""
 _UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
 
 
-def compressed(problem: Problem) -> Flat:
+def compressed(problem: PathProblem) -> Flat:
     """Solve by 11 functionals of each profile, and by Newton steps what has gaps."""
     return _solve(problem, DEFAULT_SIZE, with_residuals=True)
 
 
-def fast(problem: Problem) -> Flat:
+def fast(problem: PathProblem) -> Flat:
     """Solve by 7 functionals, without a look at the residuals where the variance is known."""
     return _solve(problem, FAST_SIZE, with_residuals=not problem.known_variance)
 
 
-def _solve(problem: Problem, size: int, *, with_residuals: bool) -> Flat:
+def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> Flat:
     if not _is_regular(problem):
-        return _methods.direct(problem)
+        return _methods.solve_by_direct_fit(problem)
     tables = _tables(problem, size)
     if tables is None:
-        return _methods.masked(problem)
+        return _methods.solve_by_masked_fit(problem)
     count, bins = problem.power.shape
     out = np.empty((len(_compressed.RESULTS), count))
     quality, state = np.empty(count, np.int32), np.empty(count, np.int64)
-    _compressed.solve_profiles(
+    _compressed.solve_compressed(
         problem.power,
         _compressed.weight_roots(tables, _weights(problem), problem.power),
         tables.envelope.astype(problem.power.dtype),
@@ -68,10 +68,12 @@ def _solve(problem: Problem, size: int, *, with_residuals: bool) -> Flat:
     routed = np.flatnonzero(state == _compressed.ROUTED)
     if routed.size == 0:
         return found
-    return found.updated(routed, _methods.masked(problem.select(routed, problem.power[routed])))
+    return found.updated(
+        routed, _methods.solve_by_masked_fit(problem.select(routed, problem.power[routed]))
+    )
 
 
-def _is_regular(problem: Problem) -> bool:
+def _is_regular(problem: PathProblem) -> bool:
     """Return whether the range is uniform, and the section neither short nor thin."""
     range_ = problem.range
     if range_.size < FEWEST_BINS or range_[-1] - range_[0] < THINNEST * range_[0]:
@@ -80,7 +82,7 @@ def _is_regular(problem: Problem) -> bool:
     return bool(np.max(np.abs(range_ - even)) <= _UNIFORM * range_[-1])
 
 
-def _tables(problem: Problem, size: int) -> Tables | None:
+def _tables(problem: PathProblem, size: int) -> Tables | None:
     """Return the tables, or None where profiles of this kind have none."""
     if not problem.common_noise or problem.range.size > MOST_BINS:
         return None
@@ -91,7 +93,7 @@ def _tables(problem: Problem, size: int) -> Tables | None:
     return tables if tables.monotonic else None
 
 
-def _weights(problem: Problem) -> Array:
+def _weights(problem: PathProblem) -> Array:
     with np.errstate(divide="ignore"):
         weights: Array = 1.0 / problem.noise[0] if problem.known_variance else problem.noise[0]
     return weights

@@ -48,14 +48,14 @@ from lidarops.retrieve.homogeneous._projection import (
     NODES,
     Grid,
     Point,
-    Scratch,
+    ProjectionScratch,
     compiled,
     evaluate,
     largest_of,
     make_scratch,
-    multiply,
     power_of_two,
     product,
+    scale_in_place,
     summing,
     total_of,
 )
@@ -92,7 +92,9 @@ def _last_valid(power: Any, noise: Array, is_variance: bool) -> int:
 
 
 @compiled
-def _load(power: Any, noise: Array, is_variance: bool, reference: float, s: Scratch) -> int:
+def _load(
+    power: Any, noise: Array, is_variance: bool, reference: float, s: ProjectionScratch
+) -> int:
     """Copy one profile less its reference, 0 where it cannot be used; return the valid bins."""
     count = 0
     for i in range(noise.size):
@@ -122,7 +124,9 @@ def _project(shape: Array, w: Array, z: Array, w0: float, wz: float, free: float
 
 
 @compiled
-def _start(g: Grid, s: Scratch, w0: float, wz: float, free: float) -> tuple[float, float, float]:
+def _start(
+    g: Grid, s: ProjectionScratch, w0: float, wz: float, free: float
+) -> tuple[float, float, float]:
     """Return tau at the vertex about the best node, and the nodes that bracket it."""
     shapes, nodes, w, z, lengths = g.shapes, g.nodes, s.w, s.z, s.lengths
     best = 0
@@ -220,7 +224,7 @@ def _moved(p: Point, row: Array) -> Point:
 
 
 @compiled
-def _fit(g: Grid, s: Scratch, free: float, kind: int, tau: float, row: Array) -> None:
+def _fit(g: Grid, s: ProjectionScratch, free: float, kind: int, tau: float, row: Array) -> None:
     """Fit one loaded profile and write what became of it, in the scaled variables."""
     w0, wz = total_of(s.w), product(s.w, s.z)
     if kind == FREE:
@@ -272,7 +276,7 @@ def _solve_profile(
     noise: Array,
     mode: tuple[bool, float, float, int, float],
     g: Grid,
-    s: Scratch,
+    s: ProjectionScratch,
     row: Array,
 ) -> None:
     is_variance, background, rounding, kind, extinction = mode
@@ -284,7 +288,7 @@ def _solve_profile(
         row[STATUS] = EMPTY if last < 0 else TOO_SHORT
         return
     unit, largest = power_of_two(largest_of(s.w)), largest_of(s.z)
-    multiply(s.w, 1.0 / unit)
+    scale_in_place(s.w, 1.0 / unit)
     row[ROUNDING] = (rounding * (abs(reference) + largest)) ** 2 * unit * total_of(s.w) / row[BINS]
     if largest < TINY:
         row[STATUS] = CONSTANT
@@ -292,14 +296,14 @@ def _solve_profile(
         row[BACKGROUND_VARIANCE] = 1.0 / (total_of(s.w) * unit)
         return
     scale = power_of_two(largest)
-    multiply(s.z, 1.0 / scale)
+    scale_in_place(s.z, 1.0 / scale)
     row[STATUS] = FITTED
     _fit(g, s, 0.0 if given else 1.0, kind, extinction * g.length, row)
     unscale(g, reference, scale, unit, row)
 
 
 @compiled
-def solve_profiles(
+def solve_direct(
     power: Any,
     noise: Array,
     is_variance: bool,

@@ -18,7 +18,7 @@ TOO_SHORT: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class PathEstimate:
     """What a solver knows of a batch of profiles, one value each, before it is judged.
 
     Variances and energies are for noise of unit variance where the weights are relative.
@@ -59,8 +59,8 @@ class Estimate:
     """The same of the extinction, times the length of the section."""
 
 
-COLUMNS: Final = tuple(field.name for field in fields(Estimate))
-"""The fields of an `Estimate`, as columns of the table that a kernel fills."""
+COLUMNS: Final = tuple(field.name for field in fields(PathEstimate))
+"""The fields of an `PathEstimate`, as columns of the table that a kernel fills."""
 (
     STATUS,
     BINS,

@@ -16,7 +16,7 @@ from scipy import special
 
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _estimate
-from lidarops.retrieve.homogeneous._estimate import Estimate
+from lidarops.retrieve.homogeneous._estimate import PathEstimate
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -107,7 +107,7 @@ def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[floa
     return float(energy), -float(special.stdtrit(dof, 0.5 * rate))
 
 
-def judge(fit: Estimate, *, known_variance: bool, unknowns: int = 3) -> Verdict:
+def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> Verdict:
     """Judge a batch of fits.
 
     Parameters
@@ -147,14 +147,14 @@ def _residual_dof(bins: Array, unknowns: int) -> Array:
     return np.maximum(bins - unknowns, 1.0)
 
 
-def _estimated_noise(fit: Estimate, unknowns: int) -> Array:
+def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
     from_bends = fit.bends / (6.0 * fit.bend_count)
     from_residuals = fit.misfit / _residual_dof(fit.bins, unknowns)
     variance = np.where(fit.bend_count >= FEWEST_BENDS, from_bends, from_residuals)
     return np.maximum(variance, fit.rounding)
 
 
-def _determined(fit: Estimate, noise: Array, widening: Array) -> npt.NDArray[np.bool_]:
+def _determined(fit: PathEstimate, noise: Array, widening: Array) -> npt.NDArray[np.bool_]:
     error = np.sqrt(fit.extinction_variance * noise) * widening
     scale = fit.extinction + 1.0 / fit.mean_range
     finite = np.isfinite(fit.amplitude * np.sqrt(fit.amplitude_relative_variance * noise))
@@ -162,7 +162,7 @@ def _determined(fit: Estimate, noise: Array, widening: Array) -> npt.NDArray[np.
     return determined
 
 
-def _limits(fit: Estimate, unknowns: int, *, known_variance: bool) -> _Limits:
+def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limits:
     counts = [np.nan_to_num(count) for count in (fit.bins, fit.bend_count, fit.trend_count)]
     # Limits depend on counts alone, which most profiles share: evaluate each kind once.
     key = np.zeros(fit.status.shape, dtype=np.int64)

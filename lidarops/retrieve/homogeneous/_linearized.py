@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.homogeneous._propagation import fill_weights
+from lidarops.retrieve.homogeneous._propagation import fill_linear_weights
 
 Array = npt.NDArray[np.float64]
 
@@ -119,7 +119,7 @@ def neglected(
     model = _Model((range_ - range_[0]) / length, np.empty(n), np.empty(n), np.empty(n))
     for k in range(power.shape[0]):
         before = prior[k % prior.size]
-        fill_weights(power[k], noise[k % noise.shape[0]], is_variance, model.weights)
+        fill_linear_weights(power[k], noise[k % noise.shape[0]], is_variance, model.weights)
         for i in range(n):
             falling = math.exp(-2.0 * before * length * model.x[i])
             model.shape[i] = falling * (range_[0] / range_[i]) ** 2

@@ -541,7 +541,7 @@ def _solve_profile(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def solve_profiles(
+def solve_masked(
     power: Any,
     weights: Array,
     want_bends: bool,

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from lidarops.retrieve.background.cubic_and_tail import solve_cubic, solve_tail
 from lidarops.retrieve.homogeneous import _direct, _linearized, _masked, _propagation
-from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, Estimate
-from lidarops.retrieve.homogeneous._fit_quality import judge
-from lidarops.retrieve.homogeneous._problem import Array, Centre, Flags, Flat, Problem
+from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
+from lidarops.retrieve.homogeneous._fit_quality import judge_fit
+from lidarops.retrieve.homogeneous._problem import Array, Centre, Flags, Flat, PathProblem
 from lidarops.retrieve.homogeneous._projection import make_grid
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
@@ -28,19 +28,19 @@ class _Given:
     extinction: Array
 
 
-def direct(problem: Problem) -> Flat:
+def solve_by_direct_fit(problem: PathProblem) -> Flat:
     """Solve by least squares for all three unknowns."""
     return _flat(_estimate(problem), problem)
 
 
-def masked(problem: Problem) -> Flat:
-    """Solve as `direct` does, in fewer passes over the bins where the range is uniform."""
+def solve_by_masked_fit(problem: PathProblem) -> Flat:
+    """Solve as `solve_by_direct_fit` does, in fewer passes over the bins where the range is uniform."""
     plan = _masked.make_plan(problem.range, problem.bounds)
     count = problem.power.shape[0]
     table, solved = np.empty((count, len(COLUMNS))), np.empty(count, np.bool_)
     with np.errstate(divide="ignore"):
         weights = 1.0 / problem.noise if problem.known_variance else problem.noise
-    _masked.solve_profiles(
+    _masked.solve_masked(
         problem.power,
         weights,
         not problem.known_variance,
@@ -53,10 +53,10 @@ def masked(problem: Problem) -> Flat:
     if others.size:
         rest = problem.select(others, problem.power[others])
         table[others] = _table(rest, np.full(1, np.nan), _direct.FREE, np.full(1, np.nan))
-    return _flat(Estimate(**dict(zip(COLUMNS, table.T, strict=True))), problem)
+    return _flat(PathEstimate(**dict(zip(COLUMNS, table.T, strict=True))), problem)
 
 
-def linearized(problem: Problem) -> Flat:
+def solve_by_linearization(problem: PathProblem) -> Flat:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
     fit = _estimate(problem, kind=_KINDS[problem.centre], extinction=prior)
@@ -77,13 +77,13 @@ def linearized(problem: Problem) -> Flat:
     return _flat(fit, problem, given=given)
 
 
-def known_extinction(problem: Problem) -> Flat:
+def solve_with_known_extinction(problem: PathProblem) -> Flat:
     """Solve for background and amplitude at the given extinction."""
     fit = _estimate(problem, kind=_direct.GIVEN, extinction=problem.extinction)
     return _flat(fit, problem, unknowns=2)
 
 
-def known_background(problem: Problem) -> Flat:
+def solve_with_known_background(problem: PathProblem) -> Flat:
     """Solve for amplitude and extinction above the given background."""
     background = np.zeros(1) if problem.background is None else problem.background
     variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
@@ -94,7 +94,7 @@ def known_background(problem: Problem) -> Flat:
     return _flat(fit, problem, unknowns=2, given=given)
 
 
-def cubic(problem: Problem) -> Flat:
+def solve_by_cubic(problem: PathProblem) -> Flat:
     """Take the background from the cubic and propagate its error into the rest."""
     with np.errstate(divide="ignore"):
         variance = problem.noise if problem.known_variance else 1.0 / problem.noise
@@ -112,7 +112,7 @@ def cubic(problem: Problem) -> Flat:
     return _flat(fit, problem, quality=found.quality)
 
 
-def tail_mean(problem: Problem) -> Flat:
+def solve_by_tail_mean(problem: PathProblem) -> Flat:
     """Take the background from the mean of the tail and propagate its noise into the rest."""
     found, gradients = solve_tail(problem.power, problem.range, problem.tail_start, problem.noise)
     fit = _above(problem, found.background, gradients)
@@ -120,7 +120,7 @@ def tail_mean(problem: Problem) -> Flat:
     return _flat(fit, problem, quality=found.quality)
 
 
-def _above(problem: Problem, background: Array, gradients: Array) -> Estimate:
+def _above(problem: PathProblem, background: Array, gradients: Array) -> PathEstimate:
     """Fit amplitude and extinction above a background that depends on the same power."""
     fit = _estimate(problem, background=background)
     spread = _propagated(problem, fit, gradients)
@@ -135,7 +135,7 @@ def _above(problem: Problem, background: Array, gradients: Array) -> Estimate:
     )
 
 
-def _propagated(problem: Problem, fit: Estimate, gradients: Array) -> Array:
+def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Array:
     out = np.empty((fit.extinction.size, 6))
     _propagation.propagate(
         problem.power,
@@ -151,12 +151,12 @@ def _propagated(problem: Problem, fit: Estimate, gradients: Array) -> Array:
 
 
 def _estimate(
-    problem: Problem,
+    problem: PathProblem,
     *,
     background: Array | None = None,
     kind: int = _direct.FREE,
     extinction: Array | None = None,
-) -> Estimate:
+) -> PathEstimate:
     """Run the kernel, with the background fitted where it is NaN."""
     nowhere = np.full(1, np.nan)
     table = _table(
@@ -165,12 +165,12 @@ def _estimate(
         kind,
         nowhere if extinction is None else extinction,
     )
-    return Estimate(**dict(zip(COLUMNS, table.T, strict=True)))
+    return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
 
 
-def _table(problem: Problem, background: Array, kind: int, extinction: Array) -> Array:
+def _table(problem: PathProblem, background: Array, kind: int, extinction: Array) -> Array:
     table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
-    _direct.solve_profiles(
+    _direct.solve_direct(
         problem.power,
         problem.noise,
         problem.known_variance,
@@ -184,14 +184,14 @@ def _table(problem: Problem, background: Array, kind: int, extinction: Array) ->
     return table
 
 
-def _rounding(problem: Problem) -> float:
+def _rounding(problem: PathProblem) -> float:
     """Half a unit in the last place, as a standard deviation, and what the kernels lose."""
     return 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
 
 
 def _flat(
-    fit: Estimate,
-    problem: Problem,
+    fit: PathEstimate,
+    problem: PathProblem,
     *,
     unknowns: int = 3,
     quality: Flags = _NOTHING,
@@ -200,7 +200,7 @@ def _flat(
     """Judge an estimate and turn it into what is reported."""
     if given is None:
         given = _Given(np.zeros(1), np.zeros(1), np.zeros(1))
-    verdict = judge(fit, known_variance=problem.known_variance, unknowns=unknowns)
+    verdict = judge_fit(fit, known_variance=problem.known_variance, unknowns=unknowns)
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         level = verdict.noise * verdict.widening**2

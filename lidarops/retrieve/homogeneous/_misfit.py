@@ -22,7 +22,7 @@ from lidarops.retrieve.homogeneous._estimate import (
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,
-    Scratch,
+    ProjectionScratch,
     compiled,
     evaluate,
     largest_of,
@@ -37,7 +37,7 @@ DEPENDENT: Final = 1e-9
 
 
 @compiled
-def _residuals(s: Scratch, p: Point) -> None:
+def _residuals(s: ProjectionScratch, p: Point) -> None:
     """Fill the residuals in units of the noise, and times weight; 0 for bins not used."""
     for i in range(s.z.size):
         residual = s.z[i] - p.mean_z - p.b * (s.phi[i] - p.mean_phi)
@@ -46,7 +46,7 @@ def _residuals(s: Scratch, p: Point) -> None:
 
 
 @summing
-def _bends(s: Scratch) -> tuple[float, float]:
+def _bends(s: ProjectionScratch) -> tuple[float, float]:
     """Sum the squared second differences of the residuals between neighbours; count them."""
     total = terms = 0.0
     # Slices, since an index that might be negative keeps a loop from vectorising.
@@ -84,7 +84,7 @@ def _left(
 
 
 @compiled
-def _trend(g: Grid, s: Scratch, p: Point, w0: float) -> tuple[float, float]:
+def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, float]:
     """Return the energy of the residuals in two shapes that the model lacks, and their number.
 
     One is backscatter that bends along the path, ``phi x^2``, the other a detector that is not
@@ -118,7 +118,7 @@ def _trend(g: Grid, s: Scratch, p: Point, w0: float) -> tuple[float, float]:
 
 
 @summing
-def _bent(g: Grid, s: Scratch, p: Point) -> tuple[float, float, float]:
+def _bent(g: Grid, s: ProjectionScratch, p: Point) -> tuple[float, float, float]:
     """Return the products of ``phi (x - centroid)^2`` with the orthogonal shapes of the model."""
     one = shape = slope = 0.0
     for i in range(g.x.size):
@@ -131,7 +131,9 @@ def _bent(g: Grid, s: Scratch, p: Point) -> tuple[float, float, float]:
 
 
 @compiled
-def describe_bend(g: Grid, s: Scratch, p: Point, w0: float, free: float, row: Array) -> None:
+def describe_bend(
+    g: Grid, s: ProjectionScratch, p: Point, w0: float, free: float, row: Array
+) -> None:
     """Write what a bent signal does to the fit, relative to its amplitude.
 
     About whichever range it bends, the parabolas differ by shapes of the model: the background
@@ -156,7 +158,12 @@ def describe_bend_given(p: Point, row: Array) -> None:
 
 @compiled
 def judge_residuals(
-    g: Grid, s: Scratch, p: Point, tau: float, sums: tuple[float, float, float], row: Array
+    g: Grid,
+    s: ProjectionScratch,
+    p: Point,
+    tau: float,
+    sums: tuple[float, float, float],
+    row: Array,
 ) -> None:
     """Write the tests of the fit, in units of the scaled noise."""
     w0, wz, free = sums

@@ -22,7 +22,7 @@ class Centre(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class PathProblem:
     """Profiles of one section and all that a solver may need to know of them.
 
     "(profile or 1,)" stands for one value for each profile, or one for all.
@@ -56,7 +56,7 @@ class Problem:
     tail_start: float | None = None
     """m: of the bins whose mean is the background of the tail."""
 
-    def select(self, rows: npt.NDArray[np.intp], power: Floats) -> Problem:
+    def select(self, rows: npt.NDArray[np.intp], power: Floats) -> PathProblem:
         """Return the problem of some profiles, with other power."""
 
         def chosen(values: Array | None) -> Array | None:
@@ -72,7 +72,7 @@ class Problem:
             shots=chosen(self.shots),
         )
 
-    def cut(self, bins: slice, bounds: tuple[float, float]) -> Problem:
+    def cut(self, bins: slice, bounds: tuple[float, float]) -> PathProblem:
         """Return the problem of some neighbouring bins."""
         return replace(
             self,

@@ -55,7 +55,7 @@ class Grid(NamedTuple):
     """L, m."""
 
 
-class Scratch(NamedTuple):
+class ProjectionScratch(NamedTuple):
     z: Array
     w: Array
     phi: Array
@@ -116,8 +116,8 @@ def make_grid(range_: Array, bounds: tuple[float, float]) -> Grid:
 
 
 @compiled
-def make_scratch(n: int) -> Scratch:
-    return Scratch(
+def make_scratch(n: int) -> ProjectionScratch:
+    return ProjectionScratch(
         np.zeros(n),
         np.zeros(n),
         np.zeros(n),
@@ -144,7 +144,7 @@ def power_of_two(value: float) -> float:
 
 
 @compiled
-def multiply(values: Array, factor: float) -> None:
+def scale_in_place(values: Array, factor: float) -> None:
     for i in range(values.size):
         values[i] *= factor
 
@@ -229,7 +229,7 @@ def _gradients(
 
 
 @compiled
-def evaluate(tau: float, g: Grid, s: Scratch, w0: float, wz: float, free: float) -> Point:
+def evaluate(tau: float, g: Grid, s: ProjectionScratch, w0: float, wz: float, free: float) -> Point:
     x, w, z, phi = g.x, s.w, s.z, s.phi
     _shape(tau, x, g.envelope, g.step, phi, s.fine)
     s1, s2, sz, x1, x2 = _moments(x, w, z, phi)

@@ -18,7 +18,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def fill_weights(power: Any, noise: Array, is_variance: bool, weights: Array) -> None:
+def fill_linear_weights(power: Any, noise: Array, is_variance: bool, weights: Array) -> None:
     for i in range(weights.size):
         weight = 1.0 / noise[i] if is_variance else noise[i]
         usable = abs(np.float64(power[i])) < HUGE and 0.0 < weight < HUGE
@@ -101,5 +101,5 @@ def propagate(
         for i in range(phi.size):
             phi[i] = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction[k] * (range_[i] - start))
         b = amplitude[k] * math.exp(-2.0 * extinction[k] * start) / start**2
-        fill_weights(power[k], noise[k % noise.shape[0]], is_variance, weights)
+        fill_linear_weights(power[k], noise[k % noise.shape[0]], is_variance, weights)
         _propagate_profile(b, phi, range_, weights, gradients[k % gradients.shape[0]], out[k])

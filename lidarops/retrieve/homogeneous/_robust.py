@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.flags import Quality
-from lidarops.retrieve.homogeneous._problem import Array, Flat, Problem
+from lidarops.retrieve.homogeneous._problem import Array, Flat, PathProblem
 
 FARTHEST: Final = 4.0
 """Deviation, in standard deviations of the noise, beyond which a bin is left out."""
@@ -28,10 +28,10 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 class Robust:
     """A solver that leaves out outlying bins and fits again, a fixed number of times."""
 
-    solver: Callable[[Problem], Flat]
+    solver: Callable[[PathProblem], Flat]
     passes: int
 
-    def __call__(self, problem: Problem) -> Flat:
+    def __call__(self, problem: PathProblem) -> Flat:
         """Solve; each profile on its own."""
         found = self.solver(problem)
         if self.passes == 0:
@@ -51,7 +51,7 @@ class Robust:
 
 
 def _find_far(
-    problem: Problem, found: Flat, left_out: npt.NDArray[np.bool_]
+    problem: PathProblem, found: Flat, left_out: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.intp]:
     """Update which bins are left out; return the profiles for which that changed."""
     changed = np.zeros(problem.power.shape[0], dtype=np.bool_)

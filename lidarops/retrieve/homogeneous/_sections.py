@@ -14,7 +14,7 @@ FEWEST_BINS: Final = 4
 """Of a section: below, the model has as many unknowns as there are values."""
 
 
-def bins_of(sections: Sequence[tuple[float, float]] | None, range_: Array) -> list[slice]:
+def section_bins(sections: Sequence[tuple[float, float]] | None, range_: Array) -> list[slice]:
     """Return the bins of each section, all for None.
 
     Parameters

@@ -42,7 +42,7 @@ _Block = npt.NDArray[Any]
 _Function = Callable[..., tuple[_Block, ...]]
 
 
-def homogeneous(
+def fit_homogeneous_path(
     power: xr.DataArray,
     *,
     sections: Sequence[tuple[float, float]],
@@ -67,7 +67,7 @@ def homogeneous(
         overlapping bins are left out; a section carries SATURATED, PILE_UP and
         INCOMPLETE_OVERLAP of its bins.
     method : str
-        See `lidarops.retrieve.homogeneous.path_fit.solve`; one that needs nothing but the power.
+        See `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`; one that needs nothing but the power.
     relative_variance : bool
         Whether `variance` holds up to a factor, which each section then finds for itself: for a
         variance that was estimated from the same data.
@@ -108,10 +108,10 @@ def homogeneous(
     return result.assign_coords(_places(edges))
 
 
-def nothing(
+def empty_fit(
     profiles: xr.DataArray, *, unit: str, sections: Sequence[tuple[float, float]]
 ) -> xr.Dataset:
-    """Return sections as of `homogeneous`, without values, and without any power.
+    """Return sections as of `fit_homogeneous_path`, without values, and without any power.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
     Parameters
     ----------
     result : xr.Dataset
-        From `homogeneous`.
+        From `fit_homogeneous_path`.
     zenith_angle : xr.DataArray
         degree, over the dimensions of `result` but ``section``, or fewer.
 
@@ -353,7 +353,9 @@ def _solve_section(
     if relative and variance is not None:
         with np.errstate(divide="ignore"):
             variance, weights = None, 1.0 / np.asarray(variance)
-    found = _homogeneous.solve(power, range, variance=variance, weights=weights, method=method)
+    found = _homogeneous.fit_homogeneous_path(
+        power, range, variance=variance, weights=weights, method=method
+    )
     values = tuple(getattr(found, name) for name in _SECTION)
     return (*values, found.valid_bins, found.quality | carried)
 

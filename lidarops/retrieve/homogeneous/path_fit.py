@@ -15,7 +15,7 @@ from lidarops.retrieve.background import photon_counts
 from lidarops.retrieve.background.cubic_and_tail import Statistics
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.homogeneous import _dense, _methods, _robust, _sections
-from lidarops.retrieve.homogeneous._problem import Array, Centre, Flags, Flat, Problem
+from lidarops.retrieve.homogeneous._problem import Array, Centre, Flags, Flat, PathProblem
 
 LOWEST_EXTINCTION: Final = -0.3
 """Default lower bound, over the far end of the section. Where extinction approaches
@@ -28,7 +28,7 @@ _LARGEST_OPTICAL_DEPTH: Final = 300.0
 """Beyond this the exponential leaves the numbers that a computer has."""
 
 
-class Method(StrEnum):
+class HomogeneousMethod(StrEnum):
     """Ways to solve a homogeneous path."""
 
     AUTO = "auto"
@@ -42,28 +42,28 @@ class Method(StrEnum):
     TAIL_MEAN = "tail_mean"
 
 
-_SOLVERS: Final[dict[Method, Callable[[Problem], Flat]]] = {
-    Method.AUTO: _dense.compressed,
-    Method.COMPRESSED: _dense.compressed,
-    Method.FAST: _dense.fast,
-    Method.DIRECT: _methods.direct,
-    Method.CUBIC: _methods.cubic,
-    Method.LINEARIZED: _methods.linearized,
-    Method.KNOWN_BACKGROUND: _methods.known_background,
-    Method.KNOWN_EXTINCTION: _methods.known_extinction,
-    Method.TAIL_MEAN: _methods.tail_mean,
+_SOLVERS: Final[dict[HomogeneousMethod, Callable[[PathProblem], Flat]]] = {
+    HomogeneousMethod.AUTO: _dense.compressed,
+    HomogeneousMethod.COMPRESSED: _dense.compressed,
+    HomogeneousMethod.FAST: _dense.fast,
+    HomogeneousMethod.DIRECT: _methods.solve_by_direct_fit,
+    HomogeneousMethod.CUBIC: _methods.solve_by_cubic,
+    HomogeneousMethod.LINEARIZED: _methods.solve_by_linearization,
+    HomogeneousMethod.KNOWN_BACKGROUND: _methods.solve_with_known_background,
+    HomogeneousMethod.KNOWN_EXTINCTION: _methods.solve_with_known_extinction,
+    HomogeneousMethod.TAIL_MEAN: _methods.solve_by_tail_mean,
 }
 
-_NEEDS: Final[dict[str, set[Method]]] = {
-    "extinction": {Method.LINEARIZED, Method.KNOWN_EXTINCTION},
-    "background": {Method.KNOWN_BACKGROUND},
+_NEEDS: Final[dict[str, set[HomogeneousMethod]]] = {
+    "extinction": {HomogeneousMethod.LINEARIZED, HomogeneousMethod.KNOWN_EXTINCTION},
+    "background": {HomogeneousMethod.KNOWN_BACKGROUND},
 }
 """Arguments that these methods need and no other takes."""
-_TAKES: Final[dict[str, set[Method]]] = {
-    "background_standard_error": {Method.KNOWN_BACKGROUND},
-    "centre": {Method.LINEARIZED},
-    "lag": {Method.CUBIC},
-    "tail_start": {Method.TAIL_MEAN},
+_TAKES: Final[dict[str, set[HomogeneousMethod]]] = {
+    "background_standard_error": {HomogeneousMethod.KNOWN_BACKGROUND},
+    "centre": {HomogeneousMethod.LINEARIZED},
+    "lag": {HomogeneousMethod.CUBIC},
+    "tail_start": {HomogeneousMethod.TAIL_MEAN},
 }
 """Arguments that these methods take and no other."""
 
@@ -136,7 +136,7 @@ class HomogeneousResult:
     """Bits of `lidarops.flags.Quality`; 0 where no test failed."""
 
 
-def solve(
+def fit_homogeneous_path(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     *,
@@ -313,7 +313,7 @@ def solve(
     >>> float(np.round(solve(power, distance).extinction, 12))
     3e-05
     """
-    way = inputs.choice(method, Method, "method")
+    way = inputs.choice(method, HomogeneousMethod, "method")
     _check_arguments(
         way,
         {
@@ -331,7 +331,7 @@ def solve(
     error = inputs.profile_values(background_standard_error, "background_standard_error", leading)
     if error is not None and np.any(error < 0):
         raise RetrievalInputError("is negative", field="background_standard_error")
-    problem = Problem(
+    problem = PathProblem(
         power=rows,
         range=grid.values,
         noise=noise,
@@ -351,7 +351,7 @@ def solve(
     solver = _robust.Robust(_SOLVERS[way], _passes(robust_passes, way))
     found = [
         solver(problem.cut(bins, _bounds(extinction_bounds, grid.values[bins])))
-        for bins in _sections.bins_of(sections, grid.values)
+        for bins in _sections.section_bins(sections, grid.values)
     ]
     shape = leading if sections is None else (*leading, len(found))
     return _result(found, shape, _share(model_error))
@@ -429,7 +429,7 @@ def _shots(
             field="variance",
             remedy="give mean_profile_variance(power, shots) of the whole block",
         )
-    return photon_counts.checked(power, shots, leading)
+    return photon_counts.checked_shots(power, shots, leading)
 
 
 def _prior(
@@ -446,7 +446,7 @@ def _prior(
     return values
 
 
-def _check_arguments(method: Method, given: Mapping[str, object]) -> None:
+def _check_arguments(method: HomogeneousMethod, given: Mapping[str, object]) -> None:
     for name, value in given.items():
         takers = (_NEEDS | _TAKES)[name]
         if value is not None and method not in takers:
@@ -459,12 +459,12 @@ def _check_arguments(method: Method, given: Mapping[str, object]) -> None:
             raise RetrievalInputError(f"is needed by the method {str(method)!r}", field=name)
 
 
-def _passes(passes: int, method: Method) -> int:
+def _passes(passes: int, method: HomogeneousMethod) -> int:
     if not isinstance(passes, int | np.integer) or passes < 0:
         raise RetrievalInputError(
             f"is {passes!r}", field="robust_passes", remedy="give 0, 1, 2 or more passes"
         )
-    if passes and method is Method.CUBIC:
+    if passes and method is HomogeneousMethod.CUBIC:
         raise RetrievalInputError(
             f"is {passes}, but the cubic takes no gaps",
             field="robust_passes",

@@ -38,7 +38,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
+class BeamBlock:
     """Logarithms of one block of profiles, and where its rays lead."""
 
     logarithm: Array
@@ -81,7 +81,7 @@ class Regression:
         return self.table[:, number]
 
 
-def make_rays(signal: npt.NDArray[np.floating], variance: Array, scan: Scan) -> Rays:
+def make_beam_block(signal: npt.NDArray[np.floating], variance: Array, scan: Scan) -> BeamBlock:
     """Take logarithms of one block.
 
     Parameters
@@ -95,7 +95,7 @@ def make_rays(signal: npt.NDArray[np.floating], variance: Array, scan: Scan) -> 
     _sample_mask.take_logarithms(signal, variance, scan.usable, logarithm, noise, ends)
     gates = np.arange(signal.shape[-1])
     alive = (ends[:, :, np.newaxis] > gates).sum(axis=1)
-    return Rays(
+    return BeamBlock(
         logarithm,
         noise,
         np.nan_to_num(scan.path, nan=1.0),
@@ -107,7 +107,7 @@ def make_rays(signal: npt.NDArray[np.floating], variance: Array, scan: Scan) -> 
     )
 
 
-def regress(rays: Rays, *, inhomogeneity: float | None, robust: bool) -> Regression:
+def regress(rays: BeamBlock, *, inhomogeneity: float | None, robust: bool) -> Regression:
     """Fit every height of one block.
 
     Parameters
@@ -127,7 +127,7 @@ def regress(rays: Rays, *, inhomogeneity: float | None, robust: bool) -> Regress
 
 
 def gradient_found(
-    rays: Rays, fit: Regression, altitude: Array, correlation: float, slack: float
+    rays: BeamBlock, fit: Regression, altitude: Array, correlation: float, slack: float
 ) -> npt.NDArray[np.bool_]:
     """Tell at which altitudes the residuals of a block show a horizontal gradient.
 
@@ -164,7 +164,7 @@ def gradient_found(
     return found
 
 
-def _unexplained(rays: Rays, fit: Regression, d: Array) -> Array:
+def _unexplained(rays: BeamBlock, fit: Regression, d: Array) -> Array:
     """Return the weighted squares of a distance that path and constant leave, (profile, gate)."""
     weights = _weights(rays, fit)
     whole = weights.sum(axis=1)
@@ -179,12 +179,12 @@ def _unexplained(rays: Rays, fit: Regression, d: Array) -> Array:
     return np.where(fit.column(kh.FREEDOM) > 0, np.nan_to_num(left), 0.0)
 
 
-def weights_of(rays: Rays, fit: Regression) -> Array:
+def weights_of(rays: BeamBlock, fit: Regression) -> Array:
     """Return the weights of the fit as (profile, angle, altitude)."""
     return _weights(rays, fit)
 
 
-def kept_information(rays: Rays, fit: Regression) -> Array:
+def kept_information(rays: BeamBlock, fit: Regression) -> Array:
     """Return the information that outliers and gaps leave of that of all rays, (profile, altitude).
 
     An altitude that lost a ray has all the noise that it shares with others, and more of its own.
@@ -212,7 +212,7 @@ def _without_gaps(noise: Array) -> Array:
     return np.where(there, noise, np.where(between, first * last, np.inf))
 
 
-def _squares_of_path(rays: Rays, weights: Array) -> Array:
+def _squares_of_path(rays: BeamBlock, weights: Array) -> Array:
     whole = weights.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = np.einsum("tak,ak->tk", weights, rays.path) / whole
@@ -221,7 +221,7 @@ def _squares_of_path(rays: Rays, weights: Array) -> Array:
     return squares
 
 
-def common_scale(rays: Rays, fit: Regression) -> Array:
+def common_scale(rays: BeamBlock, fit: Regression) -> Array:
     """Return what makes residuals of two altitudes as alike as their errors, (profile, altitude).
 
     The bisquare makes residuals small; and with other rays left out, other parts of the errors
@@ -239,13 +239,13 @@ def common_scale(rays: Rays, fit: Regression) -> Array:
     return scale
 
 
-def _weights(rays: Rays, fit: Regression) -> Array:
+def _weights(rays: BeamBlock, fit: Regression) -> Array:
     weights = 1.0 / (rays.noise + fit.inhomogeneity)
     return weights * fit.keep if fit.keep.shape[1] > 0 else weights
 
 
 def _fit(
-    rays: Rays, keep: Array, inhomogeneity: float | None, moments: tuple[float, float]
+    rays: BeamBlock, keep: Array, inhomogeneity: float | None, moments: tuple[float, float]
 ) -> Regression:
     """Estimate the inhomogeneity from a first guess and once again from that; fit with it."""
     if inhomogeneity is not None:
@@ -260,7 +260,7 @@ def _fit(
     return replace(_fit_known(rays, keep, variance, moments[1]), freedom=freedom)
 
 
-def _fit_known(rays: Rays, keep: Array, variance: Array, of_information: float) -> Regression:
+def _fit_known(rays: BeamBlock, keep: Array, variance: Array, of_information: float) -> Regression:
     table = np.empty((rays.noise.shape[0], kh.COLUMNS, rays.noise.shape[2]))
     residual, leverage = np.empty(rays.noise.shape), np.empty(rays.noise.shape)
     y, x, d = rays.logarithm, rays.path, rays.distance
@@ -274,13 +274,13 @@ def _fit_known(rays: Rays, keep: Array, variance: Array, of_information: float) 
     return Regression(table, variance, freedom, keep, keep.shape[1] > 0, residual, leverage)
 
 
-def _run(rays: Rays, keep: Array, variance: Array, table: Array) -> None:
+def _run(rays: BeamBlock, keep: Array, variance: Array, table: Array) -> None:
     y, noise, x, d = rays.logarithm, rays.noise, rays.path, rays.distance
     if rays.sides:
         nothing = np.empty((0, *noise.shape[1:]))
         kh.fit_gates(y, noise, keep, variance, x, d, rays.sides, table, nothing, nothing)
     else:
-        kh.fit_profiles(y, noise, keep, variance, x, table)
+        kh.fit_kano_hamilton(y, noise, keep, variance, x, table)
 
 
 def _dersimonian_laird(table: Array, before: Array, of_chi2: float) -> tuple[Array, Array]:
@@ -325,7 +325,7 @@ def student_factor(freedom: Array) -> Array:
     return np.where(freedom > 0, np.sqrt(nu / (nu - 2.0)), 1.0)
 
 
-def _has_outliers(rays: Rays, fit: Regression) -> bool:
+def _has_outliers(rays: BeamBlock, fit: Regression) -> bool:
     if (
         np.max(np.count_nonzero(rays.noise < np.inf, axis=1), initial=0)
         < robust_weights.FEWEST_RAYS
@@ -342,7 +342,7 @@ def outlying(count: int) -> float:
     return max(OUTLYING, -float(ndtri(0.5 * FALSE_ALARM / max(count, 1))))
 
 
-def _fit_robustly(rays: Rays, inhomogeneity: float | None) -> Regression:
+def _fit_robustly(rays: BeamBlock, inhomogeneity: float | None) -> Regression:
     residual = np.empty(rays.noise.shape)
     robust_weights.start_residuals(rays.logarithm, rays.noise, rays.path, residual)
     scale = _start_scale(rays, residual) if inhomogeneity is None else inhomogeneity**2
@@ -352,14 +352,14 @@ def _fit_robustly(rays: Rays, inhomogeneity: float | None) -> Regression:
     width = robust_weights.START_WIDTH
     leverage = np.zeros(rays.noise.shape)
     for _ in range(3):
-        robust_weights.fill_weights(residual, leverage, rays.noise, variance, width, keep)
+        robust_weights.fill_robust_weights(residual, leverage, rays.noise, variance, width, keep)
         fit = _fit(rays, keep, inhomogeneity, robust_weights.clean_moments(width))
         residual, leverage, variance = fit.residual, fit.leverage, fit.inhomogeneity
         width = robust_weights.PASS_WIDTH
     return fit
 
 
-def _start_scale(rays: Rays, residual: Array) -> Array:
+def _start_scale(rays: BeamBlock, residual: Array) -> Array:
     """Return the variance of the inhomogeneity as medians tell it, averaged over the window."""
     variance, samples = np.empty(residual.shape[2]), np.empty(residual.shape[2])
     robust_weights.median_variance(residual, rays.noise, variance, samples)
@@ -367,7 +367,7 @@ def _start_scale(rays: Rays, residual: Array) -> Array:
     return np.where(total > 0, _windowed(variance * samples) / np.maximum(total, 1.0), 0.0)
 
 
-def end_rays(rays: Rays) -> Rays:
+def end_rays(rays: BeamBlock) -> BeamBlock:
     """Return the rays with the shortest and the longest path of every altitude alone."""
     on = rays.noise < np.inf
     shortest = np.where(on, rays.path, np.inf)
@@ -380,7 +380,7 @@ def end_rays(rays: Rays) -> Rays:
     return replace(rays, noise=noise, sides=False, needed=2)
 
 
-def refit(rays: Rays, inhomogeneity: Array, freedom: Array) -> Regression:
+def refit(rays: BeamBlock, inhomogeneity: Array, freedom: Array) -> Regression:
     """Fit with an inhomogeneity that is known from elsewhere, with so many degrees of freedom."""
     keep = np.ones((rays.noise.shape[0], 0, rays.noise.shape[2]))
     fit = _fit_known(rays, keep, inhomogeneity, 1.0)

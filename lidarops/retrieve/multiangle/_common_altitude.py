@@ -21,7 +21,7 @@ _CLEAR: Final = 30.0
 noise too; below, interpolating the signal itself errs by far less than its noise."""
 
 
-class Interpolation(StrEnum):
+class AltitudeInterpolation(StrEnum):
     """How values between range bins are found."""
 
     CUBIC = "cubic"
@@ -88,7 +88,10 @@ def to_altitude(
     RetrievalInputError
         For arguments that cannot be right.
     """
-    cubic = inputs.choice(interpolation, Interpolation, "interpolation") is Interpolation.CUBIC
+    cubic = (
+        inputs.choice(interpolation, AltitudeInterpolation, "interpolation")
+        is AltitudeInterpolation.CUBIC
+    )
     height = slant_paths.altitude_grid(altitude, station_altitude)
     scan = slant_paths.make_scan(zenith_angle, height)
     values = inputs.real_array(signal, "signal").astype(np.float64)

@@ -178,7 +178,7 @@ def _expect_tile(
 
 
 @_compiled
-def fit_profiles(
+def fit_kano_hamilton(
     y: Array, noise: Array, keep: Array, inhomogeneity: Array, x: Array, out: Array
 ) -> None:
     """Fit optical depth and intercept at every height of every profile.
@@ -220,16 +220,16 @@ def fit_details(
     residuals: Array,
     leverages: Array,
 ) -> None:
-    """Fit as `fit_profiles`, with all that `fit_gates` gives where it fits no gradient.
+    """Fit as `fit_kano_hamilton`, with all that `fit_gates` gives where it fits no gradient.
 
     Parameters
     ----------
     y, noise, keep, inhomogeneity, x, out
-        As in `fit_profiles`.
+        As in `fit_kano_hamilton`.
     d, residuals, leverages
         As in `fit_gates`, with all profiles.
     """
-    fit_profiles(y, noise, keep, inhomogeneity, x, out)
+    fit_kano_hamilton(y, noise, keep, inhomogeneity, x, out)
     count, angles, gates = y.shape
     weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
     for t in range(count):
@@ -458,12 +458,12 @@ def fit_gates(
     residuals: Array,
     leverages: Array,
 ) -> None:
-    """Fit as `fit_profiles`, with gradients at gates whose rays surround the zenith.
+    """Fit as `fit_kano_hamilton`, with gradients at gates whose rays surround the zenith.
 
     Parameters
     ----------
     y, noise, keep, inhomogeneity, x, out
-        As in `fit_profiles`.
+        As in `fit_kano_hamilton`.
     d : (2, angle, altitude) float
         Horizontal distance over altitude, eastward and northward.
     sides : bool

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lidarops.retrieve.multiangle import _block, _mld_blocks, _neighbours, _path_variation
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
-from lidarops.retrieve.multiangle._block import Rays, Regression
+from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 from lidarops.retrieve.multiangle._result import Profiles
 from lidarops.retrieve.multiangle.mld import Regularisation
 from lidarops.retrieve.multiangle.slant_paths import Scan
@@ -28,7 +28,7 @@ _HARMLESS: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class BlockSettings:
     """What is common to the blocks of a retrieval."""
 
     method: str
@@ -48,7 +48,7 @@ class Settings:
 
 
 def solve_block(
-    signal: npt.NDArray[np.floating], variance: Array, prior: Array | None, settings: Settings
+    signal: npt.NDArray[np.floating], variance: Array, prior: Array | None, settings: BlockSettings
 ) -> tuple[Profiles, list[Step]]:
     """Solve the profiles of one block.
 
@@ -65,7 +65,7 @@ def solve_block(
     list of (str, bool, str)
         Steps, whether they ran, and why or why not.
     """
-    rays = _block.make_rays(signal, variance, settings.scan)
+    rays = _block.make_beam_block(signal, variance, settings.scan)
     steps = [_angles_step(settings.scan)]
     fit = _block.regress(rays, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
     steps += [_robust_step(fit, settings), _gradient_step(rays)]
@@ -91,7 +91,7 @@ def _angles_step(scan: Scan) -> Step:
     return ("drop_longest_paths", False, "no ray is longer than 10 vertical paths")
 
 
-def _robust_step(fit: Regression, settings: Settings) -> Step:
+def _robust_step(fit: Regression, settings: BlockSettings) -> Step:
     if not settings.robust:
         return ("robust_passes", False, "not wanted")
     if fit.robust:
@@ -99,13 +99,13 @@ def _robust_step(fit: Regression, settings: Settings) -> Step:
     return ("robust_passes", False, "no residual is too large for chance, or fewer than 4 rays")
 
 
-def _gradient_step(rays: Rays) -> Step:
+def _gradient_step(rays: BeamBlock) -> Step:
     if rays.sides:
         return ("horizontal_gradient", True, "rays lead to all sides")
     return ("horizontal_gradient", False, "a half turn around the zenith is free of rays")
 
 
-def _chosen(rays: Rays, fit: Regression, settings: Settings) -> tuple[str, str]:
+def _chosen(rays: BeamBlock, fit: Regression, settings: BlockSettings) -> tuple[str, str]:
     if settings.method != "auto":
         return settings.method, "chosen by name"
     if np.max(np.count_nonzero(rays.noise < np.inf, axis=1), initial=0) <= 2:
@@ -121,7 +121,7 @@ def _chosen(rays: Rays, fit: Regression, settings: Settings) -> tuple[str, str]:
 
 
 def _kano_hamilton(
-    rays: Rays, fit: Regression, _prior: Array | None, settings: Settings
+    rays: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
 ) -> Profiles:
     """Take the estimates of single altitudes as they are."""
     part = _start(rays, fit, settings)
@@ -144,7 +144,9 @@ def _kano_hamilton(
     return part
 
 
-def _two_angle(rays: Rays, fit: Regression, prior: Array | None, settings: Settings) -> Profiles:
+def _two_angle(
+    rays: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
+) -> Profiles:
     """Use the shortest and the longest path of each altitude, with the scan's inhomogeneity."""
     ends = _block.end_rays(rays)
     part = _kano_hamilton(ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), prior, settings)
@@ -152,7 +154,9 @@ def _two_angle(rays: Rays, fit: Regression, prior: Array | None, settings: Setti
     return part
 
 
-def _joint(rays: Rays, fit: Regression, _prior: Array | None, settings: Settings) -> Profiles:
+def _joint(
+    rays: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
+) -> Profiles:
     """Join the estimates of single altitudes into smooth profiles."""
     part = _start(rays, fit, settings)
     within = np.isfinite(part.optical_depth)
@@ -165,7 +169,7 @@ def _joint(rays: Rays, fit: Regression, _prior: Array | None, settings: Settings
         np.where(within, share, 0.0),
         rays.gaps,
     )
-    smooth = smooth_profile.smooth(
+    smooth = smooth_profile.smooth_optical_depth(
         part.optical_depth,
         np.where(within, fit.column(kh.INFORMATION), 0.0),
         settings.height,
@@ -219,7 +223,7 @@ def _withhold_extinction(part: Profiles, where: Mask) -> None:
         values[where] = np.nan
 
 
-def _start(rays: Rays, fit: Regression, settings: Settings) -> Profiles:
+def _start(rays: BeamBlock, fit: Regression, settings: BlockSettings) -> Profiles:
     """Return profiles with what all methods share; optical depths only within the reach."""
     count, angles, gates = rays.noise.shape
     part = Profiles.missing(count, angles, gates, len(settings.layers))
@@ -245,7 +249,7 @@ def _start(rays: Rays, fit: Regression, settings: Settings) -> Profiles:
     return part
 
 
-def _raise_common_flags(part: Profiles, rays: Rays, fit: Regression) -> None:
+def _raise_common_flags(part: Profiles, rays: BeamBlock, fit: Regression) -> None:
     """Raise the flags that depend on the geometry alone, wherever there is a value."""
     valued = np.isfinite(part.optical_depth)
     seen = fit.column(kh.INFORMATION) > 0
@@ -259,7 +263,7 @@ def _raise_common_flags(part: Profiles, rays: Rays, fit: Regression) -> None:
 
 
 def _raise_gradient(
-    part: Profiles, rays: Rays, fit: Regression, settings: Settings, correlation: float
+    part: Profiles, rays: BeamBlock, fit: Regression, settings: BlockSettings, correlation: float
 ) -> None:
     found = _block.gradient_found(
         rays, fit, settings.height, correlation, _HARMLESS * settings.largest_gradient
@@ -267,7 +271,7 @@ def _raise_gradient(
     part.flags["gradient"] |= found & np.isfinite(part.optical_depth)
 
 
-def _lag_one(rays: Rays, fit: Regression) -> float:
+def _lag_one(rays: BeamBlock, fit: Regression) -> float:
     """Return the correlation of residuals at neighbouring altitudes, 0 to 0.98."""
     u = np.nan_to_num(fit.residual) * np.sqrt(_block.weights_of(rays, fit))
     both = np.einsum("tak,tak->", u[:, :, :-1], u[:, :, 1:])
@@ -275,13 +279,13 @@ def _lag_one(rays: Rays, fit: Regression) -> float:
     return float(np.clip(both / whole, 0.0, 0.98)) if whole > 0 else 0.0
 
 
-def _gradient_slopes(fit: Regression, settings: Settings) -> Array:
+def _gradient_slopes(fit: Regression, settings: BlockSettings) -> Array:
     """Return what the largest gradient to the east and north makes of each optical depth."""
     scale = settings.largest_gradient * settings.height
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 
 
-def _state_gradient_errors(part: Profiles, slopes: Array, settings: Settings) -> None:
+def _state_gradient_errors(part: Profiles, slopes: Array, settings: BlockSettings) -> None:
     """Fill what the largest gradient does, from what it does along east and north, signed."""
     part.optical_depth_gradient_error[:] = np.hypot(*slopes)
     part.extinction_gradient_error[:] = np.hypot(
@@ -303,7 +307,7 @@ def _below(values: Array) -> Array:
     return np.concatenate([np.zeros((values.shape[0], 1)), values[:, :-1]], axis=1)
 
 
-def _subtract_bounds(part: Profiles, settings: Settings) -> None:
+def _subtract_bounds(part: Profiles, settings: BlockSettings) -> None:
     """Take optical depths of layers as differences of those of their bounds."""
     none = np.zeros((part.optical_depth.shape[0], 1))
     tau = np.hstack([part.optical_depth, none])
@@ -315,20 +319,24 @@ def _subtract_bounds(part: Profiles, settings: Settings) -> None:
         )
 
 
-def _mld(rays: Rays, fit: Regression, _prior: Array | None, settings: Settings) -> Profiles:
+def _mld(
+    rays: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
+) -> Profiles:
     return _regularised(rays, fit, None, settings)
 
 
-def _mld_prior(rays: Rays, fit: Regression, prior: Array | None, settings: Settings) -> Profiles:
-    return _regularised(rays, fit, _mld_blocks.Prior(prior), settings)
+def _mld_prior(
+    rays: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
+) -> Profiles:
+    return _regularised(rays, fit, _mld_blocks.MldPrior(prior), settings)
 
 
 def _regularised(
-    rays: Rays, fit: Regression, prior: _mld_blocks.Prior | None, settings: Settings
+    rays: BeamBlock, fit: Regression, prior: _mld_blocks.MldPrior | None, settings: BlockSettings
 ) -> Profiles:
     """Differentiate along the slant path, altitude by altitude."""
     part = _start(rays, fit, settings)
-    answer = _mld_blocks.solve(rays, fit.inhomogeneity, settings.regularisation, prior)
+    answer = _mld_blocks.solve_mld_blocks(rays, fit.inhomogeneity, settings.regularisation, prior)
     within = np.isfinite(part.optical_depth) & np.isfinite(answer.optical_depth)
     part.optical_depth[:] = np.where(within, answer.optical_depth, np.nan)
     part.optical_depth_standard_error[:] = np.where(within, answer.standard_error, np.nan)
@@ -351,7 +359,9 @@ def _regularised(
 
 _BLIND: Final = ("two_angle", "mld", "mld_prior")
 """Methods that see no horizontal gradient."""
-_METHODS: Final[dict[str, Callable[[Rays, Regression, Array | None, Settings], Profiles]]] = {
+_METHODS: Final[
+    dict[str, Callable[[BeamBlock, Regression, Array | None, BlockSettings], Profiles]]
+] = {
     "two_angle": _two_angle,
     "kano_hamilton": _kano_hamilton,
     "joint": _joint,

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.multiangle import mld
-from lidarops.retrieve.multiangle._block import Rays
+from lidarops.retrieve.multiangle._block import BeamBlock
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Prior:
+class MldPrior:
     """What is subtracted before: optical depths, or the answer at the altitude below."""
 
     optical_depth: Array | None
@@ -34,8 +34,11 @@ class Answer:
     """(2, profile, altitude): change per unit of gradient over altitude, east and north."""
 
 
-def solve(
-    rays: Rays, inhomogeneity: Array, regularisation: mld.Regularisation, prior: Prior | None
+def solve_mld_blocks(
+    rays: BeamBlock,
+    inhomogeneity: Array,
+    regularisation: mld.Regularisation,
+    prior: MldPrior | None,
 ) -> Answer:
     """Solve every altitude with the rays that it has.
 

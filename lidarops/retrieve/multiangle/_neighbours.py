@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-from lidarops.retrieve.multiangle._block import Rays, Regression
+from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 from lidarops.retrieve.multiangle._path_variation import taken_away
 
 Array = npt.NDArray[np.float64]
@@ -27,7 +27,7 @@ _COLUMNS: Final = 4
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def neighbours_alike(rays: Rays, fit: Regression) -> bool:
+def neighbours_alike(rays: BeamBlock, fit: Regression) -> bool:
     r"""Tell whether the scatter of neighbouring rays goes together.
 
     Residuals about a constant, the slant path and the horizontal distances are multiplied with

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.special import polygamma
 
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
-from lidarops.retrieve.multiangle._block import Rays, Regression
+from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 
 Array = npt.NDArray[np.float64]
 Gates = npt.NDArray[np.intp]
@@ -40,7 +40,7 @@ _COLUMNS: Final = 4
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def doubted_from(rays: Rays, fit: Regression) -> int | None:
+def doubted_from(rays: BeamBlock, fit: Regression) -> int | None:
     r"""Return the altitude from which on extinction varies along paths; None where it does not.
 
     With the inhomogeneity of the lower third of the altitudes, residuals are formed anew about a
@@ -118,7 +118,7 @@ def _grows(lower: _Means, upper: _Means) -> bool:
     return growth > GROWTH and math.log(growth) > CERTAINTY * spread
 
 
-def _ray_means(rays: Rays, fit: Regression, gates: Gates, inhomogeneity: float) -> _Means:
+def _ray_means(rays: BeamBlock, fit: Regression, gates: Gates, inhomogeneity: float) -> _Means:
     """Average each ray of each profile over a third."""
     count, angles, _ = rays.noise.shape
     residual = np.zeros((count * angles, gates.size))

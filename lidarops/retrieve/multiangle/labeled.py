@@ -18,10 +18,14 @@ from lidarops.retrieve.multiangle.labeled_altitudes import (
     Background,
     on_altitudes,
 )
-from lidarops.retrieve.multiangle.optical_depth import Method, MultiAngleResult, StepRecord
+from lidarops.retrieve.multiangle.optical_depth import (
+    MultiAngleMethod,
+    MultiAngleResult,
+    StepRecord,
+)
 from lidarops.retrieve.multiangle.vertical.monotone import project as monotone
 
-__all__ = ["Background", "on_altitudes", "retrieve", "scan"]
+__all__ = ["Background", "on_altitudes", "retrieve_optical_depth", "retrieve_scan"]
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
@@ -65,7 +69,7 @@ _OF_LAYERS: Final = (
 )
 
 
-def scan(
+def retrieve_scan(
     conditioned: xr.Dataset,
     *,
     zenith_angle: npt.ArrayLike,
@@ -83,7 +87,7 @@ def scan(
 ) -> xr.Dataset:
     """Retrieve optical depth and extinction from the profiles of a scanning lidar.
 
-    `on_altitudes`, computed, and `retrieve`, whose arguments these are.
+    `on_altitudes`, computed, and `retrieve_optical_depth`, whose arguments these are.
 
     Returns
     -------
@@ -107,7 +111,7 @@ def scan(
         background=background,
         overlap=overlap,
     )
-    return retrieve(
+    return retrieve_optical_depth(
         rays.compute(),
         station_altitude=station_altitude,
         method=method,
@@ -116,7 +120,7 @@ def scan(
     )
 
 
-def retrieve(
+def retrieve_optical_depth(
     rays: xr.Dataset,
     *,
     station_altitude: float,
@@ -130,7 +134,7 @@ def retrieve(
     ----------
     rays : xr.Dataset
         From `on_altitudes`, in memory. All its cycles are one block of
-        `lidarops.retrieve.multiangle.optical_depth.solve`.
+        `lidarops.retrieve.multiangle.optical_depth.retrieve_optical_depth`.
     station_altitude : float
         m above mean sea level.
     method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
@@ -209,22 +213,25 @@ def _in_layers(
 
 
 def _solved(*data: Array, method: str, **settings: Any) -> MultiAngleResult:
-    """Return what `optical_depth.solve` finds, of single altitudes where "auto" joined in vain.
+    """Return what `optical_depth.retrieve_optical_depth` finds, of single altitudes where "auto" joined in vain.
 
     Errors that go along with altitude, as of the energy of the shots, are no smooth profile's:
     there the joint solution doubts its own intervals, and single altitudes still stand.
     """
-    found = optical_depth.solve(*data, method=method, **settings)
+    found = optical_depth.retrieve_optical_depth(*data, method=method, **settings)
     flags = found.flags
     valued = np.isfinite(found.optical_depth)
     doubted = flags.undersmoothed | flags.high_correlation
-    if method != Method.AUTO or not valued.any() or not doubted[valued].all():
+    if method != MultiAngleMethod.AUTO or not valued.any() or not doubted[valued].all():
         return found
-    single = optical_depth.solve(*data, method=Method.KANO_HAMILTON.value, **settings)
+    single = optical_depth.retrieve_optical_depth(
+        *data, method=MultiAngleMethod.KANO_HAMILTON.value, **settings
+    )
     causes = [name for name in ("undersmoothed", "high_correlation") if getattr(flags, name).any()]
     why = f"its intervals would be too narrow ({' and '.join(causes)})"
     return replace(
-        single, steps=(*single.steps, StepRecord(0, Method.JOINT.value, ran=False, reason=why))
+        single,
+        steps=(*single.steps, StepRecord(0, MultiAngleMethod.JOINT.value, ran=False, reason=why)),
     )
 
 

@@ -383,7 +383,7 @@ def _without_background(
     if settings.shapes is not None:
         ahead = settings.ahead
         shapes = settings.shapes[ray]
-        fit = known_shape.solve(
+        fit = known_shape.fit_known_shape(
             values[:, ahead], distance[ahead], shapes[:, ahead], variance=variance[:, ahead]
         )
         usable = ~fit.singular & np.isfinite(fit.background)
@@ -453,7 +453,7 @@ def _visited(
     group = np.zeros(shots.size, dtype=np.int64)
     group[first[1:]] = 1
     group = np.cumsum(group)
-    means = averaging.mean(values, noise, groups=group, weights=shots, axis=0)
+    means = averaging.time_mean(values, noise, groups=group, weights=shots, axis=0)
     known = np.isfinite(left)
     total = np.add.reduceat(np.where(known, left, 0.0), first)
     bits = np.bitwise_or.reduceat(bits, first, axis=0)

@@ -29,7 +29,7 @@ STRENGTHS: Final[Array] = 10.0 ** np.linspace(-6.0, 6.0, 97)
 _SAME_NODE: Final = 1e-4
 
 
-class Choice(StrEnum):
+class StrengthChoice(StrEnum):
     """How the strength of the penalty is found."""
 
     DISCREPANCY = "discrepancy"
@@ -78,7 +78,10 @@ class Regularisation:
             raise RetrievalInputError(
                 f"is {self.order}", field="regularisation.order", remedy="choose 0 or 1"
             )
-        fixed = inputs.choice(self.choice, Choice, "regularisation.choice") is Choice.FIXED
+        fixed = (
+            inputs.choice(self.choice, StrengthChoice, "regularisation.choice")
+            is StrengthChoice.FIXED
+        )
         inputs.choice(self.average, Average, "regularisation.average")
         if fixed != (self.strength is not None):
             raise RetrievalInputError(
@@ -99,8 +102,8 @@ class Regularisation:
     @property
     def rule(self) -> int:
         """Number of the rule of choice; of no effect where one strength is given."""
-        names = {Choice.CP: _Rule.CP, Choice.GCV: _Rule.GCV}
-        return int(names.get(Choice(self.choice), _Rule.DISCREPANCY))
+        names = {StrengthChoice.CP: _Rule.CP, StrengthChoice.GCV: _Rule.GCV}
+        return int(names.get(StrengthChoice(self.choice), _Rule.DISCREPANCY))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.multiangle import _methods, slant_paths
-from lidarops.retrieve.multiangle._methods import Settings
+from lidarops.retrieve.multiangle._methods import BlockSettings
 from lidarops.retrieve.multiangle._result import (
     MultiAngleFlags,
     MultiAngleResult,
@@ -30,17 +30,17 @@ LARGEST_GRADIENT: Final = 5e-5
 
 __all__ = [
     "LARGEST_GRADIENT",
-    "Method",
     "MultiAngleFlags",
+    "MultiAngleMethod",
     "MultiAngleResult",
     "Regularisation",
     "StepRecord",
     "layer_bounds",
-    "solve",
+    "retrieve_optical_depth",
 ]
 
 
-class Method(StrEnum):
+class MultiAngleMethod(StrEnum):
     """How optical depths are found."""
 
     AUTO = "auto"
@@ -58,7 +58,7 @@ class Method(StrEnum):
     """The same of what is left after subtracting a prior."""
 
 
-def solve(
+def retrieve_optical_depth(
     signal: npt.ArrayLike,
     zenith_angle: npt.ArrayLike,
     altitude: npt.ArrayLike,
@@ -152,13 +152,13 @@ def solve(
     ----------
     kano1968, hamilton1969, dersimonian1986, siegel1982.
     """
-    chosen = inputs.choice(method, Method, "method")
+    chosen = inputs.choice(method, MultiAngleMethod, "method")
     _require_known(chosen, tolerance, regularisation, prior_optical_depth)
     height = slant_paths.altitude_grid(altitude, station_altitude)
     scan = slant_paths.make_scan(zenith_angle, height, azimuth)
     rows, noise, leading = _cube(signal, variance, scan.path.shape)
     labels = _labels(block, leading)
-    settings = Settings(
+    settings = BlockSettings(
         chosen.value,
         height,
         scan,
@@ -188,7 +188,7 @@ def solve(
 def layer_bounds(
     layers: Sequence[tuple[float, float]], altitude: npt.ArrayLike, *, station_altitude: float
 ) -> Array:
-    """Return the bounds of layers as `solve` moves them.
+    """Return the bounds of layers as `retrieve_optical_depth` moves them.
 
     Parameters
     ----------
@@ -215,13 +215,16 @@ def layer_bounds(
 
 
 def _require_known(
-    method: Method, tolerance: float | None, regularisation: Any, prior: npt.ArrayLike | None
+    method: MultiAngleMethod,
+    tolerance: float | None,
+    regularisation: Any,
+    prior: npt.ArrayLike | None,
 ) -> None:
     """Refuse options that the method would pass over in silence."""
     allowed = {
-        "tolerance": (tolerance, (Method.AUTO,)),
-        "regularisation": (regularisation, (Method.MLD, Method.MLD_PRIOR)),
-        "prior_optical_depth": (prior, (Method.MLD_PRIOR,)),
+        "tolerance": (tolerance, (MultiAngleMethod.AUTO,)),
+        "regularisation": (regularisation, (MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR)),
+        "prior_optical_depth": (prior, (MultiAngleMethod.MLD_PRIOR,)),
     }
     for name, (value, methods) in allowed.items():
         if value is not None and method not in methods:

@@ -215,7 +215,7 @@ def median_variance(residuals: Array, noise: Array, out: Array, rays: Array) -> 
 
 
 @_compiled
-def fill_weights(
+def fill_robust_weights(
     residuals: Array,
     leverages: Array,
     noise: Array,
@@ -263,7 +263,7 @@ def largest_residual(
 ) -> tuple[float, int]:
     """Return the largest studentised residual, in units that outliers do not stretch.
 
-    Where detector noise dominates, of the relative residual, as `fill_weights` takes it; of
+    Where detector noise dominates, of the relative residual, as `fill_robust_weights` takes it; of
     samples less than 10 times their noise only where inhomogeneity exceeds that, as the noise of
     others is not known well enough for what is rare.
 

@@ -56,7 +56,7 @@ _SCREENED: Final = 0.045
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rays:
+class BeamSignals:
     """All that the methods need to know of the signals."""
 
     layout: Layout
@@ -79,7 +79,7 @@ class Rays:
     leading: tuple[int, ...]
 
 
-def prepare(
+def prepare_signals(
     power: npt.ArrayLike,
     range_: npt.ArrayLike,
     network: Network,
@@ -90,7 +90,7 @@ def prepare(
     exponent: npt.ArrayLike,
     blocks: npt.ArrayLike | None,
     gates: int,
-) -> Rays:
+) -> BeamSignals:
     """Check and condense signals; arguments are those of `multiposition.solve`."""
     grid, turn = _grids(range_, network.rays)
     signal, leading = _signal(power, grid, turn=turn)
@@ -107,7 +107,7 @@ def prepare(
     else:
         rows, row = _variances(variance, signal.shape, turn=turn)
         about = (layout.crossings.ray, layout.window, layout.weights.shape[1])
-        block = noise_groups.part(signal, rows, row, block, about, LOUDEST_GATE)
+        block = noise_groups.split_by_noise(signal, rows, row, block, about, LOUDEST_GATE)
         count = int(block.max(initial=-1)) + 1
         members = [np.flatnonzero(block == b) for b in range(count)]
     mean, mean_rows, single, averaged = _means(signal, rows, row, members, layout)
@@ -127,7 +127,7 @@ def prepare(
     alone = _loud(signal, rows, row, single[block], layout, relative=relative)
     alone &= data.usable == 1
     data.usable[(means.usable == 0)[block] | alone] = 0
-    return Rays(
+    return BeamSignals(
         layout, powers, data, means, block, averaged, np.sqrt(_row_means(heard)),
         weak[block] | alone, leading,
     )  # fmt: skip
@@ -571,7 +571,7 @@ def _loudness(
     return out, below
 
 
-def average(
+def average_blocks(
     power: npt.ArrayLike, groups: npt.ArrayLike, variance: npt.ArrayLike | None
 ) -> tuple[Array, Array | None]:
     """Average signals of groups of profiles; see `multiposition.average`."""

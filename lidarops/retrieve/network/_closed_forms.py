@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.network import _cycle_kernels, _empirical_prior, _multiplier
-from lidarops.retrieve.network._beam_signals import Rays
+from lidarops.retrieve.network._beam_signals import BeamSignals
 from lidarops.retrieve.network._condensed_signals import Condensed
 from lidarops.retrieve.network.geometry import Cycle
 
@@ -23,7 +23,7 @@ _LARGEST_RELATIVE_ERROR: Final = 1.0 / 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class CrossingEstimate:
     """Extinction at vertices, before it is judged. NaN where there is none."""
 
     extinction: Array
@@ -69,7 +69,7 @@ class Rows:
         )
 
 
-def rows_of(data: Condensed, rays: Rays, cycle: Cycle) -> Rows:
+def rows_of(data: Condensed, rays: BeamSignals, cycle: Cycle) -> Rows:
     """Collect the rows of a cycle; NaN where a signal is missing.
 
     Raises
@@ -107,7 +107,7 @@ def rows_of(data: Condensed, rays: Rays, cycle: Cycle) -> Rows:
     return out
 
 
-def _crossing(rays: Rays, ray: int, vertex: int) -> int:
+def _crossing(rays: BeamSignals, ray: int, vertex: int) -> int:
     kept = rays.layout.crossings
     found = np.flatnonzero((kept.ray == ray) & (kept.vertex == vertex))
     if found.size == 0:
@@ -120,7 +120,13 @@ def _crossing(rays: Rays, ray: int, vertex: int) -> int:
 
 
 def _row_covariance(
-    data: Condensed, rays: Rays, ray: int, here: int, there: int, between: slice, total: Array
+    data: Condensed,
+    rays: BeamSignals,
+    ray: int,
+    here: int,
+    there: int,
+    between: slice,
+    total: Array,
 ) -> Array:
     layout = rays.layout
     first, count = int(layout.first_crossing[ray]), int(np.diff(layout.first_crossing)[ray])
@@ -141,8 +147,8 @@ def _row_covariance(
 
 
 def by_cycle(
-    rays: Rays, cycle: Cycle, multiplier: float | None, *, unbiased: bool, only_start: bool
-) -> Estimate:
+    rays: BeamSignals, cycle: Cycle, multiplier: float | None, *, unbiased: bool, only_start: bool
+) -> CrossingEstimate:
     """Solve for the start vertex of a cycle, and in turn for its other near vertices.
 
     Parameters
@@ -158,7 +164,7 @@ def by_cycle(
     rows, mean = rows_of(rays.data, rays, cycle), rows_of(rays.mean, rays, cycle)
     profiles, vertices = rows.starts.shape[0], rays.layout.vertices
     shape = (profiles, vertices)
-    out = Estimate(
+    out = CrossingEstimate(
         np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=np.bool_),
         np.zeros(shape, dtype=np.bool_), np.zeros(vertices, dtype=np.bool_), np.ones(profiles),
     )  # fmt: skip
@@ -239,7 +245,7 @@ def _weak_attenuation(rows: Rows) -> Booleans:
         return np.asarray(~(np.abs(logarithm) >= 3.0 * np.sqrt(spread)))
 
 
-def _best(mean: Rows, rays: Rays) -> Array:
+def _best(mean: Rows, rays: BeamSignals) -> Array:
     """Return the best multiplier of each block, from a homogeneous model of its mean field."""
     model = mean_extinction(rays.mean)
     depths = model[:, np.newaxis] * mean.depths
@@ -252,13 +258,13 @@ def _best(mean: Rows, rays: Rays) -> Array:
     return np.where(np.isfinite(model) & (model > 0), best, 1.0)
 
 
-def _modelled_bias(rows: Rows, rays: Rays, multiplier: Array) -> Array:
+def _modelled_bias(rows: Rows, rays: BeamSignals, multiplier: Array) -> Array:
     """Return the relative systematic error that a homogeneous mean field would have."""
     depths = mean_extinction(rays.mean)[rays.block, np.newaxis] * rows.depths
     return np.where(multiplier < 1.0, _multiplier.relative_bias(depths, multiplier), 0.0)
 
 
-def inhomogeneous(rays: Rays, estimate: Estimate) -> Booleans:
+def inhomogeneous(rays: BeamSignals, estimate: CrossingEstimate) -> Booleans:
     """Return where the segments of the mean field differ by more than a profile's errors.
 
     They must also differ by more than their noise: by 4 standard errors of their chi-square.
@@ -291,7 +297,7 @@ def _total(values: Array) -> Array:
     return np.asarray(np.cumsum(np.concatenate([start, values], axis=1), axis=1)[:, -1])
 
 
-def by_single_rays(rays: Rays, *, far_end: bool) -> Estimate:
+def by_single_rays(rays: BeamSignals, *, far_end: bool) -> CrossingEstimate:
     """Take each ray for itself: its slope, or Klett's solution from its far end.
 
     At each vertex, the segments that lead away from it are averaged, weighted by their
@@ -312,12 +318,12 @@ def by_single_rays(rays: Rays, *, far_end: bool) -> Estimate:
     with np.errstate(divide="ignore", invalid="ignore"):
         extinction = np.where(weights > 0, total / weights, np.nan)
         variance = np.where(weights > 0, 1.0 / weights, np.nan)
-    return Estimate(
+    return CrossingEstimate(
         extinction, variance, none, none, np.zeros(shape[1], dtype=np.bool_), np.ones(shape[0])
     )
 
 
-def _far_end(data: Condensed, rays: Rays, c: int) -> tuple[Array, Array]:
+def _far_end(data: Condensed, rays: BeamSignals, c: int) -> tuple[Array, Array]:
     """Return the extinction at a crossing from that at the next, and its variance."""
     ray = int(rays.layout.crossings.ray[c])
     first, count = (

@@ -65,7 +65,7 @@ class Layout:
     """(ray, 2) first gate that may be used, and the one behind the last."""
     neighbours: tuple[Indices, Array, Array]
     """(ray, bin, neighbour) gates that tell a gate, their shares, and (ray, bin) what air may
-    leave; see `lidarops.retrieve.network.noise.outlying_bins.plan`."""
+    leave; see `lidarops.retrieve.network.noise.outlying_bins.plan_neighbours`."""
     offset: Indices
     """(ray + 1,) where the covariances of a ray start."""
 
@@ -94,7 +94,7 @@ class Condensed:
     bridged: Codes
     """(profile, ray) 1 where a gate lay off its neighbours, which took its place."""
     departure: Array = field(default_factory=lambda: np.zeros((0, 0, 2)))
-    """(profile, crossing, 2) of `_curvature_errors.measure`; empty where profiles were pooled."""
+    """(profile, crossing, 2) of `_curvature_errors.measure_curvature`; empty where profiles were pooled."""
 
     def take(self, profiles: Indices) -> Condensed:
         """Return some of the profiles."""
@@ -445,7 +445,7 @@ def _screen(
     for beyond in ((first, low), (stop, last)):
         _look_beyond(power, variance, log_factor, exponent, relative, beyond, row)
     outlying_bins.make_plain(logs, noise, exponent, codes, span, plain, wide)
-    number, end = outlying_bins.find(
+    number, end = outlying_bins.find_outliers(
         (logs, noise, plain, wide), exponent, relative, grid, span, planned, codes, other[2], off
     )
     end = min(end, stop)
@@ -453,13 +453,13 @@ def _screen(
         for g in range(first, last):
             other[0][g], other[1][g] = logs[g], noise[g]
         outlying_runs.draw_lines(other[0], other[1], grid, other[2], (first, last))
-        reached = outlying_bins.bridge(
+        reached = outlying_bins.replace_outliers(
             other[0], other[1], exponent, grid, (first, last, end), other[2], nodes, shares
         )
         # Where nothing good is left, nothing is told.
         return (end, number) if reached == end else (low, 1)
     if number > 0:
-        end = outlying_bins.bridge(
+        end = outlying_bins.replace_outliers(
             logs, noise, exponent, grid, (first, last, end), codes, nodes, shares
         )
     number = 0
@@ -570,7 +570,7 @@ def _condense(
                 gradients, bounds,
             )  # fmt: skip
             plain = other if found == outlying_bins.LEFT else (logs, noise, codes)
-            _curvature_errors.measure(
+            _curvature_errors.measure_curvature(
                 plain, m, (first, first + good), window, departing, departures[n]
             )
             _join_points(

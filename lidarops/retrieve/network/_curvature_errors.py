@@ -69,7 +69,7 @@ def weights(layout: Layout) -> Array:
 
 
 @_compiled
-def measure(
+def measure_curvature(
     row: tuple[Array, Array, Codes],
     exponent: float,
     crossings: tuple[int, int],
@@ -110,7 +110,7 @@ def usual(departures: Array, usable: Codes) -> Array:
     Parameters
     ----------
     departures : (profile, crossing, 2) float64
-        Of `measure`.
+        Of `measure_curvature`.
     usable : (profile, crossing) uint8
 
     Returns
@@ -230,7 +230,7 @@ def carry_errors(
     counts = np.zeros(rays, dtype=np.intp)
     for n in range(values.shape[0]):
         data = (values[n], integrals[n], covariance[n])
-        _joint_solution.look(usable[n], geometry[0], counts)
+        _joint_solution.add_observations(usable[n], geometry[0], counts)
         for turn in range(2):
             for ray in range(rays):
                 if counts[ray] == 0:

@@ -152,7 +152,7 @@ def solve_with_sensitivities(
 
 
 @_compiled
-def substitute(
+def substitute_cycle(
     starts: Array, ends: Array, integrals: Array, first: Array, solutions: Array
 ) -> None:
     """Fill (cycle, row) solutions at all vertices from that at the first, backwards."""

@@ -60,7 +60,7 @@ _LAST_PASSES: Final = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class PriorSolution:
     """Logarithms of extinction at the measured vertices."""
 
     logarithm: Array
@@ -110,12 +110,12 @@ class _Problem:
         )  # fmt: skip
         self.start = self.constants.copy()
 
-    def afresh(self, deviation: float, strength: float = 1.0) -> Solution:
+    def afresh(self, deviation: float, strength: float = 1.0) -> PriorSolution:
         """Solve all profiles from where the first solution started."""
         self.constants[:] = self.start
         return self.solve(deviation, 2 * _FIRST_PASSES, strength)
 
-    def solve(self, deviation: float, passes: int, strength: float = 1.0) -> Solution:
+    def solve(self, deviation: float, passes: int, strength: float = 1.0) -> PriorSolution:
         """Solve all profiles; move the constants."""
         shape = (self.constants.shape[0], self.vertices)
         logarithm, variance = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -127,7 +127,7 @@ class _Problem:
         left_out = np.zeros(self.constants.shape, dtype=np.uint8)
         precision, norm, flat = _precision(self.gradient, deviation, strength)
         data = self.data
-        _joint_solution.solve_profiles(
+        _joint_solution.solve_joint(
             data.log_value, data.integral, data.usable, data.covariance, self.geometry,
             precision, self.bends, norm, flat, passes, self.constants, logarithm, variance,
             believed, missed, summary, status, left_out,
@@ -136,7 +136,7 @@ class _Problem:
         # A profile that one prior leaves undetermined must not make it likelier than others.
         terms = np.where(fine, summary[:, _joint_solution.LIKELIHOOD], _UNDETERMINED_COST)
         self.likelihood = float(np.sum(terms))
-        return Solution(
+        return PriorSolution(
             logarithm, variance, believed, missed, summary[:, 0], summary[:, 1],
             summary[:, 2], summary[:, 3], np.full(shape[0], strength * deviation),
             np.full(shape[0], strength), status, left_out, np.zeros(shape[0], dtype=np.bool_),
@@ -153,7 +153,7 @@ def lengths(layout: Layout) -> Array:
 
 def solve_without_prior(
     data: Condensed, layout: Layout, vertex: Indices, exponent: Array, position: Array
-) -> Solution:
+) -> PriorSolution:
     """Solve each profile for itself; arguments as of `solve_blocks`."""
     problem = _Problem(data, layout, vertex, exponent, position)
     return problem.solve(np.inf, 2 * _FIRST_PASSES)
@@ -166,7 +166,7 @@ def solve_blocks(
     exponent: Array,
     position: Array,
     block: Indices,
-) -> Solution:
+) -> PriorSolution:
     """Solve the profiles of each block with the prior that makes them likeliest.
 
     Parameters
@@ -186,7 +186,7 @@ def solve_blocks(
         return np.full(size, np.nan)
 
     n = block.size
-    out = Solution(
+    out = PriorSolution(
         nothing(*shape), nothing(*shape), nothing(*shape), nothing(*shape), nothing(n),
         nothing(n), nothing(n), nothing(n), nothing(n), nothing(n),
         np.full(n, _joint_solution.UNDETERMINED, dtype=np.uint8),
@@ -199,7 +199,7 @@ def solve_blocks(
             _Problem(told, layout, vertex, exponent, position),
             partial(_mean_problem, told, layout, vertex, exponent, position),
         )
-        for field in fields(Solution):
+        for field in fields(PriorSolution):
             getattr(out, field.name)[mine] = getattr(part, field.name)
     return out
 
@@ -286,7 +286,7 @@ def _depth(reach: Indices) -> int:
     return best
 
 
-def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solution:
+def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> PriorSolution:
     """Solve with the strongest prior that the rays do not contradict, each and on average."""
     alone = problem.afresh(np.inf)
     # What profiles tell well by themselves, their mean need not tell.
@@ -304,11 +304,11 @@ def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> Solu
 
 def _with_mean(
     problem: _Problem,
-    alone: Solution,
+    alone: PriorSolution,
     mean: _Problem,
-    whole: Solution,
+    whole: PriorSolution,
     strengths: tuple[float, ...],
-) -> Solution:
+) -> PriorSolution:
     """Solve a block with the strongest prior that neither profiles nor their mean contradict."""
     if whole.status[0] == _joint_solution.UNDETERMINED:
         # A mean that tells nothing speaks against no prior.
@@ -326,7 +326,7 @@ def _with_mean(
     return _widened(alone, 1.0, whole, whole)
 
 
-def _tests(problem: _Problem, alone: Solution, whole: Solution | None) -> bool:
+def _tests(problem: _Problem, alone: PriorSolution, whole: PriorSolution | None) -> bool:
     """Return whether the rays tell enough to test a prior.
 
     Where they are fewer equations than unknowns, or as many that do not tell all vertices, the
@@ -348,8 +348,8 @@ def _tests(problem: _Problem, alone: Solution, whole: Solution | None) -> bool:
 
 
 def _strongest(
-    problem: _Problem, alone: Solution, strengths: tuple[float, ...]
-) -> tuple[Solution, float]:
+    problem: _Problem, alone: PriorSolution, strengths: tuple[float, ...]
+) -> tuple[PriorSolution, float]:
     """Solve with the strongest prior that no profile contradicts; return its strength, too."""
     for strength in strengths:
         result = _likeliest(problem, strength, 0.0)
@@ -358,12 +358,12 @@ def _strongest(
     return alone, 1.0
 
 
-def _told(mean: _Problem, result: Solution, strength: float) -> Solution:
+def _told(mean: _Problem, result: PriorSolution, strength: float) -> PriorSolution:
     """Solve the mean of profiles with the prior that each of them was solved with."""
     return mean.afresh(float(result.deviation[0]) / strength, strength)
 
 
-def _unlikely(told: Solution) -> bool:
+def _unlikely(told: PriorSolution) -> bool:
     """Return whether the mean of profiles does not fit the prior that each of them fits.
 
     Noise hides in each profile what a prior has wrong; in their mean there is less of it. Asked
@@ -377,7 +377,9 @@ def _unlikely(told: Solution) -> bool:
     return bool(special.gammaincc(freedom / 2.0, max(square, 0.0) / 2.0) < _UNLIKELY)
 
 
-def _widened(result: Solution, strength: float, told: Solution, free: Solution) -> Solution:
+def _widened(
+    result: PriorSolution, strength: float, told: PriorSolution, free: PriorSolution
+) -> PriorSolution:
     """Return solutions with the errors that the mean of profiles knows of, told and free."""
     noise = _block_errors.of_noise(result.logarithm, result.variance, told.logarithm[0])
     field = _block_errors.of_field(
@@ -391,7 +393,7 @@ def _widened(result: Solution, strength: float, told: Solution, free: Solution) 
     return replace(result, variance=result.variance + (noise + field + prior))
 
 
-def _likeliest(problem: _Problem, strength: float, least: float) -> Solution:
+def _likeliest(problem: _Problem, strength: float, least: float) -> PriorSolution:
     """Solve with the largest deviation that is not much less likely than the likeliest.
 
     What is not told apart by the likelihood is told less sharply, rather than too sharply. Nor
@@ -423,7 +425,7 @@ def _costs(problem: _Problem, strength: float) -> tuple[Array, list[Array]]:
     return costs, constants
 
 
-def _contradicted(result: Solution, alone: Solution) -> bool:
+def _contradicted(result: PriorSolution, alone: PriorSolution) -> bool:
     """Return whether solutions without the prior differ from it at a vertex, on average.
 
     Of two solutions of which one is told more, the variance of the difference is the difference
@@ -443,7 +445,7 @@ def _contradicted(result: Solution, alone: Solution) -> bool:
     return bool(np.any(told & (np.abs(gap) > apart + whole)))
 
 
-def _apart(result: Solution, whole: Solution) -> bool:
+def _apart(result: PriorSolution, whole: PriorSolution) -> bool:
     """Return whether solutions are, on average, off that of their mean at a vertex.
 
     Noise that lets a prior decide each profile is less in the mean. What a prior has wrong, all
@@ -472,7 +474,7 @@ def _gradient(position: Array) -> Array:
     return np.asarray(covariance * (len(position) / size if size > 0 else 0.0))
 
 
-def prior_of(position: Array, found: Solution, profile: int) -> tuple[Array, bool]:
+def prior_of(position: Array, found: PriorSolution, profile: int) -> tuple[Array, bool]:
     """Return the precision of the prior that a profile was solved with, and whether it had none."""
     strength = float(found.strength[profile])
     deviation = float(found.deviation[profile]) / strength

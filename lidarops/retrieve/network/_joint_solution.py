@@ -66,7 +66,7 @@ def factorise(matrix: Array, size: int) -> bool:
 
 
 @_compiled
-def substitute(factor: Array, size: int, side: Array) -> None:
+def substitute_factorised(factor: Array, size: int, side: Array) -> None:
     """Overwrite a right side by the solution of the factorised system."""
     for i in range(size):
         total = side[i]
@@ -119,7 +119,7 @@ def _invert(matrix: Array, size: int, inverse: Array) -> float:
         for j in range(size):
             inverse[i, j] = 0.0
         inverse[i, i] = 1.0
-        substitute(matrix, size, inverse[i])
+        substitute_factorised(matrix, size, inverse[i])
     return logarithm
 
 
@@ -259,11 +259,11 @@ def invert_system(factor: Array, size: int, out: Array) -> None:
         for i in range(size):
             out[v, i] = 0.0
         out[v, v] = 1.0
-        substitute(factor, size, out[v])
+        substitute_factorised(factor, size, out[v])
 
 
 @_compiled
-def look(usable: Codes, first_crossing: Indices, counts: Indices) -> None:
+def add_observations(usable: Codes, first_crossing: Indices, counts: Indices) -> None:
     """Fill the crossings of each ray; 0 where there is one only."""
     for ray in range(counts.size):
         count = _count(usable, first_crossing[ray], first_crossing[ray + 1])
@@ -375,7 +375,7 @@ def workspace(first_crossing: Indices, rays: int) -> tuple[Array, Array, Array, 
 
 
 @_compiled
-def solve_profiles(
+def solve_joint(
     values: Array,
     integrals: Array,
     usable: Codes,
@@ -430,7 +430,7 @@ def solve_profiles(
     matrix, side, target = np.empty((vertices, vertices)), np.empty(vertices), np.empty(vertices)
     counts, seen = np.zeros(rays, dtype=np.intp), np.zeros(vertices, dtype=np.uint8)
     for n in range(values.shape[0]):
-        look(usable[n], geometry[0], counts)
+        add_observations(usable[n], geometry[0], counts)
         used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
         fine, moved, square, determinants = used > 0, math.inf, 0.0, 0.0
         data = (values[n], integrals[n], covariance[n])
@@ -448,7 +448,7 @@ def solve_profiles(
             fine = fine and factorise(matrix, vertices)
             if not fine:
                 break
-            substitute(matrix, vertices, side)
+            substitute_factorised(matrix, vertices, side)
             moved = _move(geometry, counts, work[3], work[4], side, constants[n])
         for ray in range(rays):
             first = geometry[0][ray]
@@ -500,7 +500,7 @@ def _least_square(matrix: Array, side: Array, seen: Codes, square: float, fine: 
     if not (fine and factorise(matrix, side.size)):
         return math.nan
     best = side.copy()
-    substitute(matrix, side.size, best)
+    substitute_factorised(matrix, side.size, best)
     return square - _dot(best, side)
 
 

@@ -153,7 +153,7 @@ def values_and_variances(
     return value.reshape(shape[:-1]), variance.reshape(shape[:-1])
 
 
-def substitute(
+def substitute_back(
     start: npt.ArrayLike, end: npt.ArrayLike, integral: npt.ArrayLike, first: npt.ArrayLike
 ) -> Array:
     """Return (..., row) reciprocal extinction at all vertices from that at the first.
@@ -173,7 +173,7 @@ def substitute(
     if value.shape != shape[:-1]:
         raise RetrievalInputError(f"has the shape {value.shape}, not {shape[:-1]}", field="first")
     out = np.empty_like(a)
-    _cycle_kernels.substitute(a, n, b, value.reshape(-1), out)
+    _cycle_kernels.substitute_cycle(a, n, b, value.reshape(-1), out)
     return out.reshape(shape)
 
 

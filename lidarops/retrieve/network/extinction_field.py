@@ -62,7 +62,7 @@ DEFAULT_UNBIASED_MULTIPLIER: Final = 0.25
 _LEAST_PROBABILITY: Final = 1e-4
 
 
-class Method(StrEnum):
+class NetworkMethod(StrEnum):
     """How extinction is found. All but the network see one cycle, or one ray."""
 
     NETWORK = "network"
@@ -79,14 +79,16 @@ class Method(StrEnum):
     """Each ray for itself, from the slope at the far end of a segment."""
 
 
-_HOMOGENEOUS: Final = frozenset({Method.MULTIPLIER, Method.UNBIASED, Method.SLOPE, Method.KLETT})
+_HOMOGENEOUS: Final = frozenset(
+    {NetworkMethod.MULTIPLIER, NetworkMethod.UNBIASED, NetworkMethod.SLOPE, NetworkMethod.KLETT}
+)
 
 
 _HARMLESS: Final = frozenset({"weak_signal", "bridged"})
 """Flags that do not speak against a value."""
 
 
-class Prior(StrEnum):
+class FieldPrior(StrEnum):
     """What a network is told about the field beforehand."""
 
     BLOCK = "block"
@@ -170,10 +172,10 @@ class MultiPositionResult:
     """(...) of ln extinction about the mean field; inf without prior, NaN without network."""
     multiplier: Array
     """(...) of the cycle; NaN for other methods."""
-    method: Method
+    method: NetworkMethod
 
 
-def average(
+def average_signals(
     power: npt.ArrayLike, groups: npt.ArrayLike, *, variance: npt.ArrayLike | None = None
 ) -> tuple[Array, Array | None]:
     """Average the signals of groups of profiles, as should be done before they are solved.
@@ -200,10 +202,10 @@ def average(
     RetrievalInputError
         For shapes that do not fit.
     """
-    return _beam_signals.average(power, groups, variance)
+    return _beam_signals.average_blocks(power, groups, variance)
 
 
-def solve(
+def retrieve_network(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     network: Network,
@@ -223,7 +225,7 @@ def solve(
 ) -> MultiPositionResult:
     """Find extinction and visibility where the rays of several lidars meet.
 
-    Average signals before (`average`), not results afterwards: noise makes these biased.
+    Average signals before (`average_signals`), not results afterwards: noise makes these biased.
 
     Parameters
     ----------
@@ -277,8 +279,8 @@ def solve(
     ----------
     drabenko2021, yegorov2008.
     """
-    chosen = inputs.choice(method, Method, "method")
-    told = inputs.choice(prior, Prior, "prior")
+    chosen = inputs.choice(method, NetworkMethod, "method")
+    told = inputs.choice(prior, FieldPrior, "prior")
     _check_settings(chosen, multiplier, cycle, start)
     sight.koschmieder_constant(contrast)
     if network.vertices == 0:
@@ -287,28 +289,28 @@ def solve(
             field="network",
             remedy="point the lidars at common volumes, or widen the tolerance of the geometry",
         )
-    rays = _beam_signals.prepare(
+    rays = _beam_signals.prepare_signals(
         power, range, network, variance=variance, overlap=overlap,
         full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, gates=gates,
     )  # fmt: skip
-    if chosen is Method.NETWORK:
+    if chosen is NetworkMethod.NETWORK:
         estimate, fit = _solve_network(rays, network.vertex, told)
     else:
         walk = None
-        if chosen not in {Method.SLOPE, Method.KLETT}:
-            walk = cycle if cycle is not None else rays_geometry.cycle(network, start=start)
+        if chosen not in {NetworkMethod.SLOPE, NetworkMethod.KLETT}:
+            walk = cycle if cycle is not None else rays_geometry.build_cycle(network, start=start)
         estimate, fit = _solve_closed(rays, chosen, walk, multiplier, start), None
     return _judged(rays, estimate, fit, chosen, contrast)
 
 
 def _solve_network(
-    rays: _beam_signals.Rays, position: Array, prior: Prior
-) -> tuple[_closed_forms.Estimate, _empirical_prior.Solution]:
+    rays: _beam_signals.BeamSignals, position: Array, prior: FieldPrior
+) -> tuple[_closed_forms.CrossingEstimate, _empirical_prior.PriorSolution]:
     layout = rays.layout
     numbers = np.cumsum(layout.measured) - 1
     vertex = numbers[layout.crossings.vertex].astype(np.intp)
     position = position[layout.measured]
-    if prior is Prior.NONE or vertex.size == 0:
+    if prior is FieldPrior.NONE or vertex.size == 0:
         fit = _empirical_prior.solve_without_prior(
             rays.data, layout, vertex, rays.exponent, position
         )
@@ -323,7 +325,7 @@ def _solve_network(
         extinction[:, layout.measured] = np.exp(fit.logarithm)
         variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
         believed[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.believed
-    if prior is Prior.BLOCK:
+    if prior is FieldPrior.BLOCK:
         seen = rays.data.usable == 1
         variance = _block_errors.at_least_typical(extinction, variance, rays.block, seen)
     with np.errstate(over="ignore", under="ignore"):
@@ -332,7 +334,7 @@ def _solve_network(
     none = np.zeros(shape, dtype=np.bool_)
     # Doubt in the prior, which is stated, is no noise that makes a value lie anywhere.
     shaky = _closed_forms.shaky(extinction, believed, rays.block) | fit.doubtful[:, np.newaxis]
-    estimate = _closed_forms.Estimate(
+    estimate = _closed_forms.CrossingEstimate(
         extinction, variance, shaky, none, np.zeros(shape[1], dtype=np.bool_),
         np.full(shape[0], np.nan),
     )  # fmt: skip
@@ -340,7 +342,10 @@ def _solve_network(
 
 
 def _by_bends(
-    rays: _beam_signals.Rays, fit: _empirical_prior.Solution, vertex: Indices, position: Array
+    rays: _beam_signals.BeamSignals,
+    fit: _empirical_prior.PriorSolution,
+    vertex: Indices,
+    position: Array,
 ) -> Array:
     """Return (profile, vertex) variances of ln extinction by what bends of signals put into values.
 
@@ -362,28 +367,32 @@ def _by_bends(
 
 
 def _solve_closed(
-    rays: _beam_signals.Rays,
-    method: Method,
+    rays: _beam_signals.BeamSignals,
+    method: NetworkMethod,
     cycle: Cycle | None,
     multiplier: float | None,
     start: int | None,
-) -> _closed_forms.Estimate:
+) -> _closed_forms.CrossingEstimate:
     if cycle is None:
-        return _closed_forms.by_single_rays(rays, far_end=method is Method.KLETT)
-    if method is Method.CYCLE:
+        return _closed_forms.by_single_rays(rays, far_end=method is NetworkMethod.KLETT)
+    if method is NetworkMethod.CYCLE:
         multiplier = 1.0
-    elif method is Method.UNBIASED and multiplier is None:
+    elif method is NetworkMethod.UNBIASED and multiplier is None:
         multiplier = DEFAULT_UNBIASED_MULTIPLIER
     return _closed_forms.by_cycle(
-        rays, cycle, multiplier, unbiased=method is Method.UNBIASED, only_start=start is not None
+        rays,
+        cycle,
+        multiplier,
+        unbiased=method is NetworkMethod.UNBIASED,
+        only_start=start is not None,
     )
 
 
 def _judged(
-    rays: _beam_signals.Rays,
-    estimate: _closed_forms.Estimate,
-    fit: _empirical_prior.Solution | None,
-    method: Method,
+    rays: _beam_signals.BeamSignals,
+    estimate: _closed_forms.CrossingEstimate,
+    fit: _empirical_prior.PriorSolution | None,
+    method: NetworkMethod,
     contrast: float,
 ) -> MultiPositionResult:
     """Report extinction at near vertices, and flag it."""
@@ -441,7 +450,7 @@ def _judged(
     errors = error.reshape(*leading, shape[1])
     return MultiPositionResult(
         values, errors,
-        sight.from_extinction(values, errors, contrast=contrast),
+        sight.visibility_from_extinction(values, errors, contrast=contrast),
         shaped, near, chi_square.reshape(leading), freedom.reshape(leading),
         deviation.reshape(leading), estimate.multiplier.reshape(leading), method,
     )  # fmt: skip
@@ -456,14 +465,14 @@ def _improbable(chi_square: Array, freedom: Array) -> Booleans:
     return np.asarray(known & (chance < _LEAST_PROBABILITY))
 
 
-def _lost(rays: _beam_signals.Rays, reason: int) -> Booleans:
+def _lost(rays: _beam_signals.BeamSignals, reason: int) -> Booleans:
     """Return where a ray of a vertex has lost it for a reason."""
     status = rays.data.status[:, rays.layout.crossings.ray]
     beyond = (rays.data.usable == 0) & ~rays.weak
     return _by_vertex(rays, (status == reason) & beyond)
 
 
-def _by_vertex(rays: _beam_signals.Rays, crossings: Booleans) -> Booleans:
+def _by_vertex(rays: _beam_signals.BeamSignals, crossings: Booleans) -> Booleans:
     out = np.zeros((crossings.shape[0], rays.layout.vertices), dtype=np.bool_)
     for c, vertex in enumerate(rays.layout.crossings.vertex):
         out[:, vertex] |= crossings[:, c]
@@ -474,11 +483,11 @@ def _by_vertex(rays: _beam_signals.Rays, crossings: Booleans) -> Booleans:
 
 
 def _check_settings(
-    method: Method, multiplier: float | None, cycle: Cycle | None, start: int | None
+    method: NetworkMethod, multiplier: float | None, cycle: Cycle | None, start: int | None
 ) -> None:
-    cyclic = method in {Method.CYCLE, Method.MULTIPLIER, Method.UNBIASED}
+    cyclic = method in {NetworkMethod.CYCLE, NetworkMethod.MULTIPLIER, NetworkMethod.UNBIASED}
     if multiplier is not None:
-        if method not in {Method.MULTIPLIER, Method.UNBIASED}:
+        if method not in {NetworkMethod.MULTIPLIER, NetworkMethod.UNBIASED}:
             raise RetrievalInputError(
                 f"is not used by the method '{method}'",
                 field="multiplier",

@@ -221,7 +221,7 @@ def locate(rays: Sequence[Ray]) -> tuple[Array, Array]:
 # Vertices -----------------------------------------------------------------------------------
 
 
-def network(
+def build_network(
     rays: Sequence[Ray],
     *,
     tolerance: float = DEFAULT_TOLERANCE,
@@ -270,7 +270,7 @@ def network_of_lines(
     farthest: float | Sequence[float] = np.inf,
     smallest_angle: float = SMALLEST_CROSSING_ANGLE,
 ) -> Network:
-    """Find the vertices of rays that are given in a local frame; else as `network`.
+    """Find the vertices of rays that are given in a local frame; else as `build_network`.
 
     Parameters
     ----------
@@ -448,7 +448,9 @@ def _widest_angle(direction: Array, rays: tuple[int, ...]) -> float:
 # Cycles -------------------------------------------------------------------------------------
 
 
-def cycle(net: Network, rays: Sequence[int] | None = None, *, start: int | None = None) -> Cycle:
+def build_cycle(
+    net: Network, rays: Sequence[int] | None = None, *, start: int | None = None
+) -> Cycle:
     """Order rays that meet pairwise into a cycle, walked in the direction of attenuation.
 
     The walk leads away from the lidars over a larger distance than towards them, so that the

@@ -60,7 +60,7 @@ without a flag."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BeamSignals:
+class BeamAverages:
     """The averaged signals of one beam."""
 
     averages: xr.Dataset
@@ -86,7 +86,7 @@ class BeamSignals:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class NetworkSettings:
     """How a network is solved, and what its systematic errors are made of."""
 
     block_intervals: int
@@ -121,7 +121,9 @@ class _Signals:
     """(ray, bin)."""
 
 
-def retrieve(beams: Sequence[BeamSignals], network: Network, settings: Settings) -> xr.Dataset:
+def retrieve_network(
+    beams: Sequence[BeamAverages], network: Network, settings: NetworkSettings
+) -> xr.Dataset:
     """Retrieve extinction and visibility where the beams of several lidars meet.
 
     Signals are averages; the background is subtracted and the network solved
@@ -158,7 +160,7 @@ def retrieve(beams: Sequence[BeamSignals], network: Network, settings: Settings)
     extinction = found.extinction[:, near]
     random, systematic = errors.random[:, near], errors.systematic[:, near]
     pair = ("time", "vertex")
-    seen = labeled.of_extinction(
+    seen = labeled.visibility_of_extinction(
         xr.DataArray(extinction, dims=pair),
         xr.DataArray(random, dims=pair),
         xr.DataArray(systematic, dims=pair),
@@ -191,7 +193,7 @@ def retrieve(beams: Sequence[BeamSignals], network: Network, settings: Settings)
     )
 
 
-def _gathered(beams: Sequence[BeamSignals], intervals: Integers, network: Network) -> _Signals:
+def _gathered(beams: Sequence[BeamAverages], intervals: Integers, network: Network) -> _Signals:
     bins = max(beam.averages.sizes["range"] for beam in beams)
     shape = (intervals.size, len(beams), bins)
     power, variance = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -269,9 +271,9 @@ class _Solver:
 
     def __init__(
         self,
-        beams: Sequence[BeamSignals],
+        beams: Sequence[BeamAverages],
         network: Network,
-        settings: Settings,
+        settings: NetworkSettings,
         signals: _Signals,
         intervals: Integers,
     ) -> None:
@@ -296,7 +298,7 @@ class _Solver:
 
     def solve(self, power: Array, exponent: Array | None = None) -> MultiPositionResult:
         """Solve for signals, and exponents where these are not the told ones."""
-        return extinction_field.solve(
+        return extinction_field.retrieve_network(
             power,
             self.signals.range,
             self.network,
@@ -347,7 +349,7 @@ class _Errors:
     """Relative change of extinction over that of the signals at the near ends of beams."""
 
     @staticmethod
-    def of(solver: _Solver, found: MultiPositionResult, settings: Settings) -> _Errors:
+    def of(solver: _Solver, found: MultiPositionResult, settings: NetworkSettings) -> _Errors:
         signals = solver.signals
         sky = np.nan_to_num(signals.background_error)[..., np.newaxis]
         random = _rooted(
@@ -427,7 +429,7 @@ def _distances(network: Network) -> Array:
     return out
 
 
-def _shots(beams: Sequence[BeamSignals], intervals: Integers) -> npt.NDArray[np.int32]:
+def _shots(beams: Sequence[BeamAverages], intervals: Integers) -> npt.NDArray[np.int32]:
     total = np.zeros(intervals.size, dtype=np.int64)
     for beam in beams:
         total[np.searchsorted(intervals, beam.interval)] += beam.averages["shots"].to_numpy()
@@ -435,7 +437,7 @@ def _shots(beams: Sequence[BeamSignals], intervals: Integers) -> npt.NDArray[np.
 
 
 def _places(
-    beams: Sequence[BeamSignals],
+    beams: Sequence[BeamAverages],
     intervals: Integers,
     network: Network,
     near: npt.NDArray[np.intp],
@@ -470,7 +472,10 @@ def _places(
 
 
 def _told(
-    beams: Sequence[BeamSignals], network: Network, found: MultiPositionResult, settings: Settings
+    beams: Sequence[BeamAverages],
+    network: Network,
+    found: MultiPositionResult,
+    settings: NetworkSettings,
 ) -> str:
     """Return in words which beam is whose, where it meets others, and what visibility is."""
     texts = [f"method {found.method.value}", settings.visibility.words]

@@ -56,7 +56,7 @@ class Windows(NamedTuple):
     """Number of values in the window of a profile without gaps."""
 
 
-class Noise(NamedTuple):
+class NoiseModel(NamedTuple):
     """What the noise model needs to know of the range grid."""
 
     narrow: Windows
@@ -87,7 +87,7 @@ class _Sums(NamedTuple):
     """Number of finite values in the window, where the profile has gaps."""
 
 
-class Scratch(NamedTuple):
+class SignalScratch(NamedTuple):
     """Memory for one profile, which stays in the cache."""
 
     sums: _Sums
@@ -96,7 +96,7 @@ class Scratch(NamedTuple):
     weight: Array
 
 
-def scratch(bins: int) -> Scratch:
+def scratch(bins: int) -> SignalScratch:
     """Return memory for profiles of that many bins."""
     blocks = -(-bins // BLOCK)
     padded = blocks * BLOCK
@@ -110,7 +110,7 @@ def scratch(bins: int) -> Scratch:
         np.zeros(padded + 1, np.int64),
         np.zeros(bins),
     )
-    return Scratch(sums, np.zeros(bins), np.zeros(bins), np.zeros(bins))
+    return SignalScratch(sums, np.zeros(bins), np.zeros(bins), np.zeros(bins))
 
 
 @_compiled
@@ -219,7 +219,7 @@ def _lowest(values: Array) -> float:
 
 
 @_compiled
-def _weigh(s: Scratch, leak: Array) -> None:
+def _weigh(s: SignalScratch, leak: Array) -> None:
     """Weight squared differences by the inverse square of their mean, at most 1."""
     for i in range(leak.size):
         mean, local = s.mean[i], s.local[i]
@@ -288,7 +288,7 @@ def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float
 
 
 @_compiled
-def _estimate(power: Array, noise: Noise, s: Scratch, out: Array) -> None:
+def _estimate(power: Array, noise: NoiseModel, s: SignalScratch, out: Array) -> None:
     complete = _load(power, s.sums)
     _averages(s.sums, noise.narrow, complete, s.mean)
     complete = _load_squares(power, s.sums)
@@ -369,7 +369,7 @@ def voltage_profiles(
 
 
 @_compiled
-def noise_profiles(power: Array, noise: Noise, s: Scratch, out: Array) -> None:
+def noise_profiles(power: Array, noise: NoiseModel, s: SignalScratch, out: Array) -> None:
     """Estimate the noise variance of every profile from third differences.
 
     Parameters
@@ -385,7 +385,7 @@ def noise_profiles(power: Array, noise: Noise, s: Scratch, out: Array) -> None:
 
 
 @_compiled
-def smooth_profiles(values: Array, windows: Windows, s: Scratch, out: Array) -> None:
+def smooth_profiles(values: Array, windows: Windows, s: SignalScratch, out: Array) -> None:
     """Average every profile over windows.
 
     Parameters
@@ -478,7 +478,7 @@ def photon_profiles(
     counter: Counter,
     overlap: Flags,
     windows: Windows,
-    s: Scratch,
+    s: SignalScratch,
     power: Array,
     variance: Array,
     quality: Flags,

@@ -77,7 +77,7 @@ def time_groups(times: npt.ArrayLike, edges: npt.ArrayLike) -> npt.NDArray[np.in
     return group.astype(np.intp)
 
 
-def mean(
+def time_mean(
     profiles: npt.ArrayLike,
     variance: npt.ArrayLike,
     *,
@@ -150,7 +150,7 @@ def range_mean(
     shared_variance: npt.ArrayLike | None = None,
     least_count: int | None = None,
 ) -> Averages:
-    """Average neighbouring bins by `mean`'s formulas, with equal weights.
+    """Average neighbouring bins by `time_mean`'s formulas, with equal weights.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def range_mean(
     Raises
     ------
     RetrievalInputError
-        Where the factor is no whole number from 1 to the number of bins, and as for `mean`.
+        Where the factor is no whole number from 1 to the number of bins, and as for `time_mean`.
     """
     values = inputs.real_array(profiles, "profiles")
     bins = values.shape[-1] if values.ndim else 0

@@ -64,7 +64,7 @@ class Signal:
     """Bits of `lidarops.flags.Quality`."""
 
 
-def analog(
+def analog_signal(
     counts: npt.NDArray[np.int32],
     shots: npt.NDArray[np.integer],
     range: Array,  # noqa: A002 - the field's word
@@ -223,7 +223,7 @@ def _flag_clipped(
     return np.unique(where[0])
 
 
-def photon(
+def photon_signal(
     counts: npt.NDArray[np.int32],
     shots: npt.NDArray[np.integer],
     range: Array,  # noqa: A002 - the field's word
@@ -428,12 +428,12 @@ def _stretch(gaps: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], npt.NDA
     return np.repeat(edges[:-1], lengths), np.repeat(edges[1:], lengths)
 
 
-def _noise(grid: Array) -> kernels.Noise:
+def _noise(grid: Array) -> kernels.NoiseModel:
     spacing = np.abs(np.gradient(grid)) if grid.size > 1 else np.ones(1)
     with np.errstate(divide="ignore"):
         # The third difference of R^-2 is 24 (h / R)^3 of the signal.
         leak = 24.0 * (spacing / grid) ** 3 / np.sqrt(20.0 * LEAK)
-    return kernels.Noise(
+    return kernels.NoiseModel(
         narrow=_windows(grid, NOISE_WINDOW),
         # A third difference needs a bin before and two behind.
         wide=_windows(grid, WEIGHT_WINDOW, ends=(1, 2)),
@@ -447,7 +447,7 @@ def _estimated_variance(power: Array, grid: Array) -> Array:
     return variance
 
 
-def smooth(
+def smooth_signal(
     values: Array,
     range: Array,  # noqa: A002 - the field's word
     *,

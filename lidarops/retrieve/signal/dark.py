@@ -23,7 +23,7 @@ FAR_SHARE: Final = 0.5
 _KNOWN_ROUGHNESS: Final = 6.0
 
 
-class Method(StrEnum):
+class DarkMethod(StrEnum):
     """Which dark files tell the dark signal of a profile."""
 
     NEAREST = "nearest"
@@ -52,7 +52,7 @@ class DarkProfile:
     """(time,) s from each time to the nearest dark file that was used."""
 
 
-def profile(
+def dark_profile(
     dark_signals: npt.ArrayLike,
     dark_times: npt.ArrayLike,
     times: npt.ArrayLike,
@@ -99,7 +99,7 @@ def profile(
     RetrievalInputError
         Where there is no dark file, a time is not known, or the arguments do not fit.
     """
-    chosen = inputs.choice(method, Method, "method")
+    chosen = inputs.choice(method, DarkMethod, "method")
     signals = _signals(dark_signals)
     moments, wanted = _seconds(dark_times, times)
     if signals.shape[-2] != moments.size:
@@ -264,13 +264,13 @@ def _smooth(means: Array, variances: Array, window: int) -> tuple[Array, Array]:
 
 
 def _shares(
-    moments: Array, sessions: list[npt.NDArray[np.intp]], wanted: Array, method: Method
+    moments: Array, sessions: list[npt.NDArray[np.intp]], wanted: Array, method: DarkMethod
 ) -> Array:
     """Return what each session counts at each time, (time, session)."""
     middles = np.array([moments[files].mean() for files in sessions])
     shares = np.zeros((wanted.size, middles.size))
     rows = np.arange(wanted.size)
-    if method is Method.NEAREST:
+    if method is DarkMethod.NEAREST:
         distances = np.stack(
             [np.abs(moments[files] - wanted[:, np.newaxis]).min(axis=1) for files in sessions]
         )

@@ -234,8 +234,8 @@ def _search(
     least_snr: float,
 ) -> tuple[Indices, Indices]:
     """Return first and past-the-last bin of the window of each block, (0, 0) for none."""
-    analog = averaging.mean(x, xv, groups=inverse)
-    rate = _smooth(averaging.mean(y, 0.0, groups=inverse).values)
+    analog = averaging.time_mean(x, xv, groups=inverse)
+    rate = _smooth(averaging.time_mean(y, 0.0, groups=inverse).values)
     highest = np.full(len(rate), np.inf)
     np.minimum.at(highest, inverse, top)
     with np.errstate(invalid="ignore"):

@@ -15,8 +15,7 @@ from lidarops.records import DetectionMode
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.counts_to_signal import Signal
-from lidarops.retrieve.signal.dark import DarkProfile
-from lidarops.retrieve.signal.dark import profile as dark_profile
+from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
 
 _Block = npt.NDArray[Any]
 
@@ -252,7 +251,7 @@ class Dark:
     method: str
 
     def at(self, times: npt.NDArray[np.datetime64]) -> DarkProfile:
-        """Return dark signal and variance at times; see `lidarops.retrieve.signal.dark.profile`."""
+        """Return dark signal and variance at times; see `lidarops.retrieve.signal.dark.dark_profile`."""
         return dark_profile(self.signals, self.times, times, method=self.method)
 
     def variance(self, times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.float64]:
@@ -270,7 +269,7 @@ def dark_of(archive: xr.Dataset, channel: str, *, method: str) -> Dark:
     channel : str
         Name of the channel.
     method : {"nearest", "interpolated"}
-        See `lidarops.retrieve.signal.dark.profile`.
+        See `lidarops.retrieve.signal.dark.dark_profile`.
 
     Returns
     -------
@@ -295,10 +294,12 @@ def _analog(
     **settings: Any,
 ) -> tuple[_Block, _Block, _Block]:
     if dark is None or times is None:
-        return _tuple(counts_to_signal.analog(counts, shots, input_range=input_range, **settings))
+        return _tuple(
+            counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
+        )
     found = dark.at(times.astype("datetime64[ns]"))
     return _tuple(
-        counts_to_signal.analog(
+        counts_to_signal.analog_signal(
             counts,
             shots,
             input_range=input_range,
@@ -310,7 +311,7 @@ def _analog(
 
 
 def _photon(counts: _Block, shots: _Block, **settings: Any) -> tuple[_Block, _Block, _Block]:
-    return _tuple(counts_to_signal.photon(counts, shots, **settings))
+    return _tuple(counts_to_signal.photon_signal(counts, shots, **settings))
 
 
 def _tuple(result: Signal) -> tuple[_Block, _Block, _Block]:

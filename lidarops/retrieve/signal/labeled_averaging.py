@@ -178,7 +178,7 @@ def _averaged_piece(
     shared: npt.NDArray[np.float64],
 ) -> _Block:
     common = shared[own]
-    means = averaging.mean(
+    means = averaging.time_mean(
         power,
         np.maximum(variance - common, 0.0),
         groups=own,

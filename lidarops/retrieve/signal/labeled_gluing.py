@@ -42,11 +42,11 @@ def estimate_lag(analog: xr.Dataset, photon: xr.Dataset) -> float:
     -------
     float
         Bins; what the ranges say where noise shows no common cause
-        (`lidarops.retrieve.signal.lag.estimate`).
+        (`lidarops.retrieve.signal.lag.estimate_lag`).
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     some = {"time": slice(LAG_PROFILES), "range": slice(bins)}
-    found = _lag.estimate(
+    found = _lag.estimate_lag(
         analog["power"].isel(some).to_numpy(), photon["power"].isel(some).to_numpy()
     )
     return float(found.lag) if found.found else told_lag(analog, photon)
@@ -116,7 +116,7 @@ def _glue(
     ahead = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
     r = distance[ahead]
     if lag:
-        analog, analog_variance = _lag.shift(analog, lag, variance=analog_variance)
+        analog, analog_variance = _lag.shift_signal(analog, lag, variance=analog_variance)
         analog_quality = _moved(analog_quality, lag)
     dark, sky = (
         cubic_and_tail.tail_mean(power[..., ahead], r).background for power in (analog, photon)

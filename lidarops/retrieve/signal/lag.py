@@ -35,7 +35,7 @@ _AROUND: Final = 4
 _MARGIN: Final = 2
 
 
-class Interpolation(StrEnum):
+class LagInterpolation(StrEnum):
     """How a signal is read between its bins."""
 
     LINEAR = "linear"
@@ -62,7 +62,7 @@ class LagEstimate:
     """(lag,), bins."""
 
 
-def estimate(
+def estimate_lag(
     analog: npt.ArrayLike,
     photon_counting: npt.ArrayLike,
     *,
@@ -269,7 +269,7 @@ def _confidence(total: Array, lags: npt.NDArray[np.int64], lag: Array) -> Array:
     return np.where(np.isfinite(lag) & (noise > 0), sure, 0.0)
 
 
-def shift(
+def shift_signal(
     profile: npt.ArrayLike,
     lag: npt.ArrayLike,
     *,
@@ -305,7 +305,7 @@ def shift(
     RetrievalInputError
         Where the lag is not finite, or the shapes do not fit.
     """
-    way = inputs.choice(interpolation, Interpolation, "interpolation")
+    way = inputs.choice(interpolation, LagInterpolation, "interpolation")
     values = inputs.real_array(profile, "profile").astype(np.float64, copy=False)
     if values.ndim == 0:
         raise RetrievalInputError("is a single number", field="profile")
@@ -324,7 +324,7 @@ def shift(
     return moved.reshape(values.shape), variances.reshape(values.shape)
 
 
-def _moved(rows: Array, noises: Array, amount: Array, way: Interpolation) -> tuple[Array, Array]:
+def _moved(rows: Array, noises: Array, amount: Array, way: LagInterpolation) -> tuple[Array, Array]:
     moved, variances = np.zeros(rows.shape), np.zeros(rows.shape)
     for value in np.unique(amount):
         same = slice(None) if np.all(amount == value) else np.flatnonzero(amount == value)
@@ -352,9 +352,9 @@ def _add_moved(rows: Array, whole: int, weight: float, total: Array) -> None:
         total[:, first:past] += weight * rows[:, first + whole : past + whole]
 
 
-def _taps(part: float, way: Interpolation) -> dict[int, float]:
+def _taps(part: float, way: LagInterpolation) -> dict[int, float]:
     """Return the weights of the bins about a place a part of a bin behind bin 0."""
-    if way is Interpolation.LINEAR:
+    if way is LagInterpolation.LINEAR:
         return {0: 1.0 - part, 1: part}
     return {
         -1: -part * (part - 1.0) * (part - 2.0) / 6.0,

@@ -14,14 +14,18 @@ from typer.testing import CliRunner
 
 from lidarops.bench import registry
 from lidarops.bench.accuracy import elastic, elastic_cases, homogeneous_report
-from lidarops.bench.accuracy.homogeneous import Measured, background_score, inversion_score
+from lidarops.bench.accuracy.homogeneous import (
+    MonteCarloFigure,
+    background_score,
+    inversion_score,
+)
 from lidarops.bench.harness import results
 from lidarops.bench.harness.terms import Effort
 from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, RawFormatError
-from lidarops.figures.charts import Chart, Panel, Series, draw
-from lidarops.reports.benchmark_page import build
+from lidarops.figures.charts import Chart, Panel, Series, draw_chart
+from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.air.molecular import MolecularProfile
 
 DRAWS = 60
@@ -29,12 +33,12 @@ DRAWS = 60
 
 @pytest.fixture(scope="module")
 def sky():
-    return elastic_cases.simulated()
+    return elastic_cases.simulated_sky()
 
 
 @pytest.fixture(scope="module")
 def found():
-    return elastic.measure(quick=True, date="2024-01-01", draws=DRAWS)
+    return elastic.measure_elastic_accuracy(quick=True, date="2024-01-01", draws=DRAWS)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +103,7 @@ def test_the_bound_is_that_of_a_weighted_straight_line(sky, level):
     determinant = w.sum() * (w * x * x).sum() - (w * x).sum() ** 2
     bound = elastic_cases.least_error(sky, level)
     assert bound == pytest.approx(math.sqrt((w * x * x).sum() / determinant), rel=1e-6)
-    told = elastic_cases.ways()[elastic_cases.TOLD](sky.counts(level, 400, 9), sky)
+    told = elastic_cases.background_methods()[elastic_cases.TOLD](sky.counts(level, 400, 9), sky)
     assert np.std(told.background) == pytest.approx(bound, rel=0.15)
 
 
@@ -108,7 +112,7 @@ def test_the_bound_is_that_of_a_weighted_straight_line(sky, level):
 
 def test_the_peers_find_the_same(sky):
     counts = sky.counts(1e3, 3, 1)
-    told = elastic_cases.ways()[elastic_cases.TOLD](counts, sky)
+    told = elastic_cases.background_methods()[elastic_cases.TOLD](counts, sky)
     apart = elastic_cases.lstsq_backgrounds(counts, sky) - told.background
     # Their weights follow the noise of the bins: a bias far below the error.
     assert np.abs(apart).max() < 0.1 * elastic_cases.least_error(sky, 1e3)
@@ -173,7 +177,7 @@ def test_the_tail_is_biased_by_its_signal_and_the_shape_is_not(found, sky):
         assert abs(mean.bias.value - tail) < 4.5 * mean.bias.error
         free = level.backgrounds[elastic_cases.KNOWN_SHAPE]
         assert level.level > 1e6 or abs(free.bias.value) < 4.5 * free.bias.error
-        assert set(level.rejected) == set(elastic_cases.ways())
+        assert set(level.rejected) == set(elastic_cases.background_methods())
 
 
 def test_backscatter_is_found_as_well_as_stated_where_the_window_is_given(found):
@@ -208,7 +212,7 @@ def test_without_noise_little_is_left(found):
 
 
 def test_published_files_are_met(data_root, published):
-    sky, files = elastic_cases.published(data_root / "synthetic" / "boeckmann")
+    sky, files = elastic_cases.published_profiles(data_root / "synthetic" / "boeckmann")
     truths = {file.level: file for file in files}
     assert sorted(truths) == [file.level for file in files]
     loud = truths[1e8]
@@ -247,12 +251,12 @@ def test_pages_hold_tables_and_figures(found, timed, published, tmp_path):
     whole = replace(found, published=published)
     assert results.load(elastic.Elastic, results.save(whole, tmp_path / "whole.json")) == whole
     reports = {
-        "accuracy": elastic.accuracy_report(whole, "result.json"),
+        "accuracy": elastic.elastic_accuracy_report(whole, "result.json"),
         "throughput": homogeneous_report.elastic_throughput_report(timed, "result.json"),
     }
     for name, report in reports.items():
         folder = tmp_path / name
-        text = build(report, folder).read_text()
+        text = build_benchmark_page(report, folder).read_text()
         for part in report.parts:
             for chart in part.charts:
                 assert (folder / f"{chart.name}.png").read_bytes().startswith(b"\x89PNG")
@@ -263,7 +267,7 @@ def test_pages_hold_tables_and_figures(found, timed, published, tmp_path):
         assert "2024-01-01" in text
     titles = [part.title for part in reports["accuracy"].parts]
     assert "Files of the intercomparison" in titles
-    alone = [part.title for part in elastic.accuracy_report(found).parts]
+    alone = [part.title for part in elastic.elastic_accuracy_report(found).parts]
     assert [title for title in titles if title not in alone] == ["Files of the intercomparison"]
 
 
@@ -283,12 +287,12 @@ def test_results_survive_json(found, timed, tmp_path):
     ],
 )
 def test_errors_stand_in_the_last_digits(value, error, told):
-    assert elastic._signed(Measured(value, error)) == told
+    assert elastic._signed(MonteCarloFigure(value, error)) == told
 
 
 def test_a_band_is_an_area_between_its_edges():
     series = Series("way", (1.0, 10.0), (5.0, 6.0), (0.1, 0.2), (2.0, 3.0), band=True)
-    figure = draw(Chart("name", "Title", "Caption.", (Panel("panel", "x", "y", (series,)),)))
+    figure = draw_chart(Chart("name", "Title", "Caption.", (Panel("panel", "x", "y", (series,)),)))
     (area,) = [one for one in figure.axes[0].collections if isinstance(one, PolyCollection)]
     corners = {tuple(corner) for corner in area.get_paths()[0].vertices.tolist()}
     assert {(1.0, 0.1), (10.0, 0.2), (1.0, 2.0), (10.0, 3.0)} <= corners
@@ -300,16 +304,16 @@ def test_a_band_is_an_area_between_its_edges():
 )
 def test_wrong_use_is_told(what, data, said):
     with pytest.raises(CampaignError, match=said):
-        registry.run(what, "elastic", [], Effort(), data=data)
+        registry.run_benchmark(what, "elastic", [], Effort(), data=data)
 
 
 def test_folders_without_the_published_files_are_refused(tmp_path):
     with pytest.raises(CampaignError, match="no files background_1e"):
-        elastic_cases.published(tmp_path)
+        elastic_cases.published_profiles(tmp_path)
     named = tmp_path / "background_1ex.licel"
     named.write_text("")
     with pytest.raises(CampaignError, match="names no background"):
-        elastic_cases.published(tmp_path)
+        elastic_cases.published_profiles(tmp_path)
     named.rename(tmp_path / "background_1e2.licel")
     table = tmp_path / "molecular_profile_hPa.csv"
     for content, said in (
@@ -320,11 +324,11 @@ def test_folders_without_the_published_files_are_refused(tmp_path):
         if content is not None:
             table.write_text(content)
         with pytest.raises(CampaignError, match=said):
-            elastic_cases.published(tmp_path)
+            elastic_cases.published_profiles(tmp_path)
     table.write_text("1013.25,288.15,0\n540.2,255.65,5000\n")
     (tmp_path / "noise_free.licel").write_bytes(b"no licel file")
     with pytest.raises(RawFormatError):
-        elastic_cases.published(tmp_path)
+        elastic_cases.published_profiles(tmp_path)
 
 
 def test_the_command_prints_writes_and_refuses(monkeypatch, found, tmp_path):
@@ -334,7 +338,7 @@ def test_the_command_prints_writes_and_refuses(monkeypatch, found, tmp_path):
         asked.update(arguments)
         return found
 
-    monkeypatch.setattr(elastic, "measure", measure)
+    monkeypatch.setattr(elastic, "measure_elastic_accuracy", measure)
     words = ["bench", "accuracy", "--case", "elastic", "--quick", "--data", str(tmp_path)]
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path), "--json"])
     assert result.exit_code == 0, result.output

@@ -22,7 +22,7 @@ from lidarops.bench.accuracy.homogeneous_cases import (
     methods,
     scenarios,
 )
-from lidarops.bench.accuracy.peers import JIT, peers
+from lidarops.bench.accuracy.peers import JIT, iterative_peers
 from lidarops.bench.harness import results
 from lidarops.bench.harness.terms import Effort
 from lidarops.bench.harness.timing import in_threads, least_times
@@ -30,7 +30,7 @@ from lidarops.bench.throughput import retrievals
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError, RawFormatError
 from lidarops.figures.charts import pareto
-from lidarops.reports.benchmark_page import build
+from lidarops.reports.benchmark_page import build_benchmark_page
 
 PATH = Scenario(2500.0, 8000.0, 3e-5, 1000.0)
 PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e-3, 1e4)]
@@ -38,12 +38,12 @@ PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e
 
 @pytest.fixture(scope="module")
 def found() -> homogeneous.Accuracy:
-    return homogeneous.measure(quick=True, date="2024-01-01", profiles=200)
+    return homogeneous.measure_homogeneous(quick=True, date="2024-01-01", profiles=200)
 
 
 @pytest.fixture(scope="module")
-def timed() -> retrievals.Throughput:
-    return retrievals.measure(profiles=40, repeats=1, date="2024-01-01")
+def timed() -> retrievals.SolverThroughput:
+    return retrievals.measure_solvers(profiles=40, repeats=1, date="2024-01-01")
 
 
 def _bound_by_mpmath(path: Scenario) -> dict[str, float]:
@@ -128,7 +128,7 @@ def test_every_peer_agrees_with_solve(path):
     power = path.powers(20)
     ours = methods()["direct"](power, path)
     bound = least_errors(path)
-    for name, way in peers().items():
+    for name, way in iterative_peers().items():
         theirs = way(power, path)
         for quantity in QUANTITIES:
             apart = np.abs(theirs.values[quantity] - ours.values[quantity]) / bound[quantity]
@@ -140,8 +140,8 @@ def test_every_peer_agrees_with_solve(path):
 def test_the_compiled_fit_takes_what_cannot_converge():
     power = PATH.powers(3)
     power[1] = np.nan
-    solved = peers()[JIT](power, PATH)
-    alone = peers()[JIT](power[:1], PATH)
+    solved = iterative_peers()[JIT](power, PATH)
+    alone = iterative_peers()[JIT](power[:1], PATH)
     assert solved.rejected.tolist() == [False, True, False]
     assert solved.values["extinction"][0] == alone.values["extinction"][0]
 
@@ -184,7 +184,7 @@ def test_least_squares_reaches_the_bound(found):
                     assert abs(score.rmse.value - 1) < 5 * score.rmse.error + 0.02, quantity
                     assert score.coverage.value > 0.85
                     assert outcome.distances[quantity] < 0.05
-    assert {o.way for o in found.cases[0].outcomes} == set(methods()) | set(peers())
+    assert {o.way for o in found.cases[0].outcomes} == set(methods()) | set(iterative_peers())
 
 
 def test_lag_1_is_biased_as_published_and_least_squares_is_not():
@@ -239,12 +239,12 @@ def test_results_survive_json(found, timed, tmp_path):
 
 def test_pages_hold_tables_and_figures(found, timed, tmp_path):
     reports = {
-        "accuracy": homogeneous_report.accuracy_report(found, "result.json"),
-        "throughput": homogeneous_report.throughput_report(timed, "result.json"),
+        "accuracy": homogeneous_report.homogeneous_accuracy_report(found, "result.json"),
+        "throughput": homogeneous_report.homogeneous_throughput_report(timed, "result.json"),
     }
     for name, report in reports.items():
         folder = tmp_path / name
-        text = build(report, folder).read_text()
+        text = build_benchmark_page(report, folder).read_text()
         charts = [chart for part in report.parts for chart in part.charts]
         assert charts
         for chart in charts:
@@ -259,7 +259,7 @@ def test_pages_hold_tables_and_figures(found, timed, tmp_path):
         assert "<script" not in text
     (tmp_path / "file").write_text("")
     with pytest.raises(CatalogError, match="cannot be written"):
-        build(report, tmp_path / "file")
+        build_benchmark_page(report, tmp_path / "file")
 
 
 def test_the_pareto_front_holds_what_nothing_beats():
@@ -281,7 +281,7 @@ def test_the_pareto_front_holds_what_nothing_beats():
 )
 def test_wrong_use_is_told(what, case, files, error, said):
     with pytest.raises(error, match=said):
-        registry.run(what, case, files, Effort())
+        registry.run_benchmark(what, case, files, Effort())
 
 
 def test_the_command_prints_writes_and_dates(monkeypatch, found, tmp_path):
@@ -291,7 +291,7 @@ def test_the_command_prints_writes_and_dates(monkeypatch, found, tmp_path):
         asked.update(arguments)
         return found
 
-    monkeypatch.setattr(homogeneous, "measure", measure)
+    monkeypatch.setattr(homogeneous, "measure_homogeneous", measure)
     words = ["bench", "accuracy", "--case", "homogeneous", "--quick", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output

@@ -10,20 +10,20 @@ import pytest
 from scipy.integrate import quad
 
 from lidarops.bench.accuracy import multiangle_cases, multiangle_report, multiangle_scores
-from lidarops.bench.accuracy.homogeneous import Measured
-from lidarops.bench.accuracy.multiangle_scores import Size
+from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
+from lidarops.bench.accuracy.multiangle_scores import StudySize
 from lidarops.bench.harness import results
 from lidarops.bench.harness.terms import RESULT, Effort, Kind
 from lidarops.bench.throughput import scan_kernels
 from lidarops.bench.throughput.retrievals import READ
-from lidarops.reports.benchmark_page import build
+from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleFlags,
     Regularisation,
-    solve,
+    retrieve_optical_depth,
 )
 
-SMALL = Size(blocks=3, profiles=8, slow=1, published=60, random=6)
+SMALL = StudySize(blocks=3, profiles=8, slow=1, published=60, random=6)
 SHORT = multiangle_cases.clear(3000.0, gates=25)
 
 
@@ -33,15 +33,17 @@ def found():
     steps = []
     scenes = (SHORT, multiangle_cases.cloud())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(multiangle_cases, "scenes", lambda: scenes)
-        result = multiangle_scores.measure(date="2024-01-01", size=SMALL, progress=steps.append)
+        patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
+        result = multiangle_scores.measure_multiangle(
+            date="2024-01-01", size=SMALL, progress=steps.append
+        )
     assert steps == [1] * (len(scenes) + 4)
     return result
 
 
 @pytest.fixture(scope="module")
 def timed():
-    return scan_kernels.measure_throughput(date="2024-01-01", batches=(1, 2), repeats=1)
+    return scan_kernels.measure_scan_kernels(date="2024-01-01", batches=(1, 2), repeats=1)
 
 
 def without_noise(scene):
@@ -97,7 +99,7 @@ def test_gradient_variation_and_outliers_enter_the_logarithm():
 
 
 def test_the_published_cloud_is_seen_in_the_middle_of_its_layers():
-    scene = multiangle_cases.published(15.0, 6, 0.1)
+    scene = multiangle_cases.published_cloud(15.0, 6, 0.1)
     expected = [0.125, 0.5, 1.125, 2.0, 2.875, 3.5, 3.95, 4.275]
     assert scene.optical_depth == pytest.approx(expected)
     assert scene.zenith_angle == pytest.approx([0.0, 3.0, 6.0, 9.0, 12.0, 15.0])
@@ -110,7 +112,7 @@ def test_the_published_scatter_is_that_of_a_uniform_error(share):
 
     expected = math.sqrt(moment(2) - moment(1) ** 2)
     assert multiangle_cases.uniform_deviation(share) == pytest.approx(expected, rel=1e-8)
-    scene = multiangle_cases.published(30.0, 6, expected)
+    scene = multiangle_cases.published_cloud(30.0, 6, expected)
     scan = multiangle_cases.uniform_scatter(share, 3000, scene, 1)
     ratio = scan.signal / np.exp(-2.0 * np.outer(scene.path, scene.optical_depth))
     assert ratio.max() == pytest.approx(1.0 + share, rel=1e-3)
@@ -153,7 +155,7 @@ def test_the_line_and_its_error_are_ours_where_weights_are_known():
     scene = multiangle_cases.cloud()
     scan = scene.draw(3, 5)
     peer = multiangle_cases.lstsq(scan)
-    ours = solve(
+    ours = retrieve_optical_depth(
         scan.signal,
         scene.zenith_angle,
         scene.altitude,
@@ -170,7 +172,7 @@ def test_tikhonov_is_the_published_method_of_order_0():
     scene = multiangle_cases.cloud()
     scan = scene.draw(2, 6)
     strength = 0.05
-    ours = solve(
+    ours = retrieve_optical_depth(
         scan.signal,
         scene.zenith_angle,
         scene.altitude,
@@ -208,14 +210,14 @@ def test_errors_come_from_independent_blocks():
     figure = multiangle_scores.over_blocks([1.0, 2.0, math.nan, 6.0])
     assert figure.value == pytest.approx(3.0)
     assert figure.error == pytest.approx(np.std([1, 2, 6], ddof=1) / math.sqrt(3))
-    square = multiangle_scores.root(Measured(4.0, 0.4))
+    square = multiangle_scores.root(MonteCarloFigure(4.0, 0.4))
     assert (square.value, square.error) == pytest.approx((2.0, 0.1))
-    assert multiangle_scores.root(Measured(0.0, 0.0)) == Measured(0.0, 0.0)
+    assert multiangle_scores.root(MonteCarloFigure(0.0, 0.0)) == MonteCarloFigure(0.0, 0.0)
     share = multiangle_scores.ratio(np.array([1.0, 0.0, 3.0]), np.array([10.0, 10.0, 20.0]))
     assert share.value == pytest.approx(0.1)
     assert share.error == pytest.approx(math.sqrt(0 + 1 + 1) / 40)
-    assert multiangle_scores.ratio(np.zeros(2), np.full(2, 5.0)) == Measured(0.0, 0.1)
-    assert multiangle_scores.ratio(np.zeros(2), np.zeros(2)) == Measured(0.0, 0.0)
+    assert multiangle_scores.ratio(np.zeros(2), np.full(2, 5.0)) == MonteCarloFigure(0.0, 0.1)
+    assert multiangle_scores.ratio(np.zeros(2), np.zeros(2)) == MonteCarloFigure(0.0, 0.0)
 
 
 def test_false_values_are_counted_with_and_without_flags():
@@ -239,7 +241,7 @@ def test_false_values_are_counted_with_and_without_flags():
 
 
 def test_every_way_is_judged_in_every_scene(found):
-    names = [*multiangle_cases.ways(), *multiangle_cases.peers()]
+    names = [*multiangle_cases.scan_methods(), *multiangle_cases.scan_peers()]
     for scene in found.scenes:
         assert [one.way for one in scene.scores] == names
         assert scene.profiles == SMALL.blocks * SMALL.profiles
@@ -271,7 +273,7 @@ def test_the_published_experiment_is_reproduced(found):
     # Closed form: sigma / (2 sqrt Sxx), sigma / (sqrt 2 (x2 - x1)) for two.
     sigma = multiangle_cases.uniform_deviation(0.25)
     for angle in (15.0, 30.0):
-        path = multiangle_cases.published(angle, 6, sigma).path
+        path = multiangle_cases.published_cloud(angle, 6, sigma).path
         line = sigma / (2.0 * math.sqrt(np.sum((path - path.mean()) ** 2)))
         assert one("kano_hamilton", angle).rmse.value == pytest.approx(line, rel=0.12)
         ends = 0.1 / (math.sqrt(2.0) * (path[-1] - path[0]))
@@ -330,9 +332,9 @@ def test_times_are_multiples_of_the_read(timed):
         group = {cost.step: cost for cost in timed.costs if cost.batch == batch}
         assert group[READ].reads == 1.0
         assert not group[READ].ours
-        ours = {"make_rays", "regress", "vertical.smooth", *multiangle_cases.ways()}
+        ours = {"make_rays", "regress", "vertical.smooth", *multiangle_cases.scan_methods()}
         assert ours <= {name for name, cost in group.items() if cost.ours}
-        assert not any(group[name].ours for name in multiangle_cases.peers())
+        assert not any(group[name].ours for name in multiangle_cases.scan_peers())
         for cost in group.values():
             assert cost.reads == pytest.approx(cost.nanoseconds / group[READ].nanoseconds)
 
@@ -342,12 +344,12 @@ def test_times_are_multiples_of_the_read(timed):
 
 def test_pages_hold_tables_and_figures(found, timed, tmp_path):
     reports = {
-        "accuracy": multiangle_report.accuracy_report(found, RESULT),
-        "throughput": multiangle_report.throughput_report(timed, RESULT),
+        "accuracy": multiangle_report.multiangle_accuracy_report(found, RESULT),
+        "throughput": multiangle_report.multiangle_throughput_report(timed, RESULT),
     }
     for name, report in reports.items():
         folder = tmp_path / name
-        text = build(report, folder).read_text()
+        text = build_benchmark_page(report, folder).read_text()
         assert "2024-01-01" in text
         assert sum(len(part.charts) for part in report.parts) >= 1
         for part in report.parts:
@@ -382,8 +384,8 @@ def test_both_kinds_run(monkeypatch, found, timed):
     monkeypatch.setattr(multiangle_report, "measure", accuracy)
     monkeypatch.setattr(multiangle_report, "measure_throughput", throughput)
     effort = Effort(quick=True, repeats=2, date="2024-01-01")
-    assert multiangle_report.run(Kind.ACCURACY, effort=effort).result is found
-    assert multiangle_report.run(Kind.THROUGHPUT, effort=effort).result is timed
+    assert multiangle_report.run_multiangle(Kind.ACCURACY, effort=effort).result is found
+    assert multiangle_report.run_multiangle(Kind.THROUGHPUT, effort=effort).result is timed
     assert [one["quick"] for one in asked] == [True, True]
     assert asked[1]["repeats"] == 2
 
@@ -398,4 +400,4 @@ def test_both_kinds_run(monkeypatch, found, timed):
     ],
 )
 def test_errors_stand_in_the_last_digits(value, error, sign, said):
-    assert multiangle_report.told(Measured(value, error), sign=sign) == said
+    assert multiangle_report.with_error(MonteCarloFigure(value, error), sign=sign) == said

@@ -12,15 +12,15 @@ from scipy.integrate import quad
 from lidarops.bench.accuracy import network as multiposition
 from lidarops.bench.accuracy import network_cases as known
 from lidarops.bench.accuracy import network_scores as scores
-from lidarops.bench.accuracy.homogeneous import Measured
+from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.network_report import (
-    accuracy_report,
     bracketed,
-    throughput_report,
+    network_accuracy_report,
+    network_throughput_report,
 )
 from lidarops.bench.harness import results
 from lidarops.bench.harness.terms import Effort, Kind
-from lidarops.reports.benchmark_page import build
+from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.cycles import solve_cycle, systematic_error
 
@@ -29,12 +29,14 @@ PROFILES = 3 * known.BLOCK
 
 @pytest.fixture(scope="module")
 def found():
-    return multiposition.measure(date="2024-01-01", profiles=PROFILES, repeats=1, peer_profiles=10)
+    return multiposition.measure_network(
+        date="2024-01-01", profiles=PROFILES, repeats=1, peer_profiles=10
+    )
 
 
 @pytest.fixture(scope="module")
 def timed():
-    return multiposition.measure_throughput(quick=True, date="2024-01-01", repeats=1)
+    return multiposition.measure_network_throughput(quick=True, date="2024-01-01", repeats=1)
 
 
 @pytest.fixture(scope="module")
@@ -113,9 +115,11 @@ def test_noise_is_as_told_and_repeats():
 
 
 def test_a_cycle_is_asked_of_one_cycle_only():
-    names = [way.name for way in known.ways(known.TRIANGLE)]
+    names = [way.name for way in known.network_solvers(known.TRIANGLE)]
     assert len(set(names)) == len(names) == 10
-    assert set(known.ways(known.THREE_BY_TWO)) < set(known.ways(known.TRIANGLE))
+    assert set(known.network_solvers(known.THREE_BY_TWO)) < set(
+        known.network_solvers(known.TRIANGLE)
+    )
 
 
 # Figure 2 -------------------------------------------------------------------------------------
@@ -253,7 +257,7 @@ def test_every_case_is_scored_in_every_way(found):
     assert len(found.cases) == len(known.PLACES) * len(known.AIRS) * len(known.NOISES)
     for one in found.cases:
         place = next(place for place in known.PLACES if place.name == one.place)
-        assert list(one.scores) == [way.name for way in known.ways(place)]
+        assert list(one.scores) == [way.name for way in known.network_solvers(place)]
         assert one.profiles == PROFILES
         for score in one.scores.values():
             assert 0.0 <= score.solved <= 1.0
@@ -285,9 +289,9 @@ def test_unflagged_values_of_the_network_are_as_stated(case):
 
 def test_multipliers_are_off_by_what_the_formula_says(case):
     seen = known.signals(known.TRIANGLE.network(), known.AIRS[0])
-    walk = geometry.cycle(seen.network)
+    walk = geometry.build_cycle(seen.network)
     depths = 2e-3 * (walk.end_range - walk.start_range)
-    for way in known.ways(known.TRIANGLE):
+    for way in known.network_solvers(known.TRIANGLE):
         bias = case(known.TRIANGLE, "homogeneous", 0.02)[way.name].visibility_bias[0]
         if way.method is known.Method.MULTIPLIER and way.multiplier is not None:
             expected = -float(systematic_error(depths, way.multiplier))
@@ -349,11 +353,11 @@ def test_times_are_multiples_of_the_read(found, timed):
 
 def test_pages_hold_tables_and_figures(found, timed, tmp_path):
     for name, report in (
-        ("accuracy", accuracy_report(found, "result.json")),
-        ("throughput", throughput_report(timed, "result.json")),
+        ("accuracy", network_accuracy_report(found, "result.json")),
+        ("throughput", network_throughput_report(timed, "result.json")),
     ):
         folder = tmp_path / name
-        text = build(report, folder).read_text()
+        text = build_benchmark_page(report, folder).read_text()
         assert "2024-01-01" in text
         for part in report.parts:
             for chart in part.charts:
@@ -361,7 +365,7 @@ def test_pages_hold_tables_and_figures(found, timed, tmp_path):
             for table in (*part.tables, *part.details):
                 assert table.rows
                 assert all(len(row) == len(table.columns) for row in table.rows)
-    titles = [part.title for part in accuracy_report(found).parts]
+    titles = [part.title for part in network_accuracy_report(found).parts]
     assert "Figure 2 of the paper, and the right signs" in titles
 
 
@@ -376,7 +380,7 @@ def test_results_survive_json(found, timed, tmp_path):
     [(4.17487, 0.00021, "4.1749(2)"), (-22.4, 1.6, "-22(2)"), (-40.0, 0.0, "-40")],
 )
 def test_errors_stand_in_the_last_digits(value, error, told):
-    assert bracketed(Measured(value, error)) == told
+    assert bracketed(MonteCarloFigure(value, error)) == told
 
 
 def test_the_entry_measures_what_is_asked(monkeypatch, found, timed):
@@ -386,12 +390,12 @@ def test_the_entry_measures_what_is_asked(monkeypatch, found, timed):
         asked.update(arguments)
         return found
 
-    monkeypatch.setattr(multiposition, "measure", measure)
-    monkeypatch.setattr(multiposition, "measure_throughput", lambda **_: timed)
-    right = multiposition.run(Kind.ACCURACY, effort=Effort(quick=True, date="2024-01-01"))
+    monkeypatch.setattr(multiposition, "measure_network", measure)
+    monkeypatch.setattr(multiposition, "measure_network_throughput", lambda **_: timed)
+    right = multiposition.run_network(Kind.ACCURACY, effort=Effort(quick=True, date="2024-01-01"))
     assert (asked["quick"], asked["date"]) == (True, "2024-01-01")
     assert right.result is found
     assert right.report.data == "result.json"
-    fast = multiposition.run(Kind.THROUGHPUT, effort=Effort())
+    fast = multiposition.run_network(Kind.THROUGHPUT, effort=Effort())
     assert fast.result is timed
     assert [part.title for part in fast.report.parts] == ["Cycles per second", "Whole profiles"]

@@ -28,13 +28,13 @@ from lidarops.bench.stability.random_scenes import (
     Judged,
     Tally,
     Verdict,
+    clustered_share,
     collect,
-    share,
 )
-from lidarops.bench.stability.stiff_cases import Outcome, Retrieval
+from lidarops.bench.stability.stiff_cases import CaseOutcome, Retrieval
 from lidarops.cli import app
 from lidarops.flags import Quality
-from lidarops.reports.benchmark_page import build
+from lidarops.reports.benchmark_page import build_benchmark_page
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous._fit_quality import FALSE_ALARM
 
@@ -130,7 +130,7 @@ def test_what_can_be_seen_is_what_three_tangents_leave_over():
         tangents = np.linalg.qr(np.stack([np.ones_like(r), shape, shape * x], axis=1))[0]
         departure = amount * (x - 0.5) ** 2 * shape
         left = np.linalg.norm(departure - tangents @ (tangents.T @ departure))
-        found = random_homogeneous.visible(r, (shape + departure)[np.newaxis])
+        found = random_homogeneous.visible_misfit(r, (shape + departure)[np.newaxis])
         assert found == pytest.approx(left, rel=0.02)
 
 
@@ -141,10 +141,10 @@ def test_the_best_test_misses_few_of_what_can_be_seen_and_ours_not_many_more():
     r = np.linspace(2000.0, 9000.0, 300)
     x = (r - r[0]) / np.ptp(r)
     shape = 1e3 * (r[0] / r) ** 2 * np.exp(-6e-5 * (r - r[0]))
-    unit = random_homogeneous.visible(r, (shape * (1.0 + 0.02 * x**2))[np.newaxis])
+    unit = random_homogeneous.visible_misfit(r, (shape * (1.0 + 0.02 * x**2))[np.newaxis])
     power = shape * (1.0 + 0.02 * VISIBLE / unit * x**2)
     noise = np.random.default_rng(5).standard_normal((2000, r.size))
-    found = path_fit.solve(power + noise, r, variance=1.0)
+    found = path_fit.fit_homogeneous_path(power + noise, r, variance=1.0)
     missed = np.mean((found.quality & int(Quality.NOT_HOMOGENEOUS)) == 0)
     assert 0.05 < missed < 0.3
 
@@ -162,16 +162,16 @@ def test_all_classes_together_hold_every_scene():
 
 def test_monte_carlo_error_is_that_of_clusters():
     whole = np.full(100, 50.0)
-    together = share(np.repeat([0.0, 50.0], 50), whole)
-    apart = share(np.full(100, 25.0) + np.tile([-1.0, 1.0], 50), whole)
+    together = clustered_share(np.repeat([0.0, 50.0], 50), whole)
+    apart = clustered_share(np.full(100, 25.0) + np.tile([-1.0, 1.0], 50), whole)
     assert together.value == apart.value == 0.5
     assert together.error == pytest.approx(0.05)
     assert apart.error < 0.01
-    assert share(np.zeros(100), whole).error == pytest.approx(1 / 5000)
+    assert clustered_share(np.zeros(100), whole).error == pytest.approx(1 / 5000)
 
 
 def test_difficulty_of_random_paths_is_that_of_the_information_matrix():
-    paths, _ = random_homogeneous.scenes(3, 8)
+    paths, _ = random_homogeneous.random_paths(3, 8)
     found = random_homogeneous.least_relative_error(paths)
     r = paths.range
     for k in range(8):
@@ -212,22 +212,24 @@ def test_where_the_model_holds_homogeneous_paths_are_not_false():
 @pytest.fixture(scope="module")
 def found():
     """Return the benchmark of some cases and few scenes."""
-    cases = tuple(case for case in study.cases() if "visibility" in case.name)
+    cases = tuple(case for case in study.all_cases() if "visibility" in case.name)
     draws = tuple(
         replace(one, quick=1, profiles=8) for one in study.DRAWS
         if one.retrieval in {Retrieval.HOMOGENEOUS, Retrieval.SIGNAL}
     )  # fmt: skip
     steps = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, "cases", lambda: cases)
+        patch.setattr(study, "all_cases", lambda: cases)
         effort = Effort(quick=True, date="2024-01-01", progress=steps.append)
-        measured = study.measure(effort, draws)
+        measured = study.measure_stability(effort, draws)
     assert steps == [1] * (len(cases) + len(draws))
     return measured
 
 
 def test_page_names_cases_and_what_cannot_be_seen(found, tmp_path):
-    page = build(stability_report.report(found, "result.json"), tmp_path).read_text()
+    page = build_benchmark_page(
+        stability_report.stability_report(found, "result.json"), tmp_path
+    ).read_text()
     assert "visibility of extinction" in page
     assert "no: an exponential of range has the shape of extinction itself" in page
     assert "False values: homogeneous" in page
@@ -244,16 +246,16 @@ def test_figures_survive_the_file(found, tmp_path):
     [(True, "", False), (False, "", True), (False, "known", False), (True, "known", True)],
 )
 def test_a_case_fails_where_it_goes_otherwise_than_known(found, passed, finding, failed):
-    outcome = Outcome("one", "made", "a value", "another", passed, finding)
+    outcome = CaseOutcome("one", "made", "a value", "another", passed, finding)
     one = replace(found, outcomes=(outcome,))
     assert one.failed is failed
     assert stability_report.verdict(outcome)
-    rows = stability_report.report(one).parts[0].tables[1].rows
+    rows = stability_report.stability_report(one).parts[0].tables[1].rows
     assert bool(rows) is (not passed or bool(finding))
 
 
 def test_command_prints_json_and_writes_the_page(found, monkeypatch, tmp_path):
-    monkeypatch.setattr(study, "measure", lambda effort: replace(found, date=effort.date))
+    monkeypatch.setattr(study, "measure_stability", lambda effort: replace(found, date=effort.date))
     folder = tmp_path / "out"
     made = CliRunner().invoke(
         app, ["bench", "stability", "--quick", "--json", "--out", str(folder)]
@@ -264,8 +266,8 @@ def test_command_prints_json_and_writes_the_page(found, monkeypatch, tmp_path):
 
 
 def test_command_fails_where_a_case_does(found, monkeypatch):
-    outcome = Outcome("one", "made", "a value", "another", passed=False, finding="")
-    monkeypatch.setattr(study, "measure", lambda _: replace(found, outcomes=(outcome,)))
+    outcome = CaseOutcome("one", "made", "a value", "another", passed=False, finding="")
+    monkeypatch.setattr(study, "measure_stability", lambda _: replace(found, outcomes=(outcome,)))
     made = CliRunner().invoke(app, ["bench", "stability"])
     assert made.exit_code == 1
     assert "FAILED" in made.stdout
@@ -289,13 +291,13 @@ def test_command_refuses_what_stability_does_not_take(option):
 
 def elastic_scene(change=1.0, level=1e6):
     """Return what is visible of a clean sky whose signal without noise is changed."""
-    base = elastic_cases.simulated()
+    base = elastic_cases.simulated_sky()
     mean = np.broadcast_to(base.signal * change + 10.0, base.range.shape)
     noise = (base.signal + 10.0) / level
     rng = np.random.default_rng(6)
     draws = base.signal + 10.0 + np.sqrt(noise) * rng.standard_normal((5, mean.size))
     found = random_elastic._process(draws, np.broadcast_to(noise, draws.shape), base)
-    return base, noise, found, random_elastic.visible(mean, noise, base, found)
+    return base, noise, found, random_elastic.visible_departure(mean, noise, base, found)
 
 
 def test_a_sky_as_the_inversion_has_it_shows_nothing():
@@ -305,7 +307,7 @@ def test_a_sky_as_the_inversion_has_it_shows_nothing():
 
 
 def test_what_has_another_shape_in_the_reference_window_is_seen_by_its_norm():
-    base = elastic_cases.simulated()
+    base = elastic_cases.simulated_sky()
     wave = 1e-3 * (-1.0) ** np.arange(base.range.size)
     _, noise, found, seen = elastic_scene(1.0 + wave * (base.range > 6000.0))
     part = (base.range >= found.window.bottom[0]) & (base.range <= found.window.top[0])
@@ -315,7 +317,7 @@ def test_what_has_another_shape_in_the_reference_window_is_seen_by_its_norm():
 
 
 def test_less_than_air_is_seen_and_more_than_air_is_haze():
-    base = elastic_cases.simulated()
+    base = elastic_cases.simulated_sky()
     part = (base.range > 3000.0) & (base.range < 3600.0)
     assert np.all(elastic_scene(1.0 - 0.5 * part, 1e4)[-1] > VISIBLE)
     haze = 0.5 * part * (base.backscatter + base.molecular_backscatter)
@@ -325,7 +327,7 @@ def test_less_than_air_is_seen_and_more_than_air_is_haze():
 
 def test_a_lidar_ratio_that_is_off_is_never_seen_by_more_than_is_declared():
     """The declared error takes it up: by twice, that is 5 of its standard errors."""
-    base = elastic_cases.simulated()
+    base = elastic_cases.simulated_sky()
     other = 2.0 * elastic_cases.LIDAR_RATIO
     more = (other - elastic_cases.LIDAR_RATIO) * np.cumsum(base.backscatter) * 15.0
     seen = elastic_scene(np.exp(-2.0 * more))[-1]
@@ -349,7 +351,7 @@ def test_single_wild_bins_cost_few_elastic_values():
     """Without bridging, the tests of background and window reject two of three."""
 
     def wild(cluster):
-        for judged, scenes in random_elastic.judged(cluster, 60):
+        for judged, scenes in random_elastic.judge_elastic(cluster, 60):
             if judged.failure.name == "outliers":
                 yield judged, scenes
 

@@ -13,7 +13,6 @@ from lidarops.bench.stability import study
 from lidarops.bench.stability.stiff_cases import (
     Answer,
     Between,
-    Case,
     Honest,
     Missing,
     Near,
@@ -21,6 +20,7 @@ from lidarops.bench.stability.stiff_cases import (
     Refused,
     Retrieval,
     Stands,
+    StiffCase,
     Unflagged,
     evaluate,
     spelled,
@@ -29,7 +29,7 @@ from lidarops.bench.stability.stiff_homogeneous import CLEAR, exact_root
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 
-CASES = study.cases()
+CASES = study.all_cases()
 BAD = int(Quality.POOR_FIT)
 CARE = int(Quality.OUTLIER)
 
@@ -93,7 +93,7 @@ def test_expectations_tell_good_from_bad(expectation, good, bad):
 
 
 def made(solve, *expected):
-    return Case("made", Retrieval.HOMOGENEOUS, dict, solve, expected)
+    return StiffCase("made", Retrieval.HOMOGENEOUS, dict, solve, expected)
 
 
 def refuse():

@@ -10,8 +10,8 @@ from lidarops.bench import registry
 from lidarops.bench.harness.terms import Effort, Kind
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import archives, stand_in_archives
-from lidarops.bench.throughput.archives import Measured, Pass, Spent
-from lidarops.bench.throughput.campaigns import Size
+from lidarops.bench.throughput.archives import ArchiveCost, Pass, ProcessCost
+from lidarops.bench.throughput.campaigns import CampaignSize
 from lidarops.bench.throughput.stand_in_archives import StandIns
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
@@ -49,8 +49,8 @@ def found():
     told = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(archives, "_alone", archives._spent)
-        result = archives.measure(
-            [Size(scenes=n, profiles=15, bins=100, retrieved=False) for n in (1, 2)],
+        result = archives.measure_archives(
+            [CampaignSize(scenes=n, profiles=15, bins=100, retrieved=False) for n in (1, 2)],
             SMALL,
             date="2024-01-01",
             progress=told.append,
@@ -85,19 +85,19 @@ def test_a_pass_can_be_measured_in_a_process_of_its_own(tmp_path):
 
 def test_growth_is_that_of_the_cost_of_a_file(tmp_path):
     def measured(files, cpu, *, read=True):
-        return Measured(files, read, {Pass.AGAIN: Spent(cpu, 2.0 * cpu, 3e8)})
+        return ArchiveCost(files, read, {Pass.AGAIN: ProcessCost(cpu, 2.0 * cpu, 3e8)})
 
     few, more = measured(1000, 0.02), measured(100_000, 2.2)
     assert archives.growth(few, more, Pass.AGAIN) == pytest.approx(1.1)
     rows = measured(1_000_000, 10.0, read=False)
     whole = archives.Archives("2024-01-01", machine(), (few, more, rows))
-    report = archives.report(whole, "result.json")
+    report = archives.archives_report(whole, "result.json")
     assert report.parts[0].tables[3].rows == (
         ("1,000", "0.02", "0.04", "20", "-", "300 MB"),
         ("100,000", "2.2", "4.4", "22", "1.10", "300 MB"),
         ("1,000,000 rows", "10", "20", "10", "-", "300 MB"),
     )
-    page = registry.write(registry.Finding(whole, report), tmp_path)
+    page = registry.write_benchmark(registry.Finding(whole, report), tmp_path)
     assert "archive.png" in page.read_text(encoding="utf-8")
     told = json.loads((tmp_path / "result.json").read_text())
     assert told["measured"][2]["spent"]["scan, all known"]["cpu"] == 10.0
@@ -105,4 +105,4 @@ def test_growth_is_that_of_the_cost_of_a_file(tmp_path):
 
 def test_there_is_no_accuracy_of_an_archive():
     with pytest.raises(CampaignError, match="no accuracy"):
-        archives.run(Kind.ACCURACY, effort=Effort())
+        archives.run_archives(Kind.ACCURACY, effort=Effort())

@@ -11,17 +11,17 @@ from lidarops.bench import registry
 from lidarops.bench.harness.terms import Effort, Kind
 from lidarops.bench.harness.timing import machine
 from lidarops.bench.throughput import campaigns, orchestration
-from lidarops.bench.throughput.campaigns import Cost, Growth, Size, Stage
+from lidarops.bench.throughput.campaigns import CampaignCost, CampaignSize, Growth, Stage
 from lidarops.errors import CampaignError, SceneError
 from lidarops.run.archive import reprocess
 
-SMALL = Size(scenes=2, profiles=15, bins=500)
+SMALL = CampaignSize(scenes=2, profiles=15, bins=500)
 
 
 @pytest.fixture(scope="module")
 def found():
     told = []
-    result = campaigns.measure(
+    result = campaigns.measure_campaigns(
         date="2024-01-01",
         along={"scenes": (replace(SMALL, scenes=1), SMALL)},
         workers=(),
@@ -37,9 +37,9 @@ def test_every_stage_has_a_time(found):
     assert all(seconds > 0 for seconds in growth.costs[1].seconds.values())
 
 
-@pytest.mark.parametrize("size", [SMALL, Size(scenes=1, profiles=30, bins=600, angles=5)])
+@pytest.mark.parametrize("size", [SMALL, CampaignSize(scenes=1, profiles=30, bins=600, angles=5)])
 def test_campaigns_have_the_size_that_is_asked_for(size, tmp_path):
-    campaign = campaigns.simulated(size, tmp_path)
+    campaign = campaigns.simulate_campaign(size, tmp_path)
     record = reprocess(campaign)
     assert [scene.error for scene in record.scenes] == [""] * size.scenes
     assert [scene.granules for scene in record.scenes] == [size.profiles] * size.scenes
@@ -50,7 +50,9 @@ def test_campaigns_have_the_size_that_is_asked_for(size, tmp_path):
 
 def test_slopes_are_those_of_the_times(found, tmp_path):
     costs = tuple(
-        Cost(Size(scenes=n), {stage: 0.01 * n**power for power, stage in enumerate(Stage)})
+        CampaignCost(
+            CampaignSize(scenes=n), {stage: 0.01 * n**power for power, stage in enumerate(Stage)}
+        )
         for n in (2, 4, 8)
     )
     slopes = dict(campaigns._slopes("scenes", costs))
@@ -58,25 +60,25 @@ def test_slopes_are_those_of_the_times(found, tmp_path):
         assert slopes[stage] == pytest.approx((power, 0.0), abs=1e-6)
     growth = Growth("scenes", costs, slopes)
     whole = replace(found, growths=(growth,), workers={1: 4.0, 2: 2.5})
-    report = campaigns.report(whole, "result.json")
+    report = campaigns.campaigns_report(whole, "result.json")
     assert report.parts[1].tables[0].rows[1][2] == "1.60"
     shares = [row[3] for row in report.parts[0].tables[0].rows if row[3] != "-"]
     assert math.isclose(
         sum(float(share.split()[0].lstrip("<")) for share in shares), 100.0, abs_tol=0.4
     )
-    page = registry.write(registry.Finding(whole, report), tmp_path)
+    page = registry.write_benchmark(registry.Finding(whole, report), tmp_path)
     assert "growth.png" in page.read_text(encoding="utf-8")
     assert whole.machine == machine()
 
 
 def test_there_is_no_accuracy_of_the_pipeline():
     with pytest.raises(CampaignError, match="no accuracy"):
-        campaigns.run(Kind.ACCURACY, effort=Effort())
+        campaigns.run_campaigns(Kind.ACCURACY, effort=Effort())
 
 
 def test_the_overhead_of_a_way_is_a_line_over_the_plain_loop():
-    serial = orchestration.Way("plain loop", (10.0, 110.0), (11.0, 120.0))
-    flow = orchestration.Way("flow", (10.0 + 16.5, 110.0 + 21.5), (30.0, 140.0))
+    serial = orchestration.RunMode("plain loop", (10.0, 110.0), (11.0, 120.0))
+    flow = orchestration.RunMode("flow", (10.0 + 16.5, 110.0 + 21.5), (30.0, 140.0))
     line = orchestration.overhead(flow, serial)
     assert line.fixed == pytest.approx(16.0)
     assert line.share == pytest.approx(0.05)
@@ -86,10 +88,10 @@ def test_the_overhead_of_a_way_is_a_line_over_the_plain_loop():
 
 
 def test_a_whole_command_is_measured_with_its_processes(tmp_path):
-    campaigns.simulated(Size(scenes=1, profiles=15, bins=500), tmp_path)
-    (way,) = orchestration.measure([tmp_path / "campaign.yaml"], ways=("plain loop",))
+    campaigns.simulate_campaign(CampaignSize(scenes=1, profiles=15, bins=500), tmp_path)
+    (way,) = orchestration.measure_orchestration([tmp_path / "campaign.yaml"], ways=("plain loop",))
     assert way.cpu[0] > 0.0
     assert list((tmp_path / "plain loop" / "products").rglob("*.nc"))
     (tmp_path / "campaign.yaml").write_text("name: 3")
     with pytest.raises(SceneError, match="failed"):
-        orchestration.measure([tmp_path / "campaign.yaml"], ways=("plain loop",))
+        orchestration.measure_orchestration([tmp_path / "campaign.yaml"], ways=("plain loop",))

@@ -17,7 +17,7 @@ from lidarops.plan import cost_estimate
 from lidarops.plan.cost_estimate import DEFAULTS, Costs, Term
 from lidarops.records import RunRecord
 from lidarops.run import archive
-from lidarops.simulate.campaign import simulate
+from lidarops.simulate.campaign import simulate_campaign
 
 
 def observed(truth: Costs, count: int = 60, noise: float = 0.0) -> list[Observation]:
@@ -73,14 +73,14 @@ def test_costs_that_miss_what_they_were_found_from_are_told(
     scenes = tuple(Observation("", (), {}, 2.0, 2.0 * each) for each in (1.0, ratio))
     found = calibration.Calibration("", machine(), DEFAULTS, scenes, "")
     monkeypatch.setattr(calibration, "calibrate", lambda **_: found)
-    page = calibration.run(Kind.THROUGHPUT, effort=Effort()).report
+    page = calibration.run_cost_calibration(Kind.THROUGHPUT, effort=Effort()).report
     assert ("calibrate again" in caplog.text) == doubted
     assert ("calibrate again" in page.parts[0].text) == doubted
 
 
 def test_costs_have_no_accuracy():
     with pytest.raises(CampaignError, match="throughput"):
-        calibration.run(Kind.ACCURACY, effort=Effort())
+        calibration.run_cost_calibration(Kind.ACCURACY, effort=Effort())
 
 
 @pytest.mark.slow
@@ -89,12 +89,12 @@ def test_a_calibration_serves_the_next_run(tmp_path: Path, monkeypatch: pytest.M
     """How close estimates come is told by the page of the calibration, not here."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     campaign = mixed_campaign.write(tmp_path, profiles=10)
-    simulate(campaign)
+    simulate_campaign(campaign)
     first = archive.reprocess(campaign)
     assert first is not None
     assert first.costs.startswith("not calibrated")
     calibration.calibrate(date="today", rounds=1)
-    assert cost_estimate.load().words == "calibrated on this machine on today"
+    assert cost_estimate.load_calibration().words == "calibrated on this machine on today"
     record = archive.reprocess(campaign, options=archive.Options(force=True))
     assert isinstance(record, RunRecord)
     assert record.costs == "calibrated on this machine on today"

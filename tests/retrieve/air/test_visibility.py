@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import visibility
-from lidarops.retrieve.air.visibility import at_reference_wavelength, from_extinction
+from lidarops.retrieve.air.visibility import (
+    at_reference_wavelength,
+    visibility_from_extinction,
+)
 
 KM = 1e-3
 
@@ -26,17 +29,19 @@ KM = 1e-3
     ],
 )
 def test_visibility_of_one_per_kilometre(contrast, kilometres):
-    result = from_extinction(1.0 * KM, contrast=contrast)
+    result = visibility_from_extinction(1.0 * KM, contrast=contrast)
     assert result.visibility == pytest.approx(1000 * kilometres, rel=1e-14)
     assert result.contrast == contrast
 
 
 def test_meteorological_optical_range_is_the_default():
-    assert from_extinction(3e-3).visibility == pytest.approx(np.log(20) / 3e-3, rel=1e-14)
+    assert visibility_from_extinction(3e-3).visibility == pytest.approx(
+        np.log(20) / 3e-3, rel=1e-14
+    )
 
 
 def test_interval_is_that_of_extinction_turned_over():
-    result = from_extinction([2e-3, 2e-3, 2e-3], [1e-5, 1e-3, 3e-3])
+    result = visibility_from_extinction([2e-3, 2e-3, 2e-3], [1e-5, 1e-3, 3e-3])
     assert result.asymmetric.tolist() == [False, True, True]
     assert result.unbounded.tolist() == [False, False, True]
     np.testing.assert_allclose(
@@ -50,13 +55,13 @@ def test_interval_is_that_of_extinction_turned_over():
 def test_linear_error_agrees_with_simulated_scatter_where_small_and_interval_where_large():
     rng = np.random.default_rng(3)
     draws = 2e-3 * (1 + 0.03 * rng.standard_normal(200_000))
-    result = from_extinction(2e-3, 0.03 * 2e-3)
-    scatter = np.std(from_extinction(draws).visibility)
+    result = visibility_from_extinction(2e-3, 0.03 * 2e-3)
+    scatter = np.std(visibility_from_extinction(draws).visibility)
     assert result.visibility_standard_error == pytest.approx(scatter, rel=0.01)
     # The interval holds 68 percent of what a noisy extinction gives, however asymmetric.
     draws = 2e-3 * (1 + 0.3 * rng.standard_normal(200_000))
-    result = from_extinction(2e-3, 0.3 * 2e-3)
-    values = from_extinction(draws).visibility
+    result = visibility_from_extinction(2e-3, 0.3 * 2e-3)
+    values = visibility_from_extinction(draws).visibility
     inside = (values > result.visibility_lower) & (values < result.visibility_upper)
     assert inside.mean() == pytest.approx(0.6827, abs=0.005)
     symmetric = np.abs(values - result.visibility) < result.visibility_standard_error
@@ -64,7 +69,9 @@ def test_linear_error_agrees_with_simulated_scatter_where_small_and_interval_whe
 
 
 def test_no_visibility_is_invented_where_extinction_is_not_positive_or_missing():
-    result = from_extinction([np.nan, 0.0, -1e-4, -2e-4, np.inf], [1e-4, 1e-4, 3e-4, 1e-4, 1.0])
+    result = visibility_from_extinction(
+        [np.nan, 0.0, -1e-4, -2e-4, np.inf], [1e-4, 1e-4, 3e-4, 1e-4, 1.0]
+    )
     assert np.isnan(result.visibility).all()
     assert np.isnan(result.visibility_standard_error).all()
     # A lower end can be told of an extinction that is zero within its error.
@@ -74,7 +81,7 @@ def test_no_visibility_is_invented_where_extinction_is_not_positive_or_missing()
 
 
 def test_missing_errors_stay_missing():
-    result = from_extinction(np.float32([1e-3, 2e-3]))
+    result = visibility_from_extinction(np.float32([1e-3, 2e-3]))
     assert np.isfinite(result.visibility).all()
     assert np.isnan(result.visibility_standard_error).all()
     assert np.isnan(result.visibility_upper).all()
@@ -194,5 +201,5 @@ def test_wrong_settings_are_refused_by_name(arguments, field):
 )
 def test_wrong_arguments_are_refused_by_name(extinction, error, contrast, field):
     with pytest.raises(RetrievalInputError) as raised:
-        from_extinction(extinction, error, contrast=contrast)
+        visibility_from_extinction(extinction, error, contrast=contrast)
     assert raised.value.field == field

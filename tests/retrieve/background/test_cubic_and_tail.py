@@ -261,7 +261,9 @@ def test_gradient_is_that_of_finite_differences():
     def solve(rows):
         out = np.full((len(rows), _cubic_kernel.COLUMNS), np.nan)
         gradients = np.zeros_like(rows)
-        _cubic_kernel.solve_profiles(rows, variance, True, np.zeros(1), triples, gradients, out)
+        _cubic_kernel.solve_cubic_profiles(
+            rows, variance, True, np.zeros(1), triples, gradients, out
+        )
         return out[:, _cubic_kernel.BACKGROUND], gradients
 
     step = 1e-4

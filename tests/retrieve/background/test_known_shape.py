@@ -16,7 +16,7 @@ from lidarops.flags import Quality
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.cubic_and_tail import tail_mean
-from lidarops.retrieve.background.known_shape import molecular_shape, solve
+from lidarops.retrieve.background.known_shape import fit_known_shape, molecular_shape
 
 RANGE = (np.arange(1000) + 0.5) * 15.0
 WAVELENGTH = 532e-9
@@ -58,7 +58,7 @@ def test_the_fit_keeps_its_digits(background):
     shape = air()[400:]
     power = background + 3.0 * shape + rng.normal(0.0, 0.1, shape.size)
     variance = 0.01 + 0.1 * rng.random(shape.size)
-    found = solve(power, RANGE[400:], shape, variance=variance, start=0.0)
+    found = fit_known_shape(power, RANGE[400:], shape, variance=variance, start=0.0)
     with mp.workdps(60):
         w = [1 / mp.mpf(float(v)) for v in variance]
         phi, p = [mp.mpf(float(x)) for x in shape], [mp.mpf(float(x)) for x in power]
@@ -85,7 +85,7 @@ def test_without_noise_both_come_back(seed, background, amplitude, exponent):
     shape = air()
     power = background + amplitude * shape
     power[np.random.default_rng(seed).random(1000) < 0.3] = np.nan
-    found = solve(power, RANGE, shape * scale, start=4000.0)
+    found = fit_known_shape(power, RANGE, shape * scale, start=4000.0)
     assert found.background == pytest.approx(background, abs=1e-11 * (1e3 + amplitude))
     assert found.amplitude * scale == pytest.approx(amplitude, rel=1e-9, abs=1e-11 * 1e3)
 
@@ -100,7 +100,7 @@ def test_standard_errors_cover_the_scatter(start, known):
     shape = air()
     noise = 0.3 if not known else 0.1 + 0.4 * np.exp(-RANGE / 4000.0)
     power = 20.0 + 5.0 * shape + noise * rng.normal(size=(3000, 1000))
-    found = solve(power, RANGE, shape, variance=noise**2 if known else None, start=start)
+    found = fit_known_shape(power, RANGE, shape, variance=noise**2 if known else None, start=start)
     off = (found.background - 20.0) / found.background_standard_error
     scale = (found.amplitude - 5.0) / found.amplitude_standard_error
     assert off.std() == pytest.approx(1.0, abs=0.06)
@@ -122,12 +122,12 @@ def test_counts_are_weighed_without_bias(background, start):
     rng = np.random.default_rng(3)
     shape, shots = air(), 20.0
     power = rng.poisson(shots * (background + 2.0 * shape), (4000, 1000)) / shots
-    found = solve(power, RANGE, shape, exposure=shots, start=start)
+    found = fit_known_shape(power, RANGE, shape, exposure=shots, start=start)
     off = found.background - background
     error = found.background_standard_error
     assert abs(off.mean()) < 0.1 * error.mean()
     assert (off / error).std() == pytest.approx(1.0, abs=0.12 if background == 0.0 else 0.06)
-    realised = solve(
+    realised = fit_known_shape(
         power, RANGE, shape, variance=np.maximum(power, 1.0 / shots) / shots, start=4500.0
     )
     bias = np.mean(realised.background) - background
@@ -140,9 +140,9 @@ def test_model_weights_reach_the_error_of_the_true_ones():
     shape, shots = air(), 1000.0
     truth = 0.3 + 30.0 * shape
     power = rng.poisson(shots * truth, (1500, 1000)) / shots
-    model = solve(power, RANGE, shape, exposure=shots, start=3000.0)
-    true = solve(power, RANGE, shape, variance=truth / shots, start=3000.0)
-    flat = solve(power, RANGE, shape, start=3000.0)
+    model = fit_known_shape(power, RANGE, shape, exposure=shots, start=3000.0)
+    true = fit_known_shape(power, RANGE, shape, variance=truth / shots, start=3000.0)
+    flat = fit_known_shape(power, RANGE, shape, start=3000.0)
     assert model.background.std() == pytest.approx(true.background.std(), rel=0.01)
     assert flat.background.std() > 1.5 * true.background.std()
     np.testing.assert_allclose(
@@ -156,7 +156,7 @@ def of_few_bins(bins, profiles, variance):
     shape = np.exp(-range_ / 8000.0) / range_**2
     shape /= shape[0]
     power = 5.0 + 50.0 * shape + np.random.default_rng(11).normal(size=(profiles, bins))
-    return solve(power, range_, shape, variance=variance, start=0.0)
+    return fit_known_shape(power, range_, shape, variance=variance, start=0.0)
 
 
 @pytest.mark.parametrize("bins", [8, 12, 20])
@@ -187,11 +187,11 @@ def test_false_alarms_are_as_rare_as_promised():
     rng = np.random.default_rng(5)
     shape = air()
     power = 3.0 + shape + rng.normal(0.0, 0.05, (20000, 1000))
-    found = solve(power, RANGE, shape, variance=0.05**2, start=5000.0)
+    found = fit_known_shape(power, RANGE, shape, variance=0.05**2, start=5000.0)
     assert found.poor_fit.sum() <= 8
     assert (np.abs(found.curvature) > 1.96).mean() == pytest.approx(0.05, abs=0.006)
     assert found.waves.mean() == pytest.approx(14.0, abs=0.3)
-    unknown = solve(power[:5000], RANGE, shape, start=5000.0)
+    unknown = fit_known_shape(power[:5000], RANGE, shape, start=5000.0)
     assert unknown.poor_fit.sum() <= 4
 
 
@@ -201,10 +201,10 @@ def test_a_cloud_in_the_window_is_seen(variance):
     shape = air()
     cloud = 1.0 + 0.5 * np.exp(-(((RANGE - 8000.0) / 300.0) ** 2))
     power = 3.0 + 5.0 * shape * cloud + rng.normal(0.0, 0.05, (200, 1000))
-    found = solve(power, RANGE, shape, variance=variance, start=5000.0)
+    found = fit_known_shape(power, RANGE, shape, variance=variance, start=5000.0)
     assert found.poor_fit.all()
     assert ((found.quality & Quality.NOT_HOMOGENEOUS) != 0).all()
-    chosen = solve(power, RANGE, shape, variance=variance)
+    chosen = fit_known_shape(power, RANGE, shape, variance=variance)
     assert (chosen.start > 8000.0).all()
     assert chosen.poor_fit.mean() < 0.01
     assert abs(np.mean(chosen.background) - 3.0) < 0.3 * chosen.background_standard_error.mean()
@@ -216,7 +216,7 @@ def test_the_window_begins_above_the_aerosol():
     for top in (3000.0, 5000.0, 7000.0):
         truth = 10.0 + with_layer(shape, top=top) * 50.0
         power = truth + rng.normal(0.0, 0.3, (300, 1000))
-        found = solve(power, RANGE, shape, variance=0.09)
+        found = fit_known_shape(power, RANGE, shape, variance=0.09)
         off = (found.background - 10.0) / found.background_standard_error
         assert (found.start >= top).all()
         assert np.sqrt(np.mean(off**2)) < 1.2
@@ -227,14 +227,14 @@ def test_clean_air_is_used_from_near():
     rng = np.random.default_rng(8)
     shape = air()
     power = 10.0 + shape + rng.normal(0.0, 0.3, (500, 1000))
-    found = solve(power, RANGE, shape, variance=0.09)
+    found = fit_known_shape(power, RANGE, shape, variance=0.09)
     assert (found.start == RANGE[np.searchsorted(RANGE, 0.3 * RANGE[-1])]).mean() > 0.95
 
 
 def test_where_no_window_is_clean_the_farthest_is_taken_and_says_so():
     shape = air()
     power = 3.0 + 5.0 * shape * (1.0 + 0.5 * np.sin(RANGE / 300.0))
-    found = solve(power, RANGE, shape, variance=1e-6)
+    found = fit_known_shape(power, RANGE, shape, variance=1e-6)
     assert found.start == RANGE[np.searchsorted(RANGE, 0.7 * RANGE[-1])]
     assert found.poor_fit
 
@@ -247,11 +247,13 @@ def test_windows_end_with_what_is_usable_and_where_told():
     mask = np.ones((4, 1000), dtype=bool)
     mask[1, 600:] = False
     stops = [2e4, 2e4, 10000.0, 2e4]
-    found = solve(power, RANGE, shape, variance=1e-4, start=4000.0, stop=stops, mask=mask)
+    found = fit_known_shape(power, RANGE, shape, variance=1e-4, start=4000.0, stop=stops, mask=mask)
     np.testing.assert_array_equal(found.stop, [RANGE[799], RANGE[599], 9997.5, RANGE[-1]])
     np.testing.assert_array_equal(found.start, RANGE[RANGE >= 4000.0][0])
     for k, last in enumerate((800, 600, 667, 1000)):
-        alone = solve(power[k, :last], RANGE[:last], shape[:last], variance=1e-4, start=4000.0)
+        alone = fit_known_shape(
+            power[k, :last], RANGE[:last], shape[:last], variance=1e-4, start=4000.0
+        )
         assert found.background[k] == alone.background
 
 
@@ -261,7 +263,7 @@ def test_windows_end_with_what_is_usable_and_where_told():
 def test_a_shape_that_is_constant_is_singular():
     power = np.random.default_rng(10).normal(5.0, 1.0, (2, 200))
     shape = np.stack([np.ones(200), 1.0 + 1e-3 * np.linspace(0.0, 1.0, 200)])
-    found = solve(power, RANGE[:200], shape, variance=1.0, start=0.0)
+    found = fit_known_shape(power, RANGE[:200], shape, variance=1.0, start=0.0)
     assert found.singular.all()
     assert np.isinf(found.condition[0])
     assert np.isnan(found.background[0])
@@ -271,8 +273,8 @@ def test_a_shape_that_is_constant_is_singular():
 
 def test_condition_is_the_price_of_the_second_unknown():
     shape = air()
-    long = solve(np.ones(1000), RANGE, shape, variance=1.0, start=2000.0)
-    short = solve(np.ones(1000), RANGE, shape, variance=1.0, start=14000.0)
+    long = fit_known_shape(np.ones(1000), RANGE, shape, variance=1.0, start=2000.0)
+    short = fit_known_shape(np.ones(1000), RANGE, shape, variance=1.0, start=14000.0)
     for found in (long, short):
         bins = found.degrees_of_freedom + 2
         assert found.condition == pytest.approx(found.background_standard_error * np.sqrt(bins))
@@ -286,21 +288,23 @@ def test_missing_profiles_stay_missing():
     power[1] = np.nan
     power[2, 303:] = np.nan
     shape = air()
-    found = solve(power, RANGE, shape, variance=1.0, start=RANGE[300])
+    found = fit_known_shape(power, RANGE, shape, variance=1.0, start=RANGE[300])
     assert np.isnan(found.background[1])
     assert np.isnan(found.start[1])
     assert found.quality[1] == Quality.INPUT_MISSING
     assert found.quality[2] & Quality.TOO_FEW_BINS
     assert found.degrees_of_freedom[2] == 1
-    none = solve(np.full((2, 1000), np.nan), RANGE, shape)
+    none = fit_known_shape(np.full((2, 1000), np.nan), RANGE, shape)
     assert np.isnan(none.background).all()
-    assert solve(np.empty((0, 1000)), RANGE, shape).background.shape == (0,)
+    assert fit_known_shape(np.empty((0, 1000)), RANGE, shape).background.shape == (0,)
 
 
 def test_a_recorder_that_stands_still_is_flagged():
     for options in ({}, {"variance": 1.0}):
-        assert solve(np.full(1000, 7.0), RANGE, air(), **options).quality & Quality.NO_SIGNAL
-    dark = solve(np.zeros(1000), RANGE, air(), exposure=100.0)
+        assert (
+            fit_known_shape(np.full(1000, 7.0), RANGE, air(), **options).quality & Quality.NO_SIGNAL
+        )
+    dark = fit_known_shape(np.zeros(1000), RANGE, air(), exposure=100.0)
     assert dark.quality == 0
     assert dark.background == 0.0
     bins = dark.degrees_of_freedom + 2
@@ -308,7 +312,7 @@ def test_a_recorder_that_stands_still_is_flagged():
 
 
 def test_a_signal_upside_down_is_flagged():
-    found = solve(10.0 - air(), RANGE, air(), variance=1e-4, start=4000.0)
+    found = fit_known_shape(10.0 - air(), RANGE, air(), variance=1e-4, start=4000.0)
     assert found.quality & Quality.NEGATIVE_AMPLITUDE
 
 
@@ -318,11 +322,11 @@ def test_no_bit_depends_on_batch_order_or_layout():
     power = (3.0 + shape + rng.normal(0.0, 0.1, (24, 1000))).astype(np.float32)
     power[rng.random(power.shape) < 0.05] = np.nan
     for options in ({}, {"exposure": 50.0}, {"variance": 0.01}):
-        whole = solve(power.reshape(2, 3, 4, 1000), RANGE, shape, **options)
-        alone = [solve(row, RANGE, shape, **options).background for row in power]
+        whole = fit_known_shape(power.reshape(2, 3, 4, 1000), RANGE, shape, **options)
+        alone = [fit_known_shape(row, RANGE, shape, **options).background for row in power]
         np.testing.assert_array_equal(whole.background.ravel(), alone)
         other = np.asfortranarray(power.astype(">f8"))[:, ::-1]
-        turned = solve(other, RANGE[::-1], shape[::-1], **options)
+        turned = fit_known_shape(other, RANGE[::-1], shape[::-1], **options)
         np.testing.assert_array_equal(turned.background, alone)
 
 
@@ -347,7 +351,7 @@ def test_no_bit_depends_on_batch_order_or_layout():
 def test_impossible_arguments_are_refused(change, field):
     arguments = {"power": np.ones(1000), "range": RANGE, "shape": air()} | change
     with pytest.raises(RetrievalInputError) as error:
-        solve(**arguments)
+        fit_known_shape(**arguments)
     assert error.value.field == field
 
 
@@ -387,14 +391,16 @@ def test_published_backgrounds_are_met(data_root, wavelength):
         data_root / "synthetic" / "boeckmann", wavelength
     ):
         # The scale of a file is known to 1e-5 only: its truth is the fit of the true shape.
-        truth = solve(power, range_, clean, variance=(clean + level) / SHOTS, start=range_[60])
-        found = solve(power, range_, shape, exposure=SHOTS)
+        truth = fit_known_shape(
+            power, range_, clean, variance=(clean + level) / SHOTS, start=range_[60]
+        )
+        found = fit_known_shape(power, range_, shape, exposure=SHOTS)
         off = found.background - truth.background
         assert abs(off) < 3.0 * found.background_standard_error
         assert level > 1e5 or abs(off) <= 1.0
         assert not found.poor_fit
         assert found.quality == 0
-        flat = solve(power, range_, shape)
+        flat = fit_known_shape(power, range_, shape)
         assert level > 1e5 or abs(flat.background - truth.background) <= 1.0
         if level <= 1e4:
             tail = tail_mean(power, range_).background - truth.background

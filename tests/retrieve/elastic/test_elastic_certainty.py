@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.inversion import solve
+from lidarops.retrieve.elastic.inversion import invert_elastic
 
 AIR = MolecularProfile.us_standard()
 RANGE = 7.5 * (np.arange(1400) + 0.5)[20:]
@@ -19,7 +19,7 @@ def test_a_doubtful_lidar_ratio_does_not_withhold_clean_air(wavelength, ratio_er
     backscatter, extinction = AIR.backscatter(RANGE, wavelength), AIR.extinction(RANGE, wavelength)
     depth = np.cumsum(extinction) * 7.5
     power = 1e12 * backscatter * np.exp(-2.0 * depth) / RANGE**2
-    found = solve(
+    found = invert_elastic(
         power,
         RANGE,
         molecular_backscatter=backscatter,
@@ -41,7 +41,7 @@ def test_a_thick_layer_of_doubtful_lidar_ratio_is_withheld_behind_it():
     layer = np.where((RANGE > 4e3) & (RANGE < 5e3), 2e-5, 0.0)
     depth = np.cumsum(extinction + 50.0 * layer) * 7.5
     power = 1e14 * (backscatter + layer) * np.exp(-2.0 * depth) / RANGE**2
-    found = solve(
+    found = invert_elastic(
         power,
         RANGE,
         molecular_backscatter=backscatter,

@@ -7,7 +7,7 @@ import pytest
 
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.inversion import solve
+from lidarops.retrieve.elastic.inversion import invert_elastic
 
 GREEN = 532e-9
 
@@ -66,7 +66,7 @@ def boeckmann(data_root):
 @pytest.mark.parametrize("level", [0, 2, 4, 6, 8])
 def test_boeckmann_set_is_found_or_said_to_be_uncertain(boeckmann, level):
     folder, r, clear, clean, setup = boeckmann
-    truth = solve(clean, r, **setup).backscatter
+    truth = invert_elastic(clean, r, **setup).backscatter
     assert np.all(np.isfinite(truth[r > 400.0]))
 
     raw = green_counts(folder / f"background_1e{level}.licel")
@@ -82,7 +82,7 @@ def test_boeckmann_set_is_found_or_said_to_be_uncertain(boeckmann, level):
         1.0, 3.5 * background_error
     )
 
-    found = solve(
+    found = invert_elastic(
         power - found_line[0], r, **setup, variance=variance,
         background_standard_error=background_error,
     )  # fmt: skip
@@ -130,8 +130,8 @@ def test_pappalardo_files_agree_within_their_errors(pappalardo):
     for k in range(len(x)):
         others = np.delete(x, k, axis=0).mean(axis=0)
         variance = np.maximum(np.nan_to_num(others), 1.0 / (len(x) - 1))
-        one = solve(x[k], r, **setup, variance=variance)
-        rest = solve(others, r, **setup, variance=variance / (len(x) - 1))
+        one = invert_elastic(x[k], r, **setup, variance=variance)
+        rest = invert_elastic(others, r, **setup, variance=variance / (len(x) - 1))
         assert np.all(one.valid[near])
         error = np.hypot(one.backscatter_standard_error, rest.backscatter_standard_error)
         deviations.append(((one.backscatter - rest.backscatter) / error)[near])
@@ -148,7 +148,7 @@ def test_pappalardo_particles_do_not_depend_on_the_reference_in_clean_air(pappal
     variance = np.maximum(np.nan_to_num(total), 1.0)
     near = within(r, (500.0, 5e3))
     solutions = [
-        solve(total, r, **setup | {"reference": window}, variance=variance)
+        invert_elastic(total, r, **setup | {"reference": window}, variance=variance)
         for window in ((7e3, 8.5e3), (8.5e3, 10e3), (10e3, 12e3))
     ]
     for other in solutions[1:]:

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.inversion import LONGEST_GAP, monte_carlo, solve
+from lidarops.retrieve.elastic.inversion import LONGEST_GAP, invert_elastic, monte_carlo
 
 GREEN = 532e-9
 AIR = MolecularProfile.us_standard()
@@ -74,7 +74,7 @@ def noisy_setup(power, r, **changes):
 
 @pytest.mark.parametrize("reference", [CLEAN, (6.5 * KM, 7.5 * KM), (11.0 * KM, 11.9 * KM)])
 def test_closed_loop_on_the_lidar_equation(reference):
-    found = solve(FINE_POWER, FINE, **air(FINE), lidar_ratio=50.0, reference=reference)
+    found = invert_elastic(FINE_POWER, FINE, **air(FINE), lidar_ratio=50.0, reference=reference)
     total = particles(FINE) + AIR.backscatter(FINE, GREEN)
     assert np.all(found.valid)
     assert np.max(np.abs(found.backscatter - particles(FINE)) / total) < 1e-4
@@ -91,7 +91,7 @@ def test_closed_loop_with_a_lidar_ratio_that_changes_with_range():
         return 30.0 + 40.0 * np.exp(-(((np.asarray(r) - 3000.0) / 900.0) ** 2))
 
     power = signal(FINE, lidar_ratio)
-    found = solve(power, FINE, **air(FINE), lidar_ratio=lidar_ratio(FINE), reference=CLEAN)
+    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=lidar_ratio(FINE), reference=CLEAN)
     total = particles(FINE) + AIR.backscatter(FINE, GREEN)
     assert np.max(np.abs(found.backscatter - particles(FINE)) / total) < 1e-4
     assert found.lidar_constant == pytest.approx(1e12, rel=1e-4)
@@ -100,7 +100,7 @@ def test_closed_loop_with_a_lidar_ratio_that_changes_with_range():
 def test_trapezoids_converge_with_the_square_of_the_bin():
     def error(step):
         r = 300.0 + step * np.arange(int(9000 / step))
-        found = solve(signal(r), r, **air(r), lidar_ratio=50.0, reference=(8000.0, 8200.0))
+        found = invert_elastic(signal(r), r, **air(r), lidar_ratio=50.0, reference=(8000.0, 8200.0))
         below = r < 5000.0
         return np.max(np.abs(found.backscatter - particles(r))[below])
 
@@ -122,7 +122,7 @@ def test_any_signal_obeys_the_differential_equation(start):
         return y * (gradient + 2.0 * (lidar_ratio * y + alpha - lidar_ratio * beta))
 
     total = 1.6 * float(AIR.backscatter(start, GREEN))
-    found = solve(
+    found = invert_elastic(
         1e6 * np.exp(log_corrected(r)) / r**2,
         r,
         **air(r),
@@ -146,7 +146,7 @@ def test_scattering_ratio_of_the_window_is_what_is_given():
     inside = (FINE >= 3000.0) & (FINE <= 3400.0)
     ratio = 1.0 + particles(FINE) / AIR.backscatter(FINE, GREEN)
     mean = float(np.mean(ratio[inside]))
-    found = solve(
+    found = invert_elastic(
         FINE_POWER, FINE, **air(FINE), lidar_ratio=50.0, reference=(3000.0, 3400.0),
         reference_scattering_ratio=mean,
     )  # fmt: skip
@@ -166,7 +166,7 @@ def gappy(power):
 
 
 def changed(setup, power=COARSE_POWER, r=COARSE):
-    return solve(power, r, **setup)
+    return invert_elastic(power, r, **setup)
 
 
 SETUPS = {
@@ -357,7 +357,7 @@ def coverage(found, truth):
 @pytest.mark.parametrize("noise", [0.003, 0.03, 0.15])
 def test_intervals_cover_the_truth(noise):
     measured, r, truth, setup = campaign(1500, 11, noise)
-    found = solve(measured, r, **setup)
+    found = invert_elastic(measured, r, **setup)
     assert np.mean(found.valid) > 0.99
     covered = coverage(found, truth)
     assert 0.935 < np.mean(covered) < 0.965
@@ -367,7 +367,7 @@ def test_intervals_cover_the_truth(noise):
 
 def test_lidar_constants_are_covered_too():
     measured, r, _, setup = campaign(1500, 12)
-    found = solve(measured, r, **setup)
+    found = invert_elastic(measured, r, **setup)
     deviation = (found.lidar_constant - 1e12) / found.lidar_constant_standard_error
     assert 0.93 < np.mean(np.abs(deviation) < 1.96) < 0.97
 
@@ -375,7 +375,7 @@ def test_lidar_constants_are_covered_too():
 def test_monte_carlo_agrees_with_the_first_order_where_errors_are_small():
     measured, r, _, setup = campaign(3, 13, 0.01)
     setup["lidar_ratio_standard_error"] = 1.0
-    found = solve(measured, r, **setup)
+    found = invert_elastic(measured, r, **setup)
     sampled = monte_carlo(measured, r, **setup, samples=1000, seed=4)
     assert np.all(sampled.solved == 1.0)
     for name in ("noise", "background", "reference", "lidar_ratio", "molecular"):
@@ -408,14 +408,14 @@ def test_short_gaps_are_bridged_and_nothing_is_told_beyond_long_ones():
     power = FINE_POWER.copy()
     short = (FINE > 2000.0) & (FINE < 2000.0 + LONGEST_GAP - 10.0)
     power[short] = np.nan
-    found = solve(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
+    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
     total = particles(FINE) + AIR.backscatter(FINE, GREEN)
     assert np.array_equal(found.valid, ~short)
     assert np.nanmax(np.abs(found.backscatter - particles(FINE)) / total) < 5e-4
 
     long = (FINE > 2000.0) & (FINE < 2000.0 + LONGEST_GAP + 10.0)
     power[long] = np.nan
-    found = solve(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
+    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
     assert np.array_equal(found.valid, ~long & (FINE > 2000.0))
     assert not np.any(found.unstable)
     # The calibration stands: what is attenuated needs no inversion.
@@ -424,14 +424,14 @@ def test_short_gaps_are_bridged_and_nothing_is_told_beyond_long_ones():
 
 def test_grids_coarser_than_a_gap_have_no_gaps():
     r = 200.0 + 2.0 * LONGEST_GAP * np.arange(40)
-    found = solve(signal(r), r, **air(r), lidar_ratio=50.0, reference=CLEAN)
+    found = invert_elastic(signal(r), r, **air(r), lidar_ratio=50.0, reference=CLEAN)
     assert np.all(found.valid)
 
 
 def test_profiles_without_data_or_reference_stay_empty():
     power = np.stack([FINE_POWER, np.full_like(FINE_POWER, np.nan), FINE_POWER, -FINE_POWER])
     bottom, top = np.array([8e3, 8e3, np.nan, 8e3]), np.array([9e3, 9e3, np.nan, 9e3])
-    found = solve(
+    found = invert_elastic(
         power,
         FINE,
         **air(FINE),
@@ -459,7 +459,7 @@ def test_integration_away_from_the_lidar_through_a_cloud_is_withheld():
     window = (2200.0, 2400.0)
     mean = 1.0 + float(np.mean(particles(np.linspace(*window)) / AIR.backscatter(2300.0, GREEN)))
     setup = {**air(FINE), "lidar_ratio": 52.0, "reference": window}
-    found = solve(power, FINE, **setup, reference_scattering_ratio=mean)
+    found = invert_elastic(power, FINE, **setup, reference_scattering_ratio=mean)
     first = FINE[np.argmax(found.unstable)]
     # The transmission squared is 0.05 where 2 * 50 sr * beta integrates to 3.
     assert 4950.0 < first < 5100.0
@@ -472,7 +472,9 @@ def test_a_reference_of_noise_is_withheld_until_the_signal_decides():
     rng = np.random.default_rng(3)
     spread = np.full(FINE.size, FINE_POWER[(FINE > 8e3) & (FINE < 9e3)].mean() * 3.0)
     power = FINE_POWER + spread * rng.standard_normal((300, FINE.size))
-    found = solve(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN, variance=spread**2)
+    found = invert_elastic(
+        power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN, variance=spread**2
+    )
     # 134 bins of a signal of a third of the noise: the mean is known to a quarter.
     inside = within(FINE, CLEAN)
     assert np.mean(found.unstable[:, inside]) > 0.5
@@ -484,7 +486,7 @@ def test_a_reference_of_noise_is_withheld_until_the_signal_decides():
 def test_negative_powers_are_neither_clipped_nor_refused():
     power = FINE_POWER.copy()
     power[-1] *= -1.0
-    found = solve(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
+    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
     air_there = AIR.backscatter(FINE[-1], GREEN)
     assert found.valid[-1]
     assert found.backscatter[-1] < -1.9 * air_there
@@ -510,31 +512,33 @@ def test_batches_do_not_change_a_bit():
         for name, value in setup.items()
         if name in ("molecular_backscatter", "molecular_extinction", "lidar_ratio", "variance")
     }
-    whole = solve(measured, r, **setup)
+    whole = invert_elastic(measured, r, **setup)
     for variant in (setup, setup | rows):
         for cut in (slice(0, 1), slice(3, 8), slice(None, None, -1)):
             shared = {
                 name: value[cut] if np.ndim(value) == 2 and len(value) == 12 else value
                 for name, value in variant.items()
             }
-            part = solve(measured[cut], r, **shared)
+            part = invert_elastic(measured[cut], r, **shared)
             for mine, all_of_them in zip(fields(part), fields(whole), strict=True):
                 np.testing.assert_array_equal(mine, all_of_them[cut])
 
 
 def test_layout_and_order_of_the_arrays_do_not_matter():
     measured, r, _, setup = campaign(6, 16)
-    whole = fields(solve(measured, r, **setup))
-    cube = fields(solve(measured.reshape(2, 3, -1), r, **setup))
+    whole = fields(invert_elastic(measured, r, **setup))
+    cube = fields(invert_elastic(measured.reshape(2, 3, -1), r, **setup))
     turned = {
         name: value[..., ::-1] if np.shape(value)[-1:] == r.shape else value
         for name, value in setup.items()
     }
-    back = fields(solve(np.asfortranarray(measured[:, ::-1]).astype(">f8"), r[::-1], **turned))
+    back = fields(
+        invert_elastic(np.asfortranarray(measured[:, ::-1]).astype(">f8"), r[::-1], **turned)
+    )
     for mine, in_cube, in_back in zip(whole, cube, back, strict=True):
         np.testing.assert_array_equal(in_cube.reshape(mine.shape), mine)
         np.testing.assert_array_equal(in_back[..., ::-1] if mine.ndim == 2 else in_back, mine)
-    single = solve(measured[0], r, **setup)
+    single = invert_elastic(measured[0], r, **setup)
     np.testing.assert_array_equal(single.backscatter, whole[0][0])
     assert single.lidar_constant.shape == ()
 
@@ -543,23 +547,26 @@ def test_float32_is_solved_in_double_precision():
     power = FINE_POWER.astype(np.float32)
     setup = {**air(FINE), "lidar_ratio": 50.0, "reference": CLEAN}
     np.testing.assert_array_equal(
-        solve(power, FINE, **setup).backscatter,
-        solve(power.astype(np.float64), FINE, **setup).backscatter,
+        invert_elastic(power, FINE, **setup).backscatter,
+        invert_elastic(power.astype(np.float64), FINE, **setup).backscatter,
     )
 
 
 def test_windows_can_be_given_as_bins_or_for_each_profile():
     power = np.stack([FINE_POWER, FINE_POWER])
     setup = {**air(FINE), "lidar_ratio": 50.0}
-    one = solve(power, FINE, **setup, reference=CLEAN)
+    one = invert_elastic(power, FINE, **setup, reference=CLEAN)
     mask = within(FINE, CLEAN)
     np.testing.assert_array_equal(
-        solve(power, FINE, **setup, reference=mask).backscatter, one.backscatter
+        invert_elastic(power, FINE, **setup, reference=mask).backscatter, one.backscatter
     )
-    two = solve(power, FINE, **setup, reference=(np.array([8e3, 7e3]), np.array([9e3, 8e3])))
+    two = invert_elastic(
+        power, FINE, **setup, reference=(np.array([8e3, 7e3]), np.array([9e3, 8e3]))
+    )
     np.testing.assert_array_equal(two.backscatter[0], one.backscatter[0])
     np.testing.assert_array_equal(
-        two.backscatter[1], solve(FINE_POWER, FINE, **setup, reference=(7e3, 8e3)).backscatter
+        two.backscatter[1],
+        invert_elastic(FINE_POWER, FINE, **setup, reference=(7e3, 8e3)).backscatter,
     )
 
 
@@ -567,10 +574,10 @@ def test_windows_can_be_given_as_bins_or_for_each_profile():
 @given(scale=st.floats(1e-6, 1e12))
 def test_the_unit_of_the_power_does_not_matter(scale):
     setup = noisy_setup(COARSE_POWER, COARSE) | ERRORS
-    one = solve(COARSE_POWER, COARSE, **setup)
+    one = invert_elastic(COARSE_POWER, COARSE, **setup)
     setup["variance"] = setup["variance"] * scale**2
     setup["background_standard_error"] *= scale
-    other = solve(COARSE_POWER * scale, COARSE, **setup)
+    other = invert_elastic(COARSE_POWER * scale, COARSE, **setup)
     np.testing.assert_allclose(other.backscatter, one.backscatter, rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(other.budget.total, one.budget.total, rtol=1e-9)
     assert other.lidar_constant == pytest.approx(scale * one.lidar_constant, rel=1e-9)
@@ -602,7 +609,7 @@ def test_the_unit_of_the_power_does_not_matter(scale):
 def test_impossible_arguments_are_refused_by_name(change, field):
     setup = {**air(FINE), "lidar_ratio": 50.0, "reference": CLEAN, **change}
     with pytest.raises(RetrievalInputError) as caught:
-        solve(FINE_POWER, FINE, **setup)
+        invert_elastic(FINE_POWER, FINE, **setup)
     assert caught.value.field == field
 
 
@@ -625,18 +632,18 @@ def test_a_bin_that_lies_off_leaves_the_errors_honest(window, size):
         **air(FINE), "lidar_ratio": 50.0, "reference": CLEAN, "variance": deviation**2,
         "reference_relative_error": 0.01,
     }  # fmt: skip
-    clean = solve(power, FINE, **given)
+    clean = invert_elastic(power, FINE, **given)
     assert not clean.outlying.any()
     bins = np.flatnonzero(within(FINE, CLEAN) if window else (FINE > KM) & (FINE < 7.5 * KM))
     at = rng.choice(bins, 200)
     wild = power.copy()
     wild[np.arange(200), at] += size * deviation[at]
-    found = solve(wild, FINE, **given)
+    found = invert_elastic(wild, FINE, **given)
     assert found.outlying[np.arange(200), at].all()
     assert found.outlying.sum() == 200
     assert np.array_equal(found.valid, clean.valid)
     off = (found.backscatter - particles(FINE)) / found.backscatter_standard_error
     assert np.mean(np.abs(off[found.valid]) > 4.0) < 1e-3
     # Without a variance, nobody knows what noise explains.
-    blind = solve(wild, FINE, **{**given, "variance": None})
+    blind = invert_elastic(wild, FINE, **{**given, "variance": None})
     assert not blind.outlying.any()

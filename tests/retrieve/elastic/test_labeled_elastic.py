@@ -13,7 +13,7 @@ from lidarops.flags import Quality
 from lidarops.products.elastic.variables import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled
-from lidarops.retrieve.elastic.labeled import Reference, elastic
+from lidarops.retrieve.elastic.labeled import Reference, invert_elastic
 
 GREEN = 532e-9
 AIR = MolecularProfile.us_standard()
@@ -86,7 +86,7 @@ def solved(data, **changes):
         "molecular_relative_error": 0.0,
         "reference": Reference(5000.0, 11_000.0, 1000.0, 1.0, 0.0),
     }
-    return elastic(data, **(settings | changes))
+    return invert_elastic(data, **(settings | changes))
 
 
 def noiseless(signal, r=distance, **changes):

@@ -8,8 +8,12 @@ from scipy import stats
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.layers import CLOUD_CONTRAST, screen
-from lidarops.retrieve.elastic.reference_window import Rejection, candidate_windows, choose
+from lidarops.retrieve.elastic.layers import CLOUD_CONTRAST, find_layers
+from lidarops.retrieve.elastic.reference_window import (
+    Rejection,
+    candidate_windows,
+    choose_reference,
+)
 
 AIR = MolecularProfile.us_standard()
 RANGE = 15.0 * (np.arange(900) + 0.5)[20:]
@@ -50,7 +54,7 @@ def counted(expected, background, rng):
 
 
 def found_in(power, variance, **settings):
-    return screen(power, RANGE, variance, molecular_attenuated=SHAPE, **settings)
+    return find_layers(power, RANGE, variance, molecular_attenuated=SHAPE, **settings)
 
 
 CLOUDS = {
@@ -156,7 +160,7 @@ def test_air_without_noise_has_no_layers_however_sensitive_the_test():
     r = 7.5 * (np.arange(10_000) + 0.5)[20:]
     extinction = AIR.extinction(r, 532e-9)
     shape = AIR.backscatter(r, 532e-9) * np.exp(-15.0 * np.cumsum(extinction)) / r**2
-    found = screen(1e9 * shape, r, 0.0, molecular_attenuated=shape, contrast=1.0)
+    found = find_layers(1e9 * shape, r, 0.0, molecular_attenuated=shape, contrast=1.0)
     assert not found.cloudy
 
 
@@ -165,7 +169,7 @@ def test_clouds_are_kept_out_of_the_reference():
     true = attenuated(aerosol(100, rng), (7000.0, 600.0, 2e-4))
     power, variance = counted(1e18 * true, 5.0, rng)
     layers = found_in(power, variance)
-    window = choose(
+    window = choose_reference(
         power, RANGE, variance, molecular_attenuated=SHAPE, exclude=layers.mask,
         candidates=candidate_windows(5e3, 12e3, 1e3, 250.0),
     )  # fmt: skip
@@ -193,7 +197,7 @@ def test_profiles_are_screened_alone_in_any_layout():
     power, variance = counted(1e17 * true, 5.0, rng)
     whole = found_in(power, variance)
     cube = found_in(power.reshape(3, 4, -1).astype(np.float32), variance.reshape(3, 4, -1))
-    turned = screen(
+    turned = find_layers(
         power[:, ::-1], RANGE[::-1], variance[:, ::-1], molecular_attenuated=SHAPE[::-1]
     )
     assert cube.mask.shape == (3, 4, RANGE.size)
@@ -219,5 +223,5 @@ def test_profiles_are_screened_alone_in_any_layout():
 )
 def test_impossible_arguments_are_refused_by_name(change, field):
     with pytest.raises(RetrievalInputError) as caught:
-        screen(SHAPE, RANGE, SHAPE**2, **{"molecular_attenuated": SHAPE, **change})
+        find_layers(SHAPE, RANGE, SHAPE**2, **{"molecular_attenuated": SHAPE, **change})
     assert caught.value.field == field

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.elastic.outlying_bins import bridge
+from lidarops.retrieve.elastic.outlying_bins import bridge_outliers
 
 RANGE = 300.0 + 15.0 * np.arange(800)
 AIR = 1e10 * np.exp(-RANGE / 8000.0) / RANGE**2
@@ -29,7 +29,7 @@ def test_a_bin_that_lies_off_gets_what_its_neighbours_say(size):
     at = np.random.default_rng(2).integers(10, RANGE.size - 10, 400)
     rows = np.arange(400)
     power[rows, at] += size * np.sqrt(variance[at])
-    found = bridge(power, RANGE, variance)
+    found = bridge_outliers(power, RANGE, variance)
     assert np.mean(found.found[rows, at]) > 0.97
     assert found.found.sum() == found.found[rows, at].sum()
     told = found.found[rows, at]
@@ -44,7 +44,7 @@ def test_sums_over_a_bridged_bin_have_the_variance_that_is_stated():
     power, variance = noisy(AIR, 50.0, 20_000)
     at = slice(399, 402)
     power[:, 400] += 100.0 * np.sqrt(variance[400])
-    found = bridge(power[:, 380:420], RANGE[380:420], variance[380:420])
+    found = bridge_outliers(power[:, 380:420], RANGE[380:420], variance[380:420])
     total = found.power[:, 19:22].sum(axis=1)
     stated = np.median(found.variance[:, 19:22].sum(axis=1))
     assert np.var(total) == pytest.approx(stated, rel=0.04)
@@ -55,7 +55,7 @@ def test_two_close_ones_are_found_although_each_is_a_neighbour_of_the_other():
     power, variance = noisy(AIR, 50.0, 100)
     for at in (300, 303):
         power[:, at] += 40.0 * np.sqrt(variance[at])
-    found = bridge(power, RANGE, variance).found
+    found = bridge_outliers(power, RANGE, variance).found
     assert found[:, [300, 303]].all()
     assert found.sum() == 200
 
@@ -64,7 +64,7 @@ def test_missing_bins_are_passed_over():
     power, variance = noisy(AIR, 50.0, 50)
     power[:, 500] += 40.0 * np.sqrt(variance[500])
     power[:, [498, 501]] = np.nan
-    found = bridge(power, RANGE, variance)
+    found = bridge_outliers(power, RANGE, variance)
     assert found.found[:, 500].all()
     assert np.isnan(found.power[:, [498, 501]]).all()
     off = (found.power[:, 500] - AIR[500]) / np.sqrt(variance[500])
@@ -74,8 +74,8 @@ def test_missing_bins_are_passed_over():
 def test_a_background_changes_nothing_but_itself():
     power, variance = noisy(AIR, 50.0, 20)
     power[:, 500] += 40.0 * np.sqrt(variance[500])
-    plain = bridge(power, RANGE, variance)
-    over = bridge(power + 64.0, RANGE, variance, background=np.full(20, 64.0))
+    plain = bridge_outliers(power, RANGE, variance)
+    over = bridge_outliers(power + 64.0, RANGE, variance, background=np.full(20, 64.0))
     assert np.array_equal(over.found, plain.found)
     np.testing.assert_allclose(over.power - 64.0, plain.power, rtol=1e-9)
 
@@ -83,8 +83,8 @@ def test_a_background_changes_nothing_but_itself():
 def test_descending_ranges_give_the_same():
     power, variance = noisy(AIR, 50.0, 20)
     power[:, 500] += 40.0 * np.sqrt(variance[500])
-    plain = bridge(power, RANGE, variance)
-    turned = bridge(power[:, ::-1], RANGE[::-1], variance[::-1])
+    plain = bridge_outliers(power, RANGE, variance)
+    turned = bridge_outliers(power[:, ::-1], RANGE[::-1], variance[::-1])
     assert plain.found.any()
     assert np.array_equal(turned.power[:, ::-1], plain.power)
     assert np.array_equal(turned.variance[:, ::-1], plain.variance)
@@ -95,13 +95,13 @@ def test_descending_ranges_give_the_same():
 
 def test_normal_noise_is_left():
     power, variance = noisy(AIR, 50.0, 5000)
-    assert not bridge(power, RANGE, variance).found.any()
+    assert not bridge_outliers(power, RANGE, variance).found.any()
 
 
 @pytest.mark.parametrize("mean", [0.01, 0.1, 3.0])
 def test_single_counts_among_none_are_left(mean):
     counts = np.random.default_rng(3).poisson(mean, (3000, RANGE.size))
-    assert bridge(counts - mean, RANGE, np.full(RANGE.size, mean)).found.sum() <= 2
+    assert bridge_outliers(counts - mean, RANGE, np.full(RANGE.size, mean)).found.sum() <= 2
 
 
 @pytest.mark.parametrize("width", [2.0, 3.0, 5.0], ids="{:g} bins".format)
@@ -111,7 +111,7 @@ def test_thin_layers_are_left(width, peak):
     at = np.random.default_rng(4).uniform(50.0, 750.0, (500, 1))
     layer = peak * np.exp(-4.0 * np.log(2.0) * ((PLACE - at) / width) ** 2)
     power, variance = noisy(AIR * (1.0 + layer), 50.0, 500)
-    assert not bridge(power, RANGE, variance).found.any()
+    assert not bridge_outliers(power, RANGE, variance).found.any()
 
 
 @pytest.mark.parametrize("bins", [1, 2, 8])
@@ -122,12 +122,12 @@ def test_clouds_are_left_even_of_one_bin(bins, depth):
     inside = (at <= PLACE) & (at + bins > PLACE)
     behind = np.exp(-2.0 * depth * np.clip((PLACE - at + 1) / bins, 0.0, 1.0))
     power, variance = noisy(AIR * (1.0 + 200.0 * inside) * behind, 200.0, 500)
-    assert not bridge(power, RANGE, variance).found.any()
+    assert not bridge_outliers(power, RANGE, variance).found.any()
 
 
 def test_noise_larger_than_stated_is_no_lone_bin():
     power, variance = noisy(AIR, 50.0, 1000)
-    assert bridge(power, RANGE, variance / 100.0).found.mean() < 1e-3
+    assert bridge_outliers(power, RANGE, variance / 100.0).found.mean() < 1e-3
 
 
 @pytest.mark.parametrize("step", [3.75, 15.0])
@@ -136,19 +136,19 @@ def test_rounding_makes_no_lone_bins_where_no_noise_is_stated(step):
     place = step * np.arange(1, 1001)
     power = 1e12 / place**2
     power[500] *= 3.0
-    assert np.flatnonzero(bridge(power, place, 0.0).found).tolist() == [500]
+    assert np.flatnonzero(bridge_outliers(power, place, 0.0).found).tolist() == [500]
 
 
 def test_profiles_without_data_stay_so():
     power, variance = noisy(AIR, 50.0, 3)
     power[0], power[1, 4:] = np.nan, np.inf
-    found = bridge(power, RANGE, variance)
+    found = bridge_outliers(power, RANGE, variance)
     assert not found.found.any()
     assert np.array_equal(found.power, power, equal_nan=True)
-    assert bridge(power[:, :3], RANGE[:3], variance[:3]).found.shape == (3, 3)
+    assert bridge_outliers(power[:, :3], RANGE[:3], variance[:3]).found.shape == (3, 3)
 
 
 def test_negative_variances_are_refused():
     with pytest.raises(RetrievalInputError) as caught:
-        bridge(AIR, RANGE, -np.ones(RANGE.size))
+        bridge_outliers(AIR, RANGE, -np.ones(RANGE.size))
     assert caught.value.field == "variance"

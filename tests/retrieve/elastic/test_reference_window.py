@@ -8,8 +8,12 @@ from scipy import stats
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.inversion import solve
-from lidarops.retrieve.elastic.reference_window import Rejection, candidate_windows, choose
+from lidarops.retrieve.elastic.inversion import invert_elastic
+from lidarops.retrieve.elastic.reference_window import (
+    Rejection,
+    candidate_windows,
+    choose_reference,
+)
 
 AIR = MolecularProfile.us_standard()
 RANGE = 15.0 * (np.arange(900) + 0.5)[20:]
@@ -49,7 +53,7 @@ def mean_over(values, window):
 def test_chosen_windows_hold_few_particles(counts):
     rng = np.random.default_rng(1)
     true = attenuated(layered(600, rng))
-    found = choose(*three(counted(counts * true, 2.0, rng)), **CLEAN)
+    found = choose_reference(*three(counted(counts * true, 2.0, rng)), **CLEAN)
     assert np.all(found.chosen)
     ratio = true / SHAPE
     clean = mean_over(ratio, (11e3, 12e3))
@@ -70,7 +74,7 @@ def three(powers):
 def test_choice_is_hardly_drawn_by_fluctuations():
     rng = np.random.default_rng(2)
     expected = np.broadcast_to(3e17 * SHAPE, (4000, RANGE.size))
-    found = choose(*three(counted(expected, 5.0, rng)), **CLEAN)
+    found = choose_reference(*three(counted(expected, 5.0, rng)), **CLEAN)
     assert np.mean(found.chosen) > 0.999
     deviation = (found.scale / 3e17 - 1.0) / (found.scale_standard_error / found.scale)
     usable = deviation[found.chosen]
@@ -81,7 +85,9 @@ def test_choice_is_hardly_drawn_by_fluctuations():
 def test_scale_and_slope_are_those_of_a_weighted_fit():
     rng = np.random.default_rng(3)
     power, variance = counted(1e18 * SHAPE, 30.0, rng)
-    found = choose(power, RANGE, variance, molecular_attenuated=SHAPE, candidates=[[6e3, 8e3]])
+    found = choose_reference(
+        power, RANGE, variance, molecular_attenuated=SHAPE, candidates=[[6e3, 8e3]]
+    )
     inside = (RANGE >= 6e3) & (RANGE <= 8e3)
     p, phi, v, z = power[inside], SHAPE[inside], variance[inside], RANGE[inside] - 7e3
     flat = np.sum(p * phi / v) / np.sum(phi**2 / v)
@@ -106,7 +112,7 @@ def test_clean_windows_pass_at_the_rate_of_the_tests():
     rng = np.random.default_rng(4)
     spread = 0.05 * SHAPE
     power = SHAPE + spread * rng.standard_normal((4000, RANGE.size))
-    found = choose(
+    found = choose_reference(
         power, RANGE, spread**2, molecular_attenuated=SHAPE, candidates=[[6e3, 7e3]],
         most_deviation=2.0,
     )  # fmt: skip
@@ -133,7 +139,9 @@ def test_each_fault_is_told_and_nothing_is_chosen(spoil, reason):
     rng = np.random.default_rng(5)
     spread = 0.03 * SHAPE
     power = SHAPE * spoil(RANGE) + spread * rng.standard_normal(RANGE.size)
-    found = choose(power, RANGE, spread**2, molecular_attenuated=SHAPE, candidates=[6e3, 7e3 + 900])
+    found = choose_reference(
+        power, RANGE, spread**2, molecular_attenuated=SHAPE, candidates=[6e3, 7e3 + 900]
+    )
     assert not found.chosen
     assert found.index == -1
     assert found.rejections[0] & reason
@@ -144,8 +152,8 @@ def test_each_fault_is_told_and_nothing_is_chosen(spoil, reason):
 def test_excluded_bins_bar_their_windows():
     power = 1e18 * SHAPE
     exclude = (RANGE > 3.5e3) & (RANGE < 5e3)
-    free = choose(power, RANGE, power, **CLEAN)
-    barred = choose(power, RANGE, power, **CLEAN, exclude=exclude)
+    free = choose_reference(power, RANGE, power, **CLEAN)
+    barred = choose_reference(power, RANGE, power, **CLEAN, exclude=exclude)
     assert free.bottom == 3e3
     assert barred.bottom == 5e3
     touched = (WINDOWS[:, 0] < 5e3) & (WINDOWS[:, 1] > 3.5e3)
@@ -157,7 +165,7 @@ def test_a_window_in_a_steady_layer_gives_way_to_cleaner_air():
     particles = np.where((RANGE > 3e3) & (RANGE < 6e3), 0.2 * BACKSCATTER, 0.0)
     true = 1e19 * attenuated(particles, lidar_ratio=8.4)
     rng = np.random.default_rng(6)
-    found = choose(*three(counted(true, 1.0, rng)), **CLEAN, most_deviation=4.0)
+    found = choose_reference(*three(counted(true, 1.0, rng)), **CLEAN, most_deviation=4.0)
     assert found.bottom >= 6e3
     inside = WINDOWS[:, 1] <= 6e3
     told = found.rejections[inside]
@@ -171,21 +179,21 @@ def test_profiles_are_chosen_alone_and_their_windows_fit_the_inversion():
     power = power.astype(float)
     power[3] = np.nan
     power[5] = rng.standard_normal(RANGE.size)
-    whole = choose(power.reshape(4, 5, -1), RANGE, variance.reshape(4, 5, -1), **CLEAN)
+    whole = choose_reference(power.reshape(4, 5, -1), RANGE, variance.reshape(4, 5, -1), **CLEAN)
     assert whole.chosen.shape == (4, 5)
     assert whole.rejections.shape == (4, 5, len(WINDOWS))
     assert not whole.chosen[0, 3]
     assert not whole.chosen[1, 0]
     assert np.all(whole.rejections[0, 3] == Rejection.TOO_FEW_BINS)
-    alone = choose(power[7], RANGE, variance[7], **CLEAN)
+    alone = choose_reference(power[7], RANGE, variance[7], **CLEAN)
     assert alone.scale == whole.scale[1, 2]
-    turned = choose(
+    turned = choose_reference(
         power[7, ::-1], RANGE[::-1], variance[7, ::-1], molecular_attenuated=SHAPE[::-1],
         candidates=WINDOWS,
     )  # fmt: skip
     assert turned.scale == alone.scale
 
-    found = solve(
+    found = invert_elastic(
         power, RANGE, molecular_backscatter=BACKSCATTER, molecular_extinction=EXTINCTION,
         lidar_ratio=50.0, reference=tuple(edge.reshape(20) for edge in whole.edges),
     )  # fmt: skip
@@ -217,5 +225,5 @@ def test_candidates_are_made_within_their_bounds():
 )
 def test_impossible_arguments_are_refused_by_name(change, field):
     with pytest.raises(RetrievalInputError) as caught:
-        choose(SHAPE, RANGE, SHAPE**2, **{**CLEAN, **change})
+        choose_reference(SHAPE, RANGE, SHAPE**2, **{**CLEAN, **change})
     assert caught.value.field == field

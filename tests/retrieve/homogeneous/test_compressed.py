@@ -17,7 +17,7 @@ from lidarops.retrieve.homogeneous import (
     _vector_loops,
 )
 from lidarops.retrieve.homogeneous._functional_tables import make_tables
-from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, solve
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 
 KM = 1e-3
 LONG = section(2500.0, 8000.0)
@@ -74,7 +74,9 @@ def test_long_profiles_are_solved_without_tables_alike(monkeypatch):
     power = signal(r, 100.0, 3e-5) + np.random.default_rng(8).standard_normal((3, r.size))
     made = []
     monkeypatch.setattr(_dense, "make_tables", lambda *given: made.append(given))
-    found, direct = (solve(power, r, variance=1.0, method=way) for way in ("auto", "direct"))
+    found, direct = (
+        fit_homogeneous_path(power, r, variance=1.0, method=way) for way in ("auto", "direct")
+    )
     assert not made
     np.testing.assert_allclose(
         found.extinction, direct.extinction, atol=1e-3 * direct.extinction_standard_error.min()
@@ -202,11 +204,11 @@ def test_noise_free_extinction_is_exact(start, length, bins, level, method):
     r = np.linspace(start, start + length, bins)
     truth = np.geomspace(1e-5, 50.0 / length, 300)[:, np.newaxis]
     power = level + np.exp(-2.0 * truth * (r - start)) * (start / r) ** 2
-    found = solve(power, r, method=method)
+    found = fit_homogeneous_path(power, r, method=method)
     np.testing.assert_allclose(found.extinction, truth[:, 0], rtol=1e-9)
     assert np.max(np.abs(found.background - level)) < 1e-9
     if bins == 225:
-        rounded = solve(power.astype(np.float32), r, method=method)
+        rounded = fit_homogeneous_path(power.astype(np.float32), r, method=method)
         apart = np.abs(rounded.extinction / truth[:, 0] - 1.0)
         assert apart.max() < 5e-5 * max(1.0, level) or apart.max() < 2e-3
         assert apart.max() < 5e-5 * max(1.0, 10.0 * level)
@@ -224,8 +226,8 @@ def test_result_is_that_of_converged_least_squares(start, length, known, method,
     power = height * np.exp(-2.0 * extinction * (r - start)) * (start / r) ** 2
     power += 370.0 + random.normal(size=power.shape)
     variance = 1.0 if known else None
-    exact = solve(power, r, variance=variance, method="direct")
-    found = solve(power, r, variance=variance, method=method)
+    exact = fit_homogeneous_path(power, r, variance=variance, method="direct")
+    found = fit_homogeneous_path(power, r, variance=variance, method=method)
     doubt = Quality.LOW_SIGNAL | Quality.POORLY_DETERMINED | Quality.AT_BOUND
     stands = (exact.quality & int(doubt)) == 0
     assert stands.sum() > 1000
@@ -262,7 +264,7 @@ def test_scatter_is_the_least_possible_and_stated(start, length, height, extinct
     count = 10_000
     power = 370.0 + signal(r, height, extinction * KM)
     power = power + np.random.default_rng(3).normal(size=(count, r.size))
-    found = solve(power, r, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, r, variance=1.0, method=method)
     lowest = lowest_errors(r, height, extinction * KM)
     amplitude = height * start**2 * np.exp(2.0 * extinction * KM * start)
     truths = {"background": 370.0, "extinction": extinction * KM, "amplitude": amplitude}
@@ -279,7 +281,7 @@ def test_scatter_is_the_least_possible_and_stated(start, length, height, extinct
 def test_curvature_misfit_is_chi_square(height, method):
     power = 370.0 + signal(LONG, height, 0.03 * KM)
     power = power + np.random.default_rng(4).normal(size=(20_000, 225))
-    found = solve(power, LONG, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     dof = _compressed.CURVATURES - 2
     assert np.mean(found.curvature_misfit) == pytest.approx(dof, rel=0.02)
     assert stats.kstest(found.curvature_misfit, stats.chi2(dof).cdf).pvalue > 1e-4
@@ -289,8 +291,8 @@ def test_common_weights_serve_counts():
     shots = 51
     mean = 10.0 + signal(LONG, 20.0, 0.03 * KM)
     power = np.random.default_rng(5).poisson(shots * mean, (10_000, 225)) / shots
-    found = solve(power, LONG, variance=mean / shots, method="compressed")
-    direct = solve(power[:300], LONG, variance=mean / shots, method="direct")
+    found = fit_homogeneous_path(power, LONG, variance=mean / shots, method="compressed")
+    direct = fit_homogeneous_path(power[:300], LONG, variance=mean / shots, method="direct")
     apart = np.abs(found.extinction[:300] - direct.extinction)
     assert np.max(apart / direct.extinction_standard_error) < 0.01
     pull = (found.extinction - 0.03 * KM) / found.extinction_standard_error
@@ -308,12 +310,14 @@ def test_bits_do_not_depend_on_size_or_start_of_the_batch(dtype, variance, metho
     power = (power + np.random.default_rng(6).normal(size=(1000, 225))).astype(dtype)
     power[17, 30] = np.nan
     power[400] = 5.0
-    whole = solve(power, LONG, variance=variance, method=method)
+    whole = fit_homogeneous_path(power, LONG, variance=variance, method=method)
     for size in (*range(1, 100), *range(100, 1000, 37)):
-        part = solve(power[:size], LONG, variance=variance, method=method)
+        part = fit_homogeneous_path(power[:size], LONG, variance=variance, method=method)
         np.testing.assert_array_equal(part.extinction, whole.extinction[:size])
     for start in range(1, 120, 7):
-        part = solve(power[start : start + 60], LONG, variance=variance, method=method)
+        part = fit_homogeneous_path(
+            power[start : start + 60], LONG, variance=variance, method=method
+        )
         for name in FIELDS:
             np.testing.assert_array_equal(
                 getattr(part, name), getattr(whole, name)[start : start + 60], err_msg=name
@@ -325,15 +329,15 @@ def test_bits_do_not_depend_on_size_or_start_of_the_batch(dtype, variance, metho
 def test_scale_of_the_power_does_not_matter(scale, method):
     power = 370.0 + signal(LONG, 100.0, 0.1 * KM)
     power = power + np.random.default_rng(7).normal(size=(20, 225))
-    expected = solve(power, LONG, method=method)
-    found = solve(power * scale, LONG, method=method)
+    expected = fit_homogeneous_path(power, LONG, method=method)
+    found = fit_homogeneous_path(power * scale, LONG, method=method)
     # Beyond 1e140 the squares leave the floats, and the direct fit takes over.
     close = 1e-9 if 1e-50 < scale < 1e50 else 1e-2
     np.testing.assert_allclose(found.extinction, expected.extinction, rtol=close)
     np.testing.assert_allclose(found.background, expected.background * scale, rtol=close)
     np.testing.assert_array_equal(found.quality, expected.quality)
     if 1e-38 < scale < 1e30:
-        single = solve((power * scale).astype(np.float32), LONG, method=method)
+        single = fit_homogeneous_path((power * scale).astype(np.float32), LONG, method=method)
         np.testing.assert_allclose(single.extinction, expected.extinction, rtol=1e-2)
         np.testing.assert_array_equal(single.quality, expected.quality)
 
@@ -346,8 +350,8 @@ def test_what_has_no_tables_is_solved_all_the_same(method):
     for r in (uneven, thin, short):
         power = 370.0 + signal(r, 1e4, 0.1 * KM)
         power = power + np.random.default_rng(8).normal(size=(3, r.size))
-        found = solve(power, r, variance=1.0, method=method)
-        exact = solve(power, r, variance=1.0, method="direct")
+        found = fit_homogeneous_path(power, r, variance=1.0, method=method)
+        exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
         np.testing.assert_array_equal(found.extinction, exact.extinction)
 
 
@@ -369,7 +373,7 @@ def test_a_thin_section_settles_far_from_where_it_starts(
     noise = np.random.default_rng(5).normal(size=(400, r.size))
     power = 50.0 + amplitude * shape + noise
     for method in ("auto", "fast"):
-        found = solve(power, r, variance=1.0, method=method)
-        exact = solve(power, r, variance=1.0, method="direct")
+        found = fit_homogeneous_path(power, r, variance=1.0, method=method)
+        exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
         off = np.abs(found.extinction - exact.extinction) / exact.extinction_standard_error
         assert off.max() < (0.01 if method == "auto" else 0.1)

@@ -22,8 +22,8 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous.path_fit import (
     HomogeneousResult,
+    fit_homogeneous_path,
     mean_profile_variance,
-    solve,
 )
 
 KM = 1e-3
@@ -69,7 +69,7 @@ def test_linear_step_solves_the_normal_equations(centre, weighted):
     weights = rng.uniform(0.2, 5.0, 225) if weighted else np.ones(225)
     weights[:30] = 0.0 if weighted else 1.0
     prior = 0.03 * KM * rng.uniform(0.5, 1.5, 30)
-    found = solve(
+    found = fit_homogeneous_path(
         power, LONG, weights=weights, method="linearized", extinction=prior, centre=centre
     )
     for k in range(30):
@@ -83,7 +83,9 @@ def test_linear_step_solves_the_normal_equations(centre, weighted):
 def test_linear_step_from_the_truth_is_exact_without_noise(centre):
     extinction = np.geomspace(0.01 * KM, 5.0 * KM, 60)
     power = 25.0 + signal(LONG, 1.0, extinction)
-    found = solve(power, LONG, method="linearized", extinction=extinction, centre=centre)
+    found = fit_homogeneous_path(
+        power, LONG, method="linearized", extinction=extinction, centre=centre
+    )
     np.testing.assert_allclose(found.extinction, extinction, rtol=1e-9)
     np.testing.assert_allclose(found.background, 25.0, rtol=1e-12)
 
@@ -97,7 +99,7 @@ def test_linear_step_covers_the_truth_from_a_prior_that_is_off(height, extinctio
     extinction *= KM
     power = clean(3000, height, extinction, seed=2)
     for variance in (1.0, None):
-        found = solve(
+        found = fit_homogeneous_path(
             power,
             LONG,
             variance=variance,
@@ -119,7 +121,7 @@ def test_centroid_keeps_the_error_of_second_order_small_where_the_path_is_turbid
     lowest = lowest_errors(LONG, 107.0, extinction)[2]
 
     def scatter(centre):
-        found = solve(
+        found = fit_homogeneous_path(
             power,
             LONG,
             variance=1.0,
@@ -136,7 +138,7 @@ def test_centroid_keeps_the_error_of_second_order_small_where_the_path_is_turbid
 def test_linear_step_from_far_off_is_flagged():
     power = clean(200, 1e4, 0.1 * KM)
     for centre in ("centroid", "zero"):
-        found = solve(
+        found = fit_homogeneous_path(
             power, LONG, variance=1.0, method="linearized", extinction=0.5 * KM, centre=centre
         )
         assert np.all(found.quality != 0)
@@ -148,7 +150,9 @@ def test_linear_step_from_far_off_is_flagged():
 def test_known_background_is_the_fit_of_two_unknowns():
     power = clean(20, 300.0, seed=4)
     variance = np.linspace(0.5, 2.0, 225)
-    found = solve(power, LONG, variance=variance, method="known_background", background=370.2)
+    found = fit_homogeneous_path(
+        power, LONG, variance=variance, method="known_background", background=370.2
+    )
     for k in range(20):
 
         def residuals(unknowns, profile=power[k]):
@@ -166,7 +170,7 @@ def test_known_background_is_the_fit_of_two_unknowns():
 
 
 def test_known_background_scatters_less_than_three_unknowns():
-    found = solve(
+    found = fit_homogeneous_path(
         clean(3000, 107.0, seed=5), LONG, variance=1.0, method="known_background", background=370.0
     )
     ratio = np.std(found.extinction) / lowest_errors(LONG, 107.0, 0.03 * KM)[2]
@@ -178,7 +182,7 @@ def test_known_background_scatters_less_than_three_unknowns():
 @pytest.mark.parametrize("known", [True, False])
 def test_error_of_a_given_background_is_propagated(known):
     given = 370.0 + 0.5 * np.random.default_rng(6).normal(size=3000)
-    found = solve(
+    found = fit_homogeneous_path(
         clean(3000, 300.0, seed=6),
         LONG,
         variance=1.0 if known else None,
@@ -193,7 +197,7 @@ def test_error_of_a_given_background_is_propagated(known):
 
 def test_background_at_known_extinction_is_the_published_formula():
     power = clean(20, seed=7)
-    found = solve(power, LONG, method="known_extinction", extinction=0.03 * KM)
+    found = fit_homogeneous_path(power, LONG, method="known_extinction", extinction=0.03 * KM)
     expected = [published_background(LONG, profile, 0.03 * KM) for profile in power]
     np.testing.assert_allclose(found.background, expected, rtol=1e-11)
     assert np.all(found.extinction == 0.03 * KM)
@@ -207,7 +211,9 @@ def test_errors_at_known_extinction_are_honest(height, extinction, known):
     power = 370.0 + signal(LONG, height, extinction * KM)
     power = power + np.sqrt(variance) * noise(3000, seed=8)
     arguments = {"variance": variance} if known else {"weights": 3.0 / variance}
-    found = solve(power, LONG, method="known_extinction", extinction=extinction * KM, **arguments)
+    found = fit_homogeneous_path(
+        power, LONG, method="known_extinction", extinction=extinction * KM, **arguments
+    )
     truth = truth_of(LONG, height, extinction * KM)
     for name in ("background", "amplitude"):
         assert 0.935 < coverage(found, name, truth[name]) < 0.965, name
@@ -215,7 +221,9 @@ def test_errors_at_known_extinction_are_honest(height, extinction, known):
 
 
 def test_wrong_known_extinction_is_flagged():
-    found = solve(clean(200), LONG, variance=1.0, method="known_extinction", extinction=0.1 * KM)
+    found = fit_homogeneous_path(
+        clean(200), LONG, variance=1.0, method="known_extinction", extinction=0.1 * KM
+    )
     assert np.all(found.quality & Quality.POOR_FIT)
 
 
@@ -223,7 +231,7 @@ def test_wrong_known_extinction_is_flagged():
 def test_tail_is_biased_by_its_signal_and_states_its_scatter(known):
     r = section(2500.0, 8000.0)
     power = clean(3000, 107.0, seed=9)
-    found = solve(power, r, variance=1.0 if known else None, method="tail_mean")
+    found = fit_homogeneous_path(power, r, variance=1.0 if known else None, method="tail_mean")
     left = np.mean(signal(r, 107.0, 0.03 * KM)[-22:])
     assert np.mean(found.background) - 370.0 == pytest.approx(left, abs=0.02)
     np.testing.assert_allclose(
@@ -239,7 +247,7 @@ def test_tail_is_biased_by_its_signal_and_states_its_scatter(known):
 def test_tail_without_signal_is_as_good_as_any():
     r = section(2500.0, 8000.0)
     extinction = 1.5 * KM
-    found = solve(
+    found = fit_homogeneous_path(
         clean(3000, 1e3, extinction, seed=10, r=r),
         r,
         variance=1.0,
@@ -255,7 +263,9 @@ def test_tail_leaves_out_what_is_missing():
     power = clean(5)
     power[1, 210:] = np.nan
     power[2, 200:] = np.nan
-    found = solve(power, LONG, variance=1.0, method="tail_mean", tail_start=LONG[203])
+    found = fit_homogeneous_path(
+        power, LONG, variance=1.0, method="tail_mean", tail_start=LONG[203]
+    )
     assert found.background[1] == pytest.approx(power[1, 203:210].mean(), rel=1e-13)
     assert found.quality[1] & Quality.TOO_FEW_BINS
     assert found.quality[2] & Quality.INPUT_MISSING
@@ -282,7 +292,7 @@ def test_every_method_is_right_for_counts(method, given, dark, height, shots):
     rng = np.random.default_rng(11)
     expected = dark + signal(LONG, height, 0.03 * KM)
     power = rng.poisson(expected * shots, (3000, 225)) / shots
-    found = solve(
+    found = fit_homogeneous_path(
         power,
         LONG,
         variance=mean_profile_variance(power, shots),
@@ -304,7 +314,7 @@ def test_counts_reach_the_least_possible_scatter():
     for dark, height, most in ((510.0, 1020.0, 1.03), (10.0, 1e5, 1.05)):
         expected = dark + signal(LONG, height, 0.03 * KM)
         power = rng.poisson(expected, (4000, 225))
-        found = solve(power, LONG, variance=mean_profile_variance(power))
+        found = fit_homogeneous_path(power, LONG, variance=mean_profile_variance(power))
         lowest = lowest_errors(LONG, height, 0.03 * KM, 1.0 / expected)
         for name, scale in zip(NAMES, lowest, strict=True):
             true = truth_of(LONG, height, 0.03 * KM, dark)[name]
@@ -363,7 +373,7 @@ def test_published_bias_is_that_of_the_noise_and_the_fit_has_none(length, expect
     r, power = table_profiles(2500.0, length, 2000, seed=15)
     published = cubic_and_tail.cubic(power, r, lag=1, variance=0.0).background
     assert np.mean(published) - 370.0 == pytest.approx(expected, abs=0.3)
-    found = solve(power, r, variance=1.0)
+    found = fit_homogeneous_path(power, r, variance=1.0)
     errors = found.background - 370.0
     spread = np.std(errors) / np.sqrt(errors.size)
     # The fit is not linear: where the background is poorly determined its distribution is
@@ -390,25 +400,25 @@ def test_published_bias_vanishes_far_away(length):
 def test_sections_are_solved_on_their_own():
     power, sections = clean(6).reshape(2, 3, 225), [(2500.0, 6000.0), (4000.0, 9000.0), (0.0, 1e5)]
     variance = np.random.default_rng(17).uniform(0.5, 2.0, power.shape)
-    found = solve(power, LONG, variance=variance, sections=sections)
+    found = fit_homogeneous_path(power, LONG, variance=variance, sections=sections)
     assert found.extinction.shape == (2, 3, 3)
     for k, (near, far) in enumerate(sections):
         inside = (near <= LONG) & (far > LONG)
-        one = solve(power[..., inside], LONG[inside], variance=variance[..., inside])
+        one = fit_homogeneous_path(power[..., inside], LONG[inside], variance=variance[..., inside])
         for name in FIELDS:
             np.testing.assert_array_equal(getattr(found, name)[..., k], getattr(one, name))
-    turned = solve(
+    turned = fit_homogeneous_path(
         power[..., ::-1], LONG[::-1], variance=variance[..., ::-1], sections=tuple(sections)
     )
     same(turned, found)
-    one = solve(power, LONG, sections=sections[:1])
+    one = fit_homogeneous_path(power, LONG, sections=sections[:1])
     assert one.quality.shape == (2, 3, 1)
 
 
 @pytest.mark.parametrize("sections", [[(1.0,)], [(3000.0, 2000.0)], [(11000.0, 12000.0)], [], 3])
 def test_sections_that_cannot_be_right_are_refused(sections):
     with pytest.raises(RetrievalInputError) as caught:
-        solve(clean(1), LONG, sections=sections)
+        fit_homogeneous_path(clean(1), LONG, sections=sections)
     assert caught.value.field == "sections"
 
 
@@ -422,8 +432,8 @@ def test_robust_passes_leave_out_a_cloud(known):
     without[:, 100:104] = np.nan
     power[:, 100:104] += 200.0
     variance = 1.0 if known else None
-    found = solve(power, LONG, variance=variance, robust_passes=2)
-    expected = solve(without, LONG, variance=variance)
+    found = fit_homogeneous_path(power, LONG, variance=variance, robust_passes=2)
+    expected = fit_homogeneous_path(without, LONG, variance=variance)
     assert np.all(found.quality & Quality.OUTLIER)
     assert np.mean((found.quality & ~Quality.OUTLIER) == 0) > 0.995
     alike = np.abs(found.extinction - expected.extinction) < 0.05 * found.extinction_standard_error
@@ -434,20 +444,22 @@ def test_robust_passes_leave_out_a_cloud(known):
 
 def test_robust_passes_leave_clean_profiles_alone():
     power = clean(1500, seed=19)
-    plain, found = (solve(power, LONG, variance=1.0, robust_passes=k) for k in (0, 2))
+    plain, found = (
+        fit_homogeneous_path(power, LONG, variance=1.0, robust_passes=k) for k in (0, 2)
+    )
     untouched = found.valid_bins == 225
     # One profile in 71 has a bin beyond 4 standard deviations.
     assert 0.97 < np.mean(untouched) < 1.0
     same(rows_of(found, untouched), rows_of(plain, untouched))
     assert np.all(found.quality[~untouched] & Quality.OUTLIER)
     noiseless = 25.0 + signal(LONG, 1.0, np.geomspace(0.01 * KM, 1.0 * KM, 30))
-    assert np.all(solve(noiseless, LONG, robust_passes=3).valid_bins == 225)
+    assert np.all(fit_homogeneous_path(noiseless, LONG, robust_passes=3).valid_bins == 225)
 
 
 def test_robust_passes_do_not_hide_that_a_path_is_not_homogeneous():
     wave = 1.0 + 0.3 * np.sin(np.pi * (LONG - LONG[0]) / 1500.0)
     power = 370.0 + signal(LONG, 1e3, 0.03 * KM) * wave + noise(300, seed=20)
-    found = solve(power, LONG, variance=1.0, robust_passes=3)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, robust_passes=3)
     rejecting = int(Quality.rejecting())
     assert np.all(found.quality & rejecting)
     assert np.all(found.valid_bins > 112)
@@ -481,7 +493,7 @@ def test_no_method_depends_on_the_batch(way, dtype):
             name: values[value][rows] if value in ("near", "given") else value
             for name, value in chosen.items()
         }
-        return solve(power[rows], LONG, variance=1.0, **arguments)
+        return fit_homogeneous_path(power[rows], LONG, variance=1.0, **arguments)
 
     whole = solved(slice(None))
     assert whole.quality.dtype == np.int32
@@ -505,7 +517,7 @@ def test_what_is_accepted_is_right_within_its_error(way, start, length):
         for name, value in ({"method": way} | WAYS[way]).items()
         if name != "lag"
     }
-    found = solve(power, r, variance=1.0, **chosen)
+    found = fit_homogeneous_path(power, r, variance=1.0, **chosen)
     accepted = found.quality == 0
     assert np.mean(accepted) > (0.03 if way == "linearized about zero" else 0.15)
     off = np.abs(found.extinction - extinction) > 4 * found.extinction_standard_error
@@ -522,7 +534,9 @@ def test_no_method_accepts_noise(way):
             for name, value in ({"method": way} | WAYS[way]).items()
         }
         for variance in (1.0, None):
-            assert not np.any(solve(power, r, variance=variance, **chosen).quality == 0)
+            assert not np.any(
+                fit_homogeneous_path(power, r, variance=variance, **chosen).quality == 0
+            )
 
 
 # Reported apart -----------------------------------------------------------------------------
@@ -530,10 +544,10 @@ def test_no_method_accepts_noise(way):
 
 def test_model_error_and_signal_to_noise_are_reported():
     power = clean(2000, 30.0, seed=21)
-    found = solve(power, LONG, variance=1.0, model_error=0.1)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, model_error=0.1)
     slope = 0.1 * (np.abs(found.extinction) + 1.0 / LONG.mean())
     assert np.all(found.extinction_model_error > slope)
-    half = solve(power, LONG, variance=1.0)
+    half = fit_homogeneous_path(power, LONG, variance=1.0)
     twice = 2.0 * half.extinction_model_error
     np.testing.assert_allclose(found.extinction_model_error, twice, rtol=1e-12)
     same_error = half.extinction_standard_error
@@ -541,9 +555,9 @@ def test_model_error_and_signal_to_noise_are_reported():
     shape = signal(LONG, 1.0, 0.03 * KM)
     expected = 30.0 * np.sqrt(np.sum((shape - shape.mean()) ** 2))
     assert np.mean(found.signal_to_noise) == pytest.approx(expected, rel=0.02)
-    upside_down = solve(740.0 - power, LONG, variance=1.0)
+    upside_down = fit_homogeneous_path(740.0 - power, LONG, variance=1.0)
     assert np.mean(upside_down.signal_to_noise < 0) > 0.99
-    assert np.isnan(solve(np.ones(225), LONG).extinction_model_error)
+    assert np.isnan(fit_homogeneous_path(np.ones(225), LONG).extinction_model_error)
 
 
 # Arguments ----------------------------------------------------------------------------------
@@ -585,5 +599,5 @@ def test_model_error_and_signal_to_noise_are_reported():
 def test_arguments_that_a_method_cannot_use_are_refused(arguments, field):
     given = {"power": clean(2)} | arguments
     with pytest.raises(RetrievalInputError) as caught:
-        solve(given.pop("power"), LONG, **given)
+        fit_homogeneous_path(given.pop("power"), LONG, **given)
     assert caught.value.field == field

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.oracle_homogeneous import iterated_fit, section, signal
 
-from lidarops.retrieve.homogeneous.path_fit import solve
+from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 
 KM = 1e-3
 LONG = section(2500.0, 8000.0)
@@ -37,7 +37,9 @@ def test_model_error_is_what_a_fit_makes_of_a_bent_signal(way, extinction, lengt
     share /= np.abs(extinction) + 1.0 / r.mean()
     refit = iterated_fit(r, bent(r, extinction, share), weights, bounds)
     straight = bent(r, extinction, 0.0)[np.newaxis]
-    found = solve(straight, r, weights=weights[np.newaxis], method=method, model_error=1e-3)
+    found = fit_homogeneous_path(
+        straight, r, weights=weights[np.newaxis], method=method, model_error=1e-3
+    )
     moved = abs(refit[0] - 370.0)
     assert moved > 1e-4
     assert found.background_model_error[0] == pytest.approx(moved, rel=0.02)
@@ -56,8 +58,8 @@ def test_model_error_by_other_methods():
             {"method": "linearized", "extinction": extinction, "centre": "zero"},
             {"method": "known_background", "background": 370.0},
         ):
-            found = solve(straight, LONG, variance=1.0, model_error=1e-4, **given)
-            moved = solve(curved, LONG, variance=1.0, **given)
+            found = fit_homogeneous_path(straight, LONG, variance=1.0, model_error=1e-4, **given)
+            moved = fit_homogeneous_path(curved, LONG, variance=1.0, **given)
             off = np.abs(moved.background - found.background)
             np.testing.assert_allclose(found.background_model_error, off, rtol=0.02)
             off = np.hypot(slope, moved.extinction - found.extinction)
@@ -66,9 +68,14 @@ def test_model_error_by_other_methods():
 
 def test_model_error_of_the_background_at_a_given_extinction_holds_a_slope_too():
     given = {"variance": 1.0, "method": "known_extinction", "extinction": 0.03 * KM}
-    found = solve(bent(LONG, 0.03 * KM, 0.0), LONG, model_error=1e-4, **given)
+    found = fit_homogeneous_path(bent(LONG, 0.03 * KM, 0.0), LONG, model_error=1e-4, **given)
     moved = [
-        float(solve(bent(LONG, 0.03 * KM, 1e-4, slopes=slopes), LONG, **given).background) - 370.0
+        float(
+            fit_homogeneous_path(
+                bent(LONG, 0.03 * KM, 1e-4, slopes=slopes), LONG, **given
+            ).background
+        )
+        - 370.0
         for slopes in ((-1.0, 1.0), (1.0, 1.0))
     ]
     assert found.background_model_error == pytest.approx(np.hypot(*moved), rel=0.02)
@@ -77,13 +84,13 @@ def test_model_error_of_the_background_at_a_given_extinction_holds_a_slope_too()
 def test_model_error_of_the_background_scales_with_signal_and_share():
     noise = np.random.default_rng(31).normal(size=(500, LONG.size))
     power = 370.0 + signal(LONG, 300.0, 0.03 * KM) + noise
-    found = solve(power, LONG, variance=1.0)
-    double = solve(power, LONG, variance=1.0, model_error=0.1)
+    found = fit_homogeneous_path(power, LONG, variance=1.0)
+    double = fit_homogeneous_path(power, LONG, variance=1.0, model_error=0.1)
     np.testing.assert_allclose(
         double.background_model_error, 2.0 * found.background_model_error, rtol=1e-12
     )
-    larger = solve(1e3 * power, LONG, variance=1e6)
+    larger = fit_homogeneous_path(1e3 * power, LONG, variance=1e6)
     np.testing.assert_allclose(
         larger.background_model_error, 1e3 * found.background_model_error, rtol=1e-9
     )
-    assert np.isnan(solve(np.ones(225), LONG).background_model_error)
+    assert np.isnan(fit_homogeneous_path(np.ones(225), LONG).background_model_error)

@@ -9,7 +9,7 @@ from support.oracle_homogeneous import section, signal
 
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous._fit_quality import FALSE_ALARM
-from lidarops.retrieve.homogeneous.path_fit import solve
+from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 
 KM = 1e-3
 BIT = int(Quality.NOT_HOMOGENEOUS)
@@ -50,7 +50,7 @@ def cut(r, height, extinction, top, count, seed):
 def test_the_bit_is_that_of_energy_and_square(length, height, extinction, top):
     r = section(2500.0, length)
     power = cut(r, height, extinction, top, 400, seed=11)
-    found = solve(power, r, variance=1.0)
+    found = fit_homogeneous_path(power, r, variance=1.0)
     square = np.abs(along_square(r, power, found))
     clear = np.abs(square - SQUARE) > 0.02
     raised = (found.quality & BIT) != 0
@@ -64,14 +64,14 @@ def test_the_bit_is_that_of_energy_and_square(length, height, extinction, top):
 def test_false_alarms_of_both_are_as_rare_as_those_of_one(variance, extinction):
     r = section(2500.0, 8000.0)
     power = cut(r, 100.0, extinction, np.inf, 40_000, seed=12)
-    found = solve(power, r, variance=variance)
+    found = fit_homogeneous_path(power, r, variance=variance)
     assert 1e-4 < np.mean((found.quality & BIT) != 0) < 8e-4
 
 
 def test_a_top_that_is_cut_off_is_seen_more_often_than_by_energy():
     r = section(2500.0, 8000.0)
     power = cut(r, 50.0, 6.0 * KM, 0.8, 4000, seed=13)
-    found = solve(power, r, variance=1.0)
+    found = fit_homogeneous_path(power, r, variance=1.0)
     by_energy = np.mean(found.curvature_misfit > stats.chi2.isf(FALSE_ALARM, 5))
     seen = np.mean((found.quality & BIT) != 0)
     assert by_energy > 0.05

@@ -27,8 +27,8 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous.path_fit import (
     HomogeneousResult,
+    fit_homogeneous_path,
     mean_profile_variance,
-    solve,
 )
 
 METHODS = ("direct", "compressed", "fast")
@@ -216,7 +216,7 @@ def test_robustness_table(case, method):
     outcome = TABLE[case]
     power = clean()
     outcome.change(power)
-    found = solve(power, LONG, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     for bit in outcome.every & seen(method):
         assert share(found, bit) == 1.0, bit
     accepted = 1.0 - share(found, Quality.rejecting())
@@ -246,16 +246,16 @@ def test_robustness_table(case, method):
 def test_outlying_bin_is_named(method):
     power = clean()
     spike(power)
-    named = share(solve(power, LONG, variance=1.0, method=method), Quality.OUTLIER)
+    named = share(fit_homogeneous_path(power, LONG, variance=1.0, method=method), Quality.OUTLIER)
     assert named > 0.97 if Quality.OUTLIER & seen(method) else named == 0.0
-    assert share(solve(power, LONG, method=method), Quality.OUTLIER) > 0.9
+    assert share(fit_homogeneous_path(power, LONG, method=method), Quality.OUTLIER) > 0.9
 
 
 @pytest.mark.parametrize("case", ["cloud", "spike"])
 def test_robust_passes_recover(case, method):
     power = clean()
     TABLE[case].change(power)
-    found = solve(power, LONG, variance=1.0, method=method, robust_passes=2)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, method=method, robust_passes=2)
     errors = (found.extinction - WEAK) / found.extinction_standard_error
     assert abs(np.mean(errors)) < 0.15
     assert np.std(errors) == pytest.approx(1.0, abs=0.08)
@@ -266,15 +266,17 @@ def test_robust_passes_recover(case, method):
 @pytest.mark.parametrize("case", [name for name in TABLE if name != "clean"])
 def test_bad_profiles_leave_their_neighbours_alone(case, method):
     power = clean(24)
-    expected = solve(power, LONG, variance=1.0, method=method)
+    expected = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     bad = np.zeros(24, dtype=bool)
     bad[[0, 5, 6, 7, 13, 23]] = True
     changed = power[bad]
     TABLE[case].change(changed)
     power[bad] = changed
-    found = solve(power, LONG, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     assert_same(rows_of(found, ~bad), rows_of(expected, ~bad))
-    assert_same(rows_of(found, bad), solve(changed, LONG, variance=1.0, method=method))
+    assert_same(
+        rows_of(found, bad), fit_homogeneous_path(changed, LONG, variance=1.0, method=method)
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -287,7 +289,7 @@ def test_result_does_not_depend_on_size_start_or_order_of_the_batch(method, dtyp
         outcome.change(changed)
 
     def solved(rows):
-        return solve(
+        return fit_homogeneous_path(
             power[rows],
             LONG,
             variance=1.0 if known else None,
@@ -309,28 +311,31 @@ def test_result_does_not_depend_on_size_start_or_order_of_the_batch(method, dtyp
 def test_s1_thin_far_section(method):
     r = section(10500.0, 100.0)
     power = 700.0 + signal(r, 1.0, WEAK)
-    assert abs(solve(power, r, method=method).background - 700.0) < 1e-8
+    assert abs(fit_homogeneous_path(power, r, method=method).background - 700.0) < 1e-8
     for lag, digits in ((1, 8), (75, 9)):
         found = cubic_and_tail.cubic(power, r, lag=lag, variance=0.0).background
         assert abs(found - 700.0) < 10.0**-digits
     # As float32, half a digit is left: the estimated noise is that of the rounding, and the
     # standard error says so.
-    found = solve(power.astype(np.float32), r, method=method)
+    found = fit_homogeneous_path(power.astype(np.float32), r, method=method)
     assert abs(found.extinction - WEAK) < 4 * found.extinction_standard_error
     assert found.extinction_standard_error > 0.2 * WEAK
 
 
 def test_s2_signal_below_the_rounding(method):
     power = 1e8 + signal(LONG, 1.0, WEAK)
-    assert solve(power.astype(np.float32), LONG, method=method).quality == Quality.NO_SIGNAL
+    assert (
+        fit_homogeneous_path(power.astype(np.float32), LONG, method=method).quality
+        == Quality.NO_SIGNAL
+    )
     assert abs(cubic_and_tail.cubic(power, LONG, lag=1, variance=0.0).background - 1e8) < 10**-6.0
-    found = solve(power, LONG, method=method)
+    found = fit_homogeneous_path(power, LONG, method=method)
     assert abs(found.extinction - WEAK) < 4 * found.extinction_standard_error
 
 
 def test_s3_no_extinction(method):
     power = 25.0 + signal(LONG, 1.0, 1e-8 * KM)
-    found = solve(power, LONG, method=method)
+    found = fit_homogeneous_path(power, LONG, method=method)
     assert abs(found.background - 25.0) < 1e-12
     assert found.extinction == pytest.approx(1e-8 * KM, abs=1e-13 * KM)
     assert found.quality == 0
@@ -339,7 +344,7 @@ def test_s3_no_extinction(method):
 def test_s4_opaque_path(method):
     extinction = 5.0 * KM
     power = clean(4000, 1e4, extinction, seed=5)
-    found = solve(power, LONG, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     lowest = lowest_errors(LONG, 1e4, extinction)[2]
     assert np.sqrt(np.mean((found.extinction - extinction) ** 2)) < 1.04 * lowest
     assert np.mean(found.quality == 0) > 0.995
@@ -351,14 +356,14 @@ def test_s5_three_real_roots(method):
     with mp.workdps(50):
         assert len(real_roots(quartic_derivative(r, power, 1))) == 3
     assert abs(cubic_and_tail.cubic(power, r, lag=1, variance=0.0).background - 25.0) < 1e-8
-    assert abs(solve(power, r, method=method).background - 25.0) < 1e-11
+    assert abs(fit_homogeneous_path(power, r, method=method).background - 25.0) < 1e-11
 
 
 def test_s6_lower_bound_keeps_out_the_second_minimum(method):
     r = section(10500.0, 8000.0)
     power = clean(3000, 15.0, 0.1 * KM, seed=6, r=r)
     lowest = lowest_errors(r, 15.0, 0.1 * KM)[2]
-    found = solve(power, r, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, r, variance=1.0, method=method)
     errors = found.extinction - 0.1 * KM
     assert np.all(np.abs(errors) < 8 * lowest)
     assert np.sqrt(np.mean(errors**2)) < 1.06 * lowest
@@ -376,9 +381,9 @@ def test_s7_unit_of_range_does_not_matter(method):
     # A section in km is refused as such; a stretch by a power of two must give the same digits.
     power = clean(50, seed=7)
     with pytest.raises(RetrievalInputError, match="in m"):
-        solve(power, LONG / 1000.0, method=method)
-    one = solve(power, LONG, variance=1.0, method=method)
-    other = solve(power, LONG / 8.0, variance=1.0, method=method)
+        fit_homogeneous_path(power, LONG / 1000.0, method=method)
+    one = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
+    other = fit_homogeneous_path(power, LONG / 8.0, variance=1.0, method=method)
     np.testing.assert_allclose(other.extinction / 8.0, one.extinction, rtol=1e-13)
     np.testing.assert_allclose(other.background, one.background, rtol=1e-13)
 
@@ -388,10 +393,12 @@ def test_s7_unit_of_range_does_not_matter(method):
 def test_s8_large_background_costs_no_digits(start, length, ratio, method):
     r = section(start, length)
     extinction = np.geomspace(0.01 * KM, 50.0 / length, 400)
-    found = solve(ratio + signal(r, 1.0, extinction), r, method=method)
+    found = fit_homogeneous_path(ratio + signal(r, 1.0, extinction), r, method=method)
     assert np.max(np.abs(found.extinction / extinction - 1.0)) < 1e-9
     assert np.max(np.abs(found.background - ratio)) < 1e-10
-    of_single = solve((ratio + signal(r, 1.0, extinction)).astype(np.float32), r, method=method)
+    of_single = fit_homogeneous_path(
+        (ratio + signal(r, 1.0, extinction)).astype(np.float32), r, method=method
+    )
     weak = extinction < 5.0 / length
     off = np.abs(of_single.extinction / extinction - 1.0)
     assert np.max(off) < 5e-5 * max(1.0, ratio)
@@ -405,14 +412,14 @@ def test_s9_many_bins_in_single_precision(method):
     with mp.workdps(40):
         exact = real_roots(quartic_derivative(r, power.astype(np.float64), 1365))[-1]
     assert abs(mp.mpf(float(found)) - exact) < 1e-8
-    assert abs(solve(power, r, method=method).extinction / WEAK - 1.0) < 1e-3
+    assert abs(fit_homogeneous_path(power, r, method=method).extinction / WEAK - 1.0) < 1e-3
 
 
 @pytest.mark.parametrize("bins", [3, 4, 7, 16])
 def test_s10_few_bins(bins, method):
     r = section(2500.0, 8000.0, bins)
     power = 370.0 + signal(r, 1e3, WEAK) + 0.01 * noise(300, bins, seed=8)
-    found = solve(power, r, variance=1e-4, method=method)
+    found = fit_homogeneous_path(power, r, variance=1e-4, method=method)
     assert share(found, Quality.TOO_FEW_BINS) == float(bins < 8)
     if bins < 4:
         assert np.isnan(found.extinction).all()
@@ -428,7 +435,7 @@ def test_s11_counts_over_a_large_dynamic_range(method):
     lowest = lowest_errors(LONG, 1e5, WEAK, 1.0 / expected)[2]
 
     def relative(variance):
-        found = solve(power, LONG, variance=variance, method=method)
+        found = fit_homogeneous_path(power, LONG, variance=variance, method=method)
         return found, np.sqrt(np.mean((found.extinction - WEAK) ** 2)) / lowest
 
     found, scatter = relative(mean_profile_variance(power))
@@ -441,7 +448,7 @@ def test_s11_counts_over_a_large_dynamic_range(method):
 
 def test_s12_single_weak_shot(method):
     power = np.random.default_rng(10).poisson(10.0 + signal(LONG, 20.0, WEAK), (2000, 225))
-    found = solve(power, LONG, variance=mean_profile_variance(power), method=method)
+    found = fit_homogeneous_path(power, LONG, variance=mean_profile_variance(power), method=method)
     assert np.all(found.quality & int(BITS_OF_DOUBT))
 
 
@@ -450,9 +457,14 @@ def test_s13_saturation(known, method):
     power = clean()
     saturated(power)
     variance = 1.0 if known else None
-    assert share(solve(power, LONG, variance=variance, method=method), Quality.rejecting()) == 1.0
+    assert (
+        share(
+            fit_homogeneous_path(power, LONG, variance=variance, method=method), Quality.rejecting()
+        )
+        == 1.0
+    )
     saturated_masked(power)
-    found = solve(power, LONG, variance=variance, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=variance, method=method)
     assert np.mean(found.quality == 0) > 0.99
     assert np.mean(found.extinction) == pytest.approx(WEAK, rel=0.01)
 
@@ -460,7 +472,7 @@ def test_s13_saturation(known, method):
 def test_s14_overlap_that_no_test_can_see(method):
     power = clean(2000, seed=11)
     overlap_near(power)
-    found = solve(power, LONG, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
     bias = np.mean(found.extinction - WEAK) / np.median(found.extinction_standard_error)
     assert -2.0 < bias < -1.0
     assert 1.0 - share(found, Quality.rejecting()) > 0.9
@@ -470,7 +482,9 @@ def test_s14_overlap_that_no_test_can_see(method):
 
 def test_s15_strong_signal_over_a_short_section(method):
     r, extinction = section(2500.0, 1700.0), 0.01 * KM
-    found = solve(clean(4000, 1e5, extinction, seed=12, r=r), r, variance=1.0, method=method)
+    found = fit_homogeneous_path(
+        clean(4000, 1e5, extinction, seed=12, r=r), r, variance=1.0, method=method
+    )
     lowest = lowest_errors(r, 1e5, extinction)[2]
     assert np.sqrt(np.mean((found.extinction - extinction) ** 2)) < 1.04 * lowest
 
@@ -478,25 +492,25 @@ def test_s15_strong_signal_over_a_short_section(method):
 @pytest.mark.parametrize("known", [True, False])
 def test_s16_inverted_signal(known, method):
     power = 740.0 - clean()
-    found = solve(power, LONG, variance=1.0 if known else None, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=1.0 if known else None, method=method)
     assert share(found, Quality.NEGATIVE_AMPLITUDE) == 1.0
 
 
 def test_s17_spacing_that_is_not_uniform(method):
     r = np.sort(np.random.default_rng(13).uniform(2500.0, 10500.0, 225))
     power = clean(4000, seed=13, r=r)
-    found = solve(power, r, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, r, variance=1.0, method=method)
     errors = found.extinction - WEAK
     assert np.sqrt(np.mean(errors**2)) < 1.04 * lowest_errors(r, 1e3, WEAK)[2]
     with pytest.raises(RetrievalInputError, match="uniform"):
-        solve(power, r, variance=1.0, method="cubic")
+        fit_homogeneous_path(power, r, variance=1.0, method="cubic")
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_s18_cloud(known, method):
     power = clean()
     cloud(power)
-    found = solve(power, LONG, variance=1.0 if known else None, method=method)
+    found = fit_homogeneous_path(power, LONG, variance=1.0 if known else None, method=method)
     doubt = Quality.POOR_FIT & seen(method, known) or Quality.NOT_HOMOGENEOUS
     assert share(found, doubt) == 1.0
     if known and method != "fast":
@@ -516,7 +530,7 @@ def test_missing_near_range_leaves_the_global_minimum(start, length, first, meth
     power = 370.0 + signal(r, 1.0, extinction) * 10 ** rng.uniform(1.5, 5.0, (25, 1))
     power += rng.normal(size=power.shape)
     power[:, :first] = np.nan
-    found = solve(power, r, variance=1.0, method=method)
+    found = fit_homogeneous_path(power, r, variance=1.0, method=method)
     compared = 0
     for k in range(25):
         least, best = brute_force(r[first:], power[k, first:], bounds)
@@ -531,7 +545,7 @@ def test_missing_near_range_leaves_the_global_minimum(start, length, first, meth
 
 
 def test_amplitude_of_the_table_is_right(method):
-    found = solve(clean(), LONG, variance=1.0, method=method)
+    found = fit_homogeneous_path(clean(), LONG, variance=1.0, method=method)
     off = (found.amplitude - amplitude(LONG, 1e3, WEAK)) / found.amplitude_standard_error
     assert abs(np.mean(off)) < 0.15
     assert np.std(off) == pytest.approx(1.0, abs=0.08)

@@ -53,10 +53,10 @@ def in_section(array, near, far):
 
 
 def test_result_is_that_of_numpy_for_each_section(power):
-    found = labeled.homogeneous(power, sections=SECTIONS, variance=1.0)
+    found = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=1.0)
     assert found["extinction"].dims == ("channel", "time", "section")
     for k, edges in enumerate(SECTIONS):
-        expected = path_fit.solve(*in_section(power, *edges), variance=1.0)
+        expected = path_fit.fit_homogeneous_path(*in_section(power, *edges), variance=1.0)
         for name in VALUES:
             np.testing.assert_array_equal(found[name][..., k], getattr(expected, name))
         np.testing.assert_array_equal(found["quality_flag"][..., k], expected.quality)
@@ -77,10 +77,10 @@ def test_any_chunking_gives_the_same_bits_lazily(power, chunks, method):
     variance = power.copy(data=rng.uniform(0.5, 2.0, power.shape))
     bits = rng.choice([0, Quality.PILE_UP], power.shape, p=[0.9, 0.1]).astype(np.int32)
     quality = power.copy(data=bits)
-    expected = labeled.homogeneous(
+    expected = labeled.fit_homogeneous_path(
         power, sections=SECTIONS, variance=variance, quality=quality, method=method
     )
-    found = labeled.homogeneous(
+    found = labeled.fit_homogeneous_path(
         power.chunk(chunks),
         sections=SECTIONS,
         variance=variance.chunk({"time": 4}),
@@ -94,10 +94,10 @@ def test_any_chunking_gives_the_same_bits_lazily(power, chunks, method):
 
 
 def test_threads_give_the_same_bits(power):
-    lazy = labeled.homogeneous(power.chunk({"time": 2}), sections=SECTIONS, variance=1.0)
+    lazy = labeled.fit_homogeneous_path(power.chunk({"time": 2}), sections=SECTIONS, variance=1.0)
     xr.testing.assert_identical(
         lazy.compute(scheduler="threads", num_workers=2),
-        labeled.homogeneous(power, sections=SECTIONS, variance=1.0),
+        labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=1.0),
     )
 
 
@@ -109,11 +109,13 @@ def test_bad_bins_are_left_out_and_their_bits_carried(power):
     quality[0, 4, 60:90] = Quality.PILE_UP
     spoiled = xr.where(quality & labeled.EXCLUDED, 1e6, power).transpose(*power.dims)
     spoiled["range"].attrs = power["range"].attrs
-    found = labeled.homogeneous(spoiled, sections=SECTIONS[:2], variance=1.0, quality=quality)
-    clean = labeled.homogeneous(power, sections=SECTIONS[:2], variance=1.0)
+    found = labeled.fit_homogeneous_path(
+        spoiled, sections=SECTIONS[:2], variance=1.0, quality=quality
+    )
+    clean = labeled.fit_homogeneous_path(power, sections=SECTIONS[:2], variance=1.0)
 
     masked = np.where((quality & labeled.EXCLUDED) != 0, np.nan, power)
-    expected = path_fit.solve(*in_section(masked, *SECTIONS[0]), variance=1.0)
+    expected = path_fit.fit_homogeneous_path(*in_section(masked, *SECTIONS[0]), variance=1.0)
     np.testing.assert_array_equal(found["extinction"][..., 0], expected.extinction)
     carried = found["quality_flag"][0, :, 0] & labeled.CARRIED
     assert carried[0] == Quality.SATURATED
@@ -132,21 +134,21 @@ def test_variance_may_lack_dimensions(power, dims):
     values = np.random.default_rng(2).uniform(0.5, 2.0, shape)
     variance = xr.DataArray(values, dims=dims)
     full = variance.broadcast_like(power).transpose(*power.dims)
-    expected = labeled.homogeneous(power, sections=SECTIONS, variance=full)
-    found = labeled.homogeneous(power, sections=SECTIONS, variance=variance)
+    expected = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=full)
+    found = labeled.fit_homogeneous_path(power, sections=SECTIONS, variance=variance)
     # A variance that all profiles share is solved another way, to the same end.
     for name in ("background", "amplitude", "extinction"):
         apart = abs(found[name] - expected[name])
         error = expected[f"{name}_standard_error"]
         assert (apart < 0.01 * error).where(error.notnull(), other=True).all()
-    chunked = labeled.homogeneous(
+    chunked = labeled.fit_homogeneous_path(
         power.chunk({"time": 3}), sections=SECTIONS, variance=variance.chunk()
     )
     xr.testing.assert_identical(chunked.compute(scheduler="synchronous"), found)
 
 
 def test_coordinates_and_units_describe_the_sections(power):
-    found = labeled.homogeneous(power, sections=SECTIONS)
+    found = labeled.fit_homogeneous_path(power, sections=SECTIONS)
     assert found["section"].to_numpy().tolist() == [0, 1, 2]
     assert found["section_range"].to_numpy().tolist() == [3750.0, 7500.0, 7500.0]
     np.testing.assert_array_equal(found["section_bounds"], SECTIONS)
@@ -158,19 +160,21 @@ def test_coordinates_and_units_describe_the_sections(power):
     assert {"time", "channel"} <= set(found.coords)
     plain = power.copy()
     plain.attrs = {}
-    assert labeled.homogeneous(plain, sections=SECTIONS)["amplitude"].attrs["units"] == "m2"
+    assert (
+        labeled.fit_homogeneous_path(plain, sections=SECTIONS)["amplitude"].attrs["units"] == "m2"
+    )
 
 
 def test_single_profile_and_descending_range(power):
     one = power.isel(channel=0, time=0)
-    found = labeled.homogeneous(one, sections=SECTIONS, variance=1.0)
+    found = labeled.fit_homogeneous_path(one, sections=SECTIONS, variance=1.0)
     assert found["extinction"].dims == ("section",)
-    turned = labeled.homogeneous(one[::-1], sections=SECTIONS, variance=1.0)
+    turned = labeled.fit_homogeneous_path(one[::-1], sections=SECTIONS, variance=1.0)
     np.testing.assert_array_equal(found["extinction"], turned["extinction"])
 
 
 def test_near_is_inside_and_far_is_not(power):
-    found = labeled.homogeneous(power, sections=[(1500.0, 3000.0)])
+    found = labeled.fit_homogeneous_path(power, sections=[(1500.0, 3000.0)])
     assert found["valid_bins"].max() == 50
 
 
@@ -205,7 +209,7 @@ def test_arguments_that_cannot_be_right_are_refused(power, change, arguments, fi
     if arguments.get("quality") == "extra":
         arguments["quality"] = xr.zeros_like(power, dtype=np.int32).expand_dims(angle=2)
     with pytest.raises(RetrievalInputError, match=words) as caught:
-        labeled.homogeneous(change(power), **arguments)
+        labeled.fit_homogeneous_path(change(power), **arguments)
     assert caught.value.field == field
 
 
@@ -234,7 +238,7 @@ def test_real_vertical_profiles_are_flagged(data_root):
     files = sorted((data_root / "pilar" / "20241002").glob("h*"))[:30]
     archive = lidarops.open_archive(files, mask_and_scale=False)
     signal_ = labeled_signal.condition(archive, "analog_532p")
-    found = labeled.homogeneous(
+    found = labeled.fit_homogeneous_path(
         signal_["power"],
         sections=[(1000.0, 3000.0), (1500.0, 5000.0), (2500.0, 10500.0)],
         variance=signal_["variance"],

@@ -7,7 +7,7 @@ from support.oracle_homogeneous import GEOMETRIES, lowest_errors, section, signa
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _masked
 from lidarops.retrieve.homogeneous._estimate import COLUMNS
-from lidarops.retrieve.homogeneous.path_fit import solve
+from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 
 KM = 1e-3
 CASES = [
@@ -53,8 +53,8 @@ def measured(case, kind, count, seed=1):
 def test_result_is_that_of_the_direct_fit(case, kind, known):
     r, power, variance = measured(case, kind, 600)
     noise = {"variance": variance} if known else {"weights": 1.0 / variance}
-    found = solve(power, r, **noise)
-    exact = solve(power, r, **noise, method="direct")
+    found = fit_homogeneous_path(power, r, **noise)
+    exact = fit_homogeneous_path(power, r, **noise, method="direct")
     stands = (exact.quality & DOUBT) == 0
     assert stands.mean() > 0.95
     for name in ("extinction", "background", "amplitude"):
@@ -75,7 +75,7 @@ def test_scatter_is_the_least_that_the_bins_allow(case, kind):
     _, _, height, extinction = case
     count = 4000
     r, power, variance = measured(case, kind, count, seed=2)
-    found = solve(power, r, variance=variance)
+    found = fit_homogeneous_path(power, r, variance=variance)
     weights = np.where(np.isfinite(power), 1.0 / variance, 0.0)
     lowest = np.mean([lowest_errors(r, height, extinction * KM, w)[2] for w in weights[:50]])
     error = found.extinction - extinction * KM
@@ -92,7 +92,7 @@ def test_noise_free_extinction_is_exact(start, length, level, kind):
     truth = np.geomspace(1e-5, 20.0 / length, 120)[:, np.newaxis]
     power = level + np.exp(-2.0 * truth * (r - start)) * (start / r) ** 2
     weights = weights_of(kind, truth.size)
-    found = solve(power, r, weights=weights)
+    found = fit_homogeneous_path(power, r, weights=weights)
     if kind in ("near", "all"):
         # What is gone before the first bin that is left cannot be told.
         stands = truth[:, 0] * (r[20] - start) < 3.0
@@ -108,22 +108,22 @@ def test_profiles_that_do_not_work_out_go_to_the_direct_fit():
     power[10:20] = 5.0
     power[20:30, 7:] = np.nan
     power[:, 100] = np.nan
-    found = solve(power, r, variance=1.0)
-    exact = solve(power, r, variance=1.0, method="direct")
+    found = fit_homogeneous_path(power, r, variance=1.0)
+    exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
     np.testing.assert_array_equal(found.quality[:30], exact.quality[:30])
     np.testing.assert_array_equal(found.background[10:30], exact.background[10:30])
     plan = _masked.make_plan(r, (-0.3 / r[-1], 60.0 / 8000.0))
     solved, table = np.empty(40, bool), np.empty((40, len(COLUMNS)))
-    _masked.solve_profiles(power, np.ones((1, 225)), False, 1e-16, plan, table, solved)
+    _masked.solve_masked(power, np.ones((1, 225)), False, 1e-16, plan, table, solved)
     assert solved[:10].all()
     assert not solved[10:30].any()
 
 
 def test_bits_do_not_depend_on_the_batch():
     r, power, variance = measured(CASES[0], "all", 60)
-    whole = solve(power, r, variance=variance)
+    whole = fit_homogeneous_path(power, r, variance=variance)
     for rows in (slice(0, 1), slice(7, 50), slice(None, None, -1)):
-        part = solve(power[rows], r, variance=variance[rows])
+        part = fit_homogeneous_path(power[rows], r, variance=variance[rows])
         np.testing.assert_array_equal(part.extinction, whole.extinction[rows])
         np.testing.assert_array_equal(part.quality, whole.quality[rows])
 
@@ -136,7 +136,7 @@ def test_a_step_that_is_small_by_chance_does_not_end_the_search():
         noise = np.random.default_rng(seed).normal(size=(4000, r.size))
         power = 1e6 + 54_205.0 * shape + noise
         power[:, :35] = np.nan
-        found = solve(power, r, variance=1.0)
-        exact = solve(power, r, variance=1.0, method="direct")
+        found = fit_homogeneous_path(power, r, variance=1.0)
+        exact = fit_homogeneous_path(power, r, variance=1.0, method="direct")
         off = np.abs(found.extinction - exact.extinction) / exact.extinction_standard_error
         assert off.max() < 0.01

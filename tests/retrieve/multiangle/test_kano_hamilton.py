@@ -19,7 +19,7 @@ from support.oracle_multiangle import (
 
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
-from lidarops.retrieve.multiangle.optical_depth import solve
+from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 SIDES = np.array([-70.0, -55.0, -40.0, -20.0, 0.0, 15.0, 35.0, 50.0, 65.0, 75.0])
 HEIGHT = np.arange(300.0, 2100.0, 30.0)
@@ -46,7 +46,7 @@ def tiled(y, variance, path, keep=None, inhomogeneity=0.0):
     keep = np.ones((y.shape[0], 0, y.shape[2])) if keep is None else keep
     kh.fit_details(y, variance, keep, added, path, nowhere, table, residual, leverage)
     short = np.full_like(table, np.nan)
-    kh.fit_profiles(y, variance, keep, added, path, short)
+    kh.fit_kano_hamilton(y, variance, keep, added, path, short)
     for column in (kh.TAU, kh.INFORMATION, kh.CHI2, kh.TRACE, kh.EXPECTED):
         assert np.array_equal(short[:, column], table[:, column], equal_nan=True)
     general = fit(y, variance, path, keep=keep, inhomogeneity=inhomogeneity)
@@ -185,7 +185,7 @@ def test_inhomogeneity_is_found_and_intervals_are_right():
     signal, variance, tau = signals(
         np.random.default_rng(6), 200, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.03
     )
-    result = solve(
+    result = retrieve_optical_depth(
         signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton", robust=False
     )
     np.testing.assert_allclose(result.inhomogeneity, 0.03, rtol=0.06)
@@ -206,7 +206,9 @@ def test_weak_signals_are_not_biased(ratio):
     mean = np.exp(-0.4 * PATHS)[:, np.newaxis]
     signal = mean + noise * rng.normal(size=(2500, 12, 12))
     height = 1000.0 + 30.0 * np.arange(12)
-    result = solve(signal, ANGLES, height, variance=noise**2, method="kano_hamilton", robust=False)
+    result = retrieve_optical_depth(
+        signal, ANGLES, height, variance=noise**2, method="kano_hamilton", robust=False
+    )
     error = result.optical_depth[:, 2:] - 0.2
     assert abs(np.nanmean(error)) < 0.05 * np.nanstd(error)
     # Taking the samples above twice their noise instead is off by far more.
@@ -228,7 +230,7 @@ def test_outliers_cost_little():
     def error(outliers, *, robust):
         rng = np.random.default_rng(8)
         signal, variance, tau = signals(rng, 100, ANGLES, atmosphere, outliers=outliers, **options)
-        result = solve(
+        result = retrieve_optical_depth(
             signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton", robust=robust
         )
         return rms((result.optical_depth - tau)[:, below])
@@ -245,7 +247,9 @@ def test_clean_blocks_skip_the_robust_passes():
         signal, variance, _ = signals(
             np.random.default_rng(9), 4, ANGLES, atmosphere, inhomogeneity=0.03, outliers=outliers
         )
-        result = solve(signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton")
+        result = retrieve_optical_depth(
+            signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton"
+        )
         ran = {step.step: step.ran for step in result.steps}
         assert ran["robust_passes"] is expected
         assert result.flags.outlier.any() == expected
@@ -261,11 +265,11 @@ def test_scans_to_both_sides_do_not_see_a_gradient():
     known = {"ratio": 1e5, "inhomogeneity": 0.03}
     signal, variance, tau = signals(rng, 200, angles, atmosphere, gradient=0.05 / 1000, **known)
     options = {"variance": variance, "method": "kano_hamilton"}
-    both = solve(signal, angles, atmosphere[0], **options)
+    both = retrieve_optical_depth(signal, angles, atmosphere[0], **options)
     error = (both.optical_depth - tau)[:, 28]
     assert abs(error.mean()) < 0.001 + 3 * error.std() / np.sqrt(200)
     signal, variance, _ = signals(rng, 200, np.abs(angles), atmosphere, **known)
-    alone = solve(signal, np.abs(angles), atmosphere[0], **options)
+    alone = retrieve_optical_depth(signal, np.abs(angles), atmosphere[0], **options)
     ratio = both.optical_depth_standard_error / alone.optical_depth_standard_error
     assert np.nanmedian(ratio) < 1.05
     assert not both.flags.one_sided.any()
@@ -282,7 +286,7 @@ def test_scans_to_one_side_bound_a_gradient_and_tell_of_it():
             rng, 100, ANGLES, atmosphere, ratio=1e5, inhomogeneity=0.03, gradient=gradient
         )
         options = {"variance": variance, "method": "kano_hamilton"}
-        results.append(solve(signal, ANGLES, atmosphere[0], **options))
+        results.append(retrieve_optical_depth(signal, ANGLES, atmosphere[0], **options))
     clean, tilted = results
     assert clean.flags.one_sided.all()
     assert not clean.flags.gradient.any()
@@ -316,7 +320,7 @@ def test_inhomogeneity_that_changes_with_height_is_followed():
     height = np.arange(100.0, 4100.0, 50.0)
     spread = np.where(height < 2000, 0.01, 0.2)
     signal = np.exp(spread * rng.normal(size=(8, 3, height.size)))
-    result = solve(
+    result = retrieve_optical_depth(
         signal, [0.0, 35.0, 66.0], height, variance=1e-12, method="kano_hamilton", robust=False
     )
     found = result.inhomogeneity[0]
@@ -336,7 +340,7 @@ def gappy(signal):
     """Rays and their fit, altitude by altitude, of signals at six angles."""
     angles = np.linspace(0.0, 60.0, signal.shape[1])
     scan = slant_paths.make_scan(angles, HEIGHT, None)
-    rays = _block.make_rays(signal, np.full(signal.shape, 1e-4), scan)
+    rays = _block.make_beam_block(signal, np.full(signal.shape, 1e-4), scan)
     return rays, _block.regress(rays, inhomogeneity=0.05, robust=False)
 
 

@@ -13,7 +13,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import labeled, labeled_altitudes
 from lidarops.retrieve.multiangle.labeled import Background
-from lidarops.retrieve.multiangle.optical_depth import Method
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleMethod
 
 STATION = 120.0
 RANGE = 15.0 * (np.arange(1200) + 0.5)
@@ -95,7 +95,7 @@ def take(conditioned: xr.Dataset, pointing: dict[str, Any], kept) -> tuple[xr.Da
 
 
 def solve(conditioned: xr.Dataset, pointing: dict[str, Any], **changes: Any) -> xr.Dataset:
-    return labeled.scan(conditioned, **(pointing | SETTINGS | changes))
+    return labeled.retrieve_scan(conditioned, **(pointing | SETTINGS | changes))
 
 
 def has(found: xr.Dataset, bit: Quality) -> np.ndarray:
@@ -238,7 +238,7 @@ def test_extinction_stays_withheld_where_single_altitudes_stand_in():
         },
         coords={"altitude": height, "ray_zenith_angle": ("ray", zenith)},
     )
-    found = labeled.retrieve(rays, station_altitude=0.0)
+    found = labeled.retrieve_optical_depth(rays, station_altitude=0.0)
     assert "left out joint" in found.attrs["steps"]
     assert has(found, Quality.POOR_STRATIFICATION).all()
     assert np.isfinite(found["optical_depth"]).any()
@@ -309,7 +309,7 @@ def test_what_is_left_of_a_cycle_is_used_as_far_as_it_goes():
     assert_explained(found)
 
 
-@pytest.mark.parametrize("method", [m.value for m in Method])
+@pytest.mark.parametrize("method", [m.value for m in MultiAngleMethod])
 def test_every_missing_value_is_explained_whatever_the_method(method):
     conditioned, pointing = scan(5, ONE_SIDE, sigma=8.0)
     conditioned["power"][7] = np.nan

@@ -11,7 +11,7 @@ from support.oracle_multiangle import PER_KM, rms
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle import mld
 from lidarops.retrieve.multiangle.mld import Regularisation
-from lidarops.retrieve.multiangle.optical_depth import solve
+from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 LAYERS = np.array([5.0, 10.0, 15.0, 20.0, 15.0, 10.0, 8.0, 5.0]) * PER_KM
 HEIGHT = 25.0 + 50.0 * np.arange(8)
@@ -42,7 +42,7 @@ def published(angle, profiles=4000, rays=6):
 
 
 def retrieve(signal, angles, method, **options):
-    return solve(
+    return retrieve_optical_depth(
         signal,
         angles,
         HEIGHT,

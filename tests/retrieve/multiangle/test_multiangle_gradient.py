@@ -23,7 +23,9 @@ def level_sky(gradient: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("method", ["two_angle", "mld", "kano_hamilton", "joint"])
 def test_who_sees_no_gradient_says_so(method):
     signal, variance = level_sky(2e-4)
-    found = optical_depth.solve(signal, ZENITH, ALTITUDE, variance=variance, method=method)
+    found = optical_depth.retrieve_optical_depth(
+        signal, ZENITH, ALTITUDE, variance=variance, method=method
+    )
     known = np.isfinite(found.optical_depth)
     assert known.any()
     if method in ("two_angle", "mld"):
@@ -39,7 +41,7 @@ def test_a_prior_that_is_not_known_is_refused(bad):
     signal, variance = level_sky(0.0)
     prior = np.full(ALTITUDE.size, bad)
     with pytest.raises(RetrievalInputError, match="prior_optical_depth"):
-        optical_depth.solve(
+        optical_depth.retrieve_optical_depth(
             signal,
             ZENITH,
             ALTITUDE,

@@ -14,7 +14,7 @@ from lidarops.retrieve.multiangle._neighbours import neighbours_alike
 
 def alike(scan: cases.Scan) -> bool:
     grid = slant_paths.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
-    rays = _block.make_rays(scan.signal, scan.variance, grid)
+    rays = _block.make_beam_block(scan.signal, scan.variance, grid)
     return neighbours_alike(rays, _block.regress(rays, inhomogeneity=None, robust=True))
 
 

@@ -24,7 +24,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleFlags,
     Regularisation,
-    solve,
+    retrieve_optical_depth,
 )
 
 METHODS = ("auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior")
@@ -81,8 +81,10 @@ def test_clear_air_to_six_kilometres():
         np.random.default_rng(2), 150, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.03
     )
     options = {"variance": variance, "robust": False}
-    joint = solve(signal, ANGLES, atmosphere[0], **options)
-    single = solve(signal, ANGLES, atmosphere[0], method="kano_hamilton", **options)
+    joint = retrieve_optical_depth(signal, ANGLES, atmosphere[0], **options)
+    single = retrieve_optical_depth(
+        signal, ANGLES, atmosphere[0], method="kano_hamilton", **options
+    )
     error = joint.optical_depth - tau
     assert rms(error) <= 0.010
     assert rms(error) <= rms(single.optical_depth - tau) / 5
@@ -99,7 +101,7 @@ def test_weak_light_keeps_its_intervals():
     signal, variance, tau = signals(
         np.random.default_rng(3), 150, ANGLES, atmosphere, ratio=300, inhomogeneity=0.03
     )
-    joint = solve(signal, ANGLES, atmosphere[0], variance=variance)
+    joint = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance)
     one, two = coverage(joint.optical_depth - tau, joint.optical_depth_standard_error)
     assert 60 < one < 82
     assert two > 92
@@ -120,7 +122,7 @@ def test_cloud_at_30_degrees(correlation):
         inhomogeneity=0.144,
         correlation=correlation,
     )
-    joint = solve(signal, STEEP, atmosphere[0], variance=variance)
+    joint = retrieve_optical_depth(signal, STEEP, atmosphere[0], variance=variance)
     error = joint.optical_depth - tau
     one, two = coverage(error, joint.optical_depth_standard_error)
     assert 58 < one < 78
@@ -128,7 +130,9 @@ def test_cloud_at_30_degrees(correlation):
     if correlation == 0:
         assert rms(error) <= 0.16
         assert rms(joint.extinction - atmosphere[1]) <= 3.0e-3
-        pair = solve(signal, STEEP, atmosphere[0], variance=variance, method="two_angle")
+        pair = retrieve_optical_depth(
+            signal, STEEP, atmosphere[0], variance=variance, method="two_angle"
+        )
         assert rms(error) <= rms(pair.optical_depth - tau) / 3
 
 
@@ -142,7 +146,7 @@ def test_thick_cloud_is_withheld_where_it_swallows_the_rays(total):
     signal = np.exp(-2 * path * tau + 0.144 * rng.normal(size=(200, 6, 60)))
     signal += noise * rng.normal(size=signal.shape)
     for method in ("kano_hamilton", "joint"):
-        result = solve(signal, STEEP, height, variance=noise**2, method=method)
+        result = retrieve_optical_depth(signal, STEEP, height, variance=noise**2, method=method)
         error = result.optical_depth - tau
         assert coverage(error, result.optical_depth_standard_error)[1] >= 93
         beyond = height > result.reach[:, np.newaxis]
@@ -161,7 +165,7 @@ def test_extinction_that_varies_along_the_paths_is_told(last, varies):
     path = 1 / np.cos(np.radians(angles))[:, np.newaxis]
     air = 0.144 * correlated(np.random.default_rng(6), (60, 6, 40), 0.5)
     tau = np.cumsum(10.0 * extinction * np.exp(air if varies else 0.0 * air), axis=-1)
-    result = solve(np.exp(air - 2 * path * tau), angles, height, variance=1e-12)
+    result = retrieve_optical_depth(np.exp(air - 2 * path * tau), angles, height, variance=1e-12)
     assert result.flags.poor_stratification.all() == varies
     assert np.isfinite(result.extinction).any() != varies
 
@@ -171,12 +175,14 @@ def test_optical_depth_can_be_bounded_for_the_declared_gradient():
     signal, variance, tau = signals(
         np.random.default_rng(7), 32, ANGLES, atmosphere, inhomogeneity=0.03, gradient=0.04 / 1000
     )
-    joint = solve(signal, ANGLES, atmosphere[0], variance=variance)
+    joint = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance)
     bias = np.abs(np.mean(joint.optical_depth - tau, axis=0))
     assert np.all(bias < joint.optical_depth_gradient_error[0] + 0.01)
     assert bias.max() > 5 * np.median(joint.optical_depth_standard_error)
     assert joint.flags.gradient.mean() > 0.9
-    without = solve(signal, ANGLES, atmosphere[0], variance=variance, largest_gradient=0.0)
+    without = retrieve_optical_depth(
+        signal, ANGLES, atmosphere[0], variance=variance, largest_gradient=0.0
+    )
     assert np.all(without.optical_depth_gradient_error == 0)
     assert np.all(without.extinction_gradient_error == 0)
 
@@ -189,8 +195,10 @@ def test_layers_are_far_more_certain_than_differences():
     layers = [(0.0, 900.0), (1500.0, 2500.0)]
     truth = [tau[25], np.interp(2500, atmosphere[0], tau) - np.interp(1500, atmosphere[0], tau)]
     options = {"variance": variance, "layers": layers}
-    joint = solve(signal, ANGLES, atmosphere[0], **options)
-    single = solve(signal, ANGLES, atmosphere[0], method="kano_hamilton", **options)
+    joint = retrieve_optical_depth(signal, ANGLES, atmosphere[0], **options)
+    single = retrieve_optical_depth(
+        signal, ANGLES, atmosphere[0], method="kano_hamilton", **options
+    )
     for result in (joint, single):
         error = result.layer_optical_depth - truth
         assert coverage(error, result.layer_optical_depth_standard_error)[1] > 90
@@ -208,7 +216,9 @@ def test_one_path_tells_nothing(small, method):
     signal, variance, height, _ = small
     for angles in ([ANGLES[3]], [30.0, 30.0, 30.0], [88.0, 89.0]):
         n = len(angles)
-        result = solve(signal[:, :n], angles, height, variance=variance[:, :n], method=method)
+        result = retrieve_optical_depth(
+            signal[:, :n], angles, height, variance=variance[:, :n], method=method
+        )
         assert np.all(np.isnan(result.optical_depth))
         assert np.all(np.isnan(result.reach))
         assert result.flags.no_data.all()
@@ -222,7 +232,7 @@ def test_tiny_leverage_is_told_with_an_honest_error():
     rng = np.random.default_rng(8)
     signal = np.exp(-2 * path[:, np.newaxis] * tau + 0.03 * rng.normal(size=(100, 12, 60)))
     angles = np.degrees(np.arccos(1 / path))
-    result = solve(signal, angles, height, variance=1e-12, method="kano_hamilton")
+    result = retrieve_optical_depth(signal, angles, height, variance=1e-12, method="kano_hamilton")
     assert result.flags.low_leverage.all()
     assert np.median(result.optical_depth_standard_error) == pytest.approx(14.4, rel=0.05)
     assert rms(result.optical_depth - tau) == pytest.approx(14.4, rel=0.05)
@@ -233,8 +243,10 @@ def test_rays_at_the_horizon_are_as_if_never_measured(small, method):
     signal, variance, height, _ = small
     horizon = np.concatenate([signal, np.ones_like(signal[:, :2])], axis=1)
     noise = np.concatenate([variance, np.ones_like(variance[:, :2])], axis=1)
-    with_them = solve(horizon, [*ANGLES, 89.0, 90.0], height, variance=noise, method=method)
-    without = solve(signal, ANGLES, height, variance=variance, method=method)
+    with_them = retrieve_optical_depth(
+        horizon, [*ANGLES, 89.0, 90.0], height, variance=noise, method=method
+    )
+    without = retrieve_optical_depth(signal, ANGLES, height, variance=variance, method=method)
     assert close(with_them.optical_depth, without.optical_depth)
     assert close(with_them.optical_depth_standard_error, without.optical_depth_standard_error)
 
@@ -245,7 +257,7 @@ def test_broken_profiles_stay_alone(small, method):
     broken = signal.copy()
     broken[0], broken[2], broken[3] = np.inf, -signal[2], np.nan
     broken[1, :, 50] = 1e300
-    result = solve(broken, ANGLES, height, variance=variance, method=method)
+    result = retrieve_optical_depth(broken, ANGLES, height, variance=variance, method=method)
     gone = [0, 2, 3]
     assert np.all(np.isnan(result.optical_depth[gone]))
     assert result.flags.no_data[gone].all()
@@ -268,7 +280,7 @@ def test_samples_without_a_variance_are_as_good_as_missing(small, method, varian
     one_left = np.where(np.arange(ANGLES.size)[:, np.newaxis] > 0, np.nan, signal[6, :, 40:50])
     signal = signal.copy()
     signal[6, :, 40:50] = one_left
-    result = solve(signal, ANGLES, height, variance=unknown, method=method)
+    result = retrieve_optical_depth(signal, ANGLES, height, variance=unknown, method=method)
     assert np.isnan(result.optical_depth[3]).all()
     assert np.all(result.quality[3] & Quality.INPUT_MISSING)
     withheld = np.isnan(result.optical_depth)
@@ -285,10 +297,12 @@ def test_holes_are_bridged_or_left(small):
     holes = np.where(rng.random(signal.shape) < 0.3, np.nan, signal)
     holes[:, :, 30:36] = np.nan
     holes[:, ::2, 60:] = np.nan
-    single = solve(holes, ANGLES, height, variance=variance, method="kano_hamilton")
+    single = retrieve_optical_depth(
+        holes, ANGLES, height, variance=variance, method="kano_hamilton"
+    )
     assert np.all(np.isnan(single.optical_depth[:, 30:36]))
     assert not single.flags.extrapolated.any()
-    joint = solve(holes, ANGLES, height, variance=variance)
+    joint = retrieve_optical_depth(holes, ANGLES, height, variance=variance)
     assert joint.flags.interpolated[:, 30:36].all()
     assert rms(joint.optical_depth - tau) < 0.0125
 
@@ -302,8 +316,8 @@ def test_gaps_cost_no_more_than_the_samples_they_take():
             rng, 16, STEEP, atmosphere, ratio=1e7, inhomogeneity=0.144, correlation=0.8
         )
         gaps = np.where(rng.random(signal.shape) < 0.3, np.nan, signal)
-        whole = solve(signal, STEEP, atmosphere[0], variance=variance)
-        found = solve(gaps, STEEP, atmosphere[0], variance=variance)
+        whole = retrieve_optical_depth(signal, STEEP, atmosphere[0], variance=variance)
+        found = retrieve_optical_depth(gaps, STEEP, atmosphere[0], variance=variance)
         errors.append(whole.optical_depth - tau)
         with_gaps.append(found.optical_depth - tau)
         deviations.append(with_gaps[-1] / found.optical_depth_standard_error)
@@ -315,7 +329,7 @@ def test_gaps_cost_no_more_than_the_samples_they_take():
 @pytest.mark.parametrize("gates", [1, 3])
 def test_few_altitudes_and_one_profile_run(small, method, gates):
     signal, variance, height, tau = small
-    result = solve(
+    result = retrieve_optical_depth(
         signal[0, :, :gates], ANGLES, height[:gates], variance=variance[0, :, :gates], method=method
     )
     assert result.optical_depth.shape == (gates,)
@@ -328,7 +342,7 @@ def test_few_altitudes_and_one_profile_run(small, method, gates):
 
 def test_no_profile_at_all(small):
     signal, variance, height, _ = small
-    result = solve(signal[:0], ANGLES, height, variance=variance[:0])
+    result = retrieve_optical_depth(signal[:0], ANGLES, height, variance=variance[:0])
     assert result.optical_depth.shape == (0, height.size)
     assert result.steps == ()
 
@@ -338,7 +352,7 @@ def test_constant_extinction_leaves_the_smoother_saturated():
     atmosphere = (height, np.full(40, 0.24 / 400), np.ones(40))
     rng = np.random.default_rng(10)
     signal, variance, _ = signals(rng, 20, STEEP, atmosphere, ratio=1e9, inhomogeneity=1e-4)
-    result = solve(signal, STEEP, height, variance=variance)
+    result = retrieve_optical_depth(signal, STEEP, height, variance=variance)
     assert result.optical_depth[:, -1] == pytest.approx(0.24, abs=0.002)
     assert result.flags.saturated.all()
 
@@ -346,23 +360,25 @@ def test_constant_extinction_leaves_the_smoother_saturated():
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
 def test_units_of_the_signal_are_of_no_effect(small, scale):
     signal, variance, height, _ = small
-    plain = solve(signal, ANGLES, height, variance=variance)
-    other = solve(signal * scale, ANGLES, height, variance=variance * scale**2)
+    plain = retrieve_optical_depth(signal, ANGLES, height, variance=variance)
+    other = retrieve_optical_depth(signal * scale, ANGLES, height, variance=variance * scale**2)
     assert other.optical_depth == pytest.approx(plain.optical_depth, abs=1e-10)
     assert other.log_intercept == pytest.approx(plain.log_intercept + np.log(scale), abs=1e-9)
 
 
 def test_no_noise_is_taken_as_very_little(small):
     signal, _, height, _ = small
-    nothing = solve(signal, ANGLES, height, variance=0.0)
-    little = solve(signal, ANGLES, height, variance=(1e-6 * signal) ** 2)
+    nothing = retrieve_optical_depth(signal, ANGLES, height, variance=0.0)
+    little = retrieve_optical_depth(signal, ANGLES, height, variance=(1e-6 * signal) ** 2)
     assert nothing.optical_depth == pytest.approx(little.optical_depth, abs=1e-11)
 
 
 def test_two_rays_have_no_residual(small):
     signal, variance, height, _ = small
     ends = [0, 11]
-    result = solve(signal[:, ends], ANGLES[ends], height, variance=variance[:, ends])
+    result = retrieve_optical_depth(
+        signal[:, ends], ANGLES[ends], height, variance=variance[:, ends]
+    )
     assert result.steps[-1].step == "two_angle"
     assert result.flags.no_residual.all()
     assert not result.flags.gradient.any()
@@ -381,10 +397,14 @@ def test_blocks_depend_on_nothing_outside(small, method):
     signal, variance, height, _ = small
     labels = np.repeat([7, 2, 5], [5, 10, 1])
     options = {"method": method, "layers": [(0.0, 600.0), (800.0, 1400.0)]}
-    whole = solve(signal, ANGLES, height, variance=variance, block=labels, **options)
+    whole = retrieve_optical_depth(
+        signal, ANGLES, height, variance=variance, block=labels, **options
+    )
     for label in (2, 5, 7):
         rows = np.flatnonzero(labels == label)
-        alone = solve(signal[rows], ANGLES, height, variance=variance[rows], **options)
+        alone = retrieve_optical_depth(
+            signal[rows], ANGLES, height, variance=variance[rows], **options
+        )
         for name in PROFILES:
             there = getattr(whole, name)[rows]
             assert np.array_equal(there, getattr(alone, name), equal_nan=True), name
@@ -393,8 +413,8 @@ def test_blocks_depend_on_nothing_outside(small, method):
 
 def test_leading_axes_and_layout_are_of_no_effect(small):
     signal, variance, height, _ = small
-    plain = solve(signal, ANGLES, height, variance=variance)
-    shaped = solve(
+    plain = retrieve_optical_depth(signal, ANGLES, height, variance=variance)
+    shaped = retrieve_optical_depth(
         np.asfortranarray(signal.reshape(4, 4, 12, -1)).astype(">f8"),
         ANGLES.tolist(),
         height,
@@ -404,15 +424,17 @@ def test_leading_axes_and_layout_are_of_no_effect(small):
     assert shaped.flags.no_data.shape == (4, 4, height.size)
     assert np.array_equal(shaped.optical_depth.reshape(16, -1), plain.optical_depth)
     signal.flags.writeable = False
-    assert_same(solve(signal, ANGLES, height, variance=variance), plain)
-    single = solve(signal.astype(np.float32), ANGLES, height, variance=variance)
+    assert_same(retrieve_optical_depth(signal, ANGLES, height, variance=variance), plain)
+    single = retrieve_optical_depth(signal.astype(np.float32), ANGLES, height, variance=variance)
     assert single.optical_depth == pytest.approx(plain.optical_depth, abs=1e-5)
 
 
 def test_altitudes_above_the_sea_are_those_above_the_lidar(small):
     signal, variance, height, _ = small
-    plain = solve(signal, ANGLES, height, variance=variance)
-    raised = solve(signal, ANGLES, height + 500.0, variance=variance, station_altitude=500.0)
+    plain = retrieve_optical_depth(signal, ANGLES, height, variance=variance)
+    raised = retrieve_optical_depth(
+        signal, ANGLES, height + 500.0, variance=variance, station_altitude=500.0
+    )
     assert close(raised.optical_depth, plain.optical_depth)
     assert raised.reach == pytest.approx(plain.reach + 500.0)
 
@@ -426,7 +448,7 @@ def test_anything_finite_or_not_gives_a_result(seed, method):
     variance = np.abs(rng.normal(size=signal.shape)) * 10.0 ** rng.integers(-300, 300)
     angles = rng.uniform(-90, 90, 5)
     height = 100.0 + 50.0 * np.arange(30)
-    result = solve(signal, angles, height, variance=variance, method=method)
+    result = retrieve_optical_depth(signal, angles, height, variance=variance, method=method)
     valued = np.isfinite(result.optical_depth)
     assert np.all(result.optical_depth_standard_error[valued] > 0)
     assert not np.any(valued & (result.flags.no_data | result.flags.extrapolated))
@@ -438,14 +460,16 @@ def test_anything_finite_or_not_gives_a_result(seed, method):
 def test_auto_stays_with_single_altitudes_where_they_are_certain_enough(small):
     signal, variance, height, _ = small
     for tolerance, expected in ((0.1, "kano_hamilton"), (1e-4, "joint")):
-        result = solve(signal, ANGLES, height, variance=variance, tolerance=tolerance)
+        result = retrieve_optical_depth(
+            signal, ANGLES, height, variance=variance, tolerance=tolerance
+        )
         assert result.steps[-1].step == expected
         assert result.steps[-1].ran
 
 
 def test_known_inhomogeneity_is_not_estimated(small):
     signal, variance, height, _ = small
-    result = solve(
+    result = retrieve_optical_depth(
         signal, ANGLES, height, variance=variance, inhomogeneity=0.06, method="kano_hamilton"
     )
     assert result.inhomogeneity == pytest.approx(0.06)
@@ -488,4 +512,4 @@ def test_refuses_what_does_not_fit(small, change, field):
         "variance": variance,
     }
     with pytest.raises(RetrievalInputError, match=field):
-        solve(**{**arguments, **change})
+        retrieve_optical_depth(**{**arguments, **change})

@@ -11,12 +11,12 @@ from scipy.special import erfc
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.retrieve.multiangle._path_variation import GROWTH, doubted_from
-from lidarops.retrieve.multiangle.optical_depth import solve
+from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 
 def varies(scan: cases.Scan) -> bool:
     grid = slant_paths.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
-    rays = _block.make_rays(scan.signal, scan.variance, grid)
+    rays = _block.make_beam_block(scan.signal, scan.variance, grid)
     found = doubted_from(rays, _block.regress(rays, inhomogeneity=None, robust=True))
     return found is not None
 
@@ -85,7 +85,7 @@ def test_noise_that_is_larger_than_stated_aloft_is_no_variation():
 def test_extinction_is_withheld_whatever_the_method():
     scan = replace(cases.cloud(0.8), variation=1.0).draw(16, 4)
     for method in ("two_angle", "kano_hamilton", "joint", "mld"):
-        found = solve(
+        found = retrieve_optical_depth(
             scan.signal,
             scan.scene.zenith_angle,
             scan.scene.altitude,
@@ -122,7 +122,7 @@ def test_a_scatter_that_is_told_too_large_makes_no_noise_a_variation(scatter):
     air = np.exp(scatter * rng.normal(size=(8, scene.zenith_angle.size, 60)))
     clean = np.exp(-2.0 * np.outer(scene.path, scene.optical_depth)) * air
     signal = clean * (1.0 + noise * rng.normal(size=clean.shape))
-    found = solve(
+    found = retrieve_optical_depth(
         signal,
         scene.zenith_angle,
         scene.altitude,
@@ -135,7 +135,7 @@ def test_a_scatter_that_is_told_too_large_makes_no_noise_a_variation(scatter):
 
 def test_signals_without_any_scatter_are_no_variation():
     scene = cases.clear(1e5, gates=49)
-    found = solve(
+    found = retrieve_optical_depth(
         np.ones((6, scene.zenith_angle.size, 49)),
         scene.zenith_angle,
         scene.altitude,

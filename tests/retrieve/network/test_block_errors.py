@@ -8,7 +8,7 @@ from support.oracle_network import grid, noisy, plume, signals, three_by_two
 
 from lidarops.bench.stability import random_networks as draws
 from lidarops.retrieve.network import _block_errors
-from lidarops.retrieve.network.extinction_field import solve
+from lidarops.retrieve.network.extinction_field import retrieve_network
 
 # Fields that a prior rules out ----------------------------------------------------------------
 
@@ -109,7 +109,7 @@ def test_a_profile_is_compared_with_those_that_see_what_it_sees():
 )
 def test_networks_that_once_stated_too_little_state_their_errors(cluster, failure, before):
     """Of the random networks of the benchmark, in which nearly all false values stood."""
-    judged = next(j for j, _ in draws.judged(cluster, 50) if j.failure.name == failure)
+    judged = next(j for j, _ in draws.judge_networks(cluster, 50) if j.failure.name == failure)
     kept = np.isfinite(judged.error) & (judged.bits == 0)
     false = kept & (np.abs(judged.error) > 4.0 * judged.random)
     assert false.sum() <= 0.01 * before
@@ -120,7 +120,11 @@ def test_networks_that_once_stated_too_little_state_their_errors(cluster, failur
 
 def test_errors_are_told_without_touching_a_value_or_a_clear_case(monkeypatch):
     def both():
-        found = [j for j, _ in draws.judged(0, 50) if j.failure.name in {"none, plume", "outliers"}]
+        found = [
+            j
+            for j, _ in draws.judge_networks(0, 50)
+            if j.failure.name in {"none, plume", "outliers"}
+        ]
         return [np.concatenate([np.ravel(getattr(j, n)) for j in found]) for n in NAMES]
 
     NAMES = ("error", "random")
@@ -159,7 +163,7 @@ def test_rays_that_contradict_each_other_in_a_profile_cost_the_others_nothing(fa
     heard = power.copy()
     heard[7, 0, 133:136] *= factor
     settings = {"variance": variance, "full_overlap_range": 100.0}
-    clean, found = (solve(one, r, net, **settings) for one in (power, heard))
+    clean, found = (retrieve_network(one, r, net, **settings) for one in (power, heard))
     others, near = np.arange(50) != 7, net.near_vertex
     ratio = found.extinction_standard_error / clean.extinction_standard_error
     np.testing.assert_allclose(ratio[others][:, near], 1.0, rtol=0.05)

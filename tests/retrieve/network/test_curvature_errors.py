@@ -40,7 +40,7 @@ def solved(net, field, relative, profiles, *, step=5.0, additive=0.0, seed=1, **
     power, variance = noisy(
         net, r, signals(net, r, field), relative, profiles, seed=seed, additive=additive
     )
-    return extinction_field.solve(
+    return extinction_field.retrieve_network(
         power, r, net, variance=variance, full_overlap_range=100.0, **settings
     )
 
@@ -221,7 +221,9 @@ def test_a_layer_that_rises_within_a_block_is_in_the_error(deep, rise):
     truth = np.stack([at_vertices(net, field) for field in fields])
     deviation = 0.003 * power
     power = power + deviation * np.random.default_rng(8).standard_normal(power.shape)
-    found = extinction_field.solve(power, r, net, variance=deviation**2, full_overlap_range=100.0)
+    found = extinction_field.retrieve_network(
+        power, r, net, variance=deviation**2, full_overlap_range=100.0
+    )
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
     errors = (np.abs(found.extinction - truth) / found.extinction_standard_error)[kept]
     assert kept.sum() > 30
@@ -284,8 +286,8 @@ def test_blocks_state_the_same_alone_and_beside_others():
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field), 0.003, 30, additive=0.0)
     given = {"variance": variance, "full_overlap_range": 100.0}
-    whole = extinction_field.solve(power, r, net, blocks=np.arange(30) // 10, **given)
-    part = extinction_field.solve(power[10:20], r, net, **given)
+    whole = extinction_field.retrieve_network(power, r, net, blocks=np.arange(30) // 10, **given)
+    part = extinction_field.retrieve_network(power[10:20], r, net, **given)
     np.testing.assert_array_equal(
         whole.extinction_standard_error[10:20], part.extinction_standard_error
     )
@@ -293,7 +295,7 @@ def test_blocks_state_the_same_alone_and_beside_others():
 
 def test_random_networks_state_what_thin_layers_do():
     name = "layer of a few gates"
-    found = [j for c in range(24) for j, _ in draws.judged(c, 10) if j.failure.name == name]
+    found = [j for c in range(24) for j, _ in draws.judge_networks(c, 10) if j.failure.name == name]
     assert 6 < len(found) <= 12
     kept = [np.isfinite(j.error) & (j.bits == 0) for j in found]
     errors = np.concatenate(

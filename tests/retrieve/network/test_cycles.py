@@ -13,7 +13,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.network import _multiplier, geometry
 from lidarops.retrieve.network.cycles import (
     solve_cycle,
-    substitute,
+    substitute_back,
     systematic_error,
     values_and_variances,
 )
@@ -50,7 +50,7 @@ def test_closed_form_agrees_with_linear_algebra(k):
     dense = np.linalg.solve(matrices(starts, ends), integrals[..., np.newaxis])[:, 0, 0]
     np.testing.assert_allclose(result.value, dense, rtol=1e-14)
     np.testing.assert_allclose(result.value, reciprocal[:, 0], rtol=2e-14)
-    everywhere = substitute(starts, ends, integrals, result.value)
+    everywhere = substitute_back(starts, ends, integrals, result.value)
     np.testing.assert_allclose(everywhere, reciprocal, rtol=1e-13)
 
 
@@ -171,7 +171,7 @@ def test_values_of_the_papers_second_figure():
             assert systematic_error(folded, 0.8) == pytest.approx(absolute, abs=6e-4)
     for angle, expected in zip(range(15, 76, 10), signed, strict=True):
         net = triangle(float(angle))
-        walk = geometry.cycle(net)
+        walk = geometry.build_cycle(net)
         depths = optical_depths(net, walk, homogeneous())
         assert systematic_error(depths, 0.8) == pytest.approx(expected, abs=6e-4)
 
@@ -188,7 +188,7 @@ def corrected_lengths(second, l13, l23=500.0, first=120.0, third=90.0):
 @pytest.mark.parametrize("angle", [50.0, 60.0, 75.0])
 def test_equation_19_with_its_misprints_corrected_is_the_geometry(angle):
     net = triangle(angle)
-    walk = geometry.cycle(net)
+    walk = geometry.build_cycle(net)
     lengths = walk.end_range - walk.start_range
     np.testing.assert_allclose(lengths * [1, 1, -1], corrected_lengths(angle, 300.0), rtol=1e-12)
 
@@ -198,7 +198,7 @@ def test_equation_19_with_its_misprints_corrected_is_the_geometry(angle):
 
 def paper_rows(angle=60.0, extinction=2e-3, relative=0.05):
     net = triangle(angle)
-    walk = geometry.cycle(net)
+    walk = geometry.build_cycle(net)
     depths = optical_depths(net, walk, homogeneous(extinction))[np.newaxis]
     starts = np.ones((1, 3))
     ends = np.exp(-2 * depths)
@@ -318,7 +318,7 @@ def test_wrong_settings_are_refused_by_name(settings_, field):
 
 def test_first_value_of_another_shape_is_refused():
     with pytest.raises(RetrievalInputError) as raised:
-        substitute(np.ones((2, 3)), np.full((2, 3), 0.8), np.ones((2, 3)), np.ones(3))
+        substitute_back(np.ones((2, 3)), np.full((2, 3), 0.8), np.ones((2, 3)), np.ones(3))
     assert raised.value.field == "first"
 
 

@@ -27,7 +27,7 @@ from support.oracle_network import (
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.network import extinction_field, geometry
 from lidarops.retrieve.network.cycles import systematic_error
-from lidarops.retrieve.network.extinction_field import solve
+from lidarops.retrieve.network.extinction_field import retrieve_network
 
 # Without noise ------------------------------------------------------------------------------
 
@@ -70,7 +70,7 @@ def test_plume_converges_with_the_step():
 @pytest.mark.parametrize("name", FIELDS)
 def test_bias_of_the_multiplier_is_as_predicted_for_any_exponent(exponent, name):
     net, field = triangle(), FIELDS[name]
-    walk = geometry.cycle(net)
+    walk = geometry.build_cycle(net)
     exact = without_noise(net, field, step=1.0, exponent=exponent)
     for multiplier in (0.0, 0.5, 0.9):
         biased = without_noise(
@@ -118,9 +118,9 @@ def test_constants_of_lidars_cancel():
     power = signals(net, r, gradient)
     gains = np.array([3e4, 1e-7, 2.0])[:, None]
     for method in ("cycle", "network"):
-        first = solve(power, r, net, method=method, variance=1e-6 * power**2,
+        first = retrieve_network(power, r, net, method=method, variance=1e-6 * power**2,
                       full_overlap_range=100.0)  # fmt: skip
-        second = solve(gains * power, r, net, method=method, variance=1e-6 * (gains * power) ** 2,
+        second = retrieve_network(gains * power, r, net, method=method, variance=1e-6 * (gains * power) ** 2,
                        full_overlap_range=100.0)  # fmt: skip
         np.testing.assert_allclose(second.extinction, first.extinction, rtol=1e-9)
 
@@ -134,7 +134,7 @@ def test_error_of_the_overlap_does_not_cancel():
     for error in (0.01, 0.03, 0.10):
         wrong = power.copy()
         wrong[0, r < 620] *= 1 + error
-        result = solve(wrong, r, net, method="cycle", variance=QUIET * wrong**2,
+        result = retrieve_network(wrong, r, net, method="cycle", variance=QUIET * wrong**2,
                        full_overlap_range=100.0)  # fmt: skip
         changes.append(truth / result.extinction[0] - 1)
     np.testing.assert_allclose(changes, [-0.049, -0.135, -0.34], atol=0.025)
@@ -146,7 +146,7 @@ def test_overlap_function_is_divided_out():
     overlap = 1.0 - np.exp(-r / 300.0)
     power = signals(net, r, gradient)
     expected = without_noise(net, gradient).extinction
-    result = solve(power * overlap, r, net, method="cycle", variance=QUIET * power**2,
+    result = retrieve_network(power * overlap, r, net, method="cycle", variance=QUIET * power**2,
                    overlap=overlap)  # fmt: skip
     np.testing.assert_allclose(result.extinction, expected, rtol=1e-10)
 
@@ -155,7 +155,7 @@ def test_exponent_may_differ_from_ray_to_ray():
     net = triangle()
     r, exponent = grid(net, 1.0), np.array([0.7, 1.0, 1.5])
     power = np.stack([signals(net, r, gradient, m)[i] for i, m in enumerate(exponent)])
-    result = solve(power, r, net, method="cycle", variance=QUIET * power**2,
+    result = retrieve_network(power, r, net, method="cycle", variance=QUIET * power**2,
                    full_overlap_range=100.0, exponent=exponent)  # fmt: skip
     np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=1e-3)
 
@@ -203,7 +203,7 @@ def test_values_stay_within_3_errors_while_a_plume_moves(relative):
     level = clean[:, :, 100:101]
     deviation = np.hypot(relative * clean, 0.01 * level)
     power = clean + deviation * np.random.default_rng(2).standard_normal(clean.shape)
-    result = solve(power, r, net, variance=deviation**2, full_overlap_range=100.0,
+    result = retrieve_network(power, r, net, variance=deviation**2, full_overlap_range=100.0,
                    blocks=np.arange(100) // 50)  # fmt: skip
     usable = ~result.flags.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
@@ -241,7 +241,7 @@ def test_prior_that_the_rays_contradict_is_weakened_or_given_up():
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.05, 50, additive=0.002)
     settings = {"variance": variance, "full_overlap_range": 100.0}
-    result = solve(power, r, net, **settings)
+    result = retrieve_network(power, r, net, **settings)
     assert np.all(result.prior_deviation > 0.2)
     usable = ~result.flags.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
@@ -250,9 +250,9 @@ def test_prior_that_the_rays_contradict_is_weakened_or_given_up():
     # In homogeneous air it stands.
     power, variance = noisy(net, r, signals(net, r, homogeneous(1e-3)), 0.05, 20, additive=0.002)
     settings["variance"] = variance
-    calm = solve(power, r, net, **settings)
+    calm = retrieve_network(power, r, net, **settings)
     assert np.all(calm.prior_deviation < 0.05)
-    alone = solve(power, r, net, prior="none", **settings)
+    alone = retrieve_network(power, r, net, prior="none", **settings)
     errors = [root_mean_square(relative_errors(x, 1e-3)) for x in (calm, alone)]
     assert np.nanmedian(errors[0]) < 0.7 * np.nanmedian(errors[1])
 
@@ -281,7 +281,7 @@ def scores_where_far_vertices_fade(scale, relative, net):
         return 1.5e-3 * np.exp(-(z - 500.0) / scale)
 
     power, variance = noisy(net, r, signals(net, r, field), relative, 40, 0, relative / 3.0)
-    result = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
     score = (result.extinction - at_vertices(net, field)) / result.extinction_standard_error
     return result, score
 
@@ -317,7 +317,7 @@ def test_rays_that_profiles_lack_cost_no_more_than_what_they_saw(name):
     power, variance = noisy(net, r, signals(net, r, field), 0.02, 50, seed=2)
     lost = np.random.default_rng(2).random((50, net.rays, 1)) < 0.25
     found = [
-        solve(one, r, net, variance=variance, full_overlap_range=100.0)
+        retrieve_network(one, r, net, variance=variance, full_overlap_range=100.0)
         for one in (power, np.where(lost, np.nan, power))
     ]
     kept = [np.isfinite(one.extinction) & ~one.flags.flagged for one in found]
@@ -333,9 +333,11 @@ def test_average_signals_before_not_solutions_afterwards():
     clean = signals(net, r, homogeneous())
     power, variance = noisy(net, r, clean, 0.1, 2000, seed=6)
     groups = power.reshape(20, 100, *clean.shape)
-    before = solve(groups.mean(axis=1), r, net, method="cycle", variance=variance / 100,
+    before = retrieve_network(groups.mean(axis=1), r, net, method="cycle", variance=variance / 100,
                    full_overlap_range=100.0)  # fmt: skip
-    after = solve(power, r, net, method="cycle", variance=variance, full_overlap_range=100.0)
+    after = retrieve_network(
+        power, r, net, method="cycle", variance=variance, full_overlap_range=100.0
+    )
     error = root_mean_square(2e-3 / before.extinction[:, 0] - 1)
     means = np.nanmean((2e-3 / after.extinction[:, 0]).reshape(20, 100), axis=1)
     assert error < 0.1
@@ -348,27 +350,27 @@ def test_averages_leave_out_rays_with_gaps():
     power[1, 0, 3] = np.nan
     power[:, 1, 6:] = np.nan
     labels = ["b", "a", "a", "b", "a"]
-    mean, variance = extinction_field.average(power, labels, variance=np.full((2, 8), 0.3))
+    mean, variance = extinction_field.average_signals(power, labels, variance=np.full((2, 8), 0.3))
     assert mean.shape == (2, 2, 8)
     np.testing.assert_allclose(mean[0, 0], power[[2, 4], 0].mean(axis=0), rtol=1e-14)
     np.testing.assert_allclose(mean[0, 1, :6], power[[1, 2, 4], 1, :6].mean(axis=0), rtol=1e-14)
     assert np.isnan(mean[:, 1, 6:]).all()
     np.testing.assert_allclose(variance[:, 0, 0], [0.15, 0.15], rtol=1e-14)
-    assert extinction_field.average(power, labels)[1] is None
+    assert extinction_field.average_signals(power, labels)[1] is None
     # A gate of unknown variance is a gap: one profile must not take it from the mean of all.
     noise = np.full(power.shape, 0.3)
     noise[[2, 0], [0, 1], [5, 2]] = np.nan, np.inf
     noise[:, 1, 5] = np.nan
-    mean, variance = extinction_field.average(power, labels, variance=noise)
+    mean, variance = extinction_field.average_signals(power, labels, variance=noise)
     np.testing.assert_allclose(mean[0, 0], power[4, 0], rtol=1e-14)
     np.testing.assert_allclose(variance[0, 0], 0.3, rtol=1e-14)
     np.testing.assert_allclose(mean[1, 1, :6], power[3, 1, :6], rtol=1e-14)
     np.testing.assert_allclose(variance[:, 1, :5], [[0.1] * 5, [0.3] * 5], rtol=1e-14)
     assert np.isnan(variance[:, 1, 5]).all()
     with pytest.raises(RetrievalInputError, match="power"):
-        extinction_field.average(power[0], labels)
+        extinction_field.average_signals(power[0], labels)
     with pytest.raises(RetrievalInputError, match="groups") as raised:
-        extinction_field.average(power, labels[:2])
+        extinction_field.average_signals(power, labels[:2])
     assert raised.value.field == "groups"
 
 
@@ -379,8 +381,8 @@ def test_unknown_noise_is_told_by_the_signal():
     rng = np.random.default_rng(3)
     power = clean * (1 + 0.03 * rng.standard_normal((200, *clean.shape)))
     settings = {"full_overlap_range": 100.0, "method": "unbiased"}
-    told = solve(power, r, net, variance=(0.03 * clean) ** 2, **settings)
-    found = solve(power, r, net, **settings)
+    told = retrieve_network(power, r, net, variance=(0.03 * clean) ** 2, **settings)
+    found = retrieve_network(power, r, net, **settings)
     ratio = found.extinction_standard_error[:, 0] / told.extinction_standard_error[:, 0]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
 
@@ -395,14 +397,18 @@ def test_blocks_do_not_know_of_each_other(method):
     power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 60)
     labels = np.repeat(["a", "b", "c"], [20, 10, 30])
     settings = {"method": method, "full_overlap_range": 100.0}
-    whole = solve(power, r, net, variance=variance, blocks=labels, **settings)
+    whole = retrieve_network(power, r, net, variance=variance, blocks=labels, **settings)
     shuffled = np.random.default_rng(0).permutation(60)
     for part in (slice(0, 20), slice(20, 60), slice(20, 30)):
-        piece = solve(power[part], r, net, variance=variance, blocks=labels[part], **settings)
+        piece = retrieve_network(
+            power[part], r, net, variance=variance, blocks=labels[part], **settings
+        )
         for name in ("extinction", "extinction_standard_error", "prior_deviation", "multiplier"):
             a, b = getattr(whole, name)[part], getattr(piece, name)
             assert np.array_equal(a, b, equal_nan=True), name
-    mixed = solve(power[shuffled], r, net, variance=variance, blocks=labels[shuffled], **settings)
+    mixed = retrieve_network(
+        power[shuffled], r, net, variance=variance, blocks=labels[shuffled], **settings
+    )
     np.testing.assert_allclose(mixed.extinction, whole.extinction[shuffled], rtol=1e-9)
 
 
@@ -410,26 +416,28 @@ def test_odd_arrays_are_taken_and_shapes_kept():
     net = triangle()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 6)
-    expected = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    expected = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
     cube = power.reshape(2, 3, *power.shape[1:])
     swapped = np.asfortranarray(cube).astype(">f8")
     swapped.setflags(write=False)
-    result = solve(swapped, r, net, variance=variance, full_overlap_range=[100.0] * 3)
+    result = retrieve_network(swapped, r, net, variance=variance, full_overlap_range=[100.0] * 3)
     assert result.extinction.shape == (2, 3, 3)
     assert result.flags.flagged.shape == (2, 3, 3)
     assert result.reduced_chi_square.shape == (2, 3)
     assert np.array_equal(result.extinction.reshape(6, 3), expected.extinction, equal_nan=True)
-    turned = solve(power[..., ::-1], r[::-1], net, variance=variance[..., ::-1],
+    turned = retrieve_network(power[..., ::-1], r[::-1], net, variance=variance[..., ::-1],
                    full_overlap_range=100.0)  # fmt: skip
     assert np.array_equal(turned.extinction, expected.extinction, equal_nan=True)
-    rows = solve(power, np.tile(r, (3, 1)), net, variance=np.tile(variance, (6, 1, 1)),
+    rows = retrieve_network(power, np.tile(r, (3, 1)), net, variance=np.tile(variance, (6, 1, 1)),
                  full_overlap_range=100.0)  # fmt: skip
     assert np.array_equal(rows.extinction, expected.extinction, equal_nan=True)
-    single = solve(power.astype(np.float32), r, net, variance=variance, full_overlap_range=100.0)
+    single = retrieve_network(
+        power.astype(np.float32), r, net, variance=variance, full_overlap_range=100.0
+    )
     np.testing.assert_allclose(single.extinction[:, 0], expected.extinction[:, 0], rtol=1e-3)
-    one = solve(power[0], r, net, variance=variance, full_overlap_range=100.0)
+    one = retrieve_network(power[0], r, net, variance=variance, full_overlap_range=100.0)
     assert one.extinction.shape == (3,)
-    none = solve(power[:0], r, net, variance=variance, full_overlap_range=100.0)
+    none = retrieve_network(power[:0], r, net, variance=variance, full_overlap_range=100.0)
     assert none.extinction.shape == (0, 3)
 
 
@@ -442,7 +450,7 @@ def test_rays_may_have_ranges_of_their_own():
     power = signals(net, fine, gradient)
     power[2, : coarse.size] = signals(net, coarse, gradient)[2]
     power[2, coarse.size :] = np.nan
-    result = solve(power, ranges, net, method="cycle", variance=1e-12 * power**2,
+    result = retrieve_network(power, ranges, net, method="cycle", variance=1e-12 * power**2,
                    full_overlap_range=100.0)  # fmt: skip
     np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=5e-3)
 
@@ -453,7 +461,7 @@ def test_vertices_without_full_overlap_are_not_measured():
     assert not result.flags.not_measured.any()
     r = grid(net)
     power = signals(net, r, homogeneous())
-    far = solve(power, r, net, variance=1e-6 * power**2, full_overlap_range=650.0)
+    far = retrieve_network(power, r, net, variance=1e-6 * power**2, full_overlap_range=650.0)
     assert far.flags.not_measured.any()
     assert np.isnan(far.extinction[far.flags.not_measured]).all()
     assert np.isfinite(far.extinction[~far.flags.not_measured & far.near_vertex]).any()
@@ -469,7 +477,7 @@ def test_weak_signals_are_left_out_and_told():
     r = grid(net)
     clean = signals(net, r, homogeneous(4e-3))
     power, variance = noisy(net, r, clean, 0.02, 50, additive=0.2)
-    result = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
     assert result.flags.weak_signal.any()
     usable = ~result.flags.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - 4e-3) / result.extinction_standard_error)[usable]
@@ -487,8 +495,8 @@ def test_one_loud_profile_costs_the_others_nothing(factor):
     if np.isfinite(factor):
         rng = np.random.default_rng(0)
         heard[3] += np.sqrt(told[3] - variance) * rng.standard_normal(heard[3].shape)
-    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
-    found = solve(heard, r, net, variance=told, full_overlap_range=100.0)
+    clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
+    found = retrieve_network(heard, r, net, variance=told, full_overlap_range=100.0)
     others, kept = np.arange(50) != 3, np.isfinite(clean.extinction)
     np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])
     assert np.all(apart(found, clean)[others][kept[others]] < 0.05)
@@ -520,8 +528,8 @@ def test_a_gate_of_unknown_variance_leaves_the_other_profiles_as_they_are(factor
     told = np.broadcast_to(variance, power.shape).copy()
     told[7, np.arange(net.rays), between(net, r)] *= factor
     settings = {"full_overlap_range": 100.0}
-    found = solve(power, r, net, variance=told, **settings)
-    whole = solve(power, r, net, variance=variance, **settings)
+    found = retrieve_network(power, r, net, variance=told, **settings)
+    whole = retrieve_network(power, r, net, variance=variance, **settings)
     others = np.arange(60) != 7
     np.testing.assert_array_equal(found.prior_deviation, whole.prior_deviation)
     np.testing.assert_array_equal(found.flags.flagged[others], whole.flags.flagged[others])
@@ -540,8 +548,8 @@ def test_a_gate_of_unknown_variance_costs_what_one_without_signal_does(bad):
     told[7, ray, gate] = bad
     lost = power.copy()
     lost[7, ray, gate] = np.nan
-    found = solve(power, r, net, variance=told, full_overlap_range=100.0)
-    other = solve(lost, r, net, variance=variance, full_overlap_range=100.0)
+    found = retrieve_network(power, r, net, variance=told, full_overlap_range=100.0)
+    other = retrieve_network(lost, r, net, variance=variance, full_overlap_range=100.0)
     for one in ("extinction", "extinction_standard_error", "degrees_of_freedom"):
         np.testing.assert_allclose(getattr(found, one)[7], getattr(other, one)[7], rtol=1e-9)
     vertices = net.on_ray(ray)[0]
@@ -556,8 +564,8 @@ def test_a_ray_without_noise_is_left_out_and_told():
     power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
     told = np.broadcast_to(variance, power.shape).copy()
     told[3, 0] = 0.0
-    found = solve(power, r, net, variance=told, full_overlap_range=100.0)
-    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
+    found = retrieve_network(power, r, net, variance=told, full_overlap_range=100.0)
+    clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
     mine = np.zeros_like(found.flags.weak_signal)
     mine[3, net.on_ray(0)[0]] = True
     np.testing.assert_array_equal(found.flags.weak_signal, mine)
@@ -571,8 +579,10 @@ def test_a_profile_of_more_energy_is_not_loud():
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.05, 50, seed=4)
     scale = np.where(np.arange(50) == 3, 20.0, 1.0)[:, np.newaxis, np.newaxis]
-    clean = solve(power, r, net, variance=variance, full_overlap_range=100.0)
-    found = solve(scale * power, r, net, variance=scale**2 * variance, full_overlap_range=100.0)
+    clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
+    found = retrieve_network(
+        scale * power, r, net, variance=scale**2 * variance, full_overlap_range=100.0
+    )
     assert not found.flags.weak_signal.any()
     np.testing.assert_allclose(found.extinction, clean.extinction, rtol=1e-9)
 
@@ -616,7 +626,7 @@ def test_wrong_settings_are_refused_by_name(settings, field):
     net = triangle()
     r = np.linspace(100.0, 1200.0, 100)
     with pytest.raises(RetrievalInputError) as raised:
-        solve(np.ones((4, 3, 100)), r, net, **{"full_overlap_range": 100.0, **settings})
+        retrieve_network(np.ones((4, 3, 100)), r, net, **{"full_overlap_range": 100.0, **settings})
     assert raised.value.field == field
 
 
@@ -633,7 +643,7 @@ def test_wrong_settings_are_refused_by_name(settings, field):
 )
 def test_wrong_arrays_are_refused_by_name(power, range_, field):
     with pytest.raises(RetrievalInputError) as raised:
-        solve(power, range_, triangle(), full_overlap_range=100.0)
+        retrieve_network(power, range_, triangle(), full_overlap_range=100.0)
     assert raised.value.field == field
 
 
@@ -642,7 +652,7 @@ def test_cycle_that_cannot_be_measured_is_refused():
     r = np.arange(100.0, 900.0, 5.0)
     power = signals(net, r, homogeneous())
     with pytest.raises(RetrievalInputError, match="cannot measure"):
-        solve(power, r, net, method="cycle", full_overlap_range=100.0)
+        retrieve_network(power, r, net, method="cycle", full_overlap_range=100.0)
 
 
 @pytest.mark.parametrize("method", ["network", "slope", "klett"])
@@ -650,7 +660,7 @@ def test_signals_that_reach_no_vertex_give_nothing(method):
     net = triangle()
     r = np.arange(100.0, 400.0, 5.0)
     power = np.tile(1 / r**2, (4, 3, 1))
-    result = solve(power, r, net, method=method, full_overlap_range=100.0)
+    result = retrieve_network(power, r, net, method=method, full_overlap_range=100.0)
     assert np.isnan(result.extinction).all()
     assert result.flags.not_measured.all()
 
@@ -659,9 +669,9 @@ def test_rays_that_do_not_meet_are_refused():
     net = fan([0.0, 100.0], [(60.0,), (60.0,)])
     r = np.arange(100.0, 400.0, 5.0)
     with pytest.raises(RetrievalInputError, match="do not meet"):
-        solve(np.ones((2, r.size)), r, net, full_overlap_range=100.0)
+        retrieve_network(np.ones((2, r.size)), r, net, full_overlap_range=100.0)
 
 
 def test_methods_are_told_in_the_result():
-    for method in extinction_field.Method:
+    for method in extinction_field.NetworkMethod:
         assert without_noise(triangle(), homogeneous(), method=method.value).method is method

@@ -85,7 +85,7 @@ def test_rays_of_three_stations_meet_where_they_are_pointed():
         point = geometry.to_earth_centred(*target)
         expected.append(point)
         rays += [Ray(*station, *bearing(station, point)) for station in stations]
-    net = geometry.network(rays, tolerance=0.5)
+    net = geometry.build_network(rays, tolerance=0.5)
     assert net.vertices == 2
     assert np.bincount(net.crossings.vertex).tolist() == [3, 3]
     order = np.argsort(net.geodetic[:, 2])
@@ -158,9 +158,9 @@ def test_vertices_lie_before_the_lidars_and_within_reach():
 
 def test_network_is_cached_and_read_only():
     rays = [Ray(47.0, 11.0, 0.0, 45.0, 10.0), Ray(47.0, 11.01, 0.0, 315.0, 10.0)]
-    net = geometry.network(rays)
-    assert geometry.network(list(rays)) is net
-    assert geometry.network(rays, tolerance=5.0) is not net
+    net = geometry.build_network(rays)
+    assert geometry.build_network(list(rays)) is net
+    assert geometry.build_network(rays, tolerance=5.0) is not net
     with pytest.raises(ValueError, match="read-only"):
         net.vertex[0, 0] = 1.0
 
@@ -186,7 +186,7 @@ def test_network_does_not_depend_on_the_order_of_rays():
 @pytest.mark.parametrize("angle", [20.0, 30.0, 40.0, 50.0, 60.0, 75.0])
 def test_cycle_starts_near_and_walks_in_the_direction_of_attenuation(angle):
     net = triangle(angle)
-    walk = geometry.cycle(net)
+    walk = geometry.build_cycle(net)
     assert not walk.far_start
     assert walk.sign[0] == 1.0
     assert walk.sign[-1] == -1.0
@@ -206,16 +206,16 @@ def test_cycle_starts_near_and_walks_in_the_direction_of_attenuation(angle):
 
 def test_start_of_a_cycle_can_be_chosen_and_is_told_when_far():
     net = triangle()
-    walk = geometry.cycle(net, start=2)
+    walk = geometry.build_cycle(net, start=2)
     assert walk.vertex[0] == 2
     assert walk.far_start
-    assert not geometry.cycle(net, start=1).far_start
+    assert not geometry.build_cycle(net, start=1).far_start
 
 
 def test_cycle_of_a_larger_network_is_named_by_its_rays():
     net = fan([-500.0, 0.0, 400.0], [(50, 68), (78, 103), (112, 130)], farthest=1000.0)
     with pytest.raises(RetrievalInputError, match="one cycle"):
-        geometry.cycle(net)
+        geometry.build_cycle(net)
     shared = {}
     for ray in range(6):
         for vertex in net.on_ray(ray)[0]:
@@ -228,7 +228,7 @@ def test_cycle_of_a_larger_network_is_named_by_its_rays():
         for c in range(b + 1, 6)
         if {(a, b), (b, c), (a, c)} <= set(pairs)
     )
-    walk = geometry.cycle(net, first)
+    walk = geometry.build_cycle(net, first)
     assert set(walk.ray.tolist()) == set(first)
     assert not walk.far_start
 
@@ -238,7 +238,7 @@ def test_square_of_four_rays_is_one_cycle():
     direction = [[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]]
     net = geometry.network_of_lines(origin, direction)
     assert net.vertices == 4
-    walk = geometry.cycle(net)
+    walk = geometry.build_cycle(net)
     assert sorted(walk.ray.tolist()) == [0, 1, 2, 3]
     assert sorted(walk.vertex.tolist()) == [0, 1, 2, 3]
 
@@ -261,7 +261,7 @@ GOOD = {"latitude": 47.0, "longitude": 11.0, "altitude": 0.0, "azimuth": 0.0, "e
 )
 def test_wrong_rays_are_refused_by_name(field, value):
     with pytest.raises(RetrievalInputError) as raised:
-        geometry.network([Ray(**GOOD), Ray(**{**GOOD, field: value})])
+        geometry.build_network([Ray(**GOOD), Ray(**{**GOOD, field: value})])
     assert raised.value.field in {field, "rays"}
 
 
@@ -279,13 +279,13 @@ def test_wrong_rays_are_refused_by_name(field, value):
 def test_wrong_settings_are_refused_by_name(arguments, field):
     rays = [Ray(**GOOD), Ray(**{**GOOD, "latitude": 47.01, "azimuth": 180.0})]
     with pytest.raises(RetrievalInputError) as raised:
-        geometry.network(rays, **arguments)
+        geometry.build_network(rays, **arguments)
     assert raised.value.field == field
 
 
 def test_no_rays_too_many_and_shapeless_lines_are_refused():
     with pytest.raises(RetrievalInputError, match="none"):
-        geometry.network([])
+        geometry.build_network([])
     many = np.zeros((600, 3)), np.tile([1.0, 0, 0], (600, 1))
     with pytest.raises(RetrievalInputError, match="split"):
         geometry.network_of_lines(*many)
@@ -301,10 +301,10 @@ def test_no_rays_too_many_and_shapeless_lines_are_refused():
 @pytest.mark.parametrize("rays", [[0, 1], [0, 1, 1], [0, 1, 7], [0, 1, 2, 3]])
 def test_wrong_cycles_are_refused(rays):
     with pytest.raises(RetrievalInputError):
-        geometry.cycle(triangle(), rays)
+        geometry.build_cycle(triangle(), rays)
 
 
 def test_start_off_the_cycle_is_refused():
     with pytest.raises(RetrievalInputError) as raised:
-        geometry.cycle(triangle(), start=3)
+        geometry.build_cycle(triangle(), start=3)
     assert raised.value.field == "start"

@@ -13,13 +13,13 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air.labeled import Definition
 from lidarops.retrieve.network import labeled
-from lidarops.retrieve.network.labeled import Settings, retrieve
+from lidarops.retrieve.network.labeled import NetworkSettings, retrieve_network
 
-PLAIN = Settings(block_intervals=72, visibility=Definition(wavelength=532e-9))
+PLAIN = NetworkSettings(block_intervals=72, visibility=Definition(wavelength=532e-9))
 
 
 def solved(beams, **changes):
-    return retrieve(beams, network(), replace(PLAIN, **changes))
+    return retrieve_network(beams, network(), replace(PLAIN, **changes))
 
 
 def test_homogeneous_air_is_found_within_the_errors():
@@ -154,7 +154,7 @@ def test_visibility_goes_by_the_definition():
 
 def test_beams_are_as_many_as_rays():
     with pytest.raises(RetrievalInputError, match="beams"):
-        retrieve([beam(0)], network(), PLAIN)
+        retrieve_network([beam(0)], network(), PLAIN)
 
 
 def test_bins_that_are_not_used_do_not_matter(monkeypatch):

@@ -20,7 +20,7 @@ from support.oracle_network import (
 )
 
 from lidarops.retrieve.network import _beam_signals, geometry
-from lidarops.retrieve.network.extinction_field import solve
+from lidarops.retrieve.network.extinction_field import retrieve_network
 
 # Flags --------------------------------------------------------------------------------------
 
@@ -31,12 +31,12 @@ def pooled(relative):
     for angle in (48.0, 50.0, 53.0, 57.0, 62.0, 66.0, 70.0):
         net = triangle(angle)
         for field in (homogeneous(), gradient):
-            start = int(geometry.cycle(net).vertex[0])
+            start = int(geometry.build_cycle(net).vertex[0])
             r = grid(net)
             power, variance = noisy(
                 net, r, signals(net, r, field), relative, 150, int(angle), additive=1e-4
             )
-            result = solve(
+            result = retrieve_network(
                 power, r, net, method="cycle", variance=variance, full_overlap_range=100.0
             )
             error = relative_errors(result, at_vertices(net, field))[:, start]
@@ -60,7 +60,7 @@ def test_flags_find_what_is_wrong_and_leave_what_is_right(relative):
 def test_extreme_a_degenerate_triangle_is_flagged_always():
     net = triangle(46.1024, tolerance=1e-6)
     result = with_noise(net, homogeneous(), 0.01, 200, method="cycle")
-    start = geometry.cycle(net).vertex[0]
+    start = geometry.build_cycle(net).vertex[0]
     assert result.flags.ill_conditioned[:, start].mean() > 0.97
     assert result.flags.flagged[:, start].mean() > 0.97
 
@@ -68,13 +68,13 @@ def test_extreme_a_degenerate_triangle_is_flagged_always():
 def test_extreme_b_nearly_degenerate_triangle_is_flagged():
     net = triangle(47.0)
     result = with_noise(net, homogeneous(), 0.01, 300, method="cycle")
-    assert result.flags.flagged[:, geometry.cycle(net).vertex[0]].mean() > 0.95
+    assert result.flags.flagged[:, geometry.build_cycle(net).vertex[0]].mean() > 0.95
 
 
 def test_extreme_c_far_start_is_flagged_and_harmless_only_when_exact():
     net = triangle(30.0)
     upper = int(np.argmax(net.vertex[:, 2]))
-    middle = [v for v in range(3) if geometry.cycle(net, start=v).far_start]
+    middle = [v for v in range(3) if geometry.build_cycle(net, start=v).far_start]
     assert upper in middle
     start = middle[0]
     exact = with_noise(net, homogeneous(), 0.01, 200, method="cycle", start=start)
@@ -83,7 +83,7 @@ def test_extreme_c_far_start_is_flagged_and_harmless_only_when_exact():
     single = with_noise(net, homogeneous(), 0.01, 200, method="multiplier", multiplier=0.0,
                         start=start)  # fmt: skip
     assert single.flags.flagged[:, start].all()
-    assert not single.flags.not_positive[:, geometry.cycle(net).vertex[0]].any()
+    assert not single.flags.not_positive[:, geometry.build_cycle(net).vertex[0]].any()
 
 
 def test_extreme_d_clear_air_is_flagged():
@@ -107,7 +107,7 @@ def test_extreme_g_steep_power_law():
     net = triangle()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, homogeneous(), 2.0), 0.01, 200, additive=0.0)
-    result = solve(power, r, net, method="cycle", variance=variance, exponent=2.0,
+    result = retrieve_network(power, r, net, method="cycle", variance=variance, exponent=2.0,
                    full_overlap_range=100.0)  # fmt: skip
     assert root_mean_square(relative_errors(result, 2e-3))[0] < 0.06
 
@@ -121,7 +121,9 @@ def test_extreme_h_no_plain_number_comes_out_of_a_bad_signal(bad, method):
     power, variance = noisy(net, r, clean, 0.005, 12)
     power[3, 0, np.searchsorted(r, 700.0)] = bad
     power[5, :, :] = bad
-    whole = solve(power, r, net, method=method, variance=variance, full_overlap_range=100.0)
+    whole = retrieve_network(
+        power, r, net, method=method, variance=variance, full_overlap_range=100.0
+    )
     assert np.isnan(whole.extinction[5]).all()
     assert whole.flags.not_finite[5].all()
     lost = whole.flags.signal_missing if not np.isfinite(bad) else whole.flags.signal_not_positive
@@ -143,7 +145,7 @@ def test_extreme_i_too_few_rays_without_prior_are_not_determined():
 def test_extreme_j_pole_is_refused():
     net = triangle(30.0)
     # Walked against the attenuation, through the far vertex.
-    forward = geometry.cycle(net)
+    forward = geometry.build_cycle(net)
     order = forward.vertex[[0, 2, 1]]
     backward = geometry.Cycle(
         forward.ray[::-1].copy(), order.copy(), forward.end_range[::-1].copy(),
@@ -163,10 +165,12 @@ def test_a_vertex_reached_against_strong_attenuation_is_flagged(method, relative
     net, field = triangle(60.0), homogeneous(0.02)
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field), relative, 200, 7, additive=0.0)
-    result = solve(power, r, net, method=method, variance=variance, full_overlap_range=100.0)
+    result = retrieve_network(
+        power, r, net, method=method, variance=variance, full_overlap_range=100.0
+    )
     error = relative_errors(result, at_vertices(net, field))
     stated = result.extinction_standard_error / result.extinction
-    start = int(geometry.cycle(net).vertex[0])
+    start = int(geometry.build_cycle(net).vertex[0])
     other = [v for v in np.flatnonzero(result.near_vertex) if v != start]
     # Values are there, and many are off by more than their linear error tells.
     assert (np.abs(error[:, other]) > 4.0 * stated[:, other]).mean() > 0.1
@@ -185,7 +189,10 @@ def test_one_loud_profile_costs_the_others_nothing_where_signals_tell_the_noise(
     power = calm.copy()
     power[7] += (factor - 1.0) * (calm[7] - clean)
     settings = {"full_overlap_range": 100.0, "prior": "none"}
-    quiet, found = solve(calm, r, net, **settings), solve(power, r, net, **settings)
+    quiet, found = (
+        retrieve_network(calm, r, net, **settings),
+        retrieve_network(power, r, net, **settings),
+    )
     others = np.arange(50) != 7
     near = found.near_vertex
     np.testing.assert_allclose(

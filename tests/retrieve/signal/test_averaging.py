@@ -36,7 +36,7 @@ def test_mean_follows_its_formulas(seed, length, bins):
     variance, shared = rng.random(values.shape), rng.random(values.shape)
     weights = rng.integers(0, 4, (2, length)).astype(float)
     groups = rng.integers(-1, 3, length)
-    result = averaging.mean(
+    result = averaging.time_mean(
         values, variance, groups=groups, weights=weights, shared_variance=shared
     )
     for k, g, i in np.ndindex(2, max(int(groups.max()), 0) + 1, bins):
@@ -60,7 +60,7 @@ def test_noise_averages_down_and_shared_errors_do_not():
     noise = 3.0 / np.sqrt(shots)
     dark = rng.normal(0.0, 0.5, (4000, 1, 1))
     profiles = 7.0 + dark + rng.normal(size=(4000, 4, 3)) * noise[:, np.newaxis]
-    result = averaging.mean(
+    result = averaging.time_mean(
         profiles, noise[:, np.newaxis] ** 2, weights=shots, shared_variance=0.25
     )
     off = result.values - 7.0
@@ -76,7 +76,7 @@ def test_gaps_keep_the_mean_unbiased_and_its_variance_honest():
     profiles[:, :5, 1] = np.nan
     profiles[:, :, 2] = np.inf
     profiles[:, 1:, 3] = np.nan
-    result = averaging.mean(profiles, 1.0)
+    result = averaging.time_mean(profiles, 1.0)
     np.testing.assert_array_equal(result.count[0, 0], [8, 3, 0, 1])
     np.testing.assert_allclose(result.variance[0, 0, [0, 1, 3]], [1 / 8, 1 / 3, 1.0])
     assert np.isnan(result.values[:, 0, 2]).all()
@@ -90,7 +90,7 @@ def test_gaps_keep_the_mean_unbiased_and_its_variance_honest():
 def test_least_count_turns_thin_means_into_gaps():
     profiles = np.ones((5, 2))
     profiles[:3, 1] = np.nan
-    result = averaging.mean(profiles, 1.0, least_count=3)
+    result = averaging.time_mean(profiles, 1.0, least_count=3)
     np.testing.assert_array_equal(result.values, [[1.0, np.nan]])
     np.testing.assert_array_equal(result.count, [[5, 2]])
     assert np.isnan(result.shared_variance[0, 1])
@@ -99,7 +99,7 @@ def test_least_count_turns_thin_means_into_gaps():
 def test_a_variance_that_is_not_known_stays_so():
     variance = np.ones((4, 2))
     variance[1, 0] = np.nan
-    result = averaging.mean(np.ones((4, 2)), variance)
+    result = averaging.time_mean(np.ones((4, 2)), variance)
     np.testing.assert_array_equal(result.values, [[1.0, 1.0]])
     np.testing.assert_array_equal(np.isnan(result.variance), [[True, False]])
 
@@ -111,18 +111,18 @@ def test_no_bit_depends_on_the_chunks(dtype):
     profiles[rng.random(profiles.shape) < 0.1] = np.nan
     variance = rng.random(profiles.shape)
     groups = np.repeat(np.arange(5), 10)
-    whole = averaging.mean(profiles, variance, groups=groups)
+    whole = averaging.time_mean(profiles, variance, groups=groups)
     for rows, bins in (
         (slice(0, 1), slice(None)),
         (slice(2, 5), slice(7, 8)),
         (slice(5, 6), slice(1, 32, 3)),
     ):
-        part = averaging.mean(profiles[rows, :, bins], variance[rows, :, bins], groups=groups)
+        part = averaging.time_mean(profiles[rows, :, bins], variance[rows, :, bins], groups=groups)
         np.testing.assert_array_equal(whole.values[rows, :, bins], part.values)
         np.testing.assert_array_equal(whole.variance[rows, :, bins], part.variance)
     for g in range(5):
         inside = groups == g
-        alone = averaging.mean(profiles[:, inside], variance[:, inside])
+        alone = averaging.time_mean(profiles[:, inside], variance[:, inside])
         np.testing.assert_array_equal(whole.values[:, g : g + 1], alone.values)
 
 
@@ -130,19 +130,19 @@ def test_any_axis_can_be_time():
     rng = np.random.default_rng(4)
     profiles = rng.normal(size=(5, 3, 4))
     shots = np.arange(1.0, 6.0)
-    first = averaging.mean(profiles, 1.0, weights=shots, axis=0)
-    moved = averaging.mean(np.moveaxis(profiles, 0, 1), 1.0, weights=shots)
+    first = averaging.time_mean(profiles, 1.0, weights=shots, axis=0)
+    moved = averaging.time_mean(np.moveaxis(profiles, 0, 1), 1.0, weights=shots)
     np.testing.assert_array_equal(first.values[0], moved.values[:, 0])
-    last = averaging.mean(np.moveaxis(profiles, 0, -1), 1.0, weights=shots, axis=-1)
+    last = averaging.time_mean(np.moveaxis(profiles, 0, -1), 1.0, weights=shots, axis=-1)
     np.testing.assert_allclose(last.values[..., 0], moved.values[:, 0], rtol=1e-14)
     assert last.count.shape == (3, 4, 1)
 
 
 def test_no_profiles_give_gaps():
-    result = averaging.mean(np.empty((0, 4)), 1.0)
+    result = averaging.time_mean(np.empty((0, 4)), 1.0)
     np.testing.assert_array_equal(result.count, np.zeros((1, 4)))
     assert np.isnan(result.values).all()
-    dark = averaging.mean(np.ones((3, 4)), 1.0, weights=[0.0, 0.0, np.nan])
+    dark = averaging.time_mean(np.ones((3, 4)), 1.0, weights=[0.0, 0.0, np.nan])
     assert np.isnan(dark.values).all()
 
 
@@ -202,7 +202,7 @@ def test_range_mean_of_a_background_error_does_not_average_down():
 def test_impossible_arguments_are_refused(change, field):
     arguments = {"profiles": np.ones((4, 2)), "variance": 1.0} | change
     with pytest.raises(RetrievalInputError) as error:
-        averaging.mean(arguments.pop("profiles"), arguments.pop("variance"), **arguments)
+        averaging.time_mean(arguments.pop("profiles"), arguments.pop("variance"), **arguments)
     assert error.value.field == field
 
 

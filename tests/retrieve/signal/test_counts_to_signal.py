@@ -22,7 +22,9 @@ SHOTS = np.array([600])
 
 def test_analog_voltage_of_known_counts() -> None:
     counts = np.full((1, 400), 123_456, np.int32)
-    result = counts_to_signal.analog(counts, SHOTS, RANGE, adc_bits=12, input_range=np.array([0.5]))
+    result = counts_to_signal.analog_signal(
+        counts, SHOTS, RANGE, adc_bits=12, input_range=np.array([0.5])
+    )
     assert result.power == pytest.approx(123_456 * 500.0 / (600 * 4096))
     assert not result.quality.any()
 
@@ -30,7 +32,7 @@ def test_analog_voltage_of_known_counts() -> None:
 def test_full_scale_and_integer_extremes_are_masked() -> None:
     counts = np.full((1, 400), 1000, np.int32)
     counts[0, :4] = [600 * 4095, 600 * 4000, 2**31 - 1, -(2**31)]
-    result = counts_to_signal.analog(
+    result = counts_to_signal.analog_signal(
         counts, SHOTS, RANGE, adc_bits=12, input_range=np.array([0.5]), noise_variance=1e-4
     )
     assert result.quality[0, 0] == Quality.SATURATED
@@ -50,7 +52,7 @@ def test_a_mean_of_shots_of_which_some_were_clipped_is_masked() -> None:
     for _ in range(shots):
         shot = level + rng.normal(0.0, spread, level.size)
         counts[0] += np.rint(np.clip(shot, 0.0, top)).astype(np.int32)
-    result = counts_to_signal.analog(
+    result = counts_to_signal.analog_signal(
         counts,
         np.array([shots]),
         7.5 * np.arange(1.0, level.size + 1),
@@ -74,7 +76,7 @@ def test_rounding_of_each_shot_is_covered_at_every_level(noise: float, shots: in
     sums = np.zeros((41, 400))
     for _ in range(shots):
         sums += np.rint(level + noise * rng.standard_normal(sums.shape))
-    found = counts_to_signal.analog(
+    found = counts_to_signal.analog_signal(
         sums.astype(np.int32), np.full(41, shots), RANGE, adc_bits=12, input_range=np.full(41, 0.5)
     )
     step = 500.0 / 4096.0
@@ -91,18 +93,22 @@ def test_the_stated_noise_is_raised_by_rounding_and_that_of_the_dark_signal_is_n
     settings = {"adc_bits": 12, "input_range": np.array([0.5])}
     step = 500.0 / 4096.0
     counts = np.full((1, 400), 60_200, np.int32)
-    quiet = counts_to_signal.analog(counts, SHOTS, RANGE, noise_variance=0.0, **settings)
+    quiet = counts_to_signal.analog_signal(counts, SHOTS, RANGE, noise_variance=0.0, **settings)
     assert quiet.variance == pytest.approx(step**2 * (1.0 + 1.0 / 600.0) / 12.0)
-    loud = counts_to_signal.analog(counts, SHOTS, RANGE, noise_variance=step**2 / 600.0, **settings)
+    loud = counts_to_signal.analog_signal(
+        counts, SHOTS, RANGE, noise_variance=step**2 / 600.0, **settings
+    )
     assert loud.variance == pytest.approx(step**2 / 600.0)
     dark = {"dark": np.zeros(400), "dark_variance": np.full(400, 7.0)}
-    both = counts_to_signal.analog(counts, SHOTS, RANGE, noise_variance=0.0, **dark, **settings)
+    both = counts_to_signal.analog_signal(
+        counts, SHOTS, RANGE, noise_variance=0.0, **dark, **settings
+    )
     assert both.variance == pytest.approx(quiet.variance + 7.0)
 
 
 def test_no_shots_is_missing_input_not_infinity() -> None:
     counts = np.full((2, 400), 1000, np.int32)
-    result = counts_to_signal.photon(counts, np.array([0, 600]), RANGE, bin_width=7.5)
+    result = counts_to_signal.photon_signal(counts, np.array([0, 600]), RANGE, bin_width=7.5)
     assert (result.quality[0] & Quality.INPUT_MISSING).all()
     assert np.isnan(result.power[0]).all()
     assert np.isfinite(result.power[1]).all()
@@ -115,7 +121,9 @@ def test_dead_time_is_undone(rate: float, dead_time: float) -> None:
     shots = np.array([10_000_000])
     measured = rate / (1.0 + rate * dead_time * 1e6)
     counts = np.full((1, 400), round(measured * shots[0] * 0.05), np.int32)
-    result = counts_to_signal.photon(counts, shots, RANGE, bin_width=7.5, dead_time=dead_time)
+    result = counts_to_signal.photon_signal(
+        counts, shots, RANGE, bin_width=7.5, dead_time=dead_time
+    )
     assert result.power == pytest.approx(rate, rel=2e-4)
     assert bool((result.quality & Quality.PILE_UP).any()) is (rate * dead_time * 1e6 > 0.1)
 
@@ -125,7 +133,7 @@ def test_photon_variance_matches_the_scatter_of_poisson_counts() -> None:
     truth = 0.2 + 40.0 * (750.0 / RANGE) ** 2
     truth[:80] = truth[80]
     counts = rng.poisson(truth * 30.0, (4000, 400)).astype(np.int32)
-    result = counts_to_signal.photon(counts, np.full(4000, 600), RANGE, bin_width=7.5)
+    result = counts_to_signal.photon_signal(counts, np.full(4000, 600), RANGE, bin_width=7.5)
     ratio = result.power.var(axis=0) / result.variance.mean(axis=0)
     # 4000 draws: 2.2 % a bin; smoothing over 10 % of range biases the variance by 1-3 %.
     assert np.abs(ratio[120:] - 1.0).max() < 0.12
@@ -135,7 +143,7 @@ def test_photon_variance_matches_the_scatter_of_poisson_counts() -> None:
 def test_zero_counts_do_not_claim_certainty() -> None:
     counts = np.zeros((2, 400), np.int32)
     counts[0, 7] = 1
-    result = counts_to_signal.photon(counts, np.full(2, 600), RANGE, bin_width=7.5)
+    result = counts_to_signal.photon_signal(counts, np.full(2, 600), RANGE, bin_width=7.5)
     assert (result.variance[0] > 0).all()
     assert not result.quality[0].any()
     # Not a single count in a profile: the recorder was off.
@@ -145,7 +153,7 @@ def test_zero_counts_do_not_claim_certainty() -> None:
 
 def test_paralysed_counters_are_masked() -> None:
     counts = np.full((1, 400), 200 * 30, np.int32)  # 200 MHz
-    result = counts_to_signal.photon(counts, SHOTS, RANGE, bin_width=7.5, dead_time=4e-9)
+    result = counts_to_signal.photon_signal(counts, SHOTS, RANGE, bin_width=7.5, dead_time=4e-9)
     assert (result.quality & Quality.SATURATED).all()
     assert np.isnan(result.power).all()
 
@@ -188,7 +196,9 @@ def test_estimated_noise_serves_a_retrieval_as_well_as_known_noise(
     profiles = 0.1 + 0.15 * shape + rng.normal(0, 0.007, (2000, 2000))
     inside = (distance >= section[0]) & (distance < section[1])
     variance = counts_to_signal.difference_variance(profiles, distance)[:, inside]
-    found = path_fit.solve(profiles[:, inside], distance[inside], weights=1.0 / variance)
+    found = path_fit.fit_homogeneous_path(
+        profiles[:, inside], distance[inside], weights=1.0 / variance
+    )
     good = found.quality == 0
     score = (found.extinction - 2e-4) / found.extinction_standard_error
     assert good.mean() > 0.995
@@ -200,17 +210,19 @@ def test_estimated_noise_serves_a_retrieval_as_well_as_known_noise(
 def test_smoothing_keeps_constants_and_passes_over_nan() -> None:
     values = np.full((2, 400), 3.0)
     values[0, 50:60] = np.nan
-    assert counts_to_signal.smooth(values, RANGE) == pytest.approx(3.0)
-    assert np.isnan(counts_to_signal.smooth(np.full((1, 400), np.nan), RANGE)).all()
+    assert counts_to_signal.smooth_signal(values, RANGE) == pytest.approx(3.0)
+    assert np.isnan(counts_to_signal.smooth_signal(np.full((1, 400), np.nan), RANGE)).all()
 
 
 def _analog(counts, shots, range=RANGE, **settings):  # noqa: A002
     volts = np.full(np.shape(shots), 0.5)
-    return counts_to_signal.analog(counts, shots, range, adc_bits=12, input_range=volts, **settings)
+    return counts_to_signal.analog_signal(
+        counts, shots, range, adc_bits=12, input_range=volts, **settings
+    )
 
 
 def _photon(counts, shots, range=RANGE, **settings):  # noqa: A002
-    return counts_to_signal.photon(counts, shots, range, bin_width=7.5, **settings)
+    return counts_to_signal.photon_signal(counts, shots, range, bin_width=7.5, **settings)
 
 
 def _assert_same_bits(one, other) -> None:
@@ -272,12 +284,12 @@ def test_analog_agrees_with_plain_numpy(bins: int, offset: float) -> None:
     settings = {"adc_bits": 12, "full_overlap_range": 200.0}
     for chosen in (settings, settings | {"dark": rng.normal(0, 0.1, bins)}):
         _assert_agree(
-            counts_to_signal.analog(counts, shots, distance, input_range=volt, **chosen),
+            counts_to_signal.analog_signal(counts, shots, distance, input_range=volt, **chosen),
             oracle_signal.analog(counts, shots, distance, input_range=volt, **chosen),
         )
     known = settings | {"noise_variance": 1e-3, "dark_variance": rng.random(bins) * 1e-2}
     _assert_agree(
-        counts_to_signal.analog(counts, shots, distance, input_range=volt, **known),
+        counts_to_signal.analog_signal(counts, shots, distance, input_range=volt, **known),
         oracle_signal.analog(counts, shots, distance, input_range=volt, **known),
     )
 
@@ -293,7 +305,7 @@ def test_photon_agrees_with_plain_numpy(bins: int, dead_time: float | None) -> N
     shots = np.array([600, 600, 600, 600, 600, 600, 0, 599])
     settings = {"bin_width": 7.5, "dead_time": dead_time, "full_overlap_range": 200.0}
     _assert_agree(
-        counts_to_signal.photon(counts, shots, distance, **settings),
+        counts_to_signal.photon_signal(counts, shots, distance, **settings),
         oracle_signal.photon(counts, shots, distance, **settings),
     )
 
@@ -308,7 +320,7 @@ def test_near_range_does_not_take_the_digits_of_the_far_range(decades: int) -> N
     inside = [values[a:b] for a, b in zip(first, past, strict=True)]
     exact = np.array([math.fsum(window) / window.size for window in inside])
     size = np.array([math.fsum(np.abs(window)) / window.size for window in inside])
-    error = np.abs(counts_to_signal.smooth(values, distance) - exact)
+    error = np.abs(counts_to_signal.smooth_signal(values, distance) - exact)
     whole = (4096 / kernels.BLOCK) ** 2 * 2.0**-106 * np.abs(values).sum() / (past - first)
     assert (error <= (kernels.BLOCK + 3) * 2.0**-53 * size + whole).all()
     if decades > 0:
@@ -328,7 +340,7 @@ def test_windows_never_leave_the_profile() -> None:
     values = np.arange(400.0)
     for window in (1e300, 1e308):
         # Both ends as far from the bin as the nearer end of the profile, or 16 bins.
-        average = counts_to_signal.smooth(values, RANGE * 1e-300, window=window)
+        average = counts_to_signal.smooth_signal(values, RANGE * 1e-300, window=window)
         np.testing.assert_allclose(average[16:-16], values[16:-16])
         assert average[0] == np.mean(values[:17])
         assert average[-1] == np.mean(values[-17:])
@@ -341,13 +353,13 @@ def test_windows_do_not_reach_over_bins_that_were_left_on_disk() -> None:
     settings = {"bin_width": 7.5, "dead_time": 3e-9}
     parts = [slice(0, 700), slice(2400, 2900), slice(3500, 4000)]
     kept = np.r_[tuple(parts)]
-    found = counts_to_signal.photon(counts[:, kept], shots, distance[kept], **settings)
-    whole = counts_to_signal.photon(counts, shots, distance, **settings)
+    found = counts_to_signal.photon_signal(counts[:, kept], shots, distance[kept], **settings)
+    whole = counts_to_signal.photon_signal(counts, shots, distance, **settings)
     np.testing.assert_array_equal(found.power, whole.power[:, kept])
     place = 0
     for part in parts:
         here = slice(place, place + part.stop - part.start)
-        alone = counts_to_signal.photon(counts[:, part], shots, distance[part], **settings)
+        alone = counts_to_signal.photon_signal(counts[:, part], shots, distance[part], **settings)
         np.testing.assert_allclose(found.variance[:, here], alone.variance, rtol=1e-12)
         place = here.stop
     # Light falls by nine decades over the gap: a window over it would take that for noise.
@@ -381,7 +393,8 @@ def test_every_layout_of_the_input_gives_the_same_bits() -> None:
     power = _analog(counts, shots).power
     for values in (power.astype(">f8"), np.asfortranarray(power), power[::-1][::-1]):
         np.testing.assert_array_equal(
-            counts_to_signal.smooth(values, RANGE), counts_to_signal.smooth(power, RANGE)
+            counts_to_signal.smooth_signal(values, RANGE),
+            counts_to_signal.smooth_signal(power, RANGE),
         )
     # Else users would wait for the compiler again and again.
     assert len(kernels.voltage_profiles.signatures) == 1
@@ -422,7 +435,7 @@ def test_nothing_is_missing_without_a_flag() -> None:
     dark = np.zeros(400)
     dark[5] = np.nan
     volts = np.array([0.5, np.nan])
-    result = counts_to_signal.analog(
+    result = counts_to_signal.analog_signal(
         counts, np.full(2, 600), RANGE, adc_bits=12, input_range=volts, dark=dark
     )
     np.testing.assert_array_equal(np.isnan(result.power), result.quality != 0)
@@ -434,7 +447,7 @@ def test_nothing_is_missing_without_a_flag() -> None:
 
 def test_range_correction_carries_both_variances() -> None:
     counts = np.full((1, 400), 900, np.int32)
-    raw = counts_to_signal.photon(counts, SHOTS, RANGE, bin_width=7.5)
+    raw = counts_to_signal.photon_signal(counts, SHOTS, RANGE, bin_width=7.5)
     result = counts_to_signal.range_corrected(
         raw, RANGE, background=np.array([40.0]), background_variance=np.array([0.25])
     )
@@ -478,12 +491,12 @@ _COUNTS = np.ones((1, 400), np.int32)
         ("dark", lambda: _analog(_COUNTS, SHOTS, dark=np.zeros(399))),
         ("dark_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=1.0, dark_variance=[1.0])),
         ("power", lambda: counts_to_signal.difference_variance(np.zeros(399), RANGE)),
-        ("values", lambda: counts_to_signal.smooth(np.zeros(399), RANGE)),
-        ("window", lambda: counts_to_signal.smooth(np.zeros(400), RANGE, window=np.nan)),
-        ("window", lambda: counts_to_signal.smooth(np.zeros(400), RANGE, window=-1.0)),
+        ("values", lambda: counts_to_signal.smooth_signal(np.zeros(399), RANGE)),
+        ("window", lambda: counts_to_signal.smooth_signal(np.zeros(400), RANGE, window=np.nan)),
+        ("window", lambda: counts_to_signal.smooth_signal(np.zeros(400), RANGE, window=-1.0)),
         ("counts", lambda: _analog(_COUNTS > 0, SHOTS)),
         ("counts", lambda: _photon(_COUNTS > 0, SHOTS)),
-        ("bin_width", lambda: counts_to_signal.photon(_COUNTS, SHOTS, RANGE, bin_width=0.0)),
+        ("bin_width", lambda: counts_to_signal.photon_signal(_COUNTS, SHOTS, RANGE, bin_width=0.0)),
         ("dead_time", lambda: _photon(_COUNTS, SHOTS, dead_time=-4e-9)),
         ("noise_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=np.nan)),
         ("full_overlap_range", lambda: _photon(_COUNTS, SHOTS, full_overlap_range=np.nan)),
@@ -495,7 +508,7 @@ _COUNTS = np.ones((1, 400), np.int32)
         ),
         (
             "input_range",
-            lambda: counts_to_signal.analog(
+            lambda: counts_to_signal.analog_signal(
                 _COUNTS, SHOTS, RANGE, adc_bits=12, input_range=np.ones(2)
             ),
         ),
@@ -509,7 +522,7 @@ def test_what_cannot_be_right_is_refused(field, call) -> None:
 
 def test_shapes_that_do_not_fit_are_named() -> None:
     with pytest.raises(RetrievalInputError, match="counts"):
-        counts_to_signal.photon(np.zeros((1, 399), np.int32), SHOTS, RANGE, bin_width=7.5)
+        counts_to_signal.photon_signal(np.zeros((1, 399), np.int32), SHOTS, RANGE, bin_width=7.5)
 
 
 @pytest.mark.parametrize("offset", [-40.0, 0.0, 3.0, 40.0])

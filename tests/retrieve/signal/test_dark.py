@@ -24,7 +24,7 @@ def sessions(rng, *, first=5, second=4, bins=400, noise=0.1, level=0.0):
 
 def test_nearest_is_the_mean_of_the_session_nearest_in_time():
     signals, times = sessions(np.random.default_rng(1))
-    result = dark.profile(signals, times, [-50.0, 1000.0, 3000.0])
+    result = dark.dark_profile(signals, times, [-50.0, 1000.0, 3000.0])
     expected = [signals[:5].mean(axis=0)] * 2 + [signals[5:].mean(axis=0)]
     np.testing.assert_allclose(result.dark, expected, rtol=1e-14)
     np.testing.assert_array_equal(result.weights[0], [0.2] * 5 + [0.0] * 4)
@@ -36,7 +36,7 @@ def test_interpolated_lies_between_the_sessions_and_is_nearest_outside():
     signals, times = sessions(np.random.default_rng(2))
     first, second = 120.0, HOUR + 90.0
     asked = np.array([0.0, first, first + 0.25 * (second - first), second, 9e3])
-    result = dark.profile(signals, times, asked, method="interpolated")
+    result = dark.dark_profile(signals, times, asked, method="interpolated")
     before, after = signals[:5].mean(axis=0), signals[5:].mean(axis=0)
     expected = [before, before, 0.75 * before + 0.25 * after, after, after]
     np.testing.assert_allclose(result.dark, expected, rtol=1e-13)
@@ -52,7 +52,7 @@ def test_variance_is_that_of_the_mean(method):
     for _ in range(60):
         signals, times = sessions(rng, level=0.5)
         signals -= signals.mean(axis=1, keepdims=True)
-        result = dark.profile(signals, times, [1500.0], method=method)
+        result = dark.dark_profile(signals, times, [1500.0], method=method)
         darks.append(result.dark[0])
         variances.append(result.variance[0])
     ratio = np.mean(np.var(darks, axis=0, ddof=1)) / np.mean(variances)
@@ -65,7 +65,7 @@ def test_a_wandering_level_is_told_apart_from_noise():
     for _ in range(200):
         times = 60.0 * np.arange(6)
         signals = rng.normal(0.0, 0.1, (6, 300)) + rng.normal(0.0, 2.0, (6, 1))
-        result = dark.profile(signals, times, [0.0])
+        result = dark.dark_profile(signals, times, [0.0])
         noise.append(result.variance.mean())
         levels.append(result.level_variance)
     assert np.mean(noise) == pytest.approx(0.1**2 / 6, rel=0.02)
@@ -76,7 +76,7 @@ def test_a_single_file_is_judged_by_its_far_bins():
     rng = np.random.default_rng(5)
     signal = rng.normal(0.0, 0.3, (1, 4000)) + 1.0
     signal[0, :200] += 50.0 * np.exp(-np.arange(200) / 40.0)
-    result = dark.profile(signal, [0.0], [10.0, 20.0])
+    result = dark.dark_profile(signal, [0.0], [10.0, 20.0])
     np.testing.assert_array_equal(result.dark, signal[[0, 0]])
     assert result.variance[0, 100] == pytest.approx(0.3**2, rel=0.1)
     assert np.isnan(result.level_variance)
@@ -86,7 +86,7 @@ def test_a_single_file_has_the_scatter_of_other_sessions():
     rng = np.random.default_rng(6)
     signals, times = sessions(rng, first=20, second=1, bins=2000, noise=0.2)
     signals[:, 0] = signals[:, 1000]
-    result = dark.profile(signals, times, [HOUR])
+    result = dark.dark_profile(signals, times, [HOUR])
     assert result.variance[0].mean() == pytest.approx(0.2**2, rel=0.05)
 
 
@@ -96,14 +96,14 @@ def test_smoothing_divides_the_variance_and_keeps_a_straight_dark():
     smooth, rough = [], []
     for _ in range(50):
         signals = straight + rng.normal(0.0, 0.1, (4, 900))
-        result = dark.profile(signals, np.arange(4.0), [0.0], smoothing=21)
+        result = dark.dark_profile(signals, np.arange(4.0), [0.0], smoothing=21)
         smooth.append(result.dark[0] - straight)
         rough.append(result.variance[0])
     inner = slice(10, -10)
     assert np.mean(smooth) == pytest.approx(0.0, abs=4 * 0.05 / np.sqrt(900 * 50))
     assert np.mean(np.array(rough)[:, inner]) == pytest.approx(0.1**2 / 4 / 21, rel=0.03)
     assert np.var(np.array(smooth)[:, inner]) == pytest.approx(0.1**2 / 4 / 21, rel=0.05)
-    exact = dark.profile(straight[np.newaxis], [0.0], [0.0], smoothing=21)
+    exact = dark.dark_profile(straight[np.newaxis], [0.0], [0.0], smoothing=21)
     np.testing.assert_allclose(exact.dark[0], straight, rtol=1e-13)
 
 
@@ -111,12 +111,12 @@ def test_gaps_are_passed_over_and_nothing_is_invented():
     signals, times = sessions(np.random.default_rng(8))
     signals[0, 10] = np.nan
     signals[:5, 20] = np.inf
-    result = dark.profile(signals, times, [0.0, HOUR])
+    result = dark.dark_profile(signals, times, [0.0, HOUR])
     assert result.dark[0, 10] == pytest.approx(signals[1:5, 10].mean())
     assert np.isnan(result.dark[0, 20])
     assert np.isnan(result.variance[0, 20])
     assert np.isfinite(result.dark[1, 20])
-    gone = dark.profile(np.full((3, 50), np.nan), [0.0, 1.0, 2.0], [0.0])
+    gone = dark.dark_profile(np.full((3, 50), np.nan), [0.0, 1.0, 2.0], [0.0])
     assert np.isnan(gone.dark).all()
     assert np.isnan(gone.variance).all()
     assert np.isnan(gone.level_variance)
@@ -128,17 +128,17 @@ def test_leading_axes_order_and_cutting_change_nothing():
     asked = np.linspace(-100.0, 5000.0, 13)
     order = rng.permutation(times.size)
     both = np.stack([signals, 2.0 * signals])
-    whole = dark.profile(both[:, order], times[order], asked, method="interpolated")
-    alone = dark.profile(signals, times, asked[4:6], method="interpolated")
+    whole = dark.dark_profile(both[:, order], times[order], asked, method="interpolated")
+    alone = dark.dark_profile(signals, times, asked[4:6], method="interpolated")
     np.testing.assert_allclose(whole.dark[0, 4:6], alone.dark, rtol=1e-14)
     np.testing.assert_allclose(whole.dark[1], 2.0 * whole.dark[0], rtol=1e-14)
-    cut = dark.profile(both[:, order], times[order], asked[4:6], method="interpolated")
+    cut = dark.dark_profile(both[:, order], times[order], asked[4:6], method="interpolated")
     np.testing.assert_array_equal(whole.dark[:, 4:6], cut.dark)
     np.testing.assert_array_equal(whole.variance[:, 4:6], cut.variance)
     moments = np.datetime64("2024-10-02T00:00:00") + (times * 1e9).astype("m8[ns]")
     wanted = np.datetime64("2024-10-02T00:00:00") + (asked * 1e9).astype("m8[ns]")
-    dated = dark.profile(signals, moments, wanted, method="interpolated")
-    plain = dark.profile(signals, times, asked, method="interpolated")
+    dated = dark.dark_profile(signals, moments, wanted, method="interpolated")
+    plain = dark.dark_profile(signals, times, asked, method="interpolated")
     np.testing.assert_allclose(dated.dark, plain.dark, rtol=1e-12)
 
 
@@ -159,7 +159,7 @@ def test_leading_axes_order_and_cutting_change_nothing():
 def test_impossible_arguments_are_refused(change, field):
     arguments = {"dark_signals": np.ones((2, 5)), "dark_times": [0.0, 1.0], "times": [0.0]}
     with pytest.raises(RetrievalInputError) as error:
-        dark.profile(**(arguments | change))
+        dark.dark_profile(**(arguments | change))
     assert error.value.field == field
 
 
@@ -175,7 +175,7 @@ def test_the_far_range_of_a_real_station_holds_sky_alone(data_root, wavelength):
     folder = data_root / "saopaulo" / "20170928"
     signals, times = _channel(folder / "signals", f"analog_{wavelength}o")
     rates, _ = _channel(folder / "signals", f"photon_{wavelength}o")
-    result = dark.profile(*_channel(folder / "dark", f"analog_{wavelength}o"), times)
+    result = dark.dark_profile(*_channel(folder / "dark", f"analog_{wavelength}o"), times)
     far, near = slice(3000, 4000), slice(400, 420)
     clean = (signals - result.dark).mean(axis=0)
     rate = rates.mean(axis=0)

@@ -9,7 +9,7 @@ from scipy import optimize
 from lidarops.errors import RetrievalInputError
 from lidarops.raw import licel
 from lidarops.retrieve.signal import gluing, lag
-from lidarops.retrieve.signal.counts_to_signal import difference_variance, smooth
+from lidarops.retrieve.signal.counts_to_signal import difference_variance, smooth_signal
 from lidarops.retrieve.signal.gluing import glue
 
 RANGE = (np.arange(800) + 0.5) * 15.0
@@ -295,17 +295,17 @@ def test_a_real_station_is_glued_once_its_lag_is_gone(data_root, wavelength):
     range_ = (np.arange(4000) + 0.5) * 7.5
     clean = analog - dark.mean(axis=0)
     sky = photon[:, 3500:3950].mean(axis=1)
-    found = lag.estimate(analog, photon)
+    found = lag.estimate_lag(analog, photon)
     results = []
     for bins in (0.0, found.lag):
-        moved, _ = lag.shift(clean, bins)
+        moved, _ = lag.shift_signal(clean, bins)
         results.append(
             glue(
                 moved - moved[:, 3500:3950].mean(axis=1, keepdims=True),
                 photon - sky[:, np.newaxis],
                 range_,
                 analog_variance=difference_variance(clean, range_),
-                photon_variance=smooth(photon, range_) / (600 * 0.05),
+                photon_variance=smooth_signal(photon, range_) / (600 * 0.05),
                 photon_background=sky,
             )
         )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.signal.dark import profile as dark_profile
+from lidarops.retrieve.signal.dark import dark_profile
 from lidarops.retrieve.signal.labeled import Dark
 from lidarops.retrieve.signal.labeled_averaging import clock_average
 

@@ -31,7 +31,7 @@ def recorded(rng, true_lag, *, profiles=12, gain_noise=0.5, electronics=2.0):
 @pytest.mark.parametrize("true_lag", [0.0, 3.0, 8.6, -5.25, 9.5, 29.0])
 def test_a_known_lag_comes_back(true_lag):
     rng = np.random.default_rng(1)
-    found = lag.estimate(*recorded(rng, true_lag))
+    found = lag.estimate_lag(*recorded(rng, true_lag))
     assert found.found
     assert found.confidence > 0.9999
     assert abs(found.lag - true_lag) < 3.0 * found.standard_error
@@ -43,7 +43,7 @@ def test_the_standard_error_covers_the_scatter():
     rng = np.random.default_rng(2)
     off, errors = [], []
     for _ in range(60):
-        found = lag.estimate(*recorded(rng, 8.3, profiles=3, electronics=10.0))
+        found = lag.estimate_lag(*recorded(rng, 8.3, profiles=3, electronics=10.0))
         off.append(found.lag - 8.3)
         errors.append(found.standard_error)
     off, errors = np.array(off), np.array(errors)
@@ -54,7 +54,7 @@ def test_the_standard_error_covers_the_scatter():
 
 def test_one_profile_will_do():
     rng = np.random.default_rng(3)
-    found = lag.estimate(*recorded(rng, 6.4, profiles=1), mask=np.arange(BINS) > 200)
+    found = lag.estimate_lag(*recorded(rng, 6.4, profiles=1), mask=np.arange(BINS) > 200)
     assert found.found
     assert abs(found.lag - 6.4) < 3.0 * found.standard_error
 
@@ -62,7 +62,7 @@ def test_one_profile_will_do():
 def test_noise_without_a_common_cause_has_no_lag():
     rng = np.random.default_rng(4)
     analog, photon = rng.normal(size=(2, 1500, 3, 500))
-    found = lag.estimate(analog, photon)
+    found = lag.estimate_lag(analog, photon)
     assert found.found.sum() <= 6
     # The confidence is uniform where there is nothing to find.
     assert found.confidence.mean() == pytest.approx(0.5, abs=0.05)
@@ -72,14 +72,14 @@ def test_noise_without_a_common_cause_has_no_lag():
 def test_profiles_of_different_times_have_no_lag():
     rng = np.random.default_rng(5)
     analog, photon = recorded(rng, 8.6)
-    assert not lag.estimate(analog[1:], photon[:-1]).found
+    assert not lag.estimate_lag(analog[1:], photon[:-1]).found
 
 
 def test_a_lag_beyond_those_tried_is_not_found():
     rng = np.random.default_rng(6)
     analog, photon = recorded(rng, 12.0)
-    assert not lag.estimate(analog, photon, largest_lag=6).found
-    found = lag.estimate(analog, photon, largest_lag=11)
+    assert not lag.estimate_lag(analog, photon, largest_lag=6).found
+    found = lag.estimate_lag(analog, photon, largest_lag=11)
     assert not found.found
 
 
@@ -90,11 +90,11 @@ def test_gaps_dead_channels_and_spikes_do_not_fool():
     photon[3] = np.nan
     analog[:, 700] = 1e6 * rng.normal(size=12)
     photon[:, 705] = 1e6 * rng.normal(size=12)
-    found = lag.estimate(analog, photon)
+    found = lag.estimate_lag(analog, photon)
     assert found.found
     assert abs(found.lag - 8.6) < 3.0 * found.standard_error
     for dead in (np.full(photon.shape, np.nan), np.zeros(photon.shape)):
-        nothing = lag.estimate(analog, dead)
+        nothing = lag.estimate_lag(analog, dead)
         assert np.isnan(nothing.lag)
         assert np.isnan(nothing.standard_error)
         assert nothing.confidence == 0.0
@@ -104,9 +104,9 @@ def test_gaps_dead_channels_and_spikes_do_not_fool():
 def test_channels_are_independent_of_each_other():
     rng = np.random.default_rng(8)
     pairs = [recorded(rng, shift, profiles=4) for shift in (2.5, 7.0)]
-    both = lag.estimate(*(np.stack(signals) for signals in zip(*pairs, strict=True)))
+    both = lag.estimate_lag(*(np.stack(signals) for signals in zip(*pairs, strict=True)))
     for k, pair in enumerate(pairs):
-        alone = lag.estimate(*(signal.astype(">f8") for signal in pair))
+        alone = lag.estimate_lag(*(signal.astype(">f8") for signal in pair))
         assert both.lag[k] == alone.lag
         assert both.standard_error[k] == alone.standard_error
         np.testing.assert_array_equal(both.correlation[k], alone.correlation)
@@ -118,15 +118,15 @@ def test_a_real_station(data_root):
     names = ["analog_532o", "photon_532o"]
     headers, values = licel.read_physical(files, names, dtype=np.float64)
     assert {d.bin_shift for d in headers[0].channels if d.name in names} == {0.0}
-    found = lag.estimate(*(values[name] for name in names))
+    found = lag.estimate_lag(*(values[name] for name in names))
     assert found.found
     assert abs(found.lag - 8.6) < 0.2
     assert found.standard_error < 0.2
     for part in (slice(0, 8), slice(8, 16)):
-        again = lag.estimate(*(values[name][part] for name in names))
+        again = lag.estimate_lag(*(values[name][part] for name in names))
         assert again.found
         assert abs(again.lag - found.lag) < 0.05
-    assert not lag.estimate(values[names[0]][1:], values[names[1]][:-1]).found
+    assert not lag.estimate_lag(values[names[0]][1:], values[names[1]][:-1]).found
 
 
 # The shift ----------------------------------------------------------------------------------
@@ -136,12 +136,12 @@ def test_a_real_station(data_root):
 def test_a_whole_shift_moves_bins(interpolation):
     values = np.arange(10.0) ** 2
     variance = np.arange(10.0) + 1.0
-    moved, noise = lag.shift(values, 3, variance=variance, interpolation=interpolation)
+    moved, noise = lag.shift_signal(values, 3, variance=variance, interpolation=interpolation)
     np.testing.assert_array_equal(moved[:7], values[3:])
     np.testing.assert_array_equal(noise[:7], variance[3:])
     assert np.isnan(moved[7:]).all()
     assert np.isnan(noise[7:]).all()
-    back, _ = lag.shift(values, -2.0, interpolation=interpolation)
+    back, _ = lag.shift_signal(values, -2.0, interpolation=interpolation)
     np.testing.assert_array_equal(back[2:], values[:-2])
     assert np.isnan(back[:2]).all()
 
@@ -152,7 +152,7 @@ def test_a_part_of_a_bin_is_exact_on_polynomials(interpolation, degree):
     coefficients = [0.5, -0.02, 0.001, -1e-5][: degree + 1]
     values = np.polynomial.Polynomial(coefficients)(index)
     for amount in (0.3, 8.6, -4.75):
-        moved, _ = lag.shift(values, amount, interpolation=interpolation)
+        moved, _ = lag.shift_signal(values, amount, interpolation=interpolation)
         expected = np.polynomial.Polynomial(coefficients)(index + amount)
         inside = np.isfinite(moved)
         assert inside.sum() >= 40 - abs(amount) - degree
@@ -164,7 +164,7 @@ def test_variance_follows_the_noise(interpolation):
     rng = np.random.default_rng(9)
     sigma = np.linspace(1.0, 3.0, 30)
     values = sigma * rng.normal(size=(20000, 30))
-    moved, noise = lag.shift(values, 2.4, variance=sigma**2, interpolation=interpolation)
+    moved, noise = lag.shift_signal(values, 2.4, variance=sigma**2, interpolation=interpolation)
     inside = np.isfinite(moved[0])
     np.testing.assert_allclose(moved[:, inside].var(axis=0), noise[0, inside], rtol=0.06)
 
@@ -172,12 +172,12 @@ def test_variance_follows_the_noise(interpolation):
 def test_gaps_stay_gaps_and_spread_only_where_they_are_used():
     values = np.arange(12.0)
     values[5] = np.nan
-    whole, _ = lag.shift(values, 2)
+    whole, _ = lag.shift_signal(values, 2)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(whole)), [3, 10, 11])
-    part, noise = lag.shift(values, 2.5, variance=1.0)
+    part, noise = lag.shift_signal(values, 2.5, variance=1.0)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(part)), [2, 3, 9, 10, 11])
     np.testing.assert_array_equal(np.isnan(noise), np.isnan(part))
-    far, _ = lag.shift(values, 1e9)
+    far, _ = lag.shift_signal(values, 1e9)
     assert np.isnan(far).all()
 
 
@@ -185,20 +185,20 @@ def test_each_profile_may_have_its_own_lag():
     rng = np.random.default_rng(10)
     values = rng.normal(size=(2, 3, 50)).astype(np.float32)
     lags = np.array([[0.0, 1.5, -2.0], [8.6, 3.0, 0.25]])
-    moved, noise = lag.shift(values, lags)
+    moved, noise = lag.shift_signal(values, lags)
     assert np.isnan(noise).all()
     for k in np.ndindex(2, 3):
-        np.testing.assert_array_equal(moved[k], lag.shift(values[k], lags[k])[0])
-    np.testing.assert_array_equal(lag.shift(values, 0.0)[0], values)
+        np.testing.assert_array_equal(moved[k], lag.shift_signal(values[k], lags[k])[0])
+    np.testing.assert_array_equal(lag.shift_signal(values, 0.0)[0], values)
 
 
 def test_a_found_lag_aligns():
     """Shifted by its lag, the analog signal has none left."""
     rng = np.random.default_rng(11)
     analog, photon = recorded(rng, 8.6)
-    found = lag.estimate(analog, photon)
-    moved, _ = lag.shift(analog, found.lag)
-    left = lag.estimate(moved, photon)
+    found = lag.estimate_lag(analog, photon)
+    moved, _ = lag.shift_signal(analog, found.lag)
+    left = lag.estimate_lag(moved, photon)
     assert left.found
     assert abs(left.lag) < 3.0 * left.standard_error
     assert abs(left.lag) < 0.3
@@ -219,7 +219,7 @@ def test_a_found_lag_aligns():
 def test_impossible_arguments_are_refused(change, field):
     arguments = {"analog": np.ones((2, 500)), "photon_counting": np.ones((2, 500))} | change
     with pytest.raises(RetrievalInputError) as error:
-        lag.estimate(**arguments)
+        lag.estimate_lag(**arguments)
     assert error.value.field == field
 
 
@@ -236,5 +236,5 @@ def test_impossible_arguments_are_refused(change, field):
 def test_impossible_shifts_are_refused(change, field):
     arguments = {"profile": np.ones((2, 20)), "lag": 1.0} | change
     with pytest.raises(RetrievalInputError) as error:
-        lag.shift(arguments.pop("profile"), arguments.pop("lag"), **arguments)
+        lag.shift_signal(arguments.pop("profile"), arguments.pop("lag"), **arguments)
     assert error.value.field == field

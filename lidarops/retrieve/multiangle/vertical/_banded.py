@@ -65,7 +65,7 @@ def _penalty(step: Array) -> Array:
 
 
 @_compiled
-def multiply(bands: Array, vector: Array, out: Array) -> None:
+def multiply_banded(bands: Array, vector: Array, out: Array) -> None:
     """Multiply a vector by one symmetric pentadiagonal matrix of (3, height) bands."""
     heights = vector.size
     for k in range(heights):
@@ -83,7 +83,7 @@ def multiply_rows(bands: Array, vectors: Array) -> Array:
     """Multiply (profile, height) rows, each by its own matrix of (3, profile, height) bands."""
     out = np.empty_like(vectors)
     for t in range(vectors.shape[0]):
-        multiply(bands[:, t], vectors[t], out[t])
+        multiply_banded(bands[:, t], vectors[t], out[t])
     return out
 
 
@@ -193,7 +193,7 @@ def _work(heights: int) -> tuple[Array, Array, Array, Array]:
 
 
 @_compiled
-def solve(
+def solve_banded(
     bands: Array, right: Array, stiffness: Array, profile: Integers, lam: Array, out: Array
 ) -> None:
     r"""Solve :math:`(\Omega + \lambda K) x = b`, with the inverse within the bands.
@@ -236,7 +236,7 @@ def _load_system(
 
 @_compiled
 def _misfits(o: Array, b: Array, t: Array, f: Array, c: Array, total: Array) -> None:
-    """Sum over heights what `scores` gives, 16 systems at a time, into (4, lane) totals."""
+    """Sum over heights what `banded_scores` gives, 16 systems at a time, into (4, lane) totals."""
     total[:] = 0.0
     product = np.ones(LANES)
     likely, rss, free = total[0], total[1], total[2]
@@ -259,7 +259,7 @@ def _misfits(o: Array, b: Array, t: Array, f: Array, c: Array, total: Array) -> 
 
 
 @_compiled
-def scores(
+def banded_scores(
     bands: Array,
     right: Array,
     estimates: Array,
@@ -272,7 +272,7 @@ def scores(
     Parameters
     ----------
     bands, right, stiffness, profile, lam
-        As for `solve`, with right sides :math:`\Omega t`.
+        As for `solve_banded`, with right sides :math:`\Omega t`.
     estimates : (profile, height) float64
         :math:`t`, 0 where there is none.
 

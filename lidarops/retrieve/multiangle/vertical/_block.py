@@ -132,7 +132,7 @@ class VerticalSystem:
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class VerticalSolution:
     """Everything that the blocks gave, as `lidarops.retrieve.multiangle.vertical.smooth_profile.VerticalResult` has it."""
 
     optical_depth: Array
@@ -171,7 +171,7 @@ class _Fit:
 
     information: Array
     bands: Array
-    choice: _smoothing_choice.Choice
+    choice: _smoothing_choice.SmoothingChoice
     pairs: Pairs
     depth: Array
     variance: Array
@@ -183,7 +183,7 @@ class _Fit:
 
 def _solve_pairs(right: Array, bands: Array, stiffness: Array, pairs: Pairs) -> Array:
     out = np.empty((4, pairs.profile.size, right.shape[1]))
-    _banded.solve(bands, right, stiffness, pairs.profile, pairs.smoothing, out)
+    _banded.solve_banded(bands, right, stiffness, pairs.profile, pairs.smoothing, out)
     return out
 
 
@@ -210,7 +210,7 @@ def _usual_information(information: Array) -> float:
     return float(min(there.mean(), _USUAL_INFORMATION * np.median(there)))
 
 
-def _telling(problem: _inputs.Problem, member: Integers) -> Integers:
+def _telling(problem: _inputs.VerticalProblem, member: Integers) -> Integers:
     """Return the members that are not negligible beside the others of their block."""
     height = problem.altitude - problem.station_altitude
     total = (problem.information[member] * height**2).sum(axis=1)
@@ -225,8 +225,8 @@ def _fit(block: _Block, information: Array) -> _Fit:
     share = block.share * _ratio(information, block.information)
     bands = _precision(block, information, share)
     unit = _usual_information(information) * block.extent**3
-    choice = _smoothing_choice.choose(
-        _smoothing_choice.score(bands, block.estimates, block.stiffness, unit)
+    choice = _smoothing_choice.choose_smoothing(
+        _smoothing_choice.score_smoothing(bands, block.estimates, block.stiffness, unit)
     )
     candidates = choice.smoothing.size
     pairs = Pairs(
@@ -256,10 +256,10 @@ def _fit(block: _Block, information: Array) -> _Fit:
 
 
 def _precision(block: _Block, information: Array, share: Array) -> Array:
-    bands = _correlation.precision(information, share, block.correlation)
+    bands = _correlation.correlated_precision(information, share, block.correlation)
     rows = block.gaps
     if rows.size and block.correlation > 0.0:
-        bands[:, rows] = _gaps.precision(information[rows], share[rows], block.correlation)
+        bands[:, rows] = _gaps.gap_precision(information[rows], share[rows], block.correlation)
     return bands
 
 
@@ -279,7 +279,9 @@ def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calib
     rough = _solve_pairs(right, fit.bands, block.stiffness, pilot)[0]
     right = _banded.multiply_rows(fit.bands, rough)
     smooth = _solve_pairs(right, fit.bands, block.stiffness, fit.pairs)[0]
-    bands = _correlation.precision(information[np.newaxis], share[np.newaxis], block.correlation)
+    bands = _correlation.correlated_precision(
+        information[np.newaxis], share[np.newaxis], block.correlation
+    )
     return _calibration.Calibration(
         np.ascontiguousarray(bands[:, 0]),
         information,
@@ -313,7 +315,7 @@ def _within_reach(information: Array) -> Booleans:
 
 
 def _block(
-    problem: _inputs.Problem,
+    problem: _inputs.VerticalProblem,
     member: Integers,
     moments: ResidualMoments | None,
     stiffness: Array,
@@ -352,7 +354,7 @@ def _members(labels: npt.NDArray[np.int64], there: Booleans) -> list[Integers]:
 def _solve_block(block: _Block, *, gate_pass: bool) -> _Fit:
     if not gate_pass:
         return _fit(block, block.information)
-    screened = _outliers.screen(block.estimates, block.information)
+    screened = _outliers.screen_outliers(block.estimates, block.information)
     fit = _fit(block, _outliers.believed(block.information, screened))
     doubted = _outliers.doubted(
         block.estimates, block.information, block.share, fit.depth, fit.variance
@@ -394,7 +396,7 @@ class _Part:
 
 
 def _part(
-    problem: _inputs.Problem,
+    problem: _inputs.VerticalProblem,
     member: Integers,
     moments: ResidualMoments | None,
     within: Booleans,
@@ -415,14 +417,14 @@ def _part(
     return _Part(member, block, fit, noise, most <= 0.0)
 
 
-def solve(
-    problem: _inputs.Problem,
+def solve_vertical_blocks(
+    problem: _inputs.VerticalProblem,
     labels: npt.NDArray[np.int64],
     moments: ResidualMoments | None,
     *,
     gate_pass: bool,
-) -> Solution:
-    """Solve all blocks, see `lidarops.retrieve.multiangle.vertical.smooth_profile.smooth`."""
+) -> VerticalSolution:
+    """Solve all blocks, see `lidarops.retrieve.multiangle.vertical.smooth_profile.smooth_optical_depth`."""
     shape = problem.optical_depth.shape
     step = np.diff(problem.altitude, prepend=problem.station_altitude)
     within = _within_reach(problem.information)
@@ -456,7 +458,7 @@ def solve(
         _joined(pairs),
         tuple(blocks),
     )
-    return Solution(
+    return VerticalSolution(
         **rows,
         **scalars,
         downweighted=downweighted,

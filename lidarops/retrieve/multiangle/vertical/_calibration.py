@@ -143,7 +143,7 @@ def sandwich(
             x[below] = -1.0
         _substitute(solution, x)
         posterior = x[k] - (x[below] if below >= 0 else 0.0)
-        _banded.multiply(bands, x, y)
+        _banded.multiply_banded(bands, x, y)
         inner = 0.0
         for j in range(x.size):
             inner += x[j] * y[j]
@@ -155,7 +155,7 @@ def sandwich(
         if below >= 0:
             x[below] -= 1.0
         _substitute(pilot, x)
-        _banded.multiply(bands, x, y)
+        _banded.multiply_banded(bands, x, y)
         out[3, i] = _noise(y, information, share, correlation)
     return out
 

@@ -125,7 +125,7 @@ def fit(products: Array, norms: Array) -> tuple[float, float]:
 
 
 @_compiled
-def precision(information: Array, share: Array, correlation: float) -> Array:
+def correlated_precision(information: Array, share: Array, correlation: float) -> Array:
     r"""Return the precision of the estimates as an autoregressive process along height.
 
     Noise of which only a share is correlated is no such process. The one here has its variance

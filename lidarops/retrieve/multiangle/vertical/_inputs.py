@@ -22,7 +22,7 @@ _UNIFORM: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class VerticalProblem:
     """Estimates of single heights, cleaned."""
 
     optical_depth: Array
@@ -76,13 +76,13 @@ def rays(*arrays: npt.ArrayLike) -> tuple[Array, Array, Array]:
     return first, second, third
 
 
-def problem(
+def vertical_problem(
     optical_depth: npt.ArrayLike,
     information: npt.ArrayLike,
     altitude: npt.ArrayLike,
     station_altitude: float,
-) -> Problem:
-    """Check and clean the input of `lidarops.retrieve.multiangle.vertical.smooth_profile.smooth`.
+) -> VerticalProblem:
+    """Check and clean the input of `lidarops.retrieve.multiangle.vertical.smooth_profile.smooth_optical_depth`.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def problem(
     weight[~np.isfinite(weight) | (weight < _INFORMATION[0])] = 0.0
     weight[~np.isfinite(depth) | (np.abs(depth) > LARGEST_DEPTH)] = 0.0
     depth[weight == 0.0] = 0.0
-    return Problem(depth, np.minimum(weight, _INFORMATION[1]), grid, station)
+    return VerticalProblem(depth, np.minimum(weight, _INFORMATION[1]), grid, station)
 
 
 def _grid(altitude: npt.ArrayLike, station_altitude: float) -> tuple[Array, float]:
@@ -172,7 +172,7 @@ def labels(block: npt.ArrayLike | None, profiles: int) -> npt.NDArray[Any]:
     return array
 
 
-def moments(given: ResidualMoments, problem_: Problem) -> ResidualMoments:
+def moments(given: ResidualMoments, problem_: VerticalProblem) -> ResidualMoments:
     """Return residual moments with their shapes checked.
 
     Raises

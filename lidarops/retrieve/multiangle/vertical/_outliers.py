@@ -36,7 +36,7 @@ def _jumps(depth: Array, information: Array, there: npt.NDArray[np.int64], count
 
 
 @_compiled
-def screen(estimates: Array, information: Array) -> Array:
+def screen_outliers(estimates: Array, information: Array) -> Array:
     """Return the information with estimates weighted down that are far from their neighbours.
 
     They are compared with the median of a window. A profile that rises has its middle value in

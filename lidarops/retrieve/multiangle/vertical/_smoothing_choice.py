@@ -28,7 +28,7 @@ _NEGLIGIBLE: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class SmoothingChoice:
     """Weights of smoothness of one block."""
 
     smoothing: Array
@@ -60,7 +60,7 @@ class Scores:
     """Profiles of the block, scored or not."""
 
 
-def score(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scores:
+def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scores:
     r"""Score every weight on the grid for the profiles of one block that have data.
 
     With :math:`x` the solution, :math:`C` its covariance and the profiles pooled,
@@ -91,7 +91,7 @@ def score(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scor
     right = _banded.multiply_rows(bands, estimates)
     profile = np.repeat(scored, GRID.size)
     lam = np.tile(GRID * unit, scored.size)
-    raw = _banded.scores(bands, right, estimates, stiffness, profile, lam)
+    raw = _banded.banded_scores(bands, right, estimates, stiffness, profile, lam)
     fit, misfit, freedom, logarithm = raw.reshape(4, scored.size, GRID.size)
     likelihood = (fit + logarithm - (heights - 1) * np.log(GRID * unit)).sum(axis=0)
     # Where a pivot lost all its digits, the weight is too large to be thought of.
@@ -103,7 +103,7 @@ def score(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scor
     return Scores(likelihood, risk[sane].sum(axis=0), freedom.mean(axis=0), profiles)
 
 
-def choose(scores: Scores) -> Choice:
+def choose_smoothing(scores: Scores) -> SmoothingChoice:
     """Choose the weight of a block, or the weights to average over.
 
     Profiles of a block share their shape, which the likelihood takes for independent draws: in
@@ -119,14 +119,16 @@ def choose(scores: Scores) -> Choice:
     risky = max(risky, likely - PER_DECADE)
     rougher = scores.freedom[risky] > _SWITCH * scores.freedom[likely]
     best = risky if rougher else likely
-    return Choice(GRID[best : best + 1], np.ones(1), float(scores.freedom[best]), best == last)
+    return SmoothingChoice(
+        GRID[best : best + 1], np.ones(1), float(scores.freedom[best]), best == last
+    )
 
 
-def _average(scores: Scores, last: int) -> Choice:
+def _average(scores: Scores, last: int) -> SmoothingChoice:
     likelihood = scores.likelihood[: last + 1]
     share = np.exp(-0.5 * (likelihood - likelihood.min()))
     kept = np.flatnonzero(share > _NEGLIGIBLE)
     share = share[kept] / share[kept].sum()
     freedom = float((share * scores.freedom[kept]).sum())
     saturated = int(kept[np.argmax(share)]) == last
-    return Choice(GRID[kept], share, freedom, saturated)
+    return SmoothingChoice(GRID[kept], share, freedom, saturated)

@@ -67,7 +67,7 @@ def _own_noise(share: Array, linked: Booleans, k: int) -> float:
 
 
 @_compiled
-def precision(information: Array, share: Array, correlation: float) -> Array:
+def gap_precision(information: Array, share: Array, correlation: float) -> Array:
     r"""Return the precision of estimates of which neighbours come from other rays.
 
     The noise is :math:`n_k = c_k + e_k`: the first is shared, of variance :math:`f / I` and

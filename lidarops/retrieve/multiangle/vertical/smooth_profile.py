@@ -43,7 +43,7 @@ __all__ = [
     "monotone_optical_depth",
     "residual_moments",
     "respond",
-    "smooth",
+    "smooth_optical_depth",
 ]
 
 
@@ -112,7 +112,7 @@ def residual_moments(
     inhomogeneity_share: npt.ArrayLike,
     gaps: npt.ArrayLike | None = None,
 ) -> ResidualMoments:
-    r"""Sum what `smooth` needs to know of the residuals of a fit over rays.
+    r"""Sum what `smooth_optical_depth` needs to know of the residuals of a fit over rays.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def residual_moments(
     return ResidualMoments(products, norms, share, freedom, holed)
 
 
-def smooth(
+def smooth_optical_depth(
     optical_depth: npt.ArrayLike,
     information: npt.ArrayLike,
     altitude: npt.ArrayLike,
@@ -222,14 +222,14 @@ def smooth(
     patterson1971 (likelihood), mallows1973 (Cp), wahba1983 (intervals), takahashi1973
     (variances), beaton1974 (bisquare).
     """
-    problem = _inputs.problem(optical_depth, information, altitude, station_altitude)
+    problem = _inputs.vertical_problem(optical_depth, information, altitude, station_altitude)
     labels = _inputs.labels(block, problem.optical_depth.shape[0])
     moments = None if residuals is None else _inputs.moments(residuals, problem)
-    return _result(_block.solve(problem, labels, moments, gate_pass=gate_pass))
+    return _result(_block.solve_vertical_blocks(problem, labels, moments, gate_pass=gate_pass))
 
 
 def respond(system: VerticalSystem, profiles: npt.ArrayLike) -> Array:
-    """Return what `smooth` would make of other estimates with the same weights.
+    """Return what `smooth_optical_depth` would make of other estimates with the same weights.
 
     Linear: the smoother of each profile applied to its row. The reply to the optical depth of
     a model atmosphere is what the smoother takes from it.
@@ -353,7 +353,7 @@ def monotone_optical_depth(result: VerticalResult) -> Array:
     return monotone.project(result.optical_depth)
 
 
-def _result(solution: _block.Solution) -> VerticalResult:
+def _result(solution: _block.VerticalSolution) -> VerticalResult:
     """Turn what the blocks gave into the public result."""
     system = solution.system
     used, within = system.information > 0.0, system.within_reach

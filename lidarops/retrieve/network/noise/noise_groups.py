@@ -24,7 +24,7 @@ _SHARE: Final = 0.1
 _LEAST: Final = 1e-30
 
 
-def part(
+def split_by_noise(
     signal: Array,
     rows: Array,
     row: Indices,

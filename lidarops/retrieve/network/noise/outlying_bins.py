@@ -160,7 +160,9 @@ def neighbours(
 
 
 @_compiled
-def plan(grid: Array, limits: Indices, nodes: Indices, shares: Array, air: Array) -> None:
+def plan_neighbours(
+    grid: Array, limits: Indices, nodes: Indices, shares: Array, air: Array
+) -> None:
     """Fill, for each ray and gate, its neighbours where all gates are good.
 
     Parameters
@@ -190,10 +192,10 @@ def plan(grid: Array, limits: Indices, nodes: Indices, shares: Array, air: Array
 
 
 def planned(grid: Array, limits: Indices) -> tuple[Indices, Array, Array]:
-    """Return what `plan` fills."""
+    """Return what `plan_neighbours` fills."""
     shape = (*grid.shape, NODES)
     out = np.zeros(shape, dtype=np.intp), np.zeros(shape), np.full(grid.shape, np.nan)
-    plan(grid, limits, *out)
+    plan_neighbours(grid, limits, *out)
     return out
 
 
@@ -447,7 +449,7 @@ def _quiet(
 
 
 @_compiled
-def find(
+def find_outliers(
     row: tuple[Array, Array, Array, Array],
     exponent: float,
     relative: bool,
@@ -474,7 +476,7 @@ def find(
         First of all gates, first and behind the last of those that are used, behind the last of
         all.
     planned : (bin, NODES) intp, (bin, NODES) float64, (bin,) float64
-        Of `plan`.
+        Of `plan_neighbours`.
     codes : (bin,) uint8
         In: GOOD or LOST; out: also BRIDGED.
     marked : (bin,) uint8
@@ -517,7 +519,7 @@ def find(
 
 
 @_compiled
-def bridge(
+def replace_outliers(
     logs: Array,
     noise: Array,
     exponent: float,

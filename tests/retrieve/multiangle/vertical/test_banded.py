@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded
-from lidarops.retrieve.multiangle.vertical._correlation import precision
+from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision
 
 STATION = 35.0
 
@@ -21,7 +21,9 @@ def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
     information[rng.random((profiles, heights)) < missing] = 0.0
     information[:, heights // 2] = 5.0
     estimates = np.where(information > 0.0, rng.normal(size=(profiles, heights)), 0.0)
-    bands = precision(information, rng.uniform(0.3, 1.0, (profiles, heights)), correlation)
+    bands = correlated_precision(
+        information, rng.uniform(0.3, 1.0, (profiles, heights)), correlation
+    )
     altitude = STATION + 120.0 + 30.0 * np.arange(heights)
     stiffness = _banded.penalty(altitude, STATION)
     return bands, estimates, stiffness, 10.0 ** rng.uniform(3.0, 8.0, profiles)
@@ -31,7 +33,7 @@ def solved(bands, estimates, stiffness, lam):
     profiles, heights = estimates.shape
     out = np.empty((4, profiles, heights))
     right = _banded.multiply_rows(bands, estimates)
-    _banded.solve(bands, right, stiffness, np.arange(profiles), lam, out)
+    _banded.solve_banded(bands, right, stiffness, np.arange(profiles), lam, out)
     return out
 
 
@@ -55,7 +57,7 @@ def test_scores_equal_dense_algebra():
     bands, estimates, stiffness, lam = systems(np.random.default_rng(1), 21, 33)
     right = _banded.multiply_rows(bands, estimates)
     which = np.array([20, 3, 3, 7, *range(15)])
-    scores = _banded.scores(bands, right, estimates, stiffness, which, lam[which])
+    scores = _banded.banded_scores(bands, right, estimates, stiffness, which, lam[which])
     for i, t in enumerate(which):
         weight = dense(bands[:, t])
         system = weight + lam[t] * dense(stiffness)
@@ -79,12 +81,12 @@ def test_solution_keeps_8_digits_of_60(smoothing, correlation):
     altitude = 150.0 + 30.0 * np.arange(heights)
     truth = 1e-4 * altitude
     estimates = (truth + rng.normal(size=heights) / np.sqrt(information[0]))[np.newaxis]
-    bands = precision(information, np.full((1, heights), 0.9), correlation)
+    bands = correlated_precision(information, np.full((1, heights), 0.9), correlation)
     stiffness = _banded.penalty(altitude, 0.0)
     lam = np.array([smoothing * information.mean() * altitude[-1] ** 3])
     right = _banded.multiply_rows(bands, estimates)
     out = np.empty((4, 1, heights))
-    _banded.solve(bands, right, stiffness, np.zeros(1, dtype=np.int64), lam, out)
+    _banded.solve_banded(bands, right, stiffness, np.zeros(1, dtype=np.int64), lam, out)
     with mp.workdps(60):
         exact, inverse_last = _exact(bands[:, 0], stiffness, float(lam[0]), estimates[0])
     assert np.abs(out[0, 0] - exact).max() <= 1e-8 * np.abs(exact).max()
@@ -158,7 +160,7 @@ def test_lanes_do_not_know_of_each_other(seed, count):
 def test_precision_is_the_inverse_of_the_covariance_of_an_autoregressive_process(missing):
     information = np.linspace(2.0, 9.0, 10)[np.newaxis].copy()
     information[0, list(missing)] = 0.0
-    bands = precision(information, np.ones((1, 10)), 0.6)
+    bands = correlated_precision(information, np.ones((1, 10)), 0.6)
     there = np.flatnonzero(information[0])
     apart = np.abs(np.subtract.outer(there, there))
     # A hole of two heights and more separates what is below it from what is above.

@@ -9,7 +9,7 @@ import pytest
 from support.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded, _calibration
-from lidarops.retrieve.multiangle.vertical._correlation import precision
+from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision
 
 HEIGHTS = 30
 EVERY = np.arange(HEIGHTS)
@@ -20,7 +20,7 @@ def calibration(correlation=0.6, profiles=1, heights=HEIGHTS):
     information = rng.uniform(20.0, 80.0, heights)
     information[7] = 0.0
     share = rng.uniform(0.2, 1.0, heights)
-    bands = precision(information[np.newaxis], share[np.newaxis], correlation)
+    bands = correlated_precision(information[np.newaxis], share[np.newaxis], correlation)
     stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1), 0.0)
     return _calibration.Calibration(
         np.ascontiguousarray(bands[:, 0]),
@@ -116,7 +116,7 @@ def test_rows_left_out_are_interpolated():
         share=np.linspace(1.0, 0.2, 600),
         scale=np.linspace(0.3, 3.0, 20),
     )
-    bands = precision(c.information[np.newaxis], c.share[np.newaxis], c.correlation)
+    bands = correlated_precision(c.information[np.newaxis], c.share[np.newaxis], c.correlation)
     c = replace(c, bands=np.ascontiguousarray(bands[:, 0]))
     for lower in (np.full(600, -1), every - 1):
         bias = c.bias - np.where(lower >= 0, c.bias[:, np.maximum(lower, 0)], 0.0)

@@ -28,7 +28,7 @@ from lidarops.retrieve.multiangle.vertical.smooth_profile import (
     monotone_optical_depth,
     residual_moments,
     respond,
-    smooth,
+    smooth_optical_depth,
 )
 
 ALTITUDE = 150.0 + 30.0 * np.arange(60)
@@ -36,7 +36,7 @@ PER_KM = 1e-3
 
 
 def solve(scene, found, **options):
-    return smooth(
+    return smooth_optical_depth(
         found.optical_depth,
         found.information,
         scene.altitude,
@@ -92,7 +92,7 @@ def test_solution_is_that_of_intercepts_and_optical_depths_together():
     square = (weight * centred**2).sum(axis=0)
     depth = -0.5 * (weight * centred * y).sum(axis=0) / square
     altitude = 100.0 + 30.0 * np.arange(heights)
-    result = smooth(depth[None], 4.0 * square[None], altitude, station_altitude=0.0)
+    result = smooth_optical_depth(depth[None], 4.0 * square[None], altitude, station_altitude=0.0)
     shares = result.system.pairs.share
     stiffness = dense(_banded.penalty(altitude, 0.0))
     together = np.zeros(heights)
@@ -110,7 +110,7 @@ def test_solution_is_that_of_intercepts_and_optical_depths_together():
 
 def test_constant_extinction_is_returned_exactly_and_called_saturated():
     depth = np.tile(4e-5 * ALTITUDE, (10, 1))
-    result = smooth(depth, np.full(depth.shape, 1e4), ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, np.full(depth.shape, 1e4), ALTITUDE, station_altitude=0.0)
     np.testing.assert_allclose(result.optical_depth, depth, rtol=1e-9)
     np.testing.assert_allclose(result.extinction, 4e-5, rtol=1e-7)
     np.testing.assert_allclose(result.data_share, 1.0, rtol=1e-9)
@@ -120,7 +120,7 @@ def test_constant_extinction_is_returned_exactly_and_called_saturated():
 
 def test_extinction_adds_up_to_the_optical_depth():
     depth, information, _ = plain(12, np.random.default_rng(0))
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     steps = np.diff(ALTITUDE, prepend=0.0)
     sums = np.cumsum(result.extinction * steps, axis=1)
     np.testing.assert_allclose(sums, result.optical_depth, atol=1e-12)
@@ -129,8 +129,8 @@ def test_extinction_adds_up_to_the_optical_depth():
 @pytest.mark.parametrize("profiles", [3, 12])
 def test_station_may_lie_at_any_altitude(profiles):
     depth, information, _ = plain(profiles, np.random.default_rng(0))
-    low = smooth(depth, information, ALTITUDE, station_altitude=0.0)
-    high = smooth(depth, information, ALTITUDE + 2500.0, station_altitude=2500.0)
+    low = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
+    high = smooth_optical_depth(depth, information, ALTITUDE + 2500.0, station_altitude=2500.0)
     np.testing.assert_allclose(high.optical_depth, low.optical_depth, rtol=1e-9)
     np.testing.assert_allclose(high.reach, low.reach + 2500.0)
 
@@ -140,7 +140,7 @@ def test_response_is_linear_and_of_the_solution_itself():
     for profiles in (3, 12):
         depth, information, _ = plain(profiles, rng)
         information[0, 10:13] = 0.0
-        result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+        result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
         np.testing.assert_allclose(
             respond(result.system, depth), result.optical_depth, rtol=1e-9, atol=1e-12
         )
@@ -322,7 +322,7 @@ def test_layers_are_as_uncertain_as_stated(profiles):
 @pytest.mark.parametrize("profiles", [3, 12])
 def test_layer_from_the_station_is_the_optical_depth(profiles):
     depth, information, _ = plain(profiles, np.random.default_rng(0))
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     layer = layer_optical_depth(result, 0.0, ALTITUDE[20] + 3.0)
     np.testing.assert_allclose(layer.optical_depth, result.optical_depth[:, 20])
     error = result.optical_depth_standard_error[:, 20]
@@ -359,7 +359,7 @@ def test_outlying_estimates_do_little_harm():
     depth, information, truth = plain(100, rng)
     wrong = depth + (rng.random(depth.shape) < 0.05) * 0.4
     clean, robust, naive = (
-        smooth(rows, information, ALTITUDE, station_altitude=0.0, gate_pass=gate_pass)
+        smooth_optical_depth(rows, information, ALTITUDE, station_altitude=0.0, gate_pass=gate_pass)
         for rows, gate_pass in ((depth, True), (wrong, True), (wrong, False))
     )
     errors = [rms(result.optical_depth - truth) for result in (clean, robust, naive)]
@@ -377,7 +377,7 @@ def test_gate_pass_costs_clean_data_nothing():
     rng = np.random.default_rng(11)
     depth, information, _ = plain(100, rng)
     depth[0, 30] += 0.12
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     assert result.downweighted[0, 30]
     share = result.system.information / information
     assert np.median(share[1:]) > 1.0
@@ -386,7 +386,7 @@ def test_gate_pass_costs_clean_data_nothing():
 
 def test_monotone_profile_is_near_and_never_decreases():
     depth, information, truth = plain(40, np.random.default_rng(12), error=0.1)
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     monotone = monotone_optical_depth(result)
     assert np.all(np.diff(monotone, axis=1) >= 0.0)
     assert rms(monotone - truth) <= 1.001 * rms(result.optical_depth - truth)
@@ -396,10 +396,10 @@ def test_screen_passes_what_is_only_steep():
     """A cloud edge of any steepness is no outlier; a single estimate off it is."""
     steep = np.concatenate([np.zeros(20), np.linspace(0.0, 4.0, 40)])[np.newaxis]
     information = np.full(steep.shape, 1e6)
-    np.testing.assert_array_equal(_outliers.screen(steep, information), information)
+    np.testing.assert_array_equal(_outliers.screen_outliers(steep, information), information)
     information = np.full(steep.shape, 400.0)
     steep[0, 33] -= 3.0
-    reduced = _outliers.screen(steep, information) < information
+    reduced = _outliers.screen_outliers(steep, information) < information
     np.testing.assert_array_equal(np.flatnonzero(reduced), [33])
 
 
@@ -412,7 +412,7 @@ def test_missing_estimates_are_bridged_and_said_so(profiles):
     depth[0, :4] = np.nan
     information[0, 20:26] = np.nan
     depth[1, 50:] = np.nan
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     np.testing.assert_array_equal(
         np.flatnonzero(result.interpolated[0]), [*range(4), *range(20, 26)]
     )
@@ -435,11 +435,11 @@ def test_missing_estimates_are_bridged_and_said_so(profiles):
 
 def test_profile_without_data_stays_empty_and_leaves_the_others_alone():
     depth, information, _ = plain(9, np.random.default_rng(21))
-    alone = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    alone = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     empty = np.full((1, 60), np.nan)
     depth = np.concatenate([depth[:4], empty, depth[4:]])
     information = np.concatenate([information[:4], np.zeros((1, 60)), information[4:]])
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     assert result.no_data[4]
     assert not np.delete(result.no_data, 4).any()
     np.testing.assert_array_equal(np.delete(result.optical_depth, 4, axis=0), alone.optical_depth)
@@ -458,7 +458,7 @@ def test_profile_without_data_stays_empty_and_leaves_the_others_alone():
 @pytest.mark.parametrize("profiles", [0, 1, 9])
 def test_nothing_at_all_gives_nothing(profiles):
     missing = np.full((profiles, 60), np.nan)
-    result = smooth(missing, missing, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(missing, missing, ALTITUDE, station_altitude=0.0)
     assert result.no_data.all()
     assert np.isnan(result.optical_depth).all()
     assert np.isnan(gradient_bound(result.system, np.ones((profiles, 60)))).all()
@@ -472,7 +472,7 @@ def test_nothing_at_all_gives_nothing(profiles):
 def test_one_impossible_estimate_is_contained(value, weight, profiles):
     depth, information, truth = plain(profiles, np.random.default_rng(22))
     depth[0, 30], information[0, 30] = value, weight
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     assert np.isfinite(result.optical_depth).all()
     assert np.isfinite(result.extinction_standard_error).all()
     error = np.abs(result.optical_depth - truth)
@@ -486,7 +486,7 @@ def test_few_heights_are_solved(heights, profiles):
     depth, information, truth = plain(
         profiles, np.random.default_rng(23), altitude=ALTITUDE[:heights]
     )
-    result = smooth(depth, information, ALTITUDE[:heights], station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE[:heights], station_altitude=0.0)
     assert (np.abs(result.optical_depth - truth) < 0.1).all()
     assert (result.optical_depth_standard_error > 0.0).all()
     assert (result.optical_depth_standard_error < 0.03).all()
@@ -503,7 +503,7 @@ def test_any_pattern_of_estimates_is_solved_or_withheld(seed, profiles, heights)
     depth = rng.normal(size=shape) * 10.0 ** rng.uniform(-6.0, 5.0, shape)
     information = 10.0 ** (rng.uniform(-9.0, 9.0) + rng.uniform(-2.0, 2.0, shape))
     information[rng.random(shape) < rng.random()] = rng.choice([0.0, np.nan])
-    result = smooth(depth, information, ALTITUDE[:heights], station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE[:heights], station_altitude=0.0)
     there = np.isfinite(information) & (information > 0.0)
     within = np.cumsum(there[:, ::-1], axis=1)[:, ::-1] > 0
     total = (np.where(there, information, 0.0) * ALTITUDE[:heights] ** 2).sum(axis=1)
@@ -519,7 +519,7 @@ def test_any_pattern_of_estimates_is_solved_or_withheld(seed, profiles, heights)
 def test_profile_that_says_nearly_nothing_is_withheld():
     depth, information, _ = plain(9, np.random.default_rng(24))
     information[3] *= 1e-5
-    result = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     np.testing.assert_array_equal(np.flatnonzero(result.no_data), [3])
     assert np.isnan(result.optical_depth[3]).all()
 
@@ -540,14 +540,14 @@ def test_whole_blocks_give_the_same_bits_in_any_company():
     found = estimates(scene, 61, rng, 0.5)
     block = np.repeat([7, -3, 12, 5], [20, 33, 1, 7])
     options = {"station_altitude": 0.0}
-    together = smooth(
+    together = smooth_optical_depth(
         found.optical_depth, found.information, scene.altitude,
         residuals=found.residuals, block=block, **options,
     )  # fmt: skip
     bound = gradient_bound(together.system, found.slope)
     layer = layer_optical_depth(together, 600.0, 1500.0)
     for rows in (slice(0, 20), slice(20, 53), slice(53, 61), slice(20, 61)):
-        alone = smooth(
+        alone = smooth_optical_depth(
             found.optical_depth[rows].copy(), found.information[rows].copy(), scene.altitude,
             residuals=take(found.residuals, rows), block=block[rows], **options,
         )  # fmt: skip
@@ -562,10 +562,10 @@ def test_whole_blocks_give_the_same_bits_in_any_company():
 def test_blocks_may_be_interleaved():
     depth, information, _ = plain(30, np.random.default_rng(31))
     block = np.arange(30) % 2
-    mixed = smooth(depth, information, ALTITUDE, station_altitude=0.0, block=block)
+    mixed = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0, block=block)
     for label in (0, 1):
         rows = block == label
-        alone = smooth(depth[rows], information[rows], ALTITUDE, station_altitude=0.0)
+        alone = smooth_optical_depth(depth[rows], information[rows], ALTITUDE, station_altitude=0.0)
         results_equal(mixed, alone, rows)
 
 
@@ -573,7 +573,7 @@ def test_blocks_may_be_interleaved():
 def test_kind_of_array_does_not_matter(profiles):
     depth, information, _ = plain(profiles, np.random.default_rng(32))
     depth, information = depth.astype(np.float32), information.astype(np.float32)
-    expected = smooth(depth, information, ALTITUDE, station_altitude=0.0)
+    expected = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
     depth.flags.writeable = False
     for other in (
         depth.astype(">f8"),
@@ -581,14 +581,16 @@ def test_kind_of_array_does_not_matter(profiles):
         np.repeat(depth, 2, axis=1)[:, ::2],
         np.ma.masked_invalid(depth),
     ):
-        results_equal(expected, smooth(other, information, ALTITUDE, station_altitude=0.0))
+        results_equal(
+            expected, smooth_optical_depth(other, information, ALTITUDE, station_altitude=0.0)
+        )
     assert expected.optical_depth.dtype == np.float64
 
 
 def test_unit_of_the_noise_scales_the_errors_only():
     depth, information, _ = plain(12, np.random.default_rng(33))
-    base = smooth(depth, information, ALTITUDE, station_altitude=0.0)
-    scaled = smooth(1e3 * depth, 1e-6 * information, ALTITUDE, station_altitude=0.0)
+    base = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
+    scaled = smooth_optical_depth(1e3 * depth, 1e-6 * information, ALTITUDE, station_altitude=0.0)
     np.testing.assert_allclose(scaled.optical_depth, 1e3 * base.optical_depth, rtol=1e-9)
     np.testing.assert_allclose(
         scaled.extinction_standard_error, 1e3 * base.extinction_standard_error, rtol=1e-7
@@ -669,9 +671,11 @@ def moments_of(profiles, *, ratio=0.0, share=1.0, freedom=10.0):
 @pytest.mark.parametrize(("freedom", "factor"), [(10.0, 1.0), (0.2, 1.0), (0.0, 4.1 / 2.1)])
 def test_noise_known_from_few_residuals_widens_the_errors(freedom, factor):
     depth, information, _ = plain(12, np.random.default_rng(41))
-    known = smooth(depth, information, ALTITUDE, station_altitude=0.0, gate_pass=False)
+    known = smooth_optical_depth(
+        depth, information, ALTITUDE, station_altitude=0.0, gate_pass=False
+    )
     moments = moments_of(12, freedom=freedom)
-    found = smooth(
+    found = smooth_optical_depth(
         depth, information, ALTITUDE, station_altitude=0.0, residuals=moments, gate_pass=False
     )
     number = 15.0 * 12.0 * freedom
@@ -684,7 +688,7 @@ def test_noise_known_from_few_residuals_widens_the_errors(freedom, factor):
 def test_correlated_noise_has_wider_errors_and_a_flag():
     depth, information, _ = plain(12, np.random.default_rng(42))
     results = [
-        smooth(
+        smooth_optical_depth(
             depth, information, ALTITUDE, station_altitude=0.0, residuals=moments_of(12, ratio=r)
         )
         for r in (0.0, 0.6, 0.9)
@@ -698,8 +702,8 @@ def test_correlated_noise_has_wider_errors_and_a_flag():
 
 def test_noise_of_detectors_is_taken_as_uncorrelated():
     depth, information, _ = plain(12, np.random.default_rng(43))
-    plainly = smooth(depth, information, ALTITUDE, station_altitude=0.0)
-    found = smooth(
+    plainly = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0)
+    found = smooth_optical_depth(
         depth, information, ALTITUDE, station_altitude=0.0,
         residuals=moments_of(12, ratio=0.8, share=0.0, freedom=1e9),
     )  # fmt: skip
@@ -710,16 +714,20 @@ def test_profile_with_more_structure_than_smoothing_is_for_is_flagged():
     rng = np.random.default_rng(44)
     steps = np.cumsum(rng.uniform(0.0, 1.0, ALTITUDE.size))
     rough = steps + 0.003 * rng.normal(size=(20, ALTITUDE.size))
-    result = smooth(rough, np.full(rough.shape, 1e5), ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(rough, np.full(rough.shape, 1e5), ALTITUDE, station_altitude=0.0)
     assert result.undersmoothed.all()
     depth, information, _ = plain(20, rng)
-    assert not smooth(depth, information, ALTITUDE, station_altitude=0.0).undersmoothed.any()
+    assert not smooth_optical_depth(
+        depth, information, ALTITUDE, station_altitude=0.0
+    ).undersmoothed.any()
 
 
 def test_data_share_is_the_reply_to_the_answer_where_that_is_significant():
     depth = np.where(ALTITUDE > 1500.0, (ALTITUDE - 1500.0) * 2e-3, 0.0) + 1e-5 * ALTITUDE
     noisy = depth + 0.3 * np.random.default_rng(45).normal(size=(40, 60))
-    result = smooth(noisy, np.full(noisy.shape, 0.3**-2.0), ALTITUDE, station_altitude=0.0)
+    result = smooth_optical_depth(
+        noisy, np.full(noisy.shape, 0.3**-2.0), ALTITUDE, station_altitude=0.0
+    )
     reply = respond(result.system, result.optical_depth)
     there = np.isfinite(result.data_share)
     np.testing.assert_allclose(
@@ -763,7 +771,7 @@ GOOD = {
 )
 def test_impossible_arguments_are_refused(change, field):
     with pytest.raises(RetrievalInputError) as caught:
-        smooth(**(GOOD | change))
+        smooth_optical_depth(**(GOOD | change))
     assert caught.value.field == field
 
 
@@ -777,14 +785,14 @@ def test_impossible_arguments_are_refused(change, field):
     ],
 )
 def test_impossible_layers_are_refused(bottom, top, field):
-    result = smooth(**GOOD)
+    result = smooth_optical_depth(**GOOD)
     with pytest.raises(RetrievalInputError) as caught:
         layer_optical_depth(result, bottom, top)
     assert caught.value.field == field
 
 
 def test_other_impossible_arguments_are_refused():
-    system = smooth(**GOOD).system
+    system = smooth_optical_depth(**GOOD).system
     with pytest.raises(RetrievalInputError, match="profiles"):
         respond(system, np.zeros((3, 60)))
     with pytest.raises(RetrievalInputError, match="largest_gradient"):

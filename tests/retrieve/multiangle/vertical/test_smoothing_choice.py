@@ -7,13 +7,13 @@ import pytest
 from support.banded_matrices import dense
 
 from lidarops.retrieve.multiangle.vertical import _banded
-from lidarops.retrieve.multiangle.vertical._correlation import precision
+from lidarops.retrieve.multiangle.vertical._correlation import correlated_precision
 from lidarops.retrieve.multiangle.vertical._smoothing_choice import (
     GRID,
     PER_DECADE,
     Scores,
-    choose,
-    score,
+    choose_smoothing,
+    score_smoothing,
 )
 
 HEIGHTS = 25
@@ -24,7 +24,7 @@ def block(profiles, correlation, rng):
     information = rng.uniform(20.0, 80.0, (profiles, HEIGHTS))
     truth = 2e-4 * ALTITUDE + 0.05 * np.sin(ALTITUDE / 200.0)
     estimates = truth + rng.normal(size=(profiles, HEIGHTS)) / np.sqrt(information)
-    bands = precision(information, np.ones_like(information), correlation)
+    bands = correlated_precision(information, np.ones_like(information), correlation)
     unit = information.mean() * ALTITUDE[-1] ** 3
     return bands, estimates, _banded.penalty(ALTITUDE, 0.0), unit
 
@@ -33,7 +33,7 @@ def block(profiles, correlation, rng):
 def test_likelihood_is_the_restricted_one_of_the_marginal_distribution(correlation):
     """Gauss: the estimates are a straight line, an integrated random walk and noise."""
     bands, estimates, stiffness, unit = block(3, correlation, np.random.default_rng(0))
-    found = score(bands, estimates, stiffness, unit).likelihood
+    found = score_smoothing(bands, estimates, stiffness, unit).likelihood
     prior = np.linalg.pinv(dense(stiffness), rcond=1e-11, hermitian=True)
     line = ALTITUDE[:, np.newaxis]
     expected = np.zeros(GRID.size)
@@ -57,11 +57,11 @@ def test_risk_estimates_the_true_error_without_bias():
     rng = np.random.default_rng(1)
     information = np.full((64, HEIGHTS), 50.0)
     truth = 0.05 * np.sin(ALTITUDE / 100.0)
-    bands = precision(information, np.ones_like(information), 0.5)
+    bands = correlated_precision(information, np.ones_like(information), 0.5)
     covariance = np.linalg.inv(dense(bands[:, 0]))
     stiffness, unit = _banded.penalty(ALTITUDE, 0.0), 50.0 * ALTITUDE[-1] ** 3
     noise = rng.multivariate_normal(np.zeros(HEIGHTS), covariance, size=64)
-    found = score(bands, truth + noise, stiffness, unit)
+    found = score_smoothing(bands, truth + noise, stiffness, unit)
     weight = dense(bands[:, 0])
     for i in range(0, GRID.size, 6):
         smoother = np.linalg.inv(weight + GRID[i] * unit * dense(stiffness)) @ weight
@@ -75,20 +75,22 @@ def test_risk_estimates_the_true_error_without_bias():
 @pytest.mark.parametrize(("profiles", "heights", "every"), [(130, 400, 3), (130, 25, 1)])
 def test_long_block_is_scored_on_every_nth_profile(profiles, heights, every):
     estimates = np.random.default_rng(3).normal(size=(profiles, heights))
-    bands = precision(np.ones_like(estimates), np.zeros_like(estimates), 0.0)
+    bands = correlated_precision(np.ones_like(estimates), np.zeros_like(estimates), 0.0)
     stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1), 0.0)
     chosen = np.ascontiguousarray(bands[:, ::every])
-    part = score(chosen, estimates[::every].copy(), stiffness, 1e8)
-    whole = score(bands, estimates, stiffness, 1e8)
+    part = score_smoothing(chosen, estimates[::every].copy(), stiffness, 1e8)
+    whole = score_smoothing(bands, estimates, stiffness, 1e8)
     np.testing.assert_array_equal(whole.likelihood, part.likelihood)
     assert whole.profiles == profiles
 
 
 def test_profile_unlike_the_others_has_no_say_in_the_risk():
     bands, estimates, stiffness, unit = block(20, 0.0, np.random.default_rng(2))
-    clean = score(bands[:, 1:], estimates[1:], stiffness, unit)
+    clean = score_smoothing(bands[:, 1:], estimates[1:], stiffness, unit)
     estimates[0] += 30.0 * (-1.0) ** np.arange(HEIGHTS)
-    np.testing.assert_allclose(score(bands, estimates, stiffness, unit).risk, clean.risk, rtol=1e-9)
+    np.testing.assert_allclose(
+        score_smoothing(bands, estimates, stiffness, unit).risk, clean.risk, rtol=1e-9
+    )
 
 
 def scores(likely, risky, profiles=300):
@@ -99,24 +101,24 @@ def scores(likely, risky, profiles=300):
 
 
 def test_likelihood_is_followed_where_the_risk_agrees():
-    assert choose(scores(30, 29)).smoothing == GRID[30]
-    assert choose(scores(30, 35)).smoothing == GRID[30]
+    assert choose_smoothing(scores(30, 29)).smoothing == GRID[30]
+    assert choose_smoothing(scores(30, 35)).smoothing == GRID[30]
 
 
 def test_risk_is_followed_where_it_asks_for_more_freedom_up_to_a_decade():
-    assert choose(scores(30, 25)).smoothing == GRID[25]
-    assert choose(scores(30, 5)).smoothing == GRID[30 - PER_DECADE]
+    assert choose_smoothing(scores(30, 25)).smoothing == GRID[25]
+    assert choose_smoothing(scores(30, 5)).smoothing == GRID[30 - PER_DECADE]
 
 
 def test_two_degrees_of_freedom_are_left():
-    choice = choose(scores(66, 66))
+    choice = choose_smoothing(scores(66, 66))
     assert choice.saturated
     assert 2.0 <= choice.effective_degrees_of_freedom < 2.1
-    assert not choose(scores(30, 30)).saturated
+    assert not choose_smoothing(scores(30, 30)).saturated
 
 
 def test_small_block_is_averaged_by_likelihood():
-    choice = choose(scores(30, 5, profiles=7))
+    choice = choose_smoothing(scores(30, 5, profiles=7))
     assert choice.share.sum() == pytest.approx(1.0)
     weight = np.exp(-0.5 * (np.arange(GRID.size) - 30.0) ** 2)
     where = np.searchsorted(GRID, choice.smoothing)
@@ -128,6 +130,6 @@ def test_small_block_is_averaged_by_likelihood():
 
 def test_data_that_never_reach_two_degrees_of_freedom_are_saturated():
     low = Scores(np.arange(GRID.size)[::-1] * 1.0, np.zeros(GRID.size), np.ones(GRID.size), 50)
-    choice = choose(low)
+    choice = choose_smoothing(low)
     assert choice.saturated
     assert choice.smoothing == GRID[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.oracle_multiangle import ANGLES, clear, cloud, rms, signals
 
-from lidarops.retrieve.multiangle.optical_depth import solve
+from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 from lidarops.retrieve.multiangle.vertical import _correlation, gaps
 
 STEEP = np.linspace(0.0, 30.0, 6)
@@ -21,7 +21,7 @@ def errors_with_gaps(atmosphere, angles, correlation, missing, **noise):
             rng, 16, angles, atmosphere, correlation=correlation, **noise
         )
         signal[rng.random(signal.shape) < missing] = np.nan
-        one = solve(signal, angles, atmosphere[0], variance=variance)
+        one = retrieve_optical_depth(signal, angles, atmosphere[0], variance=variance)
         assert np.array_equal(np.isnan(one.extinction), np.isnan(one.extinction_standard_error))
         found.append(
             (
@@ -65,7 +65,7 @@ def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
             )  # fmt: skip
             ray, first, past = hole
             signal[:, [1, ray], first:past] = np.nan
-            one = solve(signal, ANGLES, atmosphere[0], variance=variance)
+            one = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance)
             valued = np.isfinite(one.extinction)
             assert np.all(one.extinction_standard_error[valued] > 0.0)
             assert np.all(one.optical_depth_standard_error[np.isfinite(one.optical_depth)] > 0.0)
@@ -95,7 +95,7 @@ def test_precision_with_gaps_tells_how_certain_a_mean_is(correlation):
     rng, ratios = np.random.default_rng(3), []
     for _ in range(100):
         information, share, covariance = noise_with_gaps(rng, correlation)
-        bands = gaps.precision(information[None], share[None], correlation)[:, 0]
+        bands = gaps.gap_precision(information[None], share[None], correlation)[:, 0]
         dense = np.diag(bands[0])
         for step in (1, 2):
             dense += np.diag(bands[step, :-step], step) + np.diag(bands[step, :-step], -step)
@@ -108,15 +108,15 @@ def test_precision_with_gaps_tells_how_certain_a_mean_is(correlation):
 
 def test_precision_of_even_noise_is_that_without_gaps():
     information, share = np.full((2, 30), 5.0), np.full((2, 30), 0.8)
-    plain = _correlation.precision(information, share, 0.9)
-    found = gaps.precision(information, share, 0.9)
+    plain = _correlation.correlated_precision(information, share, 0.9)
+    found = gaps.gap_precision(information, share, 0.9)
     np.testing.assert_allclose(found, plain, rtol=1e-12)
 
 
 def test_no_number_is_demanded_of_heights_that_share_nothing():
     information = np.tile([4.0, 0.0, 9.0], (1, 5))
     share = np.where(np.arange(15) % 2 == 0, 0.0, 1e-300)[np.newaxis]
-    found = gaps.precision(information, share, 0.9)
+    found = gaps.gap_precision(information, share, 0.9)
     np.testing.assert_array_equal(found[0], information)
     assert not found[1:].any()
 

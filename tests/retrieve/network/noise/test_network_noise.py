@@ -15,7 +15,7 @@ from support.oracle_network import (
 )
 
 from lidarops.retrieve.network import _beam_signals
-from lidarops.retrieve.network.extinction_field import solve
+from lidarops.retrieve.network.extinction_field import retrieve_network
 
 FULL = {"full_overlap_range": 100.0}
 
@@ -71,7 +71,7 @@ def test_a_wild_gate_costs_no_other_profile_anything_where_signals_tell_the_nois
     power, _ = drawn(net, relative, 50)
     heard = power.copy()
     heard[7, 2, 60] *= factor
-    clean, found = (solve(one, grid(net), net, **FULL) for one in (power, heard))
+    clean, found = (retrieve_network(one, grid(net), net, **FULL) for one in (power, heard))
     others, near = np.arange(50) != 7, net.near_vertex
     np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])
     assert not found.flags.flagged[others][:, near].any()
@@ -91,7 +91,7 @@ def test_wild_gates_are_told_where_noise_is_too_high_to_look_for_them():
     rng = np.random.default_rng(5)
     hit = rng.random(power.shape) < 0.01
     power += hit * rng.uniform(0.5, 10.0, power.shape) * clean
-    found = solve(power, grid(net), net, blocks=np.arange(200) // 50, **FULL)
+    found = retrieve_network(power, grid(net), net, blocks=np.arange(200) // 50, **FULL)
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
     score = (found.extinction - 2e-3) / found.extinction_standard_error
     assert kept.sum() > 500
@@ -103,7 +103,9 @@ def test_a_loud_profile_states_its_own_error_where_signals_tell_the_noise():
     power, clean = drawn(net, 0.002, 400, homogeneous())
     loud = np.arange(400) % 20 == 7
     power[loud] += 11.0 * (power[loud] - clean)
-    found = solve(power, grid(net), net, prior="none", blocks=np.arange(400) // 20, **FULL)
+    found = retrieve_network(
+        power, grid(net), net, prior="none", blocks=np.arange(400) // 20, **FULL
+    )
     near = net.near_vertex
     assert found.flags.flagged[loud][:, near].mean() < 0.2
     score = (found.extinction - 2e-3) / found.extinction_standard_error
@@ -137,7 +139,7 @@ def test_noise_of_half_the_profiles_is_not_wild(ratio, first):
 def test_noisy_profiles_are_kept_among_as_many_quiet_ones(first):
     net = three_by_two()
     power, relative = half_louder(15.0, first, 64)
-    found = solve(power, grid(net), net, blocks=np.arange(64) // 16, **FULL)
+    found = retrieve_network(power, grid(net), net, blocks=np.arange(64) // 16, **FULL)
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
     assert kept[:, net.near_vertex][relative > 0.01].mean() > 0.9
     score = (found.extinction - at_vertices(net, plume)) / found.extinction_standard_error
@@ -212,7 +214,7 @@ def test_correlated_gates_state_what_their_sums_have(relative, share):
     clean = signals(net, r, plume)
     shape = (200, *clean.shape)
     power = clean * (1.0 + relative * correlated(shape, share, np.random.default_rng(3)))
-    found = solve(power, r, net, blocks=np.arange(200) // 50, **FULL)
+    found = retrieve_network(power, r, net, blocks=np.arange(200) // 50, **FULL)
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
     assert kept[:, net.near_vertex].mean() > 0.95
     score = (found.extinction - at_vertices(net, plume)) / found.extinction_standard_error
@@ -309,7 +311,7 @@ def test_a_ray_of_which_nothing_is_known_is_missing_and_not_weak():
     power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
     told = np.broadcast_to(variance, power.shape).copy()
     power[3, 0], told[3, 0] = np.nan, np.nan
-    found = solve(power, r, net, variance=told, **FULL)
+    found = retrieve_network(power, r, net, variance=told, **FULL)
     assert not found.flags.weak_signal.any()
     mine = np.zeros_like(found.flags.signal_missing)
     mine[3, net.on_ray(0)[0]] = True
@@ -321,10 +323,10 @@ def test_what_noise_alone_makes_negative_is_weak():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, homogeneous(8e-3)), 0.01, 20, additive=0.05)
-    found = solve(power, r, net, variance=variance, **FULL)
+    found = retrieve_network(power, r, net, variance=variance, **FULL)
     assert (np.median(power, axis=0) <= 0.0).any()
     assert found.flags.weak_signal.any(axis=0).any()
     assert not found.flags.signal_not_positive.any()
     power[:, 0] -= 10.0 * np.sqrt(variance[0])
-    found = solve(power, r, net, variance=variance, **FULL)
+    found = retrieve_network(power, r, net, variance=variance, **FULL)
     assert found.flags.signal_not_positive[:, net.on_ray(0)[0][1:]].all()

@@ -8,7 +8,7 @@ from scipy.interpolate import BarycentricInterpolator
 from support.oracle_network import FIELDS, fan, grid, noisy, signals, three_by_two, triangle
 
 from lidarops.retrieve.network import _condensed_signals
-from lidarops.retrieve.network.extinction_field import solve
+from lidarops.retrieve.network.extinction_field import retrieve_network
 from lidarops.retrieve.network.noise import outlying_bins, outlying_runs
 
 GATES = 7
@@ -32,7 +32,7 @@ def scene(field=ALL["homogeneous"], relative=0.01, profiles=50, step=5.0, seed=3
 
 def solved(net, r, power, variance, **settings):
     settings = {"full_overlap_range": 100.0, **settings}
-    return solve(power, r, net, variance=variance, **settings)
+    return retrieve_network(power, r, net, variance=variance, **settings)
 
 
 def condensed(net, r, power, variance, *, screened=True, relative=False, nearest=100.0):
@@ -87,7 +87,7 @@ def test_what_is_left_of_gates_is_normal(relative):
     codes, limits = np.zeros(bins, dtype=np.uint8), np.array([[0, bins]])
     ranges = 5.0 * np.arange(1.0, bins + 1)
     planned = np.zeros((1, bins, 6), np.intp), np.zeros((1, bins, 6)), np.zeros((1, bins))
-    outlying_bins.plan(ranges[None], limits, *planned)
+    outlying_bins.plan_neighbours(ranges[None], limits, *planned)
     nodes, shares, air = (one[0] for one in planned)
     off = np.empty((rows, bins))
     for n in range(rows):

@@ -16,7 +16,7 @@ from support.oracle_network import (
 )
 
 from lidarops.retrieve.network import _beam_signals
-from lidarops.retrieve.network.extinction_field import solve
+from lidarops.retrieve.network.extinction_field import retrieve_network
 from lidarops.retrieve.network.noise import noise_groups
 
 OUTCOME = ("extinction", "extinction_standard_error", "degrees_of_freedom", "prior_deviation")
@@ -47,13 +47,13 @@ def test_noisy_profiles_cost_quiet_ones_of_their_block_nothing(factor, count):
     scale = np.where(loud, factor, 1.0)[:, np.newaxis, np.newaxis]
     heard, told = clean + scale * (power - clean), scale**2 * variance
     settings = {"full_overlap_range": 100.0}
-    found = solve(heard, r, net, variance=told, **settings)
+    found = retrieve_network(heard, r, net, variance=told, **settings)
     for mine in (~loud, loud):
-        alike(solve(heard[mine], r, net, variance=told[mine], **settings), found, mine)
+        alike(retrieve_network(heard[mine], r, net, variance=told[mine], **settings), found, mine)
     near = net.near_vertex
     assert not found.flags.flagged[~loud][:, near].any()
     stated = found.extinction_standard_error / at_vertices(net, plume)
-    calm = solve(power, r, net, variance=variance, **settings)
+    calm = retrieve_network(power, r, net, variance=variance, **settings)
     usual = calm.extinction_standard_error / at_vertices(net, plume)
     np.testing.assert_allclose(stated[~loud][:, near], usual[~loud][:, near], rtol=0.15)
 
@@ -68,8 +68,8 @@ def test_thick_air_costs_what_came_before_it_nothing():
         clean = signals(net, r, homogeneous(extinction))
         power[mine], variance[mine] = noisy(net, r, clean, 0.02, int(mine.sum()), 5)
     settings = {"variance": variance, "full_overlap_range": 100.0}
-    found = solve(power, r, net, **settings)
-    apart = solve(power, r, net, blocks=dense.astype(int), **settings)
+    found = retrieve_network(power, r, net, **settings)
+    apart = retrieve_network(power, r, net, blocks=dense.astype(int), **settings)
     alike(apart, found, slice(None))
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
     assert kept[~dense].sum() > 80
@@ -80,7 +80,7 @@ def test_thick_air_costs_what_came_before_it_nothing():
 
 def parts(power, variance, net, r, block=None):
     """Return (profile,) blocks."""
-    rays = _beam_signals.prepare(
+    rays = _beam_signals.prepare_signals(
         power, r, net, variance=variance, overlap=None, full_overlap_range=100.0, exponent=1.0,
         blocks=block, gates=7,
     )  # fmt: skip
