@@ -92,7 +92,7 @@ BUDGETS: Final = {
     (ProductKind.ELASTIC, "backscatter"): Budget(_RANDOM, shared=_SHARED),
     (ProductKind.ELASTIC, "extinction"): Budget(_RANDOM, times="lidar_ratio"),
     (ProductKind.ELASTIC, "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
-    # Nothing tells the noise of its calibration from that of its gates.
+    # Nothing tells the noise of its calibration from that of its bins.
     (ProductKind.ELASTIC, "attenuated_backscatter"): Budget(()),
     # Nothing tells noise from what smoothness takes, which profiles of one sky share.
     (ProductKind.MULTIANGLE, "optical_depth"): Budget(()),

@@ -39,7 +39,7 @@ _HELPED: Final = frozenset(
 """Methods that are told more than the profile."""
 _SHOWN: Final = {
     ELASTIC: "background of 100000 counts",
-    NETWORKS: "3 x 2 rays, plume, noise 5.0 %",
+    NETWORKS: "3 x 2 beams, plume, noise 5.0 %",
 }
 """Settings that stand for all of a retrieval; else its first."""
 _PLAIN_WAYS: Final = frozenset({"slope", "Klett, far end"})

@@ -375,12 +375,12 @@ def _refused_table(refused: list[Granule]) -> Table:
 
 def _plan_table(title: str, plan: Plan) -> Table:
     from lidarops.figures.wording import decided_on
-    from lidarops.plan.signal_rules import idle_gate
+    from lidarops.plan.signal_rules import idle_window
 
     table = make_table(title, "channel", "step", "does", "why", "rule", "number")
     for step in plan.steps:
         settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
-        idle = idle_gate(step, plan.steps)
+        idle = idle_window(step, plan.steps)
         done = f"no effect: {idle}" if idle else settings or "yes"
         does = (step.channel, step.name, done, step.reason)
         add_row(table, *does, step.rule, decided_on(step.number))
@@ -408,14 +408,14 @@ def _stale_table(title: str, judged: Judgement) -> Table:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
-    from lidarops.plan.signal_rules import idle_gate
+    from lidarops.plan.signal_rules import idle_window
 
     stale = [
         {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
         for each in judged.stale
     ]
     plan = judged.asked
-    idle = [idle_gate(step, plan.steps) for step in plan.steps]
+    idle = [idle_window(step, plan.steps) for step in plan.steps]
     steps = [
         {**step.as_dict(), **({"no_effect": why} if why else {})}
         for step, why in zip(plan.steps, idle, strict=True)

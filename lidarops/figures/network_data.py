@@ -1,4 +1,4 @@
-"""Products of networks as plain arrays: series by vertex beside the truth, and beams in space."""
+"""Products of networks as plain arrays: series by crossing beside the truth, and beams in space."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lidarops.figures.series_data import Section, SeriesEstimate, require
 from lidarops.figures.time_axis import Times
 from lidarops.flags import Quality
 from lidarops.records import SceneOutcome
-from lidarops.retrieve.network.geometry import Ray, local_axes, locate, to_earth_centred
+from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
 
 Floats = NDArray[np.float64]
 
@@ -28,17 +28,17 @@ _EXTINCTION: Final = (
 )
 _VISIBILITY: Final = ("visibility_in_air", "visibility_in_air_lower", "visibility_in_air_upper")
 _ANGLES: Final = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
-_SHARED: Final = ("time", "vertex_id", "ray_range", "quality_flag")
-VERTEX_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY, "time_bnds", "ray_zenith_angle")
-"""What `read_vertices` reads of a product."""
+_SHARED: Final = ("time", "crossing_id", "beam_range", "quality_flag")
+CROSSING_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY, "time_bnds", "beam_zenith_angle")
+"""What `read_crossings` reads of a product."""
 MAP_VARIABLES: Final = (
     *_SHARED,
     "visibility_in_air",
-    *(f"ray_{name}" for name in _ANGLES),
+    *(f"beam_{name}" for name in _ANGLES),
     *_ANGLES[:3],
 )
 """What `read_map` reads of a product."""
-_PAIR: Final = ("time", "vertex")
+_PAIR: Final = ("time", "crossing")
 _SAME_BEAM: Final = 0.2
 """degree, within which a file of the truth points as a beam does."""
 _FLAT: Final = 0.2
@@ -46,52 +46,52 @@ _FLAT: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class VertexSeries(Section):
+class CrossingSeries(Section):
     """What was retrieved where beams meet, over time; `near` and `far` are its nearest range."""
 
-    vertex: int
+    crossing: int
 
     @property
     def label(self) -> str:
-        """The vertex in words."""
-        return f"vertex {self.vertex}"
+        """The crossing in words."""
+        return f"crossing {self.crossing}"
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkMap:
-    """Beams and vertices on two axes."""
+    """Beams and crossings on two axes."""
 
     stations: Floats
-    """(ray, 2) km."""
+    """(beam, 2) km."""
     ends: Floats
-    """(ray, 2) km, of the part of the beam that is used."""
-    vertices: Floats
-    """(vertex, 2) km."""
+    """(beam, 2) km, of the part of the beam that is used."""
+    crossings: Floats
+    """(crossing, 2) km."""
     numbers: tuple[int, ...]
     visibility: Floats
-    """(vertex,) km, median over time of what is to be used; NaN where there is none."""
+    """(crossing,) km, median over time of what is to be used; NaN where there is none."""
     used: NDArray[np.intp]
-    """(vertex,) Values that are to be used."""
+    """(crossing,) Values that are to be used."""
     values: int
-    """Values of a vertex."""
+    """Values of a crossing."""
     axes: tuple[str, str]
     instruments: tuple[str, ...]
-    """Of each ray."""
+    """Of each beam."""
 
 
 def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
     """Return the instrument of each beam of a scene, as its plan says; none where it does not."""
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
-        if step.name == "visibility" and "rays" in step.settings:
-            return tuple(str(ray["instrument"]) for ray in step.settings["rays"])
+        if step.name == "visibility" and "beams" in step.settings:
+            return tuple(str(beam["instrument"]) for beam in step.settings["beams"])
     return ()
 
 
-def read_vertices(
+def read_crossings(
     product: xr.Dataset, truth: xr.Dataset | None = None, *, instruments: Sequence[str] = ()
-) -> list[VertexSeries]:
-    """Take the series of the vertices out of one product.
+) -> list[CrossingSeries]:
+    """Take the series of the crossings out of one product.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def read_vertices(
 
     Returns
     -------
-    list of VertexSeries
+    list of CrossingSeries
         Standard errors hold the systematic part. Truth is that of the beams, at the time.
 
     Raises
@@ -114,7 +114,7 @@ def read_vertices(
     """
     require(
         product,
-        {"time": ("time",), "vertex_id": ("vertex",), "ray_range": ("ray", "vertex")}
+        {"time": ("time",), "crossing_id": ("crossing",), "beam_range": ("beam", "crossing")}
         | dict.fromkeys((*_EXTINCTION, *_VISIBILITY, "quality_flag"), _PAIR),
     )
     value, random, systematic = (_floats(product, name) for name in _EXTINCTION)
@@ -122,11 +122,11 @@ def read_vertices(
     flags = product["quality_flag"].values.astype(np.int64)
     known = _truth(product, truth, instruments)
     time = product["time"].values.astype("datetime64[ns]")
-    nearest = np.nanmin(_floats(product, "ray_range"), axis=0)
+    nearest = np.nanmin(_floats(product, "beam_range"), axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         true_sight = np.where(known > 0, _constant(value, seen) / known, np.nan)
     return [
-        VertexSeries(
+        CrossingSeries(
             near=float(nearest[v]),
             far=float(nearest[v]),
             time=time,
@@ -142,33 +142,33 @@ def read_vertices(
                     "km",
                 ),
             },
-            vertex=int(product["vertex_id"].values[v]),
+            crossing=int(product["crossing_id"].values[v]),
         )
-        for v in range(product.sizes["vertex"])
+        for v in range(product.sizes["crossing"])
     ]
 
 
-def join_vertices(series: Sequence[VertexSeries]) -> list[VertexSeries]:
-    """Join the series of several scenes by vertex, each over all times."""
+def join_crossings(series: Sequence[CrossingSeries]) -> list[CrossingSeries]:
+    """Join the series of several scenes by crossing, each over all times."""
     found = []
-    for number in sorted({one.vertex for one in series}):
-        mine = [one for one in series if one.vertex == number]
+    for number in sorted({one.crossing for one in series}):
+        mine = [one for one in series if one.crossing == number]
         order = np.argsort(np.concatenate([one.time for one in mine]), kind="stable")
         found.append(
-            VertexSeries(
+            CrossingSeries(
                 near=mine[0].near,
                 far=mine[0].far,
                 time=np.concatenate([one.time for one in mine])[order],
                 flag=np.concatenate([one.flag for one in mine])[order],
                 estimates={name: _joined(mine, name, order) for name in QUANTITIES},
-                vertex=number,
+                crossing=number,
             )
         )
     return found
 
 
 def _joined(
-    series: Sequence[VertexSeries], quantity: str, order: NDArray[np.intp]
+    series: Sequence[CrossingSeries], quantity: str, order: NDArray[np.intp]
 ) -> SeriesEstimate:
     parts = [one.estimates[quantity] for one in series]
     return SeriesEstimate(
@@ -180,7 +180,7 @@ def _joined(
 
 
 def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap:
-    """Take beams and vertices out of one product.
+    """Take beams and crossings out of one product.
 
     Parameters
     ----------
@@ -196,38 +196,38 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
     """
     require(
         product,
-        {"time": ("time",), "ray_range": ("ray", "vertex"), "visibility_in_air": _PAIR}
-        | {"quality_flag": _PAIR, "vertex_id": ("vertex",)}
-        | {f"ray_{name}": ("ray",) for name in _ANGLES},
+        {"time": ("time",), "beam_range": ("beam", "crossing"), "visibility_in_air": _PAIR}
+        | {"quality_flag": _PAIR, "crossing_id": ("crossing",)}
+        | {f"beam_{name}": ("beam",) for name in _ANGLES},
     )
-    columns = [_floats(product, f"ray_{name}") for name in _ANGLES]
-    rays = [
-        Ray(lat, lon, alt, azimuth, 90.0 - zenith)
+    columns = [_floats(product, f"beam_{name}") for name in _ANGLES]
+    beams = [
+        Beam(lat, lon, alt, azimuth, 90.0 - zenith)
         for lat, lon, alt, zenith, azimuth in zip(*columns, strict=True)
     ]
-    origin, direction = locate(rays)
-    reach = np.nanmax(_floats(product, "ray_range"), axis=1, initial=0.0)
+    origin, direction = locate(beams)
+    reach = np.nanmax(_floats(product, "beam_range"), axis=1, initial=0.0)
     place = [_floats(product, name) for name in _ANGLES[:3]]
-    first = to_earth_centred(rays[0].latitude, rays[0].longitude, rays[0].altitude)
-    turn = local_axes(rays[0].latitude, rays[0].longitude)
-    vertices = (to_earth_centred(*place) - first) @ turn.T
+    first = to_earth_centred(beams[0].latitude, beams[0].longitude, beams[0].altitude)
+    turn = local_axes(beams[0].latitude, beams[0].longitude)
+    crossings = (to_earth_centred(*place) - first) @ turn.T
     ends = origin + 1.08 * reach[:, np.newaxis] * direction
-    pair, names = _axes(np.concatenate([origin, vertices]))
+    pair, names = _axes(np.concatenate([origin, crossings]))
     rejected = (product["quality_flag"].values.astype(np.int64) & int(Quality.rejecting())) != 0
     seen = np.where(rejected, np.nan, _floats(product, "visibility_in_air")) / 1e3
     used = np.isfinite(seen).sum(axis=0)
     return NetworkMap(
         stations=origin[:, pair] / 1e3,
         ends=ends[:, pair] / 1e3,
-        vertices=vertices[:, pair] / 1e3,
-        numbers=tuple(int(number) for number in product["vertex_id"].values),
+        crossings=crossings[:, pair] / 1e3,
+        numbers=tuple(int(number) for number in product["crossing_id"].values),
         visibility=np.array(
             [np.nanmedian(column) if n else np.nan for column, n in zip(seen.T, used, strict=True)]
         ),
         used=used,
         values=product.sizes["time"],
         axes=names,
-        instruments=tuple(instruments) or tuple(f"ray {ray}" for ray in range(len(rays))),
+        instruments=tuple(instruments) or tuple(f"beam {beam}" for beam in range(len(beams))),
     )
 
 
@@ -253,19 +253,19 @@ def _constant(extinction: Floats, visibility: Floats) -> float:
 
 def _truth(product: xr.Dataset, truth: xr.Dataset | None, instruments: Sequence[str]) -> Floats:
     shape = product["extinction"].shape
-    if truth is None or len(instruments) != product.sizes["ray"]:
+    if truth is None or len(instruments) != product.sizes["beam"]:
         return np.full(shape, np.nan)
     bounds = product["time_bnds"].values.astype("datetime64[ns]")
-    zenith, ranges = _floats(product, "ray_zenith_angle"), _floats(product, "ray_range")
+    zenith, ranges = _floats(product, "beam_zenith_angle"), _floats(product, "beam_range")
     total, count = np.zeros(shape), np.zeros(shape)
-    for ray, name in enumerate(instruments):
-        for vertex in np.flatnonzero(np.isfinite(ranges[ray])):
-            when, known = _along(truth, name, zenith[ray], ranges[ray, vertex])
+    for beam, name in enumerate(instruments):
+        for crossing in np.flatnonzero(np.isfinite(ranges[beam])):
+            when, known = _along(truth, name, zenith[beam], ranges[beam, crossing])
             for n, (start, stop) in enumerate(bounds):
                 inside = known[(when >= start) & (when <= stop)]
                 if inside.size:
-                    total[n, vertex] += inside.mean()
-                    count[n, vertex] += 1
+                    total[n, crossing] += inside.mean()
+                    count[n, crossing] += 1
     with np.errstate(invalid="ignore"):
         return np.asarray(total / np.where(count > 0, count, np.nan))
 

@@ -1,4 +1,4 @@
-"""Figures of networks: a map of beams and vertices, and the series of each vertex."""
+"""Figures of networks: a map of beams and crossings, and the series of each crossing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from lidarops.figures import panels
-from lidarops.figures.network_data import NetworkMap, VertexSeries
+from lidarops.figures.network_data import CrossingSeries, NetworkMap
 from lidarops.figures.time_axis import time_axis
 from lidarops.figures.wording import counted, visible
 
@@ -20,12 +20,12 @@ _DPI: Final = 150
 _COLORS: Final = "cividis"
 """Perceptually uniform, and told apart by colour-blind readers and in grey."""
 _LINES: Final = ("-", "--", "-.", ":")
-VERTICES: Final = panels.SECTIONS
-"""Most vertices of one figure of series."""
+CROSSINGS: Final = panels.SECTIONS
+"""Most crossings of one figure of series."""
 
 
 def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
-    """Draw the beams of a network and the vertices in which they meet.
+    """Draw the beams of a network and the crossings in which they meet.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
     Returns
     -------
     Figure
-        Vertices are coloured by the median of visibility over time, which stands beside each as
-        a number; a vertex without a value is hollow. Lines tell instruments apart.
+        Crossings are coloured by the median of visibility over time, which stands beside each as
+        a number; a crossing without a value is hollow. Lines tell instruments apart.
     """
     figure = Figure(figsize=(7.4, 6.2), dpi=_DPI, layout="constrained")
     panel = figure.subplots()
@@ -52,7 +52,7 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
     low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
     scale = Normalize(low - 0.02 * high, high + 0.02 * high)
     for number, place, value in zip(
-        network.numbers, network.vertices, network.visibility, strict=True
+        network.numbers, network.crossings, network.visibility, strict=True
     ):
         has = bool(np.isfinite(value))
         panel.plot(
@@ -62,7 +62,7 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
             markerfacecolor=colormaps[_COLORS](scale(value)) if has else "white",
             markeredgecolor=panels.INK,
             zorder=3,
-            gid="vertex",
+            gid="crossing",
         )
         panel.annotate(
             f"{number}: {value:.3g} km" if has else f"{number}: no value",
@@ -76,7 +76,7 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
         )
     panels.legend(panel, columns=2)
     told = "; ".join(
-        f"vertex {number}: {value:.3g} km of {used} values"
+        f"crossing {number}: {value:.3g} km of {used} values"
         for number, value, used in zip(
             network.numbers, network.visibility, network.used, strict=True
         )
@@ -114,13 +114,13 @@ def _beams(panel: Axes, network: NetworkMap) -> None:
         )
 
 
-def draw_series(series: Sequence[VertexSeries], *, title: str = "") -> Figure:
-    """Draw extinction and visibility of vertices against time.
+def draw_series(series: Sequence[CrossingSeries], *, title: str = "") -> Figure:
+    """Draw extinction and visibility of crossings against time.
 
     Parameters
     ----------
-    series : sequence of VertexSeries
-        One to `VERTICES`.
+    series : sequence of CrossingSeries
+        One to `CROSSINGS`.
     title : str, optional
 
     Returns

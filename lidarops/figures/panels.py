@@ -359,7 +359,7 @@ def _signal(panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> list[Quad
     low, high = (float(level) for level in np.percentile(positive, [2.0, 99.8]))
     low = max(low, high * 10.0**-_DECADES)
     norm = LogNorm(low, max(high, 1.05 * low))
-    # The dark end of viridis is left out: rejected gates are black, in colour and in grey.
+    # The dark end of viridis is left out: rejected bins are black, in colour and in grey.
     colors = ListedColormap(colormaps["viridis"](np.linspace(0.15, 1.0, 256)), name="signal")
     # A logarithm has no place for a mean at or below zero: it takes the lowest colour.
     return [
@@ -439,7 +439,7 @@ def _notes(panel: Axes, rasters: Sequence[Raster], far: float, full: float) -> s
     care = share_with_care(rasters)
     if care > 0:
         names = [bit_name(bit) for bit in bits & ~Quality.rejecting()]
-        notes.append(f"use {percent(care)} of gates with care ({', '.join(names)}), as measured")
+        notes.append(f"use {percent(care)} of bins with care ({', '.join(names)}), as measured")
     if notes[len(handles) :]:
         words = _wrapped("; ".join(notes[len(handles) :]))
         handles.append(Line2D([], [], linestyle="none", label=words))

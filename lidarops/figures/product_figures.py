@@ -166,7 +166,7 @@ def quicklook(products: Sequence[xr.Dataset], *, title: str = "") -> Figure:
     -------
     Figure
         Block means on a logarithmic colour scale, to the range where the signal drowns in
-        noise; rejected gates black, gaps white.
+        noise; rejected bins black, gaps white.
 
     Raises
     ------
@@ -286,7 +286,7 @@ def scan_profile(profile: ScanProfile, *, title: str = "") -> Figure:
 
 
 def scan_residuals(residuals: ScanResiduals, *, title: str = "") -> Figure:
-    """Draw what the fit over angles leaves, against ray and altitude.
+    """Draw what the fit over angles leaves, against beam and altitude.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def scan_residuals(residuals: ScanResiduals, *, title: str = "") -> Figure:
     -------
     Figure
         Means over cycles on a diverging colour scale around 0, and beneath, the root mean
-        square by ray. Air in level layers leaves neither pattern nor sides that differ.
+        square by beam. Air in level layers leaves neither pattern nor sides that differ.
     """
     figure, (upper, lower) = _stack((3.9, 1.5), title)
     limit = scan_panels.residual_map(figure, upper, residuals)
@@ -308,7 +308,7 @@ def scan_residuals(residuals: ScanResiduals, *, title: str = "") -> Figure:
     worst, top = int(np.argmax(rms)), float(residuals.edges[-1]) / 1e3
     return _described(
         figure,
-        f"{title}: residuals of the signal against zenith angle of the ray and altitude to"
+        f"{title}: residuals of the signal against zenith angle of the beam and altitude to"
         f" {top:.3g} km, mean of {counted(residuals.cycles, 'cycle')}; colours to {limit:.2g}"
         f" percent. The root mean square is largest, {rms[worst]:.2g} percent, at a zenith angle"
         f" of {residuals.zenith_angle[worst]:.3g} degrees.",

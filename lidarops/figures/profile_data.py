@@ -61,7 +61,7 @@ class Profile:
 
 
 def clearest_profile(product: xr.Dataset) -> Profile | None:
-    """Return the profile with most gates that no bit speaks against, up to its reference.
+    """Return the profile with most bins that no bit speaks against, up to its reference.
 
     Parameters
     ----------

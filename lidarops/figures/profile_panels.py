@@ -47,7 +47,7 @@ def backscatter(panel: Axes, profile: Profile) -> None:
     panel.axvline(0.0, color=INK, linewidth=0.8)
     inside = value[np.isfinite(value)]
     if inside.size:
-        # A few noisy gates must not shrink what is seen of the others.
+        # A few noisy bins must not shrink what is seen of the others.
         low, high = np.percentile(inside, [0.5, 99.5])
         margin = 0.15 * max(high - low, 0.1 * high)
         panel.set_xlim(low - margin, high + margin)

@@ -64,17 +64,17 @@ class Raster:
     edges: Floats
     """(row + 1,) Edges of the rows along range, m."""
     total: Sums
-    """(column, row) Sum of the quantity over gates that are not rejected."""
+    """(column, row) Sum of the quantity over bins that are not rejected."""
     variance: Sums
     """(column, row) Variance of that sum."""
     used: Sums
-    """(column, row) Number of those gates."""
+    """(column, row) Number of those bins."""
     rejected: Sums
-    """(column, row) Number of gates that a quality bit rejects, missing data aside."""
+    """(column, row) Number of bins that a quality bit rejects, missing data aside."""
     with_care: int
-    """Number of gates in all to use with care."""
-    gates: Floats
-    """(row,) Number of gates along range in a row."""
+    """Number of bins in all to use with care."""
+    bins: Floats
+    """(row,) Number of bins along range in a row."""
     profiles: NDArray[np.int64]
     """(column,) Number of profiles in a column."""
     background: Floats
@@ -86,19 +86,19 @@ class Raster:
     units: str
     background_units: str
     bits: Quality
-    """Every bit that a gate carries."""
+    """Every bit that a bin carries."""
     altitude: tuple[float, float] | None
     """Altitude at range 0 in m and its change per m of range, where the product has it."""
 
     @property
     def mean(self) -> Floats:
-        """(column, row) Mean signal; NaN where no gate can be used."""
+        """(column, row) Mean signal; NaN where no bin can be used."""
         return np.where(self.used > 0, self.total / np.maximum(self.used, 1), np.nan)
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
-        """(column, row) Whether at least half of the gates of the block are rejected."""
-        blocks = self.profiles[:, None] * self.gates[None, :]
+        """(column, row) Whether at least half of the bins of the block are rejected."""
+        blocks = self.profiles[:, None] * self.bins[None, :]
         return np.asarray((self.rejected > 0) & (2 * self.rejected >= blocks))
 
     @property
@@ -130,7 +130,7 @@ class Raster:
             used=merged(self.used),
             rejected=merged(self.rejected),
             with_care=self.with_care,
-            gates=np.add.reduceat(self.gates[:rows], starts),
+            bins=np.add.reduceat(self.bins[:rows], starts),
             profiles=self.profiles,
             background=self.background,
             background_error=self.background_error,
@@ -195,7 +195,7 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
         used=np.concatenate([part.used for part in parts]),
         rejected=np.concatenate([part.rejected for part in parts]),
         with_care=sum(part.with_care for part in parts),
-        gates=np.diff([*rows, span.size]).astype(np.float64),
+        bins=np.diff([*rows, span.size]).astype(np.float64),
         profiles=np.diff([*columns, time.size]),
         background=background,
         background_error=background_error,
@@ -262,12 +262,12 @@ class _Part:
 def _reduced(
     product: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
 ) -> Iterator[_Part]:
-    gates = product.sizes["range"]
+    bins = product.sizes["range"]
     edges = [*columns, product.sizes["time"]]
     first = 0
     while first < columns.size:
         last = first + 1
-        while last < columns.size and (edges[last + 1] - edges[first]) * gates * 8 <= _READ_BYTES:
+        while last < columns.size and (edges[last + 1] - edges[first]) * bins * 8 <= _READ_BYTES:
             last += 1
         part = product.isel(time=slice(int(edges[first]), int(edges[last])))
         yield _sums(part, quantity, columns[first:last] - edges[first], rows)
@@ -281,7 +281,7 @@ def _sums(
         if values.dtype == np.bool_ and not values.any():
             return np.zeros((columns.size, rows.size), dtype=np.float32)
         by_row = values.astype(np.float64, copy=False)
-        # Up to as many gates as rows a row is a gate.
+        # Up to as many bins as rows a row is a bin.
         if rows.size < values.shape[1]:
             by_row = np.add.reduceat(by_row, rows, axis=1)
         return np.asarray(np.add.reduceat(by_row, columns, axis=0), dtype=np.float32)
@@ -344,8 +344,8 @@ def _column_edges(time: Times, columns: NDArray[np.intp]) -> tuple[Times, Times]
 def _row_edges(span: Floats, rows: NDArray[np.intp]) -> Floats:
     middles = 0.5 * (span[1:] + span[:-1])
     ends = [1.5 * span[0] - 0.5 * span[1], 1.5 * span[-1] - 0.5 * span[-2]]
-    gates = np.concatenate([ends[:1], middles, ends[1:]])
-    return np.asarray(gates[[*rows, span.size]])
+    bins = np.concatenate([ends[:1], middles, ends[1:]])
+    return np.asarray(bins[[*rows, span.size]])
 
 
 def _altitude(product: xr.Dataset, span: Floats) -> tuple[float, float] | None:
@@ -361,10 +361,10 @@ def _check(product: xr.Dataset, quantity: str) -> None:
     wanted |= {"range": ("range",)} | dict.fromkeys(_along_both(quantity), ("time", "range"))
     require(product, wanted)
     if product.sizes["time"] < 1 or product.sizes["range"] < 2:
-        raise ProductError("holds no profile of at least 2 gates", field=quantity)
+        raise ProductError("holds no profile of at least 2 bins", field=quantity)
 
 
 def share_with_care(rasters: Sequence[Raster]) -> float:
-    """Return the share of gates that are to be used with care."""
-    gates = sum(float((r.profiles[:, None] * r.gates).sum()) for r in rasters)
-    return sum(raster.with_care for raster in rasters) / gates if gates else 0.0
+    """Return the share of bins that are to be used with care."""
+    bins = sum(float((r.profiles[:, None] * r.bins).sum()) for r in rasters)
+    return sum(raster.with_care for raster in rasters) / bins if bins else 0.0

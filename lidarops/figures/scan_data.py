@@ -35,8 +35,8 @@ EXTINCTION_VARIABLES: Final = _PROFILES
 RESIDUAL_VARIABLES: Final = (
     "time",
     "altitude",
-    "ray_zenith_angle",
-    "ray_azimuth",
+    "beam_zenith_angle",
+    "beam_azimuth",
     "quality_flag",
     "residual",
 )
@@ -113,28 +113,28 @@ class ScanProfile:
 
 @dataclass(frozen=True, slots=True)
 class ScanResiduals:
-    """What a fit over angles leaves of the signal, by ray.
+    """What a fit over angles leaves of the signal, by beam.
 
-    Rays stand in the order of the sky: plane by plane, and in a plane from one horizon over the
+    Beams stand in the order of the sky: plane by plane, and in a plane from one horizon over the
     zenith to the other.
     """
 
     zenith_angle: Floats
-    """(ray,) degree, negative on the side away from the azimuth of the plane."""
+    """(beam,) degree, negative on the side away from the azimuth of the plane."""
     plane: NDArray[np.intp]
-    """(ray,) Index of its plane."""
+    """(beam,) Index of its plane."""
     azimuths: tuple[float, ...]
-    """(plane,) degree, of the positive side; NaN for rays whose azimuth is not known."""
+    """(plane,) degree, of the positive side; NaN for beams whose azimuth is not known."""
     edges: Floats
     """(row + 1,) m, altitude."""
     mean: Floats
-    """(row, ray) Mean residual over cycles and the altitudes of a row, per cent of the signal."""
+    """(row, beam) Mean residual over cycles and the altitudes of a row, per cent of the signal."""
     count: Floats
-    """(row, ray) Number of residuals in that mean."""
+    """(row, beam) Number of residuals in that mean."""
     rms: Floats
-    """(ray,) Root mean square over cycles and altitudes, per cent."""
+    """(beam,) Root mean square over cycles and altitudes, per cent."""
     rms_of_mean: Floats
-    """(ray,) The same of the means over cycles, weighted by their residuals: what does not average
+    """(beam,) The same of the means over cycles, weighted by their residuals: what does not average
     out."""
     cycles: int
     """Cycles with a residual."""
@@ -343,25 +343,25 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
     Raises
     ------
     ProductError
-        Where a variable is missing or has other dims; but `ray_azimuth`, where it is not known.
+        Where a variable is missing or has other dims; but `beam_azimuth`, where it is not known.
     """
-    known = {"ray_azimuth": ("ray",)} if "ray_azimuth" in product.variables else {}
+    known = {"beam_azimuth": ("beam",)} if "beam_azimuth" in product.variables else {}
     require(
         product,
         known
         | {
             "time": ("time",),
             "altitude": ("altitude",),
-            "ray_zenith_angle": ("ray",),
+            "beam_zenith_angle": ("beam",),
             "quality_flag": ("time", "altitude"),
-            "residual": ("time", "ray", "altitude"),
+            "residual": ("time", "beam", "altitude"),
         },
     )
     sums = _sums(product)
     if not sums.count.any():
         return None
-    zenith = product["ray_zenith_angle"].values.astype(np.float64)
-    azimuth = product["ray_azimuth"].values if known else np.full(zenith.size, np.nan)
+    zenith = product["beam_zenith_angle"].values.astype(np.float64)
+    azimuth = product["beam_azimuth"].values if known else np.full(zenith.size, np.nan)
     zenith, plane, azimuths, order = _in_the_sky(zenith, azimuth.astype(np.float64))
     top = int(np.flatnonzero(sums.count.any(axis=0))[-1]) + 1
     size = -(-top // _MAP_ROWS)
@@ -370,7 +370,7 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
     in_row = np.add.reduceat(count, starts, axis=1)
     by_row = _ratio(np.add.reduceat(total, starts, axis=1), in_row)
     squares_of_means = (total**2 / np.maximum(count, 1.0)).sum(axis=1)
-    of_ray = count.sum(axis=1)
+    of_beam = count.sum(axis=1)
     return ScanResiduals(
         zenith_angle=zenith,
         plane=plane,
@@ -378,8 +378,8 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
         edges=_edges(product["altitude"].values.astype(np.float64))[[*starts, top]],
         mean=100.0 * by_row.T,
         count=in_row.T,
-        rms=100.0 * np.sqrt(_ratio(sums.squares[order].sum(axis=1), of_ray)),
-        rms_of_mean=100.0 * np.sqrt(_ratio(squares_of_means, of_ray)),
+        rms=100.0 * np.sqrt(_ratio(sums.squares[order].sum(axis=1), of_beam)),
+        rms_of_mean=100.0 * np.sqrt(_ratio(squares_of_means, of_beam)),
         cycles=sums.cycles,
         altitudes=size,
     )
@@ -387,7 +387,7 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
 
 @dataclass(slots=True)
 class _Sums:
-    """Of residuals over cycles, (ray, altitude)."""
+    """Of residuals over cycles, (beam, altitude)."""
 
     total: Floats
     squares: Floats
@@ -411,7 +411,7 @@ def _sums(product: xr.Dataset) -> _Sums:
 
 
 def _parts(product: xr.Dataset) -> Iterator[xr.Dataset]:
-    one = 8 * product.sizes["ray"] * product.sizes["altitude"]
+    one = 8 * product.sizes["beam"] * product.sizes["altitude"]
     few = max(1, _READ_BYTES // max(one, 1))
     for first in range(0, product.sizes["time"], few):
         yield product[["residual", "quality_flag"]].isel(time=slice(first, first + few))
@@ -432,7 +432,7 @@ def _edges(middles: Floats) -> Floats:
 def _in_the_sky(
     zenith: Floats, azimuth: Floats
 ) -> tuple[Floats, NDArray[np.intp], tuple[float, ...], NDArray[np.intp]]:
-    """Return signed zenith angles, planes and their azimuths, and the order of the rays."""
+    """Return signed zenith angles, planes and their azimuths, and the order of the beams."""
     # A negative zenith angle leads opposite to the azimuth, also to one that is not known.
     azimuth = np.where(zenith < 0, azimuth + 180.0, azimuth) % 360.0
     signed = np.where(np.isnan(azimuth), zenith, np.abs(zenith))

@@ -1,4 +1,4 @@
-"""Panels of multi-angle products: a profile of one cycle, and what its fit leaves, by ray."""
+"""Panels of multi-angle products: a profile of one cycle, and what its fit leaves, by beam."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _USUAL: Final = 0.97
 """Share of the residuals whose cells lie inside the colour scale."""
 _LEAST: Final = 0.01
 """Per cent, the least end of the colour scale."""
-_RAY_TICKS: Final = 24
+_BEAM_TICKS: Final = 24
 
 
 def against_altitude(panel: Axes, profile: ScanProfile, quantity: str) -> None:
@@ -198,7 +198,7 @@ def bits_in_words(profile: ScanProfile) -> str:
 
 
 def residual_map(figure: Figure, panel: Axes, residuals: ScanResiduals) -> float:
-    """Draw mean residuals against ray and altitude; return the end of the colour scale, %."""
+    """Draw mean residuals against beam and altitude; return the end of the colour scale, %."""
     panel.set_facecolor("#bbbbbb")
     limit = max(_usual(residuals), _LEAST)
     across = np.arange(residuals.zenith_angle.size + 1) - 0.5
@@ -243,7 +243,7 @@ def residual_map(figure: Figure, panel: Axes, residuals: ScanResiduals) -> float
 def _usual(residuals: ScanResiduals) -> float:
     """Return the size that cells with `_USUAL` of all residuals do not exceed.
 
-    Cells that few cycles reach count little: they are noise at the end of a ray.
+    Cells that few cycles reach count little: they are noise at the end of a beam.
     """
     size, count = np.abs(residuals.mean).ravel(), residuals.count.ravel()
     order = np.argsort(np.where(count > 0, size, np.inf), kind="stable")
@@ -252,14 +252,14 @@ def _usual(residuals: ScanResiduals) -> float:
 
 
 def residual_rms(panel: Axes, residuals: ScanResiduals) -> None:
-    """Draw the root mean square residual of every ray, and what of it does not average out."""
+    """Draw the root mean square residual of every beam, and what of it does not average out."""
     panel.spines[["top", "right"]].set_visible(False)
     panel.grid(axis="y", color="#dddddd", linewidth=0.6)
     panel.set_axisbelow(True)
-    rays = np.arange(residuals.zenith_angle.size)
+    beams = np.arange(residuals.zenith_angle.size)
     many = residuals.cycles > 1
     panel.plot(
-        rays,
+        beams,
         residuals.rms,
         linestyle="none",
         marker="o",
@@ -270,7 +270,7 @@ def residual_rms(panel: Axes, residuals: ScanResiduals) -> None:
     )
     if many:
         panel.plot(
-            rays,
+            beams,
             residuals.rms_of_mean,
             linestyle="none",
             marker="_",
@@ -283,11 +283,11 @@ def residual_rms(panel: Axes, residuals: ScanResiduals) -> None:
     panel.set_ylim(bottom=0.0)
     panel.yaxis.set_major_locator(MaxNLocator(4))
     panel.set_ylabel("rms (%)")
-    some = rays[:: -(-rays.size // _RAY_TICKS)]
+    some = beams[:: -(-beams.size // _BEAM_TICKS)]
     panel.set_xticks(
         some, [f"{residuals.zenith_angle[k]:.3g}".replace("-", "\u2212") for k in some]
     )
-    panel.set_xlabel(_ray_label(residuals))
+    panel.set_xlabel(_beam_label(residuals))
     _planes(panel, residuals)
 
 
@@ -297,12 +297,12 @@ def _planes(panel: Axes, residuals: ScanResiduals) -> None:
     panel.set_xlim(-0.5, residuals.zenith_angle.size - 0.5)
 
 
-def _ray_label(residuals: ScanResiduals) -> str:
+def _beam_label(residuals: ScanResiduals) -> str:
     names = [
         "azimuth not known" if np.isnan(azimuth) else f"azimuth {azimuth:.4g}°"
         for azimuth in residuals.azimuths
     ]
     if not names:
-        return "zenith angle of the ray (°)"
+        return "zenith angle of the beam (°)"
     toward = "; ".join(names[:4]) + ("; ..." if len(names) > 4 else "")
-    return f"zenith angle of the ray (°), positive toward {toward}"
+    return f"zenith angle of the beam (°), positive toward {toward}"

@@ -44,7 +44,7 @@ def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Data
         scalar or over time); for ``signal`` also ``range`` (m, bin centres) and optionally
         ``range_bnds``, for ``homogeneous`` ``section``, ``section_range`` and
         ``section_bounds`` (m); for ``multiangle``, in place of the angles, ``altitude`` (m above
-        the geoid), ``ray``, ``ray_zenith_angle`` and optionally ``ray_azimuth`` (degree). An
+        the geoid), ``beam``, ``beam_zenith_angle`` and optionally ``beam_azimuth`` (degree). An
         attribute ``steps`` goes into the product. NaN is missing.
     context : Context
         What the product is of.

@@ -62,21 +62,21 @@ def locate_product(
     place = _PLACES.get(layout.sampled, _beam_place)
     found, vertical = place(source, layout, context.station.altitude, time.values.size)
     found["time"] = time
-    gates = {} if vertical.profiles else _sounded(found, layout, context)
+    bins = {} if vertical.profiles else _sounded(found, layout, context)
     for name, value in _fixed(context).items():
         if name in found or not any(row.name == name for row in layout.coordinates):
             continue
         row = layout.row(name)
-        if f"gate_{name}" in gates:
+        if f"bin_{name}" in bins:
             row = deployment(row)
         if np.isfinite(value):
             found[name] = Coordinate(row, (), np.asarray(value, np.float64))
-    found |= gates
+    found |= bins
     ordered = [found[row.name] for row in layout.coordinates if row.name in found]
     for coordinate in ordered:
         check_range(coordinate.row, coordinate.values)
     horizontal = [
-        gates[f"gate_{name}"].values if gates else found[name].values
+        bins[f"bin_{name}"].values if bins else found[name].values
         for name in ("latitude", "longitude")
     ]
     return ordered, _extents(source, vertical, horizontal)
@@ -115,8 +115,8 @@ def _sounded(
     found: Mapping[str, Coordinate], layout: Layout, context: Context
 ) -> dict[str, Coordinate]:
     """Return latitude and longitude of what lies along a slanting beam of known azimuth."""
-    has_gates = any(row.name == "gate_latitude" for row in layout.coordinates)
-    if not has_gates or "azimuth" not in found:
+    has_bins = any(row.name == "bin_latitude" for row in layout.coordinates)
+    if not has_bins or "azimuth" not in found:
         return {}
     # Places that change over time too are what no tool reads: CDO takes garbage for them.
     if found["zenith_angle"].dims or found["azimuth"].dims:
@@ -127,18 +127,18 @@ def _sounded(
     angle = np.deg2rad(zenith)
     ahead, up = along.values * np.sin(angle), along.values * np.cos(angle)
     places = sounded(station.latitude, station.longitude, station.altitude, ahead, azimuth, up)
-    gates = {}
-    for name, values in zip(("gate_latitude", "gate_longitude"), places, strict=True):
+    bins = {}
+    for name, values in zip(("bin_latitude", "bin_longitude"), places, strict=True):
         row = layout.row(name)
         stored = values.astype(row.dtype)
-        gates[name] = Coordinate(row, row.dims, stored)
-    return gates
+        bins[name] = Coordinate(row, row.dims, stored)
+    return bins
 
 
 def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) -> _Place:
-    """Return the coordinates of a kind whose values lie at altitudes seen by several rays."""
-    names = ["ray", "ray_zenith_angle"]
-    names += [name for name in ("ray_azimuth",) if name in source]
+    """Return the coordinates of a kind whose values lie at altitudes seen by several beams."""
+    names = ["beam", "beam_zenith_angle"]
+    names += [name for name in ("beam_azimuth",) if name in source]
     # Layers are an option; where one is used, its coordinate is none.
     names += ["layer_altitude"] if "layer_optical_depth" in source else []
     found = {name: _along(source, layout.row(name)) for name in names}
@@ -156,15 +156,15 @@ def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) 
 def _network_place(source: Intake, layout: Layout, _station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie where beams of several lidars meet."""
     angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
-    rays = (f"ray_{name}" for name in angles)
-    names = ("vertex_id", "latitude", "longitude", "altitude", "ray", *rays)
+    beams = (f"beam_{name}" for name in angles)
+    names = ("crossing_id", "latitude", "longitude", "altitude", "beam", *beams)
     found = {name: _along(source, layout.row(name)) for name in names}
     altitude = found["altitude"].values
     # Points stand in no order of altitude: there is no step from one to the next.
     return found, _Vertical(altitude, altitude[:, np.newaxis], profiles=False)
 
 
-_PLACES: Final = {"altitude": _scan_place, "vertex": _network_place}
+_PLACES: Final = {"altitude": _scan_place, "crossing": _network_place}
 """By what a product is sampled over besides time; along a beam where it is none of these."""
 
 

@@ -182,7 +182,7 @@ def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]
     }
 
 
-_SPREADS = {"vertex": "irregular: where beams meet"}
+_SPREADS = {"crossing": "irregular: where beams meet"}
 
 
 def _bounds(extents: Extents) -> str:

@@ -422,7 +422,7 @@ PLACE = (
 )
 SOUNDED = tuple(
     Row(
-        name=f"gate_{name}",
+        name=f"bin_{name}",
         dims=(),
         dtype="f4",
         units=units,
@@ -453,7 +453,7 @@ def deployment(row: Row) -> Row:
         row,
         standard_name=f"deployment_{row.name}",
         units="degree",
-        comment=f"Positive {direction}. gate_{row.name} is that of the sounded air.",
+        comment=f"Positive {direction}. bin_{row.name} is that of the sounded air.",
     )
 
 

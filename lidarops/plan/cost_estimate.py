@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lidarops.errors import CatalogError
-from lidarops.plan.signal_rules import GLUED, StepName, gates, parts_of
+from lidarops.plan.signal_rules import GLUED, StepName, parts_of, read_windows
 from lidarops.raw.model import bins_of
 from lidarops.records import Granule, Plan, ProductKind, Scene, Step
 
@@ -275,13 +275,13 @@ def _bins(part: Scene) -> dict[str, int]:
 def _conditioned(part: Scene, plan: Plan) -> float:
     """Return profiles times bins that are read and conditioned; joined channels read their own."""
     held = _bins(part)
-    gated = gates(tuple(_of(plan, part)))
+    windows = read_windows(tuple(_of(plan, part)))
     total = 0
     for step in _of(plan, part):
         if step.name == StepName.READ and not _only_a_part(step.channel, plan):
             names = parts_of(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
             total += sum(
-                bins_of(gated[name]) if name in gated else held.get(name, 0) for name in names
+                bins_of(windows[name]) if name in windows else held.get(name, 0) for name in names
             )
     return float(len(part.granules) * total)
 
@@ -299,8 +299,8 @@ def _values(step: Step, scene: Scene, plan: Plan) -> float:
         seconds = _average(step, plan)
         members = {member.instrument: member for member in scene.members}
         return float(
-            sum(_intervals(members[ray["instrument"]].granules, seconds)
-                for ray in settings["rays"])
+            sum(_intervals(members[beam["instrument"]].granules, seconds)
+                for beam in settings["beams"])
         )  # fmt: skip
     profiles = len(scene.granules)
     if step.name == ProductKind.HOMOGENEOUS:

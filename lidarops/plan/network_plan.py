@@ -46,7 +46,7 @@ SIGHT: Final = ("contrast", "law", "angstrom_exponent", "exponent_standard_error
 
 
 @dataclass(frozen=True, slots=True)
-class RayPlan:
+class BeamPlan:
     """One beam of one member of a network."""
 
     instrument: str
@@ -94,18 +94,18 @@ def plan_network(scene: Scene, campaign: Campaign) -> Plan:
     for member in scene.members:
         _sort(applied(MEMBER, MemberCase(member, campaign, asked.settings)), steps, left_out)
     able = {step.instrument for step in steps}
-    rays = [
-        ray
+    beams = [
+        beam
         for member in scene.members
         if member.instrument in able
-        for ray in MemberCase(member, campaign, asked.settings).pointings()
+        for beam in MemberCase(member, campaign, asked.settings).pointings()
     ]
     colours = [step.settings["wavelength"] for step in steps if step.name == StepName.READ]
-    found = Meeting(asked, tuple(rays), tuple(colours))
+    found = Meeting(asked, tuple(beams), tuple(colours))
     _sort(applied(MEETING, found), [], left_out)
     if found.reason:
         return Plan(scene.id, (), tuple(left_out))
-    used = {ray.instrument for ray in found.kept}
+    used = {beam.instrument for beam in found.kept}
     steps = [step for step in steps if step.instrument in used]
     _sort(applied(JOINT, found), steps, left_out)
     return Plan(scene.id, tuple(steps), tuple(left_out))
@@ -126,18 +126,20 @@ def sight(settings: VisibilitySettings) -> dict[str, Any]:
     }
 
 
-def rays_of(rays: Sequence[RayPlan], scene: Scene, campaign: Campaign) -> tuple[geometry.Ray, ...]:
+def beams_of(
+    beams: Sequence[BeamPlan], scene: Scene, campaign: Campaign
+) -> tuple[geometry.Beam, ...]:
     """Return the beams in space."""
     stations = {member.instrument: campaign.stations[member.station] for member in scene.members}
     return tuple(
-        geometry.Ray(
-            latitude=stations[ray.instrument].latitude,
-            longitude=stations[ray.instrument].longitude,
-            altitude=stations[ray.instrument].altitude,
-            azimuth=ray.azimuth,
-            elevation=90.0 - ray.zenith_angle,
+        geometry.Beam(
+            latitude=stations[beam.instrument].latitude,
+            longitude=stations[beam.instrument].longitude,
+            altitude=stations[beam.instrument].altitude,
+            azimuth=beam.azimuth,
+            elevation=90.0 - beam.zenith_angle,
         )
-        for ray in rays
+        for beam in beams
     )
 
 
@@ -241,7 +243,7 @@ class MemberCase:
             return "neither headers nor campaign tell where all beams point", None
         return "", None
 
-    def pointings(self) -> Iterator[RayPlan]:
+    def pointings(self) -> Iterator[BeamPlan]:
         """Give the beams of the member, each once."""
         told = sorted(
             {
@@ -257,7 +259,7 @@ class MemberCase:
             if not any(apart(found, other) <= SAME_POINTING for other in kept):
                 kept.append(found)
         for zenith, azimuth in kept:
-            yield RayPlan(
+            yield BeamPlan(
                 self.scene.instrument,
                 zenith,
                 azimuth,
@@ -343,7 +345,7 @@ def apart(one: tuple[float, float], other: tuple[float, float]) -> float:
 
 
 def meeting_of(
-    rays: Sequence[RayPlan],
+    beams: Sequence[BeamPlan],
     scene: Scene,
     campaign: Campaign,
     *,
@@ -352,10 +354,10 @@ def meeting_of(
 ) -> geometry.Network:
     """Return where beams meet; see `lidarops.retrieve.network.geometry.build_network`."""
     return geometry.build_network(
-        rays_of(rays, scene, campaign),
+        beams_of(beams, scene, campaign),
         tolerance=tolerance,
-        nearest=[ray.nearest for ray in rays],
-        farthest=[ray.farthest for ray in rays],
+        nearest=[beam.nearest for beam in beams],
+        farthest=[beam.farthest for beam in beams],
         smallest_angle=smallest_angle,
     )
 
@@ -364,20 +366,20 @@ class Meeting:
     """What the rules of beams that may meet look at: those that do, found on the way."""
 
     def __init__(
-        self, asked: NetworkCase, rays: Sequence[RayPlan], colours: Sequence[float]
+        self, asked: NetworkCase, beams: Sequence[BeamPlan], colours: Sequence[float]
     ) -> None:
         self.asked = asked
-        self.rays = tuple(rays)
+        self.beams = tuple(beams)
         self.colours = tuple(colours)
-        self.kept: tuple[RayPlan, ...] = ()
+        self.kept: tuple[BeamPlan, ...] = ()
         self.reason = ""
         """Why there is no network; empty where there is one."""
 
-    def net(self, rays: Sequence[RayPlan]) -> geometry.Network:
+    def net(self, beams: Sequence[BeamPlan]) -> geometry.Network:
         """Return where beams meet."""
         settings = self.asked.settings
         return meeting_of(
-            rays, self.asked.scene, self.asked.campaign,
+            beams, self.asked.scene, self.asked.campaign,
             tolerance=settings.tolerance, smallest_angle=settings.smallest_angle,
         )  # fmt: skip
 
@@ -395,27 +397,27 @@ def _one_colour(case: Meeting) -> Decisions:
 
 
 def _few_enough(case: Meeting) -> Decisions:
-    if not case.reason and len(case.rays) > geometry.MOST_RAYS:
-        reason = f"{len(case.rays)} beams are more than {geometry.MOST_RAYS}"
-        yield case.none(reason, float(len(case.rays)))
+    if not case.reason and len(case.beams) > geometry.MOST_BEAMS:
+        reason = f"{len(case.beams)} beams are more than {geometry.MOST_BEAMS}"
+        yield case.none(reason, float(len(case.beams)))
 
 
 def _beams_meet(case: Meeting) -> Decisions:
     """Leave out beams that meet fewer than two others, until all that are left meet."""
     if case.reason:
         return
-    kept = list(case.rays)
+    kept = list(case.beams)
     while kept:
         net = case.net(kept)
-        points = {ray: int(net.on_ray(n)[0].size) for n, ray in enumerate(kept)}
-        lost = [ray for ray in kept if points[ray] < 2]
-        for ray in lost:
-            told = f"the beam at {ray.zenith_angle:g} degree, azimuth {ray.azimuth:g}, meets"
+        points = {beam: int(net.on_beam(n)[0].size) for n, beam in enumerate(kept)}
+        lost = [beam for beam in kept if points[beam] < 2]
+        for beam in lost:
+            told = f"the beam at {beam.zenith_angle:g} degree, azimuth {beam.azimuth:g}, meets"
             reason = f"{told} fewer than two points that others see"
-            yield _left(case.asked.settings, ray.instrument, reason, float(points[ray]))
+            yield _left(case.asked.settings, beam.instrument, reason, float(points[beam]))
         if not lost:
             break
-        kept = [ray for ray in kept if ray not in lost]
+        kept = [beam for beam in kept if beam not in lost]
     case.kept = tuple(kept)
 
 
@@ -435,24 +437,26 @@ def _cycle(case: Meeting) -> Decisions:
         yield case.none(f"method {method}: {error}", float(len(case.kept)))
 
 
-def _gate(case: Meeting) -> Decisions:
+def _range_window(case: Meeting) -> Decisions:
     """Decide, for every instrument, which bins its beams and its background need."""
     net = case.net(case.kept)
     for member in case.asked.scene.members:
-        mine = [n for n, ray in enumerate(case.kept) if ray.instrument == member.instrument]
+        mine = [n for n, beam in enumerate(case.kept) if beam.instrument == member.instrument]
         if mine:
-            farthest = max(float(net.on_ray(n)[1][-1]) for n in mine)
-            yield _gate_of(MemberCase(member, case.asked.campaign, case.asked.settings), farthest)
+            farthest = max(float(net.on_beam(n)[1][-1]) for n in mine)
+            yield _member_window(
+                MemberCase(member, case.asked.campaign, case.asked.settings), farthest
+            )
 
 
-def _gate_of(case: MemberCase, farthest: float) -> Step | LeftOut:
+def _member_window(case: MemberCase, farthest: float) -> Step | LeftOut:
     channel = case.channel
     counts = case.of(channel)
     if channel.name.startswith(GLUED) or channel.mode is not DetectionMode.PHOTON:
         reason = "noise of analog records is estimated from the whole of them"
-        return counts.without(StepName.RANGE_GATE, reason)
+        return counts.without(StepName.RANGE_WINDOW, reason)
     if case.campaign.all_steps:
-        return counts.without(StepName.RANGE_GATE, ALL_STEPS)
+        return counts.without(StepName.RANGE_WINDOW, ALL_STEPS)
     width, (start, stop) = channel.bin_width, case.tail
     low, high = (share * (start + width) for share in BEFORE_TAIL)
     near = reaching(0.0, farthest + BEYOND * width, counts)
@@ -461,9 +465,9 @@ def _gate_of(case: MemberCase, farthest: float) -> Step | LeftOut:
     number = float(sum(past - first for first, past in kept))
     if len(kept) == 1 and number == channel.bins:
         reason = "beams and background reach over all bins"
-        return counts.without(StepName.RANGE_GATE, reason, number=number)
+        return counts.without(StepName.RANGE_WINDOW, reason, number=number)
     reason = "no bins between the farthest point and those that tell the background are needed"
-    return counts.step(StepName.RANGE_GATE, reason, number=number, bins=kept)
+    return counts.step(StepName.RANGE_WINDOW, reason, number=number, bins=kept)
 
 
 def _merged(stretches: Iterable[tuple[int, int]], bins: int) -> list[list[int]]:
@@ -503,13 +507,13 @@ def _prior(case: Meeting) -> Decisions:
 def _visibility(case: Meeting) -> Decisions:
     """Give the step that joins the members, which see light of one wavelength."""
     settings, net = case.asked.settings, case.net(case.kept)
-    rays = case.kept
+    beams = case.kept
     yield case.asked.step(
         StepName.VISIBILITY,
-        f"{len(rays)} beams of {len({ray.instrument for ray in rays})} instruments meet in"
-        f" {net.vertices} points, {int(net.near_vertex.sum())} of which are near ones",
-        number=float(net.vertices),
-        rays=[ray.as_dict() for ray in rays],
+        f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments meet in"
+        f" {net.crossings} points, {int(net.near_crossing.sum())} of which are near ones",
+        number=float(net.crossings),
+        beams=[beam.as_dict() for beam in beams],
         wavelength=min(case.colours),
         block_seconds=settings.block.total_seconds(),
         method=settings.method,
@@ -542,7 +546,12 @@ MEETING: Final = (
 )
 """Of all beams of a network; the first that finds that there is none ends it."""
 JOINT: Final = (
-    Rule("member_gate", StepName.RANGE_GATE, "Which bins do beams and background need?", _gate),
+    Rule(
+        "member_window",
+        StepName.RANGE_WINDOW,
+        "Which bins do beams and background need?",
+        _range_window,
+    ),
     Rule("network_average", StepName.AVERAGE, "How long are signals averaged?", _average),
     Rule("prior", StepName.PRIOR, "Is a mean field held beforehand?", _prior),
     Rule("visibility", StepName.VISIBILITY, "Do beams meet, and where?", _visibility),

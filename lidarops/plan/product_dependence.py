@@ -22,7 +22,7 @@ Wanted = tuple[ProductKind, str]
 _KINDS: Final = frozenset(kind.value for kind in ProductKind)
 _ONLY_FOR: Final[Mapping[str, frozenset[str]]] = {
     StepName.BACKGROUND: frozenset({ProductKind.SIGNAL, ProductKind.VISIBILITY}),
-    StepName.RANGE_GATE: frozenset({ProductKind.HOMOGENEOUS, ProductKind.VISIBILITY}),
+    StepName.RANGE_WINDOW: frozenset({ProductKind.HOMOGENEOUS, ProductKind.VISIBILITY}),
     StepName.LOOK: frozenset({ProductKind.HOMOGENEOUS}),
     StepName.ALONG_PATH: frozenset({ProductKind.HOMOGENEOUS}),
     StepName.GRADIENT: frozenset({ProductKind.MULTIANGLE}),

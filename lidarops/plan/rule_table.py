@@ -7,13 +7,13 @@ from typing import Final
 from lidarops.plan.availability import ABSENT, STRANGE
 from lidarops.plan.network_plan import NETWORK
 from lidarops.plan.preview import REFINEMENTS
-from lidarops.plan.scene_plan import CHANNEL, GATE, PRODUCTS
+from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW
 from lidarops.plan.signal_rules import CONDITIONING, GLUING, Rule
 
 RULES: Final[tuple[Rule, ...]] = tuple(
     dict.fromkeys(
         (
-            *(ABSENT, STRANGE, CHANNEL, GATE),
+            *(ABSENT, STRANGE, CHANNEL, RANGE_WINDOW),
             *CONDITIONING,
             *GLUING,
             *PRODUCTS,

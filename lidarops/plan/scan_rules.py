@@ -18,7 +18,7 @@ from lidarops.campaign.product_settings import MultiAngleSettings
 from lidarops.errors import RetrievalInputError
 from lidarops.plan.signal_rules import ChannelCase, Decisions, Rule, StepName, no_scan
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
-from lidarops.retrieve.multiangle.robust_weights import FEWEST_RAYS
+from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 
 Array = npt.NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def heights(step: float, highest: float) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
+class Beams:
     """The directions of a scan that the retrieval uses."""
 
     count: int
@@ -53,14 +53,14 @@ class Rays:
     """Whether no half turn is free, so that a horizontal gradient can be retrieved."""
 
 
-def rays(case: ChannelCase, settings: MultiAngleSettings) -> Rays:
-    """Return the rays that the retrieval will find in the files of a scan."""
+def beams(case: ChannelCase, settings: MultiAngleSettings) -> Beams:
+    """Return the beams that the retrieval will find in the files of a scan."""
     side = case.facts.azimuth
     pointings = tuple(
         (_number(granule.zenith_angle), _number(granule.azimuth if side is None else side))
         for granule in case.scene.granules
     )
-    return _rays(pointings, settings.step, settings.highest)
+    return _beams(pointings, settings.step, settings.highest)
 
 
 def _number(angle: float | None) -> float:
@@ -69,21 +69,21 @@ def _number(angle: float | None) -> float:
 
 # The rules of a channel ask one after the other, and its channels look the same way.
 @lru_cache(maxsize=1)
-def _rays(pointings: tuple[tuple[float, float], ...], step: float, highest: float) -> Rays:
+def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: float) -> Beams:
     zenith_angle, azimuth = np.array(pointings).T
     sides_known = bool(np.isfinite(azimuth).any())
     try:
         found = scan_cycles.directions(zenith_angle, azimuth)
     except RetrievalInputError:
         # The retrieval tells what is wrong with them.
-        return Rays(0, sides_known, 2 * _HALF_TURN, surround=False)
+        return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
     altitude = heights(step, highest)
     up = slant_paths.rising(found.zenith_angle, altitude)
     if up.size == 0:
-        return Rays(0, sides_known, 2 * _HALF_TURN, surround=False)
+        return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
     leaning = slant_paths.make_scan(found.zenith_angle[up], altitude, found.azimuth[up]).leaning
     free = math.degrees(slant_paths.free_turn(leaning))
-    return Rays(up.size, sides_known, free, slant_paths.surrounds_zenith(leaning))
+    return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(leaning))
 
 
 def _gradient(case: ChannelCase) -> Decisions:
@@ -123,7 +123,7 @@ def _regressor(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    found = rays(case, settings)
+    found = beams(case, settings)
     if settings.method in _BLIND:
         reason = f"method {settings.method} fits no horizontal gradient"
         yield case.without(StepName.GRADIENT_REGRESSOR, reason)
@@ -142,9 +142,9 @@ def _robust(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    count = float(rays(case, settings).count)
-    if count < FEWEST_RAYS:
-        reason = f"fewer than {FEWEST_RAYS} directions do not tell which of them is an outlier"
+    count = float(beams(case, settings).count)
+    if count < FEWEST_BEAMS:
+        reason = f"fewer than {FEWEST_BEAMS} directions do not tell which of them is an outlier"
         yield case.without(StepName.ROBUST, reason, number=count)
     else:
         reason = "decided from the data: where a residual is too large for chance"
@@ -155,8 +155,8 @@ def _vertical(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    count = rays(case, settings).count
-    gates = float(round(settings.highest / settings.step))
+    count = beams(case, settings).count
+    bins = float(round(settings.highest / settings.step))
     if settings.method in _SIMPLE:
         reason = f"method {settings.method} takes every altitude by itself"
         yield case.without(StepName.VERTICAL, reason)
@@ -165,14 +165,14 @@ def _vertical(case: ChannelCase) -> Decisions:
         yield case.without(StepName.VERTICAL, reason, number=float(count))
     else:
         reason = "decided from the data: as smooth as noise makes single altitudes uncertain"
-        yield case.step(StepName.VERTICAL, reason, number=gates)
+        yield case.step(StepName.VERTICAL, reason, number=bins)
 
 
 def _correlation(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    spare = float(rays(case, settings).count - 2)
+    spare = float(beams(case, settings).count - 2)
     if settings.method not in _JOINT:
         reason = f"method {settings.method} takes the errors of altitudes as independent"
         yield case.without(StepName.CORRELATION, reason)

@@ -155,7 +155,7 @@ def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decis
     yield from reading
     if not any(isinstance(decision, Step) for decision in reading):
         return
-    yield from glue_rules(case) if joined else applied((GATE, *CONDITIONING), case)
+    yield from glue_rules(case) if joined else applied((RANGE_WINDOW, *CONDITIONING), case)
     yield from applied(PRODUCTS, case)
 
 
@@ -201,15 +201,15 @@ def _asked(case: ChannelCase) -> Iterator[str]:
     yield from case.glued
 
 
-def _gate(case: ChannelCase) -> Decisions:
+def _range_window(case: ChannelCase) -> Decisions:
     if case.homogeneous is None:
         return
     if case.channel.mode is not DetectionMode.PHOTON:
         reason = "noise of analog records is estimated from the whole of them"
-        yield case.without(StepName.RANGE_GATE, reason)
+        yield case.without(StepName.RANGE_WINDOW, reason)
         return
     if case.all_steps:
-        yield case.without(StepName.RANGE_GATE, ALL_STEPS)
+        yield case.without(StepName.RANGE_WINDOW, ALL_STEPS)
         return
     farthest = max((far for _, far in _level_sections(case)), default=math.nan)
     if math.isnan(farthest):
@@ -217,10 +217,10 @@ def _gate(case: ChannelCase) -> Decisions:
     bins = reaching(0.0, farthest, case)[1]
     if not 0 < bins < case.channel.bins:
         reason = "a section reaches the end of the bins"
-        yield case.without(StepName.RANGE_GATE, reason, number=float(case.channel.bins))
+        yield case.without(StepName.RANGE_WINDOW, reason, number=float(case.channel.bins))
         return
     reason = "homogeneous sections need no farther bins, and counts none to tell their noise"
-    yield case.step(StepName.RANGE_GATE, reason, number=float(bins), bins=[[0, bins]])
+    yield case.step(StepName.RANGE_WINDOW, reason, number=float(bins), bins=[[0, bins]])
 
 
 def _background(case: ChannelCase) -> Decisions:
@@ -469,8 +469,11 @@ def _molecular(case: ChannelCase) -> Decisions:
 CHANNEL: Final = Rule(
     "channel", StepName.READ, "Does a product need the channel, at a known wavelength?", _read
 )
-GATE: Final = Rule(
-    "range_gate", StepName.RANGE_GATE, "Which bins do the sections of counts need?", _gate
+RANGE_WINDOW: Final = Rule(
+    "range_window",
+    StepName.RANGE_WINDOW,
+    "Which bins do the sections of counts need?",
+    _range_window,
 )
 PRODUCTS: Final = (
     Rule("background", StepName.BACKGROUND, "Does the far range hold enough bins?", _background),

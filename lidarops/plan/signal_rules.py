@@ -40,7 +40,7 @@ class StepName(StrEnum):
     """Names of the steps, in the order in which they run."""
 
     READ = "read"
-    RANGE_GATE = "range_gate"
+    RANGE_WINDOW = "range_window"
     OVERLAP = "overlap"
     RANGE_OFFSET = "range_offset"
     DARK = "dark"
@@ -333,18 +333,18 @@ def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
     return (known.range_offset or 0.0) - late
 
 
-def gates(steps: Collection[Step]) -> dict[str, Stretches]:
+def read_windows(steps: Collection[Step]) -> dict[str, Stretches]:
     """Return the channels of which only some bins are needed, and which."""
     whole = _needing_all(steps)
     return {
         step.channel: _stretches(step.settings["bins"])
         for step in steps
-        if step.name == StepName.RANGE_GATE and (step.instrument, step.channel) not in whole
+        if step.name == StepName.RANGE_WINDOW and (step.instrument, step.channel) not in whole
     }
 
 
-def idle_gate(step: Step, steps: Collection[Step]) -> str:
-    """Return why a gate of a plan keeps no bin from being read; empty where it does, or is none.
+def idle_window(step: Step, steps: Collection[Step]) -> str:
+    """Return why a range window of a plan keeps no bin from being read; empty where it does, or is none.
 
     It stands in the plan all the same: what a product tells of itself must not depend on which
     others are made.
@@ -355,7 +355,7 @@ def idle_gate(step: Step, steps: Collection[Step]) -> str:
     steps : collection of Step
         All that are carried out together.
     """
-    if step.name != StepName.RANGE_GATE:
+    if step.name != StepName.RANGE_WINDOW:
         return ""
     needing = _needing_all(steps).get((step.instrument, step.channel), [])
     if not needing:

@@ -93,7 +93,7 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
     if StepName.ELASTIC in steps:
         lazy[ProductKind.ELASTIC] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
     if StepName.MULTIANGLE in steps:
-        lazy[ProductKind.MULTIANGLE] = _rays(source, steps, bench)
+        lazy[ProductKind.MULTIANGLE] = _beams(source, steps, bench)
     # Together, so that products of one channel share one reading of the files.
     found = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
     if ProductKind.HOMOGENEOUS in found and "visibility" in steps[StepName.HOMOGENEOUS].settings:
@@ -362,8 +362,8 @@ def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> x
     return found.assign(_gluing(averages))
 
 
-def _rays(source: Plain | Glued, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
-    """Return the rays of every scan cycle on common altitudes, lazy."""
+def _beams(source: Plain | Glued, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+    """Return the beams of every scan cycle on common altitudes, lazy."""
     settings = steps[StepName.MULTIANGLE].settings
     profiles, geometry = source.profiles(), source.geometry
     near, far = settings["background_range"]

@@ -14,7 +14,7 @@ from dask.base import compute
 from lidarops.campaign.model import Station
 from lidarops.flags import Quality
 from lidarops.plan import network_plan
-from lidarops.plan.network_plan import SAME_POINTING, RayPlan
+from lidarops.plan.network_plan import SAME_POINTING, BeamPlan
 from lidarops.plan.signal_rules import StepName
 from lidarops.process import channel_steps
 from lidarops.process.channel_steps import Bench
@@ -63,14 +63,17 @@ def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.
     settings = joint[StepName.VISIBILITY].settings
     channel = joint[StepName.VISIBILITY].channel
     by_name = {member.instrument: member for member in members}
-    rays = [RayPlan(**ray) for ray in settings["rays"]]
-    beams = [_Beam(by_name[ray.instrument], ray, channel, seconds) for ray in rays]
+    beam_plans = [BeamPlan(**beam_plan) for beam_plan in settings["beams"]]
+    beams = [
+        _Beam(by_name[beam_plan.instrument], beam_plan, channel, seconds)
+        for beam_plan in beam_plans
+    ]
     # Together, so that the beams of one instrument share one reading of its files.
     computed = compute(*(beam.lazy for beam in beams))  # type: ignore[no-untyped-call]
     signals = [beam.signals(data) for beam, data in zip(beams, computed, strict=True)]
     return labeled.retrieve_network(
         signals,
-        _network(signals, settings, rays),
+        _network(signals, settings, beam_plans),
         labeled.NetworkSettings(
             block_intervals=round(settings["block_seconds"] / seconds),
             visibility=Definition(
@@ -87,16 +90,16 @@ def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.
 
 
 def _network(
-    signals: Sequence[BeamAverages], settings: Mapping[str, Any], rays: Sequence[RayPlan]
+    signals: Sequence[BeamAverages], settings: Mapping[str, Any], beam_plans: Sequence[BeamPlan]
 ) -> geometry.Network:
     return geometry.build_network(
         [
-            geometry.Ray(*beam.station, azimuth=beam.azimuth, elevation=90.0 - beam.zenith_angle)
+            geometry.Beam(*beam.station, azimuth=beam.azimuth, elevation=90.0 - beam.zenith_angle)
             for beam in signals
         ],
         tolerance=settings["tolerance"],
-        nearest=[ray.nearest for ray in rays],
-        farthest=[ray.farthest for ray in rays],
+        nearest=[beam_plan.nearest for beam_plan in beam_plans],
+        farthest=[beam_plan.farthest for beam_plan in beam_plans],
         smallest_angle=settings["smallest_angle"],
     )
 
@@ -104,13 +107,13 @@ def _network(
 class _Beam:
     """One beam of a member: the profiles of its pointing, averaged."""
 
-    def __init__(self, member: Member, ray: RayPlan, channel: str, seconds: float) -> None:
-        self._member, self._ray, self._channel = member, ray, channel
+    def __init__(self, member: Member, beam_plan: BeamPlan, channel: str, seconds: float) -> None:
+        self._member, self._beam_plan, self._channel = member, beam_plan, channel
         self._source: channel_steps.Plain | channel_steps.Glued | None = None
         self._interval: Integers = np.zeros(0, dtype=np.int64)
         self.lazy = _nothing(member.range)
         bench = member.bench
-        mine = [] if bench is None else list(_of_pointing(bench.archive, ray))
+        mine = [] if bench is None else list(_of_pointing(bench.archive, beam_plan))
         if bench is not None and mine:
             archive = bench.archive.isel(time=mine)
             self._source = channel_steps.source_of(replace(bench, archive=archive), channel)
@@ -132,23 +135,23 @@ class _Beam:
             instrument=member.instrument,
             station=(member.station.latitude, member.station.longitude, member.station.altitude),
             background_range=(near, far),
-            nearest=self._ray.nearest,
+            nearest=self._beam_plan.nearest,
             overlap=(
                 None
                 if bench is None
                 else channel_steps.overlap_at(planned, bench.ancillaries, distance)
             ),
-            exponent=self._ray.exponent,
-            zenith_angle=self._ray.zenith_angle,
-            azimuth=self._ray.azimuth,
+            exponent=self._beam_plan.exponent,
+            zenith_angle=self._beam_plan.zenith_angle,
+            azimuth=self._beam_plan.azimuth,
         )
 
 
-def _of_pointing(archive: xr.Dataset, ray: RayPlan) -> Iterator[int]:
+def _of_pointing(archive: xr.Dataset, beam_plan: BeamPlan) -> Iterator[int]:
     """Give the profiles of a beam."""
     pairs = zip(archive["zenith_angle"].to_numpy(), archive["azimuth"].to_numpy(), strict=True)
     for number, (zenith, azimuth) in enumerate(pairs):
-        found = network_plan.apart((zenith, azimuth), (ray.zenith_angle, ray.azimuth))
+        found = network_plan.apart((zenith, azimuth), (beam_plan.zenith_angle, beam_plan.azimuth))
         if found <= SAME_POINTING:
             yield number
 

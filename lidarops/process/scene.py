@@ -28,7 +28,7 @@ from lidarops.netcdf.context import Context, product_path
 from lidarops.plan import network_plan, product_dependence
 from lidarops.plan.availability import glued_channels
 from lidarops.plan.preview import refine_plan
-from lidarops.plan.signal_rules import StepName, gates
+from lidarops.plan.signal_rules import StepName, read_windows
 from lidarops.process import channel_steps, network_steps
 from lidarops.products.layouts import build_product
 from lidarops.raw import licel
@@ -307,7 +307,7 @@ def _bench(job: Job, scene: Scene, plan: Plan, root: Path) -> channel_steps.Benc
             scene.granules,
             root,
             [name for name in read if name in present],
-            gates(plan.steps),
+            read_windows(plan.steps),
         ),
         dark=_open(job, scene, scene.dark, root, subtracted) if subtracted and scene.dark else None,
         ancillaries=Ancillaries.read(job.campaign.folder, plan),

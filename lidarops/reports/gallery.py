@@ -19,12 +19,12 @@ import xarray as xr
 from lidarops.errors import ProductError
 from lidarops.figures import network_figures, panels, product_figures
 from lidarops.figures.network_data import (
+    CROSSING_VARIABLES,
     MAP_VARIABLES,
-    VERTEX_VARIABLES,
     instruments_of,
-    join_vertices,
+    join_crossings,
+    read_crossings,
     read_map,
-    read_vertices,
 )
 from lidarops.figures.profile_data import PROFILE_VARIABLES, clearest_profile
 from lidarops.figures.raster import COLUMNS, Raster, raster_variables, read_raster
@@ -361,11 +361,11 @@ def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_D
 
 def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
     read = [
-        functools.partial(read_vertices, instruments=instruments_of(scene))
+        functools.partial(read_crossings, instruments=instruments_of(scene))
         for scene, _ in group.members
     ]
-    by_scene = list(sources.each(group, VERTEX_VARIABLES, read, with_truth=True))
-    series = join_vertices([one for vertices in by_scene for one in vertices])
+    by_scene = list(sources.each(group, CROSSING_VARIABLES, read, with_truth=True))
+    series = join_crossings([one for crossings in by_scene for one in crossings])
     sources.gallery.compared += [
         Compared(group.instrument, group.channel, comparison)
         for one in series
@@ -382,8 +382,8 @@ def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Dr
             f"Beams, and visibility where they meet: {group.label}.",
             sources.draw(network_figures.draw_map, network, group.label),
         )
-    for first in range(0, len(series), network_figures.VERTICES):
-        few = series[first : first + network_figures.VERTICES]
+    for first in range(0, len(series), network_figures.CROSSINGS):
+        few = series[first : first + network_figures.CROSSINGS]
         yield _Drawn(
             f"visibility_{group.instrument}_{group.channel}",
             f"Visibility and extinction with their errors:"
@@ -423,7 +423,7 @@ def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
     if profile is not None:
         yield _Drawn(
             f"profile_{group.instrument}_{group.channel}",
-            f"The profile of a scene with most unflagged gates, and its error budget:"
+            f"The profile of a scene with most unflagged bins, and its error budget:"
             f" {group.label}.",
             sources.draw(product_figures.error_budget_figure, profile, group.label),
         )

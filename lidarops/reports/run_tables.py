@@ -10,7 +10,7 @@ from typing import Final
 
 from lidarops.figures.wording import counted, decided_on, duration, percent
 from lidarops.flags import Quality, Severity
-from lidarops.plan.signal_rules import idle_gate
+from lidarops.plan.signal_rules import idle_window
 from lidarops.records import LeftOut, ProductKind, RunRecord, SceneOutcome, Step
 
 _NAMED: Final = 8
@@ -192,7 +192,7 @@ def done(record: RunRecord) -> list[DecisionRow]:
 def _done(scene: SceneOutcome) -> Iterator[Step]:
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
-        idle = idle_gate(step, steps)
+        idle = idle_window(step, steps)
         yield replace(step, reason=f"{step.reason}; of no effect: {idle}") if idle else step
 
 

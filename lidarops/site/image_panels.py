@@ -46,14 +46,14 @@ def grid(raster: Raster, axis: TimeAxis) -> Grid:
     """Cut a raster where its signal drowns, and merge its rows to what a page shows."""
     full, reach = float(raster.edges[-1]), raster.reach
     cut = raster.shown_to(min(full, _BEYOND * reach) if reach > 0 else full)
-    rows = cut.gates.size
+    rows = cut.bins.size
     starts = np.arange(0, rows, -(-rows // ROWS))
 
     def merged(sums: Floats | NDArray[np.float32]) -> Floats:
         return np.add.reduceat(np.asarray(sums, dtype=np.float64), starts, axis=-1)
 
     used, rejected = merged(cut.used), merged(cut.rejected)
-    blocks = cut.profiles[:, None] * merged(cut.gates)[None, :]
+    blocks = cut.profiles[:, None] * merged(cut.bins)[None, :]
     return Grid(
         left=axis.x(cut.start),
         right=axis.x(cut.stop),

@@ -25,7 +25,7 @@ _TRIANGLE: Final = "M-5 4h10l-5-9z"
 
 
 def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
-    """Draw beams and vertices to one scale, with the median visibility at each vertex.
+    """Draw beams and crossings to one scale, with the median visibility at each crossing.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
         What it shows, in words.
     """
     sheet = Sheet(height=_FOOT + 50)
-    panel = _panel(np.concatenate([network.stations, network.ends, network.vertices]))
+    panel = _panel(np.concatenate([network.stations, network.ends, network.crossings]))
     sheet.frame(panel, network.axes[1], below=network.axes[0])
     for start, end in zip(
         _placed(panel, network.stations), _placed(panel, network.ends), strict=True
@@ -47,8 +47,8 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
         sheet.path(f"M{start[0]:.1f} {start[1]:.1f}L{end[0]:.1f} {end[1]:.1f}", "line d2 c1")
     for station in _placed(panel, network.stations):
         _mark(sheet, station, _TRIANGLE, "mark c1")
-    vertices = _placed(panel, network.vertices)
-    for place, number, seen in zip(vertices, network.numbers, network.visibility, strict=True):
+    crossings = _placed(panel, network.crossings)
+    for place, number, seen in zip(crossings, network.numbers, network.visibility, strict=True):
         known = bool(np.isfinite(seen))
         _mark(sheet, place, _RING, "mark c0" if known else "off")
         sheet.text(place[0] + 9, place[1] - 7, f"{number}: {_km(seen)}" if known else f"{number}")
@@ -59,8 +59,8 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
         [
             (_TRIANGLE, "mark c1", "lidar"),
             ("M-9 0H9", "line d2 c1", "beam"),
-            (_RING, "mark c0", "vertex, with its median visibility"),
-            (_RING, "off", "vertex without a value to use"),
+            (_RING, "mark c0", "crossing, with its median visibility"),
+            (_RING, "off", "crossing without a value to use"),
         ],
     )
     return sheet, _words(network)
@@ -98,7 +98,7 @@ def _km(visibility: float) -> str:
 def _words(network: NetworkMap) -> str:
     seen = zip(network.numbers, network.visibility, network.used, strict=True)
     known = [
-        f"{_km(visibility)} at vertex {number} ({used} of {counted(network.values, 'value')})"
+        f"{_km(visibility)} at crossing {number} ({used} of {counted(network.values, 'value')})"
         for number, visibility, used in seen
         if np.isfinite(visibility)
     ]

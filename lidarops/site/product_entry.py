@@ -121,7 +121,7 @@ def mean_share(entries: Iterable[Entry]) -> float | None:
     """Return the mean over products of the share of usable values.
 
     Retrievals count where there are any: the far range of a signal is flagged by nature. The
-    mean is over products and not over values, so that a product of many gates does not hide one
+    mean is over products and not over values, so that a product of many bins does not hide one
     of few sections. None where nothing is judged.
     """
     judged = [(entry.kind == SIGNAL, entry.share) for entry in entries if entry.share is not None]

@@ -11,7 +11,7 @@ import xarray as xr
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from lidarops.figures.network_data import read_map, read_vertices
+from lidarops.figures.network_data import read_crossings, read_map
 from lidarops.figures.profile_data import clearest_profile
 from lidarops.figures.raster import Raster, read_raster
 from lidarops.figures.scan_data import clearest_cycle, read_extinction
@@ -115,7 +115,7 @@ def _elastic(product: xr.Dataset) -> _Parts:
     if profile is not None:
         sheet, words = profile_panels.error_budget_panels(profile, "f2")
         moment = _moment(profile.time)
-        caption = f"Profile of {moment}, the one with most unflagged gates, and its error budget"
+        caption = f"Profile of {moment}, the one with most unflagged bins, and its error budget"
         drawn.append(_finish(sheet, caption, words, "f2"))
     return drawn, thumbnail, alt
 
@@ -168,9 +168,9 @@ def _visibility(product: xr.Dataset) -> _Parts:
         _Quantity("extinction", 1e3, "extinction", "km⁻¹"),
     )
     called = "Visibility and extinction where beams meet"
-    drawn, thumbnail, alt = _stacks(read_vertices(product), quantities, called)
+    drawn, thumbnail, alt = _stacks(read_crossings(product), quantities, called)
     sheet, words = network_map.draw_network_map(read_map(product))
-    plan = _finish(sheet, "Beams and the vertices in which they meet", words, "map")
+    plan = _finish(sheet, "Beams and the crossings in which they meet", words, "map")
     return [*drawn, plan], thumbnail, alt
 
 

@@ -37,7 +37,7 @@ def finding():
     with pytest.MonkeyPatch.context() as patch:
         for (module, name), measure in small.items():
             patch.setattr(module, name, measure)
-        scenes = (multiangle_cases.clear(3000.0, gates=25), multiangle_cases.cloud())
+        scenes = (multiangle_cases.clear(3000.0, bins=25), multiangle_cases.cloud())
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
         effort = Effort(quick=True, repeats=1, date="2024-01-01", progress=steps.append)
         found = registry.run_benchmark("accuracy", None, [], effort)

@@ -18,9 +18,9 @@ from lidarops.flags import Quality
 from lidarops.plan import product_dependence
 from lidarops.plan.preview import GAP, WITHOUT, refine_plan
 from lidarops.plan.rule_table import RULES
-from lidarops.plan.scene_plan import CHANNEL, GATE, PRODUCTS, plan_scene
+from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW, plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.plan.signal_rules import gates, idle_gate
+from lidarops.plan.signal_rules import idle_window, read_windows
 from lidarops.process import channel_steps
 from lidarops.process import scene as processing
 from lidarops.process.scene import Job, process_scene
@@ -53,7 +53,7 @@ def decided(made: Plan, rule: str) -> tuple[list[str], list[str]]:
 def test_rules_have_names_and_questions():
     assert len({rule.name for rule in RULES}) == len(RULES)
     assert all(rule.asks.endswith("?") for rule in RULES)
-    assert {CHANNEL, GATE, *PRODUCTS} <= set(RULES)
+    assert {CHANNEL, RANGE_WINDOW, *PRODUCTS} <= set(RULES)
 
 
 def told(**facts: Any) -> dict[str, Any]:
@@ -103,7 +103,7 @@ BEYOND = wanted(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 
     ("rule", "needing", "needless"),
     [
         ("channel", ([LEVEL], {}), ([LEVEL], wanted(signal={"channels": []}))),
-        ("range_gate", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
+        ("range_window", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
         ("overlap", ([LEVEL], {}), ([LEVEL], told())),
         ("range_offset", ([LEVEL], OFFSET), ([LEVEL], {})),
         ("dark", ([LEVEL, DARK], ANALOG), ([LEVEL], ANALOG)),
@@ -199,7 +199,7 @@ FLAT = scans((0.0, 90.0), (30.0, 90.0), (60.0, 90.0), (88.0, 270.0))
 @pytest.mark.parametrize(
     ("granules", "count"), [(JITTER, 3), (NEARLY_OPPOSITE, 5), (FLAT, 3), (BOTH_SIDES, 11)]
 )
-def test_the_rays_of_a_plan_are_those_of_the_retrieval(granules, count):
+def test_the_beams_of_a_plan_are_those_of_the_retrieval(granules, count):
     made = planned(*granules, **MULTI)
     told = {each.rule: each for each in (*made.steps, *made.left_out)}
     found, surrounded = retrieved(granules, highest=6000.0, step=60.0)
@@ -208,7 +208,7 @@ def test_the_rays_of_a_plan_are_those_of_the_retrieval(granules, count):
 
 
 def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int, bool]:
-    """Return how many rays the retrieval uses, and whether it can find a gradient."""
+    """Return how many beams the retrieval uses, and whether it can find a gradient."""
     times = np.datetime64("2026-03-01", "ns") + np.arange(len(granules)) * np.timedelta64(60, "s")
     distance = 7.5 * (np.arange(4000) + 0.5)
     power = np.tile(1e6 / distance**2, (len(granules), 1))
@@ -217,7 +217,7 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
         {"power": (("time", "range"), power), "variance": flat, "quality": flat},
         coords={"range": distance},
     )
-    rays = labeled_altitudes.on_altitudes(
+    on_levels = labeled_altitudes.on_altitudes(
         profiles,
         zenith_angle=np.array([granule.zenith_angle for granule in granules]),
         azimuth=np.array([granule.azimuth for granule in granules]),
@@ -231,12 +231,14 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
         ),
     ).compute()
     scan = slant_paths.make_scan(
-        rays["ray_zenith_angle"].to_numpy(),
-        rays["altitude"].to_numpy() - 20.0,
-        rays["ray_azimuth"].to_numpy(),
+        on_levels["beam_zenith_angle"].to_numpy(),
+        on_levels["altitude"].to_numpy() - 20.0,
+        on_levels["beam_azimuth"].to_numpy(),
     )
-    signal = rays["signal"].to_numpy()
-    return rays.sizes["ray"], _block.make_beam_block(signal, np.ones(signal.shape), scan).sides
+    signal = on_levels["signal"].to_numpy()
+    return on_levels.sizes["beam"], _block.make_beam_block(
+        signal, np.ones(signal.shape), scan
+    ).sides
 
 
 def test_angles_that_cannot_be_leave_the_plan_to_the_retrieval():
@@ -292,16 +294,18 @@ def test_sections_are_retrieved_where_a_beam_may_be_level(angles, kept):
     assert any("all steps" in left.reason for left in whole.left_out)
 
 
-def test_the_gate_holds_the_farthest_section_and_what_tells_its_noise():
+def test_the_window_holds_the_farthest_section_and_what_tells_its_noise():
     # 7500 m, a tenth more for the variance, and two bins for rounding.
     made = planned(products=HOMOGENEOUS)
-    (gate,) = (step for step in made.steps if step.name == "range_gate")
-    assert gate.settings == {"bins": [[0, 1102]]}
-    assert gate.number == 1102
-    assert gate.as_dict()["rule"] == "range_gate"
+    (window,) = (step for step in made.steps if step.name == "range_window")
+    assert window.settings == {"bins": [[0, 1102]]}
+    assert window.number == 1102
+    assert window.as_dict()["rule"] == "range_window"
     moved = told(channels={"photon_532o": {"range_offset": -75.0}})
-    (gate,) = (s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_gate")
-    assert gate.settings == {"bins": [[0, 1112]]}
+    (window,) = (
+        s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_window"
+    )
+    assert window.settings == {"bins": [[0, 1112]]}
 
 
 @pytest.mark.parametrize(
@@ -315,31 +319,31 @@ def test_the_gate_holds_the_farthest_section_and_what_tells_its_noise():
         ({**HOMOGENEOUS, **ELASTIC["products"], "signal": {}}, "signal and elastic need all bins"),
     ],
 )
-def test_a_gate_that_keeps_no_bin_from_being_read_says_so(products, why):
+def test_a_window_that_keeps_no_bin_from_being_read_says_so(products, why):
     # It climbs by 90 m along the section, which is level enough, and reaches clean air.
     steep = factories.granule(0, zenith_angle=0.0)
     wanted = {**products, "homogeneous": {**SECTIONS, "sections": [[750, 840]]}}
     made = planned(steep, products=wanted)
-    (gate,) = (step for step in made.steps if step.name == "range_gate")
-    assert idle_gate(gate, made.steps) == why
-    assert ("photon_532o" in gates(made.steps)) == (not why)
-    assert not any(idle_gate(step, made.steps) for step in made.steps if step is not gate)
+    (window,) = (step for step in made.steps if step.name == "range_window")
+    assert idle_window(window, made.steps) == why
+    assert ("photon_532o" in read_windows(made.steps)) == (not why)
+    assert not any(idle_window(step, made.steps) for step in made.steps if step is not window)
     # The product of sections tells the same of itself, whatever else is made.
     alone = product_dependence.plan_closure(made, [(ProductKind.HOMOGENEOUS, "photon_532o")])
-    assert gate in alone.steps
-    assert not idle_gate(gate, alone.steps)
+    assert window in alone.steps
+    assert not idle_window(window, alone.steps)
 
 
-def test_a_gate_of_one_lidar_is_not_idle_for_what_another_needs():
-    gate = Step("range_gate", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
+def test_a_window_of_one_lidar_is_not_idle_for_what_another_needs():
+    window = Step("range_window", "photon_532o", {"bins": [[0, 9]]}, "near bins", "east")
     signal = Step("signal", "photon_532o", {}, "asked for", "west")
-    assert not idle_gate(gate, [gate, signal])
-    assert gates([gate, signal]) == {"photon_532o": ((0, 9),)}
+    assert not idle_window(window, [window, signal])
+    assert read_windows([window, signal]) == {"photon_532o": ((0, 9),)}
 
 
-def test_the_gate_of_an_older_product_is_understood():
-    step = Step("range_gate", "photon_532o", {"bins": 1102}, "as it was told")
-    assert gates([step]) == {"photon_532o": ((0, 1102),)}
+def test_the_window_of_an_older_product_is_understood():
+    step = Step("range_window", "photon_532o", {"bins": 1102}, "as it was told")
+    assert read_windows([step]) == {"photon_532o": ((0, 1102),)}
 
 
 # Looks ----------------------------------------------------------------------------------------
@@ -449,14 +453,14 @@ def test_a_file_that_is_known_is_not_read_again(tmp_path):
 
 @pytest.mark.parametrize("far", [1500, 3000, 4500, 6700])
 @pytest.mark.parametrize("offset", [-60.0, 0.0, 40.0])
-def test_the_gate_changes_no_bit_of_a_section(tmp_path, far, offset):
+def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
     facts = {"zenith_angle": 90, "channels": {"photon_532o": {"range_offset": offset}}}
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, far]]}}
     campaign = archive(tmp_path, facts=[facts], products=products)
     scene = prepare(campaign).scenes[0]
     made = plan_scene(scene, campaign)
     values, read = [], []
-    for dropped in (["look"], ["look", "range_gate"]):
+    for dropped in (["look"], ["look", "range_window"]):
         steps = tuple(step for step in made.steps if step.name not in dropped)
         outcome = process_scene(Job(campaign, scene, replace(made, steps=steps)))
         values.append(xr.load_dataset(campaign.products_root / outcome.products[0].path))

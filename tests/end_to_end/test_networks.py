@@ -33,7 +33,7 @@ def opened(campaign: Campaign, outcome: SceneOutcome) -> xr.Dataset:
 
 def beams_of(job: Job) -> list[str]:
     (step,) = (step for step in job.plan.steps if step.name == "visibility")
-    return [ray["instrument"] for ray in step.settings["rays"]]
+    return [beam["instrument"] for beam in step.settings["beams"]]
 
 
 def scores(product: xr.Dataset, truth: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -85,18 +85,18 @@ def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
     assert digests[0] == digests[1] == digests[2]
 
 
-def test_the_gate_leaves_the_product_as_it_is(tmp_path):
+def test_the_window_leaves_the_product_as_it_is(tmp_path):
     told = made.tree(made.PLUME, duration=1200)
     campaign, _ = made.written(tmp_path, told)
     (job,) = jobs_of(campaign)
-    gates = [step for step in job.plan.steps if step.rule == "member_gate"]
-    assert gates
-    steps = tuple(step for step in job.plan.steps if step not in gates)
-    (gated,) = process_all([job])
-    near = opened(campaign, gated)
+    windows = [step for step in job.plan.steps if step.rule == "member_window"]
+    assert windows
+    steps = tuple(step for step in job.plan.steps if step not in windows)
+    (windowed,) = process_all([job])
+    near = opened(campaign, windowed)
     (whole,) = process_all([replace(job, plan=replace(job.plan, steps=steps))])
     full = opened(campaign, whole)
-    assert gated.bytes_read < whole.bytes_read
+    assert windowed.bytes_read < whole.bytes_read
     np.testing.assert_array_equal(near["quality_flag"], full["quality_flag"])
     for name in ("extinction", "extinction_standard_error", "extinction_systematic_error"):
         # Sums over windows begin elsewhere, and are rounded differently.

@@ -113,7 +113,7 @@ class TestQuicklook:
         assert not [line for line in figure.axes[0].get_lines() if line.get_marker() == "v"]
         assert "triangles" not in product_figures.alt_text(figure)
 
-    def test_rejected_gates_are_black(self, product):
+    def test_rejected_bins_are_black(self, product):
         figure = product_figures.backscatter_quicklook([product])
         assert "flagged" in product_figures.alt_text(figure)
         assert "no reference" in product_figures.alt_text(figure).replace("_", " ")
@@ -129,7 +129,7 @@ class TestQuicklook:
 
 
 class TestClearestProfile:
-    def test_it_is_the_one_with_most_unflagged_gates_below_its_reference(self, made, tmp_path):
+    def test_it_is_the_one_with_most_unflagged_bins_below_its_reference(self, made, tmp_path):
         made["quality_flag"][1:4, 10:20] |= np.int32(Quality.PILE_UP)
         made["quality_flag"][5:7, 10:12] |= np.int32(Quality.PILE_UP)
         product = stored(tmp_path / "flags.nc", made)
@@ -149,7 +149,7 @@ class TestClearestProfile:
             errors = product[f"backscatter_error_{cause}"].to_numpy()[4, shown]
             np.testing.assert_allclose(profile.budget[cause][good], np.abs(errors[good]))
 
-    def test_gates_to_use_with_care_are_marked(self, made, tmp_path):
+    def test_bins_to_use_with_care_are_marked(self, made, tmp_path):
         made["quality_flag"][1:, 10:20] |= np.int32(Quality.PILE_UP)
         profile = clearest_profile(stored(tmp_path / "care.nc", made))
         assert profile is not None

@@ -14,9 +14,9 @@ from lidarops.errors import ProductError
 from lidarops.figures import network_figures, product_figures
 from lidarops.figures.network_data import (
     instruments_of,
-    join_vertices,
+    join_crossings,
+    read_crossings,
     read_map,
-    read_vertices,
 )
 from lidarops.figures.series_data import compare
 from lidarops.flags import Quality
@@ -44,8 +44,8 @@ def truth(made: xr.Dataset, extinction: float = EXTINCTION) -> xr.Dataset:
 
 
 def test_series_hold_values_errors_and_truth(made):
-    series = read_vertices(made, truth(made), instruments=NAMES)
-    assert [one.label for one in series] == ["vertex 0", "vertex 1", "vertex 2"]
+    series = read_crossings(made, truth(made), instruments=NAMES)
+    assert [one.label for one in series] == ["crossing 0", "crossing 1", "crossing 2"]
     for v, one in enumerate(series):
         np.testing.assert_array_equal(
             one.estimates["extinction"].value, made["extinction"].values[:, v]
@@ -66,7 +66,7 @@ def test_series_hold_values_errors_and_truth(made):
 
 
 def test_a_wrong_truth_is_seen(made):
-    (one, *_) = read_vertices(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
+    (one, *_) = read_crossings(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
     found = compare(one, "extinction")
     assert found is not None
     assert found.bias < -3.0
@@ -82,16 +82,16 @@ def test_truth_is_that_of_the_beams_where_they_meet(made):
         known[f"range_{suffix}"] = (f"r{number}", middle)
         field = np.broadcast_to(1e-4 + 1e-7 * middle, (60, 1, middle.size))
         known[f"profile_extinction_{suffix}"] = ((f"p{number}", f"w{number}", f"r{number}"), field)
-    for v, one in enumerate(read_vertices(made, known, instruments=NAMES)):
-        expected = 1e-4 + 1e-7 * np.nanmean(made["ray_range"].values[:, v])
+    for v, one in enumerate(read_crossings(made, known, instruments=NAMES)):
+        expected = 1e-4 + 1e-7 * np.nanmean(made["beam_range"].values[:, v])
         np.testing.assert_allclose(one.estimates["extinction"].truth, expected, rtol=1e-6)
 
 
 def test_scenes_are_joined_in_time(made):
     halves = [made.isel(time=slice(6, 12)), made.isel(time=slice(6))]
-    joined = join_vertices([one for half in halves for one in read_vertices(half)])
-    whole = read_vertices(made)
-    assert [one.vertex for one in joined] == [0, 1, 2]
+    joined = join_crossings([one for half in halves for one in read_crossings(half)])
+    whole = read_crossings(made)
+    assert [one.crossing for one in joined] == [0, 1, 2]
     for one, other in zip(joined, whole, strict=True):
         np.testing.assert_array_equal(one.time, other.time)
         np.testing.assert_array_equal(
@@ -99,27 +99,27 @@ def test_scenes_are_joined_in_time(made):
         )
 
 
-def test_the_map_tells_each_vertex_in_words_and_colour(made):
+def test_the_map_tells_each_crossing_in_words_and_colour(made):
     network = read_map(made, NAMES)
     figure = network_figures.draw_map(network, title="valley")
     (panel, *_) = figure.axes
     texts = [text.get_text() for text in panel.texts]
     medians = np.median(made["visibility_in_air"].values, axis=0) / 1e3
     assert texts == [f"{v}: {value:.3g} km" for v, value in enumerate(medians)]
-    marks = [line for line in panel.lines if line.get_gid() == "vertex"]
+    marks = [line for line in panel.lines if line.get_gid() == "crossing"]
     assert len({to_rgba(mark.get_markerfacecolor()) for mark in marks}) == 3
     assert sum(line.get_gid() == "beam" for line in panel.lines) == 3
     alt = product_figures.alt_text(figure)
     assert "3 beams of 3 instruments" in alt
-    assert f"vertex 0: {medians[0]:.3g} km of 12 values" in alt
+    assert f"crossing 0: {medians[0]:.3g} km of 12 values" in alt
     # Where it lies: the first beam leads north-east of its lidar.
     assert network.axes[0].startswith("east")
     np.testing.assert_allclose(
-        np.hypot(*(network.vertices[2] - network.stations[0])), 1.588, atol=0.01
+        np.hypot(*(network.crossings[2] - network.stations[0])), 1.588, atol=0.01
     )
 
 
-def test_a_vertex_without_a_value_says_so(made):
+def test_a_crossing_without_a_value_says_so(made):
     lost = made.copy(deep=True)
     lost["quality_flag"][:, 1] = int(Quality.LOW_SIGNAL)
     figure = network_figures.draw_map(read_map(lost))
@@ -129,21 +129,21 @@ def test_a_vertex_without_a_value_says_so(made):
 def test_beams_in_a_vertical_plane_are_drawn_upright(made):
     plane = made.copy(deep=True)
     plane = plane.assign_coords(
-        ray_latitude=("ray", np.full(3, 47.25)),
-        ray_longitude=("ray", [11.3, 11.3265, 11.353]),
-        ray_azimuth=("ray", np.full(3, 90.0)),
-        ray_zenith_angle=("ray", [45.0, 30.0, 20.0]),
-        latitude=("vertex", np.full(3, 47.25)),
-        longitude=("vertex", [11.32, 11.33, 11.34]),
-        altitude=("vertex", [1500.0, 2000.0, 2500.0]),
+        beam_latitude=("beam", np.full(3, 47.25)),
+        beam_longitude=("beam", [11.3, 11.3265, 11.353]),
+        beam_azimuth=("beam", np.full(3, 90.0)),
+        beam_zenith_angle=("beam", [45.0, 30.0, 20.0]),
+        latitude=("crossing", np.full(3, 47.25)),
+        longitude=("crossing", [11.32, 11.33, 11.34]),
+        altitude=("crossing", [1500.0, 2000.0, 2500.0]),
     )
     network = read_map(plane)
     assert network.axes == ("east of the first lidar (km)", "above the first lidar (km)")
-    np.testing.assert_allclose(network.vertices[:, 1], [0.9, 1.4, 1.9], atol=0.01)
+    np.testing.assert_allclose(network.crossings[:, 1], [0.9, 1.4, 1.9], atol=0.01)
 
 
 def test_series_are_drawn_with_errors_and_truth(made):
-    series = read_vertices(made, truth(made), instruments=NAMES)
+    series = read_crossings(made, truth(made), instruments=NAMES)
     figure = network_figures.draw_series(series, title="valley")
     upper, lower = figure.axes
     for panel, quantity, scale in ((upper, "visibility", 1.0), (lower, "extinction", 1e3)):
@@ -162,13 +162,13 @@ def test_series_are_drawn_with_errors_and_truth(made):
 
 
 def test_a_foreign_product_is_refused(made):
-    with pytest.raises(ProductError, match="ray_range"):
-        read_vertices(made.drop_vars("ray_range"))
+    with pytest.raises(ProductError, match="beam_range"):
+        read_crossings(made.drop_vars("beam_range"))
 
 
 def test_instruments_are_those_of_the_plan(made):
-    rays = [{"instrument": name} for name in NAMES]
-    plan = Plan("s", (Step("visibility", "photon_532o", {"rays": rays}, "why"),), ())
+    beams = [{"instrument": name} for name in NAMES]
+    plan = Plan("s", (Step("visibility", "photon_532o", {"beams": beams}, "why"),), ())
     start = made["time"].values[0].astype("datetime64[us]").item()
     outcome = SceneOutcome("s", "valley", "valley", start, 3, plan)
     assert instruments_of(outcome) == NAMES

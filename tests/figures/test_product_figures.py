@@ -207,7 +207,7 @@ class TestComparison:
 
 class TestQuicklook:
     def test_colours_are_the_signal_and_flags_are_black(self):
-        product = signal(times(START, 48, 1800.0), gates=300)
+        product = signal(times(START, 48, 1800.0), bins=300)
         figure = product_figures.quicklook([product], title="vertical")
         image, below = figure.axes[:2]
         mesh, flagged = (found for found in image.collections if isinstance(found, QuadMesh))
@@ -230,7 +230,7 @@ class TestQuicklook:
         np.testing.assert_allclose(line.get_ydata(), product["background"].values, rtol=1e-6)
 
     def test_black_is_no_colour_of_the_signal(self):
-        product = signal(times(START, 24, 3600.0), gates=200)
+        product = signal(times(START, 24, 3600.0), bins=200)
         (mesh, _) = (c for c in product_figures.quicklook([product]).axes[0].collections)
         luminance = mesh.get_cmap()(np.linspace(0, 1, 256))[:, :3] @ [0.2126, 0.7152, 0.0722]
         assert (np.diff(luminance) > -1e-3).all()
@@ -240,36 +240,36 @@ class TestQuicklook:
         time = np.concatenate(
             [times(START, 12, 600.0), times(START + timedelta(hours=4), 12, 600.0)]
         )
-        panel = product_figures.quicklook([signal(time, gates=100)]).axes[0]
+        panel = product_figures.quicklook([signal(time, bins=100)]).axes[0]
         mesh = panel.collections[0]
         edges = mesh.get_coordinates()[0, :, 0] * 24
         (gap,) = np.flatnonzero(np.ma.getmaskarray(mesh.get_array()).all(axis=0))
         np.testing.assert_allclose(edges[gap : gap + 2], [2.0, 4.0], atol=1e-6)
 
     def test_large_products_are_reduced(self):
-        product = signal(times(START, 1600, 20.0), gates=1700, gate=3.0)
+        product = signal(times(START, 1600, 20.0), bins=1700, bin=3.0)
         panel = product_figures.quicklook([product]).axes[0]
         rows, columns = panel.collections[0].get_array().shape
         assert rows <= 800
         assert columns <= 1500
 
     def test_scenes_with_other_grids_stand_side_by_side(self):
-        one = signal(times(START, 30, 60.0), gates=200, gate=15.0)
-        two = signal(times(START + timedelta(minutes=30), 30, 60.0), gates=800, gate=7.5)
+        one = signal(times(START, 30, 60.0), bins=200, bin=15.0)
+        two = signal(times(START + timedelta(minutes=30), 30, 60.0), bins=800, bin=7.5)
         panel = product_figures.quicklook([one, two]).axes[0]
         assert panel.get_ylim()[1] <= 6.0
         assert {mesh.get_array().shape[0] for mesh in panel.collections[::2]} >= {200}
 
     @pytest.mark.parametrize("value", [-1.0, np.nan, 0.0])
     def test_nothing_to_draw_is_said(self, value):
-        product = signal(times(START, 5, 60.0), gates=40)
+        product = signal(times(START, 5, 60.0), bins=40)
         product["signal"][:] = value
         figure = product_figures.quicklook([product])
         product_figures.render(figure)
         assert "no usable signal above zero" in [t.get_text() for t in figure.axes[0].texts]
 
     def test_altitude_stands_beside_range(self):
-        figure = product_figures.quicklook([signal(times(START, 5, 60.0), gates=40)])
+        figure = product_figures.quicklook([signal(times(START, 5, 60.0), bins=40)])
         (beside,) = figure.axes[0].child_axes
         product_figures.render(figure)
         assert beside.get_ylabel() == "altitude (km)"
@@ -277,14 +277,14 @@ class TestQuicklook:
         np.testing.assert_allclose(beside.get_ylim(), [0.12 + 0.94 * low, 0.12 + 0.94 * high])
 
     def test_share_with_care_is_that_of_the_product(self):
-        product = signal(times(START, 60, 60.0), gates=4000, gate=15.0)
+        product = signal(times(START, 60, 60.0), bins=4000, bin=15.0)
         share = ((product["quality_flag"].values & int(Quality.PILE_UP)) != 0).mean()
         assert share > 0.0015
         words = product_figures.alt_text(product_figures.quicklook([product]))
-        assert f"use {100 * share:.1f} % of gates with care (pile_up)" in words
+        assert f"use {100 * share:.1f} % of bins with care (pile_up)" in words
 
     def test_far_noise_is_left_out_and_told(self):
-        figure = product_figures.quicklook([signal(times(START, 60, 60.0), gates=4000, gate=15.0)])
+        figure = product_figures.quicklook([signal(times(START, 60, 60.0), bins=4000, bin=15.0)])
         assert figure.axes[0].get_ylim()[1] < 30.0
         assert "of 60 km: noise prevails beyond" in product_figures.alt_text(figure)
 
@@ -318,7 +318,7 @@ class TestOverview:
         time = times(START, 96, 900.0)
         product = homogeneous(time, sections=SECTIONS[:1])
         figure = product_figures.overview(
-            product, truth_of(time), signal(time, gates=200), instrument="horizontal"
+            product, truth_of(time), signal(time, bins=200), instrument="horizontal"
         )
         assert picture(figure).shape == (600, 1200, 3)
         assert lines(figure.axes[0], "truth-extinction")
@@ -354,7 +354,7 @@ def test_no_global_state_of_matplotlib_is_touched():
         "from lidarops.figures import product_figures as figures\n"
         "time = fab.times(fab.START, 5, 60.0)\n"
         "figures.render(figures.retrieval([fab.homogeneous(time)]))\n"
-        "figures.render(figures.quicklook([fab.signal(time, gates=40)]))\n"
+        "figures.render(figures.quicklook([fab.signal(time, bins=40)]))\n"
         "assert state() == before\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )

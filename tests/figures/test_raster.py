@@ -20,7 +20,7 @@ CARE = [bit for bit in Quality if bit not in Quality.rejecting()]
 
 
 def oracle(product, columns, rows):
-    """Mean of the gates that no bit rejects, by plain loops."""
+    """Mean of the bins that no bit rejects, by plain loops."""
     flag, value = product["quality_flag"].values, product["signal"].values.astype(float)
     good = ((flag & BAD) == 0) & np.isfinite(value)
     out = np.full((len(columns), len(rows)), np.nan)
@@ -34,19 +34,19 @@ def oracle(product, columns, rows):
 @settings(max_examples=25, deadline=None)
 @given(
     count=st.integers(1, 40),
-    gates=st.integers(2, 50),
+    bins=st.integers(2, 50),
     profiles=st.integers(1, 9),
     seed=st.integers(0, 9),
 )
-def test_blocks_are_means_of_usable_gates(count, gates, profiles, seed):
+def test_blocks_are_means_of_usable_bins(count, bins, profiles, seed):
     random = np.random.default_rng(seed)
-    product = signal(times(START, count, 60.0), gates=gates, seed=seed)
-    flag = random.choice([0, 0, 0, *(int(bit) for bit in Quality)], size=(count, gates))
+    product = signal(times(START, count, 60.0), bins=bins, seed=seed)
+    flag = random.choice([0, 0, 0, *(int(bit) for bit in Quality)], size=(count, bins))
     product["quality_flag"][:] = flag.astype(np.int32)
-    product["signal"].values[random.random((count, gates)) < 0.1] = np.nan
+    product["signal"].values[random.random((count, bins)) < 0.1] = np.nan
     found = read_raster(product, profiles=profiles)
     columns = [slice(i, min(i + profiles, count)) for i in range(0, count, profiles)]
-    rows = [slice(j, j + 1) for j in range(gates)]
+    rows = [slice(j, j + 1) for j in range(bins)]
     np.testing.assert_allclose(found.mean, oracle(product, columns, rows), rtol=1e-5, atol=1e-3)
     assert found.with_care == np.isin(flag, CARE).sum()
     visible = BAD & ~int(Quality.INPUT_MISSING)
@@ -54,22 +54,22 @@ def test_blocks_are_means_of_usable_gates(count, gates, profiles, seed):
     np.testing.assert_array_equal(found.flagged, np.array(rejected) >= 0.5)
 
 
-@given(gates=st.integers(2, 3000), share=st.floats(0.01, 1.0))
+@given(bins=st.integers(2, 3000), share=st.floats(0.01, 1.0))
 @settings(max_examples=20, deadline=None)
-def test_rows_merge_without_loss(gates, share):
-    product = signal(times(START, 3, 60.0), gates=gates, gate=5.0)
+def test_rows_merge_without_loss(bins, share):
+    product = signal(times(START, 3, 60.0), bins=bins, bin=5.0)
     found = read_raster(product)
-    cut = found.shown_to(share * gates * 5.0)
+    cut = found.shown_to(share * bins * 5.0)
     assert cut.edges.size - 1 <= raster.ROWS
-    assert cut.edges[-1] >= share * gates * 5.0 - 1e-6 or cut.edges[-1] == found.edges[-1]
+    assert cut.edges[-1] >= share * bins * 5.0 - 1e-6 or cut.edges[-1] == found.edges[-1]
     rows = int(np.searchsorted(found.edges, cut.edges[-1]))
     np.testing.assert_allclose(cut.total.sum(), found.total[:, :rows].sum(), rtol=1e-4)
     assert cut.used.sum() == found.used[:, :rows].sum()
-    assert cut.gates.sum() == found.gates[:rows].sum()
+    assert cut.bins.sum() == found.bins[:rows].sum()
 
 
-def test_many_gates_are_read_in_blocks(monkeypatch):
-    product = signal(times(START, 30, 60.0), gates=9000, gate=3.0)
+def test_many_bins_are_read_in_blocks(monkeypatch):
+    product = signal(times(START, 30, 60.0), bins=9000, bin=3.0)
     whole = read_raster(product, profiles=4)
     assert whole.mean.shape == (8, 3000)
     monkeypatch.setattr(raster, "_READ_BYTES", 1)
@@ -102,7 +102,7 @@ def test_background_is_the_mean_with_its_error():
 
 
 def test_reach_is_where_the_signal_drowns():
-    product = signal(times(START, 60, 60.0), gates=2000, gate=15.0)
+    product = signal(times(START, 60, 60.0), bins=2000, bin=15.0)
     product["signal"].values[:, 400:] = (
         product["signal_standard_error"].values[:, 400:]
         * np.random.default_rng(0).standard_normal((60, 1600))
@@ -125,8 +125,8 @@ def test_unsorted_times_are_sorted():
     np.testing.assert_array_equal(read_raster(product).total, read_raster(backwards).total)
 
 
-def test_share_with_care_is_over_all_gates():
-    product = signal(times(START, 5, 60.0), gates=100)
+def test_share_with_care_is_over_all_bins():
+    product = signal(times(START, 5, 60.0), bins=100)
     product["quality_flag"].values[:] = 0
     product["quality_flag"].values[:, :25] = int(Quality.PILE_UP)
     assert share_with_care([read_raster(product)]) == 0.25
@@ -144,10 +144,10 @@ def test_empty_product_is_refused():
         read_raster(signal(times(START, 3, 60.0)).isel(time=slice(0)))
 
 
-def rasters_of(*starts: float, gates: int = 30) -> list[raster.Raster]:
+def rasters_of(*starts: float, bins: int = 30) -> list[raster.Raster]:
     """Rasters of an hour each, from so many hours after the start."""
     return [
-        read_raster(signal(times(START + timedelta(hours=hours), 60, 60.0), gates=gates, seed=seed))
+        read_raster(signal(times(START + timedelta(hours=hours), 60, 60.0), bins=bins, seed=seed))
         for seed, hours in enumerate(starts)
     ]
 
@@ -166,7 +166,7 @@ def test_joined_are_those_that_follow_one_another_with_the_same_rows():
 
 def test_joined_are_no_others():
     overlapping, backwards = rasters_of(0, 0.5), rasters_of(1, 0)
-    other_rows = [*rasters_of(0), *rasters_of(1, gates=31)]
+    other_rows = [*rasters_of(0), *rasters_of(1, bins=31)]
     for apart in (overlapping, backwards, other_rows):
         assert joined(apart) == apart
     assert joined([]) == []

@@ -45,7 +45,7 @@ def many(archive: Archive, tmp_path: Path) -> RunRecord:
         all_times.append(time)
         products = (
             archive.write(f"e{number}.nc", homogeneous(time, seed=number), ProductKind.HOMOGENEOUS),
-            archive.write(f"s{number}.nc", signal(time, gates=80), ProductKind.SIGNAL),
+            archive.write(f"s{number}.nc", signal(time, bins=80), ProductKind.SIGNAL),
         )
         inputs = tuple(
             InputRecord(f"raw/h{12 * number + i:05d}", Role.SIGNAL, "b" * 64) for i in range(12)
@@ -131,7 +131,7 @@ def deadly(product: xr.Dataset) -> int:
 @pytest.fixture
 def paths(archive: Archive) -> list[Path]:
     for count in range(2, 10):
-        archive.write(f"{count}.nc", signal(times(START, count, 60.0), gates=4), ProductKind.SIGNAL)
+        archive.write(f"{count}.nc", signal(times(START, count, 60.0), bins=4), ProductKind.SIGNAL)
     return [archive.root / f"{count}.nc" for count in range(2, 10)]
 
 

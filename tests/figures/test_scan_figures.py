@@ -22,7 +22,7 @@ ALTITUDE = STATION + 300.0 + 50.0 * np.arange(90)
 ZENITH = np.array([60.0, 45.0, 30.0, 0.0, 30.0, 45.0, 60.0])
 AZIMUTH = np.array([270.0, 270.0, 270.0, 90.0, 90.0, 90.0, 90.0])
 REACH = 3500.0
-RAYS = ("time", "ray", "altitude")
+BEAMS = ("time", "beam", "altitude")
 BOTH = ("time", "altitude")
 
 
@@ -72,14 +72,14 @@ def multiangle(cycles=12, *, seed=0, tilt=0.02):
             "data_share": (BOTH, np.ones(shape)),
             "inhomogeneity": (BOTH, np.full(shape, 0.01)),
             "reach": ("time", np.full(cycles, REACH), {"units": "m"}),
-            "residual": (RAYS, residual),
+            "residual": (BEAMS, residual),
             "quality_flag": (BOTH, flag),
         },
         coords={
             "time": ("time", time),
             "altitude": ("altitude", ALTITUDE, {"units": "m"}),
-            "ray_zenith_angle": ("ray", ZENITH, {"units": "degree"}),
-            "ray_azimuth": ("ray", AZIMUTH, {"units": "degree"}),
+            "beam_zenith_angle": ("beam", ZENITH, {"units": "degree"}),
+            "beam_azimuth": ("beam", AZIMUTH, {"units": "degree"}),
             "station_altitude": ((), STATION, {"units": "m"}),
             "wavelength": ((), 532.0, {"units": "nm"}),
         },
@@ -141,8 +141,8 @@ def drawn(product, truth=None):
 
 def half_width(band, z):
     """Half the width of a band between x at the altitude z (km)."""
-    vertices = band.get_paths()[0].vertices
-    x = vertices[np.isclose(vertices[:, 1], z), 0]
+    crossings = band.get_paths()[0].vertices
+    x = crossings[np.isclose(crossings[:, 1], z), 0]
     return np.ptp(x) / 2
 
 
@@ -452,12 +452,12 @@ class TestResiduals:
             ([0, 0], [0, 90], [0, 0], [0, 0], ()),
         ],
     )
-    def test_rays_stand_in_the_order_of_the_sky(self, zenith, azimuth, signed, planes, azimuths):
-        rays = len(zenith)
-        product = multiangle().isel(ray=slice(rays))
+    def test_beams_stand_in_the_order_of_the_sky(self, zenith, azimuth, signed, planes, azimuths):
+        beams = len(zenith)
+        product = multiangle().isel(beam=slice(beams))
         product = product.assign_coords(
-            ray_zenith_angle=("ray", np.array(zenith, dtype=float)),
-            ray_azimuth=("ray", np.array(azimuth, dtype=float)),
+            beam_zenith_angle=("beam", np.array(zenith, dtype=float)),
+            beam_azimuth=("beam", np.array(azimuth, dtype=float)),
         )
         read = scan_data.read_residuals(product)
         np.testing.assert_array_equal(read.zenith_angle, signed)
@@ -469,7 +469,7 @@ class TestResiduals:
         assert ("not known" in lower.get_xlabel()) == bool(np.isnan(azimuths).any())
 
     def test_azimuths_may_be_left_out_where_nobody_knows_them(self):
-        read = scan_data.read_residuals(multiangle().drop_vars("ray_azimuth"))
+        read = scan_data.read_residuals(multiangle().drop_vars("beam_azimuth"))
         np.testing.assert_array_equal(read.zenith_angle, np.sort(ZENITH))
         assert np.isnan(read.azimuths).all()
 
@@ -505,7 +505,7 @@ class TestResiduals:
         assert artist(figure.axes[0], "negative") is None
         assert picture(figure).std() > 0
 
-    def test_words_name_the_worst_ray(self):
+    def test_words_name_the_worst_beam(self):
         product = multiangle()
         product["residual"][:, 1] += 0.2
         words = product_figures.alt_text(
@@ -516,7 +516,7 @@ class TestResiduals:
 
 
 class TestQuicklook:
-    def test_extinction_in_km_with_rejected_gates_black(self):
+    def test_extinction_in_km_with_rejected_bins_black(self):
         product = multiangle()
         figure = product_figures.extinction_quicklook([product], title="scanner")
         panel = figure.axes[0]
@@ -567,7 +567,7 @@ NEEDED = {
         "time",
         "altitude",
     ),
-    "residuals": ("residual", "ray_zenith_angle", "quality_flag", "time", "altitude"),
+    "residuals": ("residual", "beam_zenith_angle", "quality_flag", "time", "altitude"),
     "quicklook": ("extinction", "extinction_standard_error", "quality_flag", "time"),
 }
 

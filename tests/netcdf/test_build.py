@@ -140,8 +140,11 @@ def test_coordinates_are_listed_where_their_dimensions_are(kind: ProductKind):
         assert "station" not in variable.attrs.get("coordinates", "").split()
     main, beam = {
         ProductKind.SIGNAL: ("signal", {"altitude", "zenith_angle", "azimuth"}),
-        ProductKind.MULTIANGLE: ("residual", {"ray_zenith_angle", "ray_azimuth"}),
-        ProductKind.VISIBILITY: ("extinction", {"latitude", "longitude", "altitude", "vertex_id"}),
+        ProductKind.MULTIANGLE: ("residual", {"beam_zenith_angle", "beam_azimuth"}),
+        ProductKind.VISIBILITY: (
+            "extinction",
+            {"latitude", "longitude", "altitude", "crossing_id"},
+        ),
     }.get(kind, ("extinction", {"altitude", "zenith_angle", "azimuth"}))
     assert beam | {"wavelength"} <= set(product[main].attrs["coordinates"].split())
     assert not beam & set(product["shots"].attrs["coordinates"].split()) - {
@@ -402,9 +405,9 @@ def test_bad_signals_are_refused(change, field, problem):
         (put("altitude", 53.5, (0,)), "altitude", "station"),
         (put("altitude", math.nan, (3,)), "altitude", "finite"),
         (lambda data: data.isel(altitude=slice(None, None, -1)), "altitude", "rise"),
-        (put("ray_zenith_angle", -30.0, (1,)), "ray_zenith_angle", "valid range"),
-        (put("ray_zenith_angle", math.nan, (1,)), "ray_zenith_angle", "finite"),
-        (put("ray", 0.5, (0,)), "ray", "whole numbers"),
+        (put("beam_zenith_angle", -30.0, (1,)), "beam_zenith_angle", "valid range"),
+        (put("beam_zenith_angle", math.nan, (1,)), "beam_zenith_angle", "finite"),
+        (put("beam", 0.5, (0,)), "beam", "whole numbers"),
         (put("optical_depth", math.nan, (2, 2)), None, ""),
         (put("quality_flag", int(Quality.CLOUD), (0, 0)), "quality_flag", "cloud"),
         (put("extinction_gradient_error", -1.0, (1, 1)), "extinction_gradient_error", "range"),
@@ -576,7 +579,7 @@ def test_a_scan_goes_from_profiles_to_a_product():
         background=labeled.Background((5400.0, 6000.0)),
     )
     product = decoded(found, ProductKind.MULTIANGLE)
-    assert {"time": 3, "altitude": 59, "ray": 4}.items() <= product.sizes.items()
+    assert {"time": 3, "altitude": 59, "beam": 4}.items() <= product.sizes.items()
     np.testing.assert_array_equal(product["quality_flag"], found["quality_flag"])
-    np.testing.assert_allclose(product["ray_azimuth"], 90.0)
+    np.testing.assert_allclose(product["beam_azimuth"], 90.0)
     assert "joint" in product.attrs["lidarops_steps"]

@@ -93,15 +93,15 @@ KEYS = st.one_of(
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.differing_executors])
-@given(time=KEYS, gates=st.one_of(st.integers(0, 1999), slices(2000)))
-def test_any_part_is_that_part_of_the_whole(chunked: Path, time: object, gates: object):
+@given(time=KEYS, bins=st.one_of(st.integers(0, 1999), slices(2000)))
+def test_any_part_is_that_part_of_the_whole(chunked: Path, time: object, bins: object):
     with open_product(chunked, ["signal", "quality_flag"]) as product:
         whole = product["signal"].values
-        part = product["signal"].isel(time=time, range=gates)
-        np.testing.assert_array_equal(part.values, whole[time][..., gates])
-        twice = product.isel(range=gates).isel(time=time)["quality_flag"]
+        part = product["signal"].isel(time=time, range=bins)
+        np.testing.assert_array_equal(part.values, whole[time][..., bins])
+        twice = product.isel(range=bins).isel(time=time)["quality_flag"]
         flags = product["quality_flag"].values
-        np.testing.assert_array_equal(twice.values, flags[time][..., gates])
+        np.testing.assert_array_equal(twice.values, flags[time][..., bins])
 
 
 def test_only_what_is_asked_for_is_read(chunked: Path, monkeypatch: pytest.MonkeyPatch):

@@ -65,20 +65,20 @@ def test_north_and_east_are_what_they_are():
 
 
 @pytest.mark.parametrize("kind", [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS])
-def test_gates_of_slanting_beams_have_their_own_place(kind: ProductKind):
+def test_bins_of_slanting_beams_have_their_own_place(kind: ProductKind):
     product = build_product(MAKERS[kind](zenith=80.0, azimuth=90.0), context(kind))
-    gates = product["gate_longitude"]
+    bins = product["bin_longitude"]
     along = product["range" if kind is ProductKind.SIGNAL else "section_range"]
-    assert gates.dims == along.dims
-    metres = (gates - STATION.longitude) * 111_320 * np.cos(np.deg2rad(STATION.latitude))
+    assert bins.dims == along.dims
+    metres = (bins - STATION.longitude) * 111_320 * np.cos(np.deg2rad(STATION.latitude))
     np.testing.assert_allclose(metres, along * np.sin(np.deg2rad(80)), rtol=0.005, atol=1.0)
     assert product["latitude"].attrs["standard_name"] == "deployment_latitude"
-    assert product["gate_latitude"].attrs["standard_name"] == "latitude"
-    assert product.attrs["geospatial_lon_max"] == float(gates.max())
+    assert product["bin_latitude"].attrs["standard_name"] == "latitude"
+    assert product.attrs["geospatial_lon_max"] == float(bins.max())
     assert product.attrs["geospatial_bounds"].startswith("POLYGON ((")
     main = "signal" if kind is ProductKind.SIGNAL else "extinction"
     # CDO 2.1 would skip the variable, or read garbage where the beam moves.
-    assert "gate_latitude" not in product[main].attrs["coordinates"].split()
+    assert "bin_latitude" not in product[main].attrs["coordinates"].split()
 
 
 def test_a_moving_beam_has_the_place_of_the_station_alone():
@@ -87,20 +87,20 @@ def test_a_moving_beam_has_the_place_of_the_station_alone():
     product = build_product(
         MAKERS[ProductKind.SIGNAL](zenith=45.0, azimuth=angles), context(ProductKind.SIGNAL)
     )
-    assert "gate_latitude" not in product
+    assert "bin_latitude" not in product
     assert product["latitude"].attrs["standard_name"] == "latitude"
 
 
 def test_where_the_place_is_that_of_the_station_or_unknown_there_is_no_other():
     for beam in ({"zenith": 90.0}, {"zenith": 3.0, "azimuth": 10.0}):
         product = build_product(MAKERS[ProductKind.SIGNAL](**beam), context(ProductKind.SIGNAL))
-        assert "gate_latitude" not in product
+        assert "bin_latitude" not in product
         assert product["latitude"].attrs["standard_name"] == "latitude"
 
 
-def test_stations_at_a_pole_have_gates_too():
+def test_stations_at_a_pole_have_bins_too():
     pole = Station(name="Pole", latitude=90.0, longitude=0.0)
     data = MAKERS[ProductKind.SIGNAL](zenith=90.0, azimuth=90.0)
     product = build_product(data, context(ProductKind.SIGNAL, station=pole))
-    assert np.isfinite(product["gate_longitude"]).all()
-    np.testing.assert_allclose(product["gate_longitude"], 90.0)
+    assert np.isfinite(product["bin_longitude"]).all()
+    np.testing.assert_allclose(product["bin_longitude"], 90.0)

@@ -46,11 +46,11 @@ def of(**changes: Any) -> dict[Term, float]:
 
 def test_amounts_of_sections():
     found = of(count=10)
-    (gate,) = (s for s in planned()[1].steps if s.name == "range_gate")
+    (bin,) = (s for s in planned()[1].steps if s.name == "range_window")
     assert found[Term.FILE] == 10
     assert found[Term.DIGEST] == 10 * 1000
     assert found[Term.CHANNEL] == found[Term.HOMOGENEOUS] == found[Term.LOOK] == 1
-    assert found[Term.VALUE] == 10 * gate.number
+    assert found[Term.VALUE] == 10 * bin.number
     assert found[Term.HOMOGENEOUS_VALUE] == 10 * (4500 - 750) / 7.5
     assert Term.SIGNAL not in found
 

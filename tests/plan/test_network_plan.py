@@ -165,7 +165,7 @@ class TestScenes:
         first, second = networks(told, [*granules(10), *granules(721)])
         assert first.stop == noon == second.start
         assert [len(member.granules) for member in first.members] == [1, 1, 1]
-        near = [ray["nearest"] for ray in plan_scene(second, told).steps[-1].settings["rays"]]
+        near = [beam["nearest"] for beam in plan_scene(second, told).steps[-1].settings["beams"]]
         assert near == [150.0, 300.0, 150.0]
 
     def test_one_lidar_alone_is_no_network(self):
@@ -197,13 +197,13 @@ class TestPlans:
         found = planned(campaign())
         step = found.steps[-1]
         assert step.name == "visibility"
-        assert [ray["azimuth"] for ray in step.settings["rays"]] == [70.0, 310.0, 190.0]
+        assert [beam["azimuth"] for beam in step.settings["beams"]] == [70.0, 310.0, 190.0]
         assert "3 beams of 3 instruments meet in 3 points, 3 of which are near ones" in step.reason
         per_member = [s for s in found.steps if s.instrument]
         assert {s.instrument for s in per_member} == set(MEMBERS)
         assert all(s.reason.startswith(f"{s.instrument}: ") for s in per_member)
         names = [s.name for s in found.steps if s.instrument == "west-lidar"]
-        assert names == ["read", "overlap", "noise", "background", "range_gate"]
+        assert names == ["read", "overlap", "noise", "background", "range_window"]
         joint = [s.name for s in found.steps if not s.instrument]
         assert joint == ["average", "prior", "visibility"]
 
@@ -221,7 +221,7 @@ class TestPlans:
     def test_it_is_plain_data(self):
         found = planned(campaign({"exponents": {"east-lidar": 1.2}}))
         assert found.as_dict()["steps"][0]["instrument"] == "west-lidar"
-        assert [ray["exponent"] for ray in found.steps[-1].settings["rays"]] == [1.0, 1.2, 1.0]
+        assert [beam["exponent"] for beam in found.steps[-1].settings["beams"]] == [1.0, 1.2, 1.0]
         assert found.hash != planned(campaign()).hash
 
     @pytest.mark.parametrize(
@@ -301,13 +301,13 @@ class TestPlans:
         apart_ = planned(campaign(), granules(zenith_angle=0.0))
         assert not [each for each in apart_.steps if each.rule == rule]
 
-    def test_the_gate_holds_beams_and_what_tells_their_background(self):
+    def test_the_bin_holds_beams_and_what_tells_their_background(self):
         found = planned(campaign())
-        gates = [step for step in found.steps if step.rule == "member_gate"]
-        assert len(gates) == len(MEMBERS)
-        for gate in gates:
-            kept = gate.settings["bins"]
-            assert gate.number == sum(past - first for first, past in kept)
+        bins = [step for step in found.steps if step.rule == "member_window"]
+        assert len(bins) == len(MEMBERS)
+        for bin in bins:
+            kept = bin.settings["bins"]
+            assert bin.number == sum(past - first for first, past in kept)
             assert kept[0][0] == 0
             assert kept[-1][1] == PHOTON.bins
             # The points are 4 km away; the tail begins at 13.5 km.
@@ -329,10 +329,10 @@ class TestPlans:
         given_ = granules(layout=(layout,))
         found = planned(campaign(**told), given_)
         assert found.steps[-1].name == "visibility"
-        left = [each for each in found.left_out if each.rule == "member_gate"]
+        left = [each for each in found.left_out if each.rule == "member_window"]
         assert len(left) == len(MEMBERS)
         assert all(said in each.reason for each in left)
-        assert not [step for step in found.steps if step.rule == "member_gate"]
+        assert not [step for step in found.steps if step.rule == "member_window"]
 
     def test_every_decision_has_a_rule_of_the_table(self):
         names = {rule.name for rule in RULES}
@@ -344,13 +344,13 @@ class TestPlans:
         facts = [{"full_overlap_range": 150.0, "zenith_angle": 90.0, "azimuth": 70.0}]
         strange = [replace(granules()[0], azimuth=12.0, zenith_angle=3.0), *granules()[1:]]
         found = planned(campaign(facts={"west-lidar": facts}), strange)
-        assert found.steps[-1].settings["rays"][0]["azimuth"] == 70.0
+        assert found.steps[-1].settings["beams"][0]["azimuth"] == 70.0
 
     def test_beams_of_one_instrument_are_told_apart(self):
         other = [replace(g, azimuth=(g.azimuth or 0) + 2.0) for g in granules(10)]
         jitter = [replace(g, azimuth=(g.azimuth or 0) + 0.05) for g in granules(20)]
-        rays = planned(campaign(), [*granules(), *other, *jitter]).steps[-1].settings["rays"]
-        assert [ray["instrument"] for ray in rays] == [m for m in MEMBERS for _ in range(2)]
+        beams = planned(campaign(), [*granules(), *other, *jitter]).steps[-1].settings["beams"]
+        assert [beam["instrument"] for beam in beams] == [m for m in MEMBERS for _ in range(2)]
 
 
 @given(st.floats(0, 180), st.floats(0, 360), st.floats(0, 180), st.floats(0, 360))

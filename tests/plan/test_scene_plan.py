@@ -35,7 +35,7 @@ def test_photon_channel() -> None:
     steps = _steps(result, "photon_532o")
     assert list(steps) == [
         "read",
-        "range_gate",
+        "range_window",
         "overlap",
         "dead_time",
         "noise",

@@ -123,7 +123,7 @@ def test_what_has_no_standard_name_is_what_the_table_does_not_know():
             "reduced_chi2",
             "degrees_of_freedom",
             "prior_deviation",
-            "ray_range",
+            "beam_range",
         },
         ProductKind.HOMOGENEOUS: {
             "visibility_in_air_lower",

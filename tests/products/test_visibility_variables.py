@@ -37,34 +37,34 @@ def test_nothing_but_missing_values_complies(data: xr.Dataset, tmp_path: Path):
     lost = data.copy(deep=True)
     lost["quality_flag"][:] = int(Quality.INPUT_MISSING)
     for name, variable in lost.data_vars.items():
-        if variable.dtype.kind == "f" and name != "ray_range":
+        if variable.dtype.kind == "f" and name != "beam_range":
             variable[...] = np.nan
     path = tmp_path / "product.nc"
     write_product(build_product(lost, context(KIND)), path)
     assert findings(path) == (set(), permitted(KIND, lost))
 
 
-def test_each_vertex_is_a_time_series(data: xr.Dataset, tmp_path: Path):
+def test_each_crossing_is_a_time_series(data: xr.Dataset, tmp_path: Path):
     path = tmp_path / "product.nc"
     write_product(build_product(data, context(KIND)), path)
     with xr.open_dataset(path) as found:
         assert found.attrs["featureType"] == "timeSeries"
         roles = [name for name, v in found.variables.items() if "cf_role" in v.attrs]
-        assert roles == ["vertex_id"]
-        assert found["vertex_id"].dims == ("vertex",)
+        assert roles == ["crossing_id"]
+        assert found["crossing_id"].dims == ("crossing",)
         main = found["visibility_in_air"]
         assert main.attrs["standard_name"] == "visibility_in_air"
         assert main.attrs["units"] == "m"
-        assert main.dims == ("time", "vertex")
-        assert {"latitude", "longitude", "altitude", "vertex_id"} <= set(main.coords)
+        assert main.dims == ("time", "crossing")
+        assert {"latitude", "longitude", "altitude", "crossing_id"} <= set(main.coords)
         assert found.attrs["geospatial_lat_min"] == pytest.approx(float(data["latitude"].min()))
         assert found.attrs["geospatial_lon_max"] == pytest.approx(float(data["longitude"].max()))
         assert "POLYGON" in found.attrs["geospatial_bounds"]
         # Where the lidars stand and point is told.
-        np.testing.assert_allclose(found["ray_azimuth"], [70, 310, 190])
-        np.testing.assert_allclose(found["ray_latitude"], data["ray_latitude"])
-        assert np.isfinite(found["ray_range"]).sum() == 6
-        assert "ray 0: lidar-0" in found.attrs["lidarops_steps"]
+        np.testing.assert_allclose(found["beam_azimuth"], [70, 310, 190])
+        np.testing.assert_allclose(found["beam_latitude"], data["beam_latitude"])
+        assert np.isfinite(found["beam_range"]).sum() == 6
+        assert "beam 0: lidar-0" in found.attrs["lidarops_steps"]
         np.testing.assert_allclose(main, data["visibility_in_air"], rtol=2e-4)
 
 

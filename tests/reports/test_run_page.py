@@ -394,12 +394,12 @@ class TestManyScenes:
         hashes = [[scene.plan.hash for scene in run.scenes] for run in (many, more)]
         assert hashes[0] == hashes[1]
 
-    def test_a_gate_of_no_effect_is_told_as_such(self, tmp_path):
-        gate = Step("range_gate", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins")
+    def test_a_bin_of_no_effect_is_told_as_such(self, tmp_path):
+        bin = Step("range_window", CHANNEL, {"bins": [[0, 9]]}, "sections need no farther bins")
         signal = Step("signal", CHANNEL, {}, "asked for")
         scenes = [
             outcome(name, plan=Plan(name, steps, ()))
-            for name, steps in (("alone", (gate,)), ("both", (gate, signal)))
+            for name, steps in (("alone", (bin,)), ("both", (bin, signal)))
         ]
         told = {row.reason: row.scenes for row in run_tables.done(run_record(tmp_path, scenes))}
         assert told == {
@@ -420,7 +420,7 @@ class TestManyScenes:
         names = [f"photon_{300 + i}o" for i in range(3)]
         products = tuple(
             replace(
-                archive.write(f"{name}.nc", signal(time, gates=50), ProductKind.SIGNAL),
+                archive.write(f"{name}.nc", signal(time, bins=50), ProductKind.SIGNAL),
                 channel=name,
             )
             for name in names

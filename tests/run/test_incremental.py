@@ -256,15 +256,15 @@ def test_the_plan_of_a_selection_is_of_its_products(archive: Archive) -> None:
     assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
 
 
-def _gates_told(told: dict[str, Any]) -> list[str]:
+def _bins_told(told: dict[str, Any]) -> list[str]:
     steps = [step for scene in told["scenes"] for step in scene["steps"]]
-    return [step.get("no_effect", "") for step in steps if step["name"] == "range_gate"]
+    return [step.get("no_effect", "") for step in steps if step["name"] == "range_window"]
 
 
-def test_a_plan_tells_a_gate_of_no_effect(archive: Archive) -> None:
+def test_a_plan_tells_a_bin_of_no_effect(archive: Archive) -> None:
     archive.write()
-    assert _gates_told(_planned(archive)) == ["signal needs all bins"] * 4
-    assert _gates_told(_planned(archive, "--product", "homogeneous")) == [""] * 4
+    assert _bins_told(_planned(archive)) == ["signal needs all bins"] * 4
+    assert _bins_told(_planned(archive, "--product", "homogeneous")) == [""] * 4
     shown = CliRunner().invoke(app, ["plan", str(archive.file)], env={"COLUMNS": "300"})
     assert shown.stdout.count("no effect: signal needs all bins") == 4
 

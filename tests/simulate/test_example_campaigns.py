@@ -80,23 +80,23 @@ def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
     places = [campaign.stations[name] for name in names]
     net = geometry.build_network(
         [
-            geometry.Ray(at.latitude, at.longitude, at.altitude, azimuth, 0.0)
+            geometry.Beam(at.latitude, at.longitude, at.altitude, azimuth, 0.0)
             for at, azimuth in zip(places, directions.values(), strict=True)
         ],
         nearest=150.0,
     )
-    assert net.vertices == 3
-    assert net.near_vertex.all()
-    for vertex in range(3):
-        here = net.crossings.vertex == vertex
+    assert net.crossings == 3
+    assert net.near_crossing.all()
+    for crossing in range(3):
+        here = net.passages.crossing == crossing
         series = []
-        for ray, distance in zip(net.crossings.ray[here], net.crossings.range[here], strict=True):
-            there = truth[f"range_{names[ray]}_lidar"].values
+        for beam, distance in zip(net.passages.beam[here], net.passages.range[here], strict=True):
+            there = truth[f"range_{names[beam]}_lidar"].values
             series.append(
-                np.log(extinction(names[ray]).values[:, np.argmin(np.abs(there - distance))])
+                np.log(extinction(names[beam]).values[:, np.argmin(np.abs(there - distance))])
             )
-        assert 1500.0 < net.crossings.range[here].min() < 1700.0
-        assert 2900.0 < net.crossings.range[here].max() < 3050.0
+        assert 1500.0 < net.passages.range[here].min() < 1700.0
+        assert 2900.0 < net.passages.range[here].max() < 3050.0
         # Half a bin apart at most, which eddies of 400 m hardly tell.
         assert np.abs(series[0] - series[1]).mean() < 0.02
         assert np.corrcoef(*series)[0, 1] > 0.98

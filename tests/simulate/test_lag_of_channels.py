@@ -22,8 +22,8 @@ def lag_of(analog, photon, lags=range(-4, 12)):
     correlation = np.array(correlation)
     best = int(correlation.argmax())
     before, here, after = correlation[best - 1 : best + 2]
-    vertex = 0.5 * (before - after) / (before - 2.0 * here + after)
-    return lags[best] + vertex, here
+    crossing = 0.5 * (before - after) / (before - 2.0 * here + after)
+    return lags[best] + crossing, here
 
 
 @pytest.mark.parametrize("lag", [0, 3, 7])

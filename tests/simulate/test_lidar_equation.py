@@ -134,24 +134,24 @@ TELESCOPES = {
 
 
 @pytest.mark.parametrize("telescope", TELESCOPES)
-def test_the_geometrical_overlap_is_that_of_single_rays(telescope):
+def test_the_geometrical_overlap_is_that_of_single_beams(telescope):
     geometry = {
         "aperture_radius": 0.1, "field_of_view": 1e-3, "beam_radius": 0.01, "divergence": 2e-4,
         "separation": 0.0, "tilt": 0.0, "obstruction_radius": 0.0,
     } | TELESCOPES[telescope]  # fmt: skip
     shape = GeometricalOverlap(**geometry)
     random = np.random.default_rng(1)
-    rays = 400_000
+    beams = 400_000
     inner, outer = geometry["obstruction_radius"] ** 2, geometry["aperture_radius"] ** 2
-    radius = np.sqrt(inner + (outer - inner) * random.random(rays))
-    angle = 2 * np.pi * random.random(rays)
+    radius = np.sqrt(inner + (outer - inner) * random.random(beams))
+    angle = 2 * np.pi * random.random(beams)
     aperture = radius * np.exp(1j * angle)
     for distance in (30.0, 150.0, 300.0, 600.0, 1500.0, 8000.0):
         width = math.hypot(0.01, 2e-4 * distance) / 2
         beam = geometry["separation"] - geometry["tilt"] * distance
-        beam = beam + width * (random.standard_normal(rays) + 1j * random.standard_normal(rays))
+        beam = beam + width * (random.standard_normal(beams) + 1j * random.standard_normal(beams))
         passed = (np.abs(beam - aperture) < 5e-4 * distance).mean()
-        error = math.sqrt(max(passed * (1 - passed), 1e-6) / rays)
+        error = math.sqrt(max(passed * (1 - passed), 1e-6) / beams)
         assert shape(np.array([distance]))[0] == pytest.approx(passed, abs=4.5 * error + 2e-3)
 
 

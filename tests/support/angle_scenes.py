@@ -17,7 +17,7 @@ from lidarops.retrieve.multiangle.vertical.smooth_profile import (
 )
 
 WINDOW = 15
-FEWEST_RAYS = 3
+FEWEST_BEAMS = 3
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Scene:
     secant: np.ndarray
     inhomogeneity: float
     zenith_snr: np.ndarray
-    """(height,): of the vertical ray without attenuation and distance beyond the vertical."""
+    """(height,): of the vertical beam without attenuation and distance beyond the vertical."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def clear_depth(altitude, aerosol=1.0, layer=3000.0):
     return molecules + aerosol * (haze + aloft)
 
 
-def clear(snr, *, inhomogeneity=0.03, largest=75.0, rays=12, aerosol=1.0, layer=3000.0):
-    """12 rays to 75 degree, uniform in the secant, 150-6150 m; `snr` at 1 km, vertically."""
+def clear(snr, *, inhomogeneity=0.03, largest=75.0, beams=12, aerosol=1.0, layer=3000.0):
+    """12 beams to 75 degree, uniform in the secant, 150-6150 m; `snr` at 1 km, vertically."""
     altitude = 150.0 + 30.0 * np.arange(201)
     fine = np.arange(0.0, 7000.0, 10.0)
     backscatter = np.gradient(clear_depth(fine), fine)
@@ -66,25 +66,25 @@ def clear(snr, *, inhomogeneity=0.03, largest=75.0, rays=12, aerosol=1.0, layer=
         altitude, np.asarray(aerosol)[..., np.newaxis], np.asarray(layer)[..., np.newaxis]
     )
     zenith = snr * relative * (1000.0 / altitude) ** 2
-    secant = np.linspace(1.0, 1.0 / np.cos(np.radians(largest)), rays)
+    secant = np.linspace(1.0, 1.0 / np.cos(np.radians(largest)), beams)
     return Scene(altitude, per_profile, secant, inhomogeneity, zenith)
 
 
-def cloud(*, largest=30.0, rays=6, inhomogeneity=0.144):
+def cloud(*, largest=30.0, beams=6, inhomogeneity=0.144):
     """Eight layers of 50 m with 5 to 20 /km, optical depth 4.4, on 40 heights above the base."""
     extinction = np.repeat([5.0, 10.0, 15.0, 20.0, 15.0, 10.0, 8.0, 5.0], 5) * 1e-3
     altitude = 10.0 * np.arange(1, 41)
     return Scene(
         altitude,
         np.cumsum(extinction * 10.0),
-        1.0 / np.cos(np.radians(np.linspace(0.0, largest, rays))),
+        1.0 / np.cos(np.radians(np.linspace(0.0, largest, beams))),
         inhomogeneity,
         np.full(40, 1e9),
     )
 
 
 def simulate(scene, profiles, rng, correlation=0.0, *, outliers=0.0):
-    """Return noisy logarithms (profile, ray, height) and the variance of their detector noise.
+    """Return noisy logarithms (profile, beam, height) and the variance of their detector noise.
 
     Heights where the expected signal-to-noise ratio is below 3 are NaN, from there upwards.
     """
@@ -113,7 +113,7 @@ def simulate(scene, profiles, rng, correlation=0.0, *, outliers=0.0):
 
 
 def _regress(y, x, w):
-    """Weighted straight line along the rays: slope, residual, leverage, centred square sum."""
+    """Weighted straight line along the beams: slope, residual, leverage, centred square sum."""
     total = w.sum(axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         centred = x - (w * x).sum(axis=1, keepdims=True) / total
@@ -132,7 +132,7 @@ def _pooled(values):
 def _weights(variance, inhomogeneity):
     w = 1.0 / (variance + inhomogeneity)
     w = np.where(np.isfinite(w), w, 0.0)
-    return w * ((w > 0.0).sum(axis=1, keepdims=True) >= FEWEST_RAYS)
+    return w * ((w > 0.0).sum(axis=1, keepdims=True) >= FEWEST_BEAMS)
 
 
 def kano_hamilton(scene, logarithm, variance):

@@ -92,11 +92,11 @@ def homogeneous(
 
 
 def signal(
-    time: np.ndarray, *, gates: int = 600, gate: float = 15.0, seed: int = 0, layer: float = 3000.0
+    time: np.ndarray, *, bins: int = 600, bin: float = 15.0, seed: int = 0, layer: float = 3000.0
 ) -> xr.Dataset:
-    """A product of kind ``signal`` with a boundary layer, a cloud layer and saturated gates."""
+    """A product of kind ``signal`` with a boundary layer, a cloud layer and saturated bins."""
     random = np.random.default_rng(seed)
-    span = (np.arange(gates) + 0.5) * gate
+    span = (np.arange(bins) + 0.5) * bin
     hour = (time - time.astype("datetime64[D]")) / np.timedelta64(1, "h")
     top = 1000.0 + 500.0 * np.sin(2 * np.pi * (hour - 8) / 24)
     beta = 0.15 * np.exp(-span / 8000.0)[None, :]
@@ -109,11 +109,11 @@ def signal(
     )
     error = 1e-3 * (span[None, :] ** 2) * np.sqrt(0.1 + true_background(time))[:, None] * 2e-2
     clean = 3e6 * beta * np.exp(-span / 9000.0) * 1e-3
-    value = clean + error * random.standard_normal((time.size, gates))
+    value = clean + error * random.standard_normal((time.size, bins))
     flag = np.zeros(value.shape, dtype=np.int32)
     flag[:, span < 150.0] |= int(Quality.INCOMPLETE_OVERLAP)
     flag[:, (span >= 150) & (span < 300.0)] |= int(Quality.PILE_UP)
-    thick = clean > 1.3 * np.median(clean[:, min(20, gates - 1)])
+    thick = clean > 1.3 * np.median(clean[:, min(20, bins - 1)])
     flag[thick] |= int(Quality.SATURATED)
     attrs = {"units": "MHz m2"}
     level = true_background(time)

@@ -25,10 +25,10 @@ START = np.datetime64("2025-06-01T20:00:00", "ns")
 
 
 def network() -> geometry.Network:
-    """The rays of the lidars."""
+    """The beams of the lidars."""
     return geometry.build_network(
         [
-            geometry.Ray(*station, azimuth=azimuth, elevation=0.0)
+            geometry.Beam(*station, azimuth=azimuth, elevation=0.0)
             for station, azimuth in zip(STATIONS, AZIMUTHS, strict=True)
         ],
         nearest=150.0,

@@ -176,16 +176,16 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
         "scattering_ratio": 2.0,
         "attenuated_backscatter": 2e-6,
     }
-    gates = {}
+    retrieved = {}
     for name, scale in scales.items():
-        gates[name] = rng.normal(scale, 0.1 * scale, shape)
-        gates[f"{name}_standard_error"] = np.full(shape, 0.1 * scale)
+        retrieved[name] = rng.normal(scale, 0.1 * scale, shape)
+        retrieved[f"{name}_standard_error"] = np.full(shape, 0.1 * scale)
     for cause in ("noise", "background", "reference", "lidar_ratio", "molecular"):
-        gates[f"backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
+        retrieved[f"backscatter_error_{cause}"] = rng.normal(0.0, 5e-8, shape)
     window = np.where(np.arange(profiles) < profiles - 1, 200.0, np.nan)
     return xr.Dataset(
         {
-            **{name: (dims, np.where(missing, np.nan, values)) for name, values in gates.items()},
+            **{name: (dims, np.where(missing, np.nan, values)) for name, values in retrieved.items()},
             "molecular_backscatter": ("range", np.linspace(1.5e-6, 1e-6, bins)),
             "molecular_extinction": ("range", np.linspace(1.3e-5, 1e-5, bins)),
             "lidar_ratio": ((), 50.0),
@@ -242,7 +242,7 @@ def multiangle(
     residual[0, -1] = np.nan
     along = {} if azimuth is None else {"azimuth": azimuth}
     pointing = {
-        f"ray_{name}": ("ray", np.broadcast_to(np.float64(values), angles.shape).copy())
+        f"beam_{name}": ("beam", np.broadcast_to(np.float64(values), angles.shape).copy())
         for name, values in {"zenith_angle": zenith, **along}.items()
     }
     times = {name: clock(profiles)[name] for name in ("time", "time_bnds")}
@@ -252,17 +252,17 @@ def multiangle(
                 name: (dims, np.where(missing, np.nan, scale * rng.uniform(0.5, 1.5, shape)))
                 for name, scale in scales.items()
             },
-            "residual": (("time", "ray", "altitude"), residual),
+            "residual": (("time", "beam", "altitude"), residual),
             "effective_degrees_of_freedom": ("time", np.full(profiles, 12.5)),
             "reach": ("time", np.full(profiles, 800.0)),
             "quality_flag": (dims, flags),
-            "rays": ("time", np.full(profiles, angles.size, np.int32)),
+            "beams": ("time", np.full(profiles, angles.size, np.int32)),
             "shots": ("time", np.full(profiles, 6000, np.int32)),
         },
         coords={
             **times,
             **pointing,
-            "ray": ("ray", np.arange(angles.size, dtype=np.int32)),
+            "beam": ("beam", np.arange(angles.size, dtype=np.int32)),
             "altitude": ("altitude", STATION.altitude + 60.0 * np.arange(1, levels + 1)),
         },
         attrs={"steps": "joint: extinction is wanted"},
@@ -288,13 +288,13 @@ def with_layers(data: xr.Dataset) -> xr.Dataset:
 
 
 def visibility(
-    profiles: int = 5, vertices: int = 3, zenith: Any = 90.0, azimuth: Any = None
+    profiles: int = 5, crossings: int = 3, zenith: Any = 90.0, azimuth: Any = None
 ) -> xr.Dataset:
     """A retrieval of a network, as `lidarops.retrieve.network.labeled.retrieve_network` gives it."""
     rng = np.random.default_rng(5)
-    rays = max(3, np.size(zenith))
-    pair = ("time", "vertex")
-    shape = (profiles, vertices)
+    beams = max(3, np.size(zenith))
+    pair = ("time", "crossing")
+    shape = (profiles, crossings)
     flags = np.zeros(shape, np.int32)
     flags[-1] = int(Quality.LOW_LEVERAGE)
     flags[0, 0] = int(Quality.INPUT_MISSING | Quality.LOW_SIGNAL)
@@ -314,20 +314,20 @@ def visibility(
         "condition": rng.uniform(1.0, 3.0, shape),
     }
     scalars = {"optical_depth": 0.8, "reduced_chi2": 1.1, "degrees_of_freedom": 1.0}
-    distance = np.full((rays, vertices), np.nan)
-    for vertex in range(vertices):
-        meeting = [vertex % rays, (vertex + 1) % rays]
-        distance[meeting, vertex] = 500.0 + 1000.0 * vertex + 100.0 * np.arange(2)
+    distance = np.full((beams, crossings), np.nan)
+    for crossing in range(crossings):
+        meeting = [crossing % beams, (crossing + 1) % beams]
+        distance[meeting, crossing] = 500.0 + 1000.0 * crossing + 100.0 * np.arange(2)
     told = {
-        "latitude": STATION.latitude + 0.01 * np.arange(rays),
-        "longitude": STATION.longitude + 0.02 * np.arange(rays),
-        "altitude": STATION.altitude + np.arange(rays),
-        "zenith_angle": np.resize(np.float64(zenith), rays),
+        "latitude": STATION.latitude + 0.01 * np.arange(beams),
+        "longitude": STATION.longitude + 0.02 * np.arange(beams),
+        "altitude": STATION.altitude + np.arange(beams),
+        "zenith_angle": np.resize(np.float64(zenith), beams),
         "azimuth": np.resize(
-            np.float64([70.0, 310.0, 190.0] if azimuth is None else azimuth), rays
+            np.float64([70.0, 310.0, 190.0] if azimuth is None else azimuth), beams
         ),
     }
-    vertex = np.arange(vertices)
+    crossing = np.arange(crossings)
     return xr.Dataset(
         {
             **{name: (pair, np.where(lost, np.nan, found)) for name, found in values.items()},
@@ -335,18 +335,18 @@ def visibility(
             "prior_deviation": ("time", np.full(profiles, np.nan)),
             "quality_flag": (pair, flags),
             "shots": ("time", np.full(profiles, 9000, np.int32)),
-            "ray_range": (("ray", "vertex"), distance),
+            "beam_range": (("beam", "crossing"), distance),
         },
         coords={
             **{name: clock(profiles)[name] for name in ("time", "time_bnds")},
-            "vertex_id": ("vertex", vertex.astype(np.int32)),
-            "latitude": ("vertex", STATION.latitude + 0.003 * (vertex + 1)),
-            "longitude": ("vertex", STATION.longitude + 0.004 * (vertex + 1)),
-            "altitude": ("vertex", STATION.altitude + 5.0 * vertex[::-1]),
-            "ray": ("ray", np.arange(rays, dtype=np.int32)),
-            **{f"ray_{name}": ("ray", found) for name, found in told.items()},
+            "crossing_id": ("crossing", crossing.astype(np.int32)),
+            "latitude": ("crossing", STATION.latitude + 0.003 * (crossing + 1)),
+            "longitude": ("crossing", STATION.longitude + 0.004 * (crossing + 1)),
+            "altitude": ("crossing", STATION.altitude + 5.0 * crossing[::-1]),
+            "beam": ("beam", np.arange(beams, dtype=np.int32)),
+            **{f"beam_{name}": ("beam", found) for name, found in told.items()},
         },
-        attrs={"steps": "method iterative; ray 0: lidar-0, with the vertices 0 at 500 m"},
+        attrs={"steps": "method iterative; beam 0: lidar-0, with the crossings 0 at 500 m"},
     )
 
 

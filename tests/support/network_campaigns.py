@@ -139,7 +139,7 @@ def written(folder: Path, told: dict[str, Any]) -> tuple[Campaign, xr.Dataset]:
 
 
 def truth_at(product: xr.Dataset, truth: xr.Dataset, instruments: list[str]) -> np.ndarray:
-    """True extinction (time, vertex) of a product, m-1: the mean over its beams and profiles.
+    """True extinction (time, crossing) of a product, m-1: the mean over its beams and profiles.
 
     Parameters
     ----------
@@ -151,20 +151,20 @@ def truth_at(product: xr.Dataset, truth: xr.Dataset, instruments: list[str]) -> 
     if np.isfinite(truth["extinction"].values).all():
         # Homogeneous: one number a file.
         return np.full(product["extinction"].shape, float(truth["extinction"].mean()))
-    found = np.full((product.sizes["ray"], *product["extinction"].shape), np.nan)
-    for ray, name in enumerate(instruments):
+    found = np.full((product.sizes["beam"], *product["extinction"].shape), np.nan)
+    for beam, name in enumerate(instruments):
         suffix = name.replace("-", "_")
         granule = truth[f"profile_granule_{suffix}"].values
         when = truth["time"].values[granule]
         zenith = truth["zenith_angle"].values[granule]
-        mine = np.abs(zenith - float(product["ray_zenith_angle"][ray])) < 0.2
+        mine = np.abs(zenith - float(product["beam_zenith_angle"][beam])) < 0.2
         field = truth[f"profile_extinction_{suffix}"].values[:, 0]
         middle = truth[f"range_{suffix}"].values
-        for vertex, distance in enumerate(product["ray_range"].values[ray]):
+        for crossing, distance in enumerate(product["beam_range"].values[beam]):
             if not np.isfinite(distance):
                 continue
             there = np.array([np.interp(distance, middle, row) for row in field])
             for n, (start, stop) in enumerate(bounds):
                 inside = mine & (when >= start) & (when <= stop)
-                found[ray, n, vertex] = there[inside].mean()
+                found[beam, n, crossing] = there[inside].mean()
     return np.nanmean(found, axis=0)

@@ -7,24 +7,24 @@ import numpy as np
 PER_KM = 1e-3
 PATHS = np.linspace(1.0, 1 / np.cos(np.radians(75.0)), 12)
 ANGLES = np.degrees(np.arccos(1 / PATHS))
-"""Twelve rays from the zenith to 75 degrees, evenly spaced in slant path."""
+"""Twelve beams from the zenith to 75 degrees, evenly spaced in slant path."""
 
 
-def clear(gates=201):
+def clear(bins=201):
     """Return heights (m), extinction (m-1) and relative backscatter of a clear atmosphere."""
-    height = 150.0 + 30.0 * np.arange(gates)
+    height = 150.0 + 30.0 * np.arange(bins)
     air = 0.0116 * PER_KM * np.exp(-height / 8000)
     haze = 0.07 * np.exp(-height / 1200) + 0.05 * np.exp(-0.5 * ((height - 3000) / 150) ** 2)
     backscatter = air / 8.4 + haze * PER_KM / 50
     return height, air + haze * PER_KM, backscatter / np.interp(1000.0, height, backscatter)
 
 
-def cloud(gates=40):
+def cloud(bins=40):
     """Return heights above its base (m), extinction (m-1) and backscatter of a cloud."""
-    height = 10.0 * np.arange(1, gates + 1)
+    height = 10.0 * np.arange(1, bins + 1)
     layers = np.array([5.0, 10.0, 15.0, 20.0, 15.0, 10.0, 8.0, 5.0]) * PER_KM
     extinction = np.interp(height - 5.0, 25.0 + 50.0 * np.arange(8), layers)
-    return height, extinction, np.ones(gates)
+    return height, extinction, np.ones(bins)
 
 
 def depth(height, extinction):

@@ -15,7 +15,7 @@ def homogeneous(extinction=2e-3):
 
 
 def gradient(x, y, z):
-    """Fall off with height: the spread over the vertices of the triangle is 14 percent."""
+    """Fall off with height: the spread over the crossings of the triangle is 14 percent."""
     return 2e-3 * np.exp(-(z - 600.0) / 1010.0 + 0.0 * x)
 
 
@@ -45,17 +45,17 @@ def three_by_two():
 
 
 def grid(net, step=5.0, start=100.3):
-    return np.arange(start, max(net.crossings.range) + 60.0, step)
+    return np.arange(start, max(net.passages.range) + 60.0, step)
 
 
 def signals(net, range_, field, exponent=1.0):
-    """Return (ray, bin) power of unit constants: Gauss-Legendre quadrature of optical depth."""
-    out = np.empty((net.rays, range_.size))
+    """Return (beam, bin) power of unit constants: Gauss-Legendre quadrature of optical depth."""
+    out = np.empty((net.beams, range_.size))
     edges = np.concatenate([[0.0], range_])
-    for ray in range(net.rays):
+    for beam in range(net.beams):
 
-        def along(r, ray=ray):
-            return field(*(net.origin[ray][:, None] + net.direction[ray][:, None] * r))
+        def along(r, beam=beam):
+            return field(*(net.origin[beam][:, None] + net.direction[beam][:, None] * r))
 
         # The first cell is long: cut it as finely as the others.
         cut = np.union1d(np.linspace(0.0, range_[0], 40), edges)
@@ -63,29 +63,29 @@ def signals(net, range_, field, exponent=1.0):
         points = (middle + half * NODES[:, None]).ravel()
         cells = (along(points).reshape(4, -1) * WEIGHTS[:, None]).sum(axis=0) * half
         depth = np.interp(range_, cut, np.concatenate([[0.0], np.cumsum(cells)]))
-        out[ray] = along(range_) ** (1 / exponent) * np.exp(-2 * depth) / range_**2
+        out[beam] = along(range_) ** (1 / exponent) * np.exp(-2 * depth) / range_**2
     return out
 
 
 def noisy(net, range_, power, relative, profiles, seed=1, additive=0.01):
-    """Return (profile, ray, bin) power, and variances: relative noise, and 1 % of the start."""
-    first = [net.on_ray(ray)[1][0] for ray in range(net.rays)]
+    """Return (profile, beam, bin) power, and variances: relative noise, and 1 % of the start."""
+    first = [net.on_beam(beam)[1][0] for beam in range(net.beams)]
     level = np.array([np.interp(r, range_, p) for r, p in zip(first, power, strict=True)])
     deviation = np.hypot(relative * power, additive * level[:, None])
     rng = np.random.default_rng(seed)
     return power + deviation * rng.standard_normal((profiles, *power.shape)), deviation**2
 
 
-def at_vertices(net, field):
-    return field(*net.vertex.T)
+def at_crossings(net, field):
+    return field(*net.crossing.T)
 
 
 def optical_depths(net, walk, field):
     """Return (row,) signed optical depths of a cycle."""
-    out = np.empty(walk.ray.size)
-    for j, ray in enumerate(walk.ray):
+    out = np.empty(walk.beam.size)
+    for j, beam in enumerate(walk.beam):
         r = np.linspace(walk.start_range[j], walk.end_range[j], 4001)
-        along = field(*(net.origin[ray][:, None] + net.direction[ray][:, None] * r))
+        along = field(*(net.origin[beam][:, None] + net.direction[beam][:, None] * r))
         out[j] = np.sum((along[1:] + along[:-1]) / 2 * np.diff(r))
     return out
 
@@ -118,7 +118,7 @@ def relative_errors(result, truth):
 
 
 def root_mean_square(values):
-    """Return the root mean square over profiles; NaN at vertices that are never reported."""
+    """Return the root mean square over profiles; NaN at crossings that are never reported."""
     known = np.isfinite(values)
     count = known.sum(axis=0)
     total = np.where(known, values, 0.0) ** 2

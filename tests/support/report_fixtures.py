@@ -33,7 +33,7 @@ def simulated(archive: Archive, tmp_path: Path) -> RunRecord:
     truth_of(time).to_netcdf(truth)
     products = (
         archive.write("h/extinction.nc", homogeneous(time), ProductKind.HOMOGENEOUS),
-        archive.write("h/signal.nc", signal(time, gates=200), ProductKind.SIGNAL),
+        archive.write("h/signal.nc", signal(time, bins=200), ProductKind.SIGNAL),
     )
     inputs = tuple(InputRecord(f"raw/h{i:05d}", Role.SIGNAL, "b" * 64) for i in range(96))
     scene = outcome("horizontal_20240301T000000", granules=96, products=products, inputs=inputs)

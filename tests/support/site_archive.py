@@ -47,7 +47,7 @@ def add(output: Path, kind: ProductKind, days: int = 0, **changes: Any) -> Path:
 
 
 def add_unknown(output: Path, name: str = "wind", **attributes: str) -> Path:
-    """Write a file of a kind that this version does not know: discrete vertices over time."""
+    """Write a file of a kind that this version does not know: discrete crossings over time."""
     rng = np.random.default_rng(5)
     time = np.datetime64("2026-03-02T06:00", "ns") + np.arange(8) * np.timedelta64(10, "m")
     attrs = {
@@ -59,9 +59,9 @@ def add_unknown(output: Path, name: str = "wind", **attributes: str) -> Path:
     }
     data = xr.Dataset(
         {
-            "speed": (("time", "vertex"), rng.normal(8.0, 1.0, (8, 6)), {"units": "m s-1"}),
-            "speed_standard_error": (("time", "vertex"), np.full((8, 6), 0.2)),
-            "quality_flag": (("time", "vertex"), np.zeros((8, 6), np.int32)),
+            "speed": (("time", "crossing"), rng.normal(8.0, 1.0, (8, 6)), {"units": "m s-1"}),
+            "speed_standard_error": (("time", "crossing"), np.full((8, 6), 0.2)),
+            "quality_flag": (("time", "crossing"), np.zeros((8, 6), np.int32)),
         },
         coords={"time": time},
         attrs=attrs | attributes,

@@ -191,18 +191,18 @@ def clear_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array
     return air + haze, air / 8.4 + haze / 50.0
 
 
-def clear(ratio: float, *, outliers: float = 0.0, gates: int = 201) -> Scene:
-    """Return 12 rays to 75 degrees, evenly spaced in slant path, up to 6.15 km.
+def clear(ratio: float, *, outliers: float = 0.0, bins: int = 201) -> Scene:
+    """Return 12 beams to 75 degrees, evenly spaced in slant path, up to 6.15 km.
 
     Parameters
     ----------
     ratio : float
         Signal over noise at the zenith in 1 km.
     outliers : float
-    gates : int
+    bins : int
         Altitudes, 30 m apart.
     """
-    height = 150.0 + 30.0 * np.arange(gates, dtype=np.float64)
+    height = 150.0 + 30.0 * np.arange(bins, dtype=np.float64)
     extinction, backscatter = clear_air(height, np.ones(1), np.full(1, 3000.0))
     path = np.linspace(1.0, 1.0 / np.cos(np.radians(75.0)), 12)
     label = f"clear air, SNR {ratio:g}"
@@ -211,7 +211,7 @@ def clear(ratio: float, *, outliers: float = 0.0, gates: int = 201) -> Scene:
 
 
 def cloud(correlation: float = 0.0, *, largest: float = 30.0) -> Scene:
-    """Return 6 rays up to an angle, of a cloud with an optical depth of 4.4 in 40 altitudes."""
+    """Return 6 beams up to an angle, of a cloud with an optical depth of 4.4 in 40 altitudes."""
     extinction = np.repeat(LAYERS, round(_LAYER / _CLOUD_STEP))
     height = _CLOUD_STEP * np.arange(1, extinction.size + 1, dtype=np.float64)
     label = f"cloud, {largest:g}°, correlation {correlation:g}"
@@ -226,14 +226,14 @@ def scan_scenes() -> tuple[Scene, ...]:
     return (clear(3000.0), clear(300.0), cloud(), cloud(0.8))
 
 
-def published_cloud(largest: float, rays: int, scatter: float) -> Scene:
+def published_cloud(largest: float, beams: int, scatter: float) -> Scene:
     """Return the cloud as the published experiment sees it: in the middle of its 8 layers.
 
     Parameters
     ----------
     largest : float
         degree; angles are evenly spaced from 0.
-    rays : int
+    beams : int
     scatter : float
         Standard deviation of the logarithm of backscatter.
     """
@@ -241,8 +241,8 @@ def published_cloud(largest: float, rays: int, scatter: float) -> Scene:
     layers = np.array(LAYERS)
     depth = _LAYER * (np.cumsum(layers) - 0.5 * layers)
     extinction = np.diff(depth, prepend=0.0) / np.diff(height, prepend=0.0)
-    label = f"{largest:g}°, {rays} rays"
-    angles = np.linspace(0.0, largest, rays)
+    label = f"{largest:g}°, {beams} beams"
+    angles = np.linspace(0.0, largest, beams)
     return Scene(label, angles, height, extinction, np.ones(height.size), NOISELESS, scatter)
 
 
@@ -274,7 +274,7 @@ def uniform_deviation(share: float) -> float:
 def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
     """Return a scene of which nothing is as assumed, with another truth for each profile.
 
-    3 to 20 rays to 15-75 degrees, clear air or a cloud, scatter up to 40 % with a correlation of
+    3 to 20 beams to 15-75 degrees, clear air or a cloud, scatter up to 40 % with a correlation of
     0-0.95, SNR 10 to 1e5; half with up to 10 % outliers, three in five with a gradient of up to
     10 % per km, one in seven with extinction that varies along the paths.
 
@@ -405,7 +405,7 @@ def scan_peers() -> Mapping[str, Way]:
 
 
 _Line = tuple[Array, Array, Array]
-"""Slant path, logarithm and weight (the reciprocal standard error) of each ray."""
+"""Slant path, logarithm and weight (the reciprocal standard error) of each beam."""
 
 
 def lstsq(scan: Scan) -> ScanEstimates:
@@ -473,10 +473,10 @@ def _corner(misfit: Array, size: Array) -> int:
 def _each(
     scan: Scan, fit: Callable[[Array, Array, Array], tuple[float, float]], *, stated: bool
 ) -> ScanEstimates:
-    profiles, _, gates = scan.signal.shape
-    depth, error = np.full((profiles, gates), np.nan), np.full((profiles, gates), np.nan)
+    profiles, _, bins = scan.signal.shape
+    depth, error = np.full((profiles, bins), np.nan), np.full((profiles, bins), np.nan)
     for t in range(profiles):
-        for k in range(gates):
+        for k in range(bins):
             line = _line(scan, t, k)
             if line[0].size >= _FEWEST:
                 depth[t, k], error[t, k] = fit(*line)
@@ -488,6 +488,6 @@ def _line(scan: Scan, t: int, k: int) -> _Line:
     seen = signal > _SEEN * np.sqrt(variance)
     signal, variance = signal[seen], variance[seen]
     scatter = variance / signal**2 + scan.scene.inhomogeneity**2
-    # Where nothing scatters, all rays count alike.
+    # Where nothing scatters, all beams count alike.
     root = 1.0 / np.sqrt(scatter) if np.all(scatter > 0.0) else np.ones(signal.size)
     return scan.scene.path[seen], np.log(signal), root

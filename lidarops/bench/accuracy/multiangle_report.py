@@ -89,9 +89,9 @@ def multiangle_throughput_report(found: MultiAngleThroughput, data: str = "") ->
 def _scenes(found: Sequence[SceneScore]) -> Part:
     return Part(
         title="Error against CPU time",
-        text="Clear air: 12 rays from 0 to 75°, evenly spaced in slant path, 201 altitudes from "
+        text="Clear air: 12 beams from 0 to 75°, evenly spaced in slant path, 201 altitudes from "
         "150 m to 6.15 km, scatter of backscatter along the horizontal 3 %, signal over noise as "
-        "stated at the zenith in 1 km. Cloud: 6 rays from 0 to 30°, 40 altitudes, optical depth "
+        "stated at the zenith in 1 km. Cloud: 6 beams from 0 to 30°, 40 altitudes, optical depth "
         "4.4, scatter 14.7 %, independent or correlated by 0.8 between altitudes. All profiles "
         "of a block are solved at once, and share inhomogeneity, smoothness and truth. Ours find "
         "the scatter themselves; the peers are told it, work altitude by altitude, and take each "
@@ -215,11 +215,11 @@ def _published(found: MultiAngle) -> Part:
             _correlation_table(found),
         ),
         details=tuple(
-            _published_table(every, angle, rays, share)
-            for rays in scores.PUBLISHED_RAYS
+            _published_table(every, angle, beams, share)
+            for beams in scores.PUBLISHED_BEAMS
             for share in scores.PUBLISHED_SHARES
             for angle in (15.0, 30.0)
-            if (rays, share) != scores.CENTRAL
+            if (beams, share) != scores.CENTRAL
         ),
     )
 
@@ -230,7 +230,7 @@ def _verdict(found: MultiAngle) -> str:
             score
             for score in found.published
             if (score.way, score.largest_angle) == (way, angle)
-            and (score.rays, score.share) == scores.CENTRAL
+            and (score.beams, score.share) == scores.CENTRAL
         )
 
     mld, alone = one("mld 0, discrepancy", 15.0), one(scores.TWO_ANGLE_ALONE, 30.0)
@@ -246,7 +246,7 @@ def _verdict(found: MultiAngle) -> str:
     times = mld.rmse.value / alone.rmse.value
     return (
         "A cloud of 8 layers of 50 m, optical depth 4.4, seen along 6 or 4 evenly spaced angles; "
-        "backscatter is off by up to 20 to 30 % from ray to ray and layer to layer. Published "
+        "backscatter is off by up to 20 to 30 % from beam to beam and layer to layer. Published "
         "(in a figure, without a number) is that the regularised derivative is stable at 15°, "
         "where two angles, shown for 30° and 10 %, are not acceptable. Of single altitudes, this "
         f"{'is not so' if times > 1.0 else 'is so'}: with 25 % at 15°, mld of order 0 is off by "
@@ -265,7 +265,7 @@ def _verdict(found: MultiAngle) -> str:
 
 
 def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
-    central = [one for one in found if (one.rays, one.share) == scores.CENTRAL]
+    central = [one for one in found if (one.beams, one.share) == scores.CENTRAL]
     ways = (
         scores.NOTHING,
         scores.TWO_ANGLE_ALONE,
@@ -278,7 +278,7 @@ def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
     return Chart(
         name="angles",
         title="Published experiment: error against the largest zenith angle",
-        caption="6 rays, backscatter off by up to 25 % (10 % where stated).",
+        caption="6 beams, backscatter off by up to 25 % (10 % where stated).",
         panels=(
             Panel(
                 title="optical depth",
@@ -315,13 +315,13 @@ def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
 
 
 def _published_table(
-    found: Sequence[PublishedCloudScore], angle: float, rays: int, share: float
+    found: Sequence[PublishedCloudScore], angle: float, beams: int, share: float
 ) -> Table:
     chosen = [
-        one for one in found if (one.largest_angle, one.rays, one.share) == (angle, rays, share)
+        one for one in found if (one.largest_angle, one.beams, one.share) == (angle, beams, share)
     ]
     return Table(
-        title=f"{angle:g}°, {rays} rays, {100.0 * share:.0f} %, "
+        title=f"{angle:g}°, {beams} beams, {100.0 * share:.0f} %, "
         f"{counted(chosen[0].profiles, 'profile')}",
         columns=(
             "way",
@@ -356,7 +356,7 @@ def _published_table(
 
 def _prior_table(found: MultiAngle) -> Table:
     return Table(
-        title="mld_prior at 15°, 6 rays, 25 %, with a multiple of the truth as prior",
+        title="mld_prior at 15°, 6 beams, 25 %, with a multiple of the truth as prior",
         columns=("prior / truth", "prior alone", "RMSE", "data share"),
         rows=tuple(
             (f"{one.factor:g}", f"{one.alone:.2f}", with_error(one.rmse), f"{one.data_share:.2f}")
@@ -368,7 +368,7 @@ def _prior_table(found: MultiAngle) -> Table:
 
 def _correlation_table(found: MultiAngle) -> Table:
     return Table(
-        title="Layers that scatter alike: 15°, 6 rays, 14.7 %",
+        title="Layers that scatter alike: 15°, 6 beams, 14.7 %",
         columns=("correlation", "way", "RMSE", "RMSE < 0.5"),
         rows=tuple(
             (f"{one.correlation:g}", one.way, with_error(one.rmse), percent(one.close.value))
@@ -466,7 +466,7 @@ def _safety(found: Sequence[SafetyScore]) -> Part:
     return Part(
         title="False and not flagged",
         text=f"{found[0].scenes:,} scenes ({found[-1].scenes:,} of calm air) of which nothing is "
-        "as assumed, 8 profiles each with its own truth: 3 to 20 rays on one side to 15-75°, "
+        "as assumed, 8 profiles each with its own truth: 3 to 20 beams on one side to 15-75°, "
         "clear air or a cloud, scatter up to 40 % (of calm air drawn by its logarithm, from "
         "0.5 %) with "
         "a correlation of 0 to 0.95, signal over noise 10 to 1e5; half with up to 10 % outliers; "
@@ -503,7 +503,7 @@ def _times(found: MultiAngleThroughput) -> Part:
     return Part(
         title="CPU time per profile",
         text=f"Clear air, {found.angles} angles, {found.altitudes} altitudes, float64, one "
-        "thread, least CPU time of interleaved repeats. make_rays, regress and vertical.smooth "
+        "thread, least CPU time of interleaved repeats. make_beams, regress and vertical.smooth "
         "are steps; the others are whole calls of solve, with all errors, residuals and flags. "
         "Plain: without the robust passes, for which a single residual calls that is too "
         "large for chance, and which cost more than all else. The peers give values without flags, "

@@ -22,9 +22,9 @@ Mask = npt.NDArray[np.bool_]
 PUBLISHED_ANGLES: Final = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
 """degree, the largest zenith angle."""
 PUBLISHED_SHARES: Final = (0.2, 0.25, 0.3)
-PUBLISHED_RAYS: Final = (6, 4)
+PUBLISHED_BEAMS: Final = (6, 4)
 CENTRAL: Final = (6, 0.25)
-"""Rays and share of what is shown at all angles."""
+"""Beams and share of what is shown at all angles."""
 TWO_ANGLE_ALONE: Final = "two_angle, 10 %"
 NOTHING: Final = "answer 0"
 PRIORS: Final = (0.0, 0.5, 1.0, 1.5)
@@ -107,7 +107,7 @@ class PublishedCloudScore:
     way: str
     largest_angle: float
     """degree."""
-    rays: int
+    beams: int
     share: float
     """Largest error of backscatter over backscatter."""
     profiles: int
@@ -392,15 +392,15 @@ def _marks(found: ScanEstimates, scene: Scene, mask: Mask) -> Marks:
 
 
 def _published(size: StudySize) -> Iterator[PublishedCloudScore]:
-    every = set(product((15.0, 30.0), PUBLISHED_RAYS, PUBLISHED_SHARES))
+    every = set(product((15.0, 30.0), PUBLISHED_BEAMS, PUBLISHED_SHARES))
     every |= {(angle, *CENTRAL) for angle in PUBLISHED_ANGLES}
-    for number, (angle, rays, share) in enumerate(sorted(every)):
-        scene = cases.published_cloud(angle, rays, cases.uniform_deviation(share))
+    for number, (angle, beams, share) in enumerate(sorted(every)):
+        scene = cases.published_cloud(angle, beams, cases.uniform_deviation(share))
         scans = [
             cases.uniform_scatter(share, size.published, scene, number, block, 1)
             for block in range(_published_blocks(size))
         ]
-        gaussian = cases.published_cloud(angle, rays, 0.1)
+        gaussian = cases.published_cloud(angle, beams, 0.1)
         loud = [
             gaussian.draw(size.published, number, block, 2)
             for block in range(_published_blocks(size))
@@ -429,7 +429,7 @@ def _published_score(
     return PublishedCloudScore(
         way=name,
         largest_angle=float(scene.zenith_angle.max()),
-        rays=scene.zenith_angle.size,
+        beams=scene.zenith_angle.size,
         share=share,
         profiles=len(depth),
         rmse=root(over_blocks([one["square"] for one in marks])),

@@ -1,4 +1,4 @@
-"""How right and how fast extinction is found where the rays of several lidars meet."""
+"""How right and how fast extinction is found where the beams of several lidars meet."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _CHUNK_BLOCKS: Final = 5
 _TIMED_PROFILES: Final = 250
 _CYCLES: Final = {3: 500_000, 12: 100_000}
 _QUICK_CYCLES: Final = {3: 100_000, 12: 20_000}
-"""Cycles of a call by the rays of each."""
+"""Cycles of a call by the beams of each."""
 _REPEATS: Final = 7
 _QUICK_REPEATS: Final = 3
 _SHORTEST: Final = 1e-9
@@ -137,7 +137,7 @@ def _case(
     place: Place, air: Air, noise: float, seen: Signals, chunks: Chunks, seed: int
 ) -> tuple[NetworkScenario, list[MultiPositionResult]]:
     """Return the scores of every way, and what the network found."""
-    truth, near = seen.truth(chunks.size), seen.network.near_vertex
+    truth, near = seen.truth(chunks.size), seen.network.near_crossing
     errors: dict[str, list[Errors]] = {way.name: [] for way in known.network_solvers(place)}
     least = dict.fromkeys((READ, *errors), math.inf)
     network = []
@@ -170,7 +170,7 @@ def _timed(call: Callable[[], _Found]) -> tuple[float, _Found]:
 
 
 def _sights(found: Sequence[MultiPositionResult], seen: Signals, noise: float) -> list[Sight]:
-    near = seen.network.near_vertex
+    near = seen.network.near_crossing
     truth = np.concatenate([seen.truth(len(one.extinction))[:, near] for one in found])
     extinction = np.concatenate([one.extinction[:, near] for one in found])
     stated = np.concatenate([one.extinction_standard_error[:, near] for one in found])
@@ -211,7 +211,10 @@ def _comparisons(profiles: int) -> Iterator[Comparison]:
     for number, (place, air) in enumerate(product(known.PLACES, airs)):
         seen = known.signals(place.network(), air)
         power, variance = seen.draw(known.PEER_NOISE, profiles, 99, number)
-        truth, near = seen.truth(profiles)[:, seen.network.near_vertex], seen.network.near_vertex
+        truth, near = (
+            seen.truth(profiles)[:, seen.network.near_crossing],
+            seen.network.near_crossing,
+        )
         ours_seconds, ours = _timed(partial(known.FREE, power, variance, seen))
         seconds, fitted = _timed(partial(known.network_by_scipy, power, variance, seen))
         found, stated = ours.extinction[:, near], ours.extinction_standard_error[:, near]
@@ -268,10 +271,10 @@ def measure_network_throughput(
 
 
 def cycle_rates(*, quick: bool, repeats: int) -> list[SolverRate]:
-    """Return the CPU time of cycles of 3 and of 12 rays in every way, the read first."""
+    """Return the CPU time of cycles of 3 and of 12 beams in every way, the read first."""
     rates = []
-    for rays, cycles in (_QUICK_CYCLES if quick else _CYCLES).items():
-        rows = known.random_rows(cycles, rays)
+    for beams, cycles in (_QUICK_CYCLES if quick else _CYCLES).items():
+        rows = known.random_rows(cycles, beams)
         sizes = {name: min(cycles, most) for name, (_, most) in _CYCLE_WAYS.items()}
         calls = {
             name: partial(way, rows.first(sizes[name])) for name, (way, _) in _CYCLE_WAYS.items()
@@ -279,7 +282,7 @@ def cycle_rates(*, quick: bool, repeats: int) -> list[SolverRate]:
         times = least_times(calls, repeats)
         each = {name: 1e9 * seconds / sizes[name] for name, seconds in times.items()}
         rates += [
-            SolverRate(name, rays, sizes[name], each[name], each[name] / each[READ], name in OURS)
+            SolverRate(name, beams, sizes[name], each[name], each[name] / each[READ], name in OURS)
             for name in calls
         ]
     return rates
@@ -330,7 +333,7 @@ def _profile_rates(place: Place, repeats: int) -> list[SolverRate]:
         calls[way.name] = partial(way, power, variance, seen)
     times = least_times(calls, repeats)
     return [
-        SolverRate(name, net.rays, size, 1e9 * s / size, s / times[READ], name != READ)
+        SolverRate(name, net.beams, size, 1e9 * s / size, s / times[READ], name != READ)
         for name, s in times.items()
     ]
 

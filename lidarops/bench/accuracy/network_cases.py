@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.cycles import systematic_error
 from lidarops.retrieve.network.extinction_field import (
-    DEFAULT_GATES,
+    DEFAULT_BINS,
     FieldPrior,
     MultiPositionResult,
     NetworkMethod,
@@ -23,21 +23,21 @@ from lidarops.retrieve.network.extinction_field import (
 Array = npt.NDArray[np.float64]
 
 STEP: Final = 5.0
-"""m, of the range gates."""
+"""m, of the range bins."""
 FULL_OVERLAP: Final = 100.0
 """m."""
 NOISES: Final = (0.02, 0.05, 0.1)
-"""Relative standard deviation of a gate."""
+"""Relative standard deviation of a bin."""
 PEER_NOISE: Final = NOISES[1]
 """Of the profiles that peers solve too."""
 ADDITIVE: Final = 0.01
-"""Standard deviation that every gate has besides, over the power at the ray's first vertex."""
+"""Standard deviation that every bin has besides, over the power at the beam's first crossing."""
 BLOCK: Final = 50
 """Profiles that share a mean field and a multiplier."""
 
-_FIRST_GATE: Final = 100.3
+_FIRST_BIN: Final = 100.3
 _BEYOND: Final = 60.0
-"""m that a signal goes on after the last vertex."""
+"""m that a signal goes on after the last crossing."""
 _LEAST_SLOPE: Final = 1e-6
 """m-1, from which a fit begins at least."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -54,12 +54,12 @@ class Place:
     east: tuple[float, ...]
     """m, of each lidar."""
     elevations: tuple[tuple[float, ...], ...]
-    """degree, of the rays of each lidar, from the east over the zenith."""
+    """degree, of the beams of each lidar, from the east over the zenith."""
     farthest: float = np.inf
     """m, to which signals are used."""
 
     def network(self) -> geometry.Network:
-        """Return rays and vertices."""
+        """Return beams and crossings."""
         pairs = [(x, a) for x, fan in zip(self.east, self.elevations, strict=True) for a in fan]
         angle = np.radians([a for _, a in pairs])
         return geometry.network_of_lines(
@@ -73,7 +73,7 @@ class Place:
 TRIANGLE: Final = Place("triangle", (300.0, -500.0, 0.0), ((120.0,), (60.0,), (90.0,)))
 """That of the paper (drabenko2021): lidars 1, 2 and 3."""
 THREE_BY_TWO: Final = Place(
-    "3 x 2 rays",
+    "3 x 2 beams",
     (-500.0, 0.0, 400.0),
     ((50.0, 68.0), (78.0, 103.0), (112.0, 130.0)),
     farthest=1000.0,
@@ -142,14 +142,14 @@ class Signals:
     range: Array
     """m."""
     power: Array
-    """(field, ray, range), unit constants."""
+    """(field, beam, range), unit constants."""
     extinction: Array
-    """(field, vertex) m-1, the truth."""
+    """(field, crossing) m-1, the truth."""
 
     def draw(
         self, noise: float, profiles: int, *seed: int, additive: float = ADDITIVE
     ) -> tuple[Array, Array]:
-        """Return (profile, ray, range) power and its variance; the same for the same seed."""
+        """Return (profile, beam, range) power and its variance; the same for the same seed."""
         rows = np.arange(profiles) % len(self.power)
         deviation = np.hypot(noise * self.power, additive * self._first[..., np.newaxis])[rows]
         random = np.random.default_rng(seed)
@@ -157,46 +157,46 @@ class Signals:
         return power, deviation**2
 
     def truth(self, profiles: int) -> Array:
-        """Return (profile, vertex) extinction, m-1."""
+        """Return (profile, crossing) extinction, m-1."""
         return self.extinction[np.arange(profiles) % len(self.extinction)]
 
     @property
     def _first(self) -> Array:
-        """(field, ray) power at the first vertex of each ray."""
+        """(field, beam) power at the first crossing of each beam."""
         out = np.empty(self.power.shape[:2])
-        for ray in range(self.network.rays):
-            near = self.network.on_ray(ray)[1][0]
-            out[:, ray] = [np.interp(near, self.range, each[ray]) for each in self.power]
+        for beam in range(self.network.beams):
+            near = self.network.on_beam(beam)[1][0]
+            out[:, beam] = [np.interp(near, self.range, each[beam]) for each in self.power]
         return out
 
 
-def signals(net: geometry.Network, air: Air, first_gate: float = _FIRST_GATE) -> Signals:
-    """Return signals; optical depth by Gauss quadrature of 4 nodes from gate to gate."""
-    gates = np.arange(first_gate, float(net.crossings.range.max()) + _BEYOND, STEP)
+def signals(net: geometry.Network, air: Air, first_bin: float = _FIRST_BIN) -> Signals:
+    """Return signals; optical depth by Gauss quadrature of 4 nodes from bin to bin."""
+    bins = np.arange(first_bin, float(net.passages.range.max()) + _BEYOND, STEP)
     fields = air.fields()
     return Signals(
         net,
-        gates,
-        np.stack([_power(net, gates, each) for each in fields]),
-        np.stack([each(net.vertex[:, 0], net.vertex[:, 2]) for each in fields]),
+        bins,
+        np.stack([_power(net, bins, each) for each in fields]),
+        np.stack([each(net.crossing[:, 0], net.crossing[:, 2]) for each in fields]),
     )
 
 
-def _power(net: geometry.Network, gates: Array, extinction: Extinction) -> Array:
-    edges = np.concatenate([np.linspace(0.0, gates[0], 40, endpoint=False), gates])
+def _power(net: geometry.Network, bins: Array, extinction: Extinction) -> Array:
+    edges = np.concatenate([np.linspace(0.0, bins[0], 40, endpoint=False), bins])
     half = 0.5 * np.diff(edges)
     nodes = edges[:-1] + half * (1.0 + _NODES[:, np.newaxis])
-    out = np.empty((net.rays, gates.size))
-    for ray in range(net.rays):
-        along = extinction(*_points(net, ray, nodes))
+    out = np.empty((net.beams, bins.size))
+    for beam in range(net.beams):
+        along = extinction(*_points(net, beam, nodes))
         depth = np.cumsum(np.sum(along * _WEIGHTS[:, np.newaxis], axis=0) * half)
-        here = extinction(*_points(net, ray, gates))
-        out[ray] = here * np.exp(-2.0 * depth[-gates.size :]) / gates**2
+        here = extinction(*_points(net, beam, bins))
+        out[beam] = here * np.exp(-2.0 * depth[-bins.size :]) / bins**2
     return out
 
 
-def _points(net: geometry.Network, ray: int, distance: Array) -> tuple[Array, Array]:
-    origin, direction = net.origin[ray], net.direction[ray]
+def _points(net: geometry.Network, beam: int, distance: Array) -> tuple[Array, Array]:
+    origin, direction = net.origin[beam], net.direction[beam]
     return origin[0] + direction[0] * distance, origin[2] + direction[2] * distance
 
 
@@ -205,7 +205,7 @@ def _points(net: geometry.Network, ray: int, distance: Array) -> tuple[Array, Ar
 
 @dataclass(frozen=True, slots=True)
 class NetworkSolver:
-    """One way to find extinction at the vertices."""
+    """One way to find extinction at the crossings."""
 
     name: str
     method: NetworkMethod
@@ -215,7 +215,7 @@ class NetworkSolver:
     def __call__(
         self, power: Array, variance: Array, seen: Signals, *, full_overlap: float = FULL_OVERLAP
     ) -> MultiPositionResult:
-        """Solve profiles (profile, ray, range), block by block."""
+        """Solve profiles (profile, beam, range), block by block."""
         return retrieve_network(
             power,
             seen.range,
@@ -241,7 +241,7 @@ NETWORK: Final = NetworkSolver("network", NetworkMethod.NETWORK)
 
 
 def network_solvers(place: Place) -> tuple[NetworkSolver, ...]:
-    """Return the ways that a network allows: cycles want one cycle of rays."""
+    """Return the ways that a network allows: cycles want one cycle of beams."""
     any_network = (SLOPE, KLETT, FREE, NETWORK)
     if place is not TRIANGLE:
         return any_network
@@ -258,8 +258,8 @@ def network_solvers(place: Place) -> tuple[NetworkSolver, ...]:
 FIGURE_FIRST_LIDARS: Final = (200.0, 300.0, 400.0)
 """m, distance of lidars 1 and 3."""
 FIGURE_ELEVATIONS: Final = tuple(float(angle) for angle in range(15, 80, 5))
-"""degree, of the second ray."""
-_FIGURE_FIRST_GATE: Final = 30.3
+"""degree, of the second beam."""
+_FIGURE_FIRST_BIN: Final = 30.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,21 +273,21 @@ class FigurePoint:
     printed: float
     """With plain lengths in place of signed ones, the only reading that fits the figure's axis."""
     signed: float | None
-    """At vertex 1 with signs; None beyond the pole."""
+    """At crossing 1 with signs; None beyond the pole."""
     near: float | None
-    """At a vertex from which the cycle leads away from the lidars."""
+    """At a crossing from which the cycle leads away from the lidars."""
     simulated: float | None
-    """The same, of signals without noise; None where no lidar sees the vertex."""
+    """The same, of signals without noise; None where no lidar sees the crossing."""
 
 
 def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
     """Return one point of figure 2 of drabenko2021, without signs and with the right ones."""
     place = Place("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
     net = place.network()
-    lengths = np.array([np.ptp(net.on_ray(ray)[1]) for ray in range(3)])
+    lengths = np.array([np.ptp(net.on_beam(beam)[1]) for beam in range(3)])
     walk = geometry.build_cycle(net)
-    seen = signals(net, AIRS[0], _FIGURE_FIRST_GATE)
-    truth = float(seen.extinction[0, walk.vertex[0]])
+    seen = signals(net, AIRS[0], _FIGURE_FIRST_BIN)
+    truth = float(seen.extinction[0, walk.crossing[0]])
     depths = truth * lengths * [1.0, 1.0, -1.0]
     away = _leads_away(net)
 
@@ -295,21 +295,21 @@ def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
         return _finite(float(systematic_error(optical_depth, PAPER_MULTIPLIER)))
 
     power = seen.power
-    solved = PAPER(power, 1e-12 * power**2, seen, full_overlap=_FIGURE_FIRST_GATE)
+    solved = PAPER(power, 1e-12 * power**2, seen, full_overlap=_FIGURE_FIRST_BIN)
     return FigurePoint(
         first_lidar,
         elevation,
         printed=float(systematic_error(depths, PAPER_MULTIPLIER)),
         signed=error(depths if away else -depths),
         near=error(truth * (walk.end_range - walk.start_range)),
-        simulated=_finite(1.0 - truth / float(solved.extinction[0, walk.vertex[0]])),
+        simulated=_finite(1.0 - truth / float(solved.extinction[0, walk.crossing[0]])),
     )
 
 
 def _leads_away(net: geometry.Network) -> bool:
-    """Return whether ray 1 meets ray 3 before ray 2."""
-    vertices, _ = net.on_ray(0)
-    return bool(vertices[0] in net.on_ray(2)[0])
+    """Return whether beam 1 meets beam 3 before beam 2."""
+    crossings, _ = net.on_beam(0)
+    return bool(crossings[0] in net.on_beam(2)[0])
 
 
 def _finite(value: float) -> float | None:
@@ -343,10 +343,10 @@ class Rows:
         return Rows(*(array[-count:] for array in self.arrays))
 
 
-def random_rows(cycles: int, rays: int) -> Rows:
-    """Return cycles whose rays all lead away from their lidars."""
-    random = np.random.default_rng((cycles, rays))
-    start = random.uniform(1.0, 2.0, (cycles, rays))
+def random_rows(cycles: int, beams: int) -> Rows:
+    """Return cycles whose beams all lead away from their lidars."""
+    random = np.random.default_rng((cycles, beams))
+    start = random.uniform(1.0, 2.0, (cycles, beams))
     return Rows(
         start,
         start * random.uniform(0.6, 0.9, start.shape),
@@ -356,7 +356,7 @@ def random_rows(cycles: int, rays: int) -> Rows:
 
 
 def solve_by_lu(rows: Rows) -> Array:
-    """Return (cycle,) reciprocal extinction at the first vertex by `numpy.linalg.solve` at once."""
+    """Return (cycle,) reciprocal extinction at the first crossing by `numpy.linalg.solve` at once."""
     return np.asarray(np.linalg.solve(_matrices(rows), rows.integral[..., np.newaxis])[:, 0, 0])
 
 
@@ -376,9 +376,9 @@ def _matrices(rows: Rows) -> Array:
 
 
 def network_by_scipy(power: Array, variance: Array, seen: Signals) -> Array:
-    """Return (profile, vertex) extinction by `scipy.optimize.least_squares`, without errors.
+    """Return (profile, crossing) extinction by `scipy.optimize.least_squares`, without errors.
 
-    Of each profile, the logarithms of extinction at the vertices and of one constant per ray are
+    Of each profile, the logarithms of extinction at the crossings and of one constant per beam are
     fitted to point values, weighted as if these were independent.
     """
     return np.stack(
@@ -387,20 +387,20 @@ def network_by_scipy(power: Array, variance: Array, seen: Signals) -> Array:
 
 
 def _condensed(power: Array, variance: Array, seen: Signals) -> tuple[Array, Array, Array]:
-    """Return values, their relative errors, and integrals from the ray's first vertex on."""
+    """Return values, their relative errors, and integrals from the beam's first crossing on."""
     values, errors, integrals = [], [], []
-    # A gate that is not positive has no logarithm: it is taken for half its noise.
+    # A bin that is not positive has no logarithm: it is taken for half its noise.
     power = np.maximum(power, 0.5 * np.sqrt(variance))
-    for ray in range(seen.network.rays):
-        logarithm = np.log(power[ray] * seen.range**2)
-        where, points = seen.network.on_ray(ray)[1], []
+    for beam in range(seen.network.beams):
+        logarithm = np.log(power[beam] * seen.range**2)
+        where, points = seen.network.on_beam(beam)[1], []
         for r in where:
             middle = int(np.argmin(np.abs(seen.range - r)))
-            gates = slice(middle - DEFAULT_GATES // 2, middle + DEFAULT_GATES // 2 + 1)
-            fit = np.polynomial.Polynomial.fit(seen.range[gates] - r, logarithm[gates], 1)
+            bins = slice(middle - DEFAULT_BINS // 2, middle + DEFAULT_BINS // 2 + 1)
+            fit = np.polynomial.Polynomial.fit(seen.range[bins] - r, logarithm[bins], 1)
             points.append(float(fit(0.0)))
-            noise = np.sqrt(variance[ray, gates]) / power[ray, gates]
-            errors.append(float(noise.mean() / np.sqrt(DEFAULT_GATES)))
+            noise = np.sqrt(variance[beam, bins]) / power[beam, bins]
+            errors.append(float(noise.mean() / np.sqrt(DEFAULT_BINS)))
         values += points
         total = 0.0
         for k, r in enumerate(where):
@@ -422,16 +422,16 @@ def _log_trapezoid(x: Array, logarithm: Array) -> float:
 
 def _fit_network(values: Array, errors: Array, integrals: Array, seen: Signals) -> Array:
     net = seen.network
-    ray, vertex = net.crossings.ray, net.crossings.vertex
-    first = np.searchsorted(ray, np.arange(net.rays))
-    last = np.searchsorted(ray, np.arange(net.rays), side="right") - 1
+    beam, crossing = net.passages.beam, net.passages.crossing
+    first = np.searchsorted(beam, np.arange(net.beams))
+    last = np.searchsorted(beam, np.arange(net.beams), side="right") - 1
     drop = np.exp(values[first]) - np.exp(values[last])
     slope = max(float(np.median(drop / (2.0 * integrals[last]))), _LEAST_SLOPE)
-    begin = np.concatenate([np.full(net.vertices, np.log(slope)), values[first] - np.log(slope)])
+    begin = np.concatenate([np.full(net.crossings, np.log(slope)), values[first] - np.log(slope)])
 
     def residuals(unknown: Array) -> Array:
-        extinction, constant = unknown[vertex], np.exp(unknown[net.vertices + ray])
+        extinction, constant = unknown[crossing], np.exp(unknown[net.crossings + beam])
         left = np.maximum(constant - 2.0 * integrals, 1e-9 * constant)
         return np.asarray((np.log(left) + extinction - values) / errors)
 
-    return np.asarray(np.exp(least_squares(residuals, begin, x_scale="jac").x[: net.vertices]))
+    return np.asarray(np.exp(least_squares(residuals, begin, x_scale="jac").x[: net.crossings]))

@@ -68,18 +68,18 @@ def _errors(found: MultiPosition, place: Place) -> Part:
     net = place.network()
     return Part(
         title=f"{place.name.capitalize()}: error against run time",
-        text=f"{net.rays} rays, {net.vertices} vertices, of which {int(net.near_vertex.sum())} "
-        f"near ones; {cases[0].profiles:,} profiles of each case, gates of {known.STEP:g} m, "
-        "relative noise of each gate as given, and 1 % of the power at the ray's first vertex "
+        text=f"{net.beams} beams, {net.crossings} crossings, of which {int(net.near_crossing.sum())} "
+        f"near ones; {cases[0].profiles:,} profiles of each case, bins of {known.STEP:g} m, "
+        "relative noise of each bin as given, and 1 % of the power at the beam's first crossing "
         f"besides; blocks of {known.BLOCK} profiles. Extinction is 2 per km at 600 m with a scale "
         "height of 1 km (gradient), or 1.5 per km with a plume of 3.5 per km, which stands still "
         "or drifts by 300 m in a block. Multipliers below 1 are those of the paper, which "
-        "neglect a part of the solution; unbiased puts that part to the start vertex. Errors "
+        "neglect a part of the solution; unbiased puts that part to the start crossing. Errors "
         "are relative and clipped at 300 %, as a quotient of noise has no variance. Where noise "
         "hides the attenuation (0.2 per km), most values are flagged, and the few that are not "
         "are those that noise has made large: their error is not as stated.",
         charts=(_chart(cases, place, found.comparisons),),
-        tables=(_first_vertex(cases, place), _network_table(cases, place)),
+        tables=(_first_crossing(cases, place), _network_table(cases, place)),
         details=tuple(_case_table(case) for case in cases),
     )
 
@@ -91,9 +91,9 @@ def _chart(
     return Chart(
         name=f"work-precision-{place.name.replace(' ', '')}",
         title=f"Error of extinction against run time, {place.name}",
-        caption="Root mean square error at the near vertices, of values with and without flags, "
+        caption="Root mean square error at the near crossings, of values with and without flags, "
         "with its Monte Carlo error. The marks of a way, joined, are noise of "
-        f"{', '.join(f'{100 * noise:g}' for noise in known.NOISES)} % of each gate; scipy has "
+        f"{', '.join(f'{100 * noise:g}' for noise in known.NOISES)} % of each bin; scipy has "
         f"{_noise(known.PEER_NOISE)} only.",
         panels=tuple(
             Panel(
@@ -136,10 +136,10 @@ def _peer_series(comparisons: Sequence[Comparison]) -> Series:
     )
 
 
-def _first_vertex(cases: Sequence[NetworkScenario], place: Place) -> Table:
+def _first_crossing(cases: Sequence[NetworkScenario], place: Place) -> Table:
     names = [way.name for way in known.network_solvers(place)]
     return Table(
-        title=f"{place.name.capitalize()}: visibility at the first vertex, mean / RMS error in %",
+        title=f"{place.name.capitalize()}: visibility at the first crossing, mean / RMS error in %",
         columns=("air", "noise", *names),
         rows=tuple(
             (
@@ -161,7 +161,7 @@ def _bias_and_rmse(score: NetworkScore) -> str:
 
 def _network_table(cases: Sequence[NetworkScenario], place: Place) -> Table:
     return Table(
-        title=f"{place.name.capitalize()}: extinction by the network, all near vertices",
+        title=f"{place.name.capitalize()}: extinction by the network, all near crossings",
         columns=("air", "noise", *_COLUMNS),
         rows=tuple(
             (case.air, _noise(case.noise), *_cells(case.scores[known.NETWORK.name]))
@@ -189,21 +189,21 @@ _COLUMNS: Final = (
     "within 1",
     "within 1.96",
     "within 3",
-    "median vertex %",
+    "median crossing %",
     "χ²/dof",
     "µs",
     "reads",
 )
 _NOTE: Final = (
     "Solved: share of values that are not withheld. Within: share of unflagged values within so "
-    "many stated standard errors; 68.3, 95 and 99.7 % where errors are as stated. Median vertex: "
+    "many stated standard errors; 68.3, 95 and 99.7 % where errors are as stated. Median crossing: "
     "of the RMS errors of visibility at each. CPU time per profile, and as multiples of "
     f"{READ}. In brackets: Monte Carlo standard error of the last digit, from block to block."
 )
 
 
 def _cells(score: NetworkScore) -> tuple[str, ...]:
-    vertices = [rmse.value for rmse in score.visibility_rmse if rmse is not None]
+    crossings = [rmse.value for rmse in score.visibility_rmse if rmse is not None]
     within = [_NONE] * 3
     if score.within is not None:
         within = [percent(inside.value) for inside in score.within]
@@ -214,7 +214,7 @@ def _cells(score: NetworkScore) -> tuple[str, ...]:
         _percents(score.rmse),
         _percents(score.unflagged_rmse),
         *within,
-        f"{100.0 * float(np.median(vertices)):.3g}" if vertices else _NONE,
+        f"{100.0 * float(np.median(crossings)):.3g}" if crossings else _NONE,
         _NONE if score.chi_square is None else f"{score.chi_square:.2f}",
         f"{score.microseconds:.0f}",
         f"{score.reads:,.1f}",
@@ -228,13 +228,13 @@ def _figure(points: Sequence[FigurePoint]) -> Part:
     return Part(
         title="Figure 2 of the paper, and the right signs",
         text="Systematic error of visibility with a multiplier of 0.8 in homogeneous air of 2 per "
-        "km, lidars 2 and 3 apart by 500 m, rays 1 and 3 at 120 and 90 degrees (drabenko2021). "
+        "km, lidars 2 and 3 apart by 500 m, beams 1 and 3 at 120 and 90 degrees (drabenko2021). "
         "Without signs: its formula with the plain lengths of the triangle's sides, the only "
         "reading whose values fit the axis of the figure; the drawn curves themselves were not "
         "compared. Below the "
-        "crossing of rays 1 and 3, vertex 1 is the far one on both of its rays, and all signs "
-        "turn: the error at vertex 1 is above 1 and grows beyond bounds, up to a pole, below "
-        "which the estimate is refused. A cycle that starts at a near vertex, and leads away "
+        "crossing of beams 1 and 3, crossing 1 is the far one on both of its beams, and all signs "
+        "turn: the error at crossing 1 is above 1 and grows beyond bounds, up to a pole, below "
+        "which the estimate is refused. A cycle that starts at a near crossing, and leads away "
         "from the lidars, keeps it below 1. At the crossing, it is 1 whatever the multiplier.",
         charts=(
             Chart(
@@ -244,8 +244,8 @@ def _figure(points: Sequence[FigurePoint]) -> Part:
                 f"solved. Errors above {_HIGHEST:g} are in the table only.",
                 panels=(
                     _figure_panel(points, "paper, without signs", "printed"),
-                    _figure_panel(points, "vertex 1, with signs", "signed"),
-                    _figure_panel(points, "near vertex", "near"),
+                    _figure_panel(points, "crossing 1, with signs", "signed"),
+                    _figure_panel(points, "near crossing", "near"),
                 ),
             ),
         ),
@@ -261,7 +261,7 @@ def _figure_panel(points: Sequence[FigurePoint], title: str, name: str) -> Panel
         series.append(_figure_series(points, None, "simulated", "signals without noise"))
     return Panel(
         title=title,
-        x_label="elevation of ray 2 (degree)",
+        x_label="elevation of beam 2 (degree)",
         y_label="" if name != "printed" else "(true - estimate) / true",
         series=tuple(series),
         x_log=False,
@@ -295,8 +295,8 @@ def _figure_table(points: Sequence[FigurePoint], first: float) -> Table:
         columns=(
             "elevation",
             "paper, without signs",
-            "vertex 1, with signs",
-            "near vertex",
+            "crossing 1, with signs",
+            "near crossing",
             "solved",
         ),
         rows=tuple(
@@ -310,7 +310,7 @@ def _figure_table(points: Sequence[FigurePoint], first: float) -> Table:
             for point in points
             if point.first_lidar == first
         ),
-        note="(true - estimate) / true. Solved: signals without noise, from the near vertex.",
+        note="(true - estimate) / true. Solved: signals without noise, from the near crossing.",
     )
 
 
@@ -325,7 +325,7 @@ def _visibility(sights: Sequence[Sight]) -> Part:
     return Part(
         title="Visibility by three contrasts",
         text=f"Of unflagged extinction by the network of {known.THREE_BY_TWO.name} in a "
-        f"{known.SIGHTS_AIR.name}, all near vertices. A contrast multiplies values and errors "
+        f"{known.SIGHTS_AIR.name}, all near crossings. A contrast multiplies values and errors "
         "alike; taken for another one, it is an error itself: 0.02 sees 31 % farther than 0.05, "
         "and exp(-3) 0.14 %.",
         tables=(
@@ -370,7 +370,7 @@ def _peers(comparisons: Sequence[Comparison]) -> Part:
     return Part(
         title="Beside a plain fit",
         text=f"Noise {_noise(known.PEER_NOISE)}, without prior: a profile's extinctions and "
-        "ray constants by scipy.optimize.least_squares, weighted as if point values were "
+        "beam constants by scipy.optimize.least_squares, weighted as if point values were "
         "independent, without errors or flags, and with every point, where ours leaves out "
         "those in too much noise.",
         tables=(
@@ -394,7 +394,7 @@ def _peers(comparisons: Sequence[Comparison]) -> Part:
                     )
                     for one in comparisons
                 ),
-                note="Of extinction at the near vertices that ours solves, clipped at 300 %. "
+                note="Of extinction at the near crossings that ours solves, clipped at 300 %. "
                 "Apart: root mean square difference over our stated standard errors.",
             ),
         ),
@@ -405,11 +405,11 @@ def _cycles(rates: Sequence[SolverRate]) -> Part:
     return Part(
         title="Cycles per second",
         text="Random cycles, one thread, least CPU time of interleaved repeats. Values and "
-        "variances at the first vertex; numpy.linalg.solve gives all vertices without variances. "
+        "variances at the first crossing; numpy.linalg.solve gives all crossings without variances. "
         "The read is a vectorised maximum of the same arrays in the same run.",
         tables=tuple(
             Table(
-                title=f"Cycles of {rays} rays",
+                title=f"Cycles of {beams} beams",
                 columns=("way", "whose", "cycles", "million / s", "ns each", "reads"),
                 rows=tuple(
                     (
@@ -421,11 +421,11 @@ def _cycles(rates: Sequence[SolverRate]) -> Part:
                         f"{rate.reads:,.2f}",
                     )
                     for rate in rates
-                    if rate.rays == rays
+                    if rate.beams == beams
                 ),
                 note=f"Reads: multiples of {READ} of start, end, integral and variance.",
             )
-            for rays in sorted({rate.rays for rate in rates})
+            for beams in sorted({rate.beams for rate in rates})
         ),
     )
 
@@ -435,11 +435,11 @@ def _profiles(found: MultiPositionThroughput) -> Part:
         title="Whole profiles",
         text="From signals to extinction with errors, visibility and flags: point values, "
         "integrals and their covariances, and the solution. One thread. Two threads with half "
-        f"of the cycles of 3 rays each are {found.gain:.2f} times as fast on the wall, which says "
+        f"of the cycles of 3 beams each are {found.gain:.2f} times as fast on the wall, which says "
         "something only of a machine with two idle cores.",
         tables=tuple(
             Table(
-                title=f"Profiles of {rays} rays",
+                title=f"Profiles of {beams} beams",
                 columns=("way", "profiles", "µs each", "reads"),
                 rows=tuple(
                     (
@@ -449,11 +449,11 @@ def _profiles(found: MultiPositionThroughput) -> Part:
                         f"{rate.reads:,.1f}",
                     )
                     for rate in found.profiles
-                    if rate.rays == rays
+                    if rate.beams == beams
                 ),
                 note=f"Reads: multiples of {READ} of the power.",
             )
-            for rays in sorted({rate.rays for rate in found.profiles})
+            for beams in sorted({rate.beams for rate in found.profiles})
         ),
     )
 

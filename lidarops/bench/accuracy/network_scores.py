@@ -26,7 +26,7 @@ READ: Final = "read (np.max)"
 
 @dataclass(frozen=True, slots=True)
 class NetworkScore:
-    """Errors of one way at the near vertices, relative to the truth. None where nothing is left.
+    """Errors of one way at the near crossings, relative to the truth. None where nothing is left.
 
     Monte Carlo errors are those of the scatter from block to block, as profiles of a block share
     their mean field.
@@ -44,7 +44,7 @@ class NetworkScore:
     within: tuple[MonteCarloFigure, MonteCarloFigure, MonteCarloFigure] | None
     """Share of unflagged values within 1, 1.96 and 3 stated standard errors."""
     visibility_bias: tuple[MonteCarloFigure | None, ...]
-    """Of visibility at each near vertex, the nearest first."""
+    """Of visibility at each near crossing, the nearest first."""
     visibility_rmse: tuple[MonteCarloFigure | None, ...]
     chi_square: float | None
     """Mean reduced chi-square of networks."""
@@ -94,7 +94,7 @@ class Comparison:
     air: str
     profiles: int
     ours: float
-    """Root mean square error of extinction at the near vertices, relative, clipped."""
+    """Root mean square error of extinction at the near crossings, relative, clipped."""
     peer: float
     apart: float
     """Root mean square difference over our stated standard errors."""
@@ -107,7 +107,7 @@ class SolverRate:
     """CPU time of one way to solve cycles, or profiles of a network."""
 
     way: str
-    rays: int
+    beams: int
     size: int
     """Cycles or profiles of a call."""
     nanoseconds: float
@@ -148,7 +148,7 @@ class MultiPositionThroughput:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """(profile, near vertex) errors of one way; NaN where withheld."""
+    """(profile, near crossing) errors of one way; NaN where withheld."""
 
     extinction: Array
     """Relative, clipped."""
@@ -167,9 +167,9 @@ def errors_of(result: MultiPositionResult, truth: Array, near: Booleans) -> Erro
     Parameters
     ----------
     result : MultiPositionResult
-    truth : (profile, vertex) float
+    truth : (profile, crossing) float
         Extinction, m-1.
-    near : (vertex,) bool
+    near : (crossing,) bool
     """
     found, truth = result.extinction[:, near], truth[:, near]
     stated = result.extinction_standard_error[:, near]

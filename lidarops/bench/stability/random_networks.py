@@ -32,15 +32,15 @@ class Told:
 
 
 def random_network(rng: Random) -> Place:
-    """Return 3 or 4 lidars on a line with 1 or 2 rays each, which meet above it."""
+    """Return 3 or 4 lidars on a line with 1 or 2 beams each, which meet above it."""
     count = int(rng.integers(3, 5))
     east = np.linspace(-600.0, 600.0, count) + rng.uniform(-150.0, 150.0, count)
     target = rng.uniform([-300.0, 300.0], [300.0, 900.0], (2, 2))
-    rays = int(rng.integers(1, 3))
+    beams = int(rng.integers(1, 3))
     elevations = tuple(
         tuple(
             float(np.degrees(np.arctan2(height + rng.uniform(-150.0, 150.0), x - lidar)))
-            for x, height in target[:rays]
+            for x, height in target[:beams]
         )
         for lidar in east
     )
@@ -76,7 +76,7 @@ def _plume(rng: Random, *, drift: float = 0.0) -> Air:
 
 
 def _thin(rng: Random) -> Air:
-    """Return a layer through which a ray is in a few gates, so that its signal bends in a fit."""
+    """Return a layer through which a beam is in a few bins, so that its signal bends in a fit."""
     value = float(np.exp(rng.uniform(np.log(1e-4), np.log(5e-3))))
     more, deep = rng.uniform(0.3, 3.0), rng.uniform(10.0, 60.0)
     middle = rng.uniform(300.0, 900.0)
@@ -102,7 +102,7 @@ def _quiet(told: Told, seen: Signals, rng: Random) -> Told:
 
 
 def _with_overlap(told: Told, seen: Signals, rng: Random) -> Told:
-    lost = rng.uniform(0.0, 0.2, (seen.network.rays, 1))
+    lost = rng.uniform(0.0, 0.2, (seen.network.beams, 1))
     scale = rng.uniform(50.0, 300.0)
     return Told(
         told.power * (1.0 - lost * np.exp(-(seen.range - _FULL_OVERLAP) / scale)), told.variance
@@ -125,13 +125,13 @@ def _with_exponent(told: Told, _: Signals, rng: Random) -> Told:
 
 
 def _with_offset(told: Told, _: Signals, rng: Random) -> Told:
-    """Leave a background of a part of the noise of the far gates."""
+    """Leave a background of a part of the noise of the far bins."""
     left = rng.normal(0.0, rng.uniform(0.0, 0.5), (*told.power.shape[:2], 1))
     return Told(told.power + left * np.sqrt(told.variance[..., -1:]), told.variance)
 
 
 _FIELD_OF: Final = "the exponent cannot be told from the field: the user declares it"
-_NOT_CANCELLED: Final = "the overlap of a lidar does not cancel, and rays that agree may share it"
+_NOT_CANCELLED: Final = "the overlap of a lidar does not cancel, and beams that agree may share it"
 FAILURES: Final[tuple[tuple[Failure, Any, Any], ...]] = (
     (Failure("none, homogeneous", satisfied=True), _homogeneous, _as_seen),
     (Failure("none, layered", satisfied=True), _layered, _as_seen),
@@ -142,7 +142,7 @@ FAILURES: Final[tuple[tuple[Failure, Any, Any], ...]] = (
     (Failure("overlap error", unseen=_NOT_CANCELLED), _layered, _with_overlap),
     (Failure("wrong exponent", unseen=_FIELD_OF), _layered, _with_exponent),
     (Failure("background left in the signals"), _layered, _with_offset),
-    (Failure("layer of a few gates"), _thin, _quiet),
+    (Failure("layer of a few bins"), _thin, _quiet),
 )
 
 
@@ -158,7 +158,7 @@ def judge_networks(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
             continue
         result, truth = found
         bits = np.where(result.flags.flagged, _DOUBTED, np.int32(0))
-        error = np.where(result.near_vertex, result.extinction - truth, np.nan)
+        error = np.where(result.near_crossing, result.extinction - truth, np.nan)
         stated = result.extinction_standard_error
         # A value is to be had where its standard error is small.
         with np.errstate(invalid="ignore"):
@@ -172,10 +172,10 @@ def judge_networks(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
 def _tried(
     rng: Random, air_of: Any, damage: Any, profiles: int
 ) -> tuple[extinction_field.MultiPositionResult, Array] | None:
-    """Return what is found and the truth; None where the rays do not meet."""
+    """Return what is found and the truth; None where the beams do not meet."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
     net = random_network(rng).network()
-    if net.vertices < 2 or not np.all(np.diff(np.bincount(net.crossings.ray)) == 0):
+    if net.crossings < 2 or not np.all(np.diff(np.bincount(net.passages.beam)) == 0):
         return None
     seen = signals(net, air_of(rng))
     power, variance = seen.draw(noise, profiles, int(rng.integers(2**31)))
@@ -186,6 +186,6 @@ def _tried(
             full_overlap_range=_FULL_OVERLAP, blocks=np.arange(profiles) // BLOCK,
         )  # fmt: skip
     except LidarOpsError:
-        # Rays without two vertices in reach are refused, not answered.
+        # Beams without two crossings in reach are refused, not answered.
         return None
     return found, seen.truth(profiles)

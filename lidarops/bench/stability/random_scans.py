@@ -64,7 +64,7 @@ def _with_overlap(scan: Scan, rng: Random) -> Scan:
 
 
 def _with_background(scan: Scan, rng: Random) -> Scan:
-    """Leave a part of the noise of one bin in the background of each ray."""
+    """Leave a part of the noise of one bin in the background of each beam."""
     left = rng.normal(0.0, rng.uniform(0.0, 0.3), (*scan.signal.shape[:2], 1))
     return replace(scan, signal=scan.signal + left * np.sqrt(scan.variance))
 
@@ -97,7 +97,7 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
         _level,
         _with_overlap,
     ),
-    (Failure("background left in the rays"), _level, _with_background),
+    (Failure("background left in the beams"), _level, _with_background),
     (Failure("everything at once"), _as_drawn, _plain),
 )
 

@@ -58,19 +58,19 @@ def answered(found: MultiPositionResult) -> Answer:
 
 
 def solve_network(near: bool = True, **arguments: Any) -> Answer:  # noqa: FBT001, FBT002
-    """Solve, and return the vertices that are near ones, or all."""
+    """Solve, and return the crossings that are near ones, or all."""
     found = extinction_field.retrieve_network(**arguments)
     answer = answered(found)
     if not near:
         return answer
-    values = {name: answer.value(name)[..., found.near_vertex] for name in answer.values}
-    return Answer(values, answer.quality[..., found.near_vertex])
+    values = {name: answer.value(name)[..., found.near_crossing] for name in answer.values}
+    return Answer(values, answer.quality[..., found.near_crossing])
 
 
-def start_vertex(walk: geometry.Cycle, **arguments: Any) -> Answer:
-    """Solve a cycle, and return the vertex at which it starts."""
+def start_crossing(walk: geometry.Cycle, **arguments: Any) -> Answer:
+    """Solve a cycle, and return the crossing at which it starts."""
     answer = answered(extinction_field.retrieve_network(cycle=walk, **arguments))
-    first = int(walk.vertex[0])
+    first = int(walk.crossing[0])
     values = {name: answer.value(name)[..., first] for name in answer.values}
     return Answer(values, answer.quality[..., first])
 
@@ -99,19 +99,19 @@ def network_arguments(
 
 
 def triangle_with_elevation(elevation: float) -> Place:
-    """Return the triangle with another elevation of its second ray."""
+    """Return the triangle with another elevation of its second beam."""
     return Place("", (300.0, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
 
 
 def _started(elevation: float, noise: float, **more: Any) -> dict[str, Any]:
-    """Return a cycle that starts at the vertex of rays 1 and 2, whichever is nearer."""
+    """Return a cycle that starts at the crossing of beams 1 and 2, whichever is nearer."""
     given = network_arguments(
         triangle_with_elevation(elevation), noise=noise, method="cycle", **more
     )
     net = given["network"]
     first = next(
-        vertex for vertex in range(net.vertices)
-        if all(vertex in net.on_ray(ray)[0] for ray in (0, 2))
+        crossing for crossing in range(net.crossings)
+        if all(crossing in net.on_beam(beam)[0] for beam in (0, 2))
     )  # fmt: skip
     return given | {"walk": geometry.build_cycle(net, start=first)}
 
@@ -123,10 +123,10 @@ def _bad(value: float) -> dict[str, Any]:
     return given | {"power": power}
 
 
-def _one_gate(value: float) -> dict[str, Any]:
+def _one_bin(value: float) -> dict[str, Any]:
     given = network_arguments()
     power = given["power"].copy()
-    at = int(np.argmin(np.abs(given["range"] - given["network"].on_ray(0)[1][0])))
+    at = int(np.argmin(np.abs(given["range"] - given["network"].on_beam(0)[1][0])))
     power[:, 0, at] = value
     return given | {"power": power}
 
@@ -169,14 +169,14 @@ def _two_lidars() -> dict[str, Any]:
 def _networks() -> tuple[StiffCase, ...]:
     honest = Honest("extinction", 2e-3, most=5e-3)
     return (
-        _case("A a rays through one point: nothing is determined", solve=start_vertex,
+        _case("A a beams through one point: nothing is determined", solve=start_crossing,
               build=lambda: _started(46.1024, 0.01), expected=(Raised(_ANY),)),
-        _case("A b nearly so, noise 1 %", solve=start_vertex,
+        _case("A b nearly so, noise 1 %", solve=start_crossing,
               build=lambda: _started(47.0, 0.01),
               expected=(Raised(_ANY, 0.9), Honest("extinction", 2e-3, most=5e-3))),
-        _case("A c below the crossing: the start is the far vertex", solve=start_vertex,
+        _case("A c below the crossing: the start is the far crossing", solve=start_crossing,
               build=lambda: _started(30.0, 0.01), expected=(Raised(_ANY),)),
-        _case("A c the same, all vertices at once", solve=solve_network,
+        _case("A c the same, all crossings at once", solve=solve_network,
               build=lambda: network_arguments(triangle_with_elevation(30.0)), expected=(honest,)),
         _case("A d visibility of 150 km, noise 0.5 %, exact cycle",
               build=lambda: network_arguments(air=homogeneous(2e-5), noise=0.005, method="cycle"),
@@ -203,19 +203,19 @@ def _networks() -> tuple[StiffCase, ...]:
             for method in ("cycle", "network", "unbiased")
         ),
         *(
-            _case(f"A h a ray of {value:g}", build=partial(_bad, value), solve=solve_network,
+            _case(f"A h a beam of {value:g}", build=partial(_bad, value), solve=solve_network,
                   expected=(Raised(_ANY),))
             for value in (np.nan, 0.0, -1.0, np.inf)
         ),
         *(
-            _case(f"A h one gate of {value:g}", build=partial(_one_gate, value), solve=solve_network,
+            _case(f"A h one bin of {value:g}", build=partial(_one_bin, value), solve=solve_network,
                   expected=(honest,))
             for value in (np.nan, 0.0, -1e9, np.inf, 1e300)
         ),
-        _case("A i one crossing of two rays, without prior", build=_two_lidars,
+        _case("A i one crossing of two beams, without prior", build=_two_lidars,
               solve=partial(solve_network, near=False),
               expected=(Missing("extinction"), Raised(_ANY))),
-        _case("A j multiplier beyond the pole", solve=start_vertex,
+        _case("A j multiplier beyond the pole", solve=start_crossing,
               build=lambda: _started(25.0, 0.01) | {"method": "multiplier", "multiplier": 0.9},
               expected=(Raised(_ANY),)),
         *(
@@ -243,14 +243,14 @@ def _networks() -> tuple[StiffCase, ...]:
 # Cycles in closed form ------------------------------------------------------------------------
 
 
-def _against_lu(rays: int) -> Answer:
-    rng = np.random.default_rng(rays)
-    start = rng.uniform(1.0, 2.0, (500, rays))
+def _against_lu(beams: int) -> Answer:
+    rng = np.random.default_rng(beams)
+    start = rng.uniform(1.0, 2.0, (500, beams))
     end, integral = start * rng.uniform(0.6, 0.9, start.shape), rng.uniform(0.1, 0.3, start.shape)
-    matrix = np.zeros((500, rays, rays), dtype=np.longdouble)
-    here = np.arange(rays)
+    matrix = np.zeros((500, beams, beams), dtype=np.longdouble)
+    here = np.arange(beams)
     matrix[:, here, here] = start
-    matrix[:, here, (here + 1) % rays] -= end
+    matrix[:, here, (here + 1) % beams] -= end
     exact = np.linalg.solve(matrix.astype(np.float64), integral[..., np.newaxis])[:, 0, 0]
     found = cycles.solve_cycle(start, end, integral).value
     return Answer({"change": np.max(np.abs(found / exact - 1.0))})
@@ -272,9 +272,9 @@ def _closed() -> tuple[StiffCase, ...]:
     flat = {"start": [1.0, 1.0, 1.0], "end": [1.0, 1.0, 1.0]}
     return (
         *(
-            _case(f"closed form against LU, {rays} rays", build=partial(dict, rays=rays),
+            _case(f"closed form against LU, {beams} beams", build=partial(dict, beams=beams),
                   solve=_against_lu, expected=(Near("change", 0.0, 1e-13, relative=False),))
-            for rays in (3, 5, 12, 40)
+            for beams in (3, 5, 12, 40)
         ),
         _case("cycle without attenuation", build=lambda: _rows(**flat), solve=_cycle,
               expected=(Raised(FLAGGED),)),
@@ -350,12 +350,12 @@ def _refused(name: str, field: str | None, **more: Any) -> StiffCase:
 def _refusals() -> tuple[StiffCase, ...]:
     return (
         _refused("range in km", "range", range=network_arguments()["range"] / 1e3),
-        _refused("one ray too few", None, power=network_arguments()["power"][:, :2]),
+        _refused("one beam too few", None, power=network_arguments()["power"][:, :2]),
         _refused("negative variance", "variance", variance=-1.0),
         _refused("neither overlap nor its range", None, full_overlap_range=None),
         _refused("multiplier of a network", "multiplier", multiplier=0.5),
         _refused("exponent of zero", "exponent", exponent=0.0),
-        _refused("no gate in the fit", "gates", gates=0),
+        _refused("no bin in the fit", "bins", bins=0),
         _refused("unknown method", "method", method="magic"),
     )  # fmt: skip
 

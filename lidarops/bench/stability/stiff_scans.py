@@ -82,7 +82,7 @@ def _clear() -> Scene:
 
 
 def _short() -> Scene:
-    return multiangle_cases.clear(3000.0, gates=60)
+    return multiangle_cases.clear(3000.0, bins=60)
 
 
 def scan_arguments(
@@ -173,7 +173,7 @@ def _one_bad(value: float) -> dict[str, Any]:
     return given | {"signal": signal}
 
 
-def _gate(value: float) -> dict[str, Any]:
+def _bin(value: float) -> dict[str, Any]:
     given = scan_arguments()
     signal = given["signal"].copy()
     signal[3, 2, 30] = value
@@ -189,8 +189,8 @@ def _others_alike(**given: Any) -> Answer:
     return Answer({"change": np.nanmax(np.abs(change / stated))})
 
 
-def _infinite_ray() -> Answer:
-    """Compare a scan with two rays along the horizon with the same without them."""
+def _infinite_beam() -> Answer:
+    """Compare a scan with two beams along the horizon with the same without them."""
     given = scan_arguments()
     base, angle = given["signal"], given["zenith_angle"]
     flat = np.repeat(base[:, -1:], 2, axis=1)
@@ -237,7 +237,7 @@ def _floor() -> Answer:
 
 
 def _subset(method: str) -> Answer:
-    """Compare rays that are all NaN with the same scan without them."""
+    """Compare beams that are all NaN with the same scan without them."""
     given = scan_arguments(method=method)
     signal = given["signal"].copy()
     signal[:, [3, 7]] = np.nan
@@ -267,9 +267,9 @@ def _listed() -> tuple[StiffCase, ...]:
     alike = (Near("change", 0.0, 1e-9, relative=False), Near("same flags", 1.0, 0.0))
     honest = Honest("optical_depth", _truth, most=1e-3)
     return (
-        _case("a one ray", build=lambda: scan_arguments(_one), solve=solve_scan,
+        _case("a one beam", build=lambda: scan_arguments(_one), solve=solve_scan,
               expected=(Raised(Quality.NO_LEVERAGE), Missing("optical_depth"))),
-        _case("b all rays alike", build=lambda: scan_arguments(_alike), solve=solve_scan,
+        _case("b all beams alike", build=lambda: scan_arguments(_alike), solve=solve_scan,
               expected=(Raised(Quality.NO_LEVERAGE), Missing("optical_depth"))),
         _case("slant paths from 1 to 1.035", build=lambda: scan_arguments(_narrow), solve=solve_scan,
               expected=(Raised(Quality.LOW_LEVERAGE),
@@ -281,7 +281,7 @@ def _listed() -> tuple[StiffCase, ...]:
               build=lambda: scan_arguments(_narrowest, method="kano_hamilton"), solve=solve_scan,
               expected=(Raised(Quality.LOW_LEVERAGE),
                         Between("random error at the top", 7.0, 28.0))),
-        _case("d rays along the horizon are left out", build=dict, solve=_infinite_ray,
+        _case("d beams along the horizon are left out", build=dict, solve=_infinite_beam,
               expected=alike),
         *(
             _case(f"e one profile {value:g}", build=partial(_one_bad, value),
@@ -289,11 +289,11 @@ def _listed() -> tuple[StiffCase, ...]:
             for value in (np.inf, np.nan, 0.0)
         ),
         *(
-            _case(f"e one gate {value:g}", build=partial(_gate, value),
+            _case(f"e one bin {value:g}", build=partial(_bin, value),
                   solve=_others_alike, expected=(Near("change", 0.0, 0.5, relative=False),))
             for value in (1e300, -1e300, np.inf)
         ),
-        _case("e the profile with a gate of 1e300", build=lambda: _gate(1e300), solve=solve_scan,
+        _case("e the profile with a bin of 1e300", build=lambda: _bin(1e300), solve=solve_scan,
               expected=(honest,)),
         _case("f all signals negative", solve=solve_scan,
               build=lambda: scan_arguments() | {"signal": -scan_arguments()["signal"]},
@@ -301,10 +301,10 @@ def _listed() -> tuple[StiffCase, ...]:
         _case("all NaN", solve=solve_scan,
               build=lambda: scan_arguments() | {"signal": np.full_like(scan_arguments()["signal"], np.nan)},
               expected=(Missing("optical_depth"), Raised(Quality.INPUT_MISSING))),
-        _case("g 30 % missing, a hole of 6 altitudes, half the rays lost aloft", build=_holes,
+        _case("g 30 % missing, a hole of 6 altitudes, half the beams lost aloft", build=_holes,
               solve=solve_scan, expected=(Honest("optical_depth", _truth, valued=0.9, most=1e-3),)),
         *(
-            _case(f"g rays that are missing are as if not there, {method}",
+            _case(f"g beams that are missing are as if not there, {method}",
                   build=partial(dict, method=method), solve=_subset, expected=alike)
             for method in ("kano_hamilton", "joint")
         ),
@@ -320,9 +320,9 @@ def _listed() -> tuple[StiffCase, ...]:
         _case("j signal over noise 10 at the zenith", build=lambda: scan_arguments(_weak, 64),
               solve=solve_scan, expected=(Honest("optical_depth", partial(_truth, _weak), most=1e-3),)),
         *(
-            _case(f"k {gates} altitudes", build=partial(_cut, gates), solve=solve_scan,
-                  expected=(Honest("optical_depth", partial(_lowest, gates), most=1e-3),))
-            for gates in (1, 3)
+            _case(f"k {bins} altitudes", build=partial(_cut, bins), solve=solve_scan,
+                  expected=(Honest("optical_depth", partial(_lowest, bins), most=1e-3),))
+            for bins in (1, 3)
         ),
         _case("k, p one profile", build=lambda: scan_arguments(_short, 1), solve=solve_scan,
               expected=(Honest("optical_depth", _truth, valued=0.5, most=1e-3),)),
@@ -331,10 +331,10 @@ def _listed() -> tuple[StiffCase, ...]:
                   solve=_scaled, expected=alike)
             for factor in (1e-30, 1e30, 1e-140, 1e140)
         ),
-        _case("rays in another order", build=dict, solve=_permuted, expected=alike),
+        _case("beams in another order", build=dict, solve=_permuted, expected=alike),
         _case("m no noise stated counts as 1e-6 of the signal", build=dict, solve=_floor,
               expected=alike),
-        _case("n rays at 0, 0.01, 7, 7 and 15 degrees", build=lambda: scan_arguments(_five),
+        _case("n beams at 0, 0.01, 7, 7 and 15 degrees", build=lambda: scan_arguments(_five),
               solve=solve_scan,
               expected=(Honest("optical_depth", partial(_truth, _five), most=1e-3),)),
         *(
@@ -363,16 +363,16 @@ def _alike() -> Scene:
     return _angles(30.0, 30.0, 30.0)
 
 
-def _cut(gates: int) -> dict[str, Any]:
+def _cut(bins: int) -> dict[str, Any]:
     given = scan_arguments()
     return given | {
-        "signal": given["signal"][..., :gates], "variance": given["variance"][..., :gates],
-        "altitude": given["altitude"][:gates],
+        "signal": given["signal"][..., :bins], "variance": given["variance"][..., :bins],
+        "altitude": given["altitude"][:bins],
     }  # fmt: skip
 
 
-def _lowest(gates: int) -> Array:
-    return _truth()[:gates]
+def _lowest(bins: int) -> Array:
+    return _truth()[:bins]
 
 
 def _refusals() -> tuple[StiffCase, ...]:

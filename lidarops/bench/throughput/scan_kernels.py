@@ -17,8 +17,8 @@ from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle.vertical import smooth_profile
 
-RAYS: Final = "make_rays"
-"""Logarithms, their variances and how far the rays reach."""
+BEAMS: Final = "make_beams"
+"""Logarithms, their variances and how far the beams reach."""
 REGRESS: Final = "regress"
 """The weighted fit of all altitudes with its scatter, without outliers."""
 SMOOTH: Final = "vertical.smooth"
@@ -101,12 +101,12 @@ def _costs(scan: Scan, repeats: int) -> Iterator[StepCost]:
 def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:
     scene = scan.scene
     geometry = slant_paths.make_scan(scene.zenith_angle, scene.altitude, None)
-    rays = _block.make_beam_block(scan.signal, scan.variance, geometry)
-    fit = _block.regress(rays, inhomogeneity=None, robust=False)
+    beams = _block.make_beam_block(scan.signal, scan.variance, geometry)
+    fit = _block.regress(beams, inhomogeneity=None, robust=False)
     share = fit.column(kh.SHARE) * fit.inhomogeneity
     residuals = smooth_profile.residual_moments(
         fit.residual,
-        np.where(np.isfinite(fit.residual), _block.weights_of(rays, fit), 0.0),
+        np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
         np.nan_to_num(fit.leverage, nan=1.0),
         np.broadcast_to(fit.inhomogeneity, share.shape),
         np.nan_to_num(share),
@@ -120,7 +120,7 @@ def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:
         residuals=residuals,
     )
     return {
-        RAYS: lambda: _block.make_beam_block(scan.signal, scan.variance, geometry),
-        REGRESS: lambda: _block.regress(rays, inhomogeneity=None, robust=False),
+        BEAMS: lambda: _block.make_beam_block(scan.signal, scan.variance, geometry),
+        REGRESS: lambda: _block.regress(beams, inhomogeneity=None, robust=False),
         SMOOTH: smooth,
     }

@@ -21,7 +21,7 @@ from lidarops.netcdf.variables import (
     shots,
 )
 
-_GATES: Final = ("time", "range")
+_BINS: Final = ("time", "range")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
 _BUDGET: Final = {
@@ -53,7 +53,7 @@ def _budget(quantity: str, called: str, units: str) -> Iterator[Row]:
     for cause, comment in _BUDGET.items():
         yield Row(
             name=f"{quantity}_error_{cause}",
-            dims=_GATES,
+            dims=_BINS,
             dtype="f4",
             units=units,
             long_name=f"error of {called} by one standard error of its {_CALLED[cause]}",
@@ -104,7 +104,7 @@ ELASTIC: Final = Layout(
     data=(
         Row(
             name="backscatter",
-            dims=_GATES,
+            dims=_BINS,
             dtype="f4",
             units="m-1 sr-1",
             standard_name="volume_backwards_scattering_coefficient_of_radiative_flux_by_ranging"
@@ -120,7 +120,7 @@ ELASTIC: Final = Layout(
         *_budget("backscatter", "backscatter", "m-1 sr-1"),
         Row(
             name="extinction",
-            dims=_GATES,
+            dims=_BINS,
             dtype="f4",
             units="m-1",
             standard_name="volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient"
@@ -143,7 +143,7 @@ ELASTIC: Final = Layout(
         ),
         Row(
             name="scattering_ratio",
-            dims=_GATES,
+            dims=_BINS,
             dtype="f4",
             units="1",
             long_name="backscatter of particles and molecules over that of molecules",
@@ -158,7 +158,7 @@ ELASTIC: Final = Layout(
         ),
         Row(
             name="attenuated_backscatter",
-            dims=_GATES,
+            dims=_BINS,
             dtype="f4",
             units="m-1 sr-1",
             standard_name="volume_attenuated_backwards_scattering_coefficient_of_radiative_flux"
@@ -243,7 +243,7 @@ ELASTIC: Final = Layout(
             comment=f"Not calibrated. {NO_NAME}",
         ),
         *GLUING,
-        quality(_GATES, FLAGS),
+        quality(_BINS, FLAGS),
         Row(
             name="profiles",
             dims=("time",),

@@ -57,9 +57,9 @@ _ALTITUDE: Final = Row(
     comment="Top of the layer in altitude_bnds, which begins at the altitude below, or at the"
     " station.",
 )
-_RAY: Final = Row(
-    name="ray",
-    dims=("ray",),
+_BEAM: Final = Row(
+    name="beam",
+    dims=("beam",),
     dtype="i4",
     units="1",
     long_name="number of the direction of the beam",
@@ -84,9 +84,9 @@ _LAYER: Final = Row(
 
 
 def _direction(name: str) -> Row:
-    """Return the row of an angle of the rays."""
+    """Return the row of an angle of the beams."""
     angle = next(row for row in PLACE if row.name == name)
-    return replace(angle, name=f"ray_{name}", dims=("ray",), follows_beam=False)
+    return replace(angle, name=f"beam_{name}", dims=("beam",), follows_beam=False)
 
 
 _STATION: Final = tuple(row for row in PLACE if row.name not in ("zenith_angle", "azimuth"))
@@ -105,7 +105,7 @@ def _gradient_error(quantity: str, called: str, units: str) -> Row:
         error_kind=ErrorKind.SYSTEMATIC,
         comment=f"Apart from {quantity}_standard_error, of noise and smoothing: what the largest"
         " horizontal gradient of ln backscatter that the settings declare would do. Near 0 where"
-        f" rays lead to all sides. {NO_NAME}",
+        f" beams lead to all sides. {NO_NAME}",
     )
 
 
@@ -136,7 +136,7 @@ MULTIANGLE: Final = Layout(
     coordinates=(
         TIME,
         _ALTITUDE,
-        _RAY,
+        _BEAM,
         _direction("zenith_angle"),
         _direction("azimuth"),
         _LAYER,
@@ -156,7 +156,7 @@ MULTIANGLE: Final = Layout(
                 "data_share",
                 "inhomogeneity",
                 "quality_flag",
-                "rays",
+                "beams",
                 "shots",
             ),
             significant_bits=_BITS,
@@ -193,7 +193,7 @@ MULTIANGLE: Final = Layout(
                 "data_share",
                 "inhomogeneity",
                 "quality_flag",
-                "rays",
+                "beams",
                 "shots",
             ),
             significant_bits=_BITS,
@@ -211,7 +211,7 @@ MULTIANGLE: Final = Layout(
             long_name="natural logarithm of the range-corrected signal at an optical depth of zero",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: point",
-            ancillaries=("quality_flag", "rays", "shots"),
+            ancillaries=("quality_flag", "beams", "shots"),
             uncertain=True,
             comment="Of the signal in mV m2 (analog) or MHz m2 (photon counting): system constant"
             f" times backscatter coefficient, not calibrated. {NO_NAME}",
@@ -235,20 +235,20 @@ MULTIANGLE: Final = Layout(
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             significant_bits=8,
-            comment=f"Of the air between the rays, common to all cycles of the file. {NO_NAME}",
+            comment=f"Of the air between the beams, common to all cycles of the file. {NO_NAME}",
         ),
         Row(
             name="reduced_chi2",
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="squared residuals over the rays by their variances, per degree of freedom",
+            long_name="squared residuals over the beams by their variances, per degree of freedom",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             significant_bits=8,
             optional=True,
             comment="About 1, as the inhomogeneity is found from the residuals; less where noise is"
-            f" overstated. Missing where no ray is redundant. {NO_NAME}",
+            f" overstated. Missing where no beam is redundant. {NO_NAME}",
         ),
         Row(
             name="layer_optical_depth",
@@ -274,13 +274,13 @@ MULTIANGLE: Final = Layout(
         ),
         Row(
             name="residual",
-            dims=("time", "ray", "altitude"),
+            dims=("time", "beam", "altitude"),
             dtype="f4",
             units="1",
-            long_name="natural logarithm of the signal of a ray less its fit over the rays",
+            long_name="natural logarithm of the signal of a beam less its fit over the beams",
             coverage=Coverage.QUALITY,
             significant_bits=8,
-            comment=f"Missing where the ray has no usable signal. {NO_NAME}",
+            comment=f"Missing where the beam has no usable signal. {NO_NAME}",
         ),
         quality(_LEVELS, FLAGS),
         Row(
@@ -303,7 +303,7 @@ MULTIANGLE: Final = Layout(
             comment=f"Missing where there is none. {NO_NAME}",
         ),
         Row(
-            name="rays",
+            name="beams",
             dims=("time",),
             dtype="i4",
             units="1",
@@ -312,6 +312,6 @@ MULTIANGLE: Final = Layout(
             coverage=Coverage.AUXILIARY,
             valid_min=0.0,
         ),
-        shots(of="all rays of the scan cycle"),
+        shots(of="all beams of the scan cycle"),
     ),
 )

@@ -20,7 +20,7 @@ from lidarops.netcdf.variables import (
 )
 from lidarops.products.visibility_variables import visibility
 
-_SERIES: Final = ("time", "vertex")
+_SERIES: Final = ("time", "crossing")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
 
@@ -47,21 +47,21 @@ def _place(name: str) -> Row:
     return next(row for row in PLACE if row.name == name)
 
 
-def _of_vertex(name: str) -> Row:
-    """Return the row of where the vertices lie, in place of where a station stands."""
+def _of_crossing(name: str) -> Row:
+    """Return the row of where the crossings lie, in place of where a station stands."""
     row = _place(name)
-    return replace(row, dims=("vertex",), long_name=f"{name} of the point where beams meet")
+    return replace(row, dims=("crossing",), long_name=f"{name} of the point where beams meet")
 
 
-def _of_ray(name: str, source: str, called: str) -> Row:
+def _of_beam(name: str, source: str, called: str) -> Row:
     row = _place(source)
     if name in ("latitude", "longitude"):
         # As of a station whose values lie elsewhere: one latitude is that of the values.
         row = replace(deployment(row), comment=None)
     return replace(
         row,
-        name=f"ray_{name}",
-        dims=("ray",),
+        name=f"beam_{name}",
+        dims=("beam",),
         long_name=called,
         follows_beam=False,
         coverage=Coverage.REFERENCE,
@@ -70,7 +70,7 @@ def _of_ray(name: str, source: str, called: str) -> Row:
 
 _ALTITUDE: Final = Row(
     name="altitude",
-    dims=("vertex",),
+    dims=("crossing",),
     dtype="f8",
     units="m",
     standard_name="altitude",
@@ -81,9 +81,9 @@ _ALTITUDE: Final = Row(
     comment="Beams are straight, on the WGS 84 ellipsoid, of which the geoid is taken for a"
     " parallel.",
 )
-_VERTEX: Final = Row(
-    name="vertex_id",
-    dims=("vertex",),
+_CROSSING: Final = Row(
+    name="crossing_id",
+    dims=("crossing",),
     dtype="i4",
     units="1",
     long_name="number of the point in the network of beams",
@@ -92,9 +92,9 @@ _VERTEX: Final = Row(
     comment="In order of the nearest range. Points that are the farthest on all of their beams"
     " have a number too, but no value: nothing tells the attenuation beyond them.",
 )
-_RAY: Final = Row(
-    name="ray",
-    dims=("ray",),
+_BEAM: Final = Row(
+    name="beam",
+    dims=("beam",),
     dtype="i4",
     units="1",
     long_name="number of the beam",
@@ -135,7 +135,7 @@ VISIBILITY: Final = Layout(
     comment="Model: along a beam, a = (P r^2 / overlap)^m is proportional to extinction times"
     " exp(-2 m optical depth), with m the exponent of backscatter ~ extinction^(1/m); where two"
     " beams meet, both see the same extinction. Signals were averaged before they were solved."
-    " Stations stand where ray_latitude, ray_longitude and ray_altitude say. A gradient over the"
+    " Stations stand where beam_latitude, beam_longitude and beam_altitude say. A gradient over the"
     " whole network looks like attenuation where air is thin or noise is high, and no test tells"
     " it there: extinction_standard_error counts with twice the gradient that is typical, and"
     " with a bend where the mean of a block's profiles allows it. In simulated random networks"
@@ -143,23 +143,23 @@ VISIBILITY: Final = Layout(
     " 0.005(3) in plumes that drift within a block. More profiles in a block and more beams tell"
     " more. All profiles share what the prior allows, so"
     " that a mean over time does not make it smaller.",
-    sampled="vertex",
+    sampled="crossing",
     feature_type="timeSeries",
     unused_steps=frozenset({"molecular", "known_shape", "reference"}),
     coordinates=(
         TIME,
-        _VERTEX,
-        _of_vertex("latitude"),
-        _of_vertex("longitude"),
+        _CROSSING,
+        _of_crossing("latitude"),
+        _of_crossing("longitude"),
         _ALTITUDE,
-        _RAY,
-        _of_ray("latitude", "latitude", "latitude of the lidar of the beam"),
-        _of_ray("longitude", "longitude", "longitude of the lidar of the beam"),
-        _of_ray(
+        _BEAM,
+        _of_beam("latitude", "latitude", "latitude of the lidar of the beam"),
+        _of_beam("longitude", "longitude", "longitude of the lidar of the beam"),
+        _of_beam(
             "altitude", "station_altitude", "altitude of the lidar of the beam above the geoid"
         ),
-        _of_ray("zenith_angle", "zenith_angle", "zenith angle of the beam, 0 = up"),
-        _of_ray("azimuth", "azimuth", "azimuth of the beam, clockwise from north"),
+        _of_beam("zenith_angle", "zenith_angle", "zenith angle of the beam, 0 = up"),
+        _of_beam("azimuth", "azimuth", "azimuth of the beam, clockwise from north"),
         _place("wavelength"),
     ),
     data=(
@@ -249,8 +249,8 @@ VISIBILITY: Final = Layout(
             "Found as the likeliest of the block of profiles. Missing where nothing is told.",
         ),
         Row(
-            name="ray_range",
-            dims=("ray", "vertex"),
+            name="beam_range",
+            dims=("beam", "crossing"),
             dtype="f4",
             units="m",
             long_name="distance of the point from the lidar along the beam",

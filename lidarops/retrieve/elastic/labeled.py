@@ -165,10 +165,10 @@ def invert_elastic(
     )
     quality = prepared.quality
     quality |= _judged(found, window, clear, quality) | _clouded(distance, window, clouds)
-    gates = {name: np.where(found.valid, v, np.nan) for name, v in _gates(found).items()}
+    bins = {name: np.where(found.valid, v, np.nan) for name, v in _bins(found).items()}
     return xr.Dataset(
         {
-            **{name: (("time", "range"), values) for name, values in gates.items()},
+            **{name: (("time", "range"), values) for name, values in bins.items()},
             "molecular_backscatter": ("range", air.backscatter),
             "molecular_extinction": ("range", air.extinction),
             "lidar_ratio": ((), np.float64(lidar_ratio)),
@@ -351,7 +351,7 @@ def _clouded(distance: Array, window: _reference.ReferenceWindow, clouds: _layer
     return (above | below).astype(np.int32) * np.int32(Quality.CLOUD)
 
 
-def _gates(found: _elastic.ElasticResult) -> dict[str, Array]:
+def _bins(found: _elastic.ElasticResult) -> dict[str, Array]:
     budget: Any = found.budget
     return {
         "backscatter": found.backscatter,

@@ -1,4 +1,4 @@
-"""Slant signals on common altitudes: each ray is interpolated where it crosses them."""
+"""Slant signals on common altitudes: each beam is interpolated where it crosses them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CommonAltitude:
     """A scan on common altitudes, (..., angle, altitude)."""
 
     signal: Array
-    """In the unit given; NaN where the ray does not reach the altitude, or a bin beside it is
+    """In the unit given; NaN where the beam does not reach the altitude, or a bin beside it is
     missing."""
     variance: Array
     """In the square of that unit."""
@@ -100,19 +100,21 @@ def to_altitude(
     shape = (*values.shape[:-1], height.size)
     out, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     for a in np.flatnonzero(scan.usable):
-        one = _along_ray(values[..., a, :], noise[..., a, :], grid[a], scan.path[a] * height, cubic)
+        one = _along_beam(
+            values[..., a, :], noise[..., a, :], grid[a], scan.path[a] * height, cubic
+        )
         out[..., a, :], spread[..., a, :] = one
     return CommonAltitude(out, spread)
 
 
-def _along_ray(
+def _along_beam(
     values: Array,
     noise: Array,
     grid: Array,
     wanted: Array,
     cubic: bool,  # noqa: FBT001 - private
 ) -> tuple[Array, Array]:
-    """Return signal and variance of one ray at the wanted ranges."""
+    """Return signal and variance of one beam at the wanted ranges."""
     inside = (wanted >= grid[0]) & (wanted <= grid[-1])
     beside = np.clip(np.searchsorted(grid, wanted, side="right") - 1, 0, grid.size - 2)
     signal = np.full((*values.shape[:-1], wanted.size), np.nan)

@@ -1,6 +1,6 @@
 r"""Compiled weighted regression of logarithms on slant path, one height at a time.
 
-The model is :math:`y_l = c - 2 x_l \tau + g \cdot d_l + e_l` with the slant path x, where rays
+The model is :math:`y_l = c - 2 x_l \tau + g \cdot d_l + e_l` with the slant path x, where beams
 lead to all sides also with a horizontal gradient g over the horizontal distance d, and with the
 variance :math:`v_l + s^2`: detector noise and what inhomogeneity of the air adds to it.
 """
@@ -25,9 +25,9 @@ INTERCEPT_VARIANCE: Final = 3
 CHI2: Final = 4
 """Sum of the squared residuals over their variances."""
 FREEDOM: Final = 5
-"""Rays less unknowns; 0 where there is no fit."""
+"""Beams less unknowns; 0 where there is no fit."""
 TRACE: Final = 6
-"""Sum over rays of weight times one less leverage: what inhomogeneity adds to chi2."""
+"""Sum over beams of weight times one less leverage: what inhomogeneity adds to chi2."""
 SPAN: Final = 7
 """Largest less smallest slant path."""
 SLOPE_EAST: Final = 8
@@ -52,7 +52,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill_weights(
     noise: Array, keep: Array, inhomogeneity: Array, first: int, last: int, weights: Array
 ) -> None:
-    """Fill weights (angle, TILE) of the gates from `first` to before `last`."""
+    """Fill weights (angle, TILE) of the bins from `first` to before `last`."""
     angles, width = noise.shape[0], last - first
     added = inhomogeneity[first:last]
     for a in range(angles):
@@ -88,7 +88,7 @@ def _average_tile(y: Array, weights: Array, x: Array, first: int, last: int, sum
 def _fit_tile(
     y: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
 ) -> None:
-    """Fit the gates from `first` to before `last` with sums centred on the weighted means.
+    """Fit the bins from `first` to before `last` with sums centred on the weighted means.
 
     Parameters
     ----------
@@ -140,9 +140,9 @@ def _judge_tile(
     """
     width = last - first
     sw, mx, my, inverse = sums[0, :width], sums[1, :width], sums[2, :width], sums[3, :width]
-    slope, chi2, trace, rays = sums[4, :width], sums[5, :width], sums[6, :width], sums[7, :width]
+    slope, chi2, trace, beams = sums[4, :width], sums[5, :width], sums[6, :width], sums[7, :width]
     for j in range(width):
-        chi2[j] = trace[j] = rays[j] = 0.0
+        chi2[j] = trace[j] = beams[j] = 0.0
         sw[j] = 1.0 / sw[j] if sw[j] > 0.0 else 0.0
     for a in range(x.shape[0]):
         w, xs, ys = weights[a, :width], x[a, first:last], y[a, first:last]
@@ -151,13 +151,13 @@ def _judge_tile(
             residual = ys[j] - my[j] - slope[j] * dx
             chi2[j] += w[j] * residual * residual
             trace[j] += w[j] * (1.0 - w[j] * (sw[j] + dx * dx * inverse[j]))
-            rays[j] += 1.0 if w[j] > 0.0 else 0.0
+            beams[j] += 1.0 if w[j] > 0.0 else 0.0
     part = out[:, first:last]
     for j in range(width):
-        on = inverse[j] > 0.0 and rays[j] > 2.0
+        on = inverse[j] > 0.0 and beams[j] > 2.0
         part[CHI2, j] = chi2[j] if on else 0.0
-        part[FREEDOM, j] = rays[j] - 2.0 if on else 0.0
-        part[EXPECTED, j] = rays[j] - 2.0 if on else 0.0
+        part[FREEDOM, j] = beams[j] - 2.0 if on else 0.0
+        part[EXPECTED, j] = beams[j] - 2.0 if on else 0.0
         part[TRACE, j] = trace[j] if on else 0.0
 
 
@@ -196,11 +196,11 @@ def fit_kano_hamilton(
     out : (profile, COLUMNS, altitude) float
         Gets optical depth, information and the rest, but for what hangs on horizontal distance.
     """
-    count, angles, gates = y.shape
+    count, angles, bins = y.shape
     weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
     for t in range(count):
-        for first in range(0, gates, TILE):
-            last = min(first + TILE, gates)
+        for first in range(0, bins, TILE):
+            last = min(first + TILE, bins)
             _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
             _fit_tile(y[t], weights, x, first, last, sums, out[t])
             _judge_tile(y[t], weights, x, first, last, sums, out[t])
@@ -220,21 +220,21 @@ def fit_details(
     residuals: Array,
     leverages: Array,
 ) -> None:
-    """Fit as `fit_kano_hamilton`, with all that `fit_gates` gives where it fits no gradient.
+    """Fit as `fit_kano_hamilton`, with all that `fit_bins` gives where it fits no gradient.
 
     Parameters
     ----------
     y, noise, keep, inhomogeneity, x, out
         As in `fit_kano_hamilton`.
     d, residuals, leverages
-        As in `fit_gates`, with all profiles.
+        As in `fit_bins`, with all profiles.
     """
     fit_kano_hamilton(y, noise, keep, inhomogeneity, x, out)
-    count, angles, gates = y.shape
+    count, angles, bins = y.shape
     weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
     for t in range(count):
-        for first in range(0, gates, TILE):
-            last = min(first + TILE, gates)
+        for first in range(0, bins, TILE):
+            last = min(first + TILE, bins)
             _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
             _fit_tile(y[t], weights, x, first, last, sums, out[t])
             _lever_tile(weights, x, d, first, last, sums, out[t])
@@ -254,7 +254,7 @@ def fit_details(
 def _lever_tile(
     weights: Array, x: Array, d: Array, first: int, last: int, sums: Array, out: Array
 ) -> None:
-    """Fill what hangs on the rays alone: span of paths, and what a gradient would do."""
+    """Fill what hangs on the beams alone: span of paths, and what a gradient would do."""
     for k in range(first, last):
         j = k - first
         low, high, east, north = np.inf, -np.inf, 0.0, 0.0
@@ -272,7 +272,7 @@ def _lever_tile(
 
 @_compiled
 def surrounds(weights: Array, design: Array) -> bool:
-    """Tell whether no half turn around the zenith is free of rays with weight.
+    """Tell whether no half turn around the zenith is free of beams with weight.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ def _dot(weights: Array, first: Array, second: Array) -> float:
 def _orthogonal(
     weights: Array, design: Array, sides: bool, q: Array, norm: Array, mean: Array
 ) -> int:
-    """Fill orthogonal columns of one gate, and where the model's zero lies on them.
+    """Fill orthogonal columns of one bin, and where the model's zero lies on them.
 
     Parameters
     ----------
@@ -366,7 +366,7 @@ def _span(weights: Array, path: Array) -> float:
 
 @_compiled
 def _slopes(weights: Array, design: Array, q: Array, norm: Array, mean: Array, out: Array) -> None:
-    """Fill what the fit of one gate says of the optical depth, its error and its leverage."""
+    """Fill what the fit of one bin says of the optical depth, its error and its leverage."""
     whole = _dot(weights, design[3], design[3])
     out[INTERCEPT_VARIANCE] = 1.0 / whole
     for c in range(3):
@@ -383,7 +383,7 @@ def _slopes(weights: Array, design: Array, q: Array, norm: Array, mean: Array, o
 
 
 @_compiled
-def fit_gate(
+def fit_bin(
     y: Array,
     weights: Array,
     keep: Array,
@@ -394,7 +394,7 @@ def fit_gate(
     hat: Array,
     out: Array,
 ) -> None:
-    """Fit one gate, with gradients where `sides`; fill residuals and leverages.
+    """Fit one bin, with gradients where `sides`; fill residuals and leverages.
 
     Parameters
     ----------
@@ -411,8 +411,8 @@ def fit_gate(
     """
     norm, mean = np.empty(3), np.empty(3)
     included = _orthogonal(weights, design, sides, q, norm, mean)
-    rays = np.count_nonzero(weights)
-    if included > 0 and rays <= 2 + included:
+    beams = np.count_nonzero(weights)
+    if included > 0 and beams <= 2 + included:
         # Without a residual left, the gradient would cost the optical depth its check.
         included = _orthogonal(weights, design, False, q, norm, mean)
     out[:] = 0.0
@@ -437,7 +437,7 @@ def fit_gate(
             for a in range(weights.size):
                 residual[a] -= slope * q[c, a]
                 hat[a] += weights[a] * q[c, a] * q[c, a] / norm[c]
-    out[FREEDOM] = rays - 2 - included
+    out[FREEDOM] = beams - 2 - included
     if out[FREEDOM] > 0.0:
         for a in range(weights.size):
             out[CHI2] += weights[a] * residual[a] * residual[a]
@@ -446,7 +446,7 @@ def fit_gate(
 
 
 @_compiled
-def fit_gates(
+def fit_bins(
     y: Array,
     noise: Array,
     keep: Array,
@@ -458,7 +458,7 @@ def fit_gates(
     residuals: Array,
     leverages: Array,
 ) -> None:
-    """Fit as `fit_kano_hamilton`, with gradients at gates whose rays surround the zenith.
+    """Fit as `fit_kano_hamilton`, with gradients at bins whose beams surround the zenith.
 
     Parameters
     ----------
@@ -472,7 +472,7 @@ def fit_gates(
         Get what the fit leaves of the logarithms (NaN where there is no sample) and the diagonal
         of the hat matrix; not filled where they hold no profile.
     """
-    count, angles, gates = y.shape
+    count, angles, bins = y.shape
     weights, before, kept, column = (
         np.empty(angles),
         np.empty(angles),
@@ -484,7 +484,7 @@ def fit_gates(
     for t in range(count):
         before[:] = 0.0
         around = False
-        for k in range(gates):
+        for k in range(bins):
             changed = False
             for a in range(angles):
                 weights[a] = 1.0 / (noise[t, a, k] + inhomogeneity[k])
@@ -497,7 +497,7 @@ def fit_gates(
                 design[0, a], design[1, a], design[2, a] = d[0, a, k], d[1, a, k], x[a, k]
             if sides and changed:
                 around = surrounds(weights, design)
-            fit_gate(column, weights, kept, design, around, q, residual, hat, row)
+            fit_bin(column, weights, kept, design, around, q, residual, hat, row)
             out[t, :, k] = row
             if residuals.shape[0] > 0:
                 for a in range(angles):

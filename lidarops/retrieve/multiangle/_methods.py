@@ -65,21 +65,21 @@ def solve_block(
     list of (str, bool, str)
         Steps, whether they ran, and why or why not.
     """
-    rays = _block.make_beam_block(signal, variance, settings.scan)
+    beams = _block.make_beam_block(signal, variance, settings.scan)
     steps = [_angles_step(settings.scan)]
-    fit = _block.regress(rays, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
-    steps += [_robust_step(fit, settings), _gradient_step(rays)]
-    method, why = _chosen(rays, fit, settings)
+    fit = _block.regress(beams, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
+    steps += [_robust_step(fit, settings), _gradient_step(beams)]
+    method, why = _chosen(beams, fit, settings)
     steps.append((method, True, why))
-    part = _METHODS[method](rays, fit, prior, settings)
-    alike = _neighbours.neighbours_alike(rays, fit)
-    doubted = 0 if alike else _path_variation.doubted_from(rays, fit)
+    part = _METHODS[method](beams, fit, prior, settings)
+    alike = _neighbours.neighbours_alike(beams, fit)
+    doubted = 0 if alike else _path_variation.doubted_from(beams, fit)
     if doubted is not None:
         part.flags["poor_stratification"][:, doubted:] = True
         _withhold_extinction(part, part.flags["poor_stratification"])
-    _raise_common_flags(part, rays, fit)
+    _raise_common_flags(part, beams, fit)
     if method in _BLIND:
-        # These fit no gradient, whatever sides the rays lead to.
+        # These fit no gradient, whatever sides the beams lead to.
         part.flags["one_sided"] |= np.isfinite(part.optical_depth)
     return part, steps
 
@@ -87,8 +87,8 @@ def solve_block(
 def _angles_step(scan: Scan) -> Step:
     left_out = int(np.count_nonzero(~scan.usable))
     if left_out:
-        return ("drop_longest_paths", True, f"{left_out} rays are longer than 10 vertical paths")
-    return ("drop_longest_paths", False, "no ray is longer than 10 vertical paths")
+        return ("drop_longest_paths", True, f"{left_out} beams are longer than 10 vertical paths")
+    return ("drop_longest_paths", False, "no beam is longer than 10 vertical paths")
 
 
 def _robust_step(fit: Regression, settings: BlockSettings) -> Step:
@@ -96,20 +96,20 @@ def _robust_step(fit: Regression, settings: BlockSettings) -> Step:
         return ("robust_passes", False, "not wanted")
     if fit.robust:
         return ("robust_passes", True, "a residual is too large for chance")
-    return ("robust_passes", False, "no residual is too large for chance, or fewer than 4 rays")
+    return ("robust_passes", False, "no residual is too large for chance, or fewer than 4 beams")
 
 
-def _gradient_step(rays: BeamBlock) -> Step:
-    if rays.sides:
-        return ("horizontal_gradient", True, "rays lead to all sides")
-    return ("horizontal_gradient", False, "a half turn around the zenith is free of rays")
+def _gradient_step(beams: BeamBlock) -> Step:
+    if beams.sides:
+        return ("horizontal_gradient", True, "beams lead to all sides")
+    return ("horizontal_gradient", False, "a half turn around the zenith is free of beams")
 
 
-def _chosen(rays: BeamBlock, fit: Regression, settings: BlockSettings) -> tuple[str, str]:
+def _chosen(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> tuple[str, str]:
     if settings.method != "auto":
         return settings.method, "chosen by name"
-    if np.max(np.count_nonzero(rays.noise < np.inf, axis=1), initial=0) <= 2:
-        return "two_angle", "no altitude is seen by more than two rays"
+    if np.max(np.count_nonzero(beams.noise < np.inf, axis=1), initial=0) <= 2:
+        return "two_angle", "no altitude is seen by more than two beams"
     if settings.tolerance is not None:
         information = fit.column(kh.INFORMATION)
         known = information[information > 0]
@@ -121,10 +121,10 @@ def _chosen(rays: BeamBlock, fit: Regression, settings: BlockSettings) -> tuple[
 
 
 def _kano_hamilton(
-    rays: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
+    beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
 ) -> Profiles:
     """Take the estimates of single altitudes as they are."""
-    part = _start(rays, fit, settings)
+    part = _start(beams, fit, settings)
     within = np.isfinite(part.optical_depth)
     factor = _block.student_factor(fit.freedom)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -140,34 +140,34 @@ def _kano_hamilton(
     part.effective_degrees_of_freedom[:] = np.where(count > 0, count, np.nan)
     part.data_share[:] = np.where(within, 1.0, np.nan)
     _subtract_bounds(part, settings)
-    _raise_gradient(part, rays, fit, settings, _lag_one(rays, fit))
+    _raise_gradient(part, beams, fit, settings, _lag_one(beams, fit))
     return part
 
 
 def _two_angle(
-    rays: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
+    beams: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
 ) -> Profiles:
     """Use the shortest and the longest path of each altitude, with the scan's inhomogeneity."""
-    ends = _block.end_rays(rays)
+    ends = _block.end_beams(beams)
     part = _kano_hamilton(ends, _block.refit(ends, fit.inhomogeneity, fit.freedom), prior, settings)
     part.flags["gradient"][:] = False
     return part
 
 
 def _joint(
-    rays: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
+    beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
 ) -> Profiles:
     """Join the estimates of single altitudes into smooth profiles."""
-    part = _start(rays, fit, settings)
+    part = _start(beams, fit, settings)
     within = np.isfinite(part.optical_depth)
-    share = fit.column(kh.SHARE) * fit.inhomogeneity * _block.kept_information(rays, fit)
+    share = fit.column(kh.SHARE) * fit.inhomogeneity * _block.kept_information(beams, fit)
     residuals = smooth_profile.residual_moments(
-        fit.residual * _block.common_scale(rays, fit)[:, np.newaxis],
-        np.where(np.isfinite(fit.residual), _block.weights_of(rays, fit), 0.0),
+        fit.residual * _block.common_scale(beams, fit)[:, np.newaxis],
+        np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
         np.nan_to_num(fit.leverage, nan=1.0),
         np.broadcast_to(fit.inhomogeneity, share.shape),
         np.where(within, share, 0.0),
-        rays.gaps,
+        beams.gaps,
     )
     smooth = smooth_profile.smooth_optical_depth(
         part.optical_depth,
@@ -194,7 +194,7 @@ def _joint(
         part.layer_optical_depth_standard_error[:, number] = layer.optical_depth_standard_error
     _take_vertical_flags(part, smooth)
     correlation = float(np.nanmax(np.append(smooth.correlation, 0.0)))
-    _raise_gradient(part, rays, fit, settings, correlation)
+    _raise_gradient(part, beams, fit, settings, correlation)
     _withhold_extinction(part, _led(part))
     return part
 
@@ -223,12 +223,12 @@ def _withhold_extinction(part: Profiles, where: Mask) -> None:
         values[where] = np.nan
 
 
-def _start(rays: BeamBlock, fit: Regression, settings: BlockSettings) -> Profiles:
+def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Profiles:
     """Return profiles with what all methods share; optical depths only within the reach."""
-    count, angles, gates = rays.noise.shape
-    part = Profiles.missing(count, angles, gates, len(settings.layers))
+    count, angles, bins = beams.noise.shape
+    part = Profiles.missing(count, angles, bins, len(settings.layers))
     tau = fit.column(kh.TAU)
-    within = (rays.alive >= rays.needed) & np.isfinite(tau)
+    within = (beams.alive >= beams.needed) & np.isfinite(tau)
     part.optical_depth[:] = np.where(within, tau, np.nan)
     part.log_intercept[:] = np.where(within, fit.column(kh.INTERCEPT), np.nan)
     factor = _block.student_factor(fit.freedom)
@@ -249,31 +249,31 @@ def _start(rays: BeamBlock, fit: Regression, settings: BlockSettings) -> Profile
     return part
 
 
-def _raise_common_flags(part: Profiles, rays: BeamBlock, fit: Regression) -> None:
+def _raise_common_flags(part: Profiles, beams: BeamBlock, fit: Regression) -> None:
     """Raise the flags that depend on the geometry alone, wherever there is a value."""
     valued = np.isfinite(part.optical_depth)
     seen = fit.column(kh.INFORMATION) > 0
     part.flags["low_leverage"] |= valued & seen & (fit.column(kh.SPAN) < LEAST_SPAN)
     part.flags["no_residual"] |= valued & (_block.pooled_freedom(fit) == 0)
     one_sided = np.hypot(fit.column(kh.SLOPE_EAST), fit.column(kh.SLOPE_NORTH)) > 1e-6
-    part.flags["one_sided"] |= (valued & one_sided) if rays.sides else valued
+    part.flags["one_sided"] |= (valued & one_sided) if beams.sides else valued
     if fit.robust:
-        low = (fit.keep < 0.5) & (rays.noise < np.inf)
+        low = (fit.keep < 0.5) & (beams.noise < np.inf)
         part.flags["outlier"] |= low.any(axis=1)
 
 
 def _raise_gradient(
-    part: Profiles, rays: BeamBlock, fit: Regression, settings: BlockSettings, correlation: float
+    part: Profiles, beams: BeamBlock, fit: Regression, settings: BlockSettings, correlation: float
 ) -> None:
     found = _block.gradient_found(
-        rays, fit, settings.height, correlation, _HARMLESS * settings.largest_gradient
+        beams, fit, settings.height, correlation, _HARMLESS * settings.largest_gradient
     )
     part.flags["gradient"] |= found & np.isfinite(part.optical_depth)
 
 
-def _lag_one(rays: BeamBlock, fit: Regression) -> float:
+def _lag_one(beams: BeamBlock, fit: Regression) -> float:
     """Return the correlation of residuals at neighbouring altitudes, 0 to 0.98."""
-    u = np.nan_to_num(fit.residual) * np.sqrt(_block.weights_of(rays, fit))
+    u = np.nan_to_num(fit.residual) * np.sqrt(_block.weights_of(beams, fit))
     both = np.einsum("tak,tak->", u[:, :, :-1], u[:, :, 1:])
     whole = np.einsum("tak,tak->", u, u)
     return float(np.clip(both / whole, 0.0, 0.98)) if whole > 0 else 0.0
@@ -320,23 +320,23 @@ def _subtract_bounds(part: Profiles, settings: BlockSettings) -> None:
 
 
 def _mld(
-    rays: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
+    beams: BeamBlock, fit: Regression, _prior: Array | None, settings: BlockSettings
 ) -> Profiles:
-    return _regularised(rays, fit, None, settings)
+    return _regularised(beams, fit, None, settings)
 
 
 def _mld_prior(
-    rays: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
+    beams: BeamBlock, fit: Regression, prior: Array | None, settings: BlockSettings
 ) -> Profiles:
-    return _regularised(rays, fit, _mld_blocks.MldPrior(prior), settings)
+    return _regularised(beams, fit, _mld_blocks.MldPrior(prior), settings)
 
 
 def _regularised(
-    rays: BeamBlock, fit: Regression, prior: _mld_blocks.MldPrior | None, settings: BlockSettings
+    beams: BeamBlock, fit: Regression, prior: _mld_blocks.MldPrior | None, settings: BlockSettings
 ) -> Profiles:
     """Differentiate along the slant path, altitude by altitude."""
-    part = _start(rays, fit, settings)
-    answer = _mld_blocks.solve_mld_blocks(rays, fit.inhomogeneity, settings.regularisation, prior)
+    part = _start(beams, fit, settings)
+    answer = _mld_blocks.solve_mld_blocks(beams, fit.inhomogeneity, settings.regularisation, prior)
     within = np.isfinite(part.optical_depth) & np.isfinite(answer.optical_depth)
     part.optical_depth[:] = np.where(within, answer.optical_depth, np.nan)
     part.optical_depth_standard_error[:] = np.where(within, answer.standard_error, np.nan)

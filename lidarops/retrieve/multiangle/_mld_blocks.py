@@ -1,4 +1,4 @@
-"""Regularised differentiation of all altitudes of a block, whatever rays each of them has."""
+"""Regularised differentiation of all altitudes of a block, whatever beams each of them has."""
 
 from __future__ import annotations
 
@@ -35,48 +35,48 @@ class Answer:
 
 
 def solve_mld_blocks(
-    rays: BeamBlock,
+    beams: BeamBlock,
     inhomogeneity: Array,
     regularisation: mld.Regularisation,
     prior: MldPrior | None,
 ) -> Answer:
-    """Solve every altitude with the rays that it has.
+    """Solve every altitude with the beams that it has.
 
     Parameters
     ----------
-    rays : Rays
+    beams : Beams
     inhomogeneity : (altitude,) float
         Variance of the logarithms on top of the noise.
     regularisation : Regularisation
     prior : Prior, optional
     """
-    profiles, _, gates = rays.noise.shape
-    out = np.full((profiles, gates, _ESTIMATES), np.nan)
+    profiles, _, bins = beams.noise.shape
+    out = np.full((profiles, bins, _ESTIMATES), np.nan)
     walk = prior is not None and prior.optical_depth is None
-    known = np.zeros((profiles, gates))
+    known = np.zeros((profiles, bins))
     if prior is not None and prior.optical_depth is not None:
         known = prior.optical_depth
-    # Gate by gate upwards, as the answer below may be the prior above.
+    # Bin by bin upwards, as the answer below may be the prior above.
     below = np.zeros((profiles, 2))
     operators: dict[bytes, mld.Operator] = {}
-    for k in range(gates):
-        on = np.ascontiguousarray(rays.noise[:, :, k] < np.inf)
+    for k in range(bins):
+        on = np.ascontiguousarray(beams.noise[:, :, k] < np.inf)
         patterns, which = _patterns(on)
         for number, pattern in enumerate(patterns):
-            path = rays.path[pattern, k]
+            path = beams.path[pattern, k]
             if path.size < 2 or np.ptp(path) < 1e-9:
                 continue
             key = path.tobytes()
             if key not in operators:
                 operators[key] = mld.make_operator(path, regularisation)
             members = np.flatnonzero(which == number)
-            _solve_gate(
-                rays.logarithm[:, :, k],
-                rays.noise[:, :, k],
+            _solve_bin(
+                beams.logarithm[:, :, k],
+                beams.noise[:, :, k],
                 members,
                 np.flatnonzero(pattern),
                 path,
-                np.ascontiguousarray(rays.distance[:, pattern, k]),
+                np.ascontiguousarray(beams.distance[:, pattern, k]),
                 inhomogeneity[k],
                 operators[key].coordinates,
                 operators[key].penalty,
@@ -99,7 +99,7 @@ def solve_mld_blocks(
 
 
 def _patterns(on: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Return the different sets of rays, and which of them each profile has."""
+    """Return the different sets of beams, and which of them each profile has."""
     if np.array_equal(on, np.broadcast_to(on[:1], on.shape)):
         # As nearly everywhere; sorting costs more than solving a single profile.
         return on[:1], np.zeros(len(on), dtype=np.intp)
@@ -113,11 +113,11 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def _solve_gate(
+def _solve_bin(
     y: Array,
     noise: Array,
     members: npt.NDArray[np.intp],
-    rays: npt.NDArray[np.intp],
+    beams: npt.NDArray[np.intp],
     path: Array,
     distance: Array,
     inhomogeneity: float,
@@ -129,17 +129,17 @@ def _solve_gate(
     prior: Array,
     out: Array,
 ) -> None:
-    """Solve the members of one altitude that share one set of rays.
+    """Solve the members of one altitude that share one set of beams.
 
     Parameters
     ----------
     y, noise : (profile, angle) float
     members : (member,) int
         Profiles.
-    rays : (ray,) int
+    beams : (beam,) int
         Angles.
-    path : (ray,) float
-    distance : (2, ray) float
+    path : (beam,) float
+    distance : (2, beam) float
     inhomogeneity : float
     coordinates, penalty, gain
         Of the operator.
@@ -150,14 +150,14 @@ def _solve_gate(
     out : (profile, 6) float
         Gets optical depth, variance, data share, degrees of freedom and slopes.
     """
-    count = rays.size
+    count = beams.size
     left, variance, t = np.empty(count), np.empty(count), np.empty(count)
     b = np.empty(penalty.size)
     for p in members:
         middle = spread = 0.0
         for i in range(count):
-            left[i] = y[p, rays[i]] + 2.0 * path[i] * prior[p, 0]
-            variance[i] = noise[p, rays[i]] + inhomogeneity
+            left[i] = y[p, beams[i]] + 2.0 * path[i] * prior[p, 0]
+            variance[i] = noise[p, beams[i]] + inhomogeneity
             middle += left[i] / count
             spread += variance[i] / count
         unit = np.sqrt(spread)

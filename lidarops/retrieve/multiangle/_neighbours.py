@@ -1,4 +1,4 @@
-"""Whether neighbouring rays scatter alike: patches of air that are wider than rays are apart."""
+"""Whether neighbouring beams scatter alike: patches of air that are wider than beams are apart."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 CHANCE: Final = 1e-3
-"""Probability of the test where rays are independent."""
+"""Probability of the test where beams are independent."""
 LEAST: Final = 0.1
-"""Correlation of neighbouring rays that counts as none."""
+"""Correlation of neighbouring beams that counts as none."""
 _FEWEST_PROFILES: Final = 4
 _CLIP: Final = 3.0
 _COLUMNS: Final = 4
@@ -27,38 +27,38 @@ _COLUMNS: Final = 4
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def neighbours_alike(rays: BeamBlock, fit: Regression) -> bool:
-    r"""Tell whether the scatter of neighbouring rays goes together.
+def neighbours_alike(beams: BeamBlock, fit: Regression) -> bool:
+    r"""Tell whether the scatter of neighbouring beams goes together.
 
     Residuals about a constant, the slant path and the horizontal distances are multiplied with
-    those of the next ray along the horizontal, and count by the share of inhomogeneity. Of
-    independent rays, the projection P that takes residuals makes the mean of these products
+    those of the next beam along the horizontal, and count by the share of inhomogeneity. Of
+    independent beams, the projection P that takes residuals makes the mean of these products
     :math:`s^2 \sum P_{l,l+1}`, which is negative. The excess is summed over altitudes; profiles
     tell by their spread how certain it is.
 
     Parameters
     ----------
-    rays : Rays
+    beams : Beams
     fit : Regression
 
     Returns
     -------
     bool
     """
-    profiles, _, gates = rays.noise.shape
+    profiles, _, bins = beams.noise.shape
     if profiles < _FEWEST_PROFILES:
         return False
-    away = rays.distance[:, :, gates // 2]
+    away = beams.distance[:, :, bins // 2]
     axis = int(np.argmax(np.ptp(away, axis=1)))
     order = np.argsort(away[axis], kind="stable")
     sums = np.zeros((profiles, 4))
     _products(
-        rays.logarithm,
-        rays.noise,
+        beams.logarithm,
+        beams.noise,
         fit.keep,
         fit.inhomogeneity,
-        rays.path,
-        rays.distance,
+        beams.path,
+        beams.distance,
         order,
         sums,
     )
@@ -100,12 +100,12 @@ def _products(
         Along the horizontal.
     sums : (profile, 4) float
     """
-    profiles, angles, gates = noise.shape
+    profiles, angles, bins = noise.shape
     left, share = np.empty(angles), np.empty(angles)
     columns = np.empty((_COLUMNS, angles))
     basis = np.empty((_COLUMNS, angles))
     for t in range(profiles):
-        for k in range(gates):
+        for k in range(bins):
             count = 0
             for a in order:
                 kept = keep[t, a, k] if keep.shape[1] > 0 else 1.0

@@ -1,7 +1,7 @@
-"""Whether extinction varies along the paths of a scan: a test of how its rays scatter.
+"""Whether extinction varies along the paths of a scan: a test of how its beams scatter.
 
-Where the extinction of level air varies along the horizontal, what a ray has lost adds up on its
-way: it differs from that of other rays, the more the higher they are, and alike at neighbouring
+Where the extinction of level air varies along the horizontal, what a beam has lost adds up on its
+way: it differs from that of other beams, the more the higher they are, and alike at neighbouring
 altitudes. Scatter of backscatter averages out over altitudes; this does not, and no smoothing over
 altitude takes it away. Scatter that grows by chance, by a gradient, by noise or by a few outliers
 must not pass for it.
@@ -22,14 +22,14 @@ from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 
 Array = npt.NDArray[np.float64]
-Gates = npt.NDArray[np.intp]
+Bins = npt.NDArray[np.intp]
 
 GROWTH: Final = 1.5**2
 """Ratio of the variances in the upper and the lower third below which they count as alike."""
 CERTAINTY: Final = 2.5
 """Standard errors by which the logarithm of that ratio must exceed zero. In simulated scenes
 without variation, 0.3 percent exceed both."""
-_FEWEST_GATES: Final = 6
+_FEWEST_BINS: Final = 6
 _FEWEST_PROFILES: Final = 4
 _CLIP: Final = 3.0
 """Standard errors to which residuals are cut, so that no outlier decides."""
@@ -40,18 +40,18 @@ _COLUMNS: Final = 4
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def doubted_from(rays: BeamBlock, fit: Regression) -> int | None:
+def doubted_from(beams: BeamBlock, fit: Regression) -> int | None:
     r"""Return the altitude from which on extinction varies along paths; None where it does not.
 
     With the inhomogeneity of the lower third of the altitudes, residuals are formed anew about a
-    constant, the slant path and the horizontal distances, which take a gradient away. Each ray is
+    constant, the slant path and the horizontal distances, which take a gradient away. Each beam is
     averaged over the altitudes of a third, as far as inhomogeneity exceeds its noise; the sums of
-    squares Q of these means over rays and profiles are compared,
+    squares Q of these means over beams and profiles are compared,
 
     .. math:: \ln \frac{Q_u / \nu_u}{Q_l / \nu_l}, \qquad
               \sigma^2 = \psi'(\nu_u / 2) + \psi'(\nu_l / 2) ,
 
-    with the degrees of freedom :math:`\nu` that an altitude has, as a ray has one mean, however
+    with the degrees of freedom :math:`\nu` that an altitude has, as a beam has one mean, however
     its altitudes are correlated.
 
     Where this holds of what differs from profile to profile, all altitudes are doubted. What all
@@ -60,7 +60,7 @@ def doubted_from(rays: BeamBlock, fit: Regression) -> int | None:
 
     Parameters
     ----------
-    rays : Rays
+    beams : Beams
     fit : Regression
 
     Returns
@@ -69,12 +69,12 @@ def doubted_from(rays: BeamBlock, fit: Regression) -> int | None:
         Index.
     """
     seen = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
-    if seen.size < _FEWEST_GATES:
+    if seen.size < _FEWEST_BINS:
         return None
     third = seen.size // 3
     thirds = seen[:third], seen[-third:]
     low = float(np.mean(fit.inhomogeneity[thirds[0]]))
-    lower, upper = (_ray_means(rays, fit, part, low) for part in thirds)
+    lower, upper = (_beam_means(beams, fit, part, low) for part in thirds)
     told = (lower.freedom > 0) & (upper.freedom > 0)
     if not _grows(lower.of(told), upper.of(told)):
         return None
@@ -87,10 +87,10 @@ def doubted_from(rays: BeamBlock, fit: Regression) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class _Means:
-    """Means of rays over a third of the altitudes, in units that are 1 for white noise."""
+    """Means of beams over a third of the altitudes, in units that are 1 for white noise."""
 
     value: Array
-    """(profile, ray)"""
+    """(profile, beam)"""
     freedom: Array
     """(profile,)"""
 
@@ -118,25 +118,25 @@ def _grows(lower: _Means, upper: _Means) -> bool:
     return growth > GROWTH and math.log(growth) > CERTAINTY * spread
 
 
-def _ray_means(rays: BeamBlock, fit: Regression, gates: Gates, inhomogeneity: float) -> _Means:
-    """Average each ray of each profile over a third."""
-    count, angles, _ = rays.noise.shape
-    residual = np.zeros((count * angles, gates.size))
-    freedom = np.zeros((count, gates.size))
+def _beam_means(beams: BeamBlock, fit: Regression, bins: Bins, inhomogeneity: float) -> _Means:
+    """Average each beam of each profile over a third."""
+    count, angles, _ = beams.noise.shape
+    residual = np.zeros((count * angles, bins.size))
+    freedom = np.zeros((count, bins.size))
     _standardise(
-        rays.logarithm,
-        rays.noise,
+        beams.logarithm,
+        beams.noise,
         fit.keep,
         inhomogeneity,
-        rays.path,
-        rays.distance,
-        gates,
+        beams.path,
+        beams.distance,
+        bins,
         residual,
         freedom,
     )
     filled = np.count_nonzero(freedom > 0, axis=1)
     # Fewer altitudes would be another third of another air.
-    on = 2 * filled >= gates.size
+    on = 2 * filled >= bins.size
     # Of white noise, too, all have one variance, however many altitudes they miss.
     mean = residual.sum(axis=1).reshape(count, angles) / np.sqrt(np.maximum(filled, 1))[:, None]
     each = freedom.sum(axis=1) / np.maximum(filled, 1)
@@ -151,7 +151,7 @@ def _standardise(
     inhomogeneity: float,
     path: Array,
     distance: Array,
-    gates: Any,
+    bins: Any,
     residual: Array,
     freedom: Array,
 ) -> None:
@@ -165,37 +165,37 @@ def _standardise(
         Variance.
     path : (angle, altitude) float
     distance : (2, angle, altitude) float
-    gates : (gate,) int
+    bins : (bin,) int
         Altitudes wanted.
-    residual : (profile * angle, gate) float
+    residual : (profile * angle, bin) float
         Zeros, where there is no sample they stay.
-    freedom : (profile, gate) float
+    freedom : (profile, bin) float
     """
     profiles, angles, _ = noise.shape
     root, left = np.empty(angles), np.empty(angles)
     columns, basis = np.empty((_COLUMNS, angles)), np.empty((_COLUMNS, angles))
-    rays = np.empty(angles, np.int64)
+    beams = np.empty(angles, np.int64)
     for t in range(profiles):
-        for j in range(gates.size):
-            k = gates[j]
+        for j in range(bins.size):
+            k = bins[j]
             count = 0
             for a in range(angles):
                 kept = keep[t, a, k] if keep.shape[1] > 0 else 1.0
                 if noise[t, a, k] < inhomogeneity and kept > _LEAST_WEIGHT:
-                    rays[count] = a
+                    beams[count] = a
                     root[count] = math.sqrt(kept / (noise[t, a, k] + inhomogeneity))
                     left[count] = y[t, a, k] * root[count]
                     count += 1
             for i in range(count):
                 columns[0, i] = root[i]
-                columns[1, i] = path[rays[i], k] * root[i]
-                columns[2, i] = distance[0, rays[i], k] * root[i]
-                columns[3, i] = distance[1, rays[i], k] * root[i]
+                columns[1, i] = path[beams[i], k] * root[i]
+                columns[2, i] = distance[0, beams[i], k] * root[i]
+                columns[3, i] = distance[1, beams[i], k] * root[i]
             known = taken_away(columns, basis, count, left)
             freedom[t, j] = max(count - known, 0)
             if count > known:
                 for i in range(count):
-                    residual[t * angles + rays[i], j] = min(max(left[i], -_CLIP), _CLIP)
+                    residual[t * angles + beams[i], j] = min(max(left[i], -_CLIP), _CLIP)
 
 
 @_compiled

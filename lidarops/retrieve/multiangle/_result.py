@@ -19,22 +19,22 @@ class MultiAngleFlags:
     no_data: Mask
     """No angle, or no two different ones, hold a signal at any altitude."""
     extrapolated: Mask
-    """Beyond the reach: fewer rays than the method needs are left. Values are withheld."""
+    """Beyond the reach: fewer beams than the method needs are left. Values are withheld."""
     interpolated: Mask
     """No estimate at this altitude; bridged from those around."""
     no_residual: Mask
-    """As many rays as unknowns in all profiles of the block, at all altitudes around: nothing
+    """As many beams as unknowns in all profiles of the block, at all altitudes around: nothing
     checks the model or tells the inhomogeneity."""
     low_leverage: Mask
     """The slant paths differ by less than a tenth of the vertical one."""
     one_sided: Mask
-    """A half turn around the zenith is free of rays: a horizontal gradient is not seen."""
+    """A half turn around the zenith is free of beams: a horizontal gradient is not seen."""
     gradient: Mask
     """The residuals show a horizontal gradient that the fit does not account for."""
     poor_stratification: Mask
-    """The mean scatter of rays over altitudes grows with altitude, more than noise, chance and a
+    """The mean scatter of beams over altitudes grows with altitude, more than noise, chance and a
     gradient make it, as it does where extinction itself varies along the horizontal; or
-    neighbouring rays scatter alike, as in patches of air that are wider than rays are apart.
+    neighbouring beams scatter alike, as in patches of air that are wider than beams are apart.
     Extinction is withheld."""
     prior_dominated: Mask
     """Smoothness or a prior, not the data, decides on the value. Extinction is withheld where
@@ -48,7 +48,7 @@ class MultiAngleFlags:
     """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too
     small."""
     outlier: Mask
-    """At least one ray or estimate was weighted down as an outlier."""
+    """At least one beam or estimate was weighted down as an outlier."""
 
     def doubtful(self) -> Mask:
         """Return where a stated uncertainty is not to be relied on."""
@@ -97,7 +97,7 @@ class MultiAngleResult:
     inhomogeneity: Array
     """Standard deviation of the logarithms of the signals on top of detector noise."""
     reduced_chi_square: Array
-    """Of the fit over angles; NaN where no ray is redundant."""
+    """Of the fit over angles; NaN where no beam is redundant."""
     reach: Array
     """(...,) m, the highest altitude with an estimate; NaN where there is none."""
     layer_optical_depth: Array
@@ -151,7 +151,7 @@ class Profiles:
     flags: dict[str, Mask]
 
     @classmethod
-    def missing(cls, profiles: int, angles: int, gates: int, layers: int) -> Profiles:
+    def missing(cls, profiles: int, angles: int, bins: int, layers: int) -> Profiles:
         """Return profiles of which nothing is known."""
         shapes: dict[str, tuple[int, ...]] = {
             "effective_degrees_of_freedom": (profiles,),
@@ -159,14 +159,14 @@ class Profiles:
             "layer_optical_depth": (profiles, layers),
             "layer_optical_depth_standard_error": (profiles, layers),
             "layer_optical_depth_gradient_error": (profiles, layers),
-            "residual": (profiles, angles, gates),
+            "residual": (profiles, angles, bins),
         }
         values: dict[str, Any] = {
-            field.name: np.full(shapes.get(field.name, (profiles, gates)), np.nan)
+            field.name: np.full(shapes.get(field.name, (profiles, bins)), np.nan)
             for field in fields(cls)
             if field.name != "flags"
         }
-        return cls(**values, flags=empty_flags((profiles, gates)))
+        return cls(**values, flags=empty_flags((profiles, bins)))
 
     def put(self, rows: npt.NDArray[np.intp], part: Profiles) -> None:
         """Write the profiles of one block."""

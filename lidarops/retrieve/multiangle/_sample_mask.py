@@ -17,15 +17,15 @@ Array = npt.NDArray[np.float64]
 Ends = npt.NDArray[np.int32]
 
 LOWEST_SNR: Final = 3.0
-"""Signal over noise, as means over a wide window around a gate, below which a ray ends: the wider,
+"""Signal over noise, as means over a wide window around a bin, below which a beam ends: the wider,
 the less a single sample has a say in its own admission."""
 AROUND: Final = 15
-"""Gates of that window."""
+"""Bins of that window."""
 SWALLOWED_SNR: Final = 2.0
-"""The same over a window from the gate upwards, below which a ray ends: the wide one would admit
-gates behind the point where a thick cloud has swallowed the ray."""
+"""The same over a window from the bin upwards, below which a beam ends: the wide one would admit
+bins behind the point where a thick cloud has swallowed the beam."""
 AHEAD: Final = 5
-"""Gates of that window."""
+"""Bins of that window."""
 LEAST_NOISE: Final = 1e-6
 """Noise over signal that no lidar undercuts; keeps variances of zero from infinite weights."""
 _FARTHEST: Final = 3.0
@@ -37,7 +37,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @_compiled
 def _clean(signal: Any, variance: Any, row: Array) -> None:
-    """Fill signal, variance and 1 of the gates that are given, zeros elsewhere."""
+    """Fill signal, variance and 1 of the bins that are given, zeros elsewhere."""
     values, spread, given = row[0], row[1], row[2]
     for k in range(signal.size):
         on = abs(signal[k]) < _HUGE and 0.0 <= variance[k] < _HUGE
@@ -48,7 +48,7 @@ def _clean(signal: Any, variance: Any, row: Array) -> None:
 
 @_compiled
 def _window_sums(row: Array, size: int, sums: Array) -> None:
-    """Fill the sums of rows over windows by the gate at which they start."""
+    """Fill the sums of rows over windows by the bin at which they start."""
     starts = row.shape[1] - size + 1
     for i in range(row.shape[0]):
         total = sums[i, :starts]
@@ -61,34 +61,34 @@ def _window_sums(row: Array, size: int, sums: Array) -> None:
 
 @_compiled
 def _first_loss(row: Array, before: int, size: int, lowest: float, sums: Array) -> int:
-    """Return the first gate whose window has a mean of less than so much noise.
+    """Return the first bin whose window has a mean of less than so much noise.
 
-    The window begins `before` the gate, and is moved inside the grid.
+    The window begins `before` the bin, and is moved inside the grid.
     """
-    gates = row.shape[1]
-    size = min(size, gates)
+    bins = row.shape[1]
+    size = min(size, bins)
     _window_sums(row, size, sums)
-    for k in range(gates):
-        j = max(min(k - before, gates - size), 0)
+    for k in range(bins):
+        j = max(min(k - before, bins - size), 0)
         lost = not sums[0, j] > lowest * math.sqrt(sums[1, j] * sums[2, j])
         if lost and sums[2, j] > 0.0:
             return k
-    return int(gates)
+    return int(bins)
 
 
 @_compiled
 def _levels(row: Array, levels: Array, roots: Array) -> None:
     """Fill the means of neighbours and their square roots, 0 where not positive.
 
-    Entry k is that of the two gates below k, entry k + 3 that of the two above, as far as there
-    are gates and they are given.
+    Entry k is that of the two bins below k, entry k + 3 that of the two above, as far as there
+    are bins and they are given.
     """
-    gates = row.shape[1]
-    for j in range(gates + 3):
+    bins = row.shape[1]
+    for j in range(bins + 3):
         total = count = 0.0
-        if 2 <= j <= gates + 1:
+        if 2 <= j <= bins + 1:
             total, count = total + row[0, j - 2], count + row[2, j - 2]
-        if 1 <= j <= gates:
+        if 1 <= j <= bins:
             total, count = total + row[0, j - 1], count + row[2, j - 1]
         levels[j] = total / count if total > 0.0 else 0.0
         roots[j] = math.sqrt(levels[j])
@@ -96,7 +96,7 @@ def _levels(row: Array, levels: Array, roots: Array) -> None:
 
 @_compiled
 def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
-    """Return the signal at a gate as its neighbours tell it, unless its own noise forbids that.
+    """Return the signal at a bin as its neighbours tell it, unless its own noise forbids that.
 
     The geometric mean of both sides is right for an exponential decay.
     """
@@ -115,7 +115,7 @@ def take_logarithms(
     r"""Take the logarithms of range-corrected signals, free of the bias that noise gives them.
 
     With the variance q of the signal over the square of its expectation, which the neighbouring
-    gates tell, the logarithm of a normal signal has the mean :math:`-q/2 - 3q^2/4` and the
+    bins tell, the logarithm of a normal signal has the mean :math:`-q/2 - 3q^2/4` and the
     variance :math:`q + 5q^2/2`, to second order.
 
     Parameters
@@ -125,11 +125,11 @@ def take_logarithms(
     logarithm, noise : (profile, angle, altitude) float64
         Get the logarithms and their variances; 0 and inf where there is no sample.
     ends : (profile, angle) int32
-        Gets the first gate of each ray that is lost in noise, the number of gates where none is.
+        Gets the first bin of each beam that is lost in noise, the number of bins where none is.
     """
-    count, angles, gates = signal.shape
-    row, sums = np.empty((3, gates)), np.empty((3, gates))
-    levels, roots = np.empty(gates + 3), np.empty(gates + 3)
+    count, angles, bins = signal.shape
+    row, sums = np.empty((3, bins)), np.empty((3, bins))
+    levels, roots = np.empty(bins + 3), np.empty(bins + 3)
     for t in range(count):
         for a in range(angles):
             _clean(signal[t, a], variance[t, a], row)
@@ -139,7 +139,7 @@ def take_logarithms(
                 end = min(end, _first_loss(row, AROUND // 2, AROUND, LOWEST_SNR, sums))
             ends[t, a] = end
             _levels(row, levels, roots)
-            for k in range(gates):
+            for k in range(bins):
                 logarithm[t, a, k] = 0.0
                 noise[t, a, k] = np.inf
                 if k < end and row[0, k] > 0.0:

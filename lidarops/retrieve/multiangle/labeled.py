@@ -97,9 +97,9 @@ def retrieve_scan(
     Raises
     ------
     RetrievalInputError
-        Where arguments cannot be right, or no ray leads above the horizon.
+        Where arguments cannot be right, or no beam leads above the horizon.
     """
-    rays = on_altitudes(
+    beams = on_altitudes(
         conditioned,
         zenith_angle=zenith_angle,
         azimuth=azimuth,
@@ -112,7 +112,7 @@ def retrieve_scan(
         overlap=overlap,
     )
     return retrieve_optical_depth(
-        rays.compute(),
+        beams.compute(),
         station_altitude=station_altitude,
         method=method,
         largest_gradient=largest_gradient,
@@ -121,7 +121,7 @@ def retrieve_scan(
 
 
 def retrieve_optical_depth(
-    rays: xr.Dataset,
+    beams: xr.Dataset,
     *,
     station_altitude: float,
     method: str = "auto",
@@ -132,7 +132,7 @@ def retrieve_optical_depth(
 
     Parameters
     ----------
-    rays : xr.Dataset
+    beams : xr.Dataset
         From `on_altitudes`, in memory. All its cycles are one block of
         `lidarops.retrieve.multiangle.optical_depth.retrieve_optical_depth`.
     station_altitude : float
@@ -158,13 +158,13 @@ def retrieve_optical_depth(
     RetrievalInputError
         Where arguments cannot be right.
     """
-    signal = rays["signal"].to_numpy()
+    signal = beams["signal"].to_numpy()
     found = _solved(
         signal,
-        rays["ray_zenith_angle"].to_numpy(),
-        rays["altitude"].to_numpy(),
-        variance=rays["variance"].to_numpy(),
-        azimuth=rays["ray_azimuth"].to_numpy() if "ray_azimuth" in rays.coords else None,
+        beams["beam_zenith_angle"].to_numpy(),
+        beams["altitude"].to_numpy(),
+        variance=beams["variance"].to_numpy(),
+        azimuth=beams["beam_azimuth"].to_numpy() if "beam_azimuth" in beams.coords else None,
         method=method,
         station_altitude=station_altitude,
         largest_gradient=largest_gradient,
@@ -174,24 +174,26 @@ def retrieve_optical_depth(
     values = {name: (("time", "altitude"), getattr(found, name)) for name in _LEVELS}
     values["reduced_chi2"] = values.pop("reduced_chi_square")
     values["monotone_optical_depth"] = (("time", "altitude"), monotone(found.optical_depth))
-    quality = _judged(found, rays["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
-    quality |= _moved(found, rays, station_altitude) * np.int32(Quality.BACKGROUND_UNCERTAIN)
+    quality = _judged(found, beams["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
+    quality |= _moved(found, beams, station_altitude) * np.int32(Quality.BACKGROUND_UNCERTAIN)
     result = xr.Dataset(
         {
             **values,
             **{name: ("time", getattr(found, name)) for name in _PROFILES},
-            "residual": (("time", "ray", "altitude"), found.residual),
+            "residual": (("time", "beam", "altitude"), found.residual),
             "quality_flag": (("time", "altitude"), quality),
-            "rays": ("time", sampled.sum(axis=1).astype(np.int32)),
-            "shots": rays["shots"],
+            "beams": ("time", sampled.sum(axis=1).astype(np.int32)),
+            "shots": beams["shots"],
         },
-        coords={name: rays[name] for name in rays.coords},
+        coords={name: beams[name] for name in beams.coords},
         attrs={"steps": _told(found)},
     )
     if not layers:
         return result
-    bounds = optical_depth.layer_bounds(layers, rays["altitude"], station_altitude=station_altitude)
-    return result.assign(_in_layers(found, quality, rays["altitude"].to_numpy(), bounds))
+    bounds = optical_depth.layer_bounds(
+        layers, beams["altitude"], station_altitude=station_altitude
+    )
+    return result.assign(_in_layers(found, quality, beams["altitude"].to_numpy(), bounds))
 
 
 def _in_layers(
@@ -267,17 +269,17 @@ def _judged(found: MultiAngleResult, carried: Flags, samples: npt.NDArray[np.int
     return bits | np.where(gapped & silent & ~lost, np.int32(Quality.INTERPOLATED), np.int32(0))
 
 
-def _moved(found: MultiAngleResult, rays: xr.Dataset, station_altitude: float) -> Flags:
+def _moved(found: MultiAngleResult, beams: xr.Dataset, station_altitude: float) -> Flags:
     """Return 1 where signal left in the background may move an optical depth, else 0.
 
     By the weighted regression on the slant path of the relative change of each signal.
     """
-    height = rays["altitude"].to_numpy() - station_altitude
-    path = slant_paths.slant_path(rays["ray_zenith_angle"].to_numpy(), height)
-    signal, variance = rays["signal"].to_numpy(), rays["variance"].to_numpy()
+    height = beams["altitude"].to_numpy() - station_altitude
+    path = slant_paths.slant_path(beams["beam_zenith_angle"].to_numpy(), height)
+    signal, variance = beams["signal"].to_numpy(), beams["variance"].to_numpy()
     scatter = np.nan_to_num(found.inhomogeneity)[:, np.newaxis, :] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        change = rays["left"].to_numpy()[:, :, np.newaxis] * (path * height) ** 2 / signal
+        change = beams["left"].to_numpy()[:, :, np.newaxis] * (path * height) ** 2 / signal
         weight = 1.0 / (variance / signal**2 + scatter)
         used = np.isfinite(found.residual) & np.isfinite(change) & np.isfinite(weight)
         weight = np.where(used, weight, 0.0)

@@ -1,4 +1,4 @@
-"""Profiles of a scan over xarray: in order of cycle and ray, on common altitudes."""
+"""Profiles of a scan over xarray: in order of cycle and beam, on common altitudes."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def on_altitudes(
     background: Background,
     overlap: Array | None = None,
 ) -> xr.Dataset:
-    """Put the profiles of a scan in order of cycle and ray, on common altitudes.
+    """Put the profiles of a scan in order of cycle and beam, on common altitudes.
 
     The variance of the background is added to that of the noise. Profiles of one cycle and
-    direction are averaged, weighted by their shots. Rays that do not rise, are longer than 10
+    direction are averaged, weighted by their shots. Beams that do not rise, are longer than 10
     vertical paths or of unknown direction are left out, and so is a cycle that has no other.
 
     Parameters
@@ -104,8 +104,8 @@ def on_altitudes(
     Returns
     -------
     xr.Dataset
-        ``signal`` (range-corrected), ``variance`` over (time, ray, altitude), NaN where missing,
-        ``quality`` (the bits of all bins at an altitude) and, over (time, ray), ``left`` (the
+        ``signal`` (range-corrected), ``variance`` over (time, beam, altitude), NaN where missing,
+        ``quality`` (the bits of all bins at an altitude) and, over (time, beam), ``left`` (the
         most signal that may have been subtracted with the background), dask-backed; ``shots``
         over time. ``time`` is the middle of ``time_bnds``, which span the profiles of a cycle.
         The same to the last bit for any chunking.
@@ -113,7 +113,7 @@ def on_altitudes(
     Raises
     ------
     RetrievalInputError
-        Where arguments cannot be right, or no ray leads above the horizon.
+        Where arguments cannot be right, or no beam leads above the horizon.
     """
     found = scan_cycles.directions(zenith_angle, azimuth)
     numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
@@ -132,19 +132,19 @@ def on_altitudes(
     counted = np.asarray(shots, dtype=np.float64)
     parts = [_part(conditioned, counted, order, batch, settings) for batch in _batches(order)]
     arrays = [da.concatenate(part) for part in zip(*parts, strict=True)]  # type: ignore[no-untyped-call]
-    cube = ("time", "ray", "altitude")
-    dims = (cube, cube, ("time", "altitude"), ("time", "ray"))
+    cube = ("time", "beam", "altitude")
+    dims = (cube, cube, ("time", "altitude"), ("time", "beam"))
     names = ("signal", "variance", "quality", "left")
     bounds = _spans(np.asarray(time_bnds), order)
     placed = {
         "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
         "time_bnds": (("time", "nv"), bounds),
-        "ray": np.arange(order.zenith_angle.size, dtype=np.int32),
-        "ray_zenith_angle": ("ray", order.zenith_angle),
+        "beam": np.arange(order.zenith_angle.size, dtype=np.int32),
+        "beam_zenith_angle": ("beam", order.zenith_angle),
         "altitude": levels,
     }
     if azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any():
-        placed["ray_azimuth"] = ("ray", order.azimuth)
+        placed["beam_azimuth"] = ("beam", order.azimuth)
     total = np.bincount(order.cycle, weights=counted[order.profile])
     return xr.Dataset(
         {
@@ -157,18 +157,18 @@ def on_altitudes(
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Where each profile goes: sorted by cycle, then ray."""
+    """Where each profile goes: sorted by cycle, then beam."""
 
     profile: Integers
     """(kept,) number of the profile in the scene."""
     cycle: Integers
     """(kept,) from 0, without gaps."""
-    ray: Integers
+    beam: Integers
     """(kept,)"""
     zenith_angle: Array
-    """(ray,) degree, 0 to 90."""
+    """(beam,) degree, 0 to 90."""
     azimuth: Array
-    """(ray,) degree."""
+    """(beam,) degree."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ class _Settings:
     overlap: Array | None
     background: Background
     shapes: Array | None
-    """(ray, range): of the signal of clean air."""
+    """(beam, range): of the signal of clean air."""
     zenith_angle: Array
     altitude: Array
     station_altitude: float
@@ -191,7 +191,7 @@ class _Settings:
 
     @property
     def reached(self) -> slice:
-        """Bins that rays need up to the highest altitude, with those beside."""
+        """Bins that beams need up to the highest altitude, with those beside."""
         height = self.altitude[-1:] - self.station_altitude
         farthest = float(np.max(slant_paths.slant_path(self.zenith_angle, height) * height))
         first = self.ahead.start
@@ -222,11 +222,11 @@ def _order(found: scan_cycles.Directions, numbers: Integers, height: Array) -> _
         )
     rank = np.full(found.zenith_angle.size + 1, -1, dtype=np.int64)
     rank[usable] = np.arange(usable.size)
-    ray = rank[found.index]
-    kept = np.flatnonzero(ray >= 0)
-    kept = kept[np.lexsort((ray[kept], numbers[kept]))]
+    beam = rank[found.index]
+    kept = np.flatnonzero(beam >= 0)
+    kept = kept[np.lexsort((beam[kept], numbers[kept]))]
     cycle = np.unique(numbers[kept], return_inverse=True)[1].astype(np.int64)
-    return _Order(kept, cycle, ray[kept], found.zenith_angle[usable], found.azimuth[usable])
+    return _Order(kept, cycle, beam[kept], found.zenith_angle[usable], found.azimuth[usable])
 
 
 def _spans(bounds: npt.NDArray[np.datetime64], order: _Order) -> npt.NDArray[np.datetime64]:
@@ -256,7 +256,7 @@ def _part(
     found = [_blocks(conditioned[name], start, stop) for name in ("power", "variance", "quality")]
     cycle = order.cycle[batch] - order.cycle[batch.start]
     whole = delayed(_crossed, nout=4, pure=True)(
-        *found, members, shots[members], cycle, order.ray[batch], settings
+        *found, members, shots[members], cycle, order.beam[batch], settings
     )
     shape = (int(cycle[-1]) + 1, settings.zenith_angle.size, settings.altitude.size)
     return tuple(
@@ -301,23 +301,23 @@ def _crossed(
     members: Integers,
     shots: Array,
     cycle: Integers,
-    ray: Integers,
+    beam: Integers,
     settings: _Settings,
 ) -> tuple[Array, Array, Flags, Array]:
-    """Return signal and variance as (cycle, ray, altitude), quality as (cycle, altitude).
+    """Return signal and variance as (cycle, beam, altitude), quality as (cycle, altitude).
 
-    And as (cycle, ray) the most signal that may have been taken for background.
+    And as (cycle, beam) the most signal that may have been taken for background.
     """
     pieces = [
         _cleared(_rows(power, some), _rows(variance, some), _rows(quality, some), turn, settings)
         for first in range(0, members.size, _AT_ONCE)
-        for some, turn in [(members[first : first + _AT_ONCE], ray[first : first + _AT_ONCE])]
+        for some, turn in [(members[first : first + _AT_ONCE], beam[first : first + _AT_ONCE])]
     ]
     values, noise, bits, left = (np.concatenate(part) for part in zip(*pieces, strict=True))
     distance = settings.distance[settings.reached]
     silent = ~np.isfinite(values) & ((bits & int(WITHHELD)) == 0)
     bits |= np.where(silent, np.int32(Quality.INPUT_MISSING), np.int32(0))
-    cell = cycle * settings.zenith_angle.size + ray
+    cell = cycle * settings.zenith_angle.size + beam
     first = np.flatnonzero(np.diff(cell, prepend=-1))
     if first.size < cell.size:
         values, noise, bits, left = _visited(values, noise, bits, left, shots, first)
@@ -326,8 +326,8 @@ def _crossed(
     signal, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     told = np.zeros((shape[0], shape[2]), dtype=np.int32)
     remains = np.full(shape[:2], np.nan)
-    remains[cycle[first], ray[first]] = left
-    turn, cycle = ray[first], cycle[first]
+    remains[cycle[first], beam[first]] = left
+    turn, cycle = beam[first], cycle[first]
     for number in np.unique(turn):
         at = turn == number
         angle = settings.zenith_angle[number : number + 1]
@@ -345,14 +345,14 @@ def _crossed(
 
 
 def _cleared(
-    power: _Block, variance: _Block, quality: _Block, ray: Integers, settings: _Settings
+    power: _Block, variance: _Block, quality: _Block, beam: Integers, settings: _Settings
 ) -> tuple[Array, Array, Flags, Array]:
     """Return signal, variance and bits of the bins that are reached, and what may be left."""
     bits = quality & np.int32(WITHHELD | CARE)
     if settings.overlap is not None:
         unknown = ~(np.isfinite(settings.overlap) & (settings.overlap > 0))
         bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
-    clear = _without_background(power, variance, bits, ray, settings)
+    clear = _without_background(power, variance, bits, beam, settings)
     bits |= np.where(clear.uncertain, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))[
         :, np.newaxis
     ]
@@ -362,7 +362,7 @@ def _cleared(
 
 
 def _without_background(
-    power: _Block, variance: _Block, bits: Flags, ray: Integers, settings: _Settings
+    power: _Block, variance: _Block, bits: Flags, beam: Integers, settings: _Settings
 ) -> _Clear:
     values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
     distance = settings.distance
@@ -382,7 +382,7 @@ def _without_background(
     uncertain = np.isfinite(background) & ~np.isfinite(left)
     if settings.shapes is not None:
         ahead = settings.ahead
-        shapes = settings.shapes[ray]
+        shapes = settings.shapes[beam]
         fit = known_shape.fit_known_shape(
             values[:, ahead], distance[ahead], shapes[:, ahead], variance=variance[:, ahead]
         )
@@ -420,7 +420,7 @@ def _left_in_tail(net: Array, distance: Array, start: float, tail: npt.NDArray[n
 def _shapes(
     background: Background, zenith_angle: Array, distance: Array, station_altitude: float
 ) -> Array | None:
-    """Return the shape of the signal of clean air along each ray; 0 behind the lidar."""
+    """Return the shape of the signal of clean air along each beam; 0 behind the lidar."""
     if background.molecules is None:
         return None
     if not background.wavelength > 0:

@@ -1,12 +1,12 @@
 r"""Regularised differentiation of the logarithm along the slant path (the historical method).
 
-The slope of :math:`\ln S` over the slant path x is taken as constant between neighbouring rays,
+The slope of :math:`\ln S` over the slant path x is taken as constant between neighbouring beams,
 :math:`y_l - c = \int_{x_0}^{x_l} \varphi\,dx`, and kept small (order 0) or level (order 1) by a
 penalty of strength :math:`\alpha`. Its mean over the path gives :math:`\tau = -\bar\varphi / 2`.
 
 With order 0, the answer is drawn to an optical depth of zero, or to a prior where one is
 subtracted first; how much of it comes from the data is the data share. With order 1 it lies
-between that of the end rays and that of the regression on the slant path.
+between that of the end beams and that of the regression on the slant path.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Average(StrEnum):
     PATH = "path"
     """Over the slant path."""
     ANGLES = "angles"
-    """Over the intervals between rays, however short; worse, as the tiny ones near the zenith
+    """Over the intervals between beams, however short; worse, as the tiny ones near the zenith
     weigh as much as the long ones."""
 
 
@@ -108,10 +108,10 @@ class Regularisation:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """What the method does to the logarithms of one set of rays, up to the strength."""
+    """What the method does to the logarithms of one set of beams, up to the strength."""
 
     coordinates: Array
-    """(component, ray): turns logarithms into uncorrelated coordinates b."""
+    """(component, beam): turns logarithms into uncorrelated coordinates b."""
     penalty: Array
     """(component,): each is kept by the share f = 1 / (1 + strength * penalty)."""
     gain: Array
@@ -121,11 +121,11 @@ class Operator:
 
 
 def make_operator(path: Array, regularisation: Regularisation) -> Operator:
-    """Decompose the method for rays that count alike.
+    """Decompose the method for beams that count alike.
 
     Parameters
     ----------
-    path : (ray,) float
+    path : (beam,) float
         Slant over vertical paths, in any order, at least two different ones.
     regularisation : Regularisation
     """
@@ -185,19 +185,19 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def _score(rss: float, freedom: float, rays: int, rule: int) -> float:
+def _score(rss: float, freedom: float, beams: int, rule: int) -> float:
     """Return what the strength is to make least; the discrepancy rule takes the last that is 0."""
     if rule == 1:
         return rss + 2.0 * freedom
     if rule == 2:
-        left = rays - 1.0 - freedom
+        left = beams - 1.0 - freedom
         return rss / (left * left) if left > 1e-9 else np.inf
-    return 0.0 if rss <= rays - 1.0 else 1.0
+    return 0.0 if rss <= beams - 1.0 else 1.0
 
 
 @_compiled
 def choose_strength(
-    b: Array, rest: float, penalty: Array, strengths: Array, rays: int, rule: int
+    b: Array, rest: float, penalty: Array, strengths: Array, beams: int, rule: int
 ) -> float:
     """Return the strength that a rule picks from a grid.
 
@@ -210,7 +210,7 @@ def choose_strength(
     penalty : (component,) float
     strengths : (strength,) float
         Ascending; the first is taken where nothing better is found.
-    rays, rule : int
+    beams, rule : int
     """
     best, least = strengths[0], np.inf
     for strength in strengths:
@@ -219,7 +219,7 @@ def choose_strength(
             kept = 1.0 / (1.0 + strength * penalty[i])
             rss += (b[i] * (1.0 - kept)) ** 2
             freedom += kept
-        score = _score(rss, freedom, rays, rule)
+        score = _score(rss, freedom, beams, rule)
         if score < least or (rule == 0 and score == least and score == 0.0):
             best, least = strength, score
     return float(best)

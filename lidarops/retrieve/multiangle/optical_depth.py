@@ -44,7 +44,7 @@ class MultiAngleMethod(StrEnum):
     """How optical depths are found."""
 
     AUTO = "auto"
-    """`TWO_ANGLE` for two rays; `KANO_HAMILTON` where it is certain enough and no extinction is
+    """`TWO_ANGLE` for two beams; `KANO_HAMILTON` where it is certain enough and no extinction is
     wanted; else `JOINT`."""
     TWO_ANGLE = "two_angle"
     """From the shortest and the longest path alone."""
@@ -84,15 +84,15 @@ def retrieve_optical_depth(
     .. math:: y_l(z) = c(z) - 2 x_l \tau(z) + g(z) \cdot d_l + e_l,
 
     with detector noise and inhomogeneity in e (variance :math:`v_l + s^2`), and a horizontal
-    gradient g over the distance d, which is fitted at the altitudes where rays lead to all sides.
-    x is the secant up to 75 degrees and follows the curvature beyond; a ray with x > 10 is left
-    out. A ray ends where the mean signal of the 15 altitudes around is less than 3 times its
+    gradient g over the distance d, which is fitted at the altitudes where beams lead to all sides.
+    x is the secant up to 75 degrees and follows the curvature beyond; a beam with x > 10 is left
+    out. A beam ends where the mean signal of the 15 altitudes around is less than 3 times its
     noise, or that of the next 5 less than twice.
 
     :math:`s^2` is the moment estimate of random-effects meta-analysis, pooled over the profiles of
     a block and 15 altitudes. In a block with a residual that is too large for chance (beyond 4.5
     standard errors, and with a probability of 1 percent in so many), outliers are weighted
-    down, starting from repeated medians and the pair of rays that most others agree
+    down, starting from repeated medians and the pair of beams that most others agree
     with. Nothing is iterated to convergence.
 
     Simulated scans of clear air and of a cloud, the air correlated by 0 to 0.9 at neighbouring
@@ -171,8 +171,8 @@ def retrieve_optical_depth(
         _layers(layers, np.append(height, 0.0) + station_altitude),
     )
     prior = _prior(prior_optical_depth, leading, height.size)
-    angles, gates = scan.path.shape
-    profiles = Profiles.missing(rows.shape[0], angles, gates, len(settings.layers))
+    angles, bins = scan.path.shape
+    profiles = Profiles.missing(rows.shape[0], angles, bins, len(settings.layers))
     steps: list[StepRecord] = []
     for label in np.unique(labels):
         members = np.flatnonzero(labels == label)
@@ -310,7 +310,7 @@ def _positive(value: float | None, name: str) -> float | None:
     return value
 
 
-def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], gates: int) -> Array | None:
+def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], bins: int) -> Array | None:
     if values is None:
         return None
     prior = inputs.real_array(values, "prior_optical_depth").astype(np.float64, copy=False)
@@ -321,10 +321,10 @@ def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], gates: int) -
             remedy="give a value for every altitude",
         )
     try:
-        return np.broadcast_to(prior, (*leading, gates)).reshape(-1, gates)
+        return np.broadcast_to(prior, (*leading, bins)).reshape(-1, bins)
     except ValueError:
         raise RetrievalInputError(
-            f"has the shape {prior.shape}, which does not broadcast to {(*leading, gates)}",
+            f"has the shape {prior.shape}, which does not broadcast to {(*leading, bins)}",
             field="prior_optical_depth",
         ) from None
 

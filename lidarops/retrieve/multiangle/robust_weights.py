@@ -1,7 +1,7 @@
 """Compiled weights against outliers in a scan: a start that outliers cannot move, then two passes.
 
-The start is the repeated median over pairs of rays (`siegel1982`), which stands up to half of
-the rays being wrong, then the pair that most other rays agree with; Tukey's bisquare of
+The start is the repeated median over pairs of beams (`siegel1982`), which stands up to half of
+the beams being wrong, then the pair that most other beams agree with; Tukey's bisquare of
 studentised residuals follows. The number of passes is fixed.
 """
 
@@ -20,7 +20,7 @@ START_WIDTH: Final = 5.0
 """Standard errors beyond which a sample has no weight, about the start."""
 PASS_WIDTH: Final = 7.0
 """The same about a weighted fit."""
-FEWEST_RAYS: Final = 4
+FEWEST_BEAMS: Final = 4
 _CLOSEST: Final = 1e-3
 _KEPT: Final = 0.3
 _FEWEST_KEPT: Final = 3
@@ -95,12 +95,12 @@ def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
         0 and inf where there is no sample.
     x : (angle, altitude) float
     residuals : (profile, angle, altitude) float
-        NaN where there is no sample, or fewer than 4 rays.
+        NaN where there is no sample, or fewer than 4 beams.
     """
-    profiles, angles, gates = y.shape
+    profiles, angles, bins = y.shape
     ys, xs, work, slopes = np.empty(angles), np.empty(angles), np.empty(angles), np.empty(angles)
     for t in range(profiles):
-        for k in range(gates):
+        for k in range(bins):
             count = 0
             low, high = np.inf, -np.inf
             for a in range(angles):
@@ -109,7 +109,7 @@ def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
                     ys[count], xs[count] = y[t, a, k], x[a, k]
                     low, high = min(low, x[a, k]), max(high, x[a, k])
                     count += 1
-            if count < FEWEST_RAYS or not high > low:
+            if count < FEWEST_BEAMS or not high > low:
                 continue
             slope, level = _repeated_median(ys, xs, count, _CLOSEST * (high - low), work, slopes)
             for a in range(angles):
@@ -130,7 +130,7 @@ def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float)
 
 @_compiled
 def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
-    """Return slope and level of the line with the least bounded sum: zero, or through two rays."""
+    """Return slope and level of the line with the least bounded sum: zero, or through two beams."""
     best, slope, level = _agreement(y, x, per_width, 0.0, 0.0), 0.0, 0.0
     closest = _CLOSEST * (np.max(x) - np.min(x))
     for i in range(y.size):
@@ -147,7 +147,7 @@ def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
 def pair_residuals(
     y: Array, noise: Array, x: Array, inhomogeneity: Array, residuals: Array
 ) -> None:
-    """Replace residuals by those about the pair of rays that most others agree with.
+    """Replace residuals by those about the pair of beams that most others agree with.
 
     Repeated medians hold, but long paths have a long lever: where their line is off by little, it
     is off by much there. Of it and the lines through all pairs, the one with the least bounded sum
@@ -161,17 +161,17 @@ def pair_residuals(
     inhomogeneity : (altitude,) float
         Variance on top of the noise.
     residuals : (profile, angle, altitude) float
-        About repeated medians; NaN where there is no sample, or fewer than 4 rays.
+        About repeated medians; NaN where there is no sample, or fewer than 4 beams.
     """
-    profiles, angles, gates = y.shape
-    rays = np.empty(angles, np.int64)
+    profiles, angles, bins = y.shape
+    beams = np.empty(angles, np.int64)
     all_y, all_x, all_per_width = np.empty(angles), np.empty(angles), np.empty(angles)
     for t in range(profiles):
-        for k in range(gates):
+        for k in range(bins):
             count = 0
             for a in range(angles):
                 if not math.isnan(residuals[t, a, k]):
-                    rays[count] = a
+                    beams[count] = a
                     all_y[count], all_x[count] = residuals[t, a, k], x[a, k]
                     spread = math.sqrt(noise[t, a, k] + inhomogeneity[k])
                     all_per_width[count] = 1.0 / (START_WIDTH * spread)
@@ -181,22 +181,22 @@ def pair_residuals(
             ys, xs = all_y[:count], all_x[:count]
             slope, level = _best_pair(ys, xs, all_per_width[:count])
             for i in range(count):
-                residuals[t, rays[i], k] -= level + slope * xs[i]
+                residuals[t, beams[i], k] -= level + slope * xs[i]
 
 
 @_compiled
-def median_variance(residuals: Array, noise: Array, out: Array, rays: Array) -> None:
-    """Fill the variance that median residuals tell, less that of the noise, gate by gate.
+def median_variance(residuals: Array, noise: Array, out: Array, beams: Array) -> None:
+    """Fill the variance that median residuals tell, less that of the noise, bin by bin.
 
     Parameters
     ----------
     residuals, noise : (profile, angle, altitude) float
-    out, rays : (altitude,) float
+    out, beams : (altitude,) float
         The latter gets the number of samples; the former 0 where there is none.
     """
-    profiles, angles, gates = residuals.shape
+    profiles, angles, bins = residuals.shape
     sizes, variances = np.empty(profiles * angles), np.empty(profiles * angles)
-    for k in range(gates):
+    for k in range(bins):
         count = fitted = 0
         for t in range(profiles):
             before = count
@@ -206,7 +206,7 @@ def median_variance(residuals: Array, noise: Array, out: Array, rays: Array) -> 
                     variances[count] = noise[t, a, k]
                     count += 1
             fitted += 1 if count > before else 0
-        rays[k] = count
+        beams[k] = count
         out[k] = 0.0
         if count > 2 * fitted:
             scale = _GAUSS * np.median(sizes[:count])
@@ -223,7 +223,7 @@ def fill_robust_weights(
     width: float,
     keep: Array,
 ) -> None:
-    """Fill the bisquare of the studentised residuals; 1 where it would leave too few rays.
+    """Fill the bisquare of the studentised residuals; 1 where it would leave too few beams.
 
     A logarithm is skewed where detector noise dominates; the residual is measured as a relative
     one there.
@@ -236,9 +236,9 @@ def fill_robust_weights(
         Standard errors from which on the weight is 0.
     keep : (profile, angle, altitude) float
     """
-    profiles, angles, gates = residuals.shape
+    profiles, angles, bins = residuals.shape
     for t in range(profiles):
-        for k in range(gates):
+        for k in range(bins):
             kept = 0
             for a in range(angles):
                 size = residuals[t, a, k]
@@ -279,14 +279,14 @@ def largest_residual(
     count : int
         Residuals.
     """
-    profiles, angles, gates = residuals.shape
+    profiles, angles, bins = residuals.shape
     stride = max(residuals.size // _MEDIAN_OF, 1)
     sizes = np.empty(residuals.size // stride + 1)
     count = seen = 0
     largest = 0.0
     for t in range(profiles):
         for a in range(angles):
-            for k in range(gates):
+            for k in range(bins):
                 free = 1.0 - leverages[t, a, k]
                 clear = noise[t, a, k] < max(_CLEAR, inhomogeneity[k])
                 if free > 1e-9 and clear:

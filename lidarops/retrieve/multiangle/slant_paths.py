@@ -22,29 +22,29 @@ SPHERICAL_BEYOND: Final = 75.0
 LONGEST: Final = 10.0
 """Slant over vertical path beyond which refraction and curvature make the model wrong."""
 _UPRIGHT: Final = 1e-9
-"""Horizontal distance over altitude up to which a ray has no azimuth."""
+"""Horizontal distance over altitude up to which a beam has no azimuth."""
 _OPPOSITE: Final = 1e-6
 """radian by which a gap between azimuths may exceed half a turn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """The rays of a scan on an altitude grid."""
+    """The beams of a scan on an altitude grid."""
 
     path: Array
-    """(angle, altitude): slant over vertical path; NaN for rays that are not used."""
+    """(angle, altitude): slant over vertical path; NaN for beams that are not used."""
     east: Array
     """(angle, altitude): horizontal distance over altitude, component along azimuth 90 degree."""
     north: Array
     """(angle, altitude): the same along azimuth 0."""
     azimuth: Array
-    """(angle,) radian, of where the ray leads (a negative zenith angle leads backwards)."""
+    """(angle,) radian, of where the beam leads (a negative zenith angle leads backwards)."""
     usable: Mask
-    """(angle,): false for rays whose path is longer than ten times the vertical one."""
+    """(angle,): false for beams whose path is longer than ten times the vertical one."""
 
     @property
     def leaning(self) -> Array:
-        """Azimuths of the usable rays that leave the zenith, radian."""
+        """Azimuths of the usable beams that leave the zenith, radian."""
         off = np.abs(self.east[:, 0]) + np.abs(self.north[:, 0]) > _UPRIGHT
         return self.azimuth[self.usable & off]
 
@@ -71,7 +71,7 @@ def make_scan(
     Returns
     -------
     Scan
-        Rays with x > 10 at any altitude, or whose angle is missing, are not usable.
+        Beams with x > 10 at any altitude, or whose angle is missing, are not usable.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def make_scan(
 
 
 def rising(zenith_angle: Array, altitude: Array) -> Integers:
-    """Return which rays lead up, and are usable at all altitudes.
+    """Return which beams lead up, and are usable at all altitudes.
 
     Parameters
     ----------
@@ -121,25 +121,25 @@ def slant_path(angle: Array, altitude: Array) -> Array:
 
 
 def surrounds_zenith(azimuth: Array) -> bool:
-    """Tell whether no half turn is free of rays, so that a horizontal gradient can be found.
+    """Tell whether no half turn is free of beams, so that a horizontal gradient can be found.
 
     The zero vector lies inside the convex hull of the directions exactly then.
 
     Parameters
     ----------
     azimuth : (angle,) float
-        radian; only of rays that leave the zenith.
+        radian; only of beams that leave the zenith.
     """
     return free_turn(azimuth) <= np.pi + _OPPOSITE
 
 
 def free_turn(azimuth: Array) -> float:
-    """Return the largest angle around the zenith that is free of rays, radian.
+    """Return the largest angle around the zenith that is free of beams, radian.
 
     Parameters
     ----------
     azimuth : (angle,) float
-        radian; only of rays that leave the zenith.
+        radian; only of beams that leave the zenith.
     """
     if azimuth.size == 0:
         return 2.0 * np.pi
@@ -158,7 +158,7 @@ def altitude_grid(altitude: npt.ArrayLike, station_altitude: float) -> Array:
     grid = real_array(altitude, "altitude").astype(np.float64)
     if grid.ndim != 1 or grid.size == 0:
         raise RetrievalInputError(
-            f"has the shape {grid.shape}", field="altitude", remedy="give one value in m per gate"
+            f"has the shape {grid.shape}", field="altitude", remedy="give one value in m per bin"
         )
     if not np.isfinite(station_altitude):
         raise RetrievalInputError(f"is {station_altitude}", field="station_altitude")

@@ -1,4 +1,4 @@
-"""Signals of the rays of a network: checked, averaged over blocks and condensed."""
+"""Signals of the beams of a network: checked, averaged over blocks and condensed."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
-LOUDEST_GATE: Final = 0.3
-"""Relative standard error of a gate, of the mean of a block, beyond which a vertex is not used:
+LOUDEST_BIN: Final = 0.3
+"""Relative standard error of a bin, of the mean of a block, beyond which a crossing is not used:
 what is positive by chance would be selected, and the logarithm turns noise into bias."""
 _OF_MEDIAN: Final = np.pi / 2.0
 """Variance of a median over that of a mean."""
@@ -31,28 +31,28 @@ LOUDER: Final = 10.0
 """Times the median variance, from which on a profile is not counted for one of its block; up
 to that many times more where its signal is stronger, whose noise is then larger too."""
 _SMOOTHED: Final = 31
-"""Gates over which an estimated noise is averaged."""
+"""Bins over which an estimated noise is averaged."""
 _WILD: Final = 60.0
-"""Times the median square of what is about it, from which on a gate is not of noise: it lies off
+"""Times the median square of what is about it, from which on a bin is not of noise: it lies off
 by 6 standard errors, as what is bridged does (`lidarops.retrieve.network.noise.outlying_bins`)."""
 _ASKED: Final = 8
-"""Profiles for a median of what is about a gate, at least, where there are as many."""
+"""Profiles for a median of what is about a bin, at least, where there are as many."""
 _APART: Final = 3
-"""Gates to the next second difference that shares none: a third of all, which tells as much."""
+"""Bins to the next second difference that shares none: a third of all, which tells as much."""
 _FEW: Final = 7
-"""Of them, at least, for what is usual of a profile and ray: fewer may mostly be wild."""
+"""Of them, at least, for what is usual of a profile and beam: fewer may mostly be wild."""
 _SUMMED: Final = 4
-"""Gates of which sums tell whether neighbours are correlated."""
+"""Bins of which sums tell whether neighbours are correlated."""
 _ASKED_SUMS: Final = 400
-"""Sums of a ray that are asked whether they are, about, where there are as many."""
+"""Sums of a beam that are asked whether they are, about, where there are as many."""
 _SUMS: Final = 300
 """Sums that are enough to tell so."""
 _MORE: Final = 4
 """Times as many are asked where too few of them are known."""
 _CORRELATED: Final = 1.5
-"""Times the variance of independent gates, up to which sums may have more by chance."""
+"""Times the variance of independent bins, up to which sums may have more by chance."""
 _SCREENED: Final = 0.045
-"""Relative standard error of a gate, up to which wild gates are surely looked for there."""
+"""Relative standard error of a bin, up to which wild bins are surely looked for there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class BeamSignals:
 
     layout: Layout
     exponent: Array
-    """(ray,)."""
+    """(beam,)."""
     data: Condensed
     """Of the profiles."""
     mean: Condensed
@@ -71,10 +71,10 @@ class BeamSignals:
     averaged: Indices
     """(block,) profiles in the means."""
     noise: Array
-    """(block,) relative standard error of a gate of a single profile, root mean square over the
-    gates about the vertices that are used."""
+    """(block,) relative standard error of a bin of a single profile, root mean square over the
+    bins about the crossings that are used."""
     weak: Booleans
-    """(profile, crossing) True where the signal of the block, or of a profile that is far louder
+    """(profile, passage) True where the signal of the block, or of a profile that is far louder
     than most of it, is too weak to be used."""
     leading: tuple[int, ...]
 
@@ -89,16 +89,16 @@ def prepare_signals(
     full_overlap_range: npt.ArrayLike | None,
     exponent: npt.ArrayLike,
     blocks: npt.ArrayLike | None,
-    gates: int,
+    bins: int,
 ) -> BeamSignals:
     """Check and condense signals; arguments are those of `multiposition.solve`."""
-    grid, turn = _grids(range_, network.rays)
+    grid, turn = _grids(range_, network.beams)
     signal, leading = _signal(power, grid, turn=turn)
     nearest, shape = _overlap(overlap, full_overlap_range, grid, turn=turn)
-    if not (isinstance(gates, int | np.integer) and 3 <= gates <= 99):
-        raise RetrievalInputError(f"is {gates}", field="gates", remedy="choose 3 to 99")
-    powers = _exponents(exponent, network.rays)
-    layout = _condensed_signals.lay_out(network, grid, shape, nearest, int(gates))
+    if not (isinstance(bins, int | np.integer) and 3 <= bins <= 99):
+        raise RetrievalInputError(f"is {bins}", field="bins", remedy="choose 3 to 99")
+    powers = _exponents(exponent, network.beams)
+    layout = _condensed_signals.lay_out(network, grid, shape, nearest, int(bins))
     block, count = _blocks(blocks, leading)
     relative = variance is None
     if variance is None:
@@ -106,20 +106,20 @@ def prepare_signals(
         rows, row = _estimated(signal, members, block)
     else:
         rows, row = _variances(variance, signal.shape, turn=turn)
-        about = (layout.crossings.ray, layout.window, layout.weights.shape[1])
-        block = noise_groups.split_by_noise(signal, rows, row, block, about, LOUDEST_GATE)
+        about = (layout.passages.beam, layout.window, layout.weights.shape[1])
+        block = noise_groups.split_by_noise(signal, rows, row, block, about, LOUDEST_BIN)
         count = int(block.max(initial=-1)) + 1
         members = [np.flatnonzero(block == b) for b in range(count)]
     mean, mean_rows, single, averaged = _means(signal, rows, row, members, layout)
     data = _condensed_signals.condense(
         signal, rows, row, powers, layout, relative=relative, screened=True
     )
-    # No single gate spoils a median, and its variance is but an estimate.
+    # No single bin spoils a median, and its variance is but an estimate.
     means = _condensed_signals.condense(
         mean, mean_rows, np.arange(count), powers, layout, relative=relative, screened=False
     )
     loudness, below = _loudness(mean, single, averaged, layout, relative=relative)
-    weak = ~(loudness <= LOUDEST_GATE**2) & ((means.usable == 1) | _faded(means, below, layout))
+    weak = ~(loudness <= LOUDEST_BIN**2) & ((means.usable == 1) | _faded(means, below, layout))
     with np.errstate(invalid="ignore"):
         heard = np.where(weak | (means.usable == 0), np.nan, loudness)
     means.usable[weak] = 0
@@ -140,25 +140,25 @@ def _row_means(values: Array) -> Array:
         return np.asarray(total / finite.sum(axis=1))
 
 
-def _grids(values: npt.ArrayLike, rays: int) -> tuple[Array, bool]:
-    """Return (ray, bin) ascending ranges, and whether they were descending."""
+def _grids(values: npt.ArrayLike, beams: int) -> tuple[Array, bool]:
+    """Return (beam, bin) ascending ranges, and whether they were descending."""
     array = inputs.real_array(values, "range").astype(np.float64)
     if array.ndim == 1:
         grid = inputs.range_grid(array)
-        return np.tile(grid.values, (rays, 1)), grid.descending
-    if array.ndim != 2 or array.shape[0] != rays:
+        return np.tile(grid.values, (beams, 1)), grid.descending
+    if array.ndim != 2 or array.shape[0] != beams:
         raise RetrievalInputError(
             f"has the shape {array.shape}",
             field="range",
-            remedy=f"give (range,) or ({rays}, range), one row per ray",
+            remedy=f"give (range,) or ({beams}, range), one row per beam",
         )
     for row in array:
         known = np.isfinite(row)
         if not known.any() or not known[: int(known.sum())].all():
             raise RetrievalInputError(
-                "is not finite before the last bin of a ray",
+                "is not finite before the last bin of a beam",
                 field="range",
-                remedy="give each ray's bins first, and NaN only behind the last of them",
+                remedy="give each beam's bins first, and NaN only behind the last of them",
             )
         if inputs.range_grid(row[known]).descending:
             raise RetrievalInputError("descends", field="range", remedy="turn it, and the power")
@@ -171,7 +171,7 @@ def _signal(power: npt.ArrayLike, grid: Array, *, turn: bool) -> tuple[Array, tu
         raise RetrievalInputError(
             f"has the shape {array.shape}",
             field="power",
-            remedy=f"its last two axes are ray and range, here {grid.shape}",
+            remedy=f"its last two axes are beam and range, here {grid.shape}",
         )
     leading = array.shape[:-2]
     flat = array[..., ::-1] if turn else array
@@ -183,12 +183,12 @@ def _signal(power: npt.ArrayLike, grid: Array, *, turn: bool) -> tuple[Array, tu
 def _overlap(
     overlap: npt.ArrayLike | None, nearest: npt.ArrayLike | None, grid: Array, *, turn: bool
 ) -> tuple[Array, Array | None]:
-    """Return the nearest range of each ray and its overlap function, where there is one."""
+    """Return the nearest range of each beam and its overlap function, where there is one."""
     if overlap is None and nearest is None:
         raise RetrievalInputError(
             "is not given, nor full_overlap_range",
             field="overlap",
-            remedy="give one of them: an error of 1 percent in the overlap at the first vertex"
+            remedy="give one of them: an error of 1 percent in the overlap at the first crossing"
             " changes extinction there by 5 percent",
         )
     limits = inputs.real_array(0.0 if nearest is None else nearest, "full_overlap_range")
@@ -196,7 +196,7 @@ def _overlap(
         raise RetrievalInputError(
             "is negative, NaN or of a wrong shape",
             field="full_overlap_range",
-            remedy="give one range in m, or one per ray",
+            remedy="give one range in m, or one per beam",
         )
     first = np.broadcast_to(limits, grid.shape[:1]).astype(np.float64)
     if overlap is None:
@@ -213,15 +213,15 @@ def _overlap(
     return first, np.broadcast_to(array[..., ::-1] if turn else array, grid.shape)
 
 
-def _exponents(exponent: npt.ArrayLike, rays: int) -> Array:
+def _exponents(exponent: npt.ArrayLike, beams: int) -> Array:
     array = inputs.real_array(exponent, "exponent").astype(np.float64)
-    if array.shape not in {(), (rays,)} or not np.all((array >= 0.1) & (array <= 10.0)):
+    if array.shape not in {(), (beams,)} or not np.all((array >= 0.1) & (array <= 10.0)):
         raise RetrievalInputError(
             "is not from 0.1 to 10, or of a wrong shape",
             field="exponent",
-            remedy=f"give m of backscatter ~ extinction^(1/m): one, or one per ray ({rays})",
+            remedy=f"give m of backscatter ~ extinction^(1/m): one, or one per beam ({beams})",
         )
-    return np.broadcast_to(array, (rays,)).copy()
+    return np.broadcast_to(array, (beams,)).copy()
 
 
 def _blocks(
@@ -262,7 +262,7 @@ def _variances(
         raise RetrievalInputError(
             f"has the shape {array.shape}",
             field="variance",
-            remedy=f"give (..., ray, range), here (..., {shape[1]}, {shape[2]})",
+            remedy=f"give (..., beam, range), here (..., {shape[1]}, {shape[2]})",
         ) from None
     row = np.zeros(shape[0], dtype=np.intp) if shared else np.arange(shape[0])
     return np.ascontiguousarray(rows), row
@@ -271,15 +271,15 @@ def _variances(
 def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[Array, Indices]:
     """Return relative variances, from second differences along range, and which go with a profile.
 
-    Gates are taken for independent. Where neighbours are correlated, second differences tell too
+    Bins are taken for independent. Where neighbours are correlated, second differences tell too
     little of them, and variances are those that sums have; of a few profiles nothing tells so.
     One row for each block, and one for each profile that is far louder than its block: it would
-    spoil the errors of all others, and state too little itself. So would one with wild gates that
+    spoil the errors of all others, and state too little itself. So would one with wild bins that
     are not bridged.
 
     Returns
     -------
-    rows : (row, ray, bin) float64
+    rows : (row, beam, bin) float64
     row : (profile,) intp
     """
     out = np.full((len(members), *signal.shape[1:]), np.nan)
@@ -302,7 +302,7 @@ def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[A
             told = known[n] & (here[n] <= _WILD * _usual_square(here[[n]], known[[n]], level[[n]]))
             plain[n, loud[n]] = told[loud[n]]
         hit = np.flatnonzero((loud | (known & ~plain).any(axis=2)).any(axis=1))
-        # Where nobody looks for wild gates they are noise, but of their profile alone.
+        # Where nobody looks for wild bins they are noise, but of their profile alone.
         wild = known[hit] & ~plain[hit]
         alone = np.broadcast_to(out[b], (hit.size, *out[b].shape)).copy()
         for k in np.flatnonzero(loud[hit].any(axis=1)):
@@ -318,19 +318,19 @@ def _estimated(signal: Array, members: list[Indices], block: Indices) -> tuple[A
 
 
 def _excess(logs: Array, plain: Booleans, level: Array) -> Array:
-    """Return (ray,) the variance of sums of gates over that of second differences of gates.
+    """Return (beam,) the variance of sums of bins over that of second differences of bins.
 
     Of what one profile differs by from the next: air that stays there would count as correlated
     noise. In units of the noise of both: where that differs much from profile to profile, medians
-    of gates and of sums would differ by chance. 1 where chance makes as much, or too little is
+    of bins and of sums would differ by chance. 1 where chance makes as much, or too little is
     known.
 
     Parameters
     ----------
-    logs : (profile, ray, bin) float64
-    plain : (profile, ray, bin) bool
-        Whether a gate is known, and not wild.
-    level : (profile, ray) float64
+    logs : (profile, beam, bin) float64
+    plain : (profile, beam, bin) bool
+        Whether a bin is known, and not wild.
+    level : (profile, beam) float64
         What variances are proportional to; where it is not finite or 0, the median of the others.
     """
     out = np.ones(logs.shape[1])
@@ -339,26 +339,26 @@ def _excess(logs: Array, plain: Booleans, level: Array) -> Array:
     if total < _SUMS:
         return out
     level = np.where(np.isfinite(level) & (level > 0.0), level, np.nan)
-    others = _ray_medians(level)
+    others = _beam_medians(level)
     level = np.where(np.isnan(level), np.where(others > 0.0, others, 1.0), level)
-    # Of long rays a part is enough, too, but for those of which too little of it is known.
-    every, rays = max(total // _ASKED_SUMS, 1), np.arange(out.size)
-    while rays.size:
+    # Of long beams a part is enough, too, but for those of which too little of it is known.
+    every, beams = max(total // _ASKED_SUMS, 1), np.arange(out.size)
+    while beams.size:
         pairs = np.arange(0, len(logs) - 1, every)
-        here, after = np.ix_(pairs, rays), np.ix_(pairs + 1, rays)
+        here, after = np.ix_(pairs, beams), np.ix_(pairs + 1, beams)
         used = slice(0, size * 3 * _SUMMED)
         steps = logs[..., used][after] - logs[..., used][here]
         steps /= np.sqrt(level[here] + level[after])[..., np.newaxis]
         steps[~(plain[..., used][here] & plain[..., used][after])] = np.nan
         parts = steps.reshape(*steps.shape[:2], size, 3, _SUMMED)
         sums = _second_squares(parts.sum(axis=4)) / _SUMMED
-        gates = _second_squares(parts[..., :3])
-        usual, whole = _ray_medians(gates, _SUMS), _ray_medians(sums, _SUMS)
+        bins = _second_squares(parts[..., :3])
+        usual, whole = _beam_medians(bins, _SUMS), _beam_medians(sums, _SUMS)
         told = (usual > 0.0) & (whole > _CORRELATED * usual)
-        out[rays[told]] = whole[told] / usual[told]
+        out[beams[told]] = whole[told] / usual[told]
         if every == 1:
             break
-        every, rays = max(every // _MORE, 1), rays[whole == 0.0]
+        every, beams = max(every // _MORE, 1), beams[whole == 0.0]
     return out
 
 
@@ -368,45 +368,45 @@ def _second_squares(values: Array) -> Array:
 
 
 def _levels(squares: Array, known: Booleans) -> Array:
-    """Return (profile, ray) medians along range, which no single wild gate moves."""
+    """Return (profile, beam) medians along range, which no single wild bin moves."""
     # What is unknown is none of the smallest.
     some = np.where(known[..., ::_APART], squares[..., ::_APART], np.inf)
     return np.asarray(np.median(some, axis=2))
 
 
 def _louder(level: Array) -> Booleans:
-    """Return (profile, ray) where noise is far above that of most profiles."""
+    """Return (profile, beam) where noise is far above that of most profiles."""
     usual = np.median(level, axis=0)
     return np.asarray(np.isfinite(level) & (level > LOUDER * usual) & (usual > 0.0))
 
 
 def _plain(squares: Array, known: Booleans, usual: Array) -> Booleans:
-    """Return (profile, ray, bin) what is known, and not wild by the (ray, bin) usual squares.
+    """Return (profile, beam, bin) what is known, and not wild by the (beam, bin) usual squares.
 
     Where many profiles are noisier than the rest, none of them is louder than most: what is
     usual in each of them is asked before its noise is called wild.
     """
     limit = _WILD * usual
     out = known & (squares <= limit)
-    profile, ray = np.nonzero((known & ~out).any(axis=2))
+    profile, beam = np.nonzero((known & ~out).any(axis=2))
     if profile.size:
-        some = known[profile, ray, ::_APART]
-        ratio = np.where(some, squares[profile, ray, ::_APART] / usual[ray, ::_APART], np.inf)
+        some = known[profile, beam, ::_APART]
+        ratio = np.where(some, squares[profile, beam, ::_APART] / usual[beam, ::_APART], np.inf)
         number = some.sum(axis=1)
         middle = np.maximum(number - 1, 0) // 2
         times = np.sort(ratio, axis=1)[np.arange(number.size), middle]
         times = np.where(number >= _FEW, np.maximum(times, 1.0), 1.0)[:, np.newaxis]
-        out[profile, ray] = known[profile, ray] & (squares[profile, ray] <= limit[ray] * times)
+        out[profile, beam] = known[profile, beam] & (squares[profile, beam] <= limit[beam] * times)
     return out
 
 
 def _smoothed(squares: Array, known: Booleans) -> Array:
-    """Return (ray, bin) means over profiles and neighbouring gates; two more bins than squares."""
+    """Return (beam, bin) means over profiles and neighbouring bins; two more bins than squares."""
     return _moving_mean(np.where(known, squares, 0.0).sum(axis=0), known.sum(axis=0))
 
 
 def _moving_mean(total: Array, number: Indices | Booleans) -> Array:
-    """Return means over neighbouring gates, of sums of so many squares; two more bins."""
+    """Return means over neighbouring bins, of sums of so many squares; two more bins."""
     width = min(_SMOOTHED, total.shape[-1])
     with np.errstate(invalid="ignore", divide="ignore"):
         smooth = _moving_sum(total, width) / _moving_sum(number.astype(np.float64), width)
@@ -414,10 +414,10 @@ def _moving_mean(total: Array, number: Indices | Booleans) -> Array:
 
 
 def _usual_square(squares: Array, known: Booleans, level: Array) -> Array:
-    """Return (ray, bin) medians of profiles and of some tens of gates; inf where they are 0.
+    """Return (beam, bin) medians of profiles and of some tens of bins; inf where they are 0.
 
-    By them a wild gate is told: one of one profile would be taken for noise of all. Some hundred
-    squares tell a median well enough, so that not all profiles are asked: by their (profile, ray)
+    By them a wild bin is told: one of one profile would be taken for noise of all. Some hundred
+    squares tell a median well enough, so that not all profiles are asked: by their (profile, beam)
     level quiet and noisy ones alike, in whichever order they come.
     """
     every = len(squares) // _ASKED
@@ -425,24 +425,24 @@ def _usual_square(squares: Array, known: Booleans, level: Array) -> Array:
         # Levels of counts may be equal.
         total = np.where(known, squares, 0.0).sum(axis=2)
         some = np.lexsort((total, level), axis=0)[every // 2 :: every]
-        rays = np.arange(squares.shape[1])
-        squares, known = squares[some, rays], known[some, rays]
+        beams = np.arange(squares.shape[1])
+        squares, known = squares[some, beams], known[some, beams]
     out = np.full(squares.shape[1:], np.inf)
     parts = max(squares.shape[-1] // _SMOOTHED, 1)
     edges = np.linspace(0, squares.shape[-1], parts + 1).astype(int)
     for low, high in pairwise(edges):
         here = np.where(known[..., low:high], squares[..., low:high], np.nan)
-        usual = _ray_medians(here)
+        usual = _beam_medians(here)
         out[:, low:high] = np.where(usual > 0.0, usual, np.inf)[:, np.newaxis]
     return out
 
 
-def _ray_medians(values: Array, least: int = 1) -> Array:
-    """Return (ray,) medians of what is known; 0 where that is less than some number.
+def _beam_medians(values: Array, least: int = 1) -> Array:
+    """Return (beam,) medians of what is known; 0 where that is less than some number.
 
     Parameters
     ----------
-    values : (profile, ray, ...) float64
+    values : (profile, beam, ...) float64
     least : int
     """
     rows = np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
@@ -468,28 +468,30 @@ def _means(
 ) -> tuple[Array, Array, Array, Indices]:  # fmt: skip
     """Take medians of the signals of blocks; return variances, those of one profile, and numbers.
 
-    Medians, because a single wild gate must not spoil a block. The energy of a laser changes from
-    profile to profile, so that one with a gap on a ray would put a step there: it is left out.
+    Medians, because a single wild bin must not spoil a block. The energy of a laser changes from
+    profile to profile, so that one with a gap on a beam would put a step there: it is left out.
     A few loud profiles do a median no harm, and are not counted in what is its variance.
     """
     shape = (len(members), *signal.shape[1:])
     mean, spread, single = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     averaged = np.zeros(len(members), dtype=np.intp)
-    first, gates = layout.first_crossing, layout.weights.shape[1]
-    for ray in range(shape[1]):
-        if first[ray] == first[ray + 1]:
+    first, bins = layout.first_passage, layout.weights.shape[1]
+    for beam in range(shape[1]):
+        if first[beam] == first[beam + 1]:
             continue
-        low, high = layout.window[first[ray]], layout.window[first[ray + 1] - 1] + gates
-        whole = np.asarray(np.isfinite(signal[:, ray, low:high]).all(axis=1))
+        low, high = layout.window[first[beam]], layout.window[first[beam + 1] - 1] + bins
+        whole = np.asarray(np.isfinite(signal[:, beam, low:high]).all(axis=1))
         for b, mine in enumerate(members):
             used = mine[whole[mine]]
             if used.size == 0:
                 continue
-            mean[b, ray] = np.median(signal[used, ray], axis=0)
-            single[b, ray, low:high] = _usual(
-                rows[row[used], ray, low:high], signal[used, ray, low:high], mean[b, ray, low:high]
+            mean[b, beam] = np.median(signal[used, beam], axis=0)
+            single[b, beam, low:high] = _usual(
+                rows[row[used], beam, low:high],
+                signal[used, beam, low:high],
+                mean[b, beam, low:high],
             )
-            spread[b, ray] = _OF_MEDIAN * single[b, ray] / used.size
+            spread[b, beam] = _OF_MEDIAN * single[b, beam] / used.size
             averaged[b] = min(averaged[b], used.size) if averaged[b] else used.size
     return mean, spread, single, averaged
 
@@ -518,53 +520,53 @@ def _usual(variances: Array, signal: Array, median: Array) -> Array:
 def _loud(
     signal: Array, rows: Array, row: Indices, single: Array, layout: Layout, *, relative: bool
 ) -> Booleans:
-    """Return (profile, crossing) where one far louder than its block is too weak by itself.
+    """Return (profile, passage) where one far louder than its block is too weak by itself.
 
     By its own level, as the energy of a laser may be what raises its noise.
     """
-    out = np.zeros((signal.shape[0], layout.crossings.ray.size), dtype=np.bool_)
+    out = np.zeros((signal.shape[0], layout.passages.beam.size), dtype=np.bool_)
     if rows.shape[0] == 1:
         return out
-    gates = layout.weights.shape[1]
+    bins = layout.weights.shape[1]
     for c in range(out.shape[1]):
-        ray, gate = layout.crossings.ray[c], slice(layout.window[c], layout.window[c] + gates)
+        beam, bin = layout.passages.beam[c], slice(layout.window[c], layout.window[c] + bins)
         with np.errstate(invalid="ignore", over="ignore"):
-            spread = rows[row, ray, gate].sum(axis=1) / gates
-            usual = single[:, ray, gate].sum(axis=1) / gates
-            level = np.maximum(signal[:, ray, gate].sum(axis=1) / gates, 0.0)
+            spread = rows[row, beam, bin].sum(axis=1) / bins
+            usual = single[:, beam, bin].sum(axis=1) / bins
+            level = np.maximum(signal[:, beam, bin].sum(axis=1) / bins, 0.0)
             louder = (usual > 0.0) & ~(spread <= LOUDER * usual)
             scale = 1.0 if relative else level**2
-            out[:, c] = louder & ~(spread <= LOUDEST_GATE**2 * scale)
+            out[:, c] = louder & ~(spread <= LOUDEST_BIN**2 * scale)
     return out
 
 
 def _faded(means: Condensed, below: Booleans, layout: Layout) -> Booleans:
-    """Return (block, crossing) where noise alone made a signal that was there not positive.
+    """Return (block, passage) where noise alone made a signal that was there not positive.
 
-    What is weaker than weak is no worse for the other rays. A ray that has no signal at all, or
+    What is weaker than weak is no worse for the other beams. A beam that has no signal at all, or
     that is less than noise makes it, is out of order, and told.
     """
-    ray, first = layout.crossings.ray, layout.first_crossing[layout.crossings.ray]
-    negative = (means.status == _condensed_signals.NOT_POSITIVE)[:, ray]
+    beam, first = layout.passages.beam, layout.first_passage[layout.passages.beam]
+    negative = (means.status == _condensed_signals.NOT_POSITIVE)[:, beam]
     return np.asarray(negative & (means.usable == 0) & (means.usable[:, first] == 1) & ~below)
 
 
 def _loudness(
     mean: Array, single: Array, averaged: Indices, layout: Layout, *, relative: bool
 ) -> tuple[Array, Booleans]:
-    """Return (block, crossing) relative variances of a gate of one profile about a vertex.
+    """Return (block, passage) relative variances of a bin of one profile about a crossing.
 
     And where the mean signal is less than zero by more than its noise.
     """
-    total, gates = layout.crossings.ray.size, layout.weights.shape[1]
+    total, bins = layout.passages.beam.size, layout.weights.shape[1]
     out, below = np.zeros((mean.shape[0], total)), np.zeros((mean.shape[0], total), dtype=np.bool_)
-    number = np.maximum(averaged, 1) * gates / _OF_MEDIAN
+    number = np.maximum(averaged, 1) * bins / _OF_MEDIAN
     for c in range(total):
-        ray, gate = layout.crossings.ray[c], slice(layout.window[c], layout.window[c] + gates)
-        # A wild gate may be so large that its square is none.
+        beam, bin = layout.passages.beam[c], slice(layout.window[c], layout.window[c] + bins)
+        # A wild bin may be so large that its square is none.
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            level = mean[:, ray, gate].sum(axis=1) / gates
-            spread = single[:, ray, gate].sum(axis=1) / gates
+            level = mean[:, beam, bin].sum(axis=1) / bins
+            spread = single[:, beam, bin].sum(axis=1) / bins
             out[:, c] = spread if relative else np.where(level > 0, spread / level**2, np.inf)
             if not relative:
                 below[:, c] = ~(level >= -_BELOW * np.sqrt(spread / number))
@@ -578,7 +580,7 @@ def average_blocks(
     signal = inputs.real_array(power, "power").astype(np.float64, copy=False)
     if signal.ndim != 3:
         raise RetrievalInputError(
-            f"has the shape {signal.shape}", field="power", remedy="give (profile, ray, range)"
+            f"has the shape {signal.shape}", field="power", remedy="give (profile, beam, range)"
         )
     group, count = _blocks(groups, signal.shape[:1], "groups")
     noise = None
@@ -592,11 +594,11 @@ def average_blocks(
         mine = np.flatnonzero(group == g)
         present = known[mine].any(axis=0)
         whole = np.asarray((known[mine] | ~present).all(axis=2))
-        for ray in range(signal.shape[1]):
-            used = mine[whole[:, ray]]
+        for beam in range(signal.shape[1]):
+            used = mine[whole[:, beam]]
             if used.size == 0:
                 continue
-            mean[g, ray] = signal[used, ray].sum(axis=0) / used.size
+            mean[g, beam] = signal[used, beam].sum(axis=0) / used.size
             if spread is not None and noise is not None:
-                spread[g, ray] = noise[used, ray].sum(axis=0) / used.size**2
+                spread[g, beam] = noise[used, beam].sum(axis=0) / used.size**2
     return mean, spread

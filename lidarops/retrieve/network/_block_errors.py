@@ -4,7 +4,7 @@ In thin air a profile alone says little of its own error. Its logarithm of extin
 where noise is amplified, and the error taken there is small; and a field that the prior rules out
 moves all profiles alike, which no profile can tell from attenuation. Of both the block knows more:
 how far single profiles lie off the solution of their mean, how large an error typically is, and
-what the mean of the rays leaves open without any prior. Nothing here changes a value.
+what the mean of the beams leaves open without any prior. Nothing here changes a value.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
 BEND: Final = 0.15
-"""Standard deviation of ln extinction over the vertices by which a field may bend beyond any
+"""Standard deviation of ln extinction over the crossings by which a field may bend beyond any
 gradient: as much as it may tilt (`lidarops.retrieve.network._empirical_prior.GRADIENT`)."""
 _HARMLESS: Final = 0.5
 """Of the standard error that is reported."""
@@ -37,18 +37,18 @@ _FLAT: Final = 1e-9
 def bends(position: Array) -> Array:
     """Return quadratic fields, free of level and gradient, that make up one of any direction.
 
-    The sum of their squares, averaged over the vertices, is `BEND` squared; the fields of
+    The sum of their squares, averaged over the crossings, is `BEND` squared; the fields of
     r_i r_j, i < j, count twice, as the squares of r' H r with a random symmetric H do.
 
     Parameters
     ----------
-    position : (vertex, 3) float64
+    position : (crossing, 3) float64
         m.
 
     Returns
     -------
-    (field, vertex) float64
-        Of ln extinction; no field where vertices are so few that a gradient describes any.
+    (field, crossing) float64
+        Of ln extinction; no field where crossings are so few that a gradient describes any.
     """
     return _bends(np.ascontiguousarray(position, dtype=np.float64).tobytes())
 
@@ -85,21 +85,21 @@ def of_noise(logarithm: Array, variance: Array, mean: Array) -> Array:
 
     Parameters
     ----------
-    logarithm, variance : (profile, vertex) float64
+    logarithm, variance : (profile, crossing) float64
         Of ln extinction; NaN where there is none.
-    mean : (vertex,) float64
-        ln extinction by the mean of the rays.
+    mean : (crossing,) float64
+        ln extinction by the mean of the beams.
 
     Returns
     -------
-    (vertex,) float64
+    (crossing,) float64
         0 where the difference is less than half of the typical standard error.
     """
     known = np.isfinite(logarithm) & np.isfinite(variance)
     number = np.maximum(known.sum(axis=0), 1)
     middle = _median(np.where(known, logarithm, np.nan))
     farthest = _FARTHEST**2 * _median(np.where(known, variance, np.nan))
-    # Of a profile whose rays contradict each other, all others would state the error.
+    # Of a profile whose beams contradict each other, all others would state the error.
     with np.errstate(invalid="ignore"):
         typical = np.where(known, np.minimum(variance, farthest), 0.0).sum(axis=0) / number
         apart = np.clip(logarithm - middle, -np.sqrt(farthest), np.sqrt(farthest))
@@ -109,23 +109,23 @@ def of_noise(logarithm: Array, variance: Array, mean: Array) -> Array:
 
 
 def of_field(missed: Array, told: Array, free: Array, variance: Array) -> Array:
-    """Return variances by fields that the prior rules out and the rays do not.
+    """Return variances by fields that the prior rules out and the beams do not.
 
-    All profiles share such an error, so that it is no larger than what the mean of the rays leaves
+    All profiles share such an error, so that it is no larger than what the mean of the beams leaves
     open when nothing is told beforehand.
 
     Parameters
     ----------
-    missed : (profile, vertex) float64
+    missed : (profile, crossing) float64
         Variance by such fields, if nothing but the prior spoke of them.
-    told, free : (vertex,) float64
-        ln extinction by the mean of the rays, with the prior and without.
-    variance : (vertex,) float64
-        Of `free`; NaN where the rays leave anything open.
+    told, free : (crossing,) float64
+        ln extinction by the mean of the beams, with the prior and without.
+    variance : (crossing,) float64
+        Of `free`; NaN where the beams leave anything open.
 
     Returns
     -------
-    (profile, vertex) float64
+    (profile, crossing) float64
     """
     gap = free - told
     allowed = variance + gap * gap
@@ -142,10 +142,10 @@ def at_least_typical(extinction: Array, variance: Array, block: Indices, seen: B
 
     Parameters
     ----------
-    extinction, variance : (profile, vertex) float64
+    extinction, variance : (profile, crossing) float64
         m-1 and m-2; NaN where there is none.
     block : (profile,) intp
-    seen : (profile, crossing) bool
+    seen : (profile, passage) bool
     """
     out = variance.copy()
     for number in np.unique(block):
@@ -168,7 +168,7 @@ def _lifted(extinction: Array, variance: Array, rows: Indices, peers: Indices) -
 
 
 def _median(values: Array) -> Array:
-    """Return (vertex,) medians of what is finite; NaN where nothing is."""
+    """Return (crossing,) medians of what is finite; NaN where nothing is."""
     known = np.isfinite(values)
     if known.all():
         return np.asarray(np.median(values, axis=0))

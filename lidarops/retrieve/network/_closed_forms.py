@@ -1,4 +1,4 @@
-"""Vertices of a network by the closed forms: cycles of rays, and single rays for comparison."""
+"""Crossings of a network by the closed forms: cycles of beams, and single beams for comparison."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _LARGEST_RELATIVE_ERROR: Final = 1.0 / 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossingEstimate:
-    """Extinction at vertices, before it is judged. NaN where there is none."""
+    """Extinction at crossings, before it is judged. NaN where there is none."""
 
     extinction: Array
-    """(profile, vertex) m-1; may be negative."""
+    """(profile, crossing) m-1; may be negative."""
     variance: Array
-    """(profile, vertex) m-2."""
+    """(profile, crossing) m-2."""
     weak_attenuation: Booleans
-    """(profile, vertex)."""
+    """(profile, crossing)."""
     pole: Booleans
-    """(profile, vertex)."""
+    """(profile, crossing)."""
     far_start: Booleans
-    """(vertex,)."""
+    """(crossing,)."""
     multiplier: Array
     """(profile,)."""
 
@@ -54,10 +54,10 @@ class Rows:
     depths: Array
     """(row,) optical depth times exponent per unit of extinction, with the row's sign, m."""
     distinct: bool
-    """Whether the fits at the two vertices of each row share no gates."""
+    """Whether the fits at the two crossings of each row share no bins."""
 
     def rotated(self, first: int) -> Rows:
-        """Return the rows in the order that starts with another vertex."""
+        """Return the rows in the order that starts with another crossing."""
         order = np.roll(np.arange(self.starts.shape[1]), -first)
         return Rows(
             np.ascontiguousarray(self.starts[:, order]),
@@ -69,27 +69,29 @@ class Rows:
         )
 
 
-def rows_of(data: Condensed, rays: BeamSignals, cycle: Cycle) -> Rows:
+def rows_of(data: Condensed, beams: BeamSignals, cycle: Cycle) -> Rows:
     """Collect the rows of a cycle; NaN where a signal is missing.
 
     Raises
     ------
     RetrievalInputError
-        Where a vertex of the cycle cannot be measured on a ray of its.
+        Where a crossing of the cycle cannot be measured on a beam of its.
     """
-    profiles, k = data.log_value.shape[0], cycle.ray.size
-    here = [_crossing(rays, int(r), int(v)) for r, v in zip(cycle.ray, cycle.vertex, strict=True)]
-    there = [
-        _crossing(rays, int(r), int(v))
-        for r, v in zip(cycle.ray, np.roll(cycle.vertex, -1), strict=True)
+    profiles, k = data.log_value.shape[0], cycle.beam.size
+    here = [
+        _passage(beams, int(r), int(v)) for r, v in zip(cycle.beam, cycle.crossing, strict=True)
     ]
-    apart = np.abs(rays.layout.window[here] - rays.layout.window[there])
+    there = [
+        _passage(beams, int(r), int(v))
+        for r, v in zip(cycle.beam, np.roll(cycle.crossing, -1), strict=True)
+    ]
+    apart = np.abs(beams.layout.window[here] - beams.layout.window[there])
     out = Rows(
         np.empty((profiles, k)), np.empty((profiles, k)), np.empty((profiles, k)),
         np.empty((profiles, k, 3, 3)), np.empty(k),
-        distinct=bool(np.all(apart >= rays.layout.weights.shape[1])),
+        distinct=bool(np.all(apart >= beams.layout.weights.shape[1])),
     )  # fmt: skip
-    lengths = _empirical_prior.lengths(rays.layout)
+    lengths = _empirical_prior.lengths(beams.layout)
     for j in range(k):
         sign = 1.0 if there[j] > here[j] else -1.0
         between = slice(min(here[j], there[j]), max(here[j], there[j]))
@@ -100,38 +102,38 @@ def rows_of(data: Condensed, rays: BeamSignals, cycle: Cycle) -> Rows:
         with np.errstate(over="ignore"):
             out.starts[:, j], out.ends[:, j] = np.exp(logs)
         out.integrals[:, j] = sign * total
-        out.depths[j] = sign * rays.exponent[cycle.ray[j]] * float(lengths[between].sum())
+        out.depths[j] = sign * beams.exponent[cycle.beam[j]] * float(lengths[between].sum())
         out.covariances[:, j] = _row_covariance(
-            data, rays, int(cycle.ray[j]), here[j], there[j], between, total
+            data, beams, int(cycle.beam[j]), here[j], there[j], between, total
         )
     return out
 
 
-def _crossing(rays: BeamSignals, ray: int, vertex: int) -> int:
-    kept = rays.layout.crossings
-    found = np.flatnonzero((kept.ray == ray) & (kept.vertex == vertex))
+def _passage(beams: BeamSignals, beam: int, crossing: int) -> int:
+    kept = beams.layout.passages
+    found = np.flatnonzero((kept.beam == beam) & (kept.crossing == crossing))
     if found.size == 0:
         raise RetrievalInputError(
-            f"passes vertex {vertex}, which ray {ray} cannot measure",
+            f"passes crossing {crossing}, which beam {beam} cannot measure",
             field="cycle",
-            remedy="give signals that reach there with full overlap, or choose other rays",
+            remedy="give signals that reach there with full overlap, or choose other beams",
         )
     return int(found[0])
 
 
 def _row_covariance(
     data: Condensed,
-    rays: BeamSignals,
-    ray: int,
+    beams: BeamSignals,
+    beam: int,
     here: int,
     there: int,
     between: slice,
     total: Array,
 ) -> Array:
-    layout = rays.layout
-    first, count = int(layout.first_crossing[ray]), int(np.diff(layout.first_crossing)[ray])
+    layout = beams.layout
+    first, count = int(layout.first_passage[beam]), int(np.diff(layout.first_passage)[beam])
     size = 2 * count - 1
-    packed = data.covariance[:, layout.offset[ray] : layout.offset[ray + 1]]
+    packed = data.covariance[:, layout.offset[beam] : layout.offset[beam + 1]]
     full = packed.reshape(-1, size, size)
     parts = np.arange(count + between.start - first, count + between.stop - first)
     points = (here - first, there - first)
@@ -147,46 +149,48 @@ def _row_covariance(
 
 
 def by_cycle(
-    rays: BeamSignals, cycle: Cycle, multiplier: float | None, *, unbiased: bool, only_start: bool
+    beams: BeamSignals, cycle: Cycle, multiplier: float | None, *, unbiased: bool, only_start: bool
 ) -> CrossingEstimate:
-    """Solve for the start vertex of a cycle, and in turn for its other near vertices.
+    """Solve for the start crossing of a cycle, and in turn for its other near crossings.
 
     Parameters
     ----------
-    rays : Rays
+    beams : Beams
     cycle : Cycle
     multiplier : float, optional
         The best one for each block where not given.
     unbiased : bool
     only_start : bool
-        Whether to leave the other vertices out.
+        Whether to leave the other crossings out.
     """
-    rows, mean = rows_of(rays.data, rays, cycle), rows_of(rays.mean, rays, cycle)
-    profiles, vertices = rows.starts.shape[0], rays.layout.vertices
-    shape = (profiles, vertices)
+    rows, mean = rows_of(beams.data, beams, cycle), rows_of(beams.mean, beams, cycle)
+    profiles, crossings = rows.starts.shape[0], beams.layout.crossings
+    shape = (profiles, crossings)
     out = CrossingEstimate(
         np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=np.bool_),
-        np.zeros(shape, dtype=np.bool_), np.zeros(vertices, dtype=np.bool_), np.ones(profiles),
+        np.zeros(shape, dtype=np.bool_), np.zeros(crossings, dtype=np.bool_), np.ones(profiles),
     )  # fmt: skip
     weak = _weak_attenuation(rows) | (not rows.distinct)
     for j in [0] if only_start else np.flatnonzero(cycle.sign > 0):
-        turned, vertex = rows.rotated(int(j)), int(cycle.vertex[j])
+        turned, crossing = rows.rotated(int(j)), int(cycle.crossing[j])
         if multiplier is None:
-            chosen = _best(mean.rotated(int(j)), rays)[rays.block]
+            chosen = _best(mean.rotated(int(j)), beams)[beams.block]
         else:
             chosen = np.full(profiles, multiplier)
         value, determinant, variance, pole, spread = _solved(turned, chosen, unbiased=unbiased)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            out.extinction[:, vertex] = 1.0 / value
-            out.variance[:, vertex] = variance / value**4
-            amplified = shaky(out.extinction[:, [vertex]], out.variance[:, [vertex]], rays.block)
+            out.extinction[:, crossing] = 1.0 / value
+            out.variance[:, crossing] = variance / value**4
+            amplified = shaky(
+                out.extinction[:, [crossing]], out.variance[:, [crossing]], beams.block
+            )
             if not unbiased:
-                bias = _modelled_bias(turned, rays, chosen)
-                out.variance[:, vertex] += (bias * out.extinction[:, vertex]) ** 2
+                bias = _modelled_bias(turned, beams, chosen)
+                out.variance[:, crossing] += (bias * out.extinction[:, crossing]) ** 2
             singular = ~(np.abs(determinant) >= 3.0 * np.sqrt(spread))
-        out.weak_attenuation[:, vertex] = amplified[:, 0] | (singular if unbiased else weak)
-        out.pole[:, vertex] = pole
-        out.far_start[vertex] = cycle.sign[j] < 0
+        out.weak_attenuation[:, crossing] = amplified[:, 0] | (singular if unbiased else weak)
+        out.pole[:, crossing] = pole
+        out.far_start[crossing] = cycle.sign[j] < 0
         if j == 0:
             out.multiplier[:] = chosen
     return out
@@ -200,7 +204,7 @@ def shaky(extinction: Array, variance: Array, block: Indices) -> Booleans:
 
     Parameters
     ----------
-    extinction, variance : (profile, vertex) float
+    extinction, variance : (profile, crossing) float
         m-1 and m-2; NaN where there is none.
     block : (profile,) int
     """
@@ -209,11 +213,11 @@ def shaky(extinction: Array, variance: Array, block: Indices) -> Booleans:
     for number in np.unique(block):
         mine = np.flatnonzero(block == number)
         known = np.isfinite(variance[mine])
-        for vertex in np.flatnonzero(known.any(axis=0)):
-            rows = mine[known[:, vertex]]
-            error = np.sqrt(np.median(variance[rows, vertex]))
-            typical = np.median(extinction[rows, vertex])
-            out[mine, vertex] |= error > _LARGEST_RELATIVE_ERROR * typical
+        for crossing in np.flatnonzero(known.any(axis=0)):
+            rows = mine[known[:, crossing]]
+            error = np.sqrt(np.median(variance[rows, crossing]))
+            typical = np.median(extinction[rows, crossing])
+            out[mine, crossing] |= error > _LARGEST_RELATIVE_ERROR * typical
     return out
 
 
@@ -245,41 +249,41 @@ def _weak_attenuation(rows: Rows) -> Booleans:
         return np.asarray(~(np.abs(logarithm) >= 3.0 * np.sqrt(spread)))
 
 
-def _best(mean: Rows, rays: BeamSignals) -> Array:
+def _best(mean: Rows, beams: BeamSignals) -> Array:
     """Return the best multiplier of each block, from a homogeneous model of its mean field."""
-    model = mean_extinction(rays.mean)
+    model = mean_extinction(beams.mean)
     depths = model[:, np.newaxis] * mean.depths
-    single = mean.covariances * rays.averaged[:, np.newaxis, np.newaxis, np.newaxis]
+    single = mean.covariances * beams.averaged[:, np.newaxis, np.newaxis, np.newaxis]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         best = _multiplier.optimal(
             mean.starts, mean.ends, mean.integrals, single, depths, 1.0 / model,
-            rays.noise > _multiplier.LOUDEST_CLOSED,
+            beams.noise > _multiplier.LOUDEST_CLOSED,
         )  # fmt: skip
     return np.where(np.isfinite(model) & (model > 0), best, 1.0)
 
 
-def _modelled_bias(rows: Rows, rays: BeamSignals, multiplier: Array) -> Array:
+def _modelled_bias(rows: Rows, beams: BeamSignals, multiplier: Array) -> Array:
     """Return the relative systematic error that a homogeneous mean field would have."""
-    depths = mean_extinction(rays.mean)[rays.block, np.newaxis] * rows.depths
+    depths = mean_extinction(beams.mean)[beams.block, np.newaxis] * rows.depths
     return np.where(multiplier < 1.0, _multiplier.relative_bias(depths, multiplier), 0.0)
 
 
-def inhomogeneous(rays: BeamSignals, estimate: CrossingEstimate) -> Booleans:
+def inhomogeneous(beams: BeamSignals, estimate: CrossingEstimate) -> Booleans:
     """Return where the segments of the mean field differ by more than a profile's errors.
 
     They must also differ by more than their noise: by 4 standard errors of their chi-square.
     """
-    known = (rays.mean.slope[:, :, 1] > 0) & np.isfinite(rays.mean.slope[:, :, 1])
-    weight = np.where(known, 1.0 / np.where(known, rays.mean.slope[:, :, 1], 1.0), 0.0)
+    known = (beams.mean.slope[:, :, 1] > 0) & np.isfinite(beams.mean.slope[:, :, 1])
+    weight = np.where(known, 1.0 / np.where(known, beams.mean.slope[:, :, 1], 1.0), 0.0)
     number = known.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        middle = mean_extinction(rays.mean)[:, np.newaxis]
-        square = np.where(known, rays.mean.slope[:, :, 0] - middle, 0.0) ** 2
+        middle = mean_extinction(beams.mean)[:, np.newaxis]
+        square = np.where(known, beams.mean.slope[:, :, 0] - middle, 0.0) ** 2
         chi_square = _total(square * weight)
         spread = _total(square) / np.maximum(number - 1, 1)
         differ = chi_square > number - 1 + 4.0 * np.sqrt(2.0 * np.maximum(number - 1, 1))
-        larger = (spread[rays.block, np.newaxis] > estimate.variance).any(axis=1)
-    told = (differ & (number > 1))[rays.block] & larger
+        larger = (spread[beams.block, np.newaxis] > estimate.variance).any(axis=1)
+    told = (differ & (number > 1))[beams.block] & larger
     return np.broadcast_to(told[:, np.newaxis], estimate.variance.shape)
 
 
@@ -292,28 +296,28 @@ def mean_extinction(data: Condensed) -> Array:
 
 
 def _total(values: Array) -> Array:
-    """Sum over crossings one by one, so that the digits do not depend on the profiles."""
+    """Sum over passages one by one, so that the digits do not depend on the profiles."""
     start = np.zeros((values.shape[0], 1))
     return np.asarray(np.cumsum(np.concatenate([start, values], axis=1), axis=1)[:, -1])
 
 
-def by_single_rays(rays: BeamSignals, *, far_end: bool) -> CrossingEstimate:
-    """Take each ray for itself: its slope, or Klett's solution from its far end.
+def by_single_beams(beams: BeamSignals, *, far_end: bool) -> CrossingEstimate:
+    """Take each beam for itself: its slope, or Klett's solution from its far end.
 
-    At each vertex, the segments that lead away from it are averaged, weighted by their
+    At each crossing, the segments that lead away from it are averaged, weighted by their
     variances. Klett's solution takes the extinction at the far end of a segment from the slope
     of its farther half; what its errors share is neglected.
     """
-    data, kept = rays.data, rays.layout.crossings
-    shape = (data.log_value.shape[0], rays.layout.vertices)
+    data, kept = beams.data, beams.layout.passages
+    shape = (data.log_value.shape[0], beams.layout.crossings)
     weights, total = np.zeros(shape), np.zeros(shape)
-    for c in np.flatnonzero(kept.ray[:-1] == kept.ray[1:]):
-        value, variance = _far_end(data, rays, int(c)) if far_end else data.slope[:, c, :2].T
+    for c in np.flatnonzero(kept.beam[:-1] == kept.beam[1:]):
+        value, variance = _far_end(data, beams, int(c)) if far_end else data.slope[:, c, :2].T
         usable = (data.usable[:, c] & data.usable[:, c + 1]) == 1
         good = usable & np.isfinite(value) & (variance > 0) & np.isfinite(variance)
         weight = 1.0 / variance[good]
-        weights[good, kept.vertex[c]] += weight
-        total[good, kept.vertex[c]] += weight * value[good]
+        weights[good, kept.crossing[c]] += weight
+        total[good, kept.crossing[c]] += weight * value[good]
     none = np.zeros(shape, dtype=np.bool_)
     with np.errstate(divide="ignore", invalid="ignore"):
         extinction = np.where(weights > 0, total / weights, np.nan)
@@ -323,15 +327,15 @@ def by_single_rays(rays: BeamSignals, *, far_end: bool) -> CrossingEstimate:
     )
 
 
-def _far_end(data: Condensed, rays: BeamSignals, c: int) -> tuple[Array, Array]:
-    """Return the extinction at a crossing from that at the next, and its variance."""
-    ray = int(rays.layout.crossings.ray[c])
+def _far_end(data: Condensed, beams: BeamSignals, c: int) -> tuple[Array, Array]:
+    """Return the extinction at a passage from that at the next, and its variance."""
+    beam = int(beams.layout.passages.beam[c])
     first, count = (
-        int(rays.layout.first_crossing[ray]),
-        int(np.diff(rays.layout.first_crossing)[ray]),
+        int(beams.layout.first_passage[beam]),
+        int(np.diff(beams.layout.first_passage)[beam]),
     )
     size, at = 2 * count - 1, c - first
-    full = data.covariance[:, rays.layout.offset[ray] : rays.layout.offset[ray + 1]]
+    full = data.covariance[:, beams.layout.offset[beam] : beams.layout.offset[beam + 1]]
     full = full.reshape(-1, size, size)
     boundary, spread = data.slope[:, c, 2], data.slope[:, c, 3]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -1,8 +1,8 @@
-"""Signals of rays condensed to values at vertices and integrals between them, with covariances.
+"""Signals of beams condensed to values at crossings and integrals between them, with covariances.
 
-Where a vertex lies, which gates a fit takes and with which weights, and what part of a cell
+Where a crossing lies, which bins a fit takes and with which weights, and what part of a cell
 belongs to a segment follow from geometry and range alone: they are computed once. The weights
-are kept sparse, because a fit takes 7 gates of a thousand, and applied in compiled loops, whose
+are kept sparse, because a fit takes 7 bins of a thousand, and applied in compiled loops, whose
 result for a profile does not depend on the others.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.network import _curvature_errors
-from lidarops.retrieve.network.geometry import Crossings, Network
+from lidarops.retrieve.network.geometry import Network, Passages
 from lidarops.retrieve.network.noise import outlying_bins, outlying_runs
 
 Array = npt.NDArray[np.float64]
@@ -38,63 +38,63 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Which gates make the values at the crossings of rays, and with which weights."""
+    """Which bins make the values at the passages of beams, and with which weights."""
 
-    crossings: Crossings
-    """Those that can be measured, ordered along the rays."""
-    vertices: int
+    passages: Passages
+    """Those that can be measured, ordered along the beams."""
+    crossings: int
     measured: Booleans
-    """(vertex,) True where at least two rays can measure there."""
-    near_vertex: Booleans
-    """(vertex,) True where one of the kept rays goes on to a further vertex."""
-    first_crossing: Indices
-    """(ray + 1,) where the crossings of a ray start."""
+    """(crossing,) True where at least two beams can measure there."""
+    near_crossing: Booleans
+    """(crossing,) True where one of the kept beams goes on to a further crossing."""
+    first_passage: Indices
+    """(beam + 1,) where the passages of a beam start."""
     window: Indices
-    """(crossing,) first gate of the fit."""
+    """(passage,) first bin of the fit."""
     weights: Array
-    """(crossing, gate) of the logarithms, for the value at the vertex."""
+    """(passage, bin) of the logarithms, for the value at the crossing."""
     cell: Indices
-    """(crossing,) the gate at or before the vertex."""
+    """(passage,) the bin at or before the crossing."""
     fraction: Array
-    """(crossing,) of the cell behind that gate, up to the vertex."""
+    """(passage,) of the cell behind that bin, up to the crossing."""
     log_factor: Array
-    """(ray, bin) logarithm of what turns power into range- and overlap-corrected signal."""
+    """(beam, bin) logarithm of what turns power into range- and overlap-corrected signal."""
     range: Array
-    """(ray, bin) m."""
+    """(beam, bin) m."""
     limits: Indices
-    """(ray, 2) first gate that may be used, and the one behind the last."""
+    """(beam, 2) first bin that may be used, and the one behind the last."""
     neighbours: tuple[Indices, Array, Array]
-    """(ray, bin, neighbour) gates that tell a gate, their shares, and (ray, bin) what air may
+    """(beam, bin, neighbour) bins that tell a bin, their shares, and (beam, bin) what air may
     leave; see `lidarops.retrieve.network.noise.outlying_bins.plan_neighbours`."""
     offset: Indices
-    """(ray + 1,) where the covariances of a ray start."""
+    """(beam + 1,) where the covariances of a beam start."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Condensed:
-    """Values at crossings and integrals between them, of each profile.
+    """Values at passages and integrals between them, of each profile.
 
-    The signal is (power / overlap * range^2)^m, scaled to 1 at the first vertex of each ray.
+    The signal is (power / overlap * range^2)^m, scaled to 1 at the first crossing of each beam.
     """
 
     log_value: Array
-    """(profile, crossing)."""
+    """(profile, passage)."""
     integral: Array
-    """(profile, crossing) m, 2 m times the integral from here to the next crossing of the ray."""
+    """(profile, passage) m, 2 m times the integral from here to the next passage of the beam."""
     usable: Codes
-    """(profile, crossing) 1 where all gates up to the crossing's are positive, and their variances
+    """(profile, passage) 1 where all bins up to the passage's are positive, and their variances
     known."""
     covariance: Array
-    """(profile, packed) for each ray, of its log values and then its integrals."""
+    """(profile, packed) for each beam, of its log values and then its integrals."""
     slope: Array
-    """(profile, crossing, 4) m-1: extinction of the segment behind, if homogeneous, from all its
-    gates and from its farther half, each followed by its variance."""
+    """(profile, passage, 4) m-1: extinction of the segment behind, if homogeneous, from all its
+    bins and from its farther half, each followed by its variance."""
     status: Codes
-    """(profile, ray) MISSING, NOT_POSITIVE or OUTLYING."""
+    """(profile, beam) MISSING, NOT_POSITIVE or OUTLYING."""
     bridged: Codes
-    """(profile, ray) 1 where a gate lay off its neighbours, which took its place."""
+    """(profile, beam) 1 where a bin lay off its neighbours, which took its place."""
     departure: Array = field(default_factory=lambda: np.zeros((0, 0, 2)))
-    """(profile, crossing, 2) of `_curvature_errors.measure_curvature`; empty where profiles were pooled."""
+    """(profile, passage, 2) of `_curvature_errors.measure_curvature`; empty where profiles were pooled."""
 
     def take(self, profiles: Indices) -> Condensed:
         """Return some of the profiles."""
@@ -106,20 +106,20 @@ class Condensed:
 
 
 def lay_out(
-    net: Network, range_: Array, overlap: Array | None, nearest: Array, gates: int
+    net: Network, range_: Array, overlap: Array | None, nearest: Array, bins: int
 ) -> Layout:
-    """Choose gates and weights.
+    """Choose bins and weights.
 
     Parameters
     ----------
     net : Network
-    range_ : (ray, bin) float64
-        m, ascending; NaN behind the last bin of a ray.
-    overlap : (ray, bin) float64, optional
+    range_ : (beam, bin) float64
+        m, ascending; NaN behind the last bin of a beam.
+    overlap : (beam, bin) float64, optional
         Overlap function; 1 where not given.
-    nearest : (ray,) float64
-        m; gates nearer are not used.
-    gates : int
+    nearest : (beam,) float64
+        m; bins nearer are not used.
+    bins : int
         Of a local fit.
     """
     factor = np.ones_like(range_) if overlap is None else overlap
@@ -127,30 +127,30 @@ def lay_out(
         usable = (range_ >= nearest[:, np.newaxis]) & (factor >= LOWEST_OVERLAP)
         log_factor = 2.0 * np.log(range_) - np.log(factor)
     limits = [_bounds(row) for row in usable]
-    keep = np.zeros(net.crossings.ray.size, dtype=np.bool_)
-    for c, (ray, where) in enumerate(zip(net.crossings.ray, net.crossings.range, strict=True)):
-        low, high = limits[ray]
-        keep[c] = high - low >= gates and range_[ray, low] <= where <= range_[ray, high - 1]
-    measured = np.bincount(net.crossings.vertex[keep], minlength=net.vertices) >= 2
-    keep &= measured[net.crossings.vertex]
-    kept = Crossings(net.crossings.ray[keep], net.crossings.vertex[keep], net.crossings.range[keep])
-    first = np.searchsorted(kept.ray, np.arange(net.rays + 1)).astype(np.intp)
+    keep = np.zeros(net.passages.beam.size, dtype=np.bool_)
+    for c, (beam, where) in enumerate(zip(net.passages.beam, net.passages.range, strict=True)):
+        low, high = limits[beam]
+        keep[c] = high - low >= bins and range_[beam, low] <= where <= range_[beam, high - 1]
+    measured = np.bincount(net.passages.crossing[keep], minlength=net.crossings) >= 2
+    keep &= measured[net.passages.crossing]
+    kept = Passages(net.passages.beam[keep], net.passages.crossing[keep], net.passages.range[keep])
+    first = np.searchsorted(kept.beam, np.arange(net.beams + 1)).astype(np.intp)
     count = np.diff(first)
-    near = np.zeros(net.vertices, dtype=np.bool_)
-    near[kept.vertex[:-1][kept.ray[:-1] == kept.ray[1:]]] = True
-    window, weights, cell, fraction = _fits(kept, range_, limits, gates)
+    near = np.zeros(net.crossings, dtype=np.bool_)
+    near[kept.crossing[:-1][kept.beam[:-1] == kept.beam[1:]]] = True
+    window, weights, cell, fraction = _fits(kept, range_, limits, bins)
     sizes = np.maximum(2 * count - 1, 0) ** 2
     offset = np.concatenate([[0], np.cumsum(sizes)]).astype(np.intp)
     bounds = np.array(limits, dtype=np.intp).reshape(-1, 2)
     return Layout(
-        kept, net.vertices, measured, near, first, window, weights, cell, fraction,
+        kept, net.crossings, measured, near, first, window, weights, cell, fraction,
         np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds,
         outlying_bins.planned(range_, bounds), offset,
     )  # fmt: skip
 
 
 def _bounds(usable: Booleans) -> tuple[int, int]:
-    """Return the first run of usable gates that reaches farthest, as start and stop."""
+    """Return the first run of usable bins that reaches farthest, as start and stop."""
     if not usable.any():
         return 0, 0
     stop = int(usable.size - np.argmax(usable[::-1]))
@@ -159,19 +159,19 @@ def _bounds(usable: Booleans) -> tuple[int, int]:
 
 
 def _fits(
-    kept: Crossings, range_: Array, limits: list[tuple[int, int]], gates: int
+    kept: Passages, range_: Array, limits: list[tuple[int, int]], bins: int
 ) -> tuple[Indices, Array, Indices, Array]:
-    total = kept.ray.size
+    total = kept.beam.size
     window, cell = np.zeros(total, dtype=np.intp), np.zeros(total, dtype=np.intp)
-    weights, fraction = np.zeros((total, gates)), np.zeros(total)
-    for c, (ray, where) in enumerate(zip(kept.ray, kept.range, strict=True)):
-        grid, (low, high) = range_[ray], limits[ray]
+    weights, fraction = np.zeros((total, bins)), np.zeros(total)
+    for c, (beam, where) in enumerate(zip(kept.beam, kept.range, strict=True)):
+        grid, (low, high) = range_[beam], limits[beam]
         centre = low + int(np.argmin(np.abs(grid[low:high] - where)))
-        start = min(max(centre - gates // 2, low), high - gates)
+        start = min(max(centre - bins // 2, low), high - bins)
         window[c] = start
-        about = grid[start : start + gates]
+        about = grid[start : start + bins]
         lever = about - about.mean()
-        weights[c] = 1.0 / gates + lever * (where - about.mean()) / np.sum(lever**2)
+        weights[c] = 1.0 / bins + lever * (where - about.mean()) / np.sum(lever**2)
         before = low + int(np.searchsorted(grid[low:high], where, side="right")) - 1
         cell[c] = min(before, high - 2)
         fraction[c] = (where - grid[cell[c]]) / (grid[cell[c] + 1] - grid[cell[c]])
@@ -188,28 +188,28 @@ def condense(
     relative: bool,
     screened: bool,
 ) -> Condensed:
-    """Condense power to values at vertices and integrals between them.
+    """Condense power to values at crossings and integrals between them.
 
-    The value at a vertex is that of a straight line through the logarithms of the gates about
+    The value at a crossing is that of a straight line through the logarithms of the bins about
     it; to second order, the logarithm is freed of what noise takes from it. The signal is taken
-    as exponential within a cell: its integral is exact on a homogeneous ray.
+    as exponential within a cell: its integral is exact on a homogeneous beam.
 
     Parameters
     ----------
-    power : (profile, ray, bin) float64
-    variance : (row, ray, bin) float64
-        Of the power of each gate, or relative; gates are independent.
+    power : (profile, beam, bin) float64
+    variance : (row, beam, bin) float64
+        Of the power of each bin, or relative; bins are independent.
     variance_row : (profile,) intp
         The row of variance that goes with a profile.
-    exponent : (ray,) float64
+    exponent : (beam,) float64
         m of backscatter ~ extinction^(1/m).
     layout : Layout
     relative : bool
         Whether variances are relative.
     screened : bool
-        Whether to look for single gates that lie off their neighbours, and to bridge them.
+        Whether to look for single bins that lie off their neighbours, and to bridge them.
     """
-    profiles, total = power.shape[0], layout.crossings.ray.size
+    profiles, total = power.shape[0], layout.passages.beam.size
     out = Condensed(
         np.full((profiles, total), np.nan),
         np.zeros((profiles, total)),
@@ -222,7 +222,7 @@ def condense(
     )
     _condense(
         power, variance, variance_row, relative, exponent, layout.log_factor, layout.range,
-        layout.first_crossing, layout.window, layout.weights, layout.cell, layout.fraction,
+        layout.first_passage, layout.window, layout.weights, layout.cell, layout.fraction,
         layout.offset, screened, layout.limits, layout.neighbours, _curvature_errors.weights(layout),
         out.log_value, out.integral, out.usable, out.covariance, out.slope, out.status, out.bridged,
         out.departure,
@@ -250,7 +250,7 @@ def _part_of_cell(step: float, start: float, stop: float) -> tuple[float, float]
 def _first_bad(
     row: Array, log_factor: Array, exponent: float, low: int, high: int, logs: Array
 ) -> tuple[int, int]:
-    """Fill logarithms of the signal up to the first gate that has none; say why."""
+    """Fill logarithms of the signal up to the first bin that has none; say why."""
     for g in range(low, high):
         if not abs(row[g]) < 1e300:
             return g, MISSING
@@ -333,7 +333,7 @@ def _fit_points(
     noise: Array,
     exponent: float,
     stop: int,
-    crossings: tuple[int, int],
+    passages: tuple[int, int],
     window: Indices,
     weights: Array,
     values: Array,
@@ -341,19 +341,19 @@ def _fit_points(
     gradients: Array,
     bounds: Indices,
 ) -> int:
-    """Fill the values at crossings whose gates are good; return how many there are."""
-    first, last = crossings
-    gates = weights.shape[1]
+    """Fill the values at passages whose bins are good; return how many there are."""
+    first, last = passages
+    bins = weights.shape[1]
     for c in range(first, last):
-        if window[c] + gates > stop:
+        if window[c] + bins > stop:
             return c - first
         value = 0.0
-        for i in range(gates):
+        for i in range(bins):
             g = window[c] + i
             # E ln(1 + e) = -e^2 / 2; noise is already multiplied by the exponent's square.
             value += weights[c, i] * (logs[g] + 0.5 * noise[g] / exponent)
             gradients[c - first, g] = weights[c, i]
-        bounds[c - first, 0], bounds[c - first, 1] = window[c], window[c] + gates
+        bounds[c - first, 0], bounds[c - first, 1] = window[c], window[c] + bins
         values[c] = value
         usable[c] = 1
     return last - first
@@ -366,7 +366,7 @@ def _join_points(
     exponent: float,
     grid: Array,
     codes: Codes,
-    crossings: tuple[int, int, int],
+    passages: tuple[int, int, int],
     cell: Indices,
     fraction: Array,
     scale: float,
@@ -375,8 +375,8 @@ def _join_points(
     gradients: Array,
     bounds: Indices,
 ) -> None:
-    """Fill integrals and slopes between the good crossings of a ray."""
-    first, count, good = crossings
+    """Fill integrals and slopes between the good passages of a beam."""
+    first, count, good = passages
     for c in range(first, first + good - 1):
         q = count + c - first
         integrals[c] = _add_segment(
@@ -407,7 +407,7 @@ def _look_beyond(
     span: tuple[int, int],
     out: tuple[Array, Array, Codes],
 ) -> None:
-    """Fill logarithms, their variances and codes of gates that only judge others."""
+    """Fill logarithms, their variances and codes of bins that only judge others."""
     logs, noise, codes = out
     for g in range(span[0], span[1]):
         codes[g] = outlying_bins.LOST
@@ -432,10 +432,10 @@ def _screen(
     other: tuple[Array, Array, Codes],
     work: tuple[Array, Array, Array, Indices, Array],
 ) -> tuple[int, int]:
-    """Bridge gates that lie off their neighbours.
+    """Bridge bins that lie off their neighbours.
 
-    Return behind which gate the ray is not to be believed, and how many are bridged before; LEFT
-    where gates lie off that are left as they are and may be wild: the other row then is the one
+    Return behind which bin the beam is not to be believed, and how many are bridged before; LEFT
+    where bins lie off that are left as they are and may be wild: the other row then is the one
     without them.
     """
     power, variance, log_factor = signal
@@ -472,11 +472,11 @@ def _screen(
 def _widen(
     one: tuple[Array, Array, Array],
     other: tuple[Array, Array, Array],
-    crossings: tuple[int, int, int],
+    passages: tuple[int, int, int],
     packed: Array,
 ) -> None:
-    """Add to covariances what two readings of a ray differ by, of which either may be true."""
-    first, count, good = crossings
+    """Add to covariances what two readings of a beam differ by, of which either may be true."""
+    first, count, good = passages
     quantities = 2 * count - 1
     apart = np.zeros(quantities)
     for c in range(good):
@@ -501,7 +501,7 @@ def _condense(
     exponent: Array,
     log_factor: Array,
     range_: Array,
-    first_crossing: Indices,
+    first_passage: Indices,
     window: Indices,
     weights: Array,
     cell: Indices,
@@ -520,50 +520,50 @@ def _condense(
     bridged: Codes,
     departures: Array,
 ) -> None:
-    bins, most = power.shape[2], 1
-    for ray in range(exponent.size):
-        most = max(most, first_crossing[ray + 1] - first_crossing[ray])
-    gradients = np.zeros((2 * most, bins))
+    size, most = power.shape[2], 1
+    for beam in range(exponent.size):
+        most = max(most, first_passage[beam + 1] - first_passage[beam])
+    gradients = np.zeros((2 * most, size))
     bounds = np.zeros((2 * most, 2), dtype=np.intp)
-    logs, noise, codes = np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.uint8)
-    nodes = np.zeros((bins, outlying_bins.NODES), dtype=np.intp)
-    work = np.zeros(bins), np.zeros(bins), np.zeros(bins), nodes, np.zeros(nodes.shape)
-    other = np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.uint8)
+    logs, noise, codes = np.zeros(size), np.zeros(size), np.zeros(size, dtype=np.uint8)
+    nodes = np.zeros((size, outlying_bins.NODES), dtype=np.intp)
+    work = np.zeros(size), np.zeros(size), np.zeros(size), nodes, np.zeros(nodes.shape)
+    other = np.zeros(size), np.zeros(size), np.zeros(size, dtype=np.uint8)
     total = values.shape[1]
     without = np.zeros(total), np.zeros(total), np.zeros((total, 4))
     reached = np.zeros(total, dtype=np.uint8)
     for n in range(power.shape[0]):
-        for ray in range(exponent.size):
-            first, last = first_crossing[ray], first_crossing[ray + 1]
+        for beam in range(exponent.size):
+            first, last = first_passage[beam], first_passage[beam + 1]
             count = last - first
             if count == 0:
                 continue
             low, high = window[first], window[last - 1] + weights.shape[1]
-            m = exponent[ray]
-            stop, reason = _first_bad(power[n, ray], log_factor[ray], m, low, high, logs)
-            spread_row = variance[variance_row[n], ray]
+            m = exponent[beam]
+            stop, reason = _first_bad(power[n, beam], log_factor[beam], m, low, high, logs)
+            spread_row = variance[variance_row[n], beam]
             for g in range(low, stop):
                 spread = spread_row[g]
-                noise[g] = m * m * (spread if relative else spread / power[n, ray, g] ** 2)
+                noise[g] = m * m * (spread if relative else spread / power[n, beam, g] ** 2)
                 if not noise[g] < math.inf:
                     stop, reason = g, MISSING
                     break
                 codes[g] = outlying_bins.GOOD
-            start = max(limits[ray, 0], low - outlying_bins.MARGIN)
-            end = min(limits[ray, 1], stop + outlying_bins.MARGIN)
+            start = max(limits[beam, 0], low - outlying_bins.MARGIN)
+            end = min(limits[beam, 1], stop + outlying_bins.MARGIN)
             found = 0
-            narrow = range_[ray, low + 1] - range_[ray, low] <= outlying_bins.WIDEST
+            narrow = range_[beam, low + 1] - range_[beam, low] <= outlying_bins.WIDEST
             if screened and narrow and stop > low:
                 believed, found = _screen(
-                    (power[n, ray], spread_row, log_factor[ray]), m, relative, range_[ray],
+                    (power[n, beam], spread_row, log_factor[beam]), m, relative, range_[beam],
                     (start, low, stop, end),
-                    (neighbours[0][ray], neighbours[1][ray], neighbours[2][ray]),
+                    (neighbours[0][beam], neighbours[1][beam], neighbours[2][beam]),
                     (logs, noise, codes), other, work,
                 )  # fmt: skip
                 reason = OUTLYING if believed < stop else reason
                 stop = believed
-            status[n, ray] = reason
-            bridged[n, ray] = min(abs(found), 1)
+            status[n, beam] = reason
+            bridged[n, beam] = min(abs(found), 1)
             gradients[:, start : max(end, high)] = 0.0
             good = _fit_points(
                 logs, noise, m, stop, (first, last), window, weights, values[n], usable[n],
@@ -574,7 +574,7 @@ def _condense(
                 plain, m, (first, first + good), window, departing, departures[n]
             )
             _join_points(
-                logs, noise, m, range_[ray], codes, (first, count, good), cell, fraction,
+                logs, noise, m, range_[beam], codes, (first, count, good), cell, fraction,
                 values[n, first], integrals[n], slopes[n], gradients, bounds,
             )  # fmt: skip
             outlying_bins.hand_on(
@@ -583,7 +583,7 @@ def _condense(
             )  # fmt: skip
             _covariance_of(
                 gradients, bounds, 2 * count - 1, noise,
-                covariance[n, offset[ray] : offset[ray + 1]],
+                covariance[n, offset[beam] : offset[beam + 1]],
             )  # fmt: skip
             if found == outlying_bins.LEFT:
                 _fit_points(
@@ -591,12 +591,12 @@ def _condense(
                     reached, gradients, bounds,
                 )  # fmt: skip
                 _join_points(
-                    other[0], other[1], m, range_[ray], other[2], (first, count, good), cell,
+                    other[0], other[1], m, range_[beam], other[2], (first, count, good), cell,
                     fraction, values[n, first], without[1], without[2], gradients, bounds,
                 )  # fmt: skip
                 _widen(
                     (values[n], integrals[n], slopes[n]), without, (first, count, good),
-                    covariance[n, offset[ray] : offset[ray + 1]],
+                    covariance[n, offset[beam] : offset[beam + 1]],
                 )  # fmt: skip
             for c in range(first + good - 1, first - 1, -1):
                 values[n, c] -= values[n, first]

@@ -1,15 +1,15 @@
-"""What curved signals put into the values at crossings, and what that makes of a solution.
+"""What curved signals put into the values at passages, and what that makes of a solution.
 
-The value at a crossing is that of a straight line through the logarithms of the gates about it.
-Of a signal that bends there, with f its logarithm along the ray, the line has about
+The value at a passage is that of a straight line through the logarithms of the bins about it.
+Of a signal that bends there, with f its logarithm along the beam, the line has about
 
-    f'' / 2 sum_i w_i (r_i - r)^2 = f'' (gates^2 - 1) step^2 / 24
+    f'' / 2 sum_i w_i (r_i - r)^2 = f'' (bins^2 - 1) step^2 / 24
 
-more, for weights w_i of gates r_i, and the right side in the middle of a fit: 8 percent too little
+more, for weights w_i of bins r_i, and the right side in the middle of a fit: 8 percent too little
 on the axis of a layer of three times the air about it and a standard deviation of 20 m, through
-35 m. A polynomial of the fourth degree through the same gates has next to nothing of that, but
+35 m. A polynomial of the fourth degree through the same bins has next to nothing of that, but
 twice the noise: it is no better value. What noise puts into the difference of the two is much less
-in the median of a block, and that tells the error, sign included. Rays amplify it, as a difference
+in the median of a block, and that tells the error, sign included. Beams amplify it, as a difference
 of values along them passes for attenuation; so it is carried over to the solution, and its square
 added to the variance, less what noise makes of it.
 """
@@ -34,7 +34,7 @@ Indices = npt.NDArray[np.intp]
 Codes = npt.NDArray[np.uint8]
 
 DEGREE: Final = 4
-"""Of the polynomial. Through 35 m it has what a layer of a standard deviation of 10 m along the ray
+"""Of the polynomial. Through 35 m it has what a layer of a standard deviation of 10 m along the beam
 takes from a value to within a tenth, a parabola to within a half."""
 _BY_NOISE: Final = 4.0
 """Variances by noise that are taken from a square: beyond, noise alone leaves 0.08 of one."""
@@ -47,7 +47,7 @@ _LOUDER: Final = 10.0
 _OF_MEDIAN: Final = np.pi / 2.0
 """Variance of a median over that of a mean."""
 _LEAST_PART: Final = 1e-3
-"""Of the signal at a vertex over extinction there, that is left behind the last integral."""
+"""Of the signal at a crossing over extinction there, that is left behind the last integral."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -57,13 +57,13 @@ def weights(layout: Layout) -> Array:
 
     Returns
     -------
-    (crossing, gate) float64
+    (passage, bin) float64
         They sum to 0, and to 0 over what is linear in range.
     """
-    crossings, gates = layout.crossings, layout.weights.shape[1]
-    near = layout.window[:, np.newaxis] + np.arange(gates)
-    apart = layout.range[crossings.ray[:, np.newaxis], near] - crossings.range[:, np.newaxis]
-    order = np.arange(min(DEGREE, gates - 1) + 1)
+    passages, bins = layout.passages, layout.weights.shape[1]
+    near = layout.window[:, np.newaxis] + np.arange(bins)
+    apart = layout.range[passages.beam[:, np.newaxis], near] - passages.range[:, np.newaxis]
+    order = np.arange(min(DEGREE, bins - 1) + 1)
     powers = (apart / np.ptp(apart, axis=1, keepdims=True))[..., np.newaxis] ** order
     return np.ascontiguousarray(layout.weights - np.linalg.pinv(powers)[:, 0])
 
@@ -72,33 +72,33 @@ def weights(layout: Layout) -> Array:
 def measure_curvature(
     row: tuple[Array, Array, Codes],
     exponent: float,
-    crossings: tuple[int, int],
+    passages: tuple[int, int],
     window: Indices,
     shares: Array,
     out: Array,
 ) -> None:
-    """Fill what lines have more than polynomials at crossings, and its variance by noise.
+    """Fill what lines have more than polynomials at passages, and its variance by noise.
 
     Parameters
     ----------
     row : (bin,) float64, (bin,) float64, (bin,) uint8
-        Logarithms of the signal along a ray, their variances and codes. Without gates that may be
+        Logarithms of the signal along a beam, their variances and codes. Without bins that may be
         wild: what these change is told otherwise.
     exponent : float
-    crossings : int, int
+    passages : int, int
         The first one, and that behind the last.
-    window : (crossing,) intp
-        First gate of each fit.
-    shares : (crossing, gate) float64
+    window : (passage,) intp
+        First bin of each fit.
+    shares : (passage, bin) float64
         Of `weights`.
-    out : (crossing, 2) float64
+    out : (passage, 2) float64
     """
     logs, noise, _ = row
-    for c in range(crossings[0], crossings[1]):
+    for c in range(passages[0], passages[1]):
         value = spread = 0.0
         for i in range(shares.shape[1]):
             g = window[c] + i
-            # As values at crossings, freed of E ln(1 + e) = -e^2 / 2.
+            # As values at passages, freed of E ln(1 + e) = -e^2 / 2.
             value += shares[c, i] * (logs[g] + 0.5 * noise[g] / exponent)
             spread += shares[c, i] * shares[c, i] * noise[g]
         out[c, 0], out[c, 1] = value, spread
@@ -109,14 +109,14 @@ def usual(departures: Array, usable: Codes) -> Array:
 
     Parameters
     ----------
-    departures : (profile, crossing, 2) float64
+    departures : (profile, passage, 2) float64
         Of `measure_curvature`.
-    usable : (profile, crossing) uint8
+    usable : (profile, passage) uint8
 
     Returns
     -------
-    (crossing, 2) float64
-        0 where no profile sees the crossing.
+    (passage, 2) float64
+        0 where no profile sees the passage.
     """
     number = np.count_nonzero(usable, axis=0)
     if np.all(number == len(usable)):
@@ -132,11 +132,11 @@ def usual(departures: Array, usable: Codes) -> Array:
 
 @_compiled
 def _place_constant(
-    values: Array, integrals: Array, vertex: Indices, count: int, solution: Array
+    values: Array, integrals: Array, crossing: Indices, count: int, solution: Array
 ) -> float:
-    """Return the constant of a ray at the last vertex that is determined; NaN where none is."""
+    """Return the constant of a beam at the last crossing that is determined; NaN where none is."""
     for c in range(count - 1, -1, -1):
-        whole = math.exp(values[c] - solution[vertex[c]])
+        whole = math.exp(values[c] - solution[crossing[c]])
         if not whole < math.inf:
             continue
         beyond = 0.0
@@ -148,37 +148,37 @@ def _place_constant(
 
 @_compiled
 def _settle(
-    columns: Array, vertex: Indices, count: int, solution: Array, information: float
+    columns: Array, crossing: Indices, count: int, solution: Array, information: float
 ) -> float:
-    """Return by how much the constant of a ray moves to fit a solution best."""
+    """Return by how much the constant of a beam moves to fit a solution best."""
     step = 0.0
     for c in range(count):
-        gap = columns[c, 0] - solution[vertex[c]]
-        # A vertex that nothing determines has no part in it.
+        gap = columns[c, 0] - solution[crossing[c]]
+        # A crossing that nothing determines has no part in it.
         if abs(gap) < math.inf:
             step += columns[c, 2] * gap
     return min(max(step / information, -_joint_solution.LONGEST_STEP), _joint_solution.LONGEST_STEP)
 
 
 @_compiled
-def _carry_ray(
+def _carry_beam(
     columns: Array,
     inverse: Array,
     information: float,
-    vertex: Indices,
+    crossing: Indices,
     whole: Array,
     shared: Array,
     own: Array,
     out: Array,
 ) -> None:
-    """Add what the errors of a ray's values move the solution by, and the variance of that."""
-    count = vertex.size
+    """Add what the errors of a beam's values move the solution by, and the variance of that."""
+    count = crossing.size
     for k in range(count):
         for v in range(out.shape[0]):
             total = 0.0
             for i in range(count):
                 entry = inverse[i, k] - columns[i, 2] * columns[k, 2] / information
-                total += whole[v, vertex[i]] * entry
+                total += whole[v, crossing[i]] * entry
             out[v, 0] += total * shared[k, 0]
             out[v, 1] += total * total * shared[k, 1]
             out[v, 2] += total * own[k, 0]
@@ -199,13 +199,13 @@ def carry_errors(
     own: Array,
     out: Array,
 ) -> None:
-    """Carry errors of the values at crossings over to the solution, to first order.
+    """Carry errors of the values at passages over to the solution, to first order.
 
-    Errors e of the log values of a ray move the solution by C A' M e, summed over the rays: A
-    picks the vertices of the ray, M = S - S j j' S / (j' S j) is what it tells of them whatever
+    Errors e of the log values of a beam move the solution by C A' M e, summed over the beams: A
+    picks the crossings of the beam, M = S - S j j' S / (j' S j) is what it tells of them whatever
     its constant, with S the inverse covariance of y = u - ln w and j the derivative of ln w by
     the constant, and C is the inverse of all information, (sum A' M A + P)^-1 with P the prior's.
-    What an error at the first crossing changes by scaling the whole ray goes into the constant.
+    What an error at the first passage changes by scaling the whole beam goes into the constant.
 
     Parameters
     ----------
@@ -213,50 +213,50 @@ def carry_errors(
         As `lidarops.retrieve.network._condensed_signals.condense` gives them.
     geometry, precision, flat
         As of `solve_profiles`.
-    logarithms : (profile, vertex) float64
+    logarithms : (profile, crossing) float64
         The solution; NaN where undetermined.
-    shared, own : (crossing, 2) and (profile, crossing, 2) float64
+    shared, own : (passage, 2) and (profile, passage, 2) float64
         Errors of the log values that profiles share, and those of each; with their variances.
-        Crossings are independent.
-    out : (profile, vertex, 4) float64
+        Passages are independent.
+    out : (profile, crossing, 4) float64
         0; gets what the shared ones and what the own ones move the solution by, each followed by
         its variance.
     """
-    rays, vertices = geometry[0].size - 1, logarithms.shape[1]
-    work = _joint_solution.workspace(geometry[0], rays)
-    constants = np.zeros(rays)
-    matrix, side = np.empty((vertices, vertices)), np.empty(vertices)
-    whole = np.empty((vertices, vertices))
-    counts = np.zeros(rays, dtype=np.intp)
+    beams, crossings = geometry[0].size - 1, logarithms.shape[1]
+    work = _joint_solution.workspace(geometry[0], beams)
+    constants = np.zeros(beams)
+    matrix, side = np.empty((crossings, crossings)), np.empty(crossings)
+    whole = np.empty((crossings, crossings))
+    counts = np.zeros(beams, dtype=np.intp)
     for n in range(values.shape[0]):
         data = (values[n], integrals[n], covariance[n])
         _joint_solution.add_observations(usable[n], geometry[0], counts)
         for turn in range(2):
-            for ray in range(rays):
-                if counts[ray] == 0:
+            for beam in range(beams):
+                if counts[beam] == 0:
                     continue
-                first, last = geometry[0][ray], geometry[0][ray] + counts[ray]
+                first, last = geometry[0][beam], geometry[0][beam] + counts[beam]
                 mine = geometry[2][first:last]
                 if turn == 0:
-                    constants[ray] = _place_constant(
-                        values[n, first:last], integrals[n, first:last], mine, counts[ray],
+                    constants[beam] = _place_constant(
+                        values[n, first:last], integrals[n, first:last], mine, counts[beam],
                         logarithms[n],
                     )  # fmt: skip
                 else:
-                    constants[ray] += _settle(
-                        work[3][ray], mine, counts[ray], logarithms[n], work[4][ray]
+                    constants[beam] += _settle(
+                        work[3][beam], mine, counts[beam], logarithms[n], work[4][beam]
                     )
-            # Rays that are not determined drop out here.
+            # Beams that are not determined drop out here.
             _joint_solution.assemble(data, geometry, counts, constants, work, matrix, side)
         _joint_solution.add_prior(matrix, side, 0.0, precision, flat)
-        if not _joint_solution.factorise(matrix, vertices):
+        if not _joint_solution.factorise(matrix, crossings):
             continue
-        _joint_solution.invert_system(matrix, vertices, whole)
-        for ray in range(rays):
-            first, last = geometry[0][ray], geometry[0][ray] + counts[ray]
-            if counts[ray] > 0:
-                _carry_ray(
-                    work[3][ray], work[1][ray], work[4][ray], geometry[2][first:last], whole,
+        _joint_solution.invert_system(matrix, crossings, whole)
+        for beam in range(beams):
+            first, last = geometry[0][beam], geometry[0][beam] + counts[beam]
+            if counts[beam] > 0:
+                _carry_beam(
+                    work[3][beam], work[1][beam], work[4][beam], geometry[2][first:last], whole,
                     shared[first:last], own[n, first:last], out[n],
                 )  # fmt: skip
 
@@ -269,12 +269,12 @@ def variance(moved: Array) -> Array:
 
     Parameters
     ----------
-    moved : (profile, vertex, 4) float64
+    moved : (profile, crossing, 4) float64
         Of `carry_errors`, of the profiles of one block.
 
     Returns
     -------
-    (profile, vertex) float64
+    (profile, crossing) float64
     """
     # What overflows has a variance by noise that leaves nothing else to say.
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,7 +1,7 @@
-"""Compiled closed form of a cycle of rays: its start vertex, variance and sensitivities.
+"""Compiled closed form of a cycle of beams: its start crossing, variance and sensitivities.
 
-Row j of a cycle joins the vertices j and j + 1 by one ray, and the last row returns to the
-first vertex: near_j s_j - far_j s_(j+1) = integral_j, where s is the reciprocal of extinction.
+Row j of a cycle joins the crossings j and j + 1 by one beam, and the last row returns to the
+first crossing: near_j s_j - far_j s_(j+1) = integral_j, where s is the reciprocal of extinction.
 With c = integral / near and q = far / near, substitution around the cycle gives s_1.
 """
 
@@ -81,19 +81,19 @@ def solve_with_variance(
     variance: Array,
     poles: Codes,
 ) -> None:
-    """Solve cycles for their start vertex, with the variance of independent relative errors.
+    """Solve cycles for their start crossing, with the variance of independent relative errors.
 
     Parameters
     ----------
     starts, ends, integrals : (cycle, row) float64
-        Signal at the first and the second vertex of each row, and twice the exponent times the
+        Signal at the first and the second crossing of each row, and twice the exponent times the
         integral between them, counted negative where the row runs towards its lidar.
     variances : (cycle or 1, row, 3) float64
         Relative variances of the three.
     multipliers : (cycle or 1,) float64
         0 to 1; row j is multiplied by its power j - 1. 1 is the exact solution.
     unbiased : bool
-        Whether what the multipliers leave over is put to the start vertex.
+        Whether what the multipliers leave over is put to the start crossing.
     solution, variance : (cycle,) float64
         Get s_1 in the unit of integrals / starts, NaN at a pole, and its variance.
     poles : (cycle,) uint8
@@ -155,7 +155,7 @@ def solve_with_sensitivities(
 def substitute_cycle(
     starts: Array, ends: Array, integrals: Array, first: Array, solutions: Array
 ) -> None:
-    """Fill (cycle, row) solutions at all vertices from that at the first, backwards."""
+    """Fill (cycle, row) solutions at all crossings from that at the first, backwards."""
     k = starts.shape[1]
     for n in range(starts.shape[0]):
         solutions[n, 0] = first[n]

@@ -1,11 +1,11 @@
 """What a network is told of a field before it looks: an empirical prior.
 
-Along a ray, a gradient of extinction looks like attenuation, and what tells them apart is weak.
+Along a beam, a gradient of extinction looks like attenuation, and what tells them apart is weak.
 So a gradient over the network is held to tens of percent beforehand: that much must be said, for
-no likelihood tells it. What else a vertex deviates by, the rays that cross there see: its size is
+no likelihood tells it. What else a crossing deviates by, the beams that cross there see: its size is
 the one that makes all profiles of a block likeliest, and no less than their mean wants. Nothing
 is said of the level of a profile. As a single field is no sample of many, errors are stated for
-one that deviates by twice as much (`lidarops.retrieve.network._joint_solution`). Where rays are too few to
+one that deviates by twice as much (`lidarops.retrieve.network._joint_solution`). Where beams are too few to
 test the prior, the widest one that is tried is taken.
 """
 
@@ -30,10 +30,10 @@ Booleans = npt.NDArray[np.bool_]
 Codes = npt.NDArray[np.uint8]
 
 GRADIENT: Final = 0.15
-"""Standard deviation of ln extinction over the vertices that a gradient makes beforehand: 0.1 to
+"""Standard deviation of ln extinction over the crossings that a gradient makes beforehand: 0.1 to
 0.2 hold 99 percent of values within 3 standard errors in gradients, plumes and tilting fields."""
 DEVIATIONS: Final = tuple(float(s) for s in np.geomspace(0.01, 1.0, 9))
-"""Standard deviations of ln extinction of single vertices that are tried."""
+"""Standard deviations of ln extinction of single crossings that are tried."""
 _NOT_MUCH_LESS: Final = 4.0
 """Of -2 ln likelihood: two standard errors."""
 _STRENGTHS: Final = (1.0, 2.0, 4.0)
@@ -43,12 +43,12 @@ _CONTRADICTION: Final = 3.5
 _HARMLESS: Final = 0.5
 """Of the standard error that is reported."""
 _ENOUGH: Final = 8
-"""Profiles that must see a ray for their mean to be asked."""
+"""Profiles that must see a beam for their mean to be asked."""
 _TOLD_BY_MEAN: Final = 0.3
 _TELLING: Final = 0.75
 """Share of the profiles, beyond which at least one has to test the prior."""
 _UNTOLD: Final = 1.0
-"""Standard error of ln extinction in the mean, from which on equations do not tell a vertex."""
+"""Standard error of ln extinction in the mean, from which on equations do not tell a crossing."""
 _APART: Final = 2.5
 """Standard errors, of both, between the mean of solutions and the solution of the mean."""
 _UNLIKELY: Final = 1e-2
@@ -61,22 +61,22 @@ _LAST_PASSES: Final = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorSolution:
-    """Logarithms of extinction at the measured vertices."""
+    """Logarithms of extinction at the measured crossings."""
 
     logarithm: Array
-    """(profile, vertex) of extinction in m-1."""
+    """(profile, crossing) of extinction in m-1."""
     variance: Array
-    """(profile, vertex), with doubt in the prior."""
+    """(profile, crossing), with doubt in the prior."""
     believed: Array
-    """(profile, vertex) variance where the prior is true."""
+    """(profile, crossing) variance where the prior is true."""
     missed: Array
-    """(profile, vertex) variance by fields that the prior rules out, where nothing else does."""
+    """(profile, crossing) variance by fields that the prior rules out, where nothing else does."""
     chi_square: Array
-    """(profile,) of the rays alone, whatever the prior."""
+    """(profile,) of the beams alone, whatever the prior."""
     degrees_of_freedom: Array
     """(profile,) of that."""
     prior_chi_square: Array
-    """(profile,) of rays and prior together."""
+    """(profile,) of beams and prior together."""
     prior_degrees_of_freedom: Array
     """(profile,) of that."""
     deviation: Array
@@ -86,27 +86,27 @@ class PriorSolution:
     status: Codes
     """(profile,) of `lidarops.retrieve.network._joint_solution`."""
     left_out: Codes
-    """(profile, ray) 1 where a ray was, because its covariance is singular or none."""
+    """(profile, beam) 1 where a beam was, because its covariance is singular or none."""
     doubtful: Booleans
-    """(profile,) True where rays tell that the field is not as the prior has it, and not how."""
+    """(profile,) True where beams tell that the field is not as the prior has it, and not how."""
 
 
 class _Problem:
-    """Condensed profiles, and the constants of rays at which a solution starts."""
+    """Condensed profiles, and the constants of beams at which a solution starts."""
 
     def __init__(
-        self, data: Condensed, layout: Layout, vertex: Indices, exponent: Array, position: Array
+        self, data: Condensed, layout: Layout, crossing: Indices, exponent: Array, position: Array
     ) -> None:
         self.data = data
-        self.vertices = position.shape[0]
+        self.crossings = position.shape[0]
         self.gradient = _gradient(position)
         self.bends = _block_errors.bends(position)
-        self.geometry = (layout.first_crossing, layout.offset, vertex)
+        self.geometry = (layout.first_passage, layout.offset, crossing)
         self.constants = np.zeros((data.log_value.shape[0], exponent.size))
         self.likelihood = 0.0
         _joint_solution.start_constants(
             data.integral, data.usable, data.slope, lengths(layout), exponent,
-            layout.first_crossing, self.constants,
+            layout.first_passage, self.constants,
         )  # fmt: skip
         self.start = self.constants.copy()
 
@@ -117,7 +117,7 @@ class _Problem:
 
     def solve(self, deviation: float, passes: int, strength: float = 1.0) -> PriorSolution:
         """Solve all profiles; move the constants."""
-        shape = (self.constants.shape[0], self.vertices)
+        shape = (self.constants.shape[0], self.crossings)
         logarithm, variance = np.full(shape, np.nan), np.full(shape, np.nan)
         believed, missed = np.full(shape, np.nan), np.full(shape, np.nan)
         summary, status = (
@@ -144,25 +144,25 @@ class _Problem:
 
 
 def lengths(layout: Layout) -> Array:
-    """Return the distance in m from each crossing to the next on its ray, 0 for the last."""
-    out = np.zeros(layout.crossings.range.size)
-    same = layout.crossings.ray[:-1] == layout.crossings.ray[1:]
-    out[:-1][same] = np.diff(layout.crossings.range)[same]
+    """Return the distance in m from each passage to the next on its beam, 0 for the last."""
+    out = np.zeros(layout.passages.range.size)
+    same = layout.passages.beam[:-1] == layout.passages.beam[1:]
+    out[:-1][same] = np.diff(layout.passages.range)[same]
     return out
 
 
 def solve_without_prior(
-    data: Condensed, layout: Layout, vertex: Indices, exponent: Array, position: Array
+    data: Condensed, layout: Layout, crossing: Indices, exponent: Array, position: Array
 ) -> PriorSolution:
     """Solve each profile for itself; arguments as of `solve_blocks`."""
-    problem = _Problem(data, layout, vertex, exponent, position)
+    problem = _Problem(data, layout, crossing, exponent, position)
     return problem.solve(np.inf, 2 * _FIRST_PASSES)
 
 
 def solve_blocks(
     data: Condensed,
     layout: Layout,
-    vertex: Indices,
+    crossing: Indices,
     exponent: Array,
     position: Array,
     block: Indices,
@@ -173,11 +173,11 @@ def solve_blocks(
     ----------
     data : Condensed
     layout : Layout
-    vertex : (crossing,) intp
-        Numbers of the measured vertices.
-    exponent : (ray,) float64
-    position : (vertex, 3) float64
-        m, of the measured vertices.
+    crossing : (passage,) intp
+        Numbers of the measured crossings.
+    exponent : (beam,) float64
+    position : (crossing, 3) float64
+        m, of the measured crossings.
     block : (profile,) intp
     """
     shape = (block.size, position.shape[0])
@@ -196,8 +196,8 @@ def solve_blocks(
         mine = np.flatnonzero(block == b)
         told = data.take(mine)
         part = _solve_block(
-            _Problem(told, layout, vertex, exponent, position),
-            partial(_mean_problem, told, layout, vertex, exponent, position),
+            _Problem(told, layout, crossing, exponent, position),
+            partial(_mean_problem, told, layout, crossing, exponent, position),
         )
         for field in fields(PriorSolution):
             getattr(out, field.name)[mine] = getattr(part, field.name)
@@ -205,27 +205,27 @@ def solve_blocks(
 
 
 def _mean_problem(
-    data: Condensed, layout: Layout, vertex: Indices, exponent: Array, position: Array
+    data: Condensed, layout: Layout, crossing: Indices, exponent: Array, position: Array
 ) -> _Problem | None:
     """Return the mean of profiles as a problem; None where too few see the same."""
     pooled = _pooled(data, layout)
-    return None if pooled is None else _Problem(pooled, layout, vertex, exponent, position)
+    return None if pooled is None else _Problem(pooled, layout, crossing, exponent, position)
 
 
 def _pooled(data: Condensed, layout: Layout) -> Condensed | None:
-    """Return the mean of profiles as one; None where too few see any ray.
+    """Return the mean of profiles as one; None where too few see any beam.
 
-    Ray by ray, up to the crossing with which most values go into it, as hardly a profile may see
-    all rays. Of values and integrals relative to each ray's first value: the energy of a laser
+    Beam by beam, up to the passage with which most values go into it, as hardly a profile may see
+    all beams. Of values and integrals relative to each beam's first value: the energy of a laser
     changes from profile to profile.
     """
     usable = np.zeros((1, data.usable.shape[1]), dtype=np.uint8)
     log_value, integral = np.full(usable.shape, np.nan), np.zeros(usable.shape)
     covariance = np.zeros((1, data.covariance.shape[1]))
     slope = np.full((*usable.shape, 4), np.nan)
-    for ray in range(layout.first_crossing.size - 1):
-        mine = slice(layout.first_crossing[ray], layout.first_crossing[ray + 1])
-        packed = slice(layout.offset[ray], layout.offset[ray + 1])
+    for beam in range(layout.first_passage.size - 1):
+        mine = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
+        packed = slice(layout.offset[beam], layout.offset[beam + 1])
         reach = np.logical_and.accumulate(data.usable[:, mine] == 1, axis=1).sum(axis=1)
         depth = _depth(reach)
         if depth == 0:
@@ -248,21 +248,21 @@ def _pooled(data: Condensed, layout: Layout) -> Condensed | None:
     )
 
 
-def _quiet(covariance: Array, crossings: int, depth: int) -> Booleans:
-    """Return (profile,) where a ray is not far louder than in most profiles.
+def _quiet(covariance: Array, passages: int, depth: int) -> Booleans:
+    """Return (profile,) where a beam is not far louder than in most profiles.
 
-    A single gate of huge or unknown variance in one profile would take a ray from the mean of
+    A single bin of huge or unknown variance in one profile would take a beam from the mean of
     all, which then speaks against no prior.
 
     Parameters
     ----------
     covariance : (profile, packed) float64
-        Of a ray: of its log values and then its integrals, both up to a depth.
-    crossings, depth : int
-        Of the ray, and those in the mean.
+        Of a beam: of its log values and then its integrals, both up to a depth.
+    passages, depth : int
+        Of the beam, and those in the mean.
     """
-    quantities = 2 * crossings - 1
-    mine = np.r_[:depth, crossings : crossings + depth - 1]
+    quantities = 2 * passages - 1
+    mine = np.r_[:depth, passages : passages + depth - 1]
     variances = covariance[:, mine * (quantities + 1)]
     known = np.isfinite(variances)
     usual = np.median(np.where(known, variances, np.inf), axis=0)
@@ -270,24 +270,24 @@ def _quiet(covariance: Array, crossings: int, depth: int) -> Booleans:
 
 
 def _depth(reach: Indices) -> int:
-    """Return how many crossings of a ray the mean of profiles takes; 0 where too few see two.
+    """Return how many passages of a beam the mean of profiles takes; 0 where too few see two.
 
     Parameters
     ----------
     reach : (profile,) intp
-        Crossings of the ray that each profile sees.
+        Passages of the beam that each profile sees.
     """
     best, most = 0, 0
     for depth in range(2, int(reach.max(initial=0)) + 1):
         number = int(np.sum(reach >= depth))
-        # Of the first crossing, all values are zero.
+        # Of the first passage, all values are zero.
         if number >= _ENOUGH and (depth - 1) * number > most:
             best, most = depth, (depth - 1) * number
     return best
 
 
 def _solve_block(problem: _Problem, pool: Callable[[], _Problem | None]) -> PriorSolution:
-    """Solve with the strongest prior that the rays do not contradict, each and on average."""
+    """Solve with the strongest prior that the beams do not contradict, each and on average."""
     alone = problem.afresh(np.inf)
     # What profiles tell well by themselves, their mean need not tell.
     with np.errstate(invalid="ignore"):
@@ -327,16 +327,16 @@ def _with_mean(
 
 
 def _tests(problem: _Problem, alone: PriorSolution, whole: PriorSolution | None) -> bool:
-    """Return whether the rays tell enough to test a prior.
+    """Return whether the beams tell enough to test a prior.
 
-    Where they are fewer equations than unknowns, or as many that do not tell all vertices, the
+    Where they are fewer equations than unknowns, or as many that do not tell all crossings, the
     prior decides what is left, and none of its tests asks for that: a steep field passes for
     large deviations about a slight gradient.
     """
     known = alone.status != _joint_solution.UNDETERMINED
     freedom = 0.0
     if known.any():
-        # Of some profiles: they see the field of those that lost a ray.
+        # Of some profiles: they see the field of those that lost a beam.
         told_by = alone.degrees_of_freedom[known]
         freedom = float(np.quantile(told_by, _TELLING, method="higher"))
     if whole is None:
@@ -367,7 +367,7 @@ def _unlikely(told: PriorSolution) -> bool:
     """Return whether the mean of profiles does not fit the prior that each of them fits.
 
     Noise hides in each profile what a prior has wrong; in their mean there is less of it. Asked
-    in values along rays, where `_apart` asks in extinction, of which thin air tells nothing.
+    in values along beams, where `_apart` asks in extinction, of which thin air tells nothing.
     """
     if told.status[0] != _joint_solution.SOLVED:
         return True
@@ -426,10 +426,10 @@ def _costs(problem: _Problem, strength: float) -> tuple[Array, list[Array]]:
 
 
 def _contradicted(result: PriorSolution, alone: PriorSolution) -> bool:
-    """Return whether solutions without the prior differ from it at a vertex, on average.
+    """Return whether solutions without the prior differ from it at a crossing, on average.
 
     Of two solutions of which one is told more, the variance of the difference is the difference
-    of the variances (`hausman1978`). Only vertices that the rays tell well can contradict, and
+    of the variances (`hausman1978`). Only crossings that the beams tell well can contradict, and
     only by more than their variance: the solution without prior is biased by that much. A
     difference of less than half of the standard error that is reported does no harm.
     """
@@ -446,7 +446,7 @@ def _contradicted(result: PriorSolution, alone: PriorSolution) -> bool:
 
 
 def _apart(result: PriorSolution, whole: PriorSolution) -> bool:
-    """Return whether solutions are, on average, off that of their mean at a vertex.
+    """Return whether solutions are, on average, off that of their mean at a crossing.
 
     Noise that lets a prior decide each profile is less in the mean. What a prior has wrong, all
     profiles share.
@@ -470,7 +470,7 @@ def _gradient(position: Array) -> Array:
     centred = position - position.mean(axis=0)
     covariance = np.sum(centred[:, np.newaxis, :] * centred[np.newaxis, :, :], axis=2)
     size = float(np.trace(covariance))
-    # One vertex has no gradient.
+    # One crossing has no gradient.
     return np.asarray(covariance * (len(position) / size if size > 0 else 0.0))
 
 

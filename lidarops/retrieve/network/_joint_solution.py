@@ -1,11 +1,11 @@
-"""Compiled solution of networks of rays: all vertices of a profile at once.
+"""Compiled solution of networks of beams: all crossings of a profile at once.
 
-Along a ray, a_p / extinction_p + 2 m (integral from the first vertex to p) is a constant. The
-network chooses one constant per ray so that the rays agree in the vertices that they share. The
+Along a beam, a_p / extinction_p + 2 m (integral from the first crossing to p) is a constant. The
+network chooses one constant per beam so that the beams agree in the crossings that they share. The
 equations are taken in logarithms, where the noise of the values is additive: written as rows that
 are linear in 1 / extinction, the noise multiplies the unknowns, and long chains of rows are biased
-by it. Each pass linearises the constants, weighs with the full covariance of a ray, eliminates
-its constant and solves for the vertices by Cholesky's method.
+by it. Each pass linearises the constants, weighs with the full covariance of a beam, eliminates
+its constant and solves for the crossings by Cholesky's method.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -24,18 +24,18 @@ Codes = npt.NDArray[np.uint8]
 
 SOLVED: Final = 0
 UNDETERMINED: Final = 1
-"""No vertices, or a singular system."""
+"""No crossings, or a singular system."""
 UNSETTLED: Final = 2
 """The last pass still moved the solution."""
 
 LIKELIHOOD: Final = 4
 COLUMNS: Final = 5
-"""Of a summary: chi-square and degrees of freedom of the rays alone, and of rays and prior; -2 ln
+"""Of a summary: chi-square and degrees of freedom of the beams alone, and of beams and prior; -2 ln
 of the marginal likelihood, but a constant."""
 
 LONGEST_STEP: Final = 1.5
 _THINNEST: Final = 1e-3
-"""Optical depth of the thinnest ray that a start is made from."""
+"""Optical depth of the thinnest beam that a start is made from."""
 _SETTLED: Final = 1e-3
 _TINIEST_PIVOT: Final = 1e-13
 _NEARLY_NONE: Final = 1e-2
@@ -124,7 +124,7 @@ def _invert(matrix: Array, size: int, inverse: Array) -> float:
 
 
 @_compiled
-def _ray(
+def _beam(
     values: Array,
     integrals: Array,
     packed: Array,
@@ -134,7 +134,7 @@ def _ray(
     work: tuple[Array, Array, Array],
     columns: Array,
 ) -> tuple[float, float]:
-    """Linearise a ray; return the information on its constant, and the log determinant.
+    """Linearise a beam; return the information on its constant, and the log determinant.
 
     Columns: y = u - ln w, the derivative j of ln w by the constant, and P j.
     """
@@ -176,21 +176,21 @@ def start_constants(
     slopes: Array,
     lengths: Array,
     exponent: Array,
-    first_crossing: Indices,
+    first_passage: Indices,
     constants: Array,
 ) -> None:
-    """Fill (profile, ray) constants as if the air were homogeneous.
+    """Fill (profile, beam) constants as if the air were homogeneous.
 
     Parameters
     ----------
     integrals, usable, slopes
         As `lidarops.retrieve.network._condensed_signals.condense` gives them.
-    lengths : (crossing,) float64
-        m, from a crossing to the next on its ray.
-    exponent : (ray,) float64
-    first_crossing : (ray + 1,) intp
-    constants : (profile, ray) float64
-        Logarithms of the signal at the last crossing over extinction there.
+    lengths : (passage,) float64
+        m, from a passage to the next on its beam.
+    exponent : (beam,) float64
+    first_passage : (beam + 1,) intp
+    constants : (profile, beam) float64
+        Logarithms of the signal at the last passage over extinction there.
     """
     for n in range(integrals.shape[0]):
         top = bottom = 0.0
@@ -199,16 +199,16 @@ def start_constants(
                 top += slopes[n, c, 0] / slopes[n, c, 1]
                 bottom += 1.0 / slopes[n, c, 1]
         extinction = top / bottom if bottom > 0.0 else 0.0
-        for ray in range(exponent.size):
-            first, last = first_crossing[ray], first_crossing[ray + 1]
+        for beam in range(exponent.size):
+            first, last = first_passage[beam], first_passage[beam + 1]
             count = _count(usable[n], first, last)
             length = 0.0
             for c in range(first, first + count - 1):
                 length += lengths[c]
-            constants[n, ray] = 0.0
+            constants[n, beam] = 0.0
             if count >= 2:
-                constants[n, ray] = _start(
-                    integrals[n, first:last], exponent[ray], count, extinction, length
+                constants[n, beam] = _start(
+                    integrals[n, first:last], exponent[beam], count, extinction, length
                 )
 
 
@@ -224,15 +224,20 @@ def _count(usable: Codes, first: int, last: int) -> int:
 
 @_compiled
 def _enter(
-    columns: Array, inverse: Array, information: float, vertex: Indices, matrix: Array, side: Array
+    columns: Array,
+    inverse: Array,
+    information: float,
+    crossing: Indices,
+    matrix: Array,
+    side: Array,
 ) -> float:
-    """Add a ray, its constant eliminated, to the normal equations; return y' M y."""
-    count, square = vertex.size, 0.0
+    """Add a beam, its constant eliminated, to the normal equations; return y' M y."""
+    count, square = crossing.size, 0.0
     for i in range(count):
         for k in range(count):
             entry = inverse[i, k] - columns[i, 2] * columns[k, 2] / information
-            matrix[vertex[i], vertex[k]] += entry
-            side[vertex[i]] += entry * columns[k, 0]
+            matrix[crossing[i], crossing[k]] += entry
+            side[crossing[i]] += entry * columns[k, 0]
             square += columns[i, 0] * entry * columns[k, 0]
     return square
 
@@ -263,30 +268,30 @@ def invert_system(factor: Array, size: int, out: Array) -> None:
 
 
 @_compiled
-def add_observations(usable: Codes, first_crossing: Indices, counts: Indices) -> None:
-    """Fill the crossings of each ray; 0 where there is one only."""
-    for ray in range(counts.size):
-        count = _count(usable, first_crossing[ray], first_crossing[ray + 1])
-        counts[ray] = count if count >= 2 else 0
+def add_observations(usable: Codes, first_passage: Indices, counts: Indices) -> None:
+    """Fill the passages of each beam; 0 where there is one only."""
+    for beam in range(counts.size):
+        count = _count(usable, first_passage[beam], first_passage[beam + 1])
+        counts[beam] = count if count >= 2 else 0
 
 
 @_compiled
 def _tally(
-    first_crossing: Indices, vertex: Indices, counts: Indices, seen: Codes
+    first_passage: Indices, crossing: Indices, counts: Indices, seen: Codes
 ) -> tuple[int, int, int]:
-    """Fill the vertices seen; return rays, crossings, vertices."""
-    used = observations = vertices = 0
+    """Fill the crossings seen; return beams, passages, crossings."""
+    used = observations = crossings = 0
     for v in range(seen.size):
         seen[v] = 0
-    for ray in range(counts.size):
-        if counts[ray] == 0:
+    for beam in range(counts.size):
+        if counts[beam] == 0:
             continue
         used += 1
-        observations += counts[ray]
-        for c in range(first_crossing[ray], first_crossing[ray] + counts[ray]):
-            vertices += 1 - seen[vertex[c]]
-            seen[vertex[c]] = 1
-    return used, observations, vertices
+        observations += counts[beam]
+        for c in range(first_passage[beam], first_passage[beam] + counts[beam]):
+            crossings += 1 - seen[crossing[c]]
+            seen[crossing[c]] = 1
+    return used, observations, crossings
 
 
 @_compiled
@@ -299,43 +304,43 @@ def assemble(
     matrix: Array,
     side: Array,
 ) -> tuple[float, float, float]:
-    """Fill the normal equations of all rays; return square, log determinants and mean level.
+    """Fill the normal equations of all beams; return square, log determinants and mean level.
 
-    A ray of singular covariance is left out: its count gets zero.
+    A beam of singular covariance is left out: its count gets zero.
     """
     values, integrals, covariance = data
-    first_crossing, offset, vertex = geometry
+    first_passage, offset, crossing = geometry
     scratch, inverses, weights, columns, information = work
     for v in range(side.size):
         side[v] = 0.0
         for w in range(side.size):
             matrix[v, w] = 0.0
     square = logarithms = level = 0.0
-    crossings = 0
-    for ray in range(counts.size):
-        if counts[ray] == 0:
+    passages = 0
+    for beam in range(counts.size):
+        if counts[beam] == 0:
             continue
-        first = first_crossing[ray]
-        last = first + counts[ray]
-        quantities = 2 * (first_crossing[ray + 1] - first) - 1
-        information[ray], logarithm = _ray(
+        first = first_passage[beam]
+        last = first + counts[beam]
+        quantities = 2 * (first_passage[beam + 1] - first) - 1
+        information[beam], logarithm = _beam(
             values[first:last], integrals[first:last],
-            covariance[offset[ray] : offset[ray + 1]], quantities, counts[ray],
-            constants[ray], (scratch, inverses[ray], weights), columns[ray],
+            covariance[offset[beam] : offset[beam + 1]], quantities, counts[beam],
+            constants[beam], (scratch, inverses[beam], weights), columns[beam],
         )  # fmt: skip
-        for c in range(counts[ray]):
-            logarithm += 0.0 * columns[ray, c, 0]
-        if not (math.isfinite(logarithm) and 0.0 < information[ray] < math.inf):
-            counts[ray] = 0
+        for c in range(counts[beam]):
+            logarithm += 0.0 * columns[beam, c, 0]
+        if not (math.isfinite(logarithm) and 0.0 < information[beam] < math.inf):
+            counts[beam] = 0
             continue
         square += _enter(
-            columns[ray], inverses[ray], information[ray], vertex[first:last], matrix, side
+            columns[beam], inverses[beam], information[beam], crossing[first:last], matrix, side
         )
-        logarithms += logarithm + math.log(information[ray])
-        for c in range(counts[ray]):
-            level += columns[ray, c, 0]
-            crossings += 1
-    return square, logarithms, level / max(crossings, 1)
+        logarithms += logarithm + math.log(information[beam])
+        for c in range(counts[beam]):
+            level += columns[beam, c, 0]
+            passages += 1
+    return square, logarithms, level / max(passages, 1)
 
 
 @_compiled
@@ -347,30 +352,30 @@ def _move(
     solution: Array,
     constants: Array,
 ) -> float:
-    """Move the constants of the rays; return by how much the farthest logarithm follows."""
-    first_crossing, _, vertex = geometry
+    """Move the constants of the beams; return by how much the farthest logarithm follows."""
+    first_passage, _, crossing = geometry
     moved = 0.0
-    for ray in range(counts.size):
-        if counts[ray] == 0:
+    for beam in range(counts.size):
+        if counts[beam] == 0:
             continue
         step = 0.0
-        for c in range(counts[ray]):
-            gap = columns[ray, c, 0] - solution[vertex[first_crossing[ray] + c]]
-            step += columns[ray, c, 2] * gap
-        step = min(max(step / information[ray], -LONGEST_STEP), LONGEST_STEP)
-        constants[ray] += step
-        moved = max(moved, abs(step) * columns[ray, 0, 1])
+        for c in range(counts[beam]):
+            gap = columns[beam, c, 0] - solution[crossing[first_passage[beam] + c]]
+            step += columns[beam, c, 2] * gap
+        step = min(max(step / information[beam], -LONGEST_STEP), LONGEST_STEP)
+        constants[beam] += step
+        moved = max(moved, abs(step) * columns[beam, 0, 1])
     return moved
 
 
 @_compiled
-def workspace(first_crossing: Indices, rays: int) -> tuple[Array, Array, Array, Array, Array]:
+def workspace(first_passage: Indices, beams: int) -> tuple[Array, Array, Array, Array, Array]:
     most = 1
-    for ray in range(rays):
-        most = max(most, first_crossing[ray + 1] - first_crossing[ray])
+    for beam in range(beams):
+        most = max(most, first_passage[beam + 1] - first_passage[beam])
     return (
-        np.empty((most, most)), np.empty((rays, most, most)), np.empty(most),
-        np.empty((rays, most, 3)), np.empty(rays),
+        np.empty((most, most)), np.empty((beams, most, most)), np.empty(most),
+        np.empty((beams, most, 3)), np.empty(beams),
     )  # fmt: skip
 
 
@@ -395,40 +400,44 @@ def solve_joint(
     status: Codes,
     left_out: Codes,
 ) -> None:
-    """Solve profiles for the logarithms of extinction at all vertices.
+    """Solve profiles for the logarithms of extinction at all crossings.
 
     Parameters
     ----------
     values, integrals, usable, covariance
         As `lidarops.retrieve.network._condensed_signals.condense` gives them.
-    geometry : (ray + 1,), (ray + 1,) and (crossing,) intp
-        Where crossings and where covariances of a ray start; the vertex of each crossing.
-    precision : (vertex, vertex) float64
+    geometry : (beam + 1,), (beam + 1,) and (passage,) intp
+        Where passages and where covariances of a beam start; the crossing of each passage.
+    precision : (crossing, crossing) float64
         Prior precision of ln extinction, which leaves a common level free.
-    doubts : (field, vertex) float64
+    doubts : (field, crossing) float64
         Fields of ln extinction that the prior rules out, each of the size that it may have.
     norm : float
         -ln of its determinant.
     flat : bool
         Whether to leave the prior out.
     passes : int
-    constants : (profile, ray) float64
+    constants : (profile, beam) float64
         In: where to start; out: where the passes ended.
-    logarithms, variances, believed, missed : (profile, vertex) float64
+    logarithms, variances, believed, missed : (profile, crossing) float64
         Get ln(extinction / m-1), its variance where fields deviate by more than the prior has it
         (`DOUBT`), and where they do not, and what `doubts` add to it; NaN where undetermined, or
         unseen.
     summary : (profile, COLUMNS) float64
     status : (profile,) uint8
-    left_out : (profile, ray) uint8
-        Gets 1 where two crossings or more of a ray are usable, and their covariance is singular
+    left_out : (profile, beam) uint8
+        Gets 1 where two passages or more of a beam are usable, and their covariance is singular
         or not finite.
     """
-    rays, vertices = constants.shape[1], logarithms.shape[1]
-    work = workspace(geometry[0], rays)
-    inverse = np.empty((vertices, vertices))
-    matrix, side, target = np.empty((vertices, vertices)), np.empty(vertices), np.empty(vertices)
-    counts, seen = np.zeros(rays, dtype=np.intp), np.zeros(vertices, dtype=np.uint8)
+    beams, crossings = constants.shape[1], logarithms.shape[1]
+    work = workspace(geometry[0], beams)
+    inverse = np.empty((crossings, crossings))
+    matrix, side, target = (
+        np.empty((crossings, crossings)),
+        np.empty(crossings),
+        np.empty(crossings),
+    )
+    counts, seen = np.zeros(beams, dtype=np.intp), np.zeros(crossings, dtype=np.uint8)
     for n in range(values.shape[0]):
         add_observations(usable[n], geometry[0], counts)
         used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
@@ -438,30 +447,30 @@ def solve_joint(
             square, determinants, level = assemble(
                 data, geometry, counts, constants[n], work, matrix, side
             )
-            for v in range(vertices):
+            for v in range(crossings):
                 target[v] = side[v]
-                for w in range(vertices):
+                for w in range(crossings):
                     inverse[v, w] = matrix[v, w]
             add_prior(matrix, side, level, precision, flat)
             used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
             fine = used > 0 and math.isfinite(square + determinants)
-            fine = fine and factorise(matrix, vertices)
+            fine = fine and factorise(matrix, crossings)
             if not fine:
                 break
-            substitute_factorised(matrix, vertices, side)
+            substitute_factorised(matrix, crossings, side)
             moved = _move(geometry, counts, work[3], work[4], side, constants[n])
-        for ray in range(rays):
-            first = geometry[0][ray]
-            usual = _count(usable[n], first, geometry[0][ray + 1])
-            left_out[n, ray] = counts[ray] == 0 and usual >= 2
-        for v in range(vertices):
+        for beam in range(beams):
+            first = geometry[0][beam]
+            usual = _count(usable[n], first, geometry[0][beam + 1])
+            left_out[n, beam] = counts[beam] == 0 and usual >= 2
+        for v in range(crossings):
             determinants += 2.0 * math.log(matrix[v, v]) if fine else math.nan
         free = (observations - used - count, observations - used - (count if flat else 1))
         rough = _square_at(inverse, target, side, square) if flat and fine else math.nan
         summary[n, 0] = _least_square(inverse, target, seen, square, fine)
         summary[n, 2] = summary[n, 0] if flat or not fine else square - _dot(side, target)
         if flat and fine and math.isnan(summary[n, 0]):
-            # Rays that leave some vertices open, or whose constants have run away, may disagree.
+            # Beams that leave some crossings open, or whose constants have run away, may disagree.
             summary[n, 2], free = rough, (free[0], observations - used - 1)
         summary[n, 1], summary[n, 3] = free
         summary[n, 4] = summary[n, 2] + determinants + norm
@@ -482,7 +491,7 @@ def _dot(left: Array, right: Array) -> float:
 
 @_compiled
 def _square_at(matrix: Array, side: Array, solution: Array, square: float) -> float:
-    """Return chi-square of the rays alone at a solution, which need not be their least."""
+    """Return chi-square of the beams alone at a solution, which need not be their least."""
     total = square
     for v in range(side.size):
         here = 0.0
@@ -494,7 +503,7 @@ def _square_at(matrix: Array, side: Array, solution: Array, square: float) -> fl
 
 @_compiled
 def _least_square(matrix: Array, side: Array, seen: Codes, square: float, fine: bool) -> float:
-    """Return chi-square of the rays alone, at the constants that the prior has led to."""
+    """Return chi-square of the beams alone, at the constants that the prior has led to."""
     for v in range(side.size):
         matrix[v, v] += 1.0 - seen[v]
     if not (fine and factorise(matrix, side.size)):
@@ -518,7 +527,7 @@ def _hand_over(
     believed: Array,
     missed: Array,
 ) -> None:
-    """Fill the solution and its variances where vertices are seen, NaN elsewhere.
+    """Fill the solution and its variances where crossings are seen, NaN elsewhere.
 
     The inverse C of all information is the covariance of a field of which the prior P is true;
     C + (d^2 - 1) C P C that of one which deviates by d times as much. A field f that the prior

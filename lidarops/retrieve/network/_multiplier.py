@@ -16,11 +16,11 @@ GRID: Final = np.linspace(0.0, 1.0, 41)
 _PLAIN: Final = False
 """The estimate with a bias, not the one that is unbiased in a homogeneous field."""
 LOUDEST_CLOSED: Final = 0.05
-"""Relative noise of a gate up to which the closed form is within 1 percent of the optimum."""
+"""Relative noise of a bin up to which the closed form is within 1 percent of the optimum."""
 
 
 def relative_bias(depths: Array, multiplier: Array) -> Array:
-    """Return (true - estimate) / true of the reciprocal extinction at the start vertex.
+    """Return (true - estimate) / true of the reciprocal extinction at the start crossing.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def optimal(
         Of a model of the field, as in `relative_bias`. Taken from the same noisy profile, the
         bias would be as noisy as what it is to correct.
     scale : (cycle,) float64
-        Reciprocal extinction at the start vertex, of the model.
+        Reciprocal extinction at the start crossing, of the model.
     loud : (cycle,) bool
         Where the grid is taken.
     """

@@ -1,4 +1,4 @@
-"""Cycles of rays in closed form: exact, or with a multiplier that trades noise for bias."""
+"""Cycles of beams in closed form: exact, or with a multiplier that trades noise for bias."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class CycleResult:
     """Solutions of cycles, with the leading axes of the rows."""
 
     value: Array
-    """(...) reciprocal extinction at the start vertex, in the unit of integral / signal."""
+    """(...) reciprocal extinction at the start crossing, in the unit of integral / signal."""
     variance: Array
     """(...) of it; NaN where no variances are given."""
     sensitivities: Array
@@ -53,9 +53,9 @@ def solve_cycle(
     multiplier: npt.ArrayLike = 1.0,
     unbiased: bool = False,
 ) -> CycleResult:
-    r"""Solve cycles of rays in closed form, for any number k of rays.
+    r"""Solve cycles of beams in closed form, for any number k of beams.
 
-    Row j joins vertex j and j + 1, the last row returns to the first vertex:
+    Row j joins crossing j and j + 1, the last row returns to the first crossing:
     :math:`a_j S_j - a'_j S_{j+1} = b_j`. With c = b / a, q = a' / a, Q the product of the q, and
     the multipliers :math:`\mu_j = \lambda^{j-1}`,
 
@@ -68,7 +68,7 @@ def solve_cycle(
     Parameters
     ----------
     start, end : (..., row) float
-        Signals (power R^2 / overlap)^m at the first and at the second vertex of each row.
+        Signals (power R^2 / overlap)^m at the first and at the second crossing of each row.
     integral : (..., row) float
         2 m times the integral between them, m; negative where the row runs towards its lidar.
     relative_variance : (..., row, 3) float, optional
@@ -156,9 +156,9 @@ def values_and_variances(
 def substitute_back(
     start: npt.ArrayLike, end: npt.ArrayLike, integral: npt.ArrayLike, first: npt.ArrayLike
 ) -> Array:
-    """Return (..., row) reciprocal extinction at all vertices from that at the first.
+    """Return (..., row) reciprocal extinction at all crossings from that at the first.
 
-    From vertex to vertex backwards, the noise of rows that run towards their lidar is amplified;
+    From crossing to crossing backwards, the noise of rows that run towards their lidar is amplified;
     `solve_cycle` with the rows turned to start elsewhere tells by how much.
 
     Parameters
@@ -184,7 +184,7 @@ def systematic_error(optical_depth: npt.ArrayLike, multiplier: npt.ArrayLike) ->
         \frac{S_1 - \tilde S_1}{S_1} = \frac{\sum_{j<k} (\mu_j - \mu_{j+1})
         e^{-2 \sum_{l \le j} s_l m_l \tau_l}}{1 - \mu_k e^{-2 \sum_l s_l m_l \tau_l}}
 
-    It holds in any field: extinction at the vertices cancels. NaN beyond the pole.
+    It holds in any field: extinction at the crossings cancels. NaN beyond the pole.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Where the rays of several lidars meet: stations and pointings in, vertices out.
+"""Where the beams of several lidars meet: stations and pointings in, crossings out.
 
-Rays are straight: refraction bends a ray by less than 1 m in 10 km of horizontal air. Heights
+Beams are straight: refraction bends a beam by less than 1 m in 10 km of horizontal air. Heights
 are above the ellipsoid; a common error of all heights (the geoid) shifts everything alike.
 """
 
@@ -33,12 +33,12 @@ _GEODETIC_PASSES: Final = 6
 DEFAULT_TOLERANCE: Final = 15.0
 """m, two bins of 7.5 m."""
 SMALLEST_CROSSING_ANGLE: Final = 2.0
-"""degree. Below, a pointing error of 0.1 degree moves the crossing by 5 percent of its range."""
-MOST_RAYS: Final = 512
+"""degree. Below, a pointing error of 0.1 degree moves the passage by 5 percent of its range."""
+MOST_BEAMS: Final = 512
 
 
 @dataclass(frozen=True, slots=True)
-class Ray:
+class Beam:
     """One direction of one lidar."""
 
     latitude: float
@@ -54,62 +54,62 @@ class Ray:
 
 
 @dataclass(frozen=True, slots=True)
-class Crossings:
-    """On which rays vertices lie: one entry for each ray and vertex, ordered along the rays."""
+class Passages:
+    """On which beams crossings lie: one entry for each beam and crossing, ordered along the beams."""
 
-    ray: Indices
-    vertex: Indices
+    beam: Indices
+    crossing: Indices
     range: Array
-    """m, from the lidar to the foot of the vertex on the ray."""
+    """m, from the lidar to the foot of the crossing on the beam."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """Rays and the vertices in which they meet. Arrays are read-only."""
+    """Beams and the crossings in which they meet. Arrays are read-only."""
 
     origin: Array
-    """(ray, 3) positions of the lidars in the local frame, m: east, north, up."""
+    """(beam, 3) positions of the lidars in the local frame, m: east, north, up."""
     direction: Array
-    """(ray, 3) unit vectors."""
-    vertex: Array
-    """(vertex, 3) positions, m, ordered by their nearest range."""
+    """(beam, 3) unit vectors."""
+    crossing: Array
+    """(crossing, 3) positions, m, ordered by their nearest range."""
     miss_distance: Array
-    """(vertex,) m, the largest distance of the vertex from a ray of its own."""
+    """(crossing,) m, the largest distance of the crossing from a beam of its own."""
     crossing_angle: Array
-    """(vertex,) degree, the largest angle between rays that meet there, folded to 0-90."""
-    crossings: Crossings
-    near_vertex: Booleans
-    """(vertex,) True where a ray goes on from the vertex to a further one: there, attenuation
-    beyond the vertex tells its extinction. Elsewhere, noise is amplified along the ray."""
+    """(crossing,) degree, the largest angle between beams that meet there, folded to 0-90."""
+    passages: Passages
+    near_crossing: Booleans
+    """(crossing,) True where a beam goes on from the crossing to a further one: there, attenuation
+    beyond the crossing tells its extinction. Elsewhere, noise is amplified along the beam."""
     geodetic: Array | None = field(default=None)
-    """(vertex, 3) latitude and longitude in degree, altitude in m, where stations have them."""
+    """(crossing, 3) latitude and longitude in degree, altitude in m, where stations have them."""
 
     @property
-    def rays(self) -> int:
-        """Number of rays."""
+    def beams(self) -> int:
+        """Number of beams."""
         return int(self.origin.shape[0])
 
     @property
-    def vertices(self) -> int:
-        """Number of vertices."""
-        return int(self.vertex.shape[0])
+    def crossings(self) -> int:
+        """Number of crossings."""
+        return int(self.crossing.shape[0])
 
-    def on_ray(self, ray: int) -> tuple[Indices, Array]:
-        """Return the vertices on a ray and their ranges, the nearest first."""
-        mine = self.crossings.ray == ray
-        return self.crossings.vertex[mine], self.crossings.range[mine]
+    def on_beam(self, beam: int) -> tuple[Indices, Array]:
+        """Return the crossings on a beam and their ranges, the nearest first."""
+        mine = self.passages.beam == beam
+        return self.passages.crossing[mine], self.passages.range[mine]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cycle:
-    """A closed walk over rays: row j leads along ray j from vertex j to vertex j + 1."""
+    """A closed walk over beams: row j leads along beam j from crossing j to crossing j + 1."""
 
-    ray: Indices
-    vertex: Indices
+    beam: Indices
+    crossing: Indices
     start_range: Array
-    """(row,) m, of the vertex at which the row starts, on its ray."""
+    """(row,) m, of the crossing at which the row starts, on its beam."""
     end_range: Array
-    """(row,) m, of the vertex at which it ends."""
+    """(row,) m, of the crossing at which it ends."""
 
     @property
     def sign(self) -> Array:
@@ -118,7 +118,7 @@ class Cycle:
 
     @property
     def far_start(self) -> bool:
-        """Whether the first vertex is the far one on the first ray."""
+        """Whether the first crossing is the far one on the first beam."""
         return bool(self.sign[0] < 0)
 
 
@@ -189,25 +189,25 @@ def local_axes(latitude: npt.ArrayLike, longitude: npt.ArrayLike) -> Array:
     return np.stack([east, north, up], axis=-2)
 
 
-def locate(rays: Sequence[Ray]) -> tuple[Array, Array]:
-    """Return (ray, 3) positions in m and unit directions in the frame of the first station.
+def locate(beams: Sequence[Beam]) -> tuple[Array, Array]:
+    """Return (beam, 3) positions in m and unit directions in the frame of the first station.
 
     Each direction is turned from the horizon of its own station to that of the first: over
     10 km they differ by 0.09 degree, which is 16 m.
 
     Parameters
     ----------
-    rays : sequence of Ray
+    beams : sequence of Beam
 
     Returns
     -------
-    origin, direction : (ray, 3) float64
+    origin, direction : (beam, 3) float64
         East, north, up.
     """
     values = inputs.real_array(
-        [(r.latitude, r.longitude, r.altitude, r.azimuth, r.elevation) for r in rays], "rays"
+        [(r.latitude, r.longitude, r.altitude, r.azimuth, r.elevation) for r in beams], "beams"
     ).astype(np.float64)
-    _check_rays(values)
+    _check_beams(values)
     latitude, longitude, altitude, azimuth, elevation = values.T
     centred = to_earth_centred(latitude, longitude, altitude)
     axes = local_axes(latitude, longitude)
@@ -218,45 +218,45 @@ def locate(rays: Sequence[Ray]) -> tuple[Array, Array]:
     return (centred - centred[0]) @ axes[0].T, direction @ axes[0].T
 
 
-# Vertices -----------------------------------------------------------------------------------
+# Crossings -----------------------------------------------------------------------------------
 
 
 def build_network(
-    rays: Sequence[Ray],
+    beams: Sequence[Beam],
     *,
     tolerance: float = DEFAULT_TOLERANCE,
     nearest: float | Sequence[float] = 0.0,
     farthest: float | Sequence[float] = np.inf,
     smallest_angle: float = SMALLEST_CROSSING_ANGLE,
 ) -> Network:
-    """Find the vertices in which the rays of stations meet. Cached by its arguments.
+    """Find the crossings in which the beams of stations meet. Cached by its arguments.
 
     Parameters
     ----------
-    rays : sequence of Ray
+    beams : sequence of Beam
     tolerance : float
-        m; rays that pass each other within it meet. Crossings of several rays within it are
-        one vertex. No vertex is nearer to a lidar than it.
-    nearest, farthest : float or one per ray
-        m, ranges between which a ray is used: full overlap, and the reach of its signal.
+        m; beams that pass each other within it meet. Passages of several beams within it are
+        one crossing. No crossing is nearer to a lidar than it.
+    nearest, farthest : float or one per beam
+        m, ranges between which a beam is used: full overlap, and the reach of its signal.
     smallest_angle : float
-        degree; rays that are more parallel do not meet.
+        degree; beams that are more parallel do not meet.
 
     Returns
     -------
     Network
-        In the frame of the first ray's station.
+        In the frame of the first beam's station.
 
     Raises
     ------
     RetrievalInputError
         For positions or pointings out of bounds, and settings that cannot be right.
     """
-    return _network_of_rays(
-        tuple(rays),
+    return _network_of_beams(
+        tuple(beams),
         float(tolerance),
-        _per_ray(nearest, len(rays), "nearest"),
-        _per_ray(farthest, len(rays), "farthest"),
+        _per_beam(nearest, len(beams), "nearest"),
+        _per_beam(farthest, len(beams), "farthest"),
         float(smallest_angle),
     )
 
@@ -270,11 +270,11 @@ def network_of_lines(
     farthest: float | Sequence[float] = np.inf,
     smallest_angle: float = SMALLEST_CROSSING_ANGLE,
 ) -> Network:
-    """Find the vertices of rays that are given in a local frame; else as `build_network`.
+    """Find the crossings of beams that are given in a local frame; else as `build_network`.
 
     Parameters
     ----------
-    origin, direction : (ray, 3) float
+    origin, direction : (beam, 3) float
         m, and vectors of any length.
     """
     start = np.array(origin, dtype=np.float64)
@@ -283,34 +283,37 @@ def network_of_lines(
         raise RetrievalInputError(
             f"has the shape {along.shape}, origin {start.shape}",
             field="direction",
-            remedy="give (ray, 3) for both",
+            remedy="give (beam, 3) for both",
         )
     length = np.linalg.norm(along, axis=1, keepdims=True)
     if not (np.isfinite(start).all() and np.isfinite(length).all() and (length > 0).all()):
         raise RetrievalInputError("is not finite, or zero", field="direction")
-    limits = (_per_ray(nearest, len(start), "nearest"), _per_ray(farthest, len(start), "farthest"))
+    limits = (
+        _per_beam(nearest, len(start), "nearest"),
+        _per_beam(farthest, len(start), "farthest"),
+    )
     return _meet(start, along / length, tolerance, limits, smallest_angle)
 
 
 @lru_cache(maxsize=64)
-def _network_of_rays(
-    rays: tuple[Ray, ...],
+def _network_of_beams(
+    beams: tuple[Beam, ...],
     tolerance: float,
     nearest: tuple[float, ...],
     farthest: tuple[float, ...],
     smallest_angle: float,
 ) -> Network:
-    if not rays:
-        raise RetrievalInputError("are none", field="rays")
-    origin, direction = locate(rays)
+    if not beams:
+        raise RetrievalInputError("are none", field="beams")
+    origin, direction = locate(beams)
     met = _meet(origin, direction, tolerance, (nearest, farthest), smallest_angle)
-    axes = local_axes(rays[0].latitude, rays[0].longitude)
-    first = to_earth_centred(rays[0].latitude, rays[0].longitude, rays[0].altitude)
-    geodetic = to_geodetic(first + met.vertex @ axes)
+    axes = local_axes(beams[0].latitude, beams[0].longitude)
+    first = to_earth_centred(beams[0].latitude, beams[0].longitude, beams[0].altitude)
+    geodetic = to_geodetic(first + met.crossing @ axes)
     return _frozen(
         Network(
-            met.origin, met.direction, met.vertex, met.miss_distance, met.crossing_angle,
-            met.crossings, met.near_vertex, geodetic,
+            met.origin, met.direction, met.crossing, met.miss_distance, met.crossing_angle,
+            met.passages, met.near_crossing, geodetic,
         )
     )  # fmt: skip
 
@@ -326,39 +329,39 @@ def _meet(
         raise RetrievalInputError(f"is {tolerance} m", field="tolerance")
     if not 0 < smallest_angle < 90:
         raise RetrievalInputError(f"is {smallest_angle} degree", field="smallest_angle")
-    if len(origin) > MOST_RAYS:
+    if len(origin) > MOST_BEAMS:
         raise RetrievalInputError(
-            f"are {len(origin)}, more than {MOST_RAYS}", field="rays", remedy="split the network"
+            f"are {len(origin)}, more than {MOST_BEAMS}", field="beams", remedy="split the network"
         )
     groups = _merged(origin, direction, tolerance, limits, smallest_angle)
     points = [_closest_point(origin, direction, group) for group in groups]
-    vertex = np.array(points).reshape(-1, 3)
+    crossing = np.array(points).reshape(-1, 3)
     ranges = [
         [float(direction[r] @ (point - origin[r])) for r in group]
         for group, point in zip(groups, points, strict=True)
     ]
     order = sorted(range(len(groups)), key=lambda v: (min(ranges[v]), groups[v]))
     entries = sorted(
-        (ray, along, number)
+        (beam, along, number)
         for number, v in enumerate(order)
-        for ray, along in zip(groups[v], ranges[v], strict=True)
+        for beam, along in zip(groups[v], ranges[v], strict=True)
     )
-    crossings = Crossings(
+    passages = Passages(
         np.array([e[0] for e in entries], dtype=np.intp),
         np.array([e[2] for e in entries], dtype=np.intp),
         np.array([e[1] for e in entries], dtype=np.float64),
     )
     near = np.zeros(len(groups), dtype=np.bool_)
-    goes_on = crossings.ray[:-1] == crossings.ray[1:]
-    near[crossings.vertex[:-1][goes_on]] = True
+    goes_on = passages.beam[:-1] == passages.beam[1:]
+    near[passages.crossing[:-1][goes_on]] = True
     return _frozen(
         Network(
             origin,
             direction,
-            vertex[order],
+            crossing[order],
             np.array([_miss(origin, direction, groups[v], points[v]) for v in order]),
             np.array([_widest_angle(direction, groups[v]) for v in order]),
-            crossings,
+            passages,
             near,
         )
     )
@@ -371,7 +374,7 @@ def _merged(
     limits: tuple[tuple[float, ...], tuple[float, ...]],
     smallest_angle: float,
 ) -> list[tuple[int, ...]]:
-    """Return the rays of every vertex: pairs that meet, joined where more meet in one place."""
+    """Return the beams of every crossing: pairs that meet, joined where more meet in one place."""
     groups: list[tuple[int, ...]] = []
     for _, i, j in sorted(_pairs(origin, direction, tolerance, limits, smallest_angle)):
         point = _closest_point(origin, direction, (i, j))
@@ -396,7 +399,7 @@ def _pairs(
     limits: tuple[tuple[float, ...], tuple[float, ...]],
     smallest_angle: float,
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs of rays that meet, with the nearer of their ranges."""
+    """Return the pairs of beams that meet, with the nearer of their ranges."""
     least = np.maximum(limits[0], tolerance)
     most = np.asarray(limits[1])
     found = []
@@ -416,22 +419,22 @@ def _pairs(
     return found
 
 
-def _closest_point(origin: Array, direction: Array, rays: tuple[int, ...]) -> Array:
-    """Return the point of the least sum of squared distances from rays."""
+def _closest_point(origin: Array, direction: Array, beams: tuple[int, ...]) -> Array:
+    """Return the point of the least sum of squared distances from beams."""
     matrix, side = np.zeros((3, 3)), np.zeros(3)
-    for r in rays:
+    for r in beams:
         across = np.eye(3) - np.outer(direction[r], direction[r])
         matrix += across
-        # From the first of the rays, so that digits are not lost far from the frame's origin.
-        side += across @ (origin[r] - origin[rays[0]])
-    return np.asarray(np.linalg.solve(matrix, side) + origin[rays[0]])
+        # From the first of the beams, so that digits are not lost far from the frame's origin.
+        side += across @ (origin[r] - origin[beams[0]])
+    return np.asarray(np.linalg.solve(matrix, side) + origin[beams[0]])
 
 
-def _miss(origin: Array, direction: Array, rays: tuple[int, ...], point: Array) -> float:
-    return max(float(np.linalg.norm(np.cross(direction[r], point - origin[r]))) for r in rays)
+def _miss(origin: Array, direction: Array, beams: tuple[int, ...], point: Array) -> float:
+    return max(float(np.linalg.norm(np.cross(direction[r], point - origin[r]))) for r in beams)
 
 
-def _widest_angle(direction: Array, rays: tuple[int, ...]) -> float:
+def _widest_angle(direction: Array, beams: tuple[int, ...]) -> float:
     return max(
         float(
             np.degrees(
@@ -441,7 +444,7 @@ def _widest_angle(direction: Array, rays: tuple[int, ...]) -> float:
                 )
             )
         )
-        for i, j in itertools.combinations(rays, 2)
+        for i, j in itertools.combinations(beams, 2)
     )
 
 
@@ -449,22 +452,22 @@ def _widest_angle(direction: Array, rays: tuple[int, ...]) -> float:
 
 
 def build_cycle(
-    net: Network, rays: Sequence[int] | None = None, *, start: int | None = None
+    net: Network, beams: Sequence[int] | None = None, *, start: int | None = None
 ) -> Cycle:
-    """Order rays that meet pairwise into a cycle, walked in the direction of attenuation.
+    """Order beams that meet pairwise into a cycle, walked in the direction of attenuation.
 
     The walk leads away from the lidars over a larger distance than towards them, so that the
-    determinant of a homogeneous field is between 0 and 1. It starts where both rays of a vertex
-    lead away from their lidars, where there is such a vertex: from a far start, every
+    determinant of a homogeneous field is between 0 and 1. It starts where both beams of a crossing
+    lead away from their lidars, where there is such a crossing: from a far start, every
     multiplier but 1 gives nonsense.
 
     Parameters
     ----------
     net : Network
-    rays : sequence of int, optional
-        Rays in their order around the cycle; those of the network where it is one cycle.
+    beams : sequence of int, optional
+        Beams in their order around the cycle; those of the network where it is one cycle.
     start : int, optional
-        The vertex to solve for, in place of the one that suits best.
+        The crossing to solve for, in place of the one that suits best.
 
     Returns
     -------
@@ -473,23 +476,23 @@ def build_cycle(
     Raises
     ------
     RetrievalInputError
-        Where the rays form no cycle, or the start is not on it.
+        Where the beams form no cycle, or the start is not on it.
     """
-    order = _single_cycle(net) if rays is None else [int(r) for r in rays]
-    if len(order) < 3 or len(set(order)) != len(order) or not set(order) <= set(range(net.rays)):
+    order = _single_cycle(net) if beams is None else [int(r) for r in beams]
+    if len(order) < 3 or len(set(order)) != len(order) or not set(order) <= set(range(net.beams)):
         raise RetrievalInputError(
-            f"are {order}", field="rays", remedy="give at least 3 different rays of the network"
+            f"are {order}", field="beams", remedy="give at least 3 different beams of the network"
         )
     k = len(order)
-    shared = [_shared_vertex(net, order[j - 1], order[j]) for j in range(k)]
+    shared = [_shared_crossing(net, order[j - 1], order[j]) for j in range(k)]
     if len(set(shared)) != k:
-        raise RetrievalInputError(f"{order} meet in one place", field="rays")
+        raise RetrievalInputError(f"{order} meet in one place", field="beams")
     lengths = [
         _range(net, order[j], shared[(j + 1) % k]) - _range(net, order[j], shared[j])
         for j in range(k)
     ]
     if sum(lengths) < 0:
-        # Backwards, row j runs along the same ray from its last vertex to its first.
+        # Backwards, row j runs along the same beam from its last crossing to its first.
         order, shared = order[::-1], [shared[(j + 1) % k] for j in range(k)][::-1]
         lengths = [-length for length in lengths[::-1]]
     first = _start_row(lengths, shared, start)
@@ -514,46 +517,46 @@ def _start_row(lengths: list[float], shared: list[int], start: int | None) -> in
 
 
 def _single_cycle(net: Network) -> list[int]:
-    counts = np.bincount(net.crossings.ray, minlength=net.rays)
-    pairs = np.bincount(net.crossings.vertex, minlength=net.vertices)
-    if net.rays < 3 or np.any(counts != 2) or np.any(pairs != 2):
+    counts = np.bincount(net.passages.beam, minlength=net.beams)
+    pairs = np.bincount(net.passages.crossing, minlength=net.crossings)
+    if net.beams < 3 or np.any(counts != 2) or np.any(pairs != 2):
         raise RetrievalInputError(
-            "are not one cycle, with two vertices on every ray and two rays at every vertex",
-            field="rays",
-            remedy="name the rays of a cycle in their order, or use the method 'network'",
+            "are not one cycle, with two crossings on every beam and two beams at every crossing",
+            field="beams",
+            remedy="name the beams of a cycle in their order, or use the method 'network'",
         )
-    order, vertex = [0], int(net.on_ray(0)[0][0])
+    order, crossing = [0], int(net.on_beam(0)[0][0])
     while True:
-        here = net.crossings.ray[net.crossings.vertex == vertex]
-        ray = int(here[here != order[-1]][0])
-        if ray == order[0]:
+        here = net.passages.beam[net.passages.crossing == crossing]
+        beam = int(here[here != order[-1]][0])
+        if beam == order[0]:
             break
-        order.append(ray)
-        vertices = net.on_ray(ray)[0]
-        vertex = int(vertices[vertices != vertex][0])
-    if len(order) != net.rays:
+        order.append(beam)
+        crossings = net.on_beam(beam)[0]
+        crossing = int(crossings[crossings != crossing][0])
+    if len(order) != net.beams:
         raise RetrievalInputError(
-            "form several cycles", field="rays", remedy="name the rays of one of them"
+            "form several cycles", field="beams", remedy="name the beams of one of them"
         )
     return order
 
 
-def _shared_vertex(net: Network, first: int, second: int) -> int:
-    shared = np.intersect1d(net.on_ray(first)[0], net.on_ray(second)[0])
+def _shared_crossing(net: Network, first: int, second: int) -> int:
+    shared = np.intersect1d(net.on_beam(first)[0], net.on_beam(second)[0])
     if shared.size != 1:
-        raise RetrievalInputError(f"{first} and {second} do not meet", field="rays")
+        raise RetrievalInputError(f"{first} and {second} do not meet", field="beams")
     return int(shared[0])
 
 
-def _range(net: Network, ray: int, vertex: int) -> float:
-    vertices, ranges = net.on_ray(ray)
-    return float(ranges[vertices == vertex][0])
+def _range(net: Network, beam: int, crossing: int) -> float:
+    crossings, ranges = net.on_beam(beam)
+    return float(ranges[crossings == crossing][0])
 
 
 # Checks -------------------------------------------------------------------------------------
 
 
-def _check_rays(values: Array) -> None:
+def _check_beams(values: Array) -> None:
     bounds = {
         "latitude": (-90.0, 90.0),
         "longitude": (-360.0, 360.0),
@@ -565,28 +568,30 @@ def _check_rays(values: Array) -> None:
         wrong = ~((column >= low) & (column <= high))
         if wrong.any():
             raise RetrievalInputError(
-                f"of ray {int(np.argmax(wrong))} is {column[wrong][0]}",
+                f"of beam {int(np.argmax(wrong))} is {column[wrong][0]}",
                 field=name,
                 remedy=f"give a value from {low:g} to {high:g}",
             )
 
 
-def _per_ray(value: float | Sequence[float], rays: int, name: str) -> tuple[float, ...]:
+def _per_beam(value: float | Sequence[float], beams: int, name: str) -> tuple[float, ...]:
     values = np.asarray(value, dtype=np.float64)
-    if values.ndim > 1 or (values.ndim == 1 and values.size != rays):
+    if values.ndim > 1 or (values.ndim == 1 and values.size != beams):
         raise RetrievalInputError(
-            f"has the shape {values.shape}", field=name, remedy=f"give one, or one per ray ({rays})"
+            f"has the shape {values.shape}",
+            field=name,
+            remedy=f"give one, or one per beam ({beams})",
         )
     if np.any(np.isnan(values)) or np.any(values < 0):
         raise RetrievalInputError("is negative or NaN", field=name)
-    return tuple(float(v) for v in np.broadcast_to(values, (rays,)))
+    return tuple(float(v) for v in np.broadcast_to(values, (beams,)))
 
 
 def _frozen(net: Network) -> Network:
-    shared = net.crossings
+    shared = net.passages
     for array in (
-        net.origin, net.direction, net.vertex, net.miss_distance, net.crossing_angle,
-        net.near_vertex, net.geodetic, shared.ray, shared.vertex, shared.range,
+        net.origin, net.direction, net.crossing, net.miss_distance, net.crossing_angle,
+        net.near_crossing, net.geodetic, shared.beam, shared.crossing, shared.range,
     ):  # fmt: skip
         if array is not None:
             array.setflags(write=False)

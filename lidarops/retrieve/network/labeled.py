@@ -43,7 +43,7 @@ _QUALITY_OF_FLAG: Final = {
     "not_homogeneous": Quality.NOT_HOMOGENEOUS,
     "not_measured": Quality.INPUT_MISSING,
 }
-"""Of `VertexFlags`; `not_finite` is told where nothing else rejects the value."""
+"""Of `CrossingFlags`; `not_finite` is told where nothing else rejects the value."""
 BEFORE_TAIL: Final = (0.6, 0.7)
 """Of the start of the tail: where the signal is taken that may be left in the tail."""
 _SEEN: Final = 3.0
@@ -51,7 +51,7 @@ _SEEN: Final = 3.0
 _PROBE: Final = 1e-2
 """Relative change of signals, by which sensitivities are found."""
 BEYOND: Final = 200
-"""Bins kept beyond the farthest vertex of a beam: more than twice the widest window of a gate."""
+"""Bins kept beyond the farthest crossing of a beam: more than twice the widest window of a bin."""
 _MOST_APART: Final = 16
 """Beams whose errors are looked at one by one; of more, those of an instrument together."""
 _SHARE_OF_ERROR: Final = 0.5
@@ -97,7 +97,7 @@ class NetworkSettings:
     exponent_relative_error: float = 0.1
     """Of m."""
     lidar_ratio_relative_error: float = 0.02
-    """Of a vertex against the others: of the constant between backscatter^m and extinction."""
+    """Of a crossing against the others: of the constant between backscatter^m and extinction."""
     overlap_relative_error: float = 0.003
     """At the nearest point of a beam that is used; falls to 0 at the farthest."""
 
@@ -107,18 +107,18 @@ class _Signals:
     """The signals of all beams on common intervals."""
 
     power: Array
-    """(interval, ray, bin), free of background; NaN where missing."""
+    """(interval, beam, bin), free of background; NaN where missing."""
     variance: Array
     range: Array
-    """(ray, bin) m; NaN beyond the bins of a ray."""
+    """(beam, bin) m; NaN beyond the bins of a beam."""
     background_error: Array
-    """(interval, ray)."""
+    """(interval, beam)."""
     left: Array
-    """(interval, ray): the most signal that may have been subtracted with the background."""
+    """(interval, beam): the most signal that may have been subtracted with the background."""
     care: Flags
-    """(interval, ray) bits of the bins between the vertices of the ray."""
+    """(interval, beam) bits of the bins between the crossings of the beam."""
     overlap: Array
-    """(ray, bin)."""
+    """(beam, bin)."""
 
 
 def retrieve_network(
@@ -135,13 +135,13 @@ def retrieve_network(
     ----------
     beams : sequence of BeamSignals
     network : Network
-        With as many rays.
+        With as many beams.
     settings : Settings
 
     Returns
     -------
     xr.Dataset
-        In memory: the variables of the ``visibility`` product, of the near vertices. Where a
+        In memory: the variables of the ``visibility`` product, of the near crossings. Where a
         value is NaN, a bit of ``quality_flag`` says why.
 
     Raises
@@ -149,17 +149,17 @@ def retrieve_network(
     RetrievalInputError
         Where arguments cannot be right.
     """
-    if len(beams) != network.rays:
-        raise RetrievalInputError(f"are {len(beams)} for {network.rays} rays", field="beams")
+    if len(beams) != network.beams:
+        raise RetrievalInputError(f"are {len(beams)} for {network.beams} beams", field="beams")
     intervals = np.unique(np.concatenate([beam.interval for beam in beams]))
     signals = _gathered(beams, intervals, network)
     solver = _Solver(beams, network, settings, signals, intervals)
     found = solver.solve(signals.power)
     errors = _Errors.of(solver, found, settings)
-    near = np.flatnonzero(network.near_vertex)
+    near = np.flatnonzero(network.near_crossing)
     extinction = found.extinction[:, near]
     random, systematic = errors.random[:, near], errors.systematic[:, near]
-    pair = ("time", "vertex")
+    pair = ("time", "crossing")
     seen = labeled.visibility_of_extinction(
         xr.DataArray(extinction, dims=pair),
         xr.DataArray(random, dims=pair),
@@ -186,7 +186,7 @@ def retrieve_network(
                 np.where(np.isfinite(found.prior_deviation), found.prior_deviation, np.nan),
             ),
             "shots": ("time", _shots(beams, intervals)),
-            "ray_range": (("ray", "vertex"), _distances(network)[:, near]),
+            "beam_range": (("beam", "crossing"), _distances(network)[:, near]),
         },
         coords=_places(beams, intervals, network, near),
         attrs={"steps": _told(beams, network, found, settings)},
@@ -200,7 +200,7 @@ def _gathered(beams: Sequence[BeamAverages], intervals: Integers, network: Netwo
     grid, overlap = np.full(shape[1:], np.nan), np.ones(shape[1:])
     error, left = np.full(shape[:2], np.nan), np.zeros(shape[:2])
     care = np.zeros(shape[:2], dtype=np.int32)
-    for ray, beam in enumerate(beams):
+    for index, beam in enumerate(beams):
         rows = np.searchsorted(intervals, beam.interval)
         data, distance = beam.averages, beam.averages["range"].to_numpy().astype(np.float64)
         bits = data["quality"].to_numpy()
@@ -212,17 +212,17 @@ def _gathered(beams: Sequence[BeamAverages], intervals: Integers, network: Netwo
             values[:, tail], distance[tail], start=start, variance=noise[:, tail]
         )
         mine = slice(distance.size)
-        power[rows, ray, mine] = values - sky.background[:, np.newaxis]
-        variance[rows, ray, mine] = noise
-        grid[ray, mine] = distance
+        power[rows, index, mine] = values - sky.background[:, np.newaxis]
+        variance[rows, index, mine] = noise
+        grid[index, mine] = distance
         if beam.overlap is not None:
             # Before the first range that is told, no bin is used.
-            overlap[ray, mine] = np.nan_to_num(beam.overlap)
-        error[rows, ray] = sky.background_standard_error
-        left[rows, ray] = _left_in_tail(power[rows, ray, mine], noise, distance, tail)
-        ranges = network.on_ray(ray)[1]
+            overlap[index, mine] = np.nan_to_num(beam.overlap)
+        error[rows, index] = sky.background_standard_error
+        left[rows, index] = _left_in_tail(power[rows, index, mine], noise, distance, tail)
+        ranges = network.on_beam(index)[1]
         used = (distance >= ranges[0]) & (distance <= ranges[-1])
-        care[rows, ray] = np.bitwise_or.reduce(bits[:, used] & np.int32(_CARE), axis=1)
+        care[rows, index] = np.bitwise_or.reduce(bits[:, used] & np.int32(_CARE), axis=1)
     # The solver looks at no farther bins, and is asked many times.
     near = slice(_bins_used(grid, network))
     return _Signals(
@@ -237,8 +237,8 @@ def _gathered(beams: Sequence[BeamAverages], intervals: Integers, network: Netwo
 
 
 def _bins_used(grid: Array, network: Network) -> int:
-    """Return how many of the bins of the beams reach beyond their farthest vertices."""
-    reached = [int(np.sum(row <= network.on_ray(ray)[1][-1])) for ray, row in enumerate(grid)]
+    """Return how many of the bins of the beams reach beyond their farthest crossings."""
+    reached = [int(np.sum(row <= network.on_beam(index)[1][-1])) for index, row in enumerate(grid)]
     return max(reached) + BEYOND
 
 
@@ -282,11 +282,11 @@ class _Solver:
         names = [beam.instrument for beam in beams]
         together = list(dict.fromkeys(names))
         self.groups = (
-            [[ray] for ray in range(len(beams))]
+            [[index] for index in range(len(beams))]
             if len(beams) <= _MOST_APART
             else [[r for r, name in enumerate(names) if name == one] for one in together]
         )
-        """Rays whose errors are looked at together."""
+        """Beams whose errors are looked at together."""
         self._told: dict[str, Any] = {
             "method": settings.method,
             "prior": settings.prior,
@@ -307,26 +307,26 @@ class _Solver:
         )
 
     def slopes(self) -> Array:
-        """Return (ray, bin) what falls from 1 at the nearest vertex of a ray to 0 at its last."""
+        """Return (beam, bin) what falls from 1 at the nearest crossing of a beam to 0 at its last."""
         out = np.zeros(self.signals.range.shape)
-        for ray in range(self.network.rays):
-            ranges = self.network.on_ray(ray)[1]
-            out[ray] = np.interp(self.signals.range[ray], [ranges[0], ranges[-1]], [1.0, 0.0])
+        for index in range(self.network.beams):
+            ranges = self.network.on_beam(index)[1]
+            out[index] = np.interp(self.signals.range[index], [ranges[0], ranges[-1]], [1.0, 0.0])
         return out
 
     def hats(self) -> Iterator[Array]:
-        """Yield, for each vertex, (ray, bin) what falls from 1 there to 0 at its neighbours."""
-        for vertex in range(self.network.vertices):
+        """Yield, for each crossing, (beam, bin) what falls from 1 there to 0 at its neighbours."""
+        for crossing in range(self.network.crossings):
             out = np.zeros(self.signals.range.shape)
-            for ray in range(self.network.rays):
-                numbers, ranges = self.network.on_ray(ray)
-                if vertex in numbers:
-                    peak = (numbers == vertex).astype(np.float64)
-                    out[ray] = np.interp(self.signals.range[ray], ranges, peak)
+            for index in range(self.network.beams):
+                numbers, ranges = self.network.on_beam(index)
+                if crossing in numbers:
+                    peak = (numbers == crossing).astype(np.float64)
+                    out[index] = np.interp(self.signals.range[index], ranges, peak)
             yield out
 
     def changes(self, found: MultiPositionResult, change: Array) -> Iterator[Array]:
-        """Yield, for each group of rays, by how much extinction moves with the signals."""
+        """Yield, for each group of beams, by how much extinction moves with the signals."""
         for group in self.groups:
             if not change[:, group].any():
                 # The same signals give the same values.
@@ -339,7 +339,7 @@ class _Solver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Errors:
-    """(interval, vertex) errors of extinction, m-1; NaN where there is no value."""
+    """(interval, crossing) errors of extinction, m-1; NaN where there is no value."""
 
     random: Array
     systematic: Array
@@ -371,7 +371,7 @@ class _Errors:
 
 
 def _mixed(solver: _Solver, found: MultiPositionResult, relative_error: float) -> Array:
-    """Return what lidar ratios that differ from vertex to vertex do, m-1."""
+    """Return what lidar ratios that differ from crossing to crossing do, m-1."""
     total = np.zeros(found.extinction.shape)
     if relative_error > 0.0:
         for hat in solver.hats():
@@ -395,8 +395,8 @@ def _judged(
     bits = np.zeros(found.extinction.shape, dtype=np.int32)
     for name, bit in _QUALITY_OF_FLAG.items():
         bits |= np.where(getattr(found.flags, name), np.int32(bit), np.int32(0))
-    for ray, vertex in zip(network.crossings.ray, network.crossings.vertex, strict=True):
-        bits[:, vertex] |= signals.care[:, ray]
+    for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
+        bits[:, crossing] |= signals.care[:, index]
     with np.errstate(invalid="ignore"):
         moved = errors.left > _SHARE_OF_ERROR * errors.random
         loose = ~(np.hypot(errors.random, errors.systematic) < found.extinction)
@@ -414,8 +414,8 @@ def _judged(
 
 
 def _depth(extinction: Array, network: Network) -> Array:
-    """Return the optical depth of the longest stretch between vertices of a beam."""
-    spans = [ranges[-1] - ranges[0] for _, ranges in map(network.on_ray, range(network.rays))]
+    """Return the optical depth of the longest stretch between crossings of a beam."""
+    spans = [ranges[-1] - ranges[0] for _, ranges in map(network.on_beam, range(network.beams))]
     known = np.isfinite(extinction)
     with np.errstate(invalid="ignore"):
         mean = np.where(known, extinction, 0.0).sum(axis=1) / known.sum(axis=1)
@@ -423,9 +423,9 @@ def _depth(extinction: Array, network: Network) -> Array:
 
 
 def _distances(network: Network) -> Array:
-    """Return (ray, vertex) ranges, NaN where a vertex does not lie on a ray."""
-    out = np.full((network.rays, network.vertices), np.nan)
-    out[network.crossings.ray, network.crossings.vertex] = network.crossings.range
+    """Return (beam, crossing) ranges, NaN where a crossing does not lie on a beam."""
+    out = np.full((network.beams, network.crossings), np.nan)
+    out[network.passages.beam, network.passages.crossing] = network.passages.range
     return out
 
 
@@ -457,17 +457,17 @@ def _places(
     return {
         "time": times[:, 0] + (times[:, 1] - times[:, 0]) // 2,
         "time_bnds": (("time", "nv"), times),
-        "vertex_id": ("vertex", near.astype(np.int32)),
-        "latitude": ("vertex", network.geodetic[near, 0]),
-        "longitude": ("vertex", network.geodetic[near, 1]),
-        "altitude": ("vertex", network.geodetic[near, 2]),
-        "ray": np.arange(network.rays, dtype=np.int32),
+        "crossing_id": ("crossing", near.astype(np.int32)),
+        "latitude": ("crossing", network.geodetic[near, 0]),
+        "longitude": ("crossing", network.geodetic[near, 1]),
+        "altitude": ("crossing", network.geodetic[near, 2]),
+        "beam": np.arange(network.beams, dtype=np.int32),
         **{
-            f"ray_{name}": ("ray", np.array([beam.station[n] for beam in beams]))
+            f"beam_{name}": ("beam", np.array([beam.station[n] for beam in beams]))
             for n, name in enumerate(("latitude", "longitude", "altitude"))
         },
-        "ray_zenith_angle": ("ray", np.array([beam.zenith_angle for beam in beams])),
-        "ray_azimuth": ("ray", np.array([beam.azimuth for beam in beams])),
+        "beam_zenith_angle": ("beam", np.array([beam.zenith_angle for beam in beams])),
+        "beam_azimuth": ("beam", np.array([beam.azimuth for beam in beams])),
     }
 
 
@@ -479,11 +479,11 @@ def _told(
 ) -> str:
     """Return in words which beam is whose, where it meets others, and what visibility is."""
     texts = [f"method {found.method.value}", settings.visibility.words]
-    for ray, beam in enumerate(beams):
-        numbers, ranges = network.on_ray(ray)
+    for index, beam in enumerate(beams):
+        numbers, ranges = network.on_beam(index)
         met = ", ".join(f"{v} at {r:.0f} m" for v, r in zip(numbers, ranges, strict=True))
         texts.append(
-            f"ray {ray}: {beam.instrument}, zenith angle {beam.zenith_angle:g}, azimuth"
-            f" {beam.azimuth:g} degree, with the vertices {met}"
+            f"beam {index}: {beam.instrument}, zenith angle {beam.zenith_angle:g}, azimuth"
+            f" {beam.azimuth:g} degree, with the crossings {met}"
         )
     return "; ".join(texts)

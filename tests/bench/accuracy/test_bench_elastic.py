@@ -294,7 +294,7 @@ def test_a_band_is_an_area_between_its_edges():
     series = Series("way", (1.0, 10.0), (5.0, 6.0), (0.1, 0.2), (2.0, 3.0), band=True)
     figure = draw_chart(Chart("name", "Title", "Caption.", (Panel("panel", "x", "y", (series,)),)))
     (area,) = [one for one in figure.axes[0].collections if isinstance(one, PolyCollection)]
-    corners = {tuple(corner) for corner in area.get_paths()[0].vertices.tolist()}
+    corners = {tuple(corner) for corner in area.get_paths()[0].crossings.tolist()}
     assert {(1.0, 0.1), (10.0, 0.2), (1.0, 2.0), (10.0, 3.0)} <= corners
 
 

@@ -24,7 +24,7 @@ from lidarops.retrieve.multiangle.optical_depth import (
 )
 
 SMALL = StudySize(blocks=3, profiles=8, slow=1, published=60, random=6)
-SHORT = multiangle_cases.clear(3000.0, gates=25)
+SHORT = multiangle_cases.clear(3000.0, bins=25)
 
 
 @pytest.fixture(scope="module")
@@ -266,7 +266,7 @@ def test_the_published_experiment_is_reproduced(found):
         (score,) = [
             one
             for one in found.published
-            if (one.way, one.largest_angle, one.rays, one.share) == (way, angle, 6, 0.25)
+            if (one.way, one.largest_angle, one.beams, one.share) == (way, angle, 6, 0.25)
         ]
         return score
 
@@ -284,7 +284,7 @@ def test_the_published_experiment_is_reproduced(found):
     assert mld.top_bias.value < -1.5
     assert mld.data_share < 0.4
     assert one(multiangle_scores.NOTHING, 15.0).rmse.value == pytest.approx(2.737, abs=0.001)
-    settings = {(p.largest_angle, p.rays, p.share) for p in found.published}
+    settings = {(p.largest_angle, p.beams, p.share) for p in found.published}
     assert {(15.0, 4, 0.3), (30.0, 4, 0.2), (60.0, 6, 0.25)} <= settings
 
 
@@ -332,7 +332,7 @@ def test_times_are_multiples_of_the_read(timed):
         group = {cost.step: cost for cost in timed.costs if cost.batch == batch}
         assert group[READ].reads == 1.0
         assert not group[READ].ours
-        ours = {"make_rays", "regress", "vertical.smooth", *multiangle_cases.scan_methods()}
+        ours = {"make_beams", "regress", "vertical.smooth", *multiangle_cases.scan_methods()}
         assert ours <= {name for name, cost in group.items() if cost.ours}
         assert not any(group[name].ours for name in multiangle_cases.scan_peers())
         for cost in group.values():
@@ -360,7 +360,7 @@ def test_pages_hold_tables_and_figures(found, timed, tmp_path):
                 assert all(len(row) == len(table.columns) for row in table.rows)
     published = reports["accuracy"].parts[1]
     assert "this is not so" in published.text
-    # 2 angles, 2 numbers of rays, 3 shares; priors and correlations.
+    # 2 angles, 2 numbers of beams, 3 shares; priors and correlations.
     assert len(published.tables) + len(published.details) == 12 + 2
 
 

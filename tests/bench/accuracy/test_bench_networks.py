@@ -50,52 +50,52 @@ def case(found):
 
 def test_the_triangle_is_that_of_the_paper():
     net = known.TRIANGLE.network()
-    assert (net.rays, net.vertices) == (3, 3)
-    # Rays 1 and 3 cross above lidar 3, rays 1 and 2 and rays 2 and 3 where lines do.
+    assert (net.beams, net.crossings) == (3, 3)
+    # Beams 1 and 3 cross above lidar 3, beams 1 and 2 and beams 2 and 3 where lines do.
     expected = {
         (0.0, 300.0 * math.sqrt(3.0)),
         (-100.0, 400.0 * math.sqrt(3.0)),
         (0.0, 500.0 * math.sqrt(3.0)),
     }
-    vertices = {(round(x, 6) + 0.0, round(up, 6)) for x, _, up in net.vertex}
-    assert vertices == {(x, round(up, 6)) for x, up in expected}
-    assert net.near_vertex.tolist() == [True, True, False]
+    crossings = {(round(x, 6) + 0.0, round(up, 6)) for x, _, up in net.crossing}
+    assert crossings == {(x, round(up, 6)) for x, up in expected}
+    assert net.near_crossing.tolist() == [True, True, False]
     six = known.THREE_BY_TWO.network()
-    assert (six.rays, six.vertices, six.crossings.ray.size) == (6, 8, 16)
+    assert (six.beams, six.crossings, six.passages.beam.size) == (6, 8, 16)
 
 
 @pytest.mark.parametrize("air", known.AIRS, ids=lambda air: air.name)
 def test_signals_obey_the_lidar_equation(air):
-    """Against adaptive quadrature of the optical depth along a ray."""
+    """Against adaptive quadrature of the optical depth along a beam."""
     net = known.TRIANGLE.network()
     seen = known.signals(net, air)
     for number, extinction in list(enumerate(air.fields()))[:: max(len(air.fields()) - 1, 1)]:
-        for ray in range(net.rays):
-            origin, direction = net.origin[ray], net.direction[ray]
+        for beam in range(net.beams):
+            origin, direction = net.origin[beam], net.direction[beam]
 
             def along(r, origin=origin, direction=direction, extinction=extinction):
                 x, up = (np.array([origin[a] + r * direction[a]]) for a in (0, 2))
                 return float(extinction(x, up)[0])
 
-            for gate in (0, seen.range.size // 2, seen.range.size - 1):
-                r = float(seen.range[gate])
+            for bin in (0, seen.range.size // 2, seen.range.size - 1):
+                r = float(seen.range[bin])
                 depth = quad(along, 0.0, r, epsrel=1e-11, limit=200)[0]
                 expected = along(r) * math.exp(-2.0 * depth) / r**2
-                assert seen.power[number, ray, gate] == pytest.approx(expected, rel=1e-8)
-    assert seen.extinction.shape == (len(air.fields()), net.vertices)
+                assert seen.power[number, beam, bin] == pytest.approx(expected, rel=1e-8)
+    assert seen.extinction.shape == (len(air.fields()), net.crossings)
 
 
 def test_airs_are_as_told():
-    vertices = {air.name: known.signals(known.TRIANGLE.network(), air) for air in known.AIRS}
-    assert np.all(vertices["homogeneous"].extinction == 2e-3)
-    assert np.all(vertices[known.THIN].extinction == 2e-4)
-    gradient = vertices["gradient"].extinction[0]
-    height = vertices["gradient"].network.vertex[:, 2]
+    crossings = {air.name: known.signals(known.TRIANGLE.network(), air) for air in known.AIRS}
+    assert np.all(crossings["homogeneous"].extinction == 2e-3)
+    assert np.all(crossings[known.THIN].extinction == 2e-4)
+    gradient = crossings["gradient"].extinction[0]
+    height = crossings["gradient"].network.crossing[:, 2]
     np.testing.assert_allclose(np.diff(np.log(gradient)), -np.diff(height) / 1010.0)
-    drift = vertices["drifting plume"].extinction
+    drift = crossings["drifting plume"].extinction
     assert len(drift) == known.BLOCK
     assert drift[:, 0].max() > 1.3 * drift[:, 0].min()
-    seen = vertices["drifting plume"]
+    seen = crossings["drifting plume"]
     np.testing.assert_array_equal(seen.truth(120)[50:100], drift)
     assert np.array_equal(seen.truth(120)[119], drift[19])
 
@@ -108,10 +108,10 @@ def test_noise_is_as_told_and_repeats():
     deviation = (power - seen.power) / np.sqrt(variance)
     assert deviation.mean() == pytest.approx(0.0, abs=4.0 / math.sqrt(deviation.size))
     assert deviation.var() == pytest.approx(1.0, abs=5.0 * math.sqrt(2.0 / deviation.size))
-    for ray in range(3):
-        first = float(np.interp(seen.network.on_ray(ray)[1][0], seen.range, seen.power[0, ray]))
-        expected = (0.05 * seen.power[0, ray]) ** 2 + (0.01 * first) ** 2
-        np.testing.assert_allclose(variance[0, ray], expected, rtol=1e-12)
+    for beam in range(3):
+        first = float(np.interp(seen.network.on_beam(beam)[1][0], seen.range, seen.power[0, beam]))
+        expected = (0.05 * seen.power[0, beam]) ** 2 + (0.01 * first) ** 2
+        np.testing.assert_allclose(variance[0, beam], expected, rtol=1e-12)
 
 
 def test_a_cycle_is_asked_of_one_cycle_only():
@@ -125,9 +125,9 @@ def test_a_cycle_is_asked_of_one_cycle_only():
 # Figure 2 -------------------------------------------------------------------------------------
 
 
-def _signed_lengths(first_lidar, elevation, apart=500.0, ray1=120.0, ray3=90.0):
-    """Equation (19) of the paper, corrected: along the rays, with their signs, in m."""
-    a1, a2, a3 = (math.radians(angle) for angle in (ray1, elevation, ray3))
+def _signed_lengths(first_lidar, elevation, apart=500.0, beam1=120.0, beam3=90.0):
+    """Equation (19) of the paper, corrected: along the beams, with their signs, in m."""
+    a1, a2, a3 = (math.radians(angle) for angle in (beam1, elevation, beam3))
     far = first_lidar + apart
     return (
         far * math.sin(a2) / math.sin(a1 - a2) - first_lidar * math.sin(a3) / math.sin(a1 - a3),
@@ -144,7 +144,7 @@ def test_the_figure_is_that_of_its_formula(point):
     depths = 2e-3 * np.array(lengths) * [1.0, 1.0, -1.0]
 
     def formula(tau, lam=0.8):
-        """(18) of the paper, for three rays."""
+        """(18) of the paper, for three beams."""
         q1, q2, q3 = np.exp(-2.0 * np.cumsum(tau))
         below = 1.0 - lam**2 * q3
         return ((1.0 - lam) * q1 + lam * (1.0 - lam) * q2) / below
@@ -183,9 +183,9 @@ def test_the_figure_has_the_values_of_the_study():
 # Peers ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rays", [3, 12])
-def test_linear_algebra_finds_the_same_cycles(rays):
-    rows = known.random_rows(40, rays)
+@pytest.mark.parametrize("beams", [3, 12])
+def test_linear_algebra_finds_the_same_cycles(beams):
+    rows = known.random_rows(40, beams)
     ours = solve_cycle(rows.start, rows.end, rows.integral).value
     np.testing.assert_allclose(known.solve_by_lu(rows), ours, rtol=1e-13)
     np.testing.assert_allclose(known.solve_by_lu_one_by_one(rows), ours, rtol=1e-13)
@@ -200,7 +200,7 @@ def test_a_plain_fit_finds_the_same_network(place):
     # What trapezoids of 5 m leave.
     np.testing.assert_allclose(clean, seen.extinction[0], rtol=0.01)
     power, variance = seen.draw(0.01, 6, 1)
-    ours, near = known.FREE(power, variance, seen), seen.network.near_vertex
+    ours, near = known.FREE(power, variance, seen), seen.network.near_crossing
     apart = (known.network_by_scipy(power, variance, seen) - ours.extinction)[:, near]
     assert np.abs(apart / ours.extinction_standard_error[:, near]).max() < 2.0
 
@@ -261,12 +261,12 @@ def test_every_case_is_scored_in_every_way(found):
         assert one.profiles == PROFILES
         for score in one.scores.values():
             assert 0.0 <= score.solved <= 1.0
-            assert len(score.visibility_rmse) == place.network().near_vertex.sum()
+            assert len(score.visibility_rmse) == place.network().near_crossing.sum()
             assert score.reads > 1.0
 
 
 def test_the_network_is_as_accurate_as_it_must_be(case):
-    """S_1 of the triangle and the median vertex of 3 x 2 rays, within 8 percent."""
+    """S_1 of the triangle and the median crossing of 3 x 2 beams, within 8 percent."""
     network = known.NETWORK.name
     for air, noise in (("homogeneous", 0.1), ("plume", 0.05), ("gradient", 0.05)):
         assert case(known.TRIANGLE, air, noise)[network].visibility_rmse[0].value <= 0.08
@@ -336,15 +336,15 @@ def test_the_plain_fit_is_met_at_a_fraction_of_its_time(found):
 
 def test_times_are_multiples_of_the_read(found, timed):
     for rates in (found.cycles, timed.cycles, timed.profiles):
-        for rays in {rate.rays for rate in rates}:
-            group = {rate.way: rate for rate in rates if rate.rays == rays}
+        for beams in {rate.beams for rate in rates}:
+            group = {rate.way: rate for rate in rates if rate.beams == beams}
             read = group[scores.READ]
             assert (read.reads, read.ours) == (1.0, False)
             for rate in group.values():
                 assert rate.reads == pytest.approx(rate.nanoseconds / read.nanoseconds)
             assert any(rate.ours for rate in group.values())
-    assert {rate.rays for rate in timed.cycles} == {3, 12}
-    assert {rate.rays for rate in timed.profiles} == {3, 6}
+    assert {rate.beams for rate in timed.cycles} == {3, 12}
+    assert {rate.beams for rate in timed.profiles} == {3, 6}
     assert timed.gain > 0.0
 
 

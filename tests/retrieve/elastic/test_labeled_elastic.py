@@ -408,7 +408,7 @@ class TestOverlap:
         np.testing.assert_array_equal(found["backscatter"], expected["backscatter"])
 
 
-GATES = [
+BINS = [
     "backscatter",
     "backscatter_standard_error",
     *(f"backscatter_error_{c}" for c in ("noise", "background", "reference", "lidar_ratio")),
@@ -424,7 +424,7 @@ GATES = [
 
 def assert_missing_is_flagged(found):
     judged = found["quality_flag"].to_numpy()
-    for name in GATES:
+    for name in BINS:
         values = found[name].to_numpy()
         assert not np.isinf(values).any(), name
         assert (judged[np.isnan(values)] != 0).all(), name

@@ -27,13 +27,13 @@ HEIGHT = np.arange(300.0, 2100.0, 30.0)
 
 def fit(y, variance, path, distance=None, keep=None, *, sides=False, inhomogeneity=0.0):
     """Return table, residuals and leverages of the general kernel."""
-    profiles, angles, gates = y.shape
-    distance = np.zeros((2, angles, gates)) if distance is None else distance
-    keep = np.ones((profiles, 0, gates)) if keep is None else keep
-    table = np.empty((profiles, kh.COLUMNS, gates))
+    profiles, angles, bins = y.shape
+    distance = np.zeros((2, angles, bins)) if distance is None else distance
+    keep = np.ones((profiles, 0, bins)) if keep is None else keep
+    table = np.empty((profiles, kh.COLUMNS, bins))
     residual, leverage = np.empty(y.shape), np.empty(y.shape)
-    added = np.full(gates, inhomogeneity)
-    kh.fit_gates(y, variance, keep, added, path, distance, sides, table, residual, leverage)
+    added = np.full(bins, inhomogeneity)
+    kh.fit_bins(y, variance, keep, added, path, distance, sides, table, residual, leverage)
     return table, residual, leverage
 
 
@@ -55,9 +55,9 @@ def tiled(y, variance, path, keep=None, inhomogeneity=0.0):
     return table
 
 
-def some_rays(rng, profiles=3, angles=7, gates=70):
-    path = np.repeat(np.sort(rng.uniform(1, 4, angles))[:, np.newaxis], gates, axis=1)
-    y = rng.normal(size=(profiles, angles, gates)) - 20
+def some_beams(rng, profiles=3, angles=7, bins=70):
+    path = np.repeat(np.sort(rng.uniform(1, 4, angles))[:, np.newaxis], bins, axis=1)
+    y = rng.normal(size=(profiles, angles, bins)) - 20
     return y, rng.uniform(0.5, 2, y.shape), path
 
 
@@ -65,7 +65,7 @@ def some_rays(rng, profiles=3, angles=7, gates=70):
 
 
 def test_both_kernels_agree_with_numpy():
-    y, variance, path = some_rays(np.random.default_rng(1))
+    y, variance, path = some_beams(np.random.default_rng(1))
     table, residual, leverage = fit(y, variance, path)
     assert tiled(y, variance, path) == pytest.approx(table, rel=1e-11, abs=1e-11)
     for t, k in ((0, 0), (1, 63), (2, 64), (2, 69)):
@@ -87,7 +87,7 @@ def test_both_kernels_agree_with_numpy():
 
 def test_reduced_weights_agree_between_kernels():
     rng = np.random.default_rng(14)
-    y, variance, path = some_rays(rng)
+    y, variance, path = some_beams(rng)
     keep = rng.uniform(0, 1, y.shape)
     keep[0, 2], keep[1, :5, 3] = 0.0, 0.0
     table = fit(y, variance, path, keep=keep, inhomogeneity=0.3)[0]
@@ -115,8 +115,8 @@ def test_gradients_agree_with_numpy():
 
 @given(st.integers(0, 2**31), st.permutations(range(7)))
 @settings(max_examples=25, deadline=None)
-def test_order_of_the_rays_is_of_no_effect(seed, order):
-    y, variance, path = some_rays(np.random.default_rng(seed), gates=5)
+def test_order_of_the_beams_is_of_no_effect(seed, order):
+    y, variance, path = some_beams(np.random.default_rng(seed), bins=5)
     there, back = (
         tiled(y, variance, path),
         tiled(y[:, list(order)], variance[:, list(order)], path[list(order)]),
@@ -124,9 +124,9 @@ def test_order_of_the_rays_is_of_no_effect(seed, order):
     assert back == pytest.approx(there, rel=1e-11, abs=1e-12)
 
 
-def test_missing_rays_are_as_if_never_measured():
+def test_missing_beams_are_as_if_never_measured():
     rng = np.random.default_rng(3)
-    y, variance, path = some_rays(rng)
+    y, variance, path = some_beams(rng)
     missing = rng.random(7) < 0.4
     variance[:, missing], y[:, missing] = np.inf, 0.0
     whole, subset = (
@@ -136,15 +136,15 @@ def test_missing_rays_are_as_if_never_measured():
     assert np.array_equal(whole, subset)
 
 
-def test_two_rays_are_the_two_angle_formula():
-    y, variance, path = some_rays(np.random.default_rng(4), angles=2)
+def test_two_beams_are_the_two_angle_formula():
+    y, variance, path = some_beams(np.random.default_rng(4), angles=2)
     expected = -(y[:, 1] - y[:, 0]) / (2 * (path[1] - path[0]))
     tau = tiled(y, variance, path)[:, kh.TAU]
     assert tau == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("last", [15.0, 2.56, 60.0])
-def test_noise_free_rays_give_the_truth(last):
+def test_noise_free_beams_give_the_truth(last):
     path = 1 / np.cos(np.radians(np.linspace(0.0, last, 6)))
     tau = np.linspace(0.0, 5.0, 40)
     with mp.workdps(40):
@@ -337,27 +337,27 @@ def test_student_factor_widens_for_few_residuals():
 
 
 def gappy(signal):
-    """Rays and their fit, altitude by altitude, of signals at six angles."""
+    """Beams and their fit, altitude by altitude, of signals at six angles."""
     angles = np.linspace(0.0, 60.0, signal.shape[1])
     scan = slant_paths.make_scan(angles, HEIGHT, None)
-    rays = _block.make_beam_block(signal, np.full(signal.shape, 1e-4), scan)
-    return rays, _block.regress(rays, inhomogeneity=0.05, robust=False)
+    beams = _block.make_beam_block(signal, np.full(signal.shape, 1e-4), scan)
+    return beams, _block.regress(beams, inhomogeneity=0.05, robust=False)
 
 
-def test_information_is_whole_where_rays_begin_late_or_end():
+def test_information_is_whole_where_beams_begin_late_or_end():
     signal = np.ones((2, 6, HEIGHT.size))
     signal[0, 2, :5] = signal[1, 4, 40:] = np.nan
     np.testing.assert_array_equal(_block.kept_information(*gappy(signal)), 1.0)
 
 
-def test_information_that_gaps_leave_is_that_of_the_other_rays():
+def test_information_that_gaps_leave_is_that_of_the_other_beams():
     signal = np.ones((2, 6, HEIGHT.size))
     signal[1, 5, 7] = signal[1, 1, 20:23] = np.nan
     kept = _block.kept_information(*gappy(signal))
     path = 1.0 / np.cos(np.radians(np.linspace(0.0, 60.0, 6)))
 
-    def spread(rays):
-        return np.sum((rays - rays.mean()) ** 2)
+    def spread(beams):
+        return np.sum((beams - beams.mean()) ** 2)
 
     expected = np.ones(kept.shape)
     expected[1, 7] = spread(path[:5]) / spread(path)

@@ -39,7 +39,7 @@ def backscatter(height):
 
 
 def power(zenith):
-    """Received power along rays without background, (ray, range)."""
+    """Received power along beams without background, (beam, range)."""
     cosine = np.cos(np.radians(zenith))[:, np.newaxis]
     height = RANGE * cosine
     return 3e14 * backscatter(height) / RANGE**2 * np.exp(-2.0 * optical_depth(height) / cosine)
@@ -56,19 +56,19 @@ def scan(
 ) -> tuple[xr.Dataset, dict[str, Any]]:
     """Return profiles as the signal chain leaves them, and where they look to.
 
-    Noise is white with the standard deviation `sigma`; the backscatter of each ray and cycle is
+    Noise is white with the standard deviation `sigma`; the backscatter of each beam and cycle is
     off by `scatter` from altitude to altitude, and the energy of each profile by `jitter`.
     """
     rng = np.random.default_rng(seed)
-    rays = len(zenith)
+    beams = len(zenith)
     clean = power(np.abs(zenith))
-    patches = rng.normal(0.0, scatter, (cycles, rays, RANGE.size))
-    energy = np.exp(rng.normal(0.0, jitter, (cycles, rays, 1)))
-    values = clean * energy * np.exp(patches) + rng.normal(5.0, 0.2, (cycles, rays, 1))
+    patches = rng.normal(0.0, scatter, (cycles, beams, RANGE.size))
+    energy = np.exp(rng.normal(0.0, jitter, (cycles, beams, 1)))
+    values = clean * energy * np.exp(patches) + rng.normal(5.0, 0.2, (cycles, beams, 1))
     values = (values + rng.normal(0.0, sigma, values.shape)).reshape(-1, RANGE.size)
     bits = np.zeros(values.shape, dtype=np.int32)
     bits[:, RANGE < 300.0] = OVERLAP
-    starts = np.datetime64("2026-03-01", "ns") + 30 * np.arange(cycles * rays).astype(
+    starts = np.datetime64("2026-03-01", "ns") + 30 * np.arange(cycles * beams).astype(
         "timedelta64[s]"
     )
     length = np.timedelta64(30, "s")
@@ -86,7 +86,7 @@ def scan(
         "azimuth": np.tile(np.where(np.asarray(zenith) < 0, 200.0, 20.0), cycles),
         "time": starts + length // 2,
         "time_bnds": np.stack([starts, starts + length], axis=-1),
-        "shots": np.full(cycles * rays, 600),
+        "shots": np.full(cycles * beams, 600),
     }
 
 
@@ -220,25 +220,25 @@ def test_monotone_profiles_and_chi_square_come_along():
 def test_extinction_stays_withheld_where_single_altitudes_stand_in():
     """Energy that jitters, in a cloud whose extinction varies along the paths."""
     rng = np.random.default_rng(3)
-    height, cycles, rays = 10.0 * np.arange(1, 61), 24, 8
-    zenith = np.linspace(0.0, 60.0, rays)
+    height, cycles, beams = 10.0 * np.arange(1, 61), 24, 8
+    zenith = np.linspace(0.0, 60.0, beams)
     path = 1.0 / np.cos(np.radians(zenith))[:, np.newaxis]
-    air = 0.1 * rng.normal(size=(cycles, rays, 1)) + 0.1 * rng.normal(size=(cycles, rays, 60))
+    air = 0.1 * rng.normal(size=(cycles, beams, 1)) + 0.1 * rng.normal(size=(cycles, beams, 60))
     lost = np.cumsum(5e-3 * 10.0 * np.exp(2.0 * air), axis=-1)
     lost *= np.clip((height - 200.0) / 100.0, 0.0, 1.0)
     signal = np.exp(air - 2.0 * path * lost)
-    dims = ("time", "ray", "altitude")
-    rays = xr.Dataset(
+    dims = ("time", "beam", "altitude")
+    beams = xr.Dataset(
         {
             "signal": (dims, signal),
             "variance": (dims, (1e-5 * signal) ** 2),
             "quality": (dims[::2], np.zeros((cycles, 60), np.int32)),
-            "left": (dims[:2], np.zeros((cycles, rays))),
+            "left": (dims[:2], np.zeros((cycles, beams))),
             "shots": ("time", np.ones(cycles, np.int32)),
         },
-        coords={"altitude": height, "ray_zenith_angle": ("ray", zenith)},
+        coords={"altitude": height, "beam_zenith_angle": ("beam", zenith)},
     )
-    found = labeled.retrieve_optical_depth(rays, station_altitude=0.0)
+    found = labeled.retrieve_optical_depth(beams, station_altitude=0.0)
     assert "left out joint" in found.attrs["steps"]
     assert has(found, Quality.POOR_STRATIFICATION).all()
     assert np.isfinite(found["optical_depth"]).any()
@@ -263,7 +263,7 @@ def test_signal_left_in_the_tail_is_flagged_where_it_matters():
 def test_cycles_times_and_shots():
     conditioned, pointing = scan(3)
     found = solve(conditioned, pointing)
-    assert dict(found.sizes) == {"time": 3, "altitude": 60, "ray": 10, "nv": 2}
+    assert dict(found.sizes) == {"time": 3, "altitude": 60, "beam": 10, "nv": 2}
     bounds = pointing["time_bnds"].reshape(3, 10, 2)
     np.testing.assert_array_equal(found["time_bnds"][:, 0], bounds[:, 0, 0])
     np.testing.assert_array_equal(found["time_bnds"][:, 1], bounds[:, -1, 1])
@@ -271,9 +271,9 @@ def test_cycles_times_and_shots():
         found["time"], bounds[:, 0, 0] + (bounds[:, -1, 1] - bounds[:, 0, 0]) // 2
     )
     np.testing.assert_array_equal(found["shots"], 6000)
-    np.testing.assert_array_equal(found["rays"], 10)
-    np.testing.assert_allclose(found["ray_zenith_angle"], np.abs(np.sort(TWO_SIDED)))
-    np.testing.assert_allclose(found["ray_azimuth"], [200.0] * 5 + [20.0] * 5)
+    np.testing.assert_array_equal(found["beams"], 10)
+    np.testing.assert_allclose(found["beam_zenith_angle"], np.abs(np.sort(TWO_SIDED)))
+    np.testing.assert_allclose(found["beam_azimuth"], [200.0] * 5 + [20.0] * 5)
     assert "joint" in found.attrs["steps"]
 
 
@@ -282,7 +282,7 @@ def test_missing_files_leave_their_cycle_with_the_others():
     whole = solve(conditioned, pointing)
     kept = np.setdiff1d(np.arange(60), [21, 24, 25])
     found = solve(*take(conditioned, pointing, kept))
-    assert found["rays"].to_numpy().tolist() == [10, 10, 7, 10, 10, 10]
+    assert found["beams"].to_numpy().tolist() == [10, 10, 7, 10, 10, 10]
     assert found["shots"].to_numpy().tolist() == [6000, 6000, 4200, 6000, 6000, 6000]
     gone = np.isnan(found["residual"].to_numpy()).all(axis=2)
     assert np.flatnonzero(gone[2]).tolist() == [1, 4, 5]
@@ -297,8 +297,8 @@ def test_what_is_left_of_a_cycle_is_used_as_far_as_it_goes():
     conditioned, pointing = scan(6)
     kept = np.setdiff1d(np.arange(60), [*range(22, 30), *range(41, 50)])
     found = solve(*take(conditioned, pointing, kept), method="kano_hamilton")
-    assert found["rays"].to_numpy().tolist() == [10, 10, 2, 10, 1, 10]
-    # Two rays to one side, of a scan to both: nothing cancels a gradient.
+    assert found["beams"].to_numpy().tolist() == [10, 10, 2, 10, 1, 10]
+    # Two beams to one side, of a scan to both: nothing cancels a gradient.
     two, full = found.isel(time=2), found.isel(time=1)
     assert has(two, Quality.ONE_SIDED)[np.isfinite(two["optical_depth"])].all()
     wider = two["optical_depth_standard_error"] > full["optical_depth_standard_error"]
@@ -321,7 +321,7 @@ def test_every_missing_value_is_explained_whatever_the_method(method):
     assert_explained(found)
     assert has(found, Quality.INPUT_MISSING)[2].all()
     assert has(found, Quality.PILE_UP)[0].any()
-    assert found["rays"].to_numpy().tolist() == [9, 10, 0, 10, 10]
+    assert found["beams"].to_numpy().tolist() == [9, 10, 0, 10, 10]
     assert has(found, Quality.EXTRAPOLATED).any()
 
 
@@ -337,14 +337,14 @@ def test_an_angle_to_one_side_is_flagged_and_has_a_systematic_error():
     )
 
 
-def test_rays_along_the_horizon_and_unknown_ones_are_left_out():
+def test_beams_along_the_horizon_and_unknown_ones_are_left_out():
     zenith = np.concatenate([ONE_SIDE, [85.5, 90.0, 95.0]])
     conditioned, pointing = scan(3, zenith)
     pointing["zenith_angle"][12] = 180.0
     pointing["zenith_angle"][5] = np.nan
     found = solve(conditioned, pointing)
-    np.testing.assert_allclose(found["ray_zenith_angle"], ONE_SIDE)
-    assert found["rays"].to_numpy().tolist() == [9, 10, 10]
+    np.testing.assert_allclose(found["beam_zenith_angle"], ONE_SIDE)
+    assert found["beams"].to_numpy().tolist() == [9, 10, 10]
     bounds = pointing["time_bnds"]
     assert found["time_bnds"].to_numpy()[0, 0] == bounds[0, 0]
     assert found["time_bnds"].to_numpy()[0, 1] == bounds[9, 1]
@@ -399,7 +399,7 @@ def test_any_chunking_gives_the_same_bits(size):
     xr.testing.assert_identical(whole, chunked)
 
 
-def test_bins_that_no_ray_reaches_and_pieces_do_not_matter(monkeypatch):
+def test_bins_that_no_beam_reaches_and_pieces_do_not_matter(monkeypatch):
     conditioned, pointing = scan(12)
     cut = solve(conditioned, pointing, background=FAR)
     monkeypatch.setattr(labeled_altitudes, "_BESIDE", 10**6)
@@ -407,11 +407,11 @@ def test_bins_that_no_ray_reaches_and_pieces_do_not_matter(monkeypatch):
     xr.testing.assert_identical(cut, solve(conditioned, pointing, background=FAR))
 
 
-def test_rays_stay_lazy_until_they_are_wanted():
+def test_beams_stay_lazy_until_they_are_wanted():
     conditioned, pointing = scan(3)
-    rays = labeled.on_altitudes(conditioned.chunk(time=10), **(pointing | SETTINGS))
-    assert rays["signal"].chunks is not None
-    assert rays["shots"].chunks is None
+    beams = labeled.on_altitudes(conditioned.chunk(time=10), **(pointing | SETTINGS))
+    assert beams["signal"].chunks is not None
+    assert beams["shots"].chunks is None
 
 
 # What is refused

@@ -32,12 +32,12 @@ def kano_hamilton(path):
     return -0.5 * centred / np.sum(centred**2)
 
 
-def published(angle, profiles=4000, rays=6):
+def published(angle, profiles=4000, beams=6):
     """Return signals of the published cloud with 25 percent of backscatter varying."""
     rng = np.random.default_rng(21)
-    angles = np.linspace(0.0, angle, rays)
+    angles = np.linspace(0.0, angle, beams)
     path = 1 / np.cos(np.radians(angles))[:, np.newaxis]
-    varying = rng.uniform(-0.25, 0.25, (profiles, rays, 8))
+    varying = rng.uniform(-0.25, 0.25, (profiles, beams, 8))
     return np.exp(-2 * path * TAU) * (1 + varying), angles
 
 
@@ -59,7 +59,7 @@ def retrieve(signal, angles, method, **options):
 
 @given(st.lists(st.floats(1.0, 5.0), min_size=3, max_size=12, unique_by=lambda x: round(x, 2)))
 @settings(max_examples=60, deadline=None)
-def test_between_the_end_rays_and_the_regression(path):
+def test_between_the_end_beams_and_the_regression(path):
     # Level slopes are the straight line of Kano and Hamilton.
     line = kano_hamilton(path)
     assert weights(path, 1e12, order=1) == pytest.approx(line, abs=1e-9 * np.max(np.abs(line)))
@@ -94,11 +94,11 @@ def test_noise_gains_are_those_of_the_study():
     assert gains == pytest.approx([88.66, 20.04], abs=0.01)
 
 
-def test_two_rays_are_the_two_angle_formula():
+def test_two_beams_are_the_two_angle_formula():
     assert weights([1.0, 1.7], 1e12, order=1) == pytest.approx([0.5 / 0.7, -0.5 / 0.7], rel=1e-12)
 
 
-def test_rays_almost_at_one_angle_are_one_node():
+def test_beams_almost_at_one_angle_are_one_node():
     path = 1 / np.cos(np.radians([0.0, 0.01, 7.0, 7.0, 15.0]))
     operator = mld.make_operator(path, Regularisation(order=1))
     assert operator.condition < 5
@@ -106,9 +106,9 @@ def test_rays_almost_at_one_angle_are_one_node():
     assert weights(path, 1e12, order=1) == pytest.approx(line, rel=1e-6)
 
 
-@pytest.mark.parametrize(("last", "rays", "largest"), [(15, 6, 18), (75, 6, 80), (84, 12, 1100)])
-def test_condition_stays_moderate(last, rays, largest):
-    path = 1 / np.cos(np.radians(np.linspace(0, last, rays)))
+@pytest.mark.parametrize(("last", "beams", "largest"), [(15, 6, 18), (75, 6, 80), (84, 12, 1100)])
+def test_condition_stays_moderate(last, beams, largest):
+    path = 1 / np.cos(np.radians(np.linspace(0, last, beams)))
     assert mld.make_operator(path, Regularisation()).condition < largest
 
 
@@ -159,7 +159,7 @@ def test_the_error_is_the_error_of_the_prior(factor, expected):
 
 
 def test_prior_from_the_altitude_below_is_a_fixed_gain_filter():
-    signal, angles = published(30.0, profiles=5, rays=2)
+    signal, angles = published(30.0, profiles=5, beams=2)
     chosen = Regularisation(choice="fixed", strength=0.7)
     result = retrieve(signal, angles, "mld_prior", regularisation=chosen)
     single = retrieve(signal, angles, "two_angle")
@@ -182,7 +182,7 @@ def test_standard_error_is_the_scatter_at_a_fixed_strength():
     assert result.optical_depth_standard_error[0] == pytest.approx(scatter, rel=0.05)
 
 
-def test_missing_rays_are_as_if_never_measured():
+def test_missing_beams_are_as_if_never_measured():
     signal, angles = published(30.0, profiles=20)
     signal[:, 2, 3:] = np.nan
     subset = retrieve(np.delete(signal, 2, axis=1), np.delete(angles, 2), "mld")

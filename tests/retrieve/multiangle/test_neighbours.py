@@ -1,4 +1,4 @@
-"""Whether neighbouring rays scatter alike: false alarms, and patches that must be seen."""
+"""Whether neighbouring beams scatter alike: false alarms, and patches that must be seen."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from lidarops.retrieve.multiangle._neighbours import neighbours_alike
 
 def alike(scan: cases.Scan) -> bool:
     grid = slant_paths.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
-    rays = _block.make_beam_block(scan.signal, scan.variance, grid)
-    return neighbours_alike(rays, _block.regress(rays, inhomogeneity=None, robust=True))
+    beams = _block.make_beam_block(scan.signal, scan.variance, grid)
+    return neighbours_alike(beams, _block.regress(beams, inhomogeneity=None, robust=True))
 
 
 def patches(scene: cases.Scene, profiles: int, width: float, seed: int) -> cases.Scan:
@@ -30,16 +30,16 @@ def patches(scene: cases.Scene, profiles: int, width: float, seed: int) -> cases
     return scene.seen(scene.inhomogeneity * air, rng)
 
 
-def test_independent_rays_are_no_patches():
+def test_independent_beams_are_no_patches():
     """In scenes with gradients, outliers, weak light and varying extinction."""
     told = [alike(cases.random_scene(seed, 8).draw(8, seed, 6)) for seed in range(400)]
     assert np.mean(told) <= 0.01
 
 
 @pytest.mark.parametrize("profiles", [8, 24])
-def test_patches_wider_than_rays_are_apart_are_flagged(profiles):
+def test_patches_wider_than_beams_are_apart_are_flagged(profiles):
     scene = replace(
-        cases.clear(3000.0, gates=60),
+        cases.clear(3000.0, bins=60),
         zenith_angle=np.array([-70.0, -60, -45, -30, -15, 0, 15, 30, 45, 60, 70]),
     )
     for seed in range(4):
@@ -52,4 +52,4 @@ def test_patches_wider_than_rays_are_apart_are_flagged(profiles):
 
 
 def test_few_profiles_tell_nothing():
-    assert not alike(patches(cases.clear(3000.0, gates=60), 3, 1000.0, 1))
+    assert not alike(patches(cases.clear(3000.0, bins=60), 3, 1000.0, 1))

@@ -137,7 +137,7 @@ def test_cloud_at_30_degrees(correlation):
 
 
 @pytest.mark.parametrize("total", [5.0, 20.0])
-def test_thick_cloud_is_withheld_where_it_swallows_the_rays(total):
+def test_thick_cloud_is_withheld_where_it_swallows_the_beams(total):
     height = 10.0 * np.arange(1, 61)
     tau = depth(height, np.full(60, total / 600.0))
     rng = np.random.default_rng(5)
@@ -239,7 +239,7 @@ def test_tiny_leverage_is_told_with_an_honest_error():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_rays_at_the_horizon_are_as_if_never_measured(small, method):
+def test_beams_at_the_horizon_are_as_if_never_measured(small, method):
     signal, variance, height, _ = small
     horizon = np.concatenate([signal, np.ones_like(signal[:, :2])], axis=1)
     noise = np.concatenate([variance, np.ones_like(variance[:, :2])], axis=1)
@@ -308,7 +308,7 @@ def test_holes_are_bridged_or_left(small):
 
 
 def test_gaps_cost_no_more_than_the_samples_they_take():
-    """Heights that see other rays than their neighbours share less of their noise with these."""
+    """Heights that see other beams than their neighbours share less of their noise with these."""
     rng, atmosphere = np.random.default_rng(21), cloud()
     errors, with_gaps, deviations = [], [], []
     for _ in range(12):
@@ -326,17 +326,17 @@ def test_gaps_cost_no_more_than_the_samples_they_take():
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("gates", [1, 3])
-def test_few_altitudes_and_one_profile_run(small, method, gates):
+@pytest.mark.parametrize("bins", [1, 3])
+def test_few_altitudes_and_one_profile_run(small, method, bins):
     signal, variance, height, tau = small
     result = retrieve_optical_depth(
-        signal[0, :, :gates], ANGLES, height[:gates], variance=variance[0, :, :gates], method=method
+        signal[0, :, :bins], ANGLES, height[:bins], variance=variance[0, :, :bins], method=method
     )
-    assert result.optical_depth.shape == (gates,)
-    assert result.residual.shape == (12, gates)
+    assert result.optical_depth.shape == (bins,)
+    assert result.residual.shape == (12, bins)
     assert result.reach.shape == ()
     if method != "mld":
-        error = result.optical_depth - tau[:gates]
+        error = result.optical_depth - tau[:bins]
         assert np.all(np.abs(error) < 5 * result.optical_depth_standard_error)
 
 
@@ -373,7 +373,7 @@ def test_no_noise_is_taken_as_very_little(small):
     assert nothing.optical_depth == pytest.approx(little.optical_depth, abs=1e-11)
 
 
-def test_two_rays_have_no_residual(small):
+def test_two_beams_have_no_residual(small):
     signal, variance, height, _ = small
     ends = [0, 11]
     result = retrieve_optical_depth(

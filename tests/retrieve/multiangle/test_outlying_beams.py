@@ -1,4 +1,4 @@
-"""Errors are as stated where outliers leave rays out and altitudes are alike."""
+"""Errors are as stated where outliers leave beams out and altitudes are alike."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import pytest
 from lidarops.bench.accuracy import multiangle_cases as cases
 
 
-@pytest.mark.parametrize(("rays", "scatter"), [(4, 0.2), (10, 0.05)])
-def test_altitudes_that_lost_a_ray_tell_nothing_false_of_their_neighbours(rays, scatter):
+@pytest.mark.parametrize(("beams", "scatter"), [(4, 0.2), (10, 0.05)])
+def test_altitudes_that_lost_a_beam_tell_nothing_false_of_their_neighbours(beams, scatter):
     """Taken for altitudes with more of the noise of all, they made errors 1.3-1.6 times."""
     ours = replace(
         cases.cloud(0.92, largest=45.0),
-        zenith_angle=np.linspace(0.0, 45.0, rays),
+        zenith_angle=np.linspace(0.0, 45.0, beams),
         inhomogeneity=scatter,
         outliers=0.05,
     )

@@ -16,8 +16,8 @@ from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 def varies(scan: cases.Scan) -> bool:
     grid = slant_paths.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
-    rays = _block.make_beam_block(scan.signal, scan.variance, grid)
-    found = doubted_from(rays, _block.regress(rays, inhomogeneity=None, robust=True))
+    beams = _block.make_beam_block(scan.signal, scan.variance, grid)
+    found = doubted_from(beams, _block.regress(beams, inhomogeneity=None, robust=True))
     return found is not None
 
 
@@ -41,7 +41,7 @@ def test_variation_in_a_cloud_is_seen(largest, correlation):
 
 
 def test_variation_is_seen_where_scatter_itself_grows_little():
-    """Where layers scatter independently: what rays have lost adds up to little, but to much in
+    """Where layers scatter independently: what beams have lost adds up to little, but to much in
     the mean over altitudes, which is what the optical depth of a smooth profile follows."""
     scene = replace(cases.cloud(0.0, largest=45.0), variation=0.5)
     assert all(varies(scene.draw(24, seed, 5)) for seed in range(8))
@@ -51,7 +51,7 @@ def test_variation_is_seen_where_scatter_itself_grows_little():
 
 
 def test_variation_is_seen_in_most_random_clouds():
-    """With 3 to 20 rays, outliers, gradients, and all scatters and correlations."""
+    """With 3 to 20 beams, outliers, gradients, and all scatters and correlations."""
     told = []
     for seed in range(120):
         scene = cases.random_scene(seed, 8)
@@ -77,7 +77,7 @@ def test_what_all_profiles_share_leaves_the_lower_altitudes_alone():
 def test_noise_that_is_larger_than_stated_aloft_is_no_variation():
     """As of a background that is a little off: 20 percent more in the logarithm's spread."""
     for seed in range(10):
-        scene = replace(cases.clear(30.0, gates=100), inhomogeneity=0.002)
+        scene = replace(cases.clear(30.0, bins=100), inhomogeneity=0.002)
         scan = scene.draw(20, seed, 3)
         assert not varies(replace(scan, variance=scan.variance / 1.2**2))
 
@@ -116,7 +116,7 @@ def test_robust_passes_run_by_chance_in_few_clean_blocks_and_wherever_outliers_a
 
 @pytest.mark.parametrize("scatter", [0.0, 0.005])
 def test_a_scatter_that_is_told_too_large_makes_no_noise_a_variation(scatter):
-    scene = replace(cases.clear(1e5, gates=60), inhomogeneity=scatter)
+    scene = replace(cases.clear(1e5, bins=60), inhomogeneity=scatter)
     noise = np.linspace(1e-3, 3e-2, 60)
     rng = np.random.default_rng(4)
     air = np.exp(scatter * rng.normal(size=(8, scene.zenith_angle.size, 60)))
@@ -134,7 +134,7 @@ def test_a_scatter_that_is_told_too_large_makes_no_noise_a_variation(scatter):
 
 
 def test_signals_without_any_scatter_are_no_variation():
-    scene = cases.clear(1e5, gates=49)
+    scene = cases.clear(1e5, bins=49)
     found = retrieve_optical_depth(
         np.ones((6, scene.zenith_angle.size, 49)),
         scene.zenith_angle,

@@ -1,4 +1,4 @@
-"""Slant paths: the spherical one against exact geometry, and which rays are usable."""
+"""Slant paths: the spherical one against exact geometry, and which beams are usable."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_negative_angle_leads_backwards():
     st.floats(0.0, 2 * np.pi),
 )
 @settings(max_examples=200, deadline=None)
-def test_rays_surround_the_zenith_when_no_half_plane_holds_them(azimuth, turn):
+def test_beams_surround_the_zenith_when_no_half_plane_holds_them(azimuth, turn):
     directions = np.array(azimuth)
     normals = np.linspace(0, 2 * np.pi, 3601)
     # The zero vector is outside the convex hull if one half plane strictly holds all directions.
@@ -77,7 +77,7 @@ def test_rays_surround_the_zenith_when_no_half_plane_holds_them(azimuth, turn):
     ("azimuth", "around"),
     [([0.0, 180.0], True), ([0.0, 120.0, 240.0], True), ([0.0, 150.0], False), ([7.0, 7.0], False)],
 )
-def test_opposite_rays_surround_the_zenith(azimuth, around):
+def test_opposite_beams_surround_the_zenith(azimuth, around):
     assert slant_paths.surrounds_zenith(np.radians(azimuth)) == around
 
 

@@ -13,9 +13,9 @@ from lidarops.retrieve.network.extinction_field import retrieve_network
 # Fields that a prior rules out ----------------------------------------------------------------
 
 
-def places(vertices, axes=3, seed=1):
+def places(crossings, axes=3, seed=1):
     rng = np.random.default_rng(seed)
-    return np.pad(rng.normal(0.0, 200.0, (vertices, axes)), ((0, 0), (0, 3 - axes)))
+    return np.pad(rng.normal(0.0, 200.0, (crossings, axes)), ((0, 0), (0, 3 - axes)))
 
 
 @pytest.mark.parametrize("axes", [2, 3])
@@ -40,9 +40,9 @@ def test_bends_are_alike_in_all_directions_and_sizes_of_a_network():
     np.testing.assert_allclose(other.T @ other, one.T @ one, atol=1e-12)
 
 
-@pytest.mark.parametrize("vertices", [0, 1, 2, 3])
-def test_few_vertices_in_a_plane_have_no_bends(vertices):
-    assert _block_errors.bends(places(vertices, 2)).size == 0
+@pytest.mark.parametrize("crossings", [0, 1, 2, 3])
+def test_few_crossings_in_a_plane_have_no_bends(crossings):
+    assert _block_errors.bends(places(crossings, 2)).size == 0
 
 
 # Errors ---------------------------------------------------------------------------------------
@@ -78,7 +78,7 @@ def test_a_profile_that_came_out_high_states_no_less_than_its_block():
 def test_a_profile_is_compared_with_those_that_see_what_it_sees():
     extinction = np.full((6, 1), 1e-4)
     variance = (np.array([[0.2], [0.3], [0.8], [0.9], [0.1], [0.7]]) * 1e-4) ** 2
-    # All rays, all, one lost (4 times).
+    # All beams, all, one lost (4 times).
     seen = np.array([[1, 1, 1]] * 2 + [[1, 1, 0]] * 3 + [[0, 1, 1]], dtype=bool)
     block = np.zeros(6, dtype=np.intp)
     found = _block_errors.at_least_typical(extinction, variance, block, seen)
@@ -94,16 +94,16 @@ def test_a_profile_is_compared_with_those_that_see_what_it_sees():
 @pytest.mark.parametrize(
     ("cluster", "failure", "before"),
     [
-        # Air that bends over the network, which the rays take for attenuation.
+        # Air that bends over the network, which the beams take for attenuation.
         (89, "none, plume", 863),
-        # Three vertices in thin air, of which nothing but the prior tells.
+        # Three crossings in thin air, of which nothing but the prior tells.
         (523, "outliers", 96),
         # Thin air, in which noise moves all profiles to one side of their mean.
         (647, "plume that drifts within a block", 124),
         (169, "outliers", 106),
         # The same, in profiles that came out highest.
         (623, "none, layered", 127),
-        # A profile in which a ray has nearly nothing left at a gate.
+        # A profile in which a beam has nearly nothing left at a bin.
         (338, "plume that drifts within a block", 22),
     ],
 )
@@ -155,7 +155,7 @@ def test_a_profile_that_is_far_off_moves_no_other(off):
 
 
 @pytest.mark.parametrize("factor", [1e4, 1e8])
-def test_rays_that_contradict_each_other_in_a_profile_cost_the_others_nothing(factor):
+def test_beams_that_contradict_each_other_in_a_profile_cost_the_others_nothing(factor):
     """The others stated up to 26 times their errors."""
     net = three_by_two()
     r = grid(net)
@@ -164,7 +164,7 @@ def test_rays_that_contradict_each_other_in_a_profile_cost_the_others_nothing(fa
     heard[7, 0, 133:136] *= factor
     settings = {"variance": variance, "full_overlap_range": 100.0}
     clean, found = (retrieve_network(one, r, net, **settings) for one in (power, heard))
-    others, near = np.arange(50) != 7, net.near_vertex
+    others, near = np.arange(50) != 7, net.near_crossing
     ratio = found.extinction_standard_error / clean.extinction_standard_error
     np.testing.assert_allclose(ratio[others][:, near], 1.0, rtol=0.05)
     np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])

@@ -1,4 +1,4 @@
-"""What signals that bend put into the values at crossings is part of the stated error."""
+"""What signals that bend put into the values at passages is part of the stated error."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.oracle_network import (
-    at_vertices,
+    at_crossings,
     gradient,
     grid,
     noisy,
@@ -47,7 +47,7 @@ def solved(net, field, relative, profiles, *, step=5.0, additive=0.0, seed=1, **
 
 def off(net, found, field):
     """Return errors in stated ones, of values that no flag rejects, and stated relative ones."""
-    truth = at_vertices(net, field)
+    truth = at_crossings(net, field)
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
     stated = found.extinction_standard_error
     return (
@@ -57,22 +57,22 @@ def off(net, found, field):
     )
 
 
-# Crossings ------------------------------------------------------------------------------------
+# Passages ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("gates", [3, 4, 5, 7, 20, 99])
-def test_a_departure_is_what_a_line_has_more_than_the_truth(gates):
+@pytest.mark.parametrize("bins", [3, 4, 5, 7, 20, 99])
+def test_a_departure_is_what_a_line_has_more_than_the_truth(bins):
     net = triangle()
-    r = np.tile(grid(net, 3.0), (net.rays, 1)) + np.array([[0.0], [0.7], [1.9]])
-    layout = _condensed_signals.lay_out(net, r, None, np.full(3, 100.0), gates)
+    r = np.tile(grid(net, 3.0), (net.beams, 1)) + np.array([[0.0], [0.7], [1.9]])
+    layout = _condensed_signals.lay_out(net, r, None, np.full(3, 100.0), bins)
     shares = _curvature_errors.weights(layout)
     rng = np.random.default_rng(4)
-    for c, (ray, where) in enumerate(
-        zip(layout.crossings.ray, layout.crossings.range, strict=True)
+    for c, (beam, where) in enumerate(
+        zip(layout.passages.beam, layout.passages.range, strict=True)
     ):
-        near = r[ray, layout.window[c] : layout.window[c] + gates]
-        # What a polynomial through so few gates can follow.
-        bend = np.polynomial.Polynomial(rng.normal(size=min(gates - 1, 4) + 1))
+        near = r[beam, layout.window[c] : layout.window[c] + bins]
+        # What a polynomial through so few bins can follow.
+        bend = np.polynomial.Polynomial(rng.normal(size=min(bins - 1, 4) + 1))
         logs = bend((near - where) / 50.0)
         line = np.polynomial.Polynomial.fit(near, logs, 1)(where)
         assert shares[c] @ logs == pytest.approx(line - bend(0.0), rel=1e-6, abs=1e-8)
@@ -110,26 +110,26 @@ def test_the_noise_of_a_departure_is_what_is_stated():
 @pytest.mark.parametrize("deviation", [*_empirical_prior.DEVIATIONS, np.inf])
 def test_a_solution_tells_the_prior_that_it_was_found_with(deviation, strength):
     net = three_by_two()
-    shape = (1, net.vertices)
+    shape = (1, net.crossings)
     layout = _condensed_signals.lay_out(
-        net, np.tile(grid(net), (net.rays, 1)), None, np.full(net.rays, 100), 7
+        net, np.tile(grid(net), (net.beams, 1)), None, np.full(net.beams, 100), 7
     )
     power = signals(net, grid(net), gradient)[np.newaxis]
     data = _condensed_signals.condense(
-        power, ((0.01 * power[0]) ** 2)[np.newaxis], np.zeros(1, dtype=np.intp), np.ones(net.rays),
+        power, ((0.01 * power[0]) ** 2)[np.newaxis], np.zeros(1, dtype=np.intp), np.ones(net.beams),
         layout, relative=False, screened=False,
     )  # fmt: skip
-    vertex = layout.crossings.vertex.astype(np.intp)
-    problem = _empirical_prior._Problem(data, layout, vertex, np.ones(net.rays), net.vertex)
+    crossing = layout.passages.crossing.astype(np.intp)
+    problem = _empirical_prior._Problem(data, layout, crossing, np.ones(net.beams), net.crossing)
     found = problem.solve(deviation, 4, strength)
-    precision, flat = _empirical_prior.prior_of(net.vertex, found, 0)
+    precision, flat = _empirical_prior.prior_of(net.crossing, found, 0)
     assert found.logarithm.shape == shape
     assert flat == np.isinf(deviation)
     if flat:
         assert not precision.any()
     else:
         expected = _empirical_prior._free_level(
-            _empirical_prior._gradient(net.vertex), deviation, strength
+            _empirical_prior._gradient(net.crossing), deviation, strength
         )[0]
         np.testing.assert_allclose(precision, expected, rtol=1e-12, atol=1e-12)
 
@@ -139,35 +139,40 @@ def test_a_solution_tells_the_prior_that_it_was_found_with(deviation, strength):
 def test_errors_of_values_move_solutions_as_if_these_were_solved_anew(build, deviation):
     net = build()
     r = grid(net)
-    # Without noise: what it leaves in a ray, weights that follow the constant change.
+    # Without noise: what it leaves in a beam, weights that follow the constant change.
     power = signals(net, r, gradient)[np.newaxis]
     variance = (0.01 * power[0]) ** 2
     layout = _condensed_signals.lay_out(
-        net, np.tile(r, (net.rays, 1)), None, np.full(net.rays, 100), 7
+        net, np.tile(r, (net.beams, 1)), None, np.full(net.beams, 100), 7
     )
     data = _condensed_signals.condense(
-        power, variance[np.newaxis], np.zeros(1, dtype=np.intp), np.ones(net.rays), layout,
+        power, variance[np.newaxis], np.zeros(1, dtype=np.intp), np.ones(net.beams), layout,
         relative=False, screened=False,
     )  # fmt: skip
-    shared = np.random.default_rng(6).normal(0.0, 1e-4, (layout.crossings.ray.size, 2))
+    shared = np.random.default_rng(6).normal(0.0, 1e-4, (layout.passages.beam.size, 2))
     shared[:, 1] = 1e-8
-    # Values are relative to the first one of their ray, and so are integrals.
-    first = shared[layout.first_crossing[layout.crossings.ray], 0]
+    # Values are relative to the first one of their beam, and so are integrals.
+    first = shared[layout.first_passage[layout.passages.beam], 0]
     other = replace(
         data, log_value=data.log_value + shared[:, 0] - first,
         integral=data.integral * np.exp(-first),
     )  # fmt: skip
     numbers = np.cumsum(layout.measured) - 1
-    given = layout, numbers[layout.crossings.vertex].astype(np.intp), np.ones(net.rays), net.vertex
+    given = (
+        layout,
+        numbers[layout.passages.crossing].astype(np.intp),
+        np.ones(net.beams),
+        net.crossing,
+    )
     here, there = (_empirical_prior._Problem(d, *given).solve(deviation, 40) for d in (data, other))
-    precision, flat = _empirical_prior.prior_of(net.vertex, here, 0)
+    precision, flat = _empirical_prior.prior_of(net.crossing, here, 0)
     assert flat == (not np.isfinite(deviation))
 
     def carried(shared, own):
-        out = np.zeros((1, net.vertices, 4))
+        out = np.zeros((1, net.crossings, 4))
         _curvature_errors.carry_errors(
             data.log_value, data.integral, data.usable, data.covariance,
-            (layout.first_crossing, layout.offset, given[1]), precision, flat, here.logarithm,
+            (layout.first_passage, layout.offset, given[1]), precision, flat, here.logarithm,
             shared, own[np.newaxis], out,
         )  # fmt: skip
         return out[0]
@@ -178,7 +183,7 @@ def test_errors_of_values_move_solutions_as_if_these_were_solved_anew(build, dev
     assert known.any()
     np.testing.assert_allclose(out[..., 0][known], moved[known], rtol=0.01, atol=1e-5)
     np.testing.assert_allclose(out[..., 2:], out[..., :2] * [2.0, 4.0], rtol=1e-9)
-    # Crossing by crossing, noise adds up in squares.
+    # Passage by passage, noise adds up in squares.
     single = [carried(one[:, np.newaxis] * [1.0, 0.0], 0.0 * shared) for one in np.eye(len(shared))]
     spread = sum(s[:, 0] ** 2 * v for s, v in zip(single, shared[:, 1], strict=True))
     np.testing.assert_allclose(out[:, 1], spread, rtol=1e-9)
@@ -218,7 +223,7 @@ def test_a_layer_that_rises_within_a_block_is_in_the_error(deep, rise):
     heights = 420.0 + rise * np.linspace(-0.5, 0.5, 50)
     fields = [layer(deep, height) for height in heights]
     power = np.stack([signals(net, r, field) for field in fields])
-    truth = np.stack([at_vertices(net, field) for field in fields])
+    truth = np.stack([at_crossings(net, field) for field in fields])
     deviation = 0.003 * power
     power = power + deviation * np.random.default_rng(8).standard_normal(power.shape)
     found = extinction_field.retrieve_network(
@@ -294,7 +299,7 @@ def test_blocks_state_the_same_alone_and_beside_others():
 
 
 def test_random_networks_state_what_thin_layers_do():
-    name = "layer of a few gates"
+    name = "layer of a few bins"
     found = [j for c in range(24) for j, _ in draws.judge_networks(c, 10) if j.failure.name == name]
     assert 6 < len(found) <= 12
     kept = [np.isfinite(j.error) & (j.bits == 0) for j in found]

@@ -1,4 +1,4 @@
-"""Cycles of rays: the closed form against linear algebra and exact arithmetic."""
+"""Cycles of beams: the closed form against linear algebra and exact arithmetic."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_result_does_not_depend_on_the_other_cycles():
 # The lambda family --------------------------------------------------------------------------
 
 
-def test_three_rays_give_the_equation_of_the_paper():
+def test_three_beams_give_the_equation_of_the_paper():
     starts, ends, b, _, _ = rows(np.random.default_rng(4), 50, 3)
     lam = 0.8
     (a11, a22, a33), (a12, a23, a31) = starts.T, ends.T
@@ -203,7 +203,7 @@ def paper_rows(angle=60.0, extinction=2e-3, relative=0.05):
     starts = np.ones((1, 3))
     ends = np.exp(-2 * depths)
     integrals = (starts - ends) / extinction
-    # Of 7 gates at a vertex, and of all gates of 5 m between.
+    # Of 7 bins at a crossing, and of all bins of 5 m between.
     variance = np.zeros((1, 3, 3, 3))
     variance[..., 0, 0] = variance[..., 1, 1] = relative**2 / 7
     variance[..., 2, 2] = relative**2 / 40

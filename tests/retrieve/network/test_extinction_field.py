@@ -7,7 +7,7 @@ import pytest
 from support.oracle_network import (
     FIELDS,
     QUIET,
-    at_vertices,
+    at_crossings,
     fan,
     gradient,
     grid,
@@ -41,7 +41,7 @@ def test_homogeneous_triangle_is_exact_at_any_step(step, extinction, method):
         if method == "network"
         else without_noise(triangle(), homogeneous(extinction), step=step, method=method)
     )
-    # Of an optical depth of 24, a cycle tells the vertex behind the first to 6 digits only.
+    # Of an optical depth of 24, a cycle tells the crossing behind the first to 6 digits only.
     reported = slice(0, 1 if extinction > 0.05 and method == "cycle" else 2)
     np.testing.assert_allclose(result.extinction[reported], extinction, rtol=1e-10)
     assert np.isnan(result.extinction[2])
@@ -51,14 +51,14 @@ def test_homogeneous_triangle_is_exact_at_any_step(step, extinction, method):
 def test_gradient_converges_with_the_step(step, bound):
     net = triangle()
     result = without_noise(net, gradient, step=step)
-    np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=bound)
+    np.testing.assert_allclose(result.extinction[:2], at_crossings(net, gradient)[:2], rtol=bound)
 
 
 def test_plume_converges_with_the_step():
     net = triangle()
     errors = [
         np.max(
-            np.abs(without_noise(net, plume, step=s).extinction / at_vertices(net, plume) - 1)[:2]
+            np.abs(without_noise(net, plume, step=s).extinction / at_crossings(net, plume) - 1)[:2]
         )
         for s in (7.5, 3.75, 1.0)
     ]
@@ -76,8 +76,8 @@ def test_bias_of_the_multiplier_is_as_predicted_for_any_exponent(exponent, name)
         biased = without_noise(
             net, field, step=1.0, exponent=exponent, method="multiplier", multiplier=multiplier
         )
-        vertex = walk.vertex[0]
-        measured = 1.0 - exact.extinction[vertex] / biased.extinction[vertex]
+        crossing = walk.crossing[0]
+        measured = 1.0 - exact.extinction[crossing] / biased.extinction[crossing]
         predicted = systematic_error(exponent * optical_depths(net, walk, field), multiplier)
         assert measured == pytest.approx(float(predicted), abs=1e-4)
 
@@ -87,9 +87,9 @@ def test_larger_networks_agree_with_the_truth(name):
     net, field = three_by_two(), FIELDS[name]
     for prior, bound in (("none", 3e-3), ("block", 3e-3)):
         result = without_noise(net, field, step=1.0, method="network", prior=prior)
-        near = net.near_vertex
+        near = net.near_crossing
         np.testing.assert_allclose(
-            result.extinction[near], at_vertices(net, field)[near], rtol=bound
+            result.extinction[near], at_crossings(net, field)[near], rtol=bound
         )
 
 
@@ -101,13 +101,13 @@ def test_network_without_prior_is_the_closed_form_on_a_triangle():
     ]
     settled = ~both[1].flags.unsettled[:, 0] & np.isfinite(both[0].extinction[:, 0])
     assert settled.mean() > 0.9
-    for vertex in (0, 1):
+    for crossing in (0, 1):
         np.testing.assert_allclose(
-            both[1].extinction[settled, vertex], both[0].extinction[settled, vertex], rtol=5e-3
+            both[1].extinction[settled, crossing], both[0].extinction[settled, crossing], rtol=5e-3
         )
         np.testing.assert_allclose(
-            both[1].extinction_standard_error[settled, vertex],
-            both[0].extinction_standard_error[settled, vertex],
+            both[1].extinction_standard_error[settled, crossing],
+            both[0].extinction_standard_error[settled, crossing],
             rtol=0.02,
         )
 
@@ -151,13 +151,13 @@ def test_overlap_function_is_divided_out():
     np.testing.assert_allclose(result.extinction, expected, rtol=1e-10)
 
 
-def test_exponent_may_differ_from_ray_to_ray():
+def test_exponent_may_differ_from_beam_to_beam():
     net = triangle()
     r, exponent = grid(net, 1.0), np.array([0.7, 1.0, 1.5])
     power = np.stack([signals(net, r, gradient, m)[i] for i, m in enumerate(exponent)])
     result = retrieve_network(power, r, net, method="cycle", variance=QUIET * power**2,
                    full_overlap_range=100.0, exponent=exponent)  # fmt: skip
-    np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=1e-3)
+    np.testing.assert_allclose(result.extinction[:2], at_crossings(net, gradient)[:2], rtol=1e-3)
 
 
 # With noise ---------------------------------------------------------------------------------
@@ -169,7 +169,7 @@ def test_exponent_may_differ_from_ray_to_ray():
 )
 def test_network_is_far_better_than_the_exact_triangle(name, relative, bound, exact):
     net, field = triangle(), FIELDS[name]
-    truth = at_vertices(net, field)
+    truth = at_crossings(net, field)
     result = with_noise(net, field, relative)
     assert root_mean_square(relative_errors(result, truth))[0] <= bound
     assert result.flags.flagged[:, 0].mean() < 0.02
@@ -181,9 +181,9 @@ def test_network_is_far_better_than_the_exact_triangle(name, relative, bound, ex
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_three_lidars_with_two_rays(name):
+def test_three_lidars_with_two_beams(name):
     net, field = three_by_two(), FIELDS[name]
-    near, truth = net.near_vertex, at_vertices(net, field)
+    near, truth = net.near_crossing, at_crossings(net, field)
     result = with_noise(net, field, 0.05, 300)
     assert np.median(root_mean_square(relative_errors(result, truth))[near]) <= 0.08
     assert 0.7 < np.mean(result.reduced_chi_square) < 1.3
@@ -199,7 +199,7 @@ def test_values_stay_within_3_errors_while_a_plume_moves(relative):
     r = grid(net)
     fields = [lambda x, y, z, e=e: plume(x, y, z, e) for e in np.linspace(-200.0, 100.0, 100)]
     clean = np.array([signals(net, r, f) for f in fields])
-    truth = np.array([at_vertices(net, f) for f in fields])
+    truth = np.array([at_crossings(net, f) for f in fields])
     level = clean[:, :, 100:101]
     deviation = np.hypot(relative * clean, 0.01 * level)
     power = clean + deviation * np.random.default_rng(2).standard_normal(clean.shape)
@@ -209,35 +209,35 @@ def test_values_stay_within_3_errors_while_a_plume_moves(relative):
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
     assert np.mean(np.abs(score) < 3) >= 0.98
     assert usable[50:, 0].mean() > 0.9
-    # Two rays reach behind the plume of the first block: they tell of it, but not how large.
+    # Two beams reach behind the plume of the first block: they tell of it, but not how large.
     assert np.all(result.degrees_of_freedom[:50] < 0)
     assert result.flags.flagged[:50].all()
 
 
 def test_long_chains_are_not_biased():
-    # 4 x 3 rays: rows that are linear in 1 / extinction have scores that spread by 2.5.
+    # 4 x 3 beams: rows that are linear in 1 / extinction have scores that spread by 2.5.
     net = fan(
         [-450.0, -150.0, 150.0, 450.0],
         [(42, 55, 68), (62, 78, 94), (86, 102, 118), (112, 125, 138)],
         farthest=900.0,
     )
-    assert net.vertices > 20
+    assert net.crossings > 20
     result = with_noise(net, homogeneous(1e-3), 0.01, 60, prior="none")
     usable = ~result.flags.flagged & np.isfinite(result.extinction)
     error = (result.extinction - 1e-3) / result.extinction_standard_error
-    assert usable[:, net.near_vertex].mean() > 0.5
+    assert usable[:, net.near_crossing].mean() > 0.5
     assert np.std(error[usable]) < 1.3
     assert 0.8 < np.mean(result.reduced_chi_square) < 1.2
 
 
-def test_prior_that_the_rays_contradict_is_weakened_or_given_up():
-    # A plume over 60 vertices is no gradient: the prior would shift them all by 2 errors.
+def test_prior_that_the_beams_contradict_is_weakened_or_given_up():
+    # A plume over 60 crossings is no gradient: the prior would shift them all by 2 errors.
     net = fan(
         np.linspace(-600, 600, 5),
         [(40, 52, 64), (55, 68, 81), (75, 90, 105), (99, 112, 125), (116, 128, 140)],
         farthest=1400.0,
     )
-    truth = at_vertices(net, plume)
+    truth = at_crossings(net, plume)
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.05, 50, additive=0.002)
     settings = {"variance": variance, "full_overlap_range": 100.0}
@@ -267,13 +267,13 @@ def test_prior_that_the_mean_of_profiles_contradicts_is_weakened_or_given_up():
               farthest=1500.0)  # fmt: skip
     result = with_noise(net, steep, 0.2, 100, seed=11)
     kept = ~result.flags.flagged & np.isfinite(result.extinction)
-    score = (result.extinction - at_vertices(net, steep)) / result.extinction_standard_error
+    score = (result.extinction - at_crossings(net, steep)) / result.extinction_standard_error
     assert np.mean((np.abs(score) > 4.0) & kept) < 0.02
     weaker = (result.prior_deviation > 0.015) | np.isinf(result.prior_deviation)
     assert weaker.all()
 
 
-def scores_where_far_vertices_fade(scale, relative, net):
+def scores_where_far_crossings_fade(scale, relative, net):
     """Return the result and errors over stated ones where the field falls off with height."""
     r = grid(net)
 
@@ -282,7 +282,7 @@ def scores_where_far_vertices_fade(scale, relative, net):
 
     power, variance = noisy(net, r, signals(net, r, field), relative, 40, 0, relative / 3.0)
     result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
-    score = (result.extinction - at_vertices(net, field)) / result.extinction_standard_error
+    score = (result.extinction - at_crossings(net, field)) / result.extinction_standard_error
     return result, score
 
 
@@ -293,15 +293,15 @@ def scores_where_far_vertices_fade(scale, relative, net):
 )  # fmt: skip
 def test_a_prior_that_nothing_tests_is_not_reported_as_a_measurement(scale, relative, net):
     """All values were without a flag, half of them off by more than 4 errors."""
-    result, score = scores_where_far_vertices_fade(scale, relative, net)
+    result, score = scores_where_far_crossings_fade(scale, relative, net)
     assert np.median(result.degrees_of_freedom) < 0
     kept = ~result.flags.flagged & np.isfinite(result.extinction)
-    assert np.mean((np.abs(score) > 4.0)[:, net.near_vertex] & kept[:, net.near_vertex]) < 0.01
+    assert np.mean((np.abs(score) > 4.0)[:, net.near_crossing] & kept[:, net.near_crossing]) < 0.01
 
 
-def test_a_field_that_too_few_rays_see_is_told_with_wide_errors():
+def test_a_field_that_too_few_beams_see_is_told_with_wide_errors():
     net = three_by_two()
-    result, score = scores_where_far_vertices_fade(500.0, 0.1, net)
+    result, score = scores_where_far_crossings_fade(500.0, 0.1, net)
     assert np.median(result.degrees_of_freedom) < 0
     kept = ~result.flags.flagged & np.isfinite(result.extinction)
     assert kept.sum() > 40
@@ -311,19 +311,19 @@ def test_a_field_that_too_few_rays_see_is_told_with_wide_errors():
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_rays_that_profiles_lack_cost_no_more_than_what_they_saw(name):
+def test_beams_that_profiles_lack_cost_no_more_than_what_they_saw(name):
     net, field = three_by_two(), FIELDS[name]
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field), 0.02, 50, seed=2)
-    lost = np.random.default_rng(2).random((50, net.rays, 1)) < 0.25
+    lost = np.random.default_rng(2).random((50, net.beams, 1)) < 0.25
     found = [
         retrieve_network(one, r, net, variance=variance, full_overlap_range=100.0)
         for one in (power, np.where(lost, np.nan, power))
     ]
     kept = [np.isfinite(one.extinction) & ~one.flags.flagged for one in found]
-    # Of a vertex that two rays see, at best (3 / 4)^2 are without a flag.
+    # Of a crossing that two beams see, at best (3 / 4)^2 are without a flag.
     assert kept[1].sum() > 0.4 * kept[0].sum()
-    score = (found[1].extinction - at_vertices(net, field)) / found[1].extinction_standard_error
+    score = (found[1].extinction - at_crossings(net, field)) / found[1].extinction_standard_error
     assert np.all(np.abs(score[kept[1]]) < 4.0)
 
 
@@ -344,7 +344,7 @@ def test_average_signals_before_not_solutions_afterwards():
     assert root_mean_square(means - 1) > 2 * error
 
 
-def test_averages_leave_out_rays_with_gaps():
+def test_averages_leave_out_beams_with_gaps():
     rng = np.random.default_rng(1)
     power = rng.uniform(1.0, 2.0, (5, 2, 8))
     power[1, 0, 3] = np.nan
@@ -357,7 +357,7 @@ def test_averages_leave_out_rays_with_gaps():
     assert np.isnan(mean[:, 1, 6:]).all()
     np.testing.assert_allclose(variance[:, 0, 0], [0.15, 0.15], rtol=1e-14)
     assert extinction_field.average_signals(power, labels)[1] is None
-    # A gate of unknown variance is a gap: one profile must not take it from the mean of all.
+    # A bin of unknown variance is a gap: one profile must not take it from the mean of all.
     noise = np.full(power.shape, 0.3)
     noise[[2, 0], [0, 1], [5, 2]] = np.nan, np.inf
     noise[:, 1, 5] = np.nan
@@ -441,7 +441,7 @@ def test_odd_arrays_are_taken_and_shapes_kept():
     assert none.extinction.shape == (0, 3)
 
 
-def test_rays_may_have_ranges_of_their_own():
+def test_beams_may_have_ranges_of_their_own():
     net = triangle()
     fine, coarse = grid(net, 3.75), grid(net, 7.5)
     ranges = np.full((3, fine.size), np.nan)
@@ -452,10 +452,10 @@ def test_rays_may_have_ranges_of_their_own():
     power[2, coarse.size :] = np.nan
     result = retrieve_network(power, ranges, net, method="cycle", variance=1e-12 * power**2,
                    full_overlap_range=100.0)  # fmt: skip
-    np.testing.assert_allclose(result.extinction[:2], at_vertices(net, gradient)[:2], rtol=5e-3)
+    np.testing.assert_allclose(result.extinction[:2], at_crossings(net, gradient)[:2], rtol=5e-3)
 
 
-def test_vertices_without_full_overlap_are_not_measured():
+def test_crossings_without_full_overlap_are_not_measured():
     net = three_by_two()
     result = with_noise(net, homogeneous(), 0.02, 5)
     assert not result.flags.not_measured.any()
@@ -464,7 +464,7 @@ def test_vertices_without_full_overlap_are_not_measured():
     far = retrieve_network(power, r, net, variance=1e-6 * power**2, full_overlap_range=650.0)
     assert far.flags.not_measured.any()
     assert np.isnan(far.extinction[far.flags.not_measured]).all()
-    assert np.isfinite(far.extinction[~far.flags.not_measured & far.near_vertex]).any()
+    assert np.isfinite(far.extinction[~far.flags.not_measured & far.near_crossing]).any()
 
 
 def apart(one, other):
@@ -507,26 +507,26 @@ def test_one_loud_profile_costs_the_others_nothing(factor):
         assert not mine.any()
         told = found.flags.weak_signal | found.flags.signal_not_positive | found.flags.outlying
         told |= found.flags.signal_missing
-        assert told[3, net.near_vertex].all()
+        assert told[3, net.near_crossing].all()
     score = (found.extinction - 2e-3) / found.extinction_standard_error
     assert np.all(np.abs(score[3][mine]) < 4.0)
 
 
 def between(net, r):
-    """Return the gate of each ray in the middle of its last two vertices."""
-    last = [net.on_ray(ray)[1][-2:] for ray in range(net.rays)]
+    """Return the bin of each beam in the middle of its last two crossings."""
+    last = [net.on_beam(beam)[1][-2:] for beam in range(net.beams)]
     return np.searchsorted(r, np.mean(last, axis=1))
 
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 1e12])
-def test_a_gate_of_unknown_variance_leaves_the_other_profiles_as_they_are(factor):
-    """One gate, between vertices, took its rays from the mean: the prior then went untested."""
+def test_a_bin_of_unknown_variance_leaves_the_other_profiles_as_they_are(factor):
+    """One bin, between crossings, took its beams from the mean: the prior then went untested."""
     net = three_by_two()
     r = grid(net)
     clean = signals(net, r, lambda _, __, z: 1.5e-3 * np.exp(-(z - 500.0) / 250.0))
     power, variance = noisy(net, r, clean, 0.05, 60)
     told = np.broadcast_to(variance, power.shape).copy()
-    told[7, np.arange(net.rays), between(net, r)] *= factor
+    told[7, np.arange(net.beams), between(net, r)] *= factor
     settings = {"full_overlap_range": 100.0}
     found = retrieve_network(power, r, net, variance=told, **settings)
     whole = retrieve_network(power, r, net, variance=variance, **settings)
@@ -538,27 +538,27 @@ def test_a_gate_of_unknown_variance_leaves_the_other_profiles_as_they_are(factor
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_gate_of_unknown_variance_costs_what_one_without_signal_does(bad):
+def test_a_bin_of_unknown_variance_costs_what_one_without_signal_does(bad):
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.01, 50, seed=4)
-    ray = int(np.argmax(np.bincount(net.crossings.ray)))
-    gate = between(net, r)[ray]
+    beam = int(np.argmax(np.bincount(net.passages.beam)))
+    bin = between(net, r)[beam]
     told = np.broadcast_to(variance, power.shape).copy()
-    told[7, ray, gate] = bad
+    told[7, beam, bin] = bad
     lost = power.copy()
-    lost[7, ray, gate] = np.nan
+    lost[7, beam, bin] = np.nan
     found = retrieve_network(power, r, net, variance=told, full_overlap_range=100.0)
     other = retrieve_network(lost, r, net, variance=variance, full_overlap_range=100.0)
     for one in ("extinction", "extinction_standard_error", "degrees_of_freedom"):
         np.testing.assert_allclose(getattr(found, one)[7], getattr(other, one)[7], rtol=1e-9)
-    vertices = net.on_ray(ray)[0]
-    assert found.flags.signal_missing[7, vertices[-1]]
-    assert not found.flags.signal_missing[7, vertices[0]]
+    crossings = net.on_beam(beam)[0]
+    assert found.flags.signal_missing[7, crossings[-1]]
+    assert not found.flags.signal_missing[7, crossings[0]]
     assert np.delete(found.flags.signal_missing, 7, axis=0).sum() == 0
 
 
-def test_a_ray_without_noise_is_left_out_and_told():
+def test_a_beam_without_noise_is_left_out_and_told():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
@@ -567,11 +567,11 @@ def test_a_ray_without_noise_is_left_out_and_told():
     found = retrieve_network(power, r, net, variance=told, full_overlap_range=100.0)
     clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
     mine = np.zeros_like(found.flags.weak_signal)
-    mine[3, net.on_ray(0)[0]] = True
+    mine[3, net.on_beam(0)[0]] = True
     np.testing.assert_array_equal(found.flags.weak_signal, mine)
     assert found.degrees_of_freedom[3] < clean.degrees_of_freedom[3]
     wider = found.extinction_standard_error[3] > 1.5 * clean.extinction_standard_error[3]
-    assert wider[net.near_vertex].any()
+    assert wider[net.near_crossing].any()
 
 
 def test_a_profile_of_more_energy_is_not_loud():
@@ -613,8 +613,8 @@ def test_visibility_follows_from_extinction():
         ({"blocks": [0.5] * 4}, "blocks"),
         ({"variance": -1.0}, "variance"),
         ({"variance": np.ones((4, 2, 100))}, "variance"),
-        ({"gates": 2}, "gates"),
-        ({"gates": 7.5}, "gates"),
+        ({"bins": 2}, "bins"),
+        ({"bins": 7.5}, "bins"),
         ({"multiplier": 0.5}, "multiplier"),
         ({"multiplier": 1.5, "method": "unbiased"}, "multiplier"),
         ({"start": 0}, "start"),
@@ -656,7 +656,7 @@ def test_cycle_that_cannot_be_measured_is_refused():
 
 
 @pytest.mark.parametrize("method", ["network", "slope", "klett"])
-def test_signals_that_reach_no_vertex_give_nothing(method):
+def test_signals_that_reach_no_crossing_give_nothing(method):
     net = triangle()
     r = np.arange(100.0, 400.0, 5.0)
     power = np.tile(1 / r**2, (4, 3, 1))
@@ -665,7 +665,7 @@ def test_signals_that_reach_no_vertex_give_nothing(method):
     assert result.flags.not_measured.all()
 
 
-def test_rays_that_do_not_meet_are_refused():
+def test_beams_that_do_not_meet_are_refused():
     net = fan([0.0, 100.0], [(60.0,), (60.0,)])
     r = np.arange(100.0, 400.0, 5.0)
     with pytest.raises(RetrievalInputError, match="do not meet"):

@@ -1,4 +1,4 @@
-"""Where rays meet: geodesy against pyproj and exact arithmetic, vertices against trigonometry."""
+"""Where beams meet: geodesy against pyproj and exact arithmetic, crossings against trigonometry."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from support.oracle_network import fan, triangle
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.network import geometry
-from lidarops.retrieve.network.geometry import Ray
+from lidarops.retrieve.network.geometry import Beam
 
 # Geodesy ------------------------------------------------------------------------------------
 
@@ -44,15 +44,15 @@ def test_earth_centred_positions_agree_with_exact_arithmetic(place):
 
 
 def test_local_frame_is_east_north_up():
-    here = Ray(47.0, 11.0, 500.0, 0.0, 0.0)
+    here = Beam(47.0, 11.0, 500.0, 0.0, 0.0)
     step = 1e-4
-    rays = [
+    beams = [
         here,
-        Ray(47.0, 11.0 + step, 500.0, 90.0, 0.0),
-        Ray(47.0 + step, 11.0, 500.0, 0.0, 45.0),
-        Ray(47.0, 11.0, 510.0, 180.0, 90.0),
+        Beam(47.0, 11.0 + step, 500.0, 90.0, 0.0),
+        Beam(47.0 + step, 11.0, 500.0, 0.0, 45.0),
+        Beam(47.0, 11.0, 510.0, 180.0, 90.0),
     ]
-    origin, direction = geometry.locate(rays)
+    origin, direction = geometry.locate(beams)
     assert origin[1, 0] == pytest.approx(7.605, abs=0.002)
     assert origin[2, 1] == pytest.approx(11.117, abs=0.002)
     np.testing.assert_allclose(origin[3], [0, 0, 10], atol=1e-8)
@@ -63,8 +63,8 @@ def test_local_frame_is_east_north_up():
 
 
 def test_verticals_of_distant_stations_differ_as_the_earth_curves():
-    rays = [Ray(47.0, 11.0, 0.0, 0.0, 90.0), Ray(47.09, 11.0, 0.0, 0.0, 90.0)]
-    _, direction = geometry.locate(rays)
+    beams = [Beam(47.0, 11.0, 0.0, 0.0, 90.0), Beam(47.09, 11.0, 0.0, 0.0, 90.0)]
+    _, direction = geometry.locate(beams)
     angle = np.degrees(np.arccos(direction[0] @ direction[1]))
     assert angle == pytest.approx(0.09, rel=1e-6)
 
@@ -77,107 +77,107 @@ def bearing(origin, target):
     return np.degrees(np.arctan2(east, north)), np.degrees(np.arctan2(up, np.hypot(east, north)))
 
 
-def test_rays_of_three_stations_meet_where_they_are_pointed():
+def test_beams_of_three_stations_meet_where_they_are_pointed():
     stations = [(47.25, 11.30, 600.0), (47.25, 11.34, 620.0), (47.28, 11.32, 900.0)]
     targets = [(47.262, 11.315, 1500.0), (47.258, 11.325, 1900.0)]
-    rays, expected = [], []
+    beams, expected = [], []
     for target in targets:
         point = geometry.to_earth_centred(*target)
         expected.append(point)
-        rays += [Ray(*station, *bearing(station, point)) for station in stations]
-    net = geometry.build_network(rays, tolerance=0.5)
-    assert net.vertices == 2
-    assert np.bincount(net.crossings.vertex).tolist() == [3, 3]
+        beams += [Beam(*station, *bearing(station, point)) for station in stations]
+    net = geometry.build_network(beams, tolerance=0.5)
+    assert net.crossings == 2
+    assert np.bincount(net.passages.crossing).tolist() == [3, 3]
     order = np.argsort(net.geodetic[:, 2])
     np.testing.assert_allclose(net.geodetic[order, :2], [t[:2] for t in targets], atol=1e-9)
     np.testing.assert_allclose(net.geodetic[order, 2], [1500.0, 1900.0], atol=1e-5)
     assert np.all(net.miss_distance < 1e-6)
-    for ray in range(6):
-        vertices, ranges = net.on_ray(ray)
-        station = geometry.to_earth_centred(*stations[ray % 3])
-        distance = np.linalg.norm(expected[ray // 3] - station)
-        assert vertices.size == 1
+    for beam in range(6):
+        crossings, ranges = net.on_beam(beam)
+        station = geometry.to_earth_centred(*stations[beam % 3])
+        distance = np.linalg.norm(expected[beam // 3] - station)
+        assert crossings.size == 1
         assert ranges[0] == pytest.approx(distance, abs=1e-6)
 
 
-# Vertices -----------------------------------------------------------------------------------
+# Crossings -----------------------------------------------------------------------------------
 
 
 def test_triangle_of_the_paper():
     net = triangle()
-    assert net.vertices == 3
+    assert net.crossings == 3
     np.testing.assert_allclose(
-        net.vertex[:, [0, 2]],
+        net.crossing[:, [0, 2]],
         [[0.0, 300 * np.sqrt(3)], [-100.0, 400 * np.sqrt(3)], [0.0, 500 * np.sqrt(3)]],
         atol=1e-9,
     )
     np.testing.assert_allclose(net.crossing_angle, [30.0, 60.0, 30.0], atol=1e-9)
-    # The third vertex is the last one on both of its rays.
-    assert net.near_vertex.tolist() == [True, True, False]
-    vertices, ranges = net.on_ray(0)
-    assert vertices.tolist() == [0, 1]
+    # The third crossing is the last one on both of its beams.
+    assert net.near_crossing.tolist() == [True, True, False]
+    crossings, ranges = net.on_beam(0)
+    assert crossings.tolist() == [0, 1]
     np.testing.assert_allclose(ranges, [600.0, 800.0], atol=1e-9)
 
 
-def test_rays_that_pass_within_the_tolerance_meet_half_way():
+def test_beams_that_pass_within_the_tolerance_meet_half_way():
     origin = [[-500.0, 0.0, 0.0], [0.0, -500.0, 8.0]]
     direction = [[2.0, 0.0, 0.0], [0.0, 0.5, 0.0]]
-    assert geometry.network_of_lines(origin, direction, tolerance=7.9).vertices == 0
+    assert geometry.network_of_lines(origin, direction, tolerance=7.9).crossings == 0
     net = geometry.network_of_lines(origin, direction, tolerance=8.1)
-    np.testing.assert_allclose(net.vertex, [[0.0, 0.0, 4.0]], atol=1e-9)
+    np.testing.assert_allclose(net.crossing, [[0.0, 0.0, 4.0]], atol=1e-9)
     assert net.miss_distance[0] == pytest.approx(4.0)
-    np.testing.assert_allclose(net.crossings.range, [500.0, 500.0])
+    np.testing.assert_allclose(net.passages.range, [500.0, 500.0])
 
 
-def test_crossings_of_several_rays_in_one_place_are_one_vertex():
+def test_passages_of_several_beams_in_one_place_are_one_crossing():
     net = fan([-500.0, 0.0, 500.0], [(45.0,), (90.0,), (135.0,)])
-    assert net.vertices == 1
-    assert net.crossings.ray.tolist() == [0, 1, 2]
+    assert net.crossings == 1
+    assert net.passages.beam.tolist() == [0, 1, 2]
     # Apart by 10 m, they are one within 15 m and three within 1 m.
     origin = [[-500.0, 0, 0], [10.0, 0, 0], [500.0, 0, 0]]
     direction = [[1.0, 0, 1.0], [0, 0, 1.0], [-1.0, 0, 1.0]]
-    assert geometry.network_of_lines(origin, direction, tolerance=15.0).vertices == 1
-    assert geometry.network_of_lines(origin, direction, tolerance=1.0).vertices == 3
+    assert geometry.network_of_lines(origin, direction, tolerance=15.0).crossings == 1
+    assert geometry.network_of_lines(origin, direction, tolerance=1.0).crossings == 3
 
 
-def test_rays_of_one_station_and_parallel_rays_do_not_meet():
-    assert fan([0.0], [(30.0, 60.0, 90.0)]).vertices == 0
-    assert fan([0.0, 100.0], [(60.0,), (60.0,)]).vertices == 0
-    assert fan([0.0, 10.0], [(89.5,), (90.5,)]).vertices == 0
+def test_beams_of_one_station_and_parallel_beams_do_not_meet():
+    assert fan([0.0], [(30.0, 60.0, 90.0)]).crossings == 0
+    assert fan([0.0, 100.0], [(60.0,), (60.0,)]).crossings == 0
+    assert fan([0.0, 10.0], [(89.5,), (90.5,)]).crossings == 0
     met = fan([0.0, 10.0], [(89.0,), (91.5,)], smallest_angle=1.0)
-    assert met.vertices == 1
+    assert met.crossings == 1
 
 
-def test_vertices_lie_before_the_lidars_and_within_reach():
-    assert fan([-500.0, 500.0], [(135.0,), (45.0,)]).vertices == 0
-    assert fan([-500.0, 500.0], [(45.0,), (135.0,)]).vertices == 1
-    assert fan([-500.0, 500.0], [(45.0,), (135.0,)], nearest=720.0).vertices == 0
-    assert fan([-500.0, 500.0], [(45.0,), (135.0,)], farthest=[800.0, 700.0]).vertices == 0
-    assert fan([-500.0, 500.0], [(45.0,), (135.0,)], farthest=[800.0, 710.0]).vertices == 1
+def test_crossings_lie_before_the_lidars_and_within_reach():
+    assert fan([-500.0, 500.0], [(135.0,), (45.0,)]).crossings == 0
+    assert fan([-500.0, 500.0], [(45.0,), (135.0,)]).crossings == 1
+    assert fan([-500.0, 500.0], [(45.0,), (135.0,)], nearest=720.0).crossings == 0
+    assert fan([-500.0, 500.0], [(45.0,), (135.0,)], farthest=[800.0, 700.0]).crossings == 0
+    assert fan([-500.0, 500.0], [(45.0,), (135.0,)], farthest=[800.0, 710.0]).crossings == 1
 
 
 def test_network_is_cached_and_read_only():
-    rays = [Ray(47.0, 11.0, 0.0, 45.0, 10.0), Ray(47.0, 11.01, 0.0, 315.0, 10.0)]
-    net = geometry.build_network(rays)
-    assert geometry.build_network(list(rays)) is net
-    assert geometry.build_network(rays, tolerance=5.0) is not net
+    beams = [Beam(47.0, 11.0, 0.0, 45.0, 10.0), Beam(47.0, 11.01, 0.0, 315.0, 10.0)]
+    net = geometry.build_network(beams)
+    assert geometry.build_network(list(beams)) is net
+    assert geometry.build_network(beams, tolerance=5.0) is not net
     with pytest.raises(ValueError, match="read-only"):
-        net.vertex[0, 0] = 1.0
+        net.crossing[0, 0] = 1.0
 
 
-def test_network_does_not_depend_on_the_order_of_rays():
+def test_network_does_not_depend_on_the_order_of_beams():
     rng = np.random.default_rng(4)
     angles = [(50, 68), (78, 103), (112, 130)]
     net = fan([-500.0, 0.0, 400.0], angles)
     shuffled = rng.permutation(6)
     other = geometry.network_of_lines(net.origin[shuffled], net.direction[shuffled], tolerance=1e-3)
-    order = np.lexsort(net.vertex.T)
+    order = np.lexsort(net.crossing.T)
     np.testing.assert_allclose(
-        other.vertex[np.lexsort(np.round(other.vertex, 6).T)],
-        net.vertex[np.lexsort(np.round(net.vertex, 6).T)],
+        other.crossing[np.lexsort(np.round(other.crossing, 6).T)],
+        net.crossing[np.lexsort(np.round(net.crossing, 6).T)],
         atol=1e-8,
     )
-    assert order.size == other.vertices
+    assert order.size == other.crossings
 
 
 # Cycles -------------------------------------------------------------------------------------
@@ -191,14 +191,14 @@ def test_cycle_starts_near_and_walks_in_the_direction_of_attenuation(angle):
     assert walk.sign[0] == 1.0
     assert walk.sign[-1] == -1.0
     assert np.sum(walk.end_range - walk.start_range) > 0
-    # Consecutive rays share the vertex between them.
+    # Consecutive beams share the crossing between them.
     for j in range(3):
-        assert walk.vertex[j] in net.on_ray(int(walk.ray[j]))[0]
-        assert walk.vertex[j] in net.on_ray(int(walk.ray[j - 1]))[0]
-    # Below the crossing of rays 1 and 3, another vertex is the near one.
-    crossing = np.degrees(np.arctan2(300 * np.sqrt(3), 500.0))
-    on_third = net.vertex[walk.vertex[0]]
-    if angle < crossing:
+        assert walk.crossing[j] in net.on_beam(int(walk.beam[j]))[0]
+        assert walk.crossing[j] in net.on_beam(int(walk.beam[j - 1]))[0]
+    # Below the passage of beams 1 and 3, another crossing is the near one.
+    passage = np.degrees(np.arctan2(300 * np.sqrt(3), 500.0))
+    on_third = net.crossing[walk.crossing[0]]
+    if angle < passage:
         assert on_third[2] == pytest.approx(500.0 * np.tan(np.radians(angle)))
     else:
         assert on_third[2] == pytest.approx(300.0 * np.sqrt(3))
@@ -207,20 +207,20 @@ def test_cycle_starts_near_and_walks_in_the_direction_of_attenuation(angle):
 def test_start_of_a_cycle_can_be_chosen_and_is_told_when_far():
     net = triangle()
     walk = geometry.build_cycle(net, start=2)
-    assert walk.vertex[0] == 2
+    assert walk.crossing[0] == 2
     assert walk.far_start
     assert not geometry.build_cycle(net, start=1).far_start
 
 
-def test_cycle_of_a_larger_network_is_named_by_its_rays():
+def test_cycle_of_a_larger_network_is_named_by_its_beams():
     net = fan([-500.0, 0.0, 400.0], [(50, 68), (78, 103), (112, 130)], farthest=1000.0)
     with pytest.raises(RetrievalInputError, match="one cycle"):
         geometry.build_cycle(net)
     shared = {}
-    for ray in range(6):
-        for vertex in net.on_ray(ray)[0]:
-            shared.setdefault(int(vertex), set()).add(ray)
-    pairs = [tuple(sorted(rays)) for rays in shared.values()]
+    for beam in range(6):
+        for crossing in net.on_beam(beam)[0]:
+            shared.setdefault(int(crossing), set()).add(beam)
+    pairs = [tuple(sorted(beams)) for beams in shared.values()]
     first = next(
         (a, b, c)
         for a in range(6)
@@ -229,18 +229,18 @@ def test_cycle_of_a_larger_network_is_named_by_its_rays():
         if {(a, b), (b, c), (a, c)} <= set(pairs)
     )
     walk = geometry.build_cycle(net, first)
-    assert set(walk.ray.tolist()) == set(first)
+    assert set(walk.beam.tolist()) == set(first)
     assert not walk.far_start
 
 
-def test_square_of_four_rays_is_one_cycle():
+def test_square_of_four_beams_is_one_cycle():
     origin = [[-600.0, 0, 0], [500.0, -600.0, 0], [600.0, 500.0, 0], [0.0, 600.0, 0]]
     direction = [[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]]
     net = geometry.network_of_lines(origin, direction)
-    assert net.vertices == 4
+    assert net.crossings == 4
     walk = geometry.build_cycle(net)
-    assert sorted(walk.ray.tolist()) == [0, 1, 2, 3]
-    assert sorted(walk.vertex.tolist()) == [0, 1, 2, 3]
+    assert sorted(walk.beam.tolist()) == [0, 1, 2, 3]
+    assert sorted(walk.crossing.tolist()) == [0, 1, 2, 3]
 
 
 # Checks -------------------------------------------------------------------------------------
@@ -259,10 +259,10 @@ GOOD = {"latitude": 47.0, "longitude": 11.0, "altitude": 0.0, "azimuth": 0.0, "e
         ("elevation", "up"),
     ],
 )
-def test_wrong_rays_are_refused_by_name(field, value):
+def test_wrong_beams_are_refused_by_name(field, value):
     with pytest.raises(RetrievalInputError) as raised:
-        geometry.build_network([Ray(**GOOD), Ray(**{**GOOD, field: value})])
-    assert raised.value.field in {field, "rays"}
+        geometry.build_network([Beam(**GOOD), Beam(**{**GOOD, field: value})])
+    assert raised.value.field in {field, "beams"}
 
 
 @pytest.mark.parametrize(
@@ -277,13 +277,13 @@ def test_wrong_rays_are_refused_by_name(field, value):
     ],
 )
 def test_wrong_settings_are_refused_by_name(arguments, field):
-    rays = [Ray(**GOOD), Ray(**{**GOOD, "latitude": 47.01, "azimuth": 180.0})]
+    beams = [Beam(**GOOD), Beam(**{**GOOD, "latitude": 47.01, "azimuth": 180.0})]
     with pytest.raises(RetrievalInputError) as raised:
-        geometry.build_network(rays, **arguments)
+        geometry.build_network(beams, **arguments)
     assert raised.value.field == field
 
 
-def test_no_rays_too_many_and_shapeless_lines_are_refused():
+def test_no_beams_too_many_and_shapeless_lines_are_refused():
     with pytest.raises(RetrievalInputError, match="none"):
         geometry.build_network([])
     many = np.zeros((600, 3)), np.tile([1.0, 0, 0], (600, 1))
@@ -298,10 +298,10 @@ def test_no_rays_too_many_and_shapeless_lines_are_refused():
             geometry.network_of_lines(origin, direction)
 
 
-@pytest.mark.parametrize("rays", [[0, 1], [0, 1, 1], [0, 1, 7], [0, 1, 2, 3]])
-def test_wrong_cycles_are_refused(rays):
+@pytest.mark.parametrize("beams", [[0, 1], [0, 1, 1], [0, 1, 7], [0, 1, 2, 3]])
+def test_wrong_cycles_are_refused(beams):
     with pytest.raises(RetrievalInputError):
-        geometry.build_cycle(triangle(), rays)
+        geometry.build_cycle(triangle(), beams)
 
 
 def test_start_off_the_cycle_is_refused():

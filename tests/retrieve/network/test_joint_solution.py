@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, optimize
 from support.oracle_network import (
-    at_vertices,
+    at_crossings,
     gradient,
     grid,
     homogeneous,
@@ -45,36 +45,36 @@ def test_singular_matrix_is_told():
     assert not _joint_solution.factorise(-np.eye(2), 2)
 
 
-# Values at vertices and integrals between them ------------------------------------------------
+# Values at crossings and integrals between them ------------------------------------------------
 
 
-def condensed(net, power, variance, exponent=1.0, gates=7, step=5.0):
+def condensed(net, power, variance, exponent=1.0, bins=7, step=5.0):
     r = grid(net, step)
     layout = _condensed_signals.lay_out(
-        net, np.tile(r, (net.rays, 1)), None, np.full(net.rays, 100.0), gates
+        net, np.tile(r, (net.beams, 1)), None, np.full(net.beams, 100.0), bins
     )
     data = _condensed_signals.condense(
-        np.atleast_3d(power).reshape(-1, net.rays, r.size), variance[np.newaxis],
-        np.zeros(power.size // (net.rays * r.size), dtype=np.intp),
-        np.full(net.rays, exponent), layout, relative=False, screened=False,
+        np.atleast_3d(power).reshape(-1, net.beams, r.size), variance[np.newaxis],
+        np.zeros(power.size // (net.beams * r.size), dtype=np.intp),
+        np.full(net.beams, exponent), layout, relative=False, screened=False,
     )  # fmt: skip
     return layout, data
 
 
-def test_value_at_a_vertex_is_that_of_a_line_through_logarithms():
+def test_value_at_a_crossing_is_that_of_a_line_through_logarithms():
     net = triangle()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 1)
     layout, data = condensed(net, power, 1e-30 * variance)
-    for c, (ray, where) in enumerate(
-        zip(layout.crossings.ray, layout.crossings.range, strict=True)
+    for c, (beam, where) in enumerate(
+        zip(layout.passages.beam, layout.passages.range, strict=True)
     ):
         near = np.argsort(np.abs(r - where))[:7]
-        line = np.polyfit(r[near] - where, np.log(power[0, ray, near] * r[near] ** 2), 1)
-        first = layout.first_crossing[ray]
-        start = layout.crossings.range[first]
+        line = np.polyfit(r[near] - where, np.log(power[0, beam, near] * r[near] ** 2), 1)
+        first = layout.first_passage[beam]
+        start = layout.passages.range[first]
         near = np.argsort(np.abs(r - start))[:7]
-        base = np.polyfit(r[near] - start, np.log(power[0, ray, near] * r[near] ** 2), 1)
+        base = np.polyfit(r[near] - start, np.log(power[0, beam, near] * r[near] ** 2), 1)
         assert data.log_value[0, c] == pytest.approx(line[1] - base[1], abs=1e-10)
 
 
@@ -84,10 +84,10 @@ def test_integral_agrees_with_quadrature_of_the_interpolated_signal(exponent):
     r = grid(net, 10.0)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 1)
     layout, data = condensed(net, power, 1e-30 * variance, exponent, step=10.0)
-    for ray in range(3):
-        c = layout.first_crossing[ray]
-        low, high = layout.crossings.range[c : c + 2]
-        logs = exponent * np.log(power[0, ray] * r**2)
+    for beam in range(3):
+        c = layout.first_passage[beam]
+        low, high = layout.passages.range[c : c + 2]
+        logs = exponent * np.log(power[0, beam] * r**2)
         near = np.argsort(np.abs(r - low))[:7]
         scale = np.polyfit(r[near] - low, logs[near], 1)[1]
         inner = r[(r > low) & (r < high)]
@@ -106,36 +106,36 @@ def test_covariance_agrees_with_finite_differences(exponent):
     layout, data = condensed(net, power, variance, exponent, step=8.0)
     relative = variance / power[0] ** 2
     step = 1e-6
-    for ray in (0, 5):
-        first, last = layout.first_crossing[ray], layout.first_crossing[ray + 1]
+    for beam in (0, 5):
+        first, last = layout.first_passage[beam], layout.first_passage[beam + 1]
         count = last - first
         slopes = np.zeros((2 * count - 1, r.size))
         quiet = np.zeros_like(variance)
         shifted = np.repeat(power, 2 * r.size, axis=0)
         for g in range(r.size):
-            shifted[2 * g, ray, g] *= 1 + step
-            shifted[2 * g + 1, ray, g] *= 1 - step
+            shifted[2 * g, beam, g] *= 1 + step
+            shifted[2 * g + 1, beam, g] *= 1 - step
         _, moved = condensed(net, shifted, quiet, exponent, step=8.0)
-        # Scaled to 1 at the first vertex, integrals lose what they share with it: put it back.
-        scale = np.exp(first_value(layout, ray, shifted, r, exponent))
+        # Scaled to 1 at the first crossing, integrals lose what they share with it: put it back.
+        scale = np.exp(first_value(layout, beam, shifted, r, exponent))
         values = moved.log_value[:, first:last] + np.log(scale)[:, None]
         sums = moved.integral[:, first : last - 1] * scale[:, None]
         window = slice(layout.window[first], layout.window[first] + 7)
-        mend = 0.5 * exponent * relative[ray, window] @ layout.weights[first]
-        centre = np.exp(first_value(layout, ray, power, r, exponent) + mend)
+        mend = 0.5 * exponent * relative[beam, window] @ layout.weights[first]
+        centre = np.exp(first_value(layout, beam, power, r, exponent) + mend)
         slopes[:count] = (values[::2] - values[1::2]).T / (2 * step)
         slopes[count:] = (sums[::2] - sums[1::2]).T / (2 * step) / centre
-        expected = (slopes * relative[ray]) @ slopes.T
-        packed = data.covariance[0, layout.offset[ray] : layout.offset[ray + 1]]
+        expected = (slopes * relative[beam]) @ slopes.T
+        packed = data.covariance[0, layout.offset[beam] : layout.offset[beam + 1]]
         measured = packed.reshape(expected.shape)
         size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         np.testing.assert_allclose(measured / size, expected / size, atol=1e-5)
 
 
-def first_value(layout, ray, power, r, exponent):
-    c = layout.first_crossing[ray]
+def first_value(layout, beam, power, r, exponent):
+    c = layout.first_passage[beam]
     window = slice(layout.window[c], layout.window[c] + layout.weights.shape[1])
-    logs = exponent * np.log(power[:, ray, window] * r[window] ** 2)
+    logs = exponent * np.log(power[:, beam, window] * r[window] ** 2)
     return logs @ layout.weights[c]
 
 
@@ -147,35 +147,35 @@ class Oracle:
 
     def __init__(self, layout, data, profile, net):
         self.layout, self.net = layout, net
-        self.vertex = layout.crossings.vertex
-        self.ray = layout.crossings.ray
+        self.crossing = layout.passages.crossing
+        self.beam = layout.passages.beam
         self.values = data.log_value[profile]
         self.integrals = data.integral[profile]
         self.packed = data.covariance[profile]
-        self.size = self.vertex.size
+        self.size = self.crossing.size
 
     def beyond(self):
         out = np.zeros(self.size)
         for c in range(self.size - 2, -1, -1):
-            if self.ray[c] == self.ray[c + 1]:
+            if self.beam[c] == self.beam[c + 1]:
                 out[c] = out[c + 1] + self.integrals[c]
         return out
 
     def residual(self, constants, logarithms):
-        weight = np.exp(constants[self.ray]) + self.beyond()
-        return self.values - np.log(weight) - logarithms[self.vertex]
+        weight = np.exp(constants[self.beam]) + self.beyond()
+        return self.values - np.log(weight) - logarithms[self.crossing]
 
     def covariance(self, constants):
-        weight = np.exp(constants[self.ray]) + self.beyond()
+        weight = np.exp(constants[self.beam]) + self.beyond()
         out = np.zeros((self.size, self.size))
-        for ray in range(self.net.rays):
-            first, last = self.layout.first_crossing[ray : ray + 2]
+        for beam in range(self.net.beams):
+            first, last = self.layout.first_passage[beam : beam + 2]
             n = last - first
             turn = np.zeros((n, 2 * n - 1))
             turn[:, :n] = np.eye(n)
             for i in range(n):
                 turn[i, n + i :] = -1.0 / weight[first + i]
-            packed = self.packed[self.layout.offset[ray] : self.layout.offset[ray + 1]]
+            packed = self.packed[self.layout.offset[beam] : self.layout.offset[beam + 1]]
             out[first:last, first:last] = turn @ packed.reshape(2 * n - 1, -1) @ turn.T
         return out
 
@@ -186,7 +186,7 @@ def case(profiles=3, relative=0.01, net=None):
     power, variance = noisy(net, r, signals(net, r, gradient), relative, profiles, additive=0.002)
     layout, data = condensed(net, power, variance)
     problem = _empirical_prior._Problem(
-        data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex
+        data, layout, layout.passages.crossing, np.ones(net.beams), net.crossing
     )
     return net, layout, data, problem
 
@@ -199,22 +199,22 @@ def test_solution_is_the_least_squares_one(deviation):
     for n in range(3):
         oracle = Oracle(layout, data, n, net)
         root = np.linalg.cholesky(oracle.covariance(problem.constants[n]))
-        prior = np.zeros((0, net.vertices))
+        prior = np.zeros((0, net.crossings))
         if np.isfinite(deviation):
             precision, _ = _empirical_prior._free_level(problem.gradient, deviation)
             values, vectors = np.linalg.eigh(precision)
             prior = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
         def objective(x, oracle=oracle, root=root, prior=prior):
-            gap = oracle.residual(x[: net.rays], x[net.rays :])
-            return np.concatenate([np.linalg.solve(root, gap), prior @ x[net.rays :]])
+            gap = oracle.residual(x[: net.beams], x[net.beams :])
+            return np.concatenate([np.linalg.solve(root, gap), prior @ x[net.beams :]])
 
         start = np.concatenate([problem.constants[n] + 0.05, result.logarithm[n] - 0.02])
         best = optimize.least_squares(objective, start, xtol=1e-15, ftol=1e-15, gtol=1e-12)
         # Without prior, the kernel holds the level by a hundredth of its information.
         bound = 1e-6 if np.isfinite(deviation) else 2e-3
-        np.testing.assert_allclose(best.x[net.rays :], result.logarithm[n], atol=bound)
-        covariance = np.linalg.inv(best.jac.T @ best.jac)[net.rays :, net.rays :]
+        np.testing.assert_allclose(best.x[net.beams :], result.logarithm[n], atol=bound)
+        covariance = np.linalg.inv(best.jac.T @ best.jac)[net.beams :, net.beams :]
         np.testing.assert_allclose(np.diag(covariance), result.believed[n], rtol=0.02)
         if np.isfinite(deviation):
             # A field that deviates by twice the prior's standard deviation.
@@ -229,14 +229,14 @@ def test_solution_is_the_least_squares_one(deviation):
             np.testing.assert_array_equal(result.variance[n], result.believed[n])
             np.testing.assert_array_equal(result.missed[n], 0.0)
             assert 2 * best.cost == pytest.approx(result.chi_square[n], rel=0.02)
-    assert result.degrees_of_freedom[0] == layout.crossings.ray.size - net.rays - net.vertices
+    assert result.degrees_of_freedom[0] == layout.passages.beam.size - net.beams - net.crossings
 
 
-def test_rays_that_contradict_tell_so_when_their_constants_run_away():
-    """With nothing told beforehand, the constant of a ray that is off goes where it counts for
-    nothing, and the equations of the rays become singular."""
+def test_beams_that_contradict_tell_so_when_their_constants_run_away():
+    """With nothing told beforehand, the constant of a beam that is off goes where it counts for
+    nothing, and the equations of the beams become singular."""
     _, layout, data, problem = case(2)
-    data.log_value[0, layout.first_crossing[0] + 1] -= 3.0
+    data.log_value[0, layout.first_passage[0] + 1] -= 3.0
     found = problem.solve(np.inf, 60)
     assert np.isnan(found.chi_square[0])
     assert found.prior_chi_square[0] > 50.0 * found.prior_degrees_of_freedom[0]
@@ -249,16 +249,16 @@ def test_likelihood_is_that_of_the_dense_linear_model():
     fixed = problem.constants.copy()
     oracle = Oracle(layout, data, 0, net)
     noise = oracle.covariance(fixed[0])
-    weight = np.exp(fixed[0][oracle.ray]) + oracle.beyond()
-    design = np.zeros((oracle.size, net.rays + 1))
-    design[np.arange(oracle.size), oracle.ray] = np.exp(fixed[0][oracle.ray]) / weight
+    weight = np.exp(fixed[0][oracle.beam]) + oracle.beyond()
+    design = np.zeros((oracle.size, net.beams + 1))
+    design[np.arange(oracle.size), oracle.beam] = np.exp(fixed[0][oracle.beam]) / weight
     design[:, -1] = 1.0
     target = oracle.values - np.log(weight)
-    choose = np.eye(net.vertices)[oracle.vertex]
+    choose = np.eye(net.crossings)[oracle.crossing]
 
     def dense(deviation):
         field = _empirical_prior.GRADIENT**2 * problem.gradient + deviation**2 * np.eye(
-            net.vertices
+            net.crossings
         )
         total = noise + choose @ field @ choose.T
         inverse = np.linalg.inv(total)
@@ -284,12 +284,12 @@ def test_standard_errors_are_the_scatter_of_solutions():
     power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.005, 400, additive=5e-4)
     layout, data = condensed(net, power, variance)
     problem = _empirical_prior._Problem(
-        data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex
+        data, layout, layout.passages.crossing, np.ones(net.beams), net.crossing
     )
     result = problem.solve(np.inf, 30)
-    truth = np.log(at_vertices(net, homogeneous()))
+    truth = np.log(at_crossings(net, homogeneous()))
     score = (result.logarithm - truth) / np.sqrt(result.variance)
-    np.testing.assert_allclose(score[:, net.near_vertex].std(axis=0), 1.0, atol=0.15)
+    np.testing.assert_allclose(score[:, net.near_crossing].std(axis=0), 1.0, atol=0.15)
     assert np.mean(result.chi_square / result.degrees_of_freedom) == pytest.approx(1.0, abs=0.15)
 
 
@@ -299,17 +299,17 @@ def test_solution_does_not_depend_on_the_other_profiles():
     whole = problem.solve(0.05, 10)
     for mine in ([0], [3, 4], [6, 1]):
         part = _empirical_prior._Problem(
-            data.take(np.array(mine)), layout, layout.crossings.vertex, exponent, position
+            data.take(np.array(mine)), layout, layout.passages.crossing, exponent, position
         ).solve(0.05, 10)
         assert np.array_equal(part.logarithm, whole.logarithm[mine])
         assert np.array_equal(part.variance, whole.variance[mine])
 
 
 def problem_position():
-    return three_by_two().vertex
+    return three_by_two().crossing
 
 
-def test_vertices_that_only_lost_rays_saw_are_missing():
+def test_crossings_that_only_lost_beams_saw_are_missing():
     net = three_by_two()
     r = grid(net)
     power = signals(net, r, homogeneous())[np.newaxis].copy()
@@ -317,11 +317,11 @@ def test_vertices_that_only_lost_rays_saw_are_missing():
     power[0, 4, :] = np.nan
     layout, data = condensed(net, power, 1e-8 * np.nan_to_num(power[0]) ** 2 + 1e-60)
     problem = _empirical_prior._Problem(
-        data, layout, layout.crossings.vertex, np.ones(net.rays), net.vertex
+        data, layout, layout.passages.crossing, np.ones(net.beams), net.crossing
     )
-    seen = np.zeros(net.vertices, dtype=bool)
-    for ray in (1, 2, 3, 5):
-        seen[net.on_ray(ray)[0]] = True
+    seen = np.zeros(net.crossings, dtype=bool)
+    for beam in (1, 2, 3, 5):
+        seen[net.on_beam(beam)[0]] = True
     result = problem.solve(0.05, 10)
     assert np.array_equal(np.isfinite(result.logarithm[0]), seen)
     np.testing.assert_allclose(np.exp(result.logarithm[0, seen]), 2e-3, rtol=0.02)
@@ -329,13 +329,13 @@ def test_vertices_that_only_lost_rays_saw_are_missing():
 
 @pytest.mark.parametrize("deviation", [np.inf, 0.1])
 @pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
-def test_a_ray_of_singular_covariance_is_left_out(deviation, bad):
+def test_a_beam_of_singular_covariance_is_left_out(deviation, bad):
     _, layout, data, problem = case(3)
     clean = problem.afresh(deviation)
     without = data.take(np.arange(3))
-    without.usable[1, : layout.first_crossing[1]] = 0
+    without.usable[1, : layout.first_passage[1]] = 0
     data.covariance[1, : layout.offset[1]] = bad
-    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    where = (layout, layout.passages.crossing, np.ones(6), problem_position())
     found, expected = (
         _empirical_prior._Problem(one, *where).afresh(deviation) for one in (data, without)
     )
@@ -352,7 +352,7 @@ def test_a_ray_of_singular_covariance_is_left_out(deviation, bad):
 def test_a_profile_of_singular_covariances_is_not_determined():
     _, layout, data, _ = case(3)
     data.covariance[1] = 0.0
-    where = (layout, layout.crossings.vertex, np.ones(6), problem_position())
+    where = (layout, layout.passages.crossing, np.ones(6), problem_position())
     for deviation in (np.inf, 0.1):
         found = _empirical_prior._Problem(data, *where).afresh(deviation)
         assert found.status.tolist() == [
@@ -361,7 +361,7 @@ def test_a_profile_of_singular_covariances_is_not_determined():
         assert np.isnan(found.logarithm[1]).all()
 
 
-def test_prior_with_an_only_vertex_is_finite():
+def test_prior_with_an_only_crossing_is_finite():
     precision, norm = _empirical_prior._free_level(
         _empirical_prior._gradient(np.zeros((1, 3))), 0.1
     )
@@ -380,7 +380,7 @@ def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told)
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field), 0.15, 50, additive=0.0)
     layout, data = condensed(net, power, variance)
-    where = (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    where = (layout, layout.passages.crossing, np.ones(net.beams), net.crossing)
     problem, mean = (
         _empirical_prior._Problem(data, *where),
         _empirical_prior._mean_problem(data, *where),
@@ -392,11 +392,11 @@ def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told)
 
 
 def uneven(net):
-    """Return air that is another at every vertex."""
-    size = 0.2 * np.sin(7.0 * np.arange(net.vertices))
+    """Return air that is another at every crossing."""
+    size = 0.2 * np.sin(7.0 * np.arange(net.crossings))
 
     def field(x, y, z):
-        apart = [(x - v[0]) ** 2 + (z - v[2]) ** 2 for v in net.vertex]
+        apart = [(x - v[0]) ** 2 + (z - v[2]) ** 2 for v in net.crossing]
         bumps = [u * np.exp(-a / (2.0 * 40.0**2)) for u, a in zip(size, apart, strict=True)]
         return 2e-3 * np.exp(np.sum(bumps, axis=0))
 
@@ -404,13 +404,13 @@ def uneven(net):
 
 
 def fifty(field, relative, lost=0.0):
-    """Return profiles, some without some of their rays, and what a problem asks besides."""
+    """Return profiles, some without some of their beams, and what a problem asks besides."""
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field(net)), relative, 50, additive=0.0)
-    gone = np.random.default_rng(2).random((50, net.rays, 1)) < lost
+    gone = np.random.default_rng(2).random((50, net.beams, 1)) < lost
     layout, data = condensed(net, np.where(gone, np.nan, power), variance)
-    return data, (layout, layout.crossings.vertex, np.ones(net.rays), net.vertex)
+    return data, (layout, layout.passages.crossing, np.ones(net.beams), net.crossing)
 
 
 def test_a_field_that_the_mean_tells_to_vary_is_not_told_to_be_even():
@@ -476,9 +476,9 @@ def test_what_the_mean_leaves_open_is_told_with_the_weakest_prior(monkeypatch):
 
 
 def asked(freedoms, whole=None):
-    """Return whether rays test a prior: of profiles, and of the freedom and errors of their mean.
+    """Return whether beams test a prior: of profiles, and of the freedom and errors of their mean.
 
-    The last of four vertices is seen by no ray."""
+    The last of four crossings is seen by no beam."""
     data = SimpleNamespace(usable=np.array([[1, 1, 1, 0]], dtype=np.uint8))
     problem = SimpleNamespace(geometry=(None, None, np.arange(4)), data=data)
     status = np.full(len(freedoms), _joint_solution.SOLVED)
@@ -496,7 +496,7 @@ def asked(freedoms, whole=None):
     [((0, [0.1, 0.5, 0.9]), True), ((0, [0.1, 0.5, 1.1]), False), ((0, [0.1, np.nan, 0.1]), False),
      ((1, [0.1, 0.5, 1.1]), True), ((-1, [0.1, 0.1, 0.1]), False)],
 )  # fmt: skip
-def test_as_many_equations_as_unknowns_test_a_prior_where_they_tell_all_vertices(whole, told):
+def test_as_many_equations_as_unknowns_test_a_prior_where_they_tell_all_crossings(whole, told):
     assert asked([-1.0] * 10, whole) == told
 
 
@@ -521,17 +521,17 @@ def test_a_mean_that_does_not_settle_tells_no_least_deviation(monkeypatch):
     assert asked[0] < asked[1] < np.inf
 
 
-# Profiles that lack rays --------------------------------------------------------------------
+# Profiles that lack beams --------------------------------------------------------------------
 
 
-def test_the_mean_of_profiles_is_made_ray_by_ray():
+def test_the_mean_of_profiles_is_made_beam_by_beam():
     data, (layout, *rest) = fifty(lambda _: homogeneous(), 0.05, lost=0.25)
     assert data.usable.all(axis=1).sum() < 20
     mean = _empirical_prior._pooled(data, layout)
     assert mean.usable.all()
-    for ray in range(6):
-        mine = slice(layout.first_crossing[ray], layout.first_crossing[ray + 1])
-        packed = slice(layout.offset[ray], layout.offset[ray + 1])
+    for beam in range(6):
+        mine = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
+        packed = slice(layout.offset[beam], layout.offset[beam + 1])
         seen = data.usable[:, mine].all(axis=1)
         np.testing.assert_allclose(mean.log_value[0, mine], data.log_value[seen, mine].mean(axis=0))
         np.testing.assert_allclose(mean.integral[0, mine], data.integral[seen, mine].mean(axis=0))
@@ -542,35 +542,35 @@ def test_the_mean_of_profiles_is_made_ray_by_ray():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e12, 20.0])
-def test_a_mean_leaves_out_a_ray_that_is_far_louder_than_most(bad):
+def test_a_mean_leaves_out_a_beam_that_is_far_louder_than_most(bad):
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     quiet = data.take(np.arange(50))
-    quiet.usable[7, : layout.first_crossing[1]] = 0
+    quiet.usable[7, : layout.first_passage[1]] = 0
     expected = _empirical_prior._pooled(quiet, layout)
-    # The variance of the ray's first integral alone.
-    count = layout.first_crossing[1]
+    # The variance of the beam's first integral alone.
+    count = layout.first_passage[1]
     data.covariance[7, 2 * count * count] *= bad
     found = _empirical_prior._pooled(data, layout)
     for one in ("log_value", "integral", "covariance", "usable", "slope"):
         np.testing.assert_array_equal(getattr(found, one), getattr(expected, one))
 
 
-def test_a_mean_of_which_hardly_a_profile_is_known_lacks_the_ray():
+def test_a_mean_of_which_hardly_a_profile_is_known_lacks_the_beam():
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     data.covariance[7:, : layout.offset[1]] = np.nan
     found = _empirical_prior._pooled(data, layout)
-    assert not found.usable[0, : layout.first_crossing[1]].any()
-    assert found.usable[0, layout.first_crossing[1] :].all()
+    assert not found.usable[0, : layout.first_passage[1]].any()
+    assert found.usable[0, layout.first_passage[1] :].all()
 
 
 def test_a_mean_of_what_nobody_sees_is_none():
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     data.usable[7:] = 0
     assert _empirical_prior._pooled(data, layout) is None
-    # A value at a ray's first vertex alone is none.
+    # A value at a beam's first crossing alone is none.
     data, _ = fifty(lambda _: homogeneous(), 0.05)
     data.usable[:] = 0
-    data.usable[:, layout.first_crossing[:-1]] = 1
+    data.usable[:, layout.first_passage[:-1]] = 1
     assert _empirical_prior._pooled(data, layout) is None
 
 
@@ -585,5 +585,5 @@ def test_a_mean_of_what_nobody_sees_is_none():
         ([], 0),
     ],
 )
-def test_a_mean_takes_as_much_of_a_ray_as_most_values_see(reach, depth):
+def test_a_mean_takes_as_much_of_a_beam_as_most_values_see(reach, depth):
     assert _empirical_prior._depth(np.array(reach, dtype=np.intp)) == depth

@@ -26,7 +26,7 @@ def test_homogeneous_air_is_found_within_the_errors():
     found = product(intervals=40)
     whole = np.hypot(found["extinction_standard_error"], found["extinction_systematic_error"])
     score = (found["extinction"] - EXTINCTION) / whole
-    assert found.sizes == {"time": 40, "vertex": 3, "nv": 2, "ray": 3}
+    assert found.sizes == {"time": 40, "crossing": 3, "nv": 2, "beam": 3}
     assert (found["quality_flag"] == 0).all()
     assert (abs(score) < 3).mean() > 0.97
     assert float(abs(found["extinction"] / EXTINCTION - 1).mean()) < 0.02
@@ -97,7 +97,7 @@ def test_a_beam_that_is_missing_leaves_a_reason():
     found = solved([without(beams[0], slice(2, 4)), *beams[1:]])
     lost = np.isnan(found["extinction"].values)
     bits = found["quality_flag"].values
-    on_beam = np.isfinite(found["ray_range"].values[0])
+    on_beam = np.isfinite(found["beam_range"].values[0])
     assert (bits[2:4, on_beam] & int(Quality.rejecting())).all()
     assert (bits[2:4] & int(Quality.PRIOR_DOMINATED)).all()
     assert (bits[[0, 1, 4, 5]] == 0).all()
@@ -152,7 +152,7 @@ def test_visibility_goes_by_the_definition():
     assert (width > 1 + 2 * 0.2 * np.log(1064 / 550)).all()
 
 
-def test_beams_are_as_many_as_rays():
+def test_beams_are_as_many_as_beams():
     with pytest.raises(RetrievalInputError, match="beams"):
         retrieve_network([beam(0)], network(), PLAIN)
 

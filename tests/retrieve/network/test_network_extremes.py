@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.oracle_network import (
-    at_vertices,
+    at_crossings,
     fan,
     gradient,
     grid,
@@ -31,7 +31,7 @@ def pooled(relative):
     for angle in (48.0, 50.0, 53.0, 57.0, 62.0, 66.0, 70.0):
         net = triangle(angle)
         for field in (homogeneous(), gradient):
-            start = int(geometry.build_cycle(net).vertex[0])
+            start = int(geometry.build_cycle(net).crossing[0])
             r = grid(net)
             power, variance = noisy(
                 net, r, signals(net, r, field), relative, 150, int(angle), additive=1e-4
@@ -39,7 +39,7 @@ def pooled(relative):
             result = retrieve_network(
                 power, r, net, method="cycle", variance=variance, full_overlap_range=100.0
             )
-            error = relative_errors(result, at_vertices(net, field))[:, start]
+            error = relative_errors(result, at_crossings(net, field))[:, start]
             errors.append(np.where(np.isnan(error), 3.0, np.abs(error)))
             flags.append(result.flags.flagged[:, start])
     return np.concatenate(errors), np.concatenate(flags)
@@ -60,7 +60,7 @@ def test_flags_find_what_is_wrong_and_leave_what_is_right(relative):
 def test_extreme_a_degenerate_triangle_is_flagged_always():
     net = triangle(46.1024, tolerance=1e-6)
     result = with_noise(net, homogeneous(), 0.01, 200, method="cycle")
-    start = geometry.build_cycle(net).vertex[0]
+    start = geometry.build_cycle(net).crossing[0]
     assert result.flags.ill_conditioned[:, start].mean() > 0.97
     assert result.flags.flagged[:, start].mean() > 0.97
 
@@ -68,12 +68,12 @@ def test_extreme_a_degenerate_triangle_is_flagged_always():
 def test_extreme_b_nearly_degenerate_triangle_is_flagged():
     net = triangle(47.0)
     result = with_noise(net, homogeneous(), 0.01, 300, method="cycle")
-    assert result.flags.flagged[:, geometry.build_cycle(net).vertex[0]].mean() > 0.95
+    assert result.flags.flagged[:, geometry.build_cycle(net).crossing[0]].mean() > 0.95
 
 
 def test_extreme_c_far_start_is_flagged_and_harmless_only_when_exact():
     net = triangle(30.0)
-    upper = int(np.argmax(net.vertex[:, 2]))
+    upper = int(np.argmax(net.crossing[:, 2]))
     middle = [v for v in range(3) if geometry.build_cycle(net, start=v).far_start]
     assert upper in middle
     start = middle[0]
@@ -83,7 +83,7 @@ def test_extreme_c_far_start_is_flagged_and_harmless_only_when_exact():
     single = with_noise(net, homogeneous(), 0.01, 200, method="multiplier", multiplier=0.0,
                         start=start)  # fmt: skip
     assert single.flags.flagged[:, start].all()
-    assert not single.flags.not_positive[:, geometry.build_cycle(net).vertex[0]].any()
+    assert not single.flags.not_positive[:, geometry.build_cycle(net).crossing[0]].any()
 
 
 def test_extreme_d_clear_air_is_flagged():
@@ -96,7 +96,7 @@ def test_extreme_d_clear_air_is_flagged():
     assert not usable.any() or np.mean(np.abs(score[usable]) < 3) >= 0.98
 
 
-def test_extreme_e_thick_air_needs_its_near_vertex_only():
+def test_extreme_e_thick_air_needs_its_near_crossing_only():
     exact = without_noise(triangle(), homogeneous(2e-2))
     single = without_noise(triangle(), homogeneous(2e-2), method="multiplier", multiplier=0.0)
     assert exact.extinction[0] == pytest.approx(2e-2, rel=1e-10)
@@ -134,9 +134,9 @@ def test_extreme_h_no_plain_number_comes_out_of_a_bad_signal(bad, method):
     assert not lost[[0, 1, 2, 4]].any()
 
 
-def test_extreme_i_too_few_rays_without_prior_are_not_determined():
+def test_extreme_i_too_few_beams_without_prior_are_not_determined():
     net = fan([-500.0, 500.0], [(45.0, 55.0), (135.0,)])
-    assert net.vertices == 2
+    assert net.crossings == 2
     result = with_noise(net, homogeneous(), 0.01, 20, prior="none")
     assert np.isnan(result.extinction).all()
     assert result.flags.not_finite.all()
@@ -144,11 +144,11 @@ def test_extreme_i_too_few_rays_without_prior_are_not_determined():
 
 def test_extreme_j_pole_is_refused():
     net = triangle(30.0)
-    # Walked against the attenuation, through the far vertex.
+    # Walked against the attenuation, through the far crossing.
     forward = geometry.build_cycle(net)
-    order = forward.vertex[[0, 2, 1]]
+    order = forward.crossing[[0, 2, 1]]
     backward = geometry.Cycle(
-        forward.ray[::-1].copy(), order.copy(), forward.end_range[::-1].copy(),
+        forward.beam[::-1].copy(), order.copy(), forward.end_range[::-1].copy(),
         forward.start_range[::-1].copy(),
     )  # fmt: skip
     result = without_noise(
@@ -161,17 +161,17 @@ def test_extreme_j_pole_is_refused():
 
 @pytest.mark.parametrize("method", ["cycle", "multiplier"])
 @pytest.mark.parametrize("relative", [0.01, 0.03])
-def test_a_vertex_reached_against_strong_attenuation_is_flagged(method, relative):
+def test_a_crossing_reached_against_strong_attenuation_is_flagged(method, relative):
     net, field = triangle(60.0), homogeneous(0.02)
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, field), relative, 200, 7, additive=0.0)
     result = retrieve_network(
         power, r, net, method=method, variance=variance, full_overlap_range=100.0
     )
-    error = relative_errors(result, at_vertices(net, field))
+    error = relative_errors(result, at_crossings(net, field))
     stated = result.extinction_standard_error / result.extinction
-    start = int(geometry.build_cycle(net).vertex[0])
-    other = [v for v in np.flatnonzero(result.near_vertex) if v != start]
+    start = int(geometry.build_cycle(net).crossing[0])
+    other = [v for v in np.flatnonzero(result.near_crossing) if v != start]
     # Values are there, and many are off by more than their linear error tells.
     assert (np.abs(error[:, other]) > 4.0 * stated[:, other]).mean() > 0.1
     assert result.flags.ill_conditioned[:, other].mean() > 0.6
@@ -194,7 +194,7 @@ def test_one_loud_profile_costs_the_others_nothing_where_signals_tell_the_noise(
         retrieve_network(power, r, net, **settings),
     )
     others = np.arange(50) != 7
-    near = found.near_vertex
+    near = found.near_crossing
     np.testing.assert_allclose(
         found.extinction_standard_error[others][:, near],
         quiet.extinction_standard_error[others][:, near], rtol=0.05,

@@ -31,7 +31,7 @@ _LARGEST_INFORMATION: Final = 1e6
 _USUAL_INFORMATION: Final = 100.0
 _NEGLIGIBLE: Final = 1e-4
 _LEAST_FREEDOM_TO_DOUBT: Final = 2.0
-"""Of 4 rays: from fewer, an estimate that is off cannot be told."""
+"""Of 4 beams: from fewer, an estimate that is off cannot be told."""
 _FEWEST_FREEDOM: Final = 4.1
 _DOUBTED_BELOW: Final = 0.5
 """Share of its weight below which an estimate is reported as weighted down."""
@@ -162,7 +162,7 @@ class _Block:
     extent: float
     """m, from the lidar to the highest estimate."""
     gaps: Integers
-    """Rows of which neighbouring heights come from other rays."""
+    """Rows of which neighbouring heights come from other beams."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,8 +351,8 @@ def _members(labels: npt.NDArray[np.int64], there: Booleans) -> list[Integers]:
     return [member for member in members if member.size]
 
 
-def _solve_block(block: _Block, *, gate_pass: bool) -> _Fit:
-    if not gate_pass:
+def _solve_block(block: _Block, *, bin_pass: bool) -> _Fit:
+    if not bin_pass:
         return _fit(block, block.information)
     screened = _outliers.screen_outliers(block.estimates, block.information)
     fit = _fit(block, _outliers.believed(block.information, screened))
@@ -401,13 +401,13 @@ def _part(
     moments: ResidualMoments | None,
     within: Booleans,
     *,
-    gate_pass: bool,
+    bin_pass: bool,
 ) -> _Part:
     stiffness = _banded.penalty(problem.altitude, problem.station_altitude)
     block = _block(problem, member, moments, stiffness)
     freedom = None if moments is None else moments.degrees_of_freedom[member]
     most = np.inf if freedom is None else float(freedom.max())
-    fit = _solve_block(block, gate_pass=gate_pass and most >= _LEAST_FREEDOM_TO_DOUBT)
+    fit = _solve_block(block, bin_pass=bin_pass and most >= _LEAST_FREEDOM_TO_DOUBT)
     calibrated = member.size >= _smoothing_choice.FEWEST_TO_CHOOSE
     noise = BlockNoise(
         member,
@@ -422,7 +422,7 @@ def solve_vertical_blocks(
     labels: npt.NDArray[np.int64],
     moments: ResidualMoments | None,
     *,
-    gate_pass: bool,
+    bin_pass: bool,
 ) -> VerticalSolution:
     """Solve all blocks, see `lidarops.retrieve.multiangle.vertical.smooth_profile.smooth_optical_depth`."""
     shape = problem.optical_depth.shape
@@ -437,7 +437,7 @@ def solve_vertical_blocks(
     for candidates in _members(labels, within[:, 0]):
         member = _telling(problem, candidates)
         within[np.setdiff1d(candidates, member)] = False
-        part = _part(problem, member, moments, within[member], gate_pass=gate_pass)
+        part = _part(problem, member, moments, within[member], bin_pass=bin_pass)
         for name, values in part.rows(step).items():
             rows[name][member] = np.where(within[member], values, np.nan)
         for name, value in part.scalars().items():

@@ -25,24 +25,24 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @dataclass(frozen=True, slots=True)
 class ResidualMoments:
-    """What the residuals of the rays tell about the noise of the optical depths.
+    """What the residuals of the beams tell about the noise of the optical depths.
 
     Made by `lidarops.retrieve.multiangle.vertical.smooth_profile.residual_moments`. The correlation along height and the
     standard errors need it.
     """
 
     lag_products: Array
-    """(profile, 3): sums over rays and heights of products of weighted residuals 1, 2 and 3
+    """(profile, 3): sums over beams and heights of products of weighted residuals 1, 2 and 3
     heights apart, weighted by the share of the inhomogeneity in them."""
     lag_norms: Array
     """(profile, 3): the same sums, where the inhomogeneity is wholly correlated."""
     inhomogeneity_share: Array
     """(profile, height): share of the inhomogeneity in the variance of the optical depth, 0..1."""
     degrees_of_freedom: Array
-    """(profile, height): rays used less 2, at least 0."""
+    """(profile, height): beams used less 2, at least 0."""
     gaps: Booleans
     """(profile,): whether samples are missing between others, so that neighbouring heights come
-    from other rays."""
+    from other beams."""
 
 
 @_compiled
@@ -52,11 +52,11 @@ def lag_sums(
     """Sum products of weighted residuals along height, and what they are for full correlation.
 
     Each product counts by the share of the inhomogeneity in it: where noise dominates, it tells
-    of errors that rays have in common with themselves, as of a background, not of the air.
+    of errors that beams have in common with themselves, as of a background, not of the air.
 
     Parameters
     ----------
-    residual, weight, leverage : (profile, ray, height) float64
+    residual, weight, leverage : (profile, beam, height) float64
     variance : (profile, height) float64
         Of the inhomogeneity.
 
@@ -64,18 +64,18 @@ def lag_sums(
     -------
     products, norms : (profile, 3) float64
     freedom : (profile, height) float64
-        Rays used less 2, at least 0.
+        Beams used less 2, at least 0.
     """
-    profiles, rays, heights = residual.shape
+    profiles, beams, heights = residual.shape
     products, norms = np.zeros((profiles, LAGS)), np.zeros((profiles, LAGS))
     freedom = np.zeros((profiles, heights))
     weighted, spread = np.zeros(heights), np.zeros(heights)
     for t in range(profiles):
-        for ray in range(rays):
+        for beam in range(beams):
             for k in range(heights):
-                w = weight[t, ray, k]
-                share = w * variance[t, k] * (1.0 - leverage[t, ray, k])
-                u = residual[t, ray, k] * np.sqrt(w)
+                w = weight[t, beam, k]
+                share = w * variance[t, k] * (1.0 - leverage[t, beam, k])
+                u = residual[t, beam, k] * np.sqrt(w)
                 used = w > 0.0 and np.isfinite(u) and share > 0.0
                 freedom[t, k] += 1.0 if w > 0.0 and np.isfinite(u) else 0.0
                 weighted[k] = u if used else 0.0

@@ -54,8 +54,8 @@ def matrix(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
         ) from None
 
 
-def rays(*arrays: npt.ArrayLike) -> tuple[Array, Array, Array]:
-    """Return residual, weight and leverage as contiguous (profile, ray, height) float64.
+def beams(*arrays: npt.ArrayLike) -> tuple[Array, Array, Array]:
+    """Return residual, weight and leverage as contiguous (profile, beam, height) float64.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def rays(*arrays: npt.ArrayLike) -> tuple[Array, Array, Array]:
             raise RetrievalInputError(
                 f"has the shape {array.shape}",
                 field=name,
-                remedy="give (profile, ray, height), the same for residual, weight and leverage",
+                remedy="give (profile, beam, height), the same for residual, weight and leverage",
             )
     return first, second, third
 

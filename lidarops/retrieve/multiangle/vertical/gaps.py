@@ -21,15 +21,15 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 def between(there: Booleans, signal: npt.NDArray[np.floating], variance: Array) -> Booleans:
-    """Tell which profiles miss samples between others of the same ray.
+    """Tell which profiles miss samples between others of the same beam.
 
     Of weak light, a sample that noise made negative is not missing, though it is not used.
 
     Parameters
     ----------
-    there : (profile, ray, height) bool
+    there : (profile, beam, height) bool
         Samples that are used.
-    signal, variance : (profile, ray, height) float
+    signal, variance : (profile, beam, height) float
         NaN where missing.
 
     Returns
@@ -68,11 +68,11 @@ def _own_noise(share: Array, linked: Booleans, k: int) -> float:
 
 @_compiled
 def gap_precision(information: Array, share: Array, correlation: float) -> Array:
-    r"""Return the precision of estimates of which neighbours come from other rays.
+    r"""Return the precision of estimates of which neighbours come from other beams.
 
     The noise is :math:`n_k = c_k + e_k`: the first is shared, of variance :math:`f / I` and
     correlated by :math:`\rho^d`, the second of a height alone. The variance of
-    c hardly changes with the rays that are missing, that of e does from height to height. In
+    c hardly changes with the beams that are missing, that of e does from height to height. In
     a chain of the standard errors of single heights, :math:`z_k - r z_{k-1}` over
     :math:`\sqrt{1 - r^2}` would take a smooth profile for one that jumps with these,
     and the data for far more certain than they are; so links have the mean

@@ -89,7 +89,7 @@ class VerticalResult:
     high_correlation: Booleans
     """(profile,): the correlation exceeds 0.85; standard errors may be too small."""
     no_residual: Booleans
-    """(profile,): no ray is redundant; correlation and inhomogeneity are unknown."""
+    """(profile,): no beam is redundant; correlation and inhomogeneity are unknown."""
     no_data: Booleans
     """(profile,): no height has an estimate; all values NaN."""
     system: VerticalSystem
@@ -112,15 +112,15 @@ def residual_moments(
     inhomogeneity_share: npt.ArrayLike,
     gaps: npt.ArrayLike | None = None,
 ) -> ResidualMoments:
-    r"""Sum what `smooth_optical_depth` needs to know of the residuals of a fit over rays.
+    r"""Sum what `smooth_optical_depth` needs to know of the residuals of a fit over beams.
 
     Parameters
     ----------
-    residual : (profile, ray, height) float
+    residual : (profile, beam, height) float
         Logarithm of the signal less its fit.
-    weight : (profile, ray, height) float
-        :math:`w = 1 / (v + s^2)`; zero or NaN where a ray was not used.
-    leverage : (profile, ray, height) float
+    weight : (profile, beam, height) float
+        :math:`w = 1 / (v + s^2)`; zero or NaN where a beam was not used.
+    leverage : (profile, beam, height) float
         Diagonal of the hat matrix, :math:`h = w (1 / \sum w + (x - \bar x)^2 / S_{xx})`.
     inhomogeneity_variance : (profile, height) float
         :math:`s^2`.
@@ -129,7 +129,7 @@ def residual_moments(
         variance of the optical depth.
     gaps : (profile,) bool, optional
         Whether samples are missing between others, so that neighbouring heights come from other
-        rays; none where not given.
+        beams; none where not given.
 
     Returns
     -------
@@ -140,11 +140,11 @@ def residual_moments(
     RetrievalInputError
         For shapes that do not belong together.
     """
-    rays = _inputs.rays(residual, weight, leverage)
-    shape = (rays[0].shape[0], rays[0].shape[2])
+    beams = _inputs.beams(residual, weight, leverage)
+    shape = (beams[0].shape[0], beams[0].shape[2])
     variance = _inputs.matrix(inhomogeneity_variance, "inhomogeneity_variance", shape)
     share = _inputs.matrix(inhomogeneity_share, "inhomogeneity_share", shape)
-    products, norms, freedom = _correlation.lag_sums(*rays, variance)
+    products, norms, freedom = _correlation.lag_sums(*beams, variance)
     holed = np.zeros(shape[0], dtype=np.bool_) if gaps is None else np.asarray(gaps, np.bool_)
     share = np.clip(np.nan_to_num(share), 0.0, 1.0)
     return ResidualMoments(products, norms, share, freedom, holed)
@@ -158,7 +158,7 @@ def smooth_optical_depth(
     station_altitude: float,
     block: npt.ArrayLike | None = None,
     residuals: ResidualMoments | None = None,
-    gate_pass: bool = True,
+    bin_pass: bool = True,
 ) -> VerticalResult:
     r"""Join optical depths of single heights into profiles of smooth extinction.
 
@@ -201,11 +201,11 @@ def smooth_optical_depth(
         Label of the block of each profile; one block where not given.
     residuals : ResidualMoments, optional
         Where not given, the estimates are taken as uncorrelated, of exactly known variance.
-    gate_pass : bool
+    bin_pass : bool
         Whether to weight outlying estimates down: first those that are 6 standard errors off
         the median of 15 heights, then, where one is 4.5 standard errors off the solution,
         all by Tukey's bisquare at 6 standard errors. Not done where `residuals` tell of fewer
-        than 4 rays, nor in a profile of which that would doubt more than half.
+        than 4 beams, nor in a profile of which that would doubt more than half.
 
     Returns
     -------
@@ -225,7 +225,7 @@ def smooth_optical_depth(
     problem = _inputs.vertical_problem(optical_depth, information, altitude, station_altitude)
     labels = _inputs.labels(block, problem.optical_depth.shape[0])
     moments = None if residuals is None else _inputs.moments(residuals, problem)
-    return _result(_block.solve_vertical_blocks(problem, labels, moments, gate_pass=gate_pass))
+    return _result(_block.solve_vertical_blocks(problem, labels, moments, bin_pass=bin_pass))
 
 
 def respond(system: VerticalSystem, profiles: npt.ArrayLike) -> Array:

@@ -1,7 +1,7 @@
 """Profiles of a block, parted where many are far noisier than many others.
 
 What is too weak, what is an unusual error and which field is likeliest is asked of a block as a
-whole. Where most of it is noisy, by background light or by thick air, the rest would lose rays
+whole. Where most of it is noisy, by background light or by thick air, the rest would lose beams
 that it hears well and state errors that it does not have; so each part is a block of its own.
 """
 
@@ -29,24 +29,24 @@ def split_by_noise(
     rows: Array,
     row: Indices,
     block: Indices,
-    crossings: tuple[Indices, Indices, int],
+    passages: tuple[Indices, Indices, int],
     loudest: float,
 ) -> Indices:
-    """Return blocks, numbered anew, of profiles of like noise about every vertex.
+    """Return blocks, numbered anew, of profiles of like noise about every crossing.
 
     Parameters
     ----------
-    signal : (profile, ray, bin) float64
-    rows : (row, ray, bin) float64
+    signal : (profile, beam, bin) float64
+    rows : (row, beam, bin) float64
         Variances as stated, in the signal's unit squared.
     row : (profile,) intp
         Of the variances of a profile.
     block : (profile,) intp
         0, 1, ... without a gap.
-    crossings : (crossing,) intp, (crossing,) intp, int
-        Rays, first gates about the vertices, and how many gates there are.
+    passages : (passage,) intp, (passage,) intp, int
+        Beams, first bins about the crossings, and how many bins there are.
     loudest : float
-        Relative standard error of a gate, beyond which a signal is not used.
+        Relative standard error of a bin, beyond which a signal is not used.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def split_by_noise(
     members = [np.flatnonzero(block == b) for b in range(count)]
     if all(mine.size < 2 * _enough(mine.size) for mine in members):
         return block
-    noise = _relative(signal, rows, row, crossings)
+    noise = _relative(signal, rows, row, passages)
     # All that is not used is alike, and what its chance levels are does not matter.
     most = FARTHER * loudest**2
     out, number = np.empty_like(block), 0
@@ -72,15 +72,15 @@ def _enough(size: int) -> int:
 
 
 def _relative(
-    signal: Array, rows: Array, row: Indices, crossings: tuple[Indices, Indices, int]
+    signal: Array, rows: Array, row: Indices, passages: tuple[Indices, Indices, int]
 ) -> Array:
-    """Return (profile, crossing) relative variances of a gate; inf of what is not positive.
+    """Return (profile, passage) relative variances of a bin; inf of what is not positive.
 
-    Of the median level of the gates, which no single wild gate moves.
+    Of the median level of the bins, which no single wild bin moves.
     """
-    ray = crossings[0][:, np.newaxis]
-    gate = crossings[1][:, np.newaxis] + np.arange(crossings[2])
-    level, spread = np.median(signal[:, ray, gate], axis=2), np.median(rows[:, ray, gate], axis=2)
+    beam = passages[0][:, np.newaxis]
+    bin = passages[1][:, np.newaxis] + np.arange(passages[2])
+    level, spread = np.median(signal[:, beam, bin], axis=2), np.median(rows[:, beam, bin], axis=2)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         return np.where(level > 0.0, spread[row] / level**2, np.where(level <= 0.0, np.inf, np.nan))
 
@@ -100,7 +100,7 @@ def _parts(mine: Indices, noise: Array) -> list[Indices]:
     Parameters
     ----------
     mine : (profile,) intp
-    noise : (profile, crossing) float64
+    noise : (profile, passage) float64
     """
     least = _enough(mine.size)
     if mine.size < 2 * least:

@@ -1,15 +1,15 @@
-"""Compiled search for single gates that lie off their neighbours, and what takes their place.
+"""Compiled search for single bins that lie off their neighbours, and what takes their place.
 
-Air leaves next to nothing in what is left of a gate when a polynomial through the three gates on
-either side is taken from it: a plume of 50 m less than 1e-5 of the signal at gates of 7.5 m. So a
-gate that alone lies off by more than noise explains is no air. It is bridged: the logarithm of the
-same polynomial takes its place, and its derivatives go to the gates that made it, so that
-variances stay those of the gates that were used. Edges of layers and clouds are air: they leave
-several gates off, or something beside the one that is taken out, and such a ray stays as it is.
-So do rays of wider gates than 10 m, where a layer may fill a single one. As wild gates may lie
-together too, what bridging them would change is added to the covariance of such a ray, straight
-lines across long runs of them too (`lidarops.retrieve.network.noise.outlying_runs`). Where more gates lie off than
-could be wild, noise is not what is stated, and the ray is not believed.
+Air leaves next to nothing in what is left of a bin when a polynomial through the three bins on
+either side is taken from it: a plume of 50 m less than 1e-5 of the signal at bins of 7.5 m. So a
+bin that alone lies off by more than noise explains is no air. It is bridged: the logarithm of the
+same polynomial takes its place, and its derivatives go to the bins that made it, so that
+variances stay those of the bins that were used. Edges of layers and clouds are air: they leave
+several bins off, or something beside the one that is taken out, and such a beam stays as it is.
+So do beams of wider bins than 10 m, where a layer may fill a single one. As wild bins may lie
+together too, what bridging them would change is added to the covariance of such a beam, straight
+lines across long runs of them too (`lidarops.retrieve.network.noise.outlying_runs`). Where more bins lie off than
+could be wild, noise is not what is stated, and the beam is not believed.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -27,11 +27,11 @@ Indices = npt.NDArray[np.intp]
 Codes = npt.NDArray[np.uint8]
 
 OUTLYING: Final = 6.0
-"""Standard errors off; chance goes beyond once in 5e8 gates."""
+"""Standard errors off; chance goes beyond once in 5e8 bins."""
 REACH: Final = 8
-"""Gates to either side among which neighbours are sought."""
+"""Bins to either side among which neighbours are sought."""
 MARGIN: Final = 4
-"""Gates before and behind those of a ray that are used, which judge them."""
+"""Bins before and behind those of a beam that are used, which judge them."""
 NODES: Final = 6
 """Neighbours through which a polynomial goes."""
 GOOD: Final = 0
@@ -40,7 +40,7 @@ LOST: Final = 1
 BRIDGED: Final = 2
 
 LEFT: Final = -1
-"""Number of bridged gates of a ray with some that lie off together, which stay as they are."""
+"""Number of bridged bins of a beam with some that lie off together, which stay as they are."""
 
 _SIDE: Final = 3
 _OTHER_SIDE: Final = (6, 3, 4, 3)
@@ -49,22 +49,22 @@ _ONE_SIDED_DEGREE: Final = 2
 _AIR: Final = (5e-2, 1e-3, 5e-4, 5e-4)
 """Relative: what air may leave there, at most, by the neighbours on the side with fewer."""
 _JUDGES: Final = 4
-"""Neighbours on either side by which the worst of several gates is told."""
+"""Neighbours on either side by which the worst of several bins is told."""
 _JUDGES_DEGREE: Final = 3
 _LOUD: Final = 0.02
-"""Relative standard error of a gate from which on logarithms are not normal in their tails."""
+"""Relative standard error of a bin from which on logarithms are not normal in their tails."""
 _LOUD_ESTIMATED: Final = 0.05
-"""The same of an estimated one, that tells nothing of a single gate: louder ones are not tested."""
+"""The same of an estimated one, that tells nothing of a single bin: louder ones are not tested."""
 WIDEST: Final = 10.0
-"""m, of gates of which a single one is too narrow for a layer of air."""
+"""m, of bins of which a single one is too narrow for a layer of air."""
 _SUSPECT: Final = 4.5
-"""Standard errors off, of gates about a bridged one, from which on it may be an edge."""
+"""Standard errors off, of bins about a bridged one, from which on it may be an edge."""
 _STEP: Final = 0.1
-"""Logarithm by which air may change over 4 gates: that of 2 km of visibility."""
+"""Logarithm by which air may change over 4 bins: that of 2 km of visibility."""
 _FEW: Final = 14
-"""Gates that two edges of layers put off."""
+"""Bins that two edges of layers put off."""
 _SHARE: Final = 0.2
-"""Of the gates of a ray, that may lie off beside them."""
+"""Of the bins of a beam, that may lie off beside them."""
 _LARGEST_LOGARITHM: Final = 300.0
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -72,9 +72,9 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @_compiled
 def _fit_shares(grid: Array, at: int, nodes: Indices, count: int, degree: int, out: Array) -> None:
-    """Fill the shares of some gates in a least-squares polynomial at another gate.
+    """Fill the shares of some bins in a least-squares polynomial at another bin.
 
-    By orthogonal polynomials (`forsythe1957`); of degree count - 1, it goes through the gates.
+    By orthogonal polynomials (`forsythe1957`); of degree count - 1, it goes through the bins.
     """
     x, p, before = np.empty(NODES + 2), np.ones(NODES + 2), np.zeros(NODES + 2)
     scale = abs(grid[nodes[count - 1]] - grid[nodes[0]]) / count
@@ -101,7 +101,7 @@ def _fit_shares(grid: Array, at: int, nodes: Indices, count: int, degree: int, o
 def _gather(
     codes: Codes, at: int, first: int, stop: int, wanted: tuple[int, int], nodes: Indices
 ) -> int:
-    """Fill the nearest good gates before and behind a gate, in order; return how many."""
+    """Fill the nearest good bins before and behind a bin, in order; return how many."""
     below = 0
     g = at - 1
     while below < wanted[0] and g >= max(first, at - REACH):
@@ -123,7 +123,7 @@ def _gather(
 
 @_compiled
 def _sides(codes: Codes, at: int, first: int, stop: int) -> tuple[int, int]:
-    """Return how many good gates before and behind a gate make its polynomial."""
+    """Return how many good bins before and behind a bin make its polynomial."""
     below = above = 0
     for g in range(at - 1, max(first, at - REACH) - 1, -1):
         below += codes[g] == GOOD
@@ -140,7 +140,7 @@ def _sides(codes: Codes, at: int, first: int, stop: int) -> tuple[int, int]:
 def neighbours(
     grid: Array, codes: Codes, at: int, first: int, stop: int, nodes: Indices, shares: Array
 ) -> tuple[int, float]:
-    """Fill the gates that tell a gate, and their shares.
+    """Fill the bins that tell a bin, and their shares.
 
     Returns
     -------
@@ -163,32 +163,32 @@ def neighbours(
 def plan_neighbours(
     grid: Array, limits: Indices, nodes: Indices, shares: Array, air: Array
 ) -> None:
-    """Fill, for each ray and gate, its neighbours where all gates are good.
+    """Fill, for each beam and bin, its neighbours where all bins are good.
 
     Parameters
     ----------
-    grid : (ray, bin) float64
+    grid : (beam, bin) float64
         m.
-    limits : (ray, 2) intp
-        First gate that may be used, and the one behind the last.
-    nodes : (ray, bin, NODES) intp
+    limits : (beam, 2) intp
+        First bin that may be used, and the one behind the last.
+    nodes : (beam, bin, NODES) intp
         Filled up with the last one.
-    shares : (ray, bin, NODES) float64
+    shares : (beam, bin, NODES) float64
         Filled up with 0.
-    air : (ray, bin) float64
+    air : (beam, bin) float64
         NaN where neighbours are too few.
     """
     codes = np.zeros(grid.shape[1], dtype=np.uint8)
-    for ray in range(grid.shape[0]):
-        first, stop = limits[ray, 0], limits[ray, 1]
+    for beam in range(grid.shape[0]):
+        first, stop = limits[beam, 0], limits[beam, 1]
         for g in range(first, stop):
             count, allowed = neighbours(
-                grid[ray], codes, g, first, stop, nodes[ray, g], shares[ray, g]
+                grid[beam], codes, g, first, stop, nodes[beam, g], shares[beam, g]
             )
-            air[ray, g] = allowed if count > 0 else math.nan
+            air[beam, g] = allowed if count > 0 else math.nan
             for i in range(count, NODES):
-                nodes[ray, g, i] = nodes[ray, g, max(count - 1, 0)]
-                shares[ray, g, i] = 0.0
+                nodes[beam, g, i] = nodes[beam, g, max(count - 1, 0)]
+                shares[beam, g, i] = 0.0
 
 
 def planned(grid: Array, limits: Indices) -> tuple[Indices, Array, Array]:
@@ -209,7 +209,7 @@ def make_plain(
     plain: Array,
     wide: Array,
 ) -> None:
-    """Fill the signal, in units of a level along the ray that no single gate decides.
+    """Fill the signal, in units of a level along the beam that no single bin decides.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def make_plain(
     exponent : float
     codes : (bin,) uint8
     span : four int
-        First of all gates, first and behind the last of those that are surely good, behind the
+        First of all bins, first and behind the last of those that are surely good, behind the
         last of all.
     plain, wide : (bin,) float64
         The signal and its variances, filled where they may be asked for.
@@ -247,7 +247,7 @@ def _off(
     count: int,
     air: float,
 ) -> float:
-    """Return by how many standard errors a gate lies off a polynomial, beyond what air does.
+    """Return by how many standard errors a bin lies off a polynomial, beyond what air does.
 
     In logarithms where noise is low; otherwise in the signal itself, whose noise is normal.
     """
@@ -263,7 +263,7 @@ def _off(
         gap = abs(logs[at] - told) - air * exponent
         spread += noise[at]
     elif relative:
-        # Such variances know nothing of a gate's own noise.
+        # Such variances know nothing of a bin's own noise.
         return 0.0
     else:
         for i in range(count):
@@ -285,7 +285,7 @@ def _measure(
     planned: tuple[Indices, Array, Array],
     off: Array,
 ) -> None:
-    """Fill how far off gates lie, from one gate to another."""
+    """Fill how far off bins lie, from one bin to another."""
     first, stop, start, end = span
     nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     for g in range(start, end):
@@ -317,9 +317,9 @@ def _worst(
     first: int,
     stop: int,
 ) -> int:
-    """Return the gate about a hit that lies farthest off a smoother curve.
+    """Return the bin about a hit that lies farthest off a smoother curve.
 
-    A wild gate makes its neighbours look wild, the less so the more gates judge.
+    A wild bin makes its neighbours look wild, the less so the more bins judge.
     """
     nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     found, most = hit, 0.0
@@ -340,9 +340,9 @@ def _worst(
 def _jumps(
     logs: Array, noise: Array, exponent: float, codes: Codes, at: int, first: int, stop: int
 ) -> bool:
-    """Return whether the signal before a gate and that behind it differ by more than air's slope.
+    """Return whether the signal before a bin and that behind it differ by more than air's slope.
 
-    The gate may then be the one in which a layer begins.
+    The bin may then be the one in which a layer begins.
     """
     step = spread = 0.0
     for way in (-1, 1):
@@ -367,7 +367,7 @@ def _alone(
     first: int,
     stop: int,
 ) -> bool:
-    """Return whether every bridged gate lies alone, and all gates about it are as they should be.
+    """Return whether every bridged bin lies alone, and all bins about it are as they should be.
 
     Several together, what is left beside one, or a jump from one side to the other may be the
     edge of a layer or a cloud.
@@ -388,7 +388,7 @@ def _alone(
 def _exceeds(
     values: Array, variances: Array, at: int, shares: Array, air: tuple[float, float]
 ) -> bool:
-    """Return whether a gate lies off the three on either side, without a square root.
+    """Return whether a bin lies off the three on either side, without a square root.
 
     Of what air leaves, the first part is absolute, the second one of the value.
     """
@@ -418,7 +418,7 @@ def _quiet(
     span: tuple[int, int, int, int],
     planned: tuple[Indices, Array, Array],
 ) -> bool:
-    """Return whether no gate that is used lies off, where all are good, as on most rays."""
+    """Return whether no bin that is used lies off, where all are good, as on most beams."""
     logs, noise, plain, wide = row
     first, low, stop, last = span
     loud = (_LOUD * exponent) ** 2
@@ -460,7 +460,7 @@ def find_outliers(
     marked: Codes,
     off: Array,
 ) -> tuple[int, int]:
-    """Mark the gates of a ray that are to be bridged.
+    """Mark the bins of a beam that are to be bridged.
 
     The one that lies farthest off is taken out, and the others are looked at again without it.
 
@@ -473,14 +473,14 @@ def find_outliers(
     grid : (bin,) float64
         m.
     span : four int
-        First of all gates, first and behind the last of those that are used, behind the last of
+        First of all bins, first and behind the last of those that are used, behind the last of
         all.
     planned : (bin, NODES) intp, (bin, NODES) float64, (bin,) float64
         Of `plan_neighbours`.
     codes : (bin,) uint8
         In: GOOD or LOST; out: also BRIDGED.
     marked : (bin,) uint8
-        Where gates lie together that are left: `codes` as if they were wild.
+        Where bins lie together that are left: `codes` as if they were wild.
     off : (bin,) float64
         Scratch.
 
@@ -489,7 +489,7 @@ def find_outliers(
     int
         How many are to be bridged; LEFT where several lie together.
     int
-        Behind the last gate to be believed.
+        Behind the last bin to be believed.
     """
     first, _, _, stop = span
     most = _FEW + int(_SHARE * (stop - first))
@@ -529,9 +529,9 @@ def replace_outliers(
     nodes: Indices,
     shares: Array,
 ) -> int:
-    """Put what neighbours tell into gates that are marked; return where the first has none.
+    """Put what neighbours tell into bins that are marked; return where the first has none.
 
-    The mean of a logarithm lies half its variance low, of one gate as of what several make.
+    The mean of a logarithm lies half its variance low, of one bin as of what several make.
 
     Parameters
     ----------
@@ -539,11 +539,11 @@ def replace_outliers(
     exponent : float
     grid : (bin,) float64
     span : int, int and int
-        First gate that neighbours come from, that behind the last, and that behind the last
-        gate to be bridged.
+        First bin that neighbours come from, that behind the last, and that behind the last
+        bin to be bridged.
     codes : (bin,) uint8
     nodes : (bin, NODES) intp
-        Filled for bridged gates; the first of them is -1 where neighbours are fewer.
+        Filled for bridged bins; the first of them is -1 where neighbours are fewer.
     shares : (bin, NODES) float64
         0 where there is no neighbour.
     """
@@ -575,7 +575,7 @@ def hand_on(
     nodes: Indices,
     shares: Array,
 ) -> None:
-    """Give the derivatives by bridged gates to the gates that made them."""
+    """Give the derivatives by bridged bins to the bins that made them."""
     for g in range(span[0], span[1]):
         if codes[g] != BRIDGED:
             continue

@@ -1,12 +1,12 @@
-"""Runs of gates of a network's rays that lie off: what is between them if they are wild.
+"""Runs of bins of a network's beams that lie off: what is between them if they are wild.
 
-The gates in the middle of a run lie on one curve with their neighbours, as wild as these may be:
+The bins in the middle of a run lie on one curve with their neighbours, as wild as these may be:
 only the edges of the run show, where the signal jumps, and jumps back. A thin layer of air with
 sharp edges looks the same. So what lies between two edges is bridged by a straight line, as one of
-two readings of the ray. Single gates that lie off do not make the signal jump: a line across many
-of them would take curved air away. Of a run that reaches beyond an end of the ray but one edge
-shows: the other reading is the ray without the jump. Farther from the ends, such an edge is that
-of a layer, for all that the ray tells.
+two readings of the beam. Single bins that lie off do not make the signal jump: a line across many
+of them would take curved air away. Of a run that reaches beyond an end of the beam but one edge
+shows: the other reading is the beam without the jump. Farther from the ends, such an edge is that
+of a layer, for all that the beam tells.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ Array = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint8]
 
 _LONGEST: Final = 32
-"""Gates between two edges that are taken for those of one run."""
+"""Bins between two edges that are taken for those of one run."""
 _SHORT: Final = 6
-"""Gates that a polynomial still bridges."""
+"""Bins that a polynomial still bridges."""
 _SIDE: Final = 3
-"""Gates on either side that make a line."""
+"""Bins on either side that make a line."""
 _MOST: Final = 5
-"""Gates on either side that tell a jump, where so many are good."""
+"""Bins on either side that tell a jump, where so many are good."""
 _STEP: Final = 0.05
 """Logarithm that the curvature of air may leave there."""
 _SHARE: Final = 1 / 3
-"""Of the gates of a ray, that may lie off where some of them lie together."""
+"""Of the bins of a beam, that may lie off where some of them lie together."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -52,7 +52,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 def _side(
     logs: Array, noise: Array, grid: Array, codes: Codes, span: tuple[int, int, int]
 ) -> tuple[int, float, float, float]:
-    """Return number, mean logarithm, its variance and mean range of the good gates on a side."""
+    """Return number, mean logarithm, its variance and mean range of the good bins on a side."""
     start, stop, way = span
     count, value, spread, where = 0, 0.0, 0.0, 0.0
     for g in range(start, stop, way):
@@ -72,7 +72,7 @@ def _draw(
     run: tuple[int, int],
     ends: tuple[int, int],
 ) -> None:
-    """Put gates on a line between the means of the good ones on either side.
+    """Put bins on a line between the means of the good ones on either side.
 
     Where there are none on the one side, on the mean of the other; nothing where on neither.
     """
@@ -93,9 +93,9 @@ def _draw(
 def _jump(
     logs: Array, noise: Array, grid: Array, codes: Codes, at: int, ends: tuple[int, int]
 ) -> float:
-    """Return by how much the signal rises at a gate; 0 where noise or air may have done it.
+    """Return by how much the signal rises at a bin; 0 where noise or air may have done it.
 
-    Of two parallel lines through the good gates on either side, least squares: air's own slope is
+    Of two parallel lines through the good bins on either side, least squares: air's own slope is
     as steep as a run is high, where a layer begins.
     """
     count, x, y = np.zeros(2), np.zeros(2), np.zeros(2)
@@ -139,9 +139,9 @@ def _partner(
     edge: tuple[int, float],
     ends: tuple[int, int],
 ) -> int:
-    """Return the gate, if none that is marked, where the signal jumps back; -1 where it does not.
+    """Return the bin, if none that is marked, where the signal jumps back; -1 where it does not.
 
-    By single gates, noise hides lower edges than by several on either side.
+    By single bins, noise hides lower edges than by several on either side.
     """
     at, rise = edge
     found, most = -1, 0.0
@@ -163,14 +163,14 @@ def _join(codes: Codes, steps: Array, ends: tuple[int, int]) -> None:
     ----------
     codes : (bin,) uint8
     steps : (bin,) float64
-        How far the logarithm jumps at gates that are marked. Out: 0 where a run accounts for it.
+        How far the logarithm jumps at bins that are marked. Out: 0 where a run accounts for it.
     ends : two int
     """
     start, last, back = -1, -1, 0.0
     for g in range(ends[0], ends[1]):
         if steps[g] == 0.0:
             continue
-        # More than one gate may be marked at an edge.
+        # More than one bin may be marked at an edge.
         if last >= 0 and g - last <= _SIDE and steps[g] * back > 0.0:
             codes[last:g] = BRIDGED
             last, steps[g] = g, 0.0
@@ -193,7 +193,7 @@ def _complete(
             continue
         other = _partner(logs, noise, grid, codes, (g, steps[g]), ends)
         if other >= 0:
-            # Either gate at a jump may be the last of the run.
+            # Either bin at a jump may be the last of the run.
             low, stop = min(g, other - 1), max(g + 1, other + 2)
             codes[low:stop] = BRIDGED
             steps[low:stop] = 0.0
@@ -201,15 +201,15 @@ def _complete(
 
 @_compiled
 def _level(logs: Array, steps: Array, ends: tuple[int, int]) -> None:
-    """Move what lies between an end of the ray and a jump near it to where the rest of it is.
+    """Move what lies between an end of the beam and a jump near it to where the rest of it is.
 
-    The constant of a ray cancels: which side of the jump is wild makes no difference.
+    The constant of a beam cancels: which side of the jump is wild makes no difference.
     """
     last = -1
     for g in range(ends[0], ends[1]):
         if steps[g] == 0.0:
             continue
-        # More than one gate may be marked at an edge.
+        # More than one bin may be marked at an edge.
         again = last >= 0 and g - last <= _SIDE and steps[g] * steps[last] > 0.0
         last = g
         if again:
@@ -228,9 +228,9 @@ def draw_lines(
     codes: Codes,
     ends: tuple[int, int],
 ) -> None:
-    """Put straight lines across the runs of gates that lie off, and mark them as lost.
+    """Put straight lines across the runs of bins that lie off, and mark them as lost.
 
-    What lies between a lone jump and an end of the ray near it is moved by the jump. All gates are
+    What lies between a lone jump and an end of the beam near it is moved by the jump. All bins are
     left BRIDGED, by nothing, where so many lie off that the others may be wild too.
 
     Parameters
@@ -240,9 +240,9 @@ def draw_lines(
     grid : (bin,) float64
         m.
     codes : (bin,) uint8
-        BRIDGED where gates lie off; what no polynomial can bridge, or lies between, gets LOST.
+        BRIDGED where bins lie off; what no polynomial can bridge, or lies between, gets LOST.
     ends : two int
-        First of all gates, and behind the last.
+        First of all bins, and behind the last.
     """
     marked = np.sum(codes[ends[0] : ends[1]] == BRIDGED)
     if marked > _SHARE * (marked + np.sum(codes[ends[0] : ends[1]] == GOOD)):
@@ -265,6 +265,6 @@ def draw_lines(
         start = stop + 1
     nodes, shares = np.empty(NODES + 2, dtype=np.intp), np.empty(NODES + 2)
     for g in range(ends[0], ends[1]):
-        # Beside a run at an end of the ray, too few are left for a polynomial.
+        # Beside a run at an end of the beam, too few are left for a polynomial.
         if codes[g] == BRIDGED and neighbours(grid, codes, g, *ends, nodes, shares)[0] == 0:
             _draw(logs, noise, grid, codes, (g, g + 1), ends)

@@ -199,7 +199,7 @@ def test_profiles_are_compared_at_the_reach_of_each():
 
 @pytest.mark.parametrize("farther", [1, 2])
 def test_profiles_that_reach_farther_are_not_compared_with_themselves(farther):
-    """Thick hazes that alone are seen one gate higher are as thick as without that gate."""
+    """Thick hazes that alone are seen one bin higher are as thick as without that bin."""
     amounts = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 2.0])
     depth, variance, within = hazes(amounts)
     equal = _calibration.relative_squares(depth[:, :-1], variance[:, :-1], within[:, :-1])

@@ -274,7 +274,7 @@ def test_clear_profile_is_far_better_than_height_by_height():
     reached = np.isfinite(result.optical_depth)
     error = rms(result.optical_depth - depth)
     assert error <= 0.010
-    # A ninth of it in the study; the scenes differ in how noisy the highest gates are.
+    # A ninth of it in the study; the scenes differ in how noisy the highest bins are.
     assert error <= rms(np.where(reached, found.optical_depth - depth, np.nan)) / 8.0
     assert rms(result.extinction - extinction) <= 0.010 * PER_KM
 
@@ -339,7 +339,7 @@ def test_gradient_bound_is_the_bias_that_a_gradient_makes():
     rng = np.random.default_rng(9)
     logarithm, variance = simulate(scene, 20, rng)
     tangent = np.tan(np.arccos(1.0 / scene.secant))[:, np.newaxis]
-    flat = solve(scene, kano_hamilton(scene, logarithm, variance), gate_pass=False)
+    flat = solve(scene, kano_hamilton(scene, logarithm, variance), bin_pass=False)
     tilted = kano_hamilton(scene, logarithm + 1e-9 * scene.altitude * tangent, variance)
     plain_estimates = kano_hamilton(scene, logarithm, variance)
     shift = tilted.optical_depth - plain_estimates.optical_depth
@@ -359,8 +359,8 @@ def test_outlying_estimates_do_little_harm():
     depth, information, truth = plain(100, rng)
     wrong = depth + (rng.random(depth.shape) < 0.05) * 0.4
     clean, robust, naive = (
-        smooth_optical_depth(rows, information, ALTITUDE, station_altitude=0.0, gate_pass=gate_pass)
-        for rows, gate_pass in ((depth, True), (wrong, True), (wrong, False))
+        smooth_optical_depth(rows, information, ALTITUDE, station_altitude=0.0, bin_pass=bin_pass)
+        for rows, bin_pass in ((depth, True), (wrong, True), (wrong, False))
     )
     errors = [rms(result.optical_depth - truth) for result in (clean, robust, naive)]
     assert errors[1] < 1.15 * errors[0]
@@ -373,7 +373,7 @@ def test_outlying_estimates_do_little_harm():
     assert two >= 0.91
 
 
-def test_gate_pass_costs_clean_data_nothing():
+def test_bin_pass_costs_clean_data_nothing():
     rng = np.random.default_rng(11)
     depth, information, _ = plain(100, rng)
     depth[0, 30] += 0.12
@@ -601,7 +601,7 @@ def test_unit_of_the_noise_scales_the_errors_only():
 
 
 def test_coherent_residuals_in_noise_are_no_correlation_of_the_air():
-    """The far half is noise, and all of it off along each ray, as by a background."""
+    """The far half is noise, and all of it off along each beam, as by a background."""
     rng = np.random.default_rng(41)
     shape = (30, 8, 60)
     noise = np.where(np.arange(60) < 30, 1e-4, 0.04)
@@ -671,12 +671,10 @@ def moments_of(profiles, *, ratio=0.0, share=1.0, freedom=10.0):
 @pytest.mark.parametrize(("freedom", "factor"), [(10.0, 1.0), (0.2, 1.0), (0.0, 4.1 / 2.1)])
 def test_noise_known_from_few_residuals_widens_the_errors(freedom, factor):
     depth, information, _ = plain(12, np.random.default_rng(41))
-    known = smooth_optical_depth(
-        depth, information, ALTITUDE, station_altitude=0.0, gate_pass=False
-    )
+    known = smooth_optical_depth(depth, information, ALTITUDE, station_altitude=0.0, bin_pass=False)
     moments = moments_of(12, freedom=freedom)
     found = smooth_optical_depth(
-        depth, information, ALTITUDE, station_altitude=0.0, residuals=moments, gate_pass=False
+        depth, information, ALTITUDE, station_altitude=0.0, residuals=moments, bin_pass=False
     )
     number = 15.0 * 12.0 * freedom
     factor = number / (number - 2.0) if number > 4.1 else factor

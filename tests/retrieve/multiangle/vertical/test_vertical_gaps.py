@@ -1,4 +1,4 @@
-"""Stated errors where samples are missing here and there: neighbours that come from other rays."""
+"""Stated errors where samples are missing here and there: neighbours that come from other beams."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_stated_errors_of_clear_air_hold_with_gaps():
     assert rms(extinction / of_extinction) < 1.1
 
 
-@pytest.mark.parametrize("hole", [(1, 60, 61), (3, 30, 60)], ids=["one sample", "half a ray"])
+@pytest.mark.parametrize("hole", [(1, 60, 61), (3, 30, 60)], ids=["one sample", "half a beam"])
 def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
     """Undoubted estimates must not share more of their noise than all of it."""
     rng, atmosphere = np.random.default_rng(1), clear(120)
@@ -63,8 +63,8 @@ def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
                 rng, 16, ANGLES, atmosphere, ratio=3000.0, inhomogeneity=0.03,
                 correlation=correlation,
             )  # fmt: skip
-            ray, first, past = hole
-            signal[:, [1, ray], first:past] = np.nan
+            beam, first, past = hole
+            signal[:, [1, beam], first:past] = np.nan
             one = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance)
             valued = np.isfinite(one.extinction)
             assert np.all(one.extinction_standard_error[valued] > 0.0)
@@ -75,18 +75,18 @@ def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
     assert np.mean(np.abs(np.concatenate(deviations)) > 4.0) < 5e-4
 
 
-def noise_with_gaps(rng, correlation, rays=8, heights=60):
-    """Return information, share and true covariance of means over rays, a third missing.
+def noise_with_gaps(rng, correlation, beams=8, heights=60):
+    """Return information, share and true covariance of means over beams, a third missing.
 
-    Rays whose noise is all shared along height, of variance 1.
+    Beams whose noise is all shared along height, of variance 1.
     """
-    there = rng.random((heights, rays)) > 1.0 / 3.0
+    there = rng.random((heights, beams)) > 1.0 / 3.0
     there[:, 0] |= ~there.any(axis=1)
     weight = there / there.sum(axis=1, keepdims=True)
     apart = np.abs(np.subtract.outer(np.arange(heights), np.arange(heights)))
     covariance = (weight @ weight.T) * correlation**apart
     information = there.sum(axis=1).astype(np.float64)
-    return information, information / rays, covariance
+    return information, information / beams, covariance
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.7, 0.9, 0.95])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.oracle_network import (
-    at_vertices,
+    at_crossings,
     grid,
     homogeneous,
     noisy,
@@ -21,7 +21,7 @@ FULL = {"full_overlap_range": 100.0}
 
 
 def estimated(power):
-    """Return (row, ray, bin) relative standard deviations of one block."""
+    """Return (row, beam, bin) relative standard deviations of one block."""
     rows, row = _beam_signals._estimated(
         power, [np.arange(len(power))], np.zeros(len(power), np.intp)
     )
@@ -29,7 +29,7 @@ def estimated(power):
 
 
 def drawn(net, relative, profiles, field=plume, seed=2):
-    """Return power whose relative noise is the same at all gates, and the power without."""
+    """Return power whose relative noise is the same at all bins, and the power without."""
     clean = signals(net, grid(net), field)
     rng = np.random.default_rng(seed)
     return clean * (1.0 + relative * rng.standard_normal((profiles, *clean.shape))), clean
@@ -39,13 +39,13 @@ def drawn(net, relative, profiles, field=plume, seed=2):
 
 
 @pytest.mark.parametrize("profiles", [1, 50])
-def test_wild_gates_are_not_taken_for_noise(profiles):
+def test_wild_bins_are_not_taken_for_noise(profiles):
     power, _ = drawn(three_by_two(), 0.02, profiles, homogeneous())
     wild = np.random.default_rng(4).random(power.shape) < 0.003
     noise, _ = estimated(np.where(wild, 1e6, 1.0) * power)
     assert wild.any()
     assert np.median(noise) == pytest.approx(0.02, rel=0.05)
-    # Of one profile, 31 gates tell the noise.
+    # Of one profile, 31 bins tell the noise.
     assert noise.max() < 0.02 * (1.15 if profiles > 1 else 2.0)
 
 
@@ -65,26 +65,26 @@ def test_noise_of_mostly_equal_counts_is_what_the_others_have():
 
 @pytest.mark.parametrize("relative", [0.01, 0.1])
 @pytest.mark.parametrize("factor", [1.0 / 3.0, 3.0, 1e6])
-def test_a_wild_gate_costs_no_other_profile_anything_where_signals_tell_the_noise(factor, relative):
+def test_a_wild_bin_costs_no_other_profile_anything_where_signals_tell_the_noise(factor, relative):
     """The errors of all others were five times as large."""
     net = three_by_two()
     power, _ = drawn(net, relative, 50)
     heard = power.copy()
     heard[7, 2, 60] *= factor
     clean, found = (retrieve_network(one, grid(net), net, **FULL) for one in (power, heard))
-    others, near = np.arange(50) != 7, net.near_vertex
+    others, near = np.arange(50) != 7, net.near_crossing
     np.testing.assert_array_equal(found.flags.flagged[others], clean.flags.flagged[others])
     assert not found.flags.flagged[others][:, near].any()
     np.testing.assert_allclose(
         found.extinction_standard_error[others][:, near],
         clean.extinction_standard_error[others][:, near], rtol=0.02,
     )  # fmt: skip
-    score = (found.extinction - at_vertices(net, plume)) / found.extinction_standard_error
+    score = (found.extinction - at_crossings(net, plume)) / found.extinction_standard_error
     kept = np.isfinite(found.extinction[7]) & ~found.flags.flagged[7]
     assert np.all(np.abs(score[7, kept]) < 4.0)
 
 
-def test_wild_gates_are_told_where_noise_is_too_high_to_look_for_them():
+def test_wild_bins_are_told_where_noise_is_too_high_to_look_for_them():
     """Not bridged, they left values 5 errors off in a hundredth of all."""
     net = three_by_two()
     power, clean = drawn(net, 0.1, 200, homogeneous())
@@ -106,7 +106,7 @@ def test_a_loud_profile_states_its_own_error_where_signals_tell_the_noise():
     found = retrieve_network(
         power, grid(net), net, prior="none", blocks=np.arange(400) // 20, **FULL
     )
-    near = net.near_vertex
+    near = net.near_crossing
     assert found.flags.flagged[loud][:, near].mean() < 0.2
     score = (found.extinction - 2e-3) / found.extinction_standard_error
     for mine in (loud, ~loud):
@@ -141,8 +141,8 @@ def test_noisy_profiles_are_kept_among_as_many_quiet_ones(first):
     power, relative = half_louder(15.0, first, 64)
     found = retrieve_network(power, grid(net), net, blocks=np.arange(64) // 16, **FULL)
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
-    assert kept[:, net.near_vertex][relative > 0.01].mean() > 0.9
-    score = (found.extinction - at_vertices(net, plume)) / found.extinction_standard_error
+    assert kept[:, net.near_crossing][relative > 0.01].mean() > 0.9
+    score = (found.extinction - at_crossings(net, plume)) / found.extinction_standard_error
     assert np.all(np.abs(score[kept]) < 4.0)
 
 
@@ -175,7 +175,7 @@ def test_profiles_of_equal_levels_are_asked_in_any_order():
 
 @pytest.mark.parametrize("hit", [4, 5])
 @pytest.mark.parametrize("ratio", [1.0, 15.0])
-def test_a_wild_gate_is_told_among_quiet_and_noisy_profiles(ratio, hit):
+def test_a_wild_bin_is_told_among_quiet_and_noisy_profiles(ratio, hit):
     power, _ = half_louder(ratio, 0)
     clean, _ = estimated(power)
     power[hit, 2, 60] *= 1e6
@@ -183,7 +183,7 @@ def test_a_wild_gate_is_told_among_quiet_and_noisy_profiles(ratio, hit):
     np.testing.assert_allclose(noise[0], clean[0], rtol=0.03)
 
 
-def test_few_gates_that_are_mostly_wild_are_no_noisy_profile():
+def test_few_bins_that_are_mostly_wild_are_no_noisy_profile():
     power, _ = drawn(three_by_two(), 0.02, 20, homogeneous())
     clean, _ = estimated(power)
     power[4, :, 20:] = np.nan
@@ -192,7 +192,7 @@ def test_few_gates_that_are_mostly_wild_are_no_noisy_profile():
     np.testing.assert_allclose(noise[0], clean[0], rtol=0.05)
 
 
-# Gates that are not independent -------------------------------------------------------------
+# Bins that are not independent -------------------------------------------------------------
 
 
 def correlated(shape, share, rng):
@@ -202,12 +202,12 @@ def correlated(shape, share, rng):
 
 
 def excess(logs):
-    """Return (ray,) what sums of gates of the same noise in all profiles have more."""
+    """Return (beam,) what sums of bins of the same noise in all profiles have more."""
     return _beam_signals._excess(logs, np.isfinite(logs), np.ones(logs.shape[:2]))
 
 
 @pytest.mark.parametrize(("relative", "share"), [(0.003, 0.4), (0.02, 1.0)])
-def test_correlated_gates_state_what_their_sums_have(relative, share):
+def test_correlated_bins_state_what_their_sums_have(relative, share):
     """A tenth of the values lay off by more than 4 errors, without a flag."""
     net = three_by_two()
     r = grid(net)
@@ -216,8 +216,8 @@ def test_correlated_gates_state_what_their_sums_have(relative, share):
     power = clean * (1.0 + relative * correlated(shape, share, np.random.default_rng(3)))
     found = retrieve_network(power, r, net, blocks=np.arange(200) // 50, **FULL)
     kept = np.isfinite(found.extinction) & ~found.flags.flagged
-    assert kept[:, net.near_vertex].mean() > 0.95
-    score = (found.extinction - at_vertices(net, plume)) / found.extinction_standard_error
+    assert kept[:, net.near_crossing].mean() > 0.95
+    score = (found.extinction - at_crossings(net, plume)) / found.extinction_standard_error
     assert np.mean(np.abs(score[kept]) > 4.0) < 0.002
     # Sums of many have (1 + share)^2 / (1 + share^2) times the variance of independent ones.
     noise, _ = estimated(power[:50])
@@ -226,19 +226,19 @@ def test_correlated_gates_state_what_their_sums_have(relative, share):
 
 
 @pytest.mark.parametrize("lost", ["far third", "first profile", "both", "a twentieth"])
-@pytest.mark.parametrize("gates", [1200, 6000])
-def test_gates_are_correlated_also_where_some_are_unknown(gates, lost):
+@pytest.mark.parametrize("bins", [1200, 6000])
+def test_bins_are_correlated_also_where_some_are_unknown(bins, lost):
     """Second differences alone were told, less than half of the noise."""
     rng = np.random.default_rng(1)
-    logs = 0.02 * correlated((60, 3, gates), 1.0, rng)
+    logs = 0.02 * correlated((60, 3, bins), 1.0, rng)
     whole = excess(logs)
     part = logs.copy()
     if lost in {"far third", "both"}:
-        part[:, 1, -gates // 3 :] = np.nan
+        part[:, 1, -bins // 3 :] = np.nan
     if lost in {"first profile", "both"}:
         part[0, 1] = np.nan
     if lost == "a twentieth":
-        part[:, 1][rng.random((60, gates)) < 0.05] = np.nan
+        part[:, 1][rng.random((60, bins)) < 0.05] = np.nan
     part[:, 2] = np.nan
     found = excess(part)
     # Correlations of neighbours are 1/2, those of neighbouring sums 1/14.
@@ -248,13 +248,13 @@ def test_gates_are_correlated_also_where_some_are_unknown(gates, lost):
 
 
 @pytest.mark.parametrize("profiles", [1, 2, 12, 50])
-def test_independent_gates_are_not_taken_for_correlated(profiles):
+def test_independent_bins_are_not_taken_for_correlated(profiles):
     power, _ = drawn(three_by_two(), 0.05, profiles)
     np.testing.assert_array_equal(excess(np.log(power)), 1.0)
 
 
 def test_noise_that_differs_between_profiles_is_not_taken_for_correlated():
-    """By chance it was, of 2 to 6 rays in a hundred."""
+    """By chance it was, of 2 to 6 beams in a hundred."""
     for seed in range(60):
         rng = np.random.default_rng(seed)
         level = np.where(rng.permutation(24) % 2, 1.0, 225.0)[:, np.newaxis] * np.ones(6)
@@ -274,7 +274,7 @@ def test_air_that_drifts_is_no_correlated_noise():
     np.testing.assert_array_equal(excess(np.log(power)), 1.0)
 
 
-def test_wild_gates_are_no_correlated_noise():
+def test_wild_bins_are_no_correlated_noise():
     power, _ = drawn(three_by_two(), 0.02, 50, homogeneous())
     wild = np.random.default_rng(4).random(power.shape) < 0.015
     noise, _ = estimated(np.where(wild, 3.0, 1.0) * power)
@@ -305,7 +305,7 @@ def test_profiles_are_loud_by_more_than_their_signal_is_strong():
     np.testing.assert_allclose(_beam_signals._usual(variances, signal, signal[0]), 1.0)
 
 
-def test_a_ray_of_which_nothing_is_known_is_missing_and_not_weak():
+def test_a_beam_of_which_nothing_is_known_is_missing_and_not_weak():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.01, 20)
@@ -314,12 +314,12 @@ def test_a_ray_of_which_nothing_is_known_is_missing_and_not_weak():
     found = retrieve_network(power, r, net, variance=told, **FULL)
     assert not found.flags.weak_signal.any()
     mine = np.zeros_like(found.flags.signal_missing)
-    mine[3, net.on_ray(0)[0]] = True
+    mine[3, net.on_beam(0)[0]] = True
     np.testing.assert_array_equal(found.flags.signal_missing, mine)
 
 
 def test_what_noise_alone_makes_negative_is_weak():
-    """A ray that is out of order is told from one of which little is left."""
+    """A beam that is out of order is told from one of which little is left."""
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, homogeneous(8e-3)), 0.01, 20, additive=0.05)
@@ -329,4 +329,4 @@ def test_what_noise_alone_makes_negative_is_weak():
     assert not found.flags.signal_not_positive.any()
     power[:, 0] -= 10.0 * np.sqrt(variance[0])
     found = retrieve_network(power, r, net, variance=variance, **FULL)
-    assert found.flags.signal_not_positive[:, net.on_ray(0)[0][1:]].all()
+    assert found.flags.signal_not_positive[:, net.on_beam(0)[0][1:]].all()

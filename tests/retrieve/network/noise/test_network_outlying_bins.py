@@ -1,4 +1,4 @@
-"""Single gates of a network's rays that lie off their neighbours: found, bridged, or told."""
+"""Single bins of a network's beams that lie off their neighbours: found, bridged, or told."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidarops.retrieve.network import _condensed_signals
 from lidarops.retrieve.network.extinction_field import retrieve_network
 from lidarops.retrieve.network.noise import outlying_bins, outlying_runs
 
-GATES = 7
+BINS = 7
 
 
 def narrow(x, y, z):
@@ -36,24 +36,24 @@ def solved(net, r, power, variance, **settings):
 
 
 def condensed(net, r, power, variance, *, screened=True, relative=False, nearest=100.0):
-    ranges = np.tile(r, (net.rays, 1))
-    layout = _condensed_signals.lay_out(net, ranges, None, np.full(net.rays, nearest), GATES)
+    ranges = np.tile(r, (net.beams, 1))
+    layout = _condensed_signals.lay_out(net, ranges, None, np.full(net.beams, nearest), BINS)
     rows = np.broadcast_to(variance, (1, *power.shape[1:]))
     data = _condensed_signals.condense(
         power, np.ascontiguousarray(rows), np.zeros(len(power), dtype=np.intp),
-        np.ones(net.rays), layout, relative=relative, screened=screened,
+        np.ones(net.beams), layout, relative=relative, screened=screened,
     )  # fmt: skip
     return data, layout
 
 
-def hit(power, variance, profile, ray, gate, size):
-    """Return power with gates of a ray moved by so many standard errors."""
+def hit(power, variance, profile, beam, bin, size):
+    """Return power with bins of a beam moved by so many standard errors."""
     out = power.copy()
-    out[profile, ray, gate] += size * np.sqrt(np.broadcast_to(variance, power.shape[1:])[ray, gate])
+    out[profile, beam, bin] += size * np.sqrt(np.broadcast_to(variance, power.shape[1:])[beam, bin])
     return out
 
 
-def gate_at(r, where):
+def bin_at(r, where):
     return int(np.argmin(np.abs(r - where)))
 
 
@@ -78,27 +78,27 @@ def test_air_and_noise_are_left_alone_to_the_bit(name, step):
 
 
 @pytest.mark.parametrize("relative", [2e-3, 0.01, 0.05, 0.2])
-def test_what_is_left_of_gates_is_normal(relative):
-    """So that the threshold means what it says: beyond 6, once in 5e8 gates."""
+def test_what_is_left_of_bins_is_normal(relative):
+    """So that the threshold means what it says: beyond 6, once in 5e8 bins."""
     rng = np.random.default_rng(5)
-    rows, bins = 400, 200
-    slope = -0.01 * np.arange(bins)
-    plain = np.exp(slope) * (1 + relative * rng.standard_normal((rows, bins)))
-    codes, limits = np.zeros(bins, dtype=np.uint8), np.array([[0, bins]])
-    ranges = 5.0 * np.arange(1.0, bins + 1)
-    planned = np.zeros((1, bins, 6), np.intp), np.zeros((1, bins, 6)), np.zeros((1, bins))
+    rows, count = 400, 200
+    slope = -0.01 * np.arange(count)
+    plain = np.exp(slope) * (1 + relative * rng.standard_normal((rows, count)))
+    codes, limits = np.zeros(count, dtype=np.uint8), np.array([[0, count]])
+    ranges = 5.0 * np.arange(1.0, count + 1)
+    planned = np.zeros((1, count, 6), np.intp), np.zeros((1, count, 6)), np.zeros((1, count))
     outlying_bins.plan_neighbours(ranges[None], limits, *planned)
     nodes, shares, air = (one[0] for one in planned)
-    off = np.empty((rows, bins))
+    off = np.empty((rows, count))
     for n in range(rows):
         noise = (relative * np.exp(slope) / plain[n]) ** 2
         row = np.log(np.maximum(plain[n], 1e-9)), noise, plain[n], (relative * np.exp(slope)) ** 2
         outlying_bins._measure(
-            row, 1.0, False, ranges, codes, (0, bins, 0, bins), (nodes, shares, 0.0 * air), off[n]
+            row, 1.0, False, ranges, codes, (0, count, 0, count), (nodes, shares, 0.0 * air), off[n]
         )
     for many, chance in ((2.0, 4.55e-2), (3.0, 2.7e-3), (4.0, 6.3e-5)):
         expected = chance * off.size
-        # A gate of noise shows in 7 of them: so many fewer are independent.
+        # A bin of noise shows in 7 of them: so many fewer are independent.
         assert abs(np.sum(off > many) - expected) < 4 * np.sqrt(7 * expected) + 3
     assert off.max() < outlying_bins.OUTLYING
 
@@ -114,17 +114,17 @@ def test_counts_at_low_light_are_not_taken_for_outliers():
     assert not found.flags.outlying.any()
 
 
-# Where gates are hit ------------------------------------------------------------------------
+# Where bins are hit ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relative", [1e-3, 0.02, 0.1])
 @pytest.mark.parametrize("size", [15.0, 40.0, 1e3, 1e9])
-def test_a_spike_at_a_vertex_is_bridged_and_told(relative, size):
+def test_a_spike_at_a_crossing_is_bridged_and_told(relative, size):
     net, r, power, variance = scene(relative=relative)
-    at = gate_at(r, net.on_ray(0)[1][0])
+    at = bin_at(r, net.on_beam(0)[1][0])
     clean = solved(net, r, power, variance)
     found = solved(net, r, hit(power, variance, 7, 0, at, size), variance)
-    mine = net.on_ray(0)[0]
+    mine = net.on_beam(0)[0]
     assert found.flags.bridged[7, mine].all()
     assert not found.flags.bridged[np.arange(50) != 7].any()
     np.testing.assert_array_equal(found.flags.flagged, clean.flags.flagged)
@@ -135,10 +135,10 @@ def test_a_spike_at_a_vertex_is_bridged_and_told(relative, size):
 
 
 @pytest.mark.parametrize("size", [-20.0, 15.0, 100.0])
-def test_a_spike_in_the_middle_of_a_long_ray_costs_nothing(size):
+def test_a_spike_in_the_middle_of_a_long_beam_costs_nothing(size):
     net, r, power, variance = scene(relative=0.02)
-    low, high = net.on_ray(1)[1][[0, -1]]
-    at = gate_at(r, (low + high) / 2)
+    low, high = net.on_beam(1)[1][[0, -1]]
+    at = bin_at(r, (low + high) / 2)
     clean = solved(net, r, power, variance)
     found = solved(net, r, hit(power, variance, 3, 1, at, size), variance)
     np.testing.assert_array_equal(found.flags.flagged, clean.flags.flagged)
@@ -146,8 +146,8 @@ def test_a_spike_in_the_middle_of_a_long_ray_costs_nothing(size):
 
 
 def spiked(net, r, power, variance, sizes):
-    """Put spikes side by side on the first ray of all profiles, where beams meet."""
-    at = gate_at(r, net.on_ray(0)[1][0])
+    """Put spikes side by side on the first beam of all profiles, where beams meet."""
+    at = bin_at(r, net.on_beam(0)[1][0])
     for k, size in enumerate(sizes):
         power = hit(power, variance, slice(None), 0, at + k, size)
     return power
@@ -166,11 +166,11 @@ def test_spikes_that_lie_together_are_told_and_left(sizes):
 
 
 @pytest.mark.parametrize("place", ["first", "last"])
-def test_the_ends_of_a_ray_are_looked_at_too(place):
-    """Beyond the last vertex a gate is missing; before the first there are none."""
+def test_the_ends_of_a_beam_are_looked_at_too(place):
+    """Beyond the last crossing a bin is missing; before the first there are none."""
     net, r, power, variance = scene(relative=0.02)
-    ranges = net.on_ray(0)[1]
-    first, last = gate_at(r, ranges[0]), gate_at(r, ranges[-1])
+    ranges = net.on_beam(0)[1]
+    first, last = bin_at(r, ranges[0]), bin_at(r, ranges[-1])
     if place == "first":
         at, nearest = first - 3, np.array([r[first - 3] - 0.1, 100.0, 100.0])
     else:
@@ -180,25 +180,25 @@ def test_the_ends_of_a_ray_are_looked_at_too(place):
     found = solved(
         net, r, hit(power, variance, 9, 0, at, 120.0), variance, full_overlap_range=nearest
     )
-    assert (found.flags.bridged | found.flags.outlying)[9, net.on_ray(0)[0]].any()
+    assert (found.flags.bridged | found.flags.outlying)[9, net.on_beam(0)[0]].any()
     kept = ~found.flags.flagged & ~clean.flags.flagged & np.isfinite(found.extinction)
     assert (apart(found, clean)[9][kept[9]] < 1.5).all()
 
 
 def test_gaps_among_neighbours_are_passed_over():
     net, r, power, variance = scene(relative=0.02)
-    last = gate_at(r, net.on_ray(0)[1][-1])
+    last = bin_at(r, net.on_beam(0)[1][-1])
     power[:, 0, last + 5] = np.nan
     clean = solved(net, r, power, variance)
     found = solved(net, r, hit(power, variance, 9, 0, last + 3, 60.0), variance)
-    assert found.flags.bridged[9, net.on_ray(0)[0]].all()
+    assert found.flags.bridged[9, net.on_beam(0)[0]].all()
     assert np.nanmax(apart(found, clean)[9]) < 1.0
 
 
 def test_a_crowd_of_spikes_is_told_and_left():
     net, r, power, variance = scene(relative=0.01)
-    ranges = net.on_ray(0)[1]
-    at = gate_at(r, (ranges[0] + ranges[-1]) / 2)
+    ranges = net.on_beam(0)[1]
+    at = bin_at(r, (ranges[0] + ranges[-1]) / 2)
     rng = np.random.default_rng(1)
     damaged = power.copy()
     damaged[4, 0, at : at + 6] *= rng.uniform(0.3, 3.0, 6)
@@ -209,19 +209,19 @@ def test_a_crowd_of_spikes_is_told_and_left():
     np.testing.assert_array_equal(found.integral, plain.integral)
 
 
-def run(net, r, power, variance, after, gates, size=40.0):
-    """Move gates side by side on the first ray of all profiles, so many behind where beams meet."""
-    at = gate_at(r, net.on_ray(0)[1][0]) + after
-    for k in range(gates):
+def run(net, r, power, variance, after, bins, size=40.0):
+    """Move bins side by side on the first beam of all profiles, so many behind where beams meet."""
+    at = bin_at(r, net.on_beam(0)[1][0]) + after
+    for k in range(bins):
         power = hit(power, variance, slice(None), 0, at + k, size)
     return power
 
 
-@pytest.mark.parametrize(("after", "gates"), [(-3, 6), (-6, 12), (9, 12), (5, 20), (0, 30)])
-def test_a_run_of_wild_gates_is_part_of_the_standard_error(after, gates):
+@pytest.mark.parametrize(("after", "bins"), [(-3, 6), (-6, 12), (9, 12), (5, 20), (0, 30)])
+def test_a_run_of_wild_bins_is_part_of_the_standard_error(after, bins):
     """Only its edges show: those in the middle lie on one curve."""
     net, r, power, variance = scene(relative=0.02)
-    damaged = run(net, r, power, variance, after, gates)
+    damaged = run(net, r, power, variance, after, bins)
     told, layout = condensed(net, r, damaged, variance)
     plain, _ = condensed(net, r, damaged, variance, screened=False)
     clean, _ = condensed(net, r, power, variance)
@@ -236,10 +236,10 @@ def test_a_run_of_wild_gates_is_part_of_the_standard_error(after, gates):
     score = (found.extinction - 2e-3) / found.extinction_standard_error
     kept = ~found.flags.flagged & np.isfinite(found.extinction)
     assert np.all(np.abs(score[kept]) < 3.0)
-    assert np.isfinite(found.extinction[:, found.near_vertex]).mean() > 0.9
+    assert np.isfinite(found.extinction[:, found.near_crossing]).mean() > 0.9
 
 
-def test_a_line_goes_through_the_good_gates_on_either_side():
+def test_a_line_goes_through_the_good_bins_on_either_side():
     grid_, noise = 5.0 * np.arange(20.0), np.full(20, 0.09)
     logs, codes = 1.0 - 0.02 * grid_, np.zeros(20, dtype=np.uint8)
     expected, wild = logs.copy(), slice(6, 15)
@@ -249,7 +249,7 @@ def test_a_line_goes_through_the_good_gates_on_either_side():
     np.testing.assert_allclose(logs, expected, atol=1e-12)
     assert np.all(codes[wild] == outlying_bins.LOST)
     assert np.all(codes[[5, 15]] == outlying_bins.GOOD)
-    # Of two means of 3 gates: in the middle, a half of each.
+    # Of two means of 3 bins: in the middle, a half of each.
     assert noise[10] == pytest.approx(0.09 / 6.0)
 
 
@@ -258,7 +258,7 @@ def test_what_no_line_can_be_drawn_across_stays_as_it_is():
     for marked, expected in (
         ([2, 3], logs),
         (np.arange(30), logs),
-        # Beyond the last good gates, the signal stays as there.
+        # Beyond the last good bins, the signal stays as there.
         (np.arange(20, 30), np.where(logs < 20.0, logs, 18.0)),
     ):
         codes = np.zeros(30, dtype=np.uint8)
@@ -268,7 +268,7 @@ def test_what_no_line_can_be_drawn_across_stays_as_it_is():
         np.testing.assert_array_equal(told, expected)
 
 
-def test_of_rays_with_many_gates_off_nothing_is_told():
+def test_of_beams_with_many_bins_off_nothing_is_told():
     """Those on one curve may be the wild ones."""
     marked = np.arange(0, 30, 2)
     logs = np.zeros(30)
@@ -278,7 +278,7 @@ def test_of_rays_with_many_gates_off_nothing_is_told():
 
 
 def lined(logs, marked, noise=1e-4):
-    """Return logarithms across whose runs lines are drawn, and what became of the gates."""
+    """Return logarithms across whose runs lines are drawn, and what became of the bins."""
     codes = np.zeros(logs.size, dtype=np.uint8)
     codes[marked] = outlying_bins.BRIDGED
     out = logs.copy()
@@ -302,7 +302,7 @@ def test_a_run_jumps_and_jumps_back(slope, rise, marked):
 
 
 @pytest.mark.parametrize("apart", [5, 10, 25, 32])
-def test_single_gates_make_no_run(apart):
+def test_single_bins_make_no_run(apart):
     """However many they are: a line would take the air between them away."""
     logs = np.exp(-(((np.arange(200.0) - 100.0) / 22.0) ** 2))
     marked = np.arange(4, 196, apart)
@@ -313,16 +313,16 @@ def test_single_gates_make_no_run(apart):
     assert np.count_nonzero(codes) == marked.size
 
 
-@pytest.mark.parametrize("gates", [6, 12, 30])
+@pytest.mark.parametrize("bins", [6, 12, 30])
 @pytest.mark.parametrize("slope", [-0.08, 0.08])
 @pytest.mark.parametrize("end", ["first", "last"])
 @pytest.mark.parametrize("more", [0, 1])
-def test_of_a_run_at_the_end_of_a_ray_the_jump_is_taken_out(gates, slope, end, more):
-    """Also where two gates are marked at its only edge."""
+def test_of_a_run_at_the_end_of_a_beam_the_jump_is_taken_out(bins, slope, end, more):
+    """Also where two bins are marked at its only edge."""
     air = slope * np.arange(100.0)
     logs = air.copy()
-    logs[:gates] += 0.4
-    marked = [gates - 1, gates][: 1 + more]
+    logs[:bins] += 0.4
+    marked = [bins - 1, bins][: 1 + more]
     if end == "last":
         logs, air, marked = logs[::-1], air[::-1], [99 - g for g in marked]
     out, codes = lined(logs, marked)
@@ -362,7 +362,7 @@ def layer(x, y, z):
 
 @pytest.mark.parametrize("step", [5.0, 2.0])
 @pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 4.0), (layer, 6.0)])
-def test_single_wild_gates_in_curved_air_cost_little(field, most, step):
+def test_single_wild_bins_in_curved_air_cost_little(field, most, step):
     """Lines from one to the next would take the plume away, and state errors for it."""
     net = three_by_two()
     r = grid(net, step)
@@ -370,10 +370,10 @@ def test_single_wild_gates_in_curved_air_cost_little(field, most, step):
     clean = solved(net, r, power, variance)
     rng = np.random.default_rng(5)
     wild = np.zeros(power.shape, dtype=bool)
-    for ray in wild.reshape(-1, r.size):
-        ray[rng.integers(5, 25) : -4 : 25] = True
+    for beam in wild.reshape(-1, r.size):
+        beam[rng.integers(5, 25) : -4 : 25] = True
     found = solved(net, r, power + wild * 30.0 * np.sqrt(variance), variance)
-    near = found.near_vertex
+    near = found.near_crossing
     dearer = (found.extinction_standard_error / clean.extinction_standard_error)[:, near]
     assert np.nanmedian(dearer) < most
 
@@ -381,7 +381,7 @@ def test_single_wild_gates_in_curved_air_cost_little(field, most, step):
 @pytest.mark.parametrize("share", [0.02, 0.04])
 @pytest.mark.parametrize("step", [5.0, 2.0])
 @pytest.mark.parametrize("field", [ALL["plume"], layer])
-def test_wild_gates_in_curved_air_leave_values_within_their_errors(field, step, share):
+def test_wild_bins_in_curved_air_leave_values_within_their_errors(field, step, share):
     net = three_by_two()
     r = grid(net, step)
     power, variance = noisy(net, r, signals(net, r, field), 0.01, 150, 3, 0.003)
@@ -390,9 +390,9 @@ def test_wild_gates_in_curved_air_leave_values_within_their_errors(field, step, 
     found = solved(
         net, r, power + wild * np.sqrt(variance), variance, blocks=np.arange(150) // 50
     )  # fmt: skip
-    near = found.near_vertex
+    near = found.near_crossing
     kept = (~found.flags.flagged & np.isfinite(found.extinction))[:, near]
-    score = (found.extinction - field(*net.vertex.T)) / found.extinction_standard_error
+    score = (found.extinction - field(*net.crossing.T)) / found.extinction_standard_error
     assert kept.mean() > 0.95
     assert np.mean(np.abs(score[:, near][kept]) > 4.0) <= 7e-3
 
@@ -400,7 +400,7 @@ def test_wild_gates_in_curved_air_leave_values_within_their_errors(field, step, 
 @pytest.mark.parametrize("step", [0.3, 1.1, 4.0])
 def test_an_edge_of_a_layer_is_no_crowd(step):
     net, r, power, variance = scene(relative=0.01)
-    ranges = net.on_ray(0)[1]
+    ranges = net.on_beam(0)[1]
     beyond = r > (ranges[0] + ranges[-1]) / 2
     power[:, 0, beyond] *= step
     variance[0, beyond] *= step**2
@@ -411,9 +411,9 @@ def test_an_edge_of_a_layer_is_no_crowd(step):
 
 @pytest.mark.parametrize("step", [0.1, 0.5, 3.0, 20.0])
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_an_edge_inside_a_gate_stays_as_it_is(step, share):
+def test_an_edge_inside_a_bin_stays_as_it_is(step, share):
     net, r, power, variance = scene(relative=0.01)
-    at = gate_at(r, net.on_ray(0)[1][0]) + 1
+    at = bin_at(r, net.on_beam(0)[1][0]) + 1
     scale = np.where(np.arange(r.size) > at, step, 1.0)
     scale[at] = 1.0 + share * (step - 1.0)
     power[:, 0] *= scale
@@ -424,7 +424,7 @@ def test_an_edge_inside_a_gate_stays_as_it_is(step, share):
     np.testing.assert_array_equal(found.log_value, plain.log_value)
 
 
-def test_a_layer_may_fill_one_wide_gate():
+def test_a_layer_may_fill_one_wide_bin():
     net, r, power, variance = scene(relative=0.01)
     wide = slice(None, None, 4)
     at = r[wide].size // 3
@@ -451,27 +451,27 @@ def test_noise_that_is_not_stated_alarms_nobody(variance):
 
 def test_spikes_are_seen_where_signals_tell_the_noise():
     net, r, power, variance = scene(relative=0.01, additive=0.0)
-    at = gate_at(r, net.on_ray(0)[1][0])
+    at = bin_at(r, net.on_beam(0)[1][0])
     clean = solved(net, r, power, None)
     found = solved(net, r, hit(power, variance, 7, 0, at, 60.0), None)
-    assert found.flags.bridged[7, net.on_ray(0)[0]].all()
+    assert found.flags.bridged[7, net.on_beam(0)[0]].all()
     assert np.nanmax(apart(found, clean)[7]) < 1.0
 
 
 @pytest.mark.parametrize(("wild", "left"), [((0, 1, -2, -1), True), ((0, 1), False)])
-def test_a_ray_nothing_good_is_left_of_is_not_believed(wild, left):
-    """Between wild gates at either end of a short ray, all may be wild; nothing lies beyond."""
+def test_a_beam_nothing_good_is_left_of_is_not_believed(wild, left):
+    """Between wild bins at either end of a short beam, all may be wild; nothing lies beyond."""
     net = fan([-30.0, 0.0, 40.0], [(60,), (90,), (120,)])
     r = np.arange(20.0, 140.0, 4.0)
     field = ALL["homogeneous"]
     power, variance = noisy(net, r, signals(net, r, field), 2e-3, 50, 3, 0.0)
-    ends = net.on_ray(0)[1][[0, -1]]
-    used = np.arange(gate_at(r, ends[0]) - 3, gate_at(r, ends[1]) + 4)
+    ends = net.on_beam(0)[1][[0, -1]]
+    used = np.arange(bin_at(r, ends[0]) - 3, bin_at(r, ends[1]) + 4)
     power[:, 0, used[-1] + 1 :] = np.nan
     nearest = np.array([r[used[0]] - 1.0, 20.0, 20.0])
     damaged = hit(power, variance, 4, 0, used[list(wild)], 60.0)
     data, layout = condensed(net, r, damaged, variance, nearest=nearest)
-    mine = slice(layout.first_crossing[0], layout.first_crossing[1])
+    mine = slice(layout.first_passage[0], layout.first_passage[1])
     others = np.arange(50) != 4
     assert (data.usable[others, mine] == 1).all()
     assert not data.bridged[others].any()
@@ -479,26 +479,26 @@ def test_a_ray_nothing_good_is_left_of_is_not_believed(wild, left):
     assert (data.status[4, 0] == _condensed_signals.OUTLYING) == left
     assert (data.usable[4, mine] == 0).all() == left
     found = solved(net, r, damaged, variance, full_overlap_range=nearest)
-    assert found.flags.outlying[4, net.on_ray(0)[0]].all() == left
+    assert found.flags.outlying[4, net.on_beam(0)[0]].all() == left
     assert not found.flags.outlying[others].any()
 
 
 # Honesty ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("where", ["vertex", "between"])
+@pytest.mark.parametrize("where", ["crossing", "between"])
 @pytest.mark.parametrize("relative", [0.01, 0.2])
-def test_variances_of_bridged_rays_are_those_of_many_draws(where, relative):
+def test_variances_of_bridged_beams_are_those_of_many_draws(where, relative):
     net, r, power, variance = scene(relative=relative, profiles=3000)
-    ranges = net.on_ray(0)[1]
-    at = gate_at(r, ranges[0] if where == "vertex" else (ranges[0] + ranges[-1]) / 2)
+    ranges = net.on_beam(0)[1]
+    at = bin_at(r, ranges[0] if where == "crossing" else (ranges[0] + ranges[-1]) / 2)
     damaged = hit(power, variance, slice(None), 0, [at, at + 5], 100.0)
     data, layout = condensed(net, r, damaged, variance)
     plain, _ = condensed(net, r, damaged, variance, screened=False)
     assert data.bridged[:, 0].all()
     left = np.all(data.integral == plain.integral, axis=1)
     assert left.mean() < 0.1
-    first, last = layout.first_crossing[:2]
+    first, last = layout.first_passage[:2]
     count = last - first
     size = 2 * count - 1
     told = data.covariance[:, layout.offset[0] : layout.offset[1]].reshape(-1, size, size)
@@ -545,7 +545,7 @@ def test_results_do_not_depend_on_what_else_is_solved():
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.6])
-def test_one_percent_of_wild_gates_leaves_values_within_their_errors(exponent):
+def test_one_percent_of_wild_bins_leaves_values_within_their_errors(exponent):
     net = fan([-500.0, 0.0, 400.0], [(50, 68), (78, 103), (112, 130)], farthest=1000.0)
     r = grid(net)
     clean = signals(net, r, ALL["homogeneous"], exponent)
@@ -558,7 +558,7 @@ def test_one_percent_of_wild_gates_leaves_values_within_their_errors(exponent):
     )  # fmt: skip
     kept = ~found.flags.flagged & np.isfinite(found.extinction)
     score = ((found.extinction - 2e-3) / found.extinction_standard_error)[kept]
-    assert kept[:, found.near_vertex].mean() > 0.9
+    assert kept[:, found.near_crossing].mean() > 0.9
     assert np.mean(np.abs(score) > 4.0) <= 3e-3
 
 
@@ -569,14 +569,14 @@ def test_spikes_that_are_left_are_part_of_the_standard_error(sizes):
     found, layout = condensed(net, r, damaged, variance)
     plain, _ = condensed(net, r, damaged, variance, screened=False)
     clean, _ = condensed(net, r, power, variance)
-    size = 2 * int(layout.first_crossing[1]) - 1
+    size = 2 * int(layout.first_passage[1]) - 1
     told, own = (
         each.covariance[:, : layout.offset[1]].reshape(-1, size, size) for each in (found, plain)
     )
     left = (found.bridged[:, 0] == 1) & np.all(found.log_value == plain.log_value, axis=1)
     assert left.all()
     added = (told - own)[left]
-    # One direction, by as much as the spikes have moved the ray, but for noise.
+    # One direction, by as much as the spikes have moved the beam, but for noise.
     assert np.all(np.linalg.matrix_rank(added, tol=1e-9 * np.abs(added).max()) == 1)
     moved = (plain.log_value - clean.log_value)[left, 1]
     stated = np.sqrt(added[:, 0, 0] + added[:, 1, 1] - 2.0 * added[:, 0, 1])
@@ -584,7 +584,7 @@ def test_spikes_that_are_left_are_part_of_the_standard_error(sizes):
     assert not np.allclose(told[left], own[left], rtol=0.1)
 
 
-def test_rays_that_show_nothing_keep_their_covariance():
+def test_beams_that_show_nothing_keep_their_covariance():
     net, r, power, variance = scene(ALL["narrow plume"], relative=0.02)
     found, _ = condensed(net, r, power, variance)
     plain, _ = condensed(net, r, power, variance, screened=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.oracle_network import (
-    at_vertices,
+    at_crossings,
     grid,
     homogeneous,
     noisy,
@@ -38,7 +38,7 @@ def alike(found, whole, where):
 @pytest.mark.parametrize("factor", [3.0, 5.0])
 @pytest.mark.parametrize("count", [20, 30])
 def test_noisy_profiles_cost_quiet_ones_of_their_block_nothing(factor, count):
-    """They lost their far vertices with the others, and all their values to flags."""
+    """They lost their far crossings with the others, and all their values to flags."""
     net = three_by_two()
     r = grid(net)
     clean = signals(net, r, plume)
@@ -50,11 +50,11 @@ def test_noisy_profiles_cost_quiet_ones_of_their_block_nothing(factor, count):
     found = retrieve_network(heard, r, net, variance=told, **settings)
     for mine in (~loud, loud):
         alike(retrieve_network(heard[mine], r, net, variance=told[mine], **settings), found, mine)
-    near = net.near_vertex
+    near = net.near_crossing
     assert not found.flags.flagged[~loud][:, near].any()
-    stated = found.extinction_standard_error / at_vertices(net, plume)
+    stated = found.extinction_standard_error / at_crossings(net, plume)
     calm = retrieve_network(power, r, net, variance=variance, **settings)
-    usual = calm.extinction_standard_error / at_vertices(net, plume)
+    usual = calm.extinction_standard_error / at_crossings(net, plume)
     np.testing.assert_allclose(stated[~loud][:, near], usual[~loud][:, near], rtol=0.15)
 
 
@@ -62,7 +62,7 @@ def test_thick_air_costs_what_came_before_it_nothing():
     net = three_by_two()
     r = grid(net)
     dense = shuffled(30)
-    shape = (50, net.rays, r.size)
+    shape = (50, net.beams, r.size)
     power, variance = np.empty(shape), np.empty(shape)
     for mine, extinction in ((~dense, 5e-4), (dense, 5e-3)):
         clean = signals(net, r, homogeneous(extinction))
@@ -80,11 +80,11 @@ def test_thick_air_costs_what_came_before_it_nothing():
 
 def parts(power, variance, net, r, block=None):
     """Return (profile,) blocks."""
-    rays = _beam_signals.prepare_signals(
+    beams = _beam_signals.prepare_signals(
         power, r, net, variance=variance, overlap=None, full_overlap_range=100.0, exponent=1.0,
-        blocks=block, gates=7,
+        blocks=block, bins=7,
     )  # fmt: skip
-    return rays.block
+    return beams.block
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.3, 0.4, 0.5, 0.7, 1.0, 3.0])
@@ -100,16 +100,16 @@ def test_chance_parts_no_block(noise, profiles):
     assert not parts(power, told, net, r).any()
 
 
-def test_few_loud_profiles_energies_gaps_and_wild_gates_part_no_block():
+def test_few_loud_profiles_energies_gaps_and_wild_bins_part_no_block():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, plume), 0.02, 50)
     told = np.broadcast_to(variance, power.shape).copy()
     assert not parts(power, told, net, r).any()
     rng = np.random.default_rng(3)
-    energy = np.exp(rng.uniform(-2.0, 2.0, (50, net.rays, 1)))
+    energy = np.exp(rng.uniform(-2.0, 2.0, (50, net.beams, 1)))
     assert not parts(energy * power, energy**2 * told, net, r).any()
-    lost = rng.random((50, net.rays, 1)) < 0.3
+    lost = rng.random((50, net.beams, 1)) < 0.3
     assert not parts(np.where(lost, np.nan, power), told, net, r).any()
     assert not parts(power, np.where(lost, np.nan, told), net, r).any()
     wild = np.where(rng.random(power.shape) < 0.05, 1e3, 1.0)
