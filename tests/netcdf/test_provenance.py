@@ -186,7 +186,7 @@ def sources(tmp_path: Path) -> Path:
         ("unheard_of.py", True),
         ("reports/page.py", False),
         ("cli/app.py", False),
-        ("engine.py", False),
+        ("run/executor.py", False),
         ("catalog/scan.py", False),
         ("site/pages.py", False),
         ("bench/speed.py", False),

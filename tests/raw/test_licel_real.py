@@ -15,14 +15,15 @@ from lidarops.raw import licel
 
 @pytest.fixture(scope="session")
 def files(data_root) -> list[Path]:
-    found = [
+    other = {".csv", ".nc", ".txt"}
+    paths = [
         path
-        for folder in ("manaus", "pilar", "saopaulo", "synthetic")
+        for folder in ("manaus", "manaus_raman", "pilar", "saopaulo", "synthetic")
         for path in sorted((data_root / folder).rglob("*"))
-        if path.is_file() and path.suffix != ".csv"
+        if path.is_file() and path.suffix not in other
     ]
-    assert len(found) >= 171
-    return found
+    assert len(paths) >= 201
+    return paths
 
 
 def rebuild(header: licel.Header) -> licel.Header:

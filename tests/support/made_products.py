@@ -185,7 +185,10 @@ def elastic(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     window = np.where(np.arange(profiles) < profiles - 1, 200.0, np.nan)
     return xr.Dataset(
         {
-            **{name: (dims, np.where(missing, np.nan, values)) for name, values in retrieved.items()},
+            **{
+                name: (dims, np.where(missing, np.nan, values))
+                for name, values in retrieved.items()
+            },
             "molecular_backscatter": ("range", np.linspace(1.5e-6, 1e-6, bins)),
             "molecular_extinction": ("range", np.linspace(1.3e-5, 1e-5, bins)),
             "lidar_ratio": ((), 50.0),

@@ -61,7 +61,7 @@ def test_a_run_costs_no_less_than_one_with_nothing_to_do(
         return whole if "--force" in words else next(idle)
 
     monkeypatch.setattr(calibration, "_of_run", of_run)
-    monkeypatch.setattr(calibration.pipeline, "assess", lambda *_, **__: [])
+    monkeypatch.setattr(calibration.archive, "assess", lambda *_, **__: [])
     monkeypatch.setattr(cost_estimate.Tally, "total", 101.0)
     assert calibration._beside(None, Costs(DEFAULTS)) == pytest.approx(cost)
 
