@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
-from compliance_checker.runner import CheckSuite, ComplianceChecker
+from support.compliance import findings, permitted
 from support.made_products import MAKERS, context, homogeneous
 
 from lidarops.flags import Quality
 from lidarops.netcdf.write import write_product
-from lidarops.products.layouts import LAYOUTS, build_product
+from lidarops.products.layouts import build_product
 from lidarops.records import DetectionMode, ProductKind
 
 SCAN = {"zenith": [0.0, 30.0, 60.0, 80.0, 90.0], "azimuth": [0.0, 1.0, 2.0, 3.0, 4.0]}
@@ -35,42 +33,6 @@ def missing(kind: ProductKind) -> xr.Dataset:
         if variable.dtype.kind == "f":
             variable[...] = np.nan
     return data
-
-
-def findings(path: Path) -> tuple[set[str], set[str]]:
-    """Everything that the checker has to say of a file: of CF, and of ACDD."""
-    checks = ["cf:1.11", "acdd:1.3"]
-    CheckSuite.load_all_available_checkers()
-    report = path.with_suffix(".json")
-    ComplianceChecker.run_checker(
-        str(path), checks, 0, "strict", output_filename=str(report), output_format="json"
-    )
-    results = json.loads(report.read_text(encoding="utf-8"))
-    said = []
-    for check in checks:
-        said.append(set(_said(results[check]["all_priorities"])))
-        assert results[check]["possible_points"] > 90
-        full = results[check]["scored_points"] == results[check]["possible_points"]
-        assert full == (not said[-1])
-    return said[0], said[1]
-
-
-def _said(results: list[dict[str, Any]]) -> Iterator[str]:
-    for result in results:
-        scored, possible = result["value"]
-        # A test that is passed may still give advice, such as on the default calendar.
-        if scored != possible:
-            yield from (f"{result['name']} {message}" for message in result["msgs"])
-        yield from _said(result["children"])
-
-
-def permitted(kind: ProductKind, data: xr.Dataset) -> set[str]:
-    """One finding for each quantity that CF has no standard name for; none is left out."""
-    return {
-        f'variable "{row.name}" missing the following attributes: standard_name'
-        for row in LAYOUTS[kind].variables
-        if row.standard_name is None and (row.name in data or not row.optional)
-    }
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -1,0 +1,109 @@
+"""The shape of the house: layers without cycles, small folders, one name for one thing."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+MOST_PACKAGES = 20
+MOST_LEVELS = 10
+MOST_MODULES = 25
+
+
+@pytest.fixture(scope="module")
+def picture(repository: Path) -> ModuleType:
+    """The module that draws the packages and their imports."""
+    spec = spec_from_file_location("picture", repository / "docs/architecture_picture.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def sources(repository: Path, *roots: str) -> Iterator[tuple[Path, ast.Module]]:
+    for root in roots:
+        for path in sorted((repository / root).rglob("*.py")):
+            yield path, ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imported_modules(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def test_packages_form_few_levels_and_import_only_downwards(picture: ModuleType):
+    graph, rows = picture.imports(), picture.levels()
+    level = {name: number for number, row in enumerate(rows) for name in row}
+    assert set(graph) == set(level)
+    assert len(level) <= MOST_PACKAGES
+    assert len(rows) <= MOST_LEVELS
+    upwards = [(a, b) for a, used in graph.items() for b in used if level[b] <= level[a]]
+    assert upwards == []
+
+
+def test_every_module_stands_in_a_package(repository: Path, picture: ModuleType):
+    modules = {path.stem for path in (repository / "lidarops").glob("*.py")}
+    assert modules == {"__init__", "__main__"} | picture.VOCABULARY
+    packages = {path.parent.name for path in (repository / "lidarops").glob("*/__init__.py")}
+    assert packages | {"flows", "vocabulary"} == set(picture.PURPOSES)
+
+
+def test_no_folder_is_crowded(repository: Path):
+    modules: dict[Path, int] = defaultdict(int)
+    for path, _ in sources(repository, "lidarops", "flows"):
+        modules[path.parent] += 1
+    assert {folder: count for folder, count in modules.items() if count > MOST_MODULES} == {}
+
+
+def test_a_public_name_means_one_thing_in_its_layer(repository: Path, picture: ModuleType):
+    """But that a labeled shell has the name of what it wraps: it is the same over xarray."""
+    level = {name: number for number, row in enumerate(picture.levels()) for name in row}
+    places: dict[tuple[int, str], list[str]] = defaultdict(list)
+    for path, tree in sources(repository, "lidarops"):
+        package = path.relative_to(repository / "lidarops").parts[0]
+        if package not in level or path.stem.startswith("labeled"):
+            continue
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                places[level[package], node.name].append(str(path.relative_to(repository)))
+    assert {name: paths for (_, name), paths in places.items() if len(paths) > 1} == {}
+
+
+def test_no_test_imports_another_test_and_no_retrieval_test_a_benchmark(repository: Path):
+    tests = {path.stem for path in (repository / "tests").rglob("test_*.py")}
+    for path, tree in sources(repository, "tests"):
+        names = set(imported_modules(tree))
+        assert not {name for name in names if name.split(".")[0] in tests}, path
+        if path.is_relative_to(repository / "tests/retrieve"):
+            assert not {name for name in names if name.startswith("lidarops.bench")}, path
+
+
+def test_private_modules_are_imported_within_their_package_only(repository: Path):
+    """But by the benchmark of the kernels themselves."""
+    for path, tree in sources(repository, "lidarops", "flows"):
+        package = ".".join(path.relative_to(repository).parent.parts)
+        for name in imported_modules(tree):
+            private = re.match(r"(lidarops\..*)\._[a-z]\w*", name)
+            if private and path.name != "scan_kernels.py":
+                assert package.startswith(private[1]), f"{path} imports {name}"
+
+
+def test_every_package_and_module_says_what_it_is_for(repository: Path):
+    for path, tree in sources(repository, "lidarops", "flows"):
+        assert ast.get_docstring(tree), path
+
+
+def test_the_picture_shows_the_packages_as_they_are(repository: Path, picture: ModuleType):
+    drawn = (repository / "docs/architecture.svg").read_text(encoding="utf-8")
+    assert drawn == picture.draw(), "run: python docs/architecture_picture.py"
