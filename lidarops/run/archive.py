@@ -10,7 +10,6 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
-from datetime import datetime
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
@@ -20,8 +19,7 @@ from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError, SceneError
-from lidarops.plan.scenes import Cut, cut_scenes, select_scenes
+from lidarops.errors import CatalogError
 from lidarops.process.scene import Job, failed
 from lidarops.records import Granule, RunRecord, Unmet
 from lidarops.reports import run_page, run_record
@@ -42,7 +40,6 @@ __all__ = [
     "Selection",
     "assess",
     "bring_up_to_date",
-    "prepare",
     "remove_orphans",
     "report_run",
     "reprocess",
@@ -531,49 +528,6 @@ def remove_orphans(campaign: Campaign, found: Result, *, wait: float = 0.0) -> i
             path.unlink(missing_ok=True)
         store.forget_products(still, lock.token)
     return removed
-
-
-def prepare(
-    campaign: Campaign,
-    *,
-    instruments: Sequence[str] = (),
-    since: datetime | None = None,
-    until: datetime | None = None,
-) -> Cut:
-    """Bring the catalog up to date and cut it into the scenes that are asked for.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    instruments : sequence of str
-        All where empty.
-    since, until : datetime, optional
-        Only scenes that touch this interval.
-
-    Returns
-    -------
-    Cut
-
-    Raises
-    ------
-    CatalogError
-        If the archive or the catalog cannot be used.
-    SceneError
-        If there is no scene, or none of an instrument that is asked for.
-    """
-    update_catalog(campaign)
-    with Store(campaign.catalog_url, campaign.name) as store:
-        everything = cut_scenes(campaign, store.granules())
-    chosen = select_scenes(everything.scenes, instruments=instruments, since=since, until=until)
-    if not chosen:
-        raise SceneError(
-            f"holds {len(everything.scenes)} scenes, none of which is asked for"
-            if everything.scenes
-            else "holds no good file that an instrument claims as a signal",
-            file=campaign.archive,
-            remedy="see lidarops catalog, the patterns of the campaign, --since and --until",
-        )
-    return Cut(chosen, everything.set_aside)
 
 
 def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_page.RunReport:

@@ -15,23 +15,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from lidarops.campaign.model import Campaign
-from lidarops.catalog.ledger import RunStatus
-from lidarops.catalog.lock import Lock
-from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
 from lidarops.netcdf.provenance import code_version
-from lidarops.plan.scene_plan import plan_scene
-from lidarops.plan.scenes import Cut
 from lidarops.process.scene import Job, attempt, failed
-from lidarops.records import RunRecord, SceneOutcome
+from lidarops.records import SceneOutcome
 from lidarops.run import worker
-from lidarops.run.session import Session
-from lidarops.run.staleness import Judge
 from lidarops.system.processes import keep_memory, start_method
 
 if TYPE_CHECKING:
@@ -39,8 +30,6 @@ if TYPE_CHECKING:
     from distributed import Future as AnyFuture
 
     Future = AnyFuture[Any]
-
-Progress = Callable[[SceneOutcome], None]
 
 AHEAD: Final = 2
 """Scenes a worker thread has at hand, the one that it works on included."""
@@ -142,119 +131,9 @@ class Stop:
         _LOG.warning("%s: scenes in hand are ended; once more to abandon them", self.reason)
 
 
-def make_jobs(campaign: Campaign, cut: Cut, *, profiles_per_chunk: int | None = None) -> list[Job]:
-    """Plan every scene."""
-    return [
-        Job(campaign, scene, plan_scene(scene, campaign), profiles_per_chunk)
-        for scene in cut.scenes
-    ]
-
-
-def run(
-    campaign: Campaign,
-    cut: Cut,
-    *,
-    workers: int = 1,
-    client: Client | None = None,
-    profiles_per_chunk: int | None = None,
-    progress: Progress | None = None,
-) -> RunRecord:
-    """Process scenes, fresh or stale, and enter the run in the ledger.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    cut : Cut
-        The scenes, from `lidarops.plan.scenes.cut_scenes` (and `select`).
-    workers : int
-        Processes; 1 runs in this one, more start a dask cluster on this machine.
-    client : distributed.Client, optional
-        A cluster to use instead.
-    profiles_per_chunk : int, optional
-        Profiles a dask chunk; changes memory and speed, never a result.
-    progress : callable, optional
-        Called with the outcome of each scene as it ends.
-
-    Returns
-    -------
-    RunRecord
-
-    Raises
-    ------
-    CatalogError
-        If the ledger cannot be written, or another run holds it.
-    """
-    started = datetime.now(UTC)
-    jobs = make_jobs(campaign, cut, profiles_per_chunk=profiles_per_chunk)
-    outcomes = process_all(jobs, workers=workers, client=client, progress=progress)
-    return conclude(campaign, cut, outcomes, started=started)
-
-
-def conclude(
-    campaign: Campaign, cut: Cut, outcomes: Sequence[SceneOutcome], *, started: datetime
-) -> RunRecord:
-    """Make the record of a run whose scenes have ended, and enter it in the ledger; see `run`."""
-    scenes = {scene.id: scene for scene in cut.scenes}
-    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
-        lock.acquire()
-        judge = Judge(campaign, store)
-        session = Session(campaign, store, lock, judge, started=started)
-        session.begin()
-        for outcome in outcomes:
-            scene = scenes[outcome.scene]
-            # What staleness compares is the plan before any file was looked at.
-            judged = judge.judgement(scene, plan_scene(scene, campaign))
-            session.end(judged, outcome, final=False)
-        return session.finish(RunStatus.FINISHED, cut.set_aside)
-
-
-def process_all(
-    jobs: Sequence[Job],
-    *,
-    workers: int = 1,
-    client: Client | None = None,
-    progress: Progress | None = None,
-) -> list[SceneOutcome]:
-    """Process scenes serially, on new local workers or on a cluster, without a ledger.
-
-    Parameters
-    ----------
-    jobs : sequence of Job
-    workers : int
-        Processes; 1 runs in this one, more start a dask cluster on this machine.
-    client : distributed.Client, optional
-        A cluster to use instead.
-    progress : callable, optional
-        Called with the outcome of each scene as it ends.
-
-    Returns
-    -------
-    list of SceneOutcome
-    """
-    outcomes: list[SceneOutcome] = []
-    with cluster_of(min(workers, len(jobs)), client) as used, Stop() as stop:
-        for ended in process_jobs(
-            sorted(jobs, key=read_bytes, reverse=True), client=used, stop=stop
-        ):
-            outcomes.append(ended.outcome)
-            if progress:
-                progress(ended.outcome)
-    return outcomes
-
-
 def read_bytes(job: Job) -> int:
     """Return the bytes that a job reads."""
     return sum(granule.size for granule in job.scene.granules)
-
-
-@contextmanager
-def cluster_of(workers: int, client: Client | None = None) -> Iterator[Client | None]:
-    """Give the client, or one of so many new local workers, or None for one worker."""
-    if client is not None or workers <= 1:
-        yield client
-    else:
-        with local_client(workers) as own:
-            yield own
 
 
 @contextmanager

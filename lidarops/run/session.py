@@ -49,8 +49,6 @@ class Session:
         store: Store,
         lock: Lock,
         judge: Judge,
-        *,
-        started: datetime | None = None,
     ) -> None:
         self._campaign = campaign
         self._store = store
@@ -64,7 +62,7 @@ class Session:
         self.settled: set[str] = set()
         """Scenes of which another look would find every product fresh."""
         self._tally = cost_estimate.Tally(cost_estimate.load_calibration())
-        self.started = started or datetime.now(UTC)
+        self.started = datetime.now(UTC)
         self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
 
     def begin(self) -> None:

@@ -7,7 +7,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,10 +15,9 @@ import yaml
 from support import raw_archives, servers
 
 from lidarops.campaign.model import load_campaign
-from lidarops.records import SceneOutcome
+from lidarops.records import RunRecord
 from lidarops.run import clusters
-from lidarops.run.archive import prepare
-from lidarops.run.executor import make_jobs, process_all
+from lidarops.run.archive import Options, reprocess
 
 PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "scancel", "squeue")
 pytestmark = [pytest.mark.deployment, pytest.mark.timeout(600)]
@@ -119,8 +118,7 @@ def test_a_cancelled_worker_loses_nothing(slurm: Path, tmp_path: Path) -> None:
     campaign = tmp_path / "campaign.yaml"
     campaign.write_text(yaml.safe_dump(many_scenes(tmp_path)))
     settings = load_campaign(campaign)
-    cut = prepare(settings)
-    expected = digests(process_all(make_jobs(settings, cut)))
+    expected = digests(reprocess(settings))
     assert len(expected) == 24
     shutil.rmtree(settings.products_root)
 
@@ -146,15 +144,15 @@ def test_a_cancelled_worker_loses_nothing(slurm: Path, tmp_path: Path) -> None:
     with clusters.connect_client(clusters.choose_cluster(cluster=str(described))) as client:
         assert client.scheduler.address.startswith("tls://127.0.0.1:")
         client.wait_for_workers(2, timeout=120)
-        outcomes = process_all(make_jobs(settings, cut), client=client, progress=cancel_one)
+        record = reprocess(settings, options=Options(progress=cancel_one), client=client)
         assert cancelled
         servers.wait_until(lambda: len(jobs()) == 2, 90, "the lost worker was not replaced")
-    assert digests(outcomes) == expected
+    assert digests(record) == expected
     servers.wait_until(lambda: not said("squeue", "--noheader"), 60, "the queue is not empty")
 
 
-def digests(outcomes: Iterable[SceneOutcome]) -> dict[str, str]:
-    return {product.path: product.sha256 for each in outcomes for product in each.products}
+def digests(record: RunRecord) -> dict[str, str]:
+    return {product.path: product.sha256 for scene in record.scenes for product in scene.products}
 
 
 def many_scenes(folder: Path) -> dict[str, object]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from datetime import timedelta
 from pathlib import Path
 
 import fsspec
@@ -17,11 +16,15 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.store import Store
 from lidarops.cli import app
-from lidarops.errors import SceneError
 from lidarops.flags import Quality
 from lidarops.records import RunRecord, Status
-from lidarops.run.archive import prepare
-from lidarops.run.executor import run
+from lidarops.run.archive import (
+    Options,
+    Selection,
+    bring_up_to_date,
+    reprocess,
+    update_catalog,
+)
 
 
 def _campaign(repository: Path, archive: Path, out: Path) -> Campaign:
@@ -34,7 +37,7 @@ def demo(
 ) -> Iterator[tuple[Campaign, RunRecord]]:
     """One serial run over it."""
     campaign = _campaign(repository, demo_archive, tmp_path_factory.mktemp("serial"))
-    return campaign, run(campaign, prepare(campaign))
+    return campaign, reprocess(campaign)
 
 
 def _products(record: RunRecord, kind: str, instrument: str) -> xr.Dataset:
@@ -80,7 +83,8 @@ def test_a_vertical_path_is_left_out_of_homogeneous_retrievals(
     for scene in scenes:
         assert all(product.kind != "homogeneous" for product in scene.products)
         assert scene.plan is not None
-        (left,) = (left for left in scene.plan.left_out if left.rule == "section_level")
+        omitted = (*scene.plan.left_out, *scene.left_out)
+        (left,) = (left for left in omitted if left.rule == "section_level")
         assert left.channel == "analog_532o"
         assert "climbs by 3750 m" in left.reason
         assert left.number == pytest.approx(3750.0)
@@ -90,7 +94,7 @@ def test_a_vertical_path_that_is_retrieved_all_the_same_is_said_not_to_be_homoge
     repository: Path, demo_archive: Path, tmp_path: Path
 ) -> None:
     campaign = _campaign(repository, demo_archive, tmp_path).model_copy(update={"all_steps": True})
-    record = run(campaign, prepare(campaign, instruments=["hill-vertical"]))
+    record = reprocess(campaign, selection=Selection(instruments=("hill-vertical",)))
     retrieved = _products(record, "homogeneous", "hill-vertical")
     assert (retrieved["quality_flag"].values != 0).mean() > 0.99
 
@@ -138,7 +142,8 @@ def test_products_do_not_depend_on_workers_and_chunks(
     profiles_per_chunk: int | None,
 ) -> None:
     campaign = _campaign(repository, demo_archive, tmp_path)
-    again = run(campaign, prepare(campaign), workers=workers, profiles_per_chunk=profiles_per_chunk)
+    options = Options(workers=workers, profiles_per_chunk=profiles_per_chunk)
+    again = reprocess(campaign, options=options)
     assert _hashes(again) == _hashes(demo[1])
 
 
@@ -246,7 +251,7 @@ def test_a_profile_without_shots_is_flagged_and_the_rest_stands(tmp_path: Path) 
             "all_steps": True,
         }
     )
-    record = run(campaign, prepare(campaign))
+    record = reprocess(campaign)
     assert not record.failed
     for product in record.scenes[0].products:
         opened = xr.load_dataset(Path(record.products) / product.path)
@@ -261,10 +266,12 @@ def test_a_file_that_changes_after_cataloguing_is_refused(tmp_path: Path) -> Non
     campaign = factories.campaign().model_copy(
         update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
     )
-    cut = prepare(campaign)
-    raw_archives.write(tmp_path / "raw" / "coast" / "h1", b"grown")
-    (tmp_path / "raw" / "coast" / "h2").unlink()
-    record = run(campaign, cut)
+
+    def damage(_granules: int) -> None:
+        raw_archives.write(tmp_path / "raw" / "coast" / "h1", b"grown")
+        (tmp_path / "raw" / "coast" / "h2").unlink(missing_ok=True)
+
+    record = reprocess(campaign, options=Options(expect=damage))
     assert record.failed
     assert record.scenes[0].error == ""
     reasons = {granule.path: granule.reason for granule in record.scenes[0].refused}
@@ -278,9 +285,9 @@ def test_a_disk_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     campaign = factories.campaign().model_copy(
         update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
     )
-    cut = prepare(campaign)
+    update_catalog(campaign)
     (tmp_path / "out" / "products").write_text("a file where a folder should be")
-    record = run(campaign, cut)
+    record = reprocess(campaign)
     assert record.failed
     assert "products" in record.scenes[0].error
     assert not record.scenes[0].products
@@ -301,7 +308,7 @@ def test_an_archive_behind_a_url_gives_the_same_products(
             campaign = factories.campaign().model_copy(
                 update={"archive": where, "output": str(out)}
             )
-            hashes.append(_hashes(run(campaign, prepare(campaign))))
+            hashes.append(_hashes(reprocess(campaign)))
     finally:
         memory.rm("/lidar-url", recursive=True)
     assert hashes[0] == hashes[1]
@@ -318,25 +325,14 @@ def test_the_campaign_knows_the_pointing_better_than_the_header(tmp_path: Path) 
             update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / f"{zenith_angle}")}
         )
         if not level:
-            (scene,) = run(campaign, prepare(campaign)).scenes
-            assert scene.error.startswith("nothing to do: homogeneous of photon_532o: section")
-            assert not scene.products
+            result = bring_up_to_date(campaign)
+            assert result.record is None
+            (reason,) = result.barren.values()
+            assert reason.startswith("nothing to do: homogeneous of photon_532o: section")
         campaign = campaign.model_copy(update={"all_steps": True})
-        record = run(campaign, prepare(campaign))
+        record = reprocess(campaign)
         (path,) = (product.path for product in record.scenes[0].products)
         product = xr.load_dataset(Path(record.products) / path)
         assert product["zenith_angle"] == (0.0 if zenith_angle is None else zenith_angle)
         raised = (product["quality_flag"].values & Quality.NOT_LEVEL) != 0
         assert raised.all() == (not level)
-
-
-def test_nothing_to_process_is_an_error_not_an_empty_run(tmp_path: Path) -> None:
-    raw_archives.write(tmp_path / "raw" / "dark" / "d0", raw_archives.content(0))
-    campaign = factories.campaign().model_copy(
-        update={"archive": str(tmp_path / "raw"), "output": str(tmp_path / "out")}
-    )
-    with pytest.raises(SceneError, match="no good file"):
-        prepare(campaign)
-    raw_archives.write(tmp_path / "raw" / "coast" / "h0", raw_archives.content(0))
-    with pytest.raises(SceneError, match="1 scenes"):
-        prepare(campaign, since=factories.DAY + timedelta(days=3))

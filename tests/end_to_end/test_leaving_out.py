@@ -11,6 +11,7 @@ import pytest
 import sqlalchemy as sa
 import xarray as xr
 from support import factories, mixed_campaign, raw_archives
+from support.scene_jobs import catalogued_scenes
 
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
@@ -28,8 +29,7 @@ from lidarops.raw.licel import RawFile
 from lidarops.records import Plan, ProductKind, Role, RunRecord, Step
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import _block, labeled_altitudes, slant_paths
-from lidarops.run.archive import Options, prepare, reprocess
-from lidarops.run.executor import run
+from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.simulate.campaign import simulate_campaign
 
 SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}
@@ -221,7 +221,6 @@ def retrieved(granules: list[Any], *, highest: float, step: float) -> tuple[int,
         profiles,
         zenith_angle=np.array([granule.zenith_angle for granule in granules]),
         azimuth=np.array([granule.azimuth for granule in granules]),
-        time=times,
         time_bnds=np.stack([times, times + np.timedelta64(60, "s")], axis=-1),
         shots=np.ones(len(granules)),
         altitude_grid=np.arange(step, highest + 1e-6, step) + 20.0,
@@ -341,11 +340,6 @@ def test_a_window_of_one_lidar_is_not_idle_for_what_another_needs():
     assert read_windows([window, signal]) == {"photon_532o": ((0, 9),)}
 
 
-def test_the_window_of_an_older_product_is_understood():
-    step = Step("range_window", "photon_532o", {"bins": 1102}, "as it was told")
-    assert read_windows([step]) == {"photon_532o": ((0, 1102),)}
-
-
 # Looks ----------------------------------------------------------------------------------------
 
 RANGE = 7.5 * (np.arange(2000) + 0.5)
@@ -457,7 +451,7 @@ def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
     facts = {"zenith_angle": 90, "channels": {"photon_532o": {"range_offset": offset}}}
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, far]]}}
     campaign = archive(tmp_path, facts=[facts], products=products)
-    scene = prepare(campaign).scenes[0]
+    scene = catalogued_scenes(campaign)[0]
     made = plan_scene(scene, campaign)
     values, read = [], []
     for dropped in (["look"], ["look", "range_window"]):
@@ -475,7 +469,7 @@ def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
 def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeypatch):
     products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, 1500]]}}
     campaign = archive(tmp_path, products=products)
-    scene = prepare(campaign).scenes[0]
+    scene = catalogued_scenes(campaign)[0]
     made = plan_scene(scene, campaign)
     absent = {WITHOUT: [[700.0, 1500.0, "LOW_SIGNAL"]]}
     told = [
@@ -503,7 +497,7 @@ def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
     tmp_path, monkeypatch, bytes_at_once
 ):
     campaign = archive(tmp_path)
-    scene = prepare(campaign).scenes[0]
+    scene = catalogued_scenes(campaign)[0]
     job = Job(campaign, scene, plan_scene(scene, campaign))
     usual = [product.sha256 for product in process_scene(job).products]
     monkeypatch.setattr(channel_steps, "AT_ONCE", bytes_at_once)
@@ -514,7 +508,7 @@ def test_a_changed_time_has_a_file_read_again(tmp_path, monkeypatch):
     campaign = archive(tmp_path)
     one = reprocess(campaign).scenes[0]
     size = sum(path.stat().st_size for path in (tmp_path / "raw").rglob("h*"))
-    scene = prepare(campaign).scenes[0]
+    scene = catalogued_scenes(campaign)[0]
     stale = replace(scene, granules=tuple(replace(g, mtime_ns=1) for g in scene.granules))
     found = process_scene(Job(campaign, stale, plan_scene(stale, campaign)))
     assert found.inputs == one.inputs
@@ -557,9 +551,9 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
 
 def test_what_was_asked_for_is_told_first_where_there_is_nothing_to_do(tmp_path):
     campaign = archive(tmp_path, facts=[{"zenith_angle": 0.0}])
-    (scene,) = run(campaign, prepare(campaign)).scenes
-    assert scene.error.startswith("nothing to do: homogeneous of photon_532o: section 750-4500 m")
-    assert "no product of the campaign asks" not in scene.error
+    (reason,) = bring_up_to_date(campaign).barren.values()
+    assert reason.startswith("nothing to do: homogeneous of photon_532o: section 750-4500 m")
+    assert "no product of the campaign asks" not in reason
 
 
 # All together ---------------------------------------------------------------------------------

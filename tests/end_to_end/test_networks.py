@@ -10,19 +10,23 @@ import numpy as np
 import pytest
 import xarray as xr
 from support import network_campaigns as made
+from support.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import Campaign
 from lidarops.flags import Quality
-from lidarops.process.scene import Job
-from lidarops.records import SceneOutcome
-from lidarops.run.archive import prepare
-from lidarops.run.executor import make_jobs, process_all
+from lidarops.process.scene import process_scene
+from lidarops.records import ProductKind, RunRecord, SceneOutcome
+from lidarops.run.archive import Options, Selection, reprocess
 
 AIRS = {"homogeneous": made.HOMOGENEOUS, "gradient": made.GRADIENT, "plume": made.PLUME}
 
 
-def jobs_of(campaign: Campaign) -> list[Job]:
-    return [job for job in make_jobs(campaign, prepare(campaign)) if job.scene.members]
+def reprocess_network(campaign: Campaign, **options: int) -> RunRecord:
+    """Make every visibility product of a campaign, also those that are fresh."""
+    selection = Selection(kinds=(ProductKind.VISIBILITY,))
+    record = reprocess(campaign, selection=selection, options=Options(force=True, **options))
+    assert record is not None
+    return record
 
 
 def opened(campaign: Campaign, outcome: SceneOutcome) -> xr.Dataset:
@@ -31,8 +35,8 @@ def opened(campaign: Campaign, outcome: SceneOutcome) -> xr.Dataset:
     return xr.load_dataset(campaign.products_root / product.path)
 
 
-def beams_of(job: Job) -> list[str]:
-    (step,) = (step for step in job.plan.steps if step.name == "visibility")
+def beams_of(outcome: SceneOutcome) -> list[str]:
+    (step,) = (step for step in outcome.plan.steps if step.name == "visibility")
     return [beam["instrument"] for beam in step.settings["beams"]]
 
 
@@ -48,10 +52,9 @@ def test_visibility_is_found_within_its_errors(six_beams, tmp_path):
     found = []
     for air, told in AIRS.items():
         campaign, truth = made.written(tmp_path / air, made.tree(told, six_beams=six_beams))
-        (job,) = jobs_of(campaign)
-        (outcome,) = process_all([job])
+        (outcome,) = reprocess_network(campaign).scenes
         product = opened(campaign, outcome)
-        true = made.truth_at(product, truth, beams_of(job))
+        true = made.truth_at(product, truth, beams_of(outcome))
         usable = product["usable"].values < 2
         assert usable.mean() > 0.95
         error = (product["extinction"].values / true - 1.0)[usable]
@@ -72,29 +75,32 @@ def test_the_same_bits_for_any_chunks_and_workers(tmp_path):
     told = made.tree(made.PLUME, duration=1200)
     told["scenes"] = {"window": "10min"}
     campaign, _ = made.written(tmp_path, told)
-    jobs = jobs_of(campaign)
-    assert len(jobs) == 2
-    digests = [
-        {outcome.scene: outcome.products[0].sha256 for outcome in process_all(again, workers=n)}
-        for again, n in (
-            (jobs, 1),
-            ([replace(job, profiles_per_chunk=1) for job in jobs], 1),
-            ([replace(job, profiles_per_chunk=4) for job in jobs], 2),
+    records = [
+        reprocess_network(campaign, **options)
+        for options in (
+            {},
+            {"profiles_per_chunk": 1},
+            {"profiles_per_chunk": 4, "workers": 2},
         )
     ]
+    digests = [
+        {outcome.scene: outcome.products[0].sha256 for outcome in record.scenes}
+        for record in records
+    ]
+    assert len(digests[0]) == 2
     assert digests[0] == digests[1] == digests[2]
 
 
 def test_the_window_leaves_the_product_as_it_is(tmp_path):
     told = made.tree(made.PLUME, duration=1200)
     campaign, _ = made.written(tmp_path, told)
-    (job,) = jobs_of(campaign)
+    (job,) = (job for job in scene_jobs(campaign) if job.scene.members)
     windows = [step for step in job.plan.steps if step.rule == "member_window"]
     assert windows
     steps = tuple(step for step in job.plan.steps if step not in windows)
-    (windowed,) = process_all([job])
+    windowed = process_scene(job)
     near = opened(campaign, windowed)
-    (whole,) = process_all([replace(job, plan=replace(job.plan, steps=steps))])
+    whole = process_scene(replace(job, plan=replace(job.plan, steps=steps)))
     full = opened(campaign, whole)
     assert windowed.bytes_read < whole.bytes_read
     np.testing.assert_array_equal(near["quality_flag"], full["quality_flag"])
@@ -111,9 +117,9 @@ def test_thin_air_is_flagged_and_never_believed(tmp_path):
         }
     }
     campaign, truth = made.written(tmp_path, made.tree(air, rate=1.0))
-    (job,) = jobs_of(campaign)
-    product = opened(campaign, process_all([job])[0])
-    true = made.truth_at(product, truth, beams_of(job))
+    (outcome,) = reprocess_network(campaign).scenes
+    product = opened(campaign, outcome)
+    true = made.truth_at(product, truth, beams_of(outcome))
     usable = product["usable"].values < 2
     wrong = np.abs(product["extinction"].values / true - 1.0) > 0.5
     assert usable.mean() < 0.2
@@ -126,8 +132,8 @@ def test_a_lidar_that_falls_silent_leaves_a_reason(tmp_path):
     # From its tenth file on, north is silent.
     for path in sorted((raw / "north").iterdir())[10:]:
         path.unlink()
-    (job,) = jobs_of(campaign)
-    product = opened(campaign, process_all([job])[0])
+    (outcome,) = reprocess_network(campaign).scenes
+    product = opened(campaign, outcome)
     bits = product["quality_flag"].values
     assert (bits[:2] == 0).all()
     assert (bits[2:] != 0).all()
@@ -138,14 +144,13 @@ def test_a_lidar_that_falls_silent_leaves_a_reason(tmp_path):
 def test_the_record_of_the_product_names_what_went_in(tmp_path):
     told = made.tree(made.HOMOGENEOUS, duration=900)
     campaign, _ = made.written(tmp_path, told)
-    (job,) = jobs_of(campaign)
-    outcome = process_all([job])[0]
+    (outcome,) = reprocess_network(campaign).scenes
     product = opened(campaign, outcome)
     assert product.attrs["lidarops_input_count"] == 45
     assert product.attrs["lidarops_kind"] == "visibility"
     assert product.attrs["lidarops_station"] == "valley"
     history = product.attrs["history"]
-    for name in beams_of(job):
+    for name in beams_of(outcome):
         assert f"dead_time: {name}: given by the campaign" in history
     assert "averaged before they are solved" in history
 
@@ -161,12 +166,8 @@ def test_a_level_path_gives_visibility_too(tmp_path):
         }
     }
     campaign, truth = made.written(tmp_path, told)
-    (job,) = [
-        job
-        for job in make_jobs(campaign, prepare(campaign))
-        if job.scene.instrument == "west-lidar"
-    ]
-    product = opened(campaign, process_all([job])[0])
+    (outcome,) = reprocess(campaign, selection=Selection(instruments=("west-lidar",))).scenes
+    product = opened(campaign, outcome)
     usable = product["usable"].values < 2
     assert usable.any()
     seen = product["visibility_in_air"].values

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from support.scene_jobs import catalogued_scenes
 
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.records import Role, RunRecord
-from lidarops.run.archive import prepare, report_run
-from lidarops.run.executor import run
+from lidarops.run.archive import report_run, reprocess
 
 CAMPAIGNS = Path(__file__).parent / "campaigns"
 
@@ -26,8 +26,8 @@ def _reprocess(name: str, data_root: Path, out: Path) -> RunRecord:
     campaign = campaign.model_copy(update={"all_steps": True})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        cut = prepare(campaign)
-        record = run(campaign, cut)
+        record = reprocess(campaign)
+    assert record is not None
     report_run(campaign, record)
     return record
 
@@ -63,7 +63,7 @@ def test_pilar_loses_no_file(pilar: RunRecord) -> None:
     # The header's 53200 nm is told by the campaign for one of its two channels only.
     told = [
         left.channel
-        for left in (scene.plan.left_out if scene.plan else ())
+        for left in (*(scene.plan.left_out if scene.plan else ()), *scene.left_out)
         if "wavelength" in left.reason
     ]
     assert told == ["photon_53200o"]
@@ -135,7 +135,7 @@ def test_sections_of_a_vertical_path_are_left_out(
     data_root: Path, tmp_path: Path, name: str
 ) -> None:
     campaign = load_campaign(CAMPAIGNS / f"{name}.yaml", archive=data_root / name, output=tmp_path)
-    (scene,) = prepare(campaign).scenes
+    (scene,) = catalogued_scenes(campaign)
     planned = plan_scene(scene, campaign)
     assert not [step for step in planned.steps if step.name == "homogeneous"]
     left = [item for item in planned.left_out if item.rule == "section_level"]

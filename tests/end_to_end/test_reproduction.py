@@ -23,8 +23,7 @@ from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.provenance import read_provenance
 from lidarops.netcdf.write import write_product
 from lidarops.records import ProductKind
-from lidarops.run.archive import prepare
-from lidarops.run.executor import make_jobs, process_all
+from lidarops.run.archive import Selection, reprocess
 from lidarops.run.reproduction import Reproduction, explain_difference, reproduce_product
 from lidarops.simulate.campaign import simulate_campaign
 
@@ -33,6 +32,7 @@ SOUNDING = "altitude [m],pressure [hPa],temperature [K]\n" + "".join(
     for km in range(12)
 )
 OVERLAP = "range [m],overlap\n100,0.2\n300,0.7\n600,1\n"
+COAST = Selection(instruments=("coast-horizontal",))
 KINDS = [ProductKind.SIGNAL, ProductKind.HOMOGENEOUS, ProductKind.ELASTIC, ProductKind.MULTIANGLE]
 
 
@@ -65,8 +65,8 @@ def campaign(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Camp
     path.write_text(yaml.safe_dump(tree(repository)), encoding="utf-8")
     told = load_campaign(path)
     simulate_campaign(told)
-    outcomes = process_all(make_jobs(told, prepare(told)))
-    assert not [outcome.error for outcome in outcomes if outcome.error]
+    record = reprocess(told)
+    assert not [outcome.error for outcome in record.scenes if outcome.error]
     return told
 
 
@@ -99,7 +99,7 @@ def test_every_kind_is_made_again_to_the_last_byte(kind: ProductKind, campaign: 
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
 def test_the_product_of_a_network_is_made_again(six_beams: bool, tmp_path: Path):
     told, _ = networks.written(tmp_path, networks.tree(networks.HOMOGENEOUS, six_beams=six_beams))
-    process_all([job for job in make_jobs(told, prepare(told)) if job.scene.members])
+    reprocess(told)
     product = of_kind(told, ProductKind.VISIBILITY)
     result = reproduce_product(product)
     assert result.identical, explain_difference(result)
@@ -117,7 +117,7 @@ def test_products_that_were_dated_by_the_environment_are_dated_so_again(
 ):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
     dated = campaign.model_copy(update={"output": str(tmp_path / "out")})
-    process_all([job for job in make_jobs(dated, prepare(dated)) if "coast" in job.scene.id][:1])
+    reprocess(dated, selection=COAST)
     product = of_kind(dated, ProductKind.HOMOGENEOUS)
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
     assert reproduce_product(product, archive=campaign.archive).identical
@@ -165,7 +165,7 @@ def test_one_changed_byte_of_an_input_changes_the_id(moved: Campaign, tmp_path: 
     content[-3] ^= 1
     file.write_bytes(content)
     other = moved.model_copy(update={"output": str(tmp_path / "out")})
-    process_all([job for job in make_jobs(other, prepare(other)) if "coast" in job.scene.id])
+    reprocess(other, selection=COAST)
     for product in sorted(other.products_root.rglob("*.nc")):
         before = moved.products_root / product.relative_to(other.products_root)
         with xr.open_dataset(product) as after, xr.open_dataset(before) as original:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ import yaml
 from support.scan_campaign import ALTITUDE, TREE
 
 from lidarops.campaign.model import Campaign, load_campaign
-from lidarops.run.archive import prepare
-from lidarops.run.executor import make_jobs, process_all
+from lidarops.run.archive import Options, reprocess
 from lidarops.simulate.campaign import simulate_campaign
 
 
@@ -52,8 +50,7 @@ def scores(told: Campaign, truth: xr.Dataset, paths: list[str]) -> np.ndarray[An
 
 def test_scans_become_optical_depths_within_their_errors(tmp_path):
     told, truth = campaign(tmp_path)
-    jobs = make_jobs(told, prepare(told))
-    (outcome,) = process_all(jobs)
+    (outcome,) = reprocess(told).scenes
     assert outcome.error == ""
     (product,) = outcome.products
     score = scores(told, truth, [product.path])
@@ -63,7 +60,8 @@ def test_scans_become_optical_depths_within_their_errors(tmp_path):
     # The plan names what it did, and that the beam scans.
     assert any(step.name == "multiangle" and "scans" in step.reason for step in outcome.plan.steps)
     for chunk in (1, 7):
-        (again,) = process_all([replace(jobs[0], profiles_per_chunk=chunk)])
+        options = Options(force=True, profiles_per_chunk=chunk)
+        (again,) = reprocess(told, options=options).scenes
         assert again.products[0].sha256 == product.sha256
 
 
@@ -72,14 +70,14 @@ def test_a_beam_that_stands_still_is_no_scan(tmp_path):
     instrument = simulation["instruments"]["scanner"]
     still = instrument | {"scan": {"zenith_angles": [0], "azimuth": 90}}
     told, _ = campaign(tmp_path, duration=400, instruments={"scanner": still})
-    (outcome,) = process_all(make_jobs(told, prepare(told)))
+    (outcome,) = reprocess(told).scenes
     assert "does not scan" in outcome.error
 
 
 @pytest.mark.slow
 def test_two_hundred_scans(tmp_path):
     told, truth = campaign(tmp_path, duration=86_400)
-    outcomes = process_all(make_jobs(told, prepare(told)))
+    outcomes = reprocess(told).scenes
     assert [outcome.error for outcome in outcomes] == [""] * 4
     paths = [product.path for outcome in outcomes for product in outcome.products]
     cycles = sum(xr.open_dataset(told.products_root / path).sizes["time"] for path in paths)

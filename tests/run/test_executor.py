@@ -14,6 +14,7 @@ from distributed import Client, Nanny
 from distributed.core import Status
 from distributed.deploy.spec import SpecCluster
 from support.poison import Poison
+from support.scene_jobs import catalogued_scenes, scene_jobs
 from support.small_archive import Archive, made
 
 from lidarops.catalog.ledger import RunStatus
@@ -22,16 +23,8 @@ from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
 from lidarops.process.scene import Job, failed
 from lidarops.run import executor
-from lidarops.run.archive import Options, Selection, bring_up_to_date, prepare, reprocess
-from lidarops.run.executor import (
-    Ended,
-    Stop,
-    alone,
-    local_client,
-    make_jobs,
-    process_all,
-    process_jobs,
-)
+from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
+from lidarops.run.executor import Ended, Stop, alone, local_client, process_jobs
 from lidarops.run.session import Session
 from lidarops.run.staleness import Judge
 
@@ -79,10 +72,13 @@ def test_a_signal_while_workers_start_leaves_no_cluster_behind(
 
 def test_a_file_that_vanishes_after_the_scan_is_refused_as_such(archive: Archive) -> None:
     campaign = archive.write()
-    jobs = make_jobs(campaign, prepare(campaign, instruments=["poor"]))
-    (archive.folder / "raw/poor/h10").unlink()
-    refused = [granule for outcome in process_all(jobs) for granule in outcome.refused]
-    (granule,) = refused
+
+    def remove_file(_granules: int) -> None:
+        (archive.folder / "raw/poor/h10").unlink(missing_ok=True)
+
+    selection = Selection(instruments=("poor",))
+    record = reprocess(campaign, selection=selection, options=Options(expect=remove_file))
+    (granule,) = (granule for outcome in record.scenes for granule in outcome.refused)
     assert granule.path == "poor/h10"
     assert granule.reason == "vanished after it was catalogued (run lidarops catalog again)"
 
@@ -118,7 +114,7 @@ def test_scenes_that_took_their_process_down_are_tried_in_another(
     archive: Archive, crashed: int
 ) -> None:
     campaign = archive.write()
-    scenes = {scene.id for scene in prepare(campaign).scenes[:crashed]}
+    scenes = {scene.id for scene in catalogued_scenes(campaign)[:crashed]}
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
         judge = Judge(campaign, store)
@@ -142,8 +138,7 @@ def test_scenes_that_took_their_process_down_are_tried_in_another(
 def test_scenes_are_taken_one_by_one_and_never_many_ahead(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cut = prepare(archive.write())
-    jobs = executor.make_jobs(archive.write(), cut) * 50
+    jobs = scene_jobs(archive.write()) * 50
     taken = 0
 
     def counted() -> Iterator[Job]:
@@ -163,8 +158,7 @@ def test_scenes_are_taken_one_by_one_and_never_many_ahead(
 def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
     archive: Archive, client: Client
 ) -> None:
-    cut = prepare(archive.write())
-    jobs = executor.make_jobs(archive.write(), cut) * 4
+    jobs = scene_jobs(archive.write()) * 4
     at_hand = most = done = 0
 
     def took(_job: Job) -> None:
@@ -183,7 +177,7 @@ def test_workers_that_are_gone_for_good_are_not_waited_for(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaign = archive.write()
-    jobs = executor.make_jobs(campaign, prepare(campaign))
+    jobs = scene_jobs(campaign)
     with local_client(1) as client:
         # Not before, as the first worker may well take longer to start.
         monkeypatch.setattr(executor, "PATIENCE", 1.0)
@@ -236,7 +230,7 @@ def test_workers_that_come_later_get_scenes_before_one_has_ended(
     monkeypatch.setattr(
         executor, "_ended", lambda _, job: Ended(job, failed(job, "no"), final=True)
     )
-    jobs = executor.make_jobs(archive.write(), prepare(archive.write())) * 4
+    jobs = scene_jobs(archive.write()) * 4
     assert len(list(process_jobs(jobs, client=Growing()))) == len(jobs)
 
 
@@ -245,7 +239,7 @@ def test_a_worker_with_other_code_is_named_and_makes_nothing(
 ) -> None:
     monkeypatch.setattr(executor, "code_version", lambda: "newer")
     campaign = archive.write()
-    ended = list(process_jobs(executor.make_jobs(campaign, prepare(campaign))[:1], client=client))
+    ended = list(process_jobs(scene_jobs(campaign)[:1], client=client))
     assert [each.final for each in ended] == [False]
     assert "the worker has other code of lidarops" in ended[0].outcome.error
     assert not (archive.folder / "out" / "products").exists()
@@ -255,7 +249,7 @@ def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> No
     campaign = archive.write()
     stop = Stop()
     ended = []
-    for each in process_jobs(executor.make_jobs(campaign, prepare(campaign)), stop=stop):
+    for each in process_jobs(scene_jobs(campaign), stop=stop):
         ended.append(each)
         stop.now("enough")
     assert len(ended) == 1

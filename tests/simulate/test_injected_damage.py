@@ -17,8 +17,7 @@ from lidarops.flags import Quality
 from lidarops.plan.scenes import cut_scenes
 from lidarops.raw import licel
 from lidarops.records import Role, Status
-from lidarops.run.archive import prepare
-from lidarops.run.executor import run
+from lidarops.run.archive import reprocess
 from lidarops.simulate.campaign import simulate_campaign
 
 KINDS = list(DamageKind)
@@ -91,7 +90,7 @@ def test_what_must_be_flagged_is_flagged_by_the_retrieval(small):
 
     campaign = small(retrieved)
     truth = simulate_campaign(campaign).truth
-    record = run(campaign, prepare(campaign))
+    record = reprocess(campaign)
     assert not any(scene.error for scene in record.scenes)
     flags = {}
     for scene in record.scenes:
