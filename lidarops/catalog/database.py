@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any, Final, Self
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
-from lidarops.catalog.schema import GRANULE, METADATA, PRODUCT, SCHEMA, SCHEMA_VERSION
+from lidarops.catalog.schema import METADATA, SCHEMA, SCHEMA_VERSION
 from lidarops.errors import CatalogError
 
 BATCH = 1000
@@ -20,8 +20,6 @@ _MOVE_AWAY: Final = "move it away: a new one is made from the archive, and produ
 _URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
 _BROKEN: Final = ("malformed", "not a database")
 """Words of SQLite about a file that is damaged."""
-_ADDED: Final[Mapping[int, sa.Column[Any]]] = {2: PRODUCT.c.usable, 3: GRANULE.c.header_digest}
-"""Version of a catalog -> the column that the next version has more."""
 
 
 class Database:
@@ -113,33 +111,24 @@ class Database:
     def _settle_schema(self, connection: sa.Connection) -> None:
         inspector = sa.inspect(connection)
         if not inspector.has_table(SCHEMA.name):
-            if inspector.has_table(GRANULE.name):
-                raise self._other_version(1)
             if not self._create:
                 raise self._absent()
             METADATA.create_all(connection)
             connection.execute(self.insert_new(SCHEMA), {"version": SCHEMA_VERSION})
-        newest = sa.select(sa.func.max(SCHEMA.c.version))
-        found = connection.scalar(newest)
-        while found in _ADDED:
-            _bring_up(connection, found)
-            found = connection.scalar(newest)
-        if found != SCHEMA_VERSION:
-            raise self._other_version(found)
+        version = connection.scalar(sa.select(sa.func.max(SCHEMA.c.version)))
+        if version != SCHEMA_VERSION:
+            raise self._other_version(version)
 
     def _absent(self) -> CatalogError:
         return CatalogError(
             "there is no catalog yet", file=self.place, remedy="run lidarops reprocess first"
         )
 
-    def _other_version(self, found: int | None) -> CatalogError:
-        older = found is None or found < SCHEMA_VERSION
+    def _other_version(self, version: int | None) -> CatalogError:
         return CatalogError(
-            f"is a catalog of version {found}, and this lidarops works with {SCHEMA_VERSION}",
+            f"is a catalog of schema version {version}; this lidarops needs {SCHEMA_VERSION}",
             file=self.place,
-            remedy=_MOVE_AWAY
-            if older
-            else "use the newer lidarops that made it, or another catalog",
+            remedy=_MOVE_AWAY,
         )
 
     def _told(self, error: sa.exc.SQLAlchemyError) -> CatalogError:
@@ -181,19 +170,6 @@ def _conflicting(table: sa.Table, *, in_sqlite: bool, replacing: bool) -> sa.Tex
     # Text alone does not know how the database holds times.
     typed = [sa.bindparam(column.name, type_=column.type) for column in table.columns]
     return sa.text(str(statement.compile(dialect=dialect))).bindparams(*typed)
-
-
-def _bring_up(connection: sa.Connection, found: int) -> None:
-    """Add to a catalog of version `found` the column that the next one has, with nothing in it."""
-    # First, as SQLite begins no transaction with a change of a table, and only one of two
-    # processes finds the old number.
-    raised = connection.execute(
-        sa.update(SCHEMA).where(SCHEMA.c.version == found).values(version=found + 1)
-    )
-    if raised.rowcount == 1:
-        added = _ADDED[found]
-        column = sa.schema.CreateColumn(added).compile(dialect=connection.dialect)
-        connection.execute(sa.text(f"ALTER TABLE {added.table.name} ADD COLUMN {column}"))
 
 
 def refuse_wrong_url(url: str) -> None:

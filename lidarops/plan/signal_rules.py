@@ -337,7 +337,7 @@ def read_windows(steps: Collection[Step]) -> dict[str, Stretches]:
     """Return the channels of which only some bins are needed, and which."""
     whole = _needing_all(steps)
     return {
-        step.channel: _stretches(step.settings["bins"])
+        step.channel: tuple((first, past) for first, past in step.settings["bins"])
         for step in steps
         if step.name == StepName.RANGE_WINDOW and (step.instrument, step.channel) not in whole
     }
@@ -373,11 +373,6 @@ def _needing_all(steps: Collection[Step]) -> dict[tuple[str, str], list[str]]:
             for part in step.settings.values():
                 found.setdefault((step.instrument, part), []).append(step.channel)
     return found
-
-
-def _stretches(told: Any) -> Stretches:
-    # Older products tell in their plan how many of the nearest bins were kept.
-    return ((0, told),) if isinstance(told, int) else tuple((low, past) for low, past in told)
 
 
 def reaching(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
