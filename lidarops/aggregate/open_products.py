@@ -28,7 +28,7 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.index import INDEX, Found, find_in_index
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.aggregate.selection import select
-from lidarops.aggregate.usable import CARE, masked, with_usable
+from lidarops.aggregate.usable import CARE, masked
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
 from lidarops.records import DetectionMode, ProductKind
@@ -97,7 +97,7 @@ def open_products(
             remedy="choose by kind, channel, station, instrument, or give the files of one grid",
         )
     (products,) = sorted_.values()
-    return masked(with_usable(_opened(root, products)), usable)
+    return masked(_opened(root, products), usable)
 
 
 def _told(source: Paths) -> str | None:

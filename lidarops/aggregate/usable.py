@@ -4,28 +4,16 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
-from lidarops.netcdf.variables import QUALITY_FLAG, USABLE, attributes, sum_up, usable
-from lidarops.products.layouts import LAYOUTS
-from lidarops.records import DetectionMode, ProductKind
+from lidarops.netcdf.variables import (
+    USABLE,
+)
 
 GOOD: Final = 0
 CARE: Final = 1
 REJECTED: Final = 2
-
-
-def with_usable(data: xr.Dataset) -> xr.Dataset:
-    """Add ``usable`` to a dataset that lacks it, derived from ``quality_flag``."""
-    if USABLE in data:
-        return data
-    flags = data[QUALITY_FLAG]
-    found = xr.apply_ufunc(sum_up, flags, dask="parallelized", output_dtypes=[np.int8])
-    row = usable(LAYOUTS[ProductKind(data.attrs["lidarops_kind"])].row(QUALITY_FLAG))
-    found.attrs = attributes(row, mode=DetectionMode(data.attrs["lidarops_detection_mode"]))
-    return data.assign({USABLE: found})
 
 
 def masked(data: xr.Dataset, worst: int) -> xr.Dataset:

@@ -31,7 +31,7 @@ from lidarops.aggregate._references import (
     template,
 )
 from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates, within
-from lidarops.aggregate.usable import CARE, masked, with_usable
+from lidarops.aggregate.usable import CARE, masked
 from lidarops.errors import ProductError
 from lidarops.records import DetectionMode
 from lidarops.reports.run_record import write_atomically
@@ -188,7 +188,7 @@ def open_view(path: str | os.PathLike[str], *, usable: int = CARE) -> xr.Dataset
         elif "" in refs:
             refs[""][key] = content
     pieces = [_part(root, each) for each in refs.values()]
-    return masked(with_usable(join(pieces)), usable)
+    return masked(join(pieces), usable)
 
 
 def _part(root: Path, refs: Refs) -> xr.Dataset:
