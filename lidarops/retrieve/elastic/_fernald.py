@@ -3,8 +3,8 @@ r"""Compiled inversion of the two-component lidar equation, with its first-order
 With the particle lidar ratio :math:`S`, the power :math:`P` and the molecular backscatter and
 extinction :math:`\beta_m, \alpha_m`, let :math:`g = R^2 e^{2 E}` with
 :math:`E(R) = \int_{R_0}^{R} (\alpha_m - S \beta_m)` and :math:`q = g P`. Then the total
-backscatter is :math:`\beta = q / D`, :math:`D(R) = D_c - 2 \int_{R_c}^{R} S q`: linear in the
-power above and below, so that the first-order errors are exact sums.
+backscatter is :math:`\beta = q / D`, :math:`D(R) = D_c - 2 \int_{R_c}^{R} S q`. Numerator and
+denominator are linear in the power, so the first-order errors are exact sums.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -22,7 +22,7 @@ Codes = npt.NDArray[np.uint8]
 
 HUGE: Final = 1e300
 
-# What `trace_path` writes, row by row.
+# Rows that `_trace_path` writes.
 GAIN, RATIO, AIR, SHAPE = 0, 1, 2, 3
 DEPTH, DEPTH_RATIO, DEPTH_AIR = 4, 5, 6
 GAIN_RATIO, SOURCE_RATIO = 7, 8
@@ -30,16 +30,16 @@ GAIN_AIR, SOURCE_AIR, OWN_AIR = 9, 10, 11
 COLUMN, COLUMN_AIR, RATIO_ERROR, AIR_ERROR = 12, 13, 14, 15
 PATH_ROWS: Final = 16
 
-# What `invert_fernald` writes for each bin, and for each profile.
+# Values that `invert_fernald` writes for each bin, and for each profile.
 BACKSCATTER, ATTENUATED, ATTENUATED_ERROR = 0, 1, 2
 NOISE, BACKGROUND, REFERENCE, LIDAR_RATIO, MOLECULAR = 3, 4, 5, 6, 7
 FIELDS: Final = 8
 CONSTANT, CONSTANT_ERROR = 0, 1
 SCALARS: Final = 2
 
-# What is known of the denominator of each bin while a profile is solved: its value, derivative
-# with respect to the power of the bin, variance by the other bins, changes by the causes, and how
-# much its square exceeds what its errors ask for; its inverse, and the total backscatter.
+# Rows of the work array. For the denominator of each bin: its value, its derivative with respect
+# to the power of the bin, its variance by the other bins, its changes by the causes, and the
+# excess of its square over the least one that its errors allow; its inverse. Total backscatter.
 DENOMINATOR, OWN_SHARE, OTHERS, BY_OFFSET, BY_RATIO, BY_AIR, CERTAINTY = 0, 1, 2, 3, 4, 5, 6
 INVERSE, TOTAL = 7, 8
 WORK_ROWS: Final = 9
@@ -51,7 +51,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def trace_path(
+def _trace_path(
     range_: Array,
     backscatter: Array,
     extinction: Array,
@@ -61,7 +61,7 @@ def trace_path(
     air_error: Array,
     path: Array,
 ) -> None:
-    """Integrate what does not depend on the power, by trapezoids from the first bin on.
+    """Integrate the quantities that do not depend on the power, by trapezoids from the first bin.
 
     Parameters
     ----------
@@ -70,9 +70,9 @@ def trace_path(
     scattering_ratio : float
         In the reference window.
     ratio_error, air_error : (bin,) float64
-        sr; relative. Each is one error of that shape, common to all bins.
+        sr; relative. Each is one error of this shape, common to all bins.
     path : (`PATH_ROWS`, bin) float64
-        Gets the rows that this module names.
+        Output: the rows named at the top of this module.
     """
     e = u = u_ratio = u_air = b_ratio = e_air = 0.0
     column, column_air = extinction[0] * range_[0], extinction[0] * air_error[0] * range_[0]
@@ -110,43 +110,43 @@ def _usable(power: float, variance: float) -> bool:
 
 @_compiled
 def _calibrate(power: Any, variance: Array, window: Any, path: Array, out: Array) -> int:
-    """Compare the summed power of the window with what its scattering ratio makes expected.
+    """Calibrate with the summed power of the window over that expected for its scattering ratio.
 
     Returns
     -------
     int
-        The bin in the middle of the window, from which the integrals start; -1 where none is.
-        `out` gets the denominator there, the weight of a bin of the window in it, the variance
-        and the number of bins, and the relative changes of the expectation with the scattering
-        ratio, the lidar ratio and the air.
+        The bin in the middle of the window, from which the integrals start; -1 without a
+        positive signal. `out` gets the denominator there, the weight of a bin of the window in
+        it, its variance, the number of bins, and the relative changes of the expected power with
+        the scattering ratio, the lidar ratio and the air density.
     """
     count, signal, shape, noise = 0, 0.0, 0.0, 0.0
-    with_ratio = with_lidar_ratio = with_air = 0.0
+    by_scattering_ratio = by_lidar_ratio = by_air = 0.0
     for i in range(path.shape[1]):
         if not (window[i] and _usable(power[i], variance[i])):
             continue
-        h = path[SHAPE, i]
+        expected = path[SHAPE, i]
         count += 1
         signal += power[i]
-        shape += h
+        shape += expected
         noise += variance[i]
-        with_ratio += h * (1.0 - 2.0 * path[DEPTH, i])
-        with_lidar_ratio -= h * (2.0 * path[DEPTH_RATIO, i] + path[GAIN_RATIO, i])
-        with_air += h * (path[AIR_ERROR, i] - 2.0 * path[DEPTH_AIR, i] - path[GAIN_AIR, i])
+        by_scattering_ratio += expected * (1.0 - 2.0 * path[DEPTH, i])
+        by_lidar_ratio -= expected * (2.0 * path[DEPTH_RATIO, i] + path[GAIN_RATIO, i])
+        by_air += expected * (path[AIR_ERROR, i] - 2.0 * path[DEPTH_AIR, i] - path[GAIN_AIR, i])
     if not (shape > 0.0 and signal > 0.0):
         return -1
-    seen, centre = 0, -1
+    passed, centre = 0, -1
     for i in range(path.shape[1]):
         if window[i] and _usable(power[i], variance[i]):
-            if seen == count // 2:
+            if passed == count // 2:
                 centre = i
                 break
-            seen += 1
+            passed += 1
     weight = math.exp(-2.0 * path[DEPTH, centre]) / shape
     out[0], out[1], out[2], out[3] = signal * weight, weight, noise * weight * weight, count
-    out[4] = with_ratio / shape + 2.0 * path[DEPTH, centre]
-    out[5] = with_lidar_ratio / shape + 2.0 * path[DEPTH_RATIO, centre]
-    out[6] = with_air / shape + 2.0 * path[DEPTH_AIR, centre]
+    out[4] = by_scattering_ratio / shape + 2.0 * path[DEPTH, centre]
+    out[5] = by_lidar_ratio / shape + 2.0 * path[DEPTH_RATIO, centre]
+    out[6] = by_air / shape + 2.0 * path[DEPTH_AIR, centre]
     return centre
 
 
@@ -157,51 +157,62 @@ def _integrate(
     window: Any,
     range_: Array,
     path: Array,
-    way: int,
+    direction: int,
     calibration: Array,
     longest_gap: float,
     work: Array,
     state: Codes,
 ) -> None:
-    """Integrate from the reference bin on, the first one here, away from the lidar (`way` 1).
+    """Integrate from the reference bin, the first one, away from the lidar (`direction` 1).
 
-    With `way` -1, all arrays along range are turned. Bins that are reached become `VALID`.
+    With `direction` -1, all arrays along range are reversed. Bins that are reached become `VALID`.
     """
-    d_start, weight, rest, count = calibration[0], calibration[1], calibration[2], calibration[3]
-    passed = integral = shadow = shadow_ratio = shadow_air = half = 0.0
-    twice, last = 2.0 * way, -1
-    at_last = source = source_gain = source_ratio = source_air = noise = share_last = 0.0
+    d_start, weight, window_variance, count = (
+        calibration[0],
+        calibration[1],
+        calibration[2],
+        calibration[3],
+    )
+    passed_variance = integral = gain_integral = ratio_integral = air_integral = half = 0.0
+    twice, last = 2.0 * direction, -1
+    last_power = last_gain = last_ratio = last_air = 0.0
+    last_distance = last_variance = last_slope = 0.0
     for i in range(range_.size):
         p, v = np.float64(power[i]), variance[i]
         if not _usable(p, v):
             continue
-        g, s, here = path[GAIN, i], path[RATIO, i], range_[i]
+        g, s, distance = path[GAIN, i], path[RATIO, i], range_[i]
         q = g * p
-        of_gain, of_power = s * g, s * q
-        of_ratio, of_air = q * path[SOURCE_RATIO, i], q * path[SOURCE_AIR, i]
+        gain_term, power_term = s * g, s * q
+        ratio_term, air_term = q * path[SOURCE_RATIO, i], q * path[SOURCE_AIR, i]
         if last >= 0:
-            step = abs(here - at_last)
+            step = abs(distance - last_distance)
             if i - last > 1 and step > longest_gap:
                 break
             half = 0.5 * step
-            share = share_last - twice * half * source_gain
-            passed += noise * share * share
-            integral += half * (source + of_power)
-            shadow += half * (source_gain + of_gain)
-            shadow_ratio += half * (source_ratio + of_ratio)
-            shadow_air += half * (source_air + of_air)
-        slope = -twice * half * of_gain
+            share = last_slope - twice * half * last_gain
+            passed_variance += last_variance * share * share
+            integral += half * (last_power + power_term)
+            gain_integral += half * (last_gain + gain_term)
+            ratio_integral += half * (last_ratio + ratio_term)
+            air_integral += half * (last_air + air_term)
+        slope = -twice * half * gain_term
         if window[i]:
             slope += weight
-            rest -= weight * weight * v
+            window_variance -= weight * weight * v
         work[DENOMINATOR, i] = d_start - twice * integral
-        work[OWN_SHARE, i], work[OTHERS, i] = slope, passed + max(rest, 0.0)
-        work[BY_OFFSET, i] = count * weight - twice * shadow
-        work[BY_RATIO, i] = -d_start * calibration[5] - twice * shadow_ratio
-        work[BY_AIR, i] = -d_start * calibration[6] - twice * shadow_air
+        work[OWN_SHARE, i], work[OTHERS, i] = slope, passed_variance + max(window_variance, 0.0)
+        work[BY_OFFSET, i] = count * weight - twice * gain_integral
+        work[BY_RATIO, i] = -d_start * calibration[5] - twice * ratio_integral
+        work[BY_AIR, i] = -d_start * calibration[6] - twice * air_integral
         state[i] = VALID
-        last, at_last, noise, share_last = i, here, v, slope
-        source, source_gain, source_ratio, source_air = of_power, of_gain, of_ratio, of_air
+        last, last_distance, last_variance, last_slope = i, distance, v, slope
+        last_power, last_gain, last_ratio, last_air = (
+            power_term,
+            gain_term,
+            ratio_term,
+            air_term,
+        )
 
 
 @_compiled
@@ -252,12 +263,12 @@ def _measure_certainty(
     path: Array,
     limits: Array,
     work: Array,
-    of_noise: Array,
+    noise_error: Array,
 ) -> None:
-    """Compare denominators with their errors, without what changes the gain of a bin as much.
+    """Compare denominators with their errors, less the changes that the gain of a bin shares.
 
-    `limits` are the least square of the denominator over its variance, and the one from which on
-    errors by noise are skewed, for which they are widened here.
+    `limits` are the least square of the denominator over its variance, and the ratio of that
+    square to the variance by noise below which noise errors are skewed; these are widened.
     """
     d, share, others, certainty = work[DENOMINATOR], work[OWN_SHARE], work[OTHERS], work[CERTAINTY]
     by_offset, by_ratio, by_air = work[BY_OFFSET], work[BY_RATIO], work[BY_AIR]
@@ -266,12 +277,12 @@ def _measure_certainty(
         noise = others[i] + share[i] * share[i] * variance[i]
         noise += offset * offset * by_offset[i] * by_offset[i]
         square = noise + reference
-        ratio = by_ratio[i] - d[i] * path[GAIN_RATIO, i]
-        air = by_air[i] - d[i] * path[GAIN_AIR, i]
-        square += ratio * ratio + air * air
+        ratio_change = by_ratio[i] - d[i] * path[GAIN_RATIO, i]
+        air_change = by_air[i] - d[i] * path[GAIN_AIR, i]
+        square += ratio_change * ratio_change + air_change * air_change
         certainty[i] = d[i] * d[i] - limits[0] * square
         skewed = limits[1] * noise / (d[i] * d[i])
-        of_noise[i] *= max(1.0, 0.98 + skewed * math.sqrt(skewed))
+        noise_error[i] *= max(1.0, 0.98 + skewed * math.sqrt(skewed))
 
 
 @_compiled
@@ -285,9 +296,9 @@ def _solve_bins(
     k: int,
     out: Array,
 ) -> None:
-    """Write the backscatter of all bins, and what each cause adds to it.
+    """Write the backscatter of all bins and its error by each cause.
 
-    Loops without branches over few arrays are compiled to vectors; `_withhold` follows.
+    Loops without branches over few arrays are vectorised; `_withhold` then removes invalid bins.
     """
     _divide(power, path[GAIN], path[AIR], work, out[BACKSCATTER, k])
     _propagate_noise(variance, path[GAIN], work, out[NOISE, k])
@@ -295,23 +306,23 @@ def _solve_bins(
     _propagate_reference(by_reference, work, out[REFERENCE, k])
     _propagate_path(path[GAIN_RATIO], work[BY_RATIO], work, out[LIDAR_RATIO, k])
     _propagate_path(path[GAIN_AIR], work[BY_AIR], work, out[MOLECULAR, k])
-    molecular, own = out[MOLECULAR, k], path[OWN_AIR]
-    for i in range(own.size):
-        molecular[i] -= own[i]
+    molecular, own_air = out[MOLECULAR, k], path[OWN_AIR]
+    for i in range(own_air.size):
+        molecular[i] -= own_air[i]
 
 
 @_compiled
-def _doubt(start: int, least: float, work: Array, state: Codes) -> int:
-    """Mark the bins that are not certain as `UNSTABLE`, and return the first `VALID` one."""
-    alive, first = True, -1
+def _mark_unstable(start: int, least: float, work: Array, state: Codes) -> int:
+    """Mark uncertain bins, and all farther than one beyond `start`; return the first valid bin."""
+    stable_so_far, first = True, -1
     for i in range(state.size):
         if state[i] == MISSING:
             continue
-        # An unknown error of a cause, NaN, must not pass for a large one.
+        # NaN, an unknown error of a cause, does not make a bin unstable.
         if work[DENOMINATOR, i] <= least or work[CERTAINTY, i] <= 0.0:
             state[i] = UNSTABLE
-            alive = alive and i < start
-        elif not alive:
+            stable_so_far = stable_so_far and i < start
+        elif not stable_so_far:
             state[i] = UNSTABLE
         elif first < 0:
             first = i
@@ -329,16 +340,15 @@ def _scale(
     work: Array,
     out: Array,
 ) -> tuple[float, float, float, float]:
-    """Return the lidar constant, and its relative errors: noise, background, all the others.
+    """Return the lidar constant and its relative errors: noise, background, all other causes.
 
-    The extinction by particles of bin `i`, the nearest solved one, is taken to hold down to the
-    lidar.
+    The particle extinction of bin `i`, the nearest solved one, is assumed down to the lidar.
     """
     d, g, reach = work[DENOMINATOR, i], path[GAIN, i], 2.0 * path[RATIO, i] * range_[i]
     particles = out[BACKSCATTER, i]
     total = particles + path[AIR, i]
     constant = d * range_[i] ** 2 / g * math.exp(reach * particles + 2.0 * path[COLUMN, i])
-    # The logarithm changes by that of d, and by `reach` times the change of the backscatter.
+    # The logarithm changes by that of d plus `reach` times the change of the backscatter.
     damped = 1.0 - reach * total
     own = damped * work[OWN_SHARE, i] + reach * g
     noise = math.sqrt(damped * damped * work[OTHERS, i] + own * own * variance[i]) / d
@@ -376,10 +386,10 @@ def _attenuate(
 def _withhold(
     power: Any, variance: Array, calibrated: bool, state: Codes, k: int, out: Array
 ) -> None:
-    others = 0
+    invalid = 0
     for i in range(state.size):
-        others |= state[i] ^ VALID
-    if others == 0:
+        invalid |= state[i] ^ VALID
+    if invalid == 0:
         return
     for i in range(state.size):
         if state[i] == VALID:
@@ -406,12 +416,12 @@ def invert_fernald(
     scalars: Array,
     state: Codes,
 ) -> None:
-    """Invert profiles, one after the other.
+    """Invert profiles one by one.
 
     Parameters
     ----------
     power : (profile, bin) float32 or float64
-        Free of background.
+        Background subtracted.
     variance : (profile or 1, bin) float64
     window : (profile or 1, bin) bool
         Bins of the reference window.
@@ -426,14 +436,15 @@ def invert_fernald(
     causes : (profile or 1, 2) float64
         Standard error of the background, relative one of the scattering ratio.
     limits : (4,) float64
-        m, the longest gap that is bridged; least share of the denominator at the reference;
-        least square of the denominator over its variance, and of that by noise for `SKEWED`.
+        Longest gap that is integrated over, m; least share of the denominator at the reference;
+        least square of the denominator over its variance; that over the variance by noise below
+        which errors are skewed.
     out : (`FIELDS`, profile, bin) float64
-        Gets what this module names, NaN where nothing is known.
+        Output: the fields named at the top of this module, NaN where there is no value.
     scalars : (profile, `SCALARS`) float64
-        Gets the lidar constant and its standard error, NaN where not known.
+        Output: the lidar constant and its standard error, NaN where there is no value.
     state : (profile, bin) uint8
-        Gets the state of each bin.
+        Output: the state of each bin.
     """
     varied = max(
         air[0].shape[0], air[1].shape[0], air[2].shape[0], scattering_ratio.size,
@@ -443,7 +454,7 @@ def invert_fernald(
     work, calibration = np.zeros((WORK_ROWS, range_.size)), np.empty(7)
     for k in range(power.shape[0]):
         if k == 0 or varied > 1:
-            trace_path(
+            _trace_path(
                 range_,
                 air[0][k % air[0].shape[0]],
                 air[1][k % air[1].shape[0]],
@@ -453,27 +464,27 @@ def invert_fernald(
                 errors[1][k % errors[1].shape[0]],
                 path,
             )
-        noise, inside = variance[k % variance.shape[0]], window[k % window.shape[0]]
+        noise, in_window = variance[k % variance.shape[0]], window[k % window.shape[0]]
         cause = causes[k % causes.shape[0]]
         scalars[k], state[k] = np.nan, MISSING
-        start = _calibrate(power[k], noise, inside, path, calibration)
+        start = _calibrate(power[k], noise, in_window, path, calibration)
         nearest = -1
         if start >= 0:
             _integrate(
-                power[k, start:], noise[start:], inside[start:], range_[start:], path[:, start:],
+                power[k, start:], noise[start:], in_window[start:], range_[start:], path[:, start:],
                 1, calibration, limits[0], work[:, start:], state[k, start:],
             )  # fmt: skip
             _integrate(
-                power[k, start::-1], noise[start::-1], inside[start::-1], range_[start::-1],
+                power[k, start::-1], noise[start::-1], in_window[start::-1], range_[start::-1],
                 path[:, start::-1], -1, calibration, limits[0], work[:, start::-1],
                 state[k, start::-1],
             )  # fmt: skip
-            change = -calibration[0] * cause[1] * calibration[4]
-            _solve_bins(power[k], noise, path, change, cause[0], work, k, out)
-            _measure_certainty(noise, change, cause[0], path, limits[2:], work, out[NOISE, k])
-            nearest = _doubt(start, limits[1] * calibration[0], work, state[k])
+            by_reference = -calibration[0] * cause[1] * calibration[4]
+            _solve_bins(power[k], noise, path, by_reference, cause[0], work, k, out)
+            _measure_certainty(noise, by_reference, cause[0], path, limits[2:], work, out[NOISE, k])
+            nearest = _mark_unstable(start, limits[1] * calibration[0], work, state[k])
         if nearest >= 0:
-            scale = _scale(nearest, noise, range_, path, change, cause[0], work, out[:, k])
+            scale = _scale(nearest, noise, range_, path, by_reference, cause[0], work, out[:, k])
             _attenuate(
                 power[k],
                 noise,

@@ -13,16 +13,16 @@ Array = npt.NDArray[np.float64]
 
 HUGE: Final = 1e300
 _TOP: Final = 2.0
-"""Standard errors above the level below the base under which a layer has ended."""
-_SEEN: Final = 3.0
-"""Standard errors that a signal above a layer must exceed to be one."""
-_LITTLE: Final = 0.1
-"""Share of the level below a layer that must be visible where its opacity is judged."""
-_FAINT: Final = 0.01
-"""Share below which a signal is none, where noise would let even less be seen."""
+"""A layer has ended within this many standard errors of the level below its base."""
+_DETECTED: Final = 3.0
+"""Standard errors that a signal above a layer must exceed."""
+_VISIBLE_SHARE: Final = 0.1
+"""Share of the level below a layer that noise must let be seen where opacity is judged."""
+_LEAST_SHARE: Final = 0.01
+"""Share of that level below which there is no signal, however low the noise."""
 
 _ROUNDING: Final = 1e-9
-"""Relative rise that is none but the rounding of sums."""
+"""Relative rise that the rounding of sums can cause."""
 
 BASE, TOP, CONTRAST, SIGNAL = 0, 1, 2, 3
 FIELDS: Final = 4
@@ -38,7 +38,7 @@ def _usable(power: float, variance: float) -> bool:
 
 @_compiled
 def _accumulate(power: Any, variance: Array, shape: Array, sums: Array) -> None:
-    """Sum from the far end on, so that sums over far bins keep their digits."""
+    """Sum from the far end, so that sums over far bins keep their digits."""
     signal = air = noise = count = 0.0
     sums[:, power.size] = 0.0
     for j in range(power.size):
@@ -58,7 +58,7 @@ def _accumulate(power: Any, variance: Array, shape: Array, sums: Array) -> None:
 
 @_compiled
 def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
-    """Return the ratio to air over some bins and its variance; NaN where few hold data."""
+    """Return the mean ratio to air and its variance; NaN with data in less than half the bins."""
     if first < 0 or stop >= sums.shape[1]:
         return np.nan, np.nan
     count = sums[COUNT, first] - sums[COUNT, stop]
@@ -71,11 +71,11 @@ def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
 
 @_compiled
 def _rise(sums: Array, i: int, length: int, contrast: float) -> float:
-    """Return by how many standard errors the ratio to air rises by more than a factor."""
+    """Return by how many standard errors the rise of the ratio to air exceeds `contrast`."""
     first, stop = i - length, i + length
     if first < 0 or stop >= sums.shape[1]:
         return 0.0
-    # Most bins end here, before anything is divided.
+    # Most bins end here, without a division.
     below = (sums[POWER, first] - sums[POWER, i]) * (sums[SHAPE, i] - sums[SHAPE, stop])
     above = (sums[POWER, i] - sums[POWER, stop]) * (sums[SHAPE, first] - sums[SHAPE, i])
     if not above > contrast * below:
@@ -98,7 +98,7 @@ def _steepest(
     contrast: float,
     threshold: float,
 ) -> tuple[int, int]:
-    """Return where the shortest length that shows a rise shows it best, and that length."""
+    """Return the bin of the steepest rise for the shortest window that shows it, and its length."""
     stop = min(start + reach + 1, int(sums.shape[1]) - 1)
     for length in lengths:
         best, highest = start, 0.0
@@ -112,10 +112,10 @@ def _steepest(
 
 
 @_compiled
-def _find(
+def _next_base(
     sums: Array, start: int, lengths: npt.NDArray[np.int64], contrast: float, threshold: float
 ) -> tuple[int, int]:
-    """Return the bin at which the next layer begins, and the length that shows it; or -1."""
+    """Return the bin where the next layer begins and the window length that shows it; or -1."""
     for i in range(start, sums.shape[1] - 1):
         for length in lengths:
             if _rise(sums, i, length, contrast) >= threshold:
@@ -125,7 +125,7 @@ def _find(
 
 @_compiled
 def _end(sums: Array, base: int, length: int) -> int:
-    """Return the first bin from which on the ratio to air is back at its level below a base."""
+    """Return the first bin from which the ratio to air is back at its level below the base."""
     level, level_variance = _mean(sums, base - length, base)
     bins = int(sums.shape[1]) - 1
     for i in range(base + 1, bins):
@@ -137,19 +137,19 @@ def _end(sums: Array, base: int, length: int) -> int:
 
 @_compiled
 def _is_opaque(sums: Array, first: int, length: int, level: float) -> bool:
-    """Return whether little of a level of air is left where that would be seen.
+    """Return whether no signal of air is seen where it would be above the noise.
 
-    The farthest of adjoining windows decides, as a signal may fade within a layer for long.
+    The farthest of adjoining windows decides, because a signal may fade slowly within a layer.
     """
-    for share in (_LITTLE, 1.0):
-        seen, decided = False, False
+    for share in (_VISIBLE_SHARE, 1.0):
+        visible, decided = False, False
         for i in range(first, sums.shape[1] - length, length):
             ratio, variance = _mean(sums, i, i + length)
-            error = _SEEN * math.sqrt(max(variance, 0.0))
+            error = _DETECTED * math.sqrt(max(variance, 0.0))
             if share * level > error:
-                seen, decided = ratio > max(error, _FAINT * level), True
+                visible, decided = ratio > max(error, _LEAST_SHARE * level), True
         if decided:
-            return not seen
+            return not visible
     return True
 
 
@@ -165,7 +165,7 @@ def detect_rises(
     out: Array,
     opaque: Any,
 ) -> None:
-    """Find the layers of every profile.
+    """Find the layers of each profile.
 
     Parameters
     ----------
@@ -176,14 +176,14 @@ def detect_rises(
     contrast : float
         Least factor by which the ratio to air rises.
     threshold : float
-        Standard errors of the rise beyond that factor.
+        Standard errors by which the rise exceeds that factor.
     layers : (profile, bin) bool
-        As False; gets the bins between base and top of every layer.
+        Output, False before: the bins between base and top of all layers.
     out : (profile, `FIELDS`) float64
-        As NaN; gets first bin of the lowest layer, first bin above it, ratio to air above its
-        base over that below, and the standard errors of its rise.
+        Output, NaN before: first bin of the lowest layer, first bin above it, ratio to air above
+        its base over that below, and the standard errors of its rise.
     opaque : (profile,) bool
-        Gets whether the air above the highest layer is hidden.
+        Output: whether the air above the highest layer is hidden.
     """
     sums = np.empty((4, power.shape[1] + 1))
     for k in range(power.shape[0]):
@@ -191,7 +191,7 @@ def detect_rises(
         _accumulate(power[k], noise, air, sums)
         end, level = 0, 0.0
         while True:
-            base, length = _find(sums, end, lengths, contrast, threshold)
+            base, length = _next_base(sums, end, lengths, contrast, threshold)
             if base < 0:
                 break
             end = _end(sums, base, length)

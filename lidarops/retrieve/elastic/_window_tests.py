@@ -1,4 +1,4 @@
-"""Compiled comparison of profiles with the shape of air, window by window."""
+"""Compiled tests of whether a profile has the shape of the molecular signal in a window."""
 
 from __future__ import annotations
 
@@ -13,17 +13,9 @@ Array = npt.NDArray[np.float64]
 
 HUGE: Final = 1e300
 
-# What `compare_with_air` writes for each window.
-SCALE, SCALE_ERROR, SLOPE, SLOPE_ERROR, CURVATURE, SCATTER, COUNT, TAKEN_OUT = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-)
+# Values that `compare_with_air` writes for each window.
+SCALE, SCALE_ERROR, SLOPE, SLOPE_ERROR = 0, 1, 2, 3
+CURVATURE, SCATTER, COUNT, EXCLUDED_BINS = 4, 5, 6, 7
 FIELDS: Final = 8
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -38,14 +30,14 @@ def _usable(power: float, variance: float) -> bool:
 def _fit(
     power: Any, variance: Array, shape: Array, range_: Array, excluded: Any, out: Array
 ) -> None:
-    """Fit a window with its shape times polynomials in range that are orthogonal under noise."""
+    """Fit the molecular shape times polynomials in range that are orthogonal under the noise."""
     middle = 0.5 * (range_[0] + range_[-1])
     half = max(0.5 * (range_[-1] - range_[0]), 1e-9)
     s0 = s1 = s2 = s3 = s4 = y0 = y1 = y2 = 0.0
-    count, out[TAKEN_OUT] = 0, 0.0
+    count, out[EXCLUDED_BINS] = 0, 0.0
     for i in range(range_.size):
         if excluded[i]:
-            out[TAKEN_OUT] += 1.0
+            out[EXCLUDED_BINS] += 1.0
         if excluded[i] or not _usable(power[i], variance[i]):
             continue
         t = (range_[i] - middle) / half
@@ -93,7 +85,7 @@ def compare_with_air(
     edges: npt.NDArray[np.int64],
     out: Array,
 ) -> None:
-    """Compare every profile with the shape of air in every window.
+    """Compare each profile with the molecular shape in each window.
 
     Parameters
     ----------
@@ -103,19 +95,19 @@ def compare_with_air(
         m, ascending.
     excluded : (profile or 1, bin) bool
     edges : (window, 2) int64
-        First bin of the window, and first bin behind it.
+        First bin of the window, and first bin beyond it.
     out : (profile, window, `FIELDS`) float64
-        As NaN; gets what this module names: scale of the shape with its error, slope of the
-        logarithm of the ratio to the shape in m-1 with its error, curvature over its error,
-        chi-square over the degrees of freedom, number of bins, number of excluded bins.
+        Output, NaN before: scale of the shape with its error, slope of the logarithm of the
+        ratio to the shape in m-1 with its error, curvature over its error, chi-square over the
+        degrees of freedom, number of bins, number of excluded bins.
     """
     for k in range(power.shape[0]):
         noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
-        barred = excluded[k % excluded.shape[0]]
+        masked = excluded[k % excluded.shape[0]]
         for j in range(edges.shape[0]):
             first, stop = edges[j, 0], edges[j, 1]
             if stop > first:
                 _fit(
                     power[k, first:stop], noise[first:stop], air[first:stop], range_[first:stop],
-                    barred[first:stop], out[k, j],
+                    masked[first:stop], out[k, j],
                 )  # fmt: skip

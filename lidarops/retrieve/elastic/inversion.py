@@ -1,8 +1,8 @@
-"""Backscatter and extinction of particles from an elastic lidar, with an error budget.
+"""Particle backscatter and extinction from elastic lidar profiles, with an error budget.
 
-The two-component solution of Fernald and Sasano: the scattering ratio is known in a reference
-window, the lidar ratio everywhere; from the window on the lidar equation is solved in closed
-form, towards the lidar and away from it.
+The two-component solution of Fernald and Sasano. Given are the scattering ratio in a reference
+window and the lidar ratio in all bins. The lidar equation is then solved in closed form from the
+window towards the lidar and away from it.
 """
 
 from __future__ import annotations
@@ -23,63 +23,65 @@ Mask = npt.NDArray[np.bool_]
 Reference = tuple[npt.ArrayLike, npt.ArrayLike] | npt.NDArray[np.bool_]
 
 LONGEST_GAP: Final = 150.0
-"""m. Over more bins without data than this, nothing is known of what lies beyond."""
+"""m; a longer gap without data ends the integration."""
 
 LEAST_DENOMINATOR: Final = 0.05
-"""Of that at the reference. Away from the lidar, errors grow as the inverse of this share."""
+"""Share of the denominator at the reference. Beyond the reference, errors grow as its inverse."""
 
 LEAST_CERTAINTY: Final = 5.0
-"""Standard errors by which the denominator must exceed zero, for errors of first order."""
+"""Standard errors by which the denominator must exceed zero for first-order errors to hold."""
 
 SKEWED: Final = 5.5
-"""Standard errors s of the denominator by noise at which the errors by noise are twice those of
-first order: a reference that is high by noise gives values that are low, and errors that are low
-as well. Multiplied by 0.98 + (5.5 / s)^3, where that is above 1 (s below 20), 4 of them are passed
-by less than 1 in 1000 values; of first order, by 1 to 3 percent where s is 5 to 8 (simulations)."""
+"""Ratio s of the denominator to its noise error at which noise errors are twice those of first
+order. A reference that is too high by noise makes both the values and their errors too low. Noise
+errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1 (s below 20): less than 0.1
+percent of the values are then off by more than 4 errors. With first-order errors it is 1 to 3
+percent where s is 5 to 8 (simulations)."""
 
 LARGEST_BACKSCATTER: Final = 5e-4
-"""m-1 sr-1. Air scatters less than a tenth of this at 0.25 micrometres: a guard of units."""
+"""m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorBudget:
-    """What each cause adds to the error of a quantity, all of its shape.
+    """Contribution of each cause to the error of a quantity, with the shape of the quantity.
 
-    The errors of one cause but the noise are fully correlated along range, and keep their
-    signs: they are the change of the quantity where the cause is one standard error too large,
-    and add up along range before they are squared.
+    Except for noise, the errors of one cause are fully correlated along range and keep their
+    signs: they are the change of the quantity where the cause is one standard error too large.
+    Sum them along range before squaring.
     """
 
     noise: Array
     """Standard error by the noise of the power; NaN where no variance was given."""
     background: Array
-    """By the background that was not subtracted."""
+    """Error by residual background."""
     reference: Array
-    """By the scattering ratio of the reference window."""
+    """Error by the scattering ratio of the reference window."""
     lidar_ratio: Array
+    """Error by the lidar ratio."""
     molecular: Array
-    """By the density of the air."""
+    """Error by the density of the air."""
 
     @property
     def total(self) -> Array:
         """Standard error by all causes, which are independent; NaN where one is unknown."""
-        parts = (self.noise, self.background, self.reference, self.lidar_ratio, self.molecular)
-        square = np.zeros_like(self.noise)
-        for part in parts:
-            square += part * part
-        return np.asarray(np.sqrt(square))
+        errors = (self.noise, self.background, self.reference, self.lidar_ratio, self.molecular)
+        variance = np.zeros_like(self.noise)
+        for error in errors:
+            variance += error * error
+        return np.asarray(np.sqrt(variance))
 
 
 @dataclass(frozen=True, slots=True)
 class ElasticResult:
-    """Particles along the beam, with the shape of the power, and one calibration a profile."""
+    """Particle optical properties with the shape of the power, and one calibration a profile."""
 
     backscatter: Array
     """m-1 sr-1, of the particles; NaN where not `valid`."""
     budget: ErrorBudget
-    """m-1 sr-1, of `backscatter`."""
+    """Errors of `backscatter`, m-1 sr-1."""
     attenuated_backscatter: Array
-    """m-1 sr-1, of particles and air, attenuated by both from the lidar on."""
+    """m-1 sr-1, total backscatter times the two-way transmission of particles and air."""
     attenuated_backscatter_standard_error: Array
     lidar_constant: Array
     """Unit of the power times m3 sr, with the leading axes of the power."""
@@ -94,65 +96,66 @@ class ElasticResult:
     """As given, broadcast to the power."""
     valid: Mask
     unstable: Mask
-    """Withheld: the denominator of the solution is too small, or not certain to be positive."""
+    """No value: the denominator of the solution is too small, or not certain to be positive."""
     calibrated: Mask
     """Whether the reference window holds a positive signal, with the leading axes of the power."""
     outlying: Mask
-    """The bin lies off on its own: the value is that of its neighbours (`outlying_bins.bridge_outliers`)."""
+    """The bin is an isolated outlier: its value is interpolated from its neighbours
+    (`outlying_bins.bridge_outliers`)."""
 
     @property
     def backscatter_standard_error(self) -> Array:
-        """Of all causes, m-1 sr-1."""
+        """Standard error of `backscatter` by all causes, m-1 sr-1."""
         return self.budget.total
 
     @property
     def extinction(self) -> Array:
-        """Of the particles, m-1: lidar ratio times backscatter."""
+        """Particle extinction, m-1: lidar ratio times backscatter."""
         return np.asarray(self.lidar_ratio * self.backscatter)
 
     @property
     def extinction_budget(self) -> ErrorBudget:
-        """Of `extinction`, m-1."""
-        ratio, part = self.lidar_ratio, self.budget
+        """Errors of `extinction`, m-1."""
+        ratio, budget = self.lidar_ratio, self.budget
         return ErrorBudget(
-            ratio * part.noise,
-            ratio * part.background,
-            ratio * part.reference,
-            ratio * part.lidar_ratio + self.lidar_ratio_standard_error * self.backscatter,
-            ratio * part.molecular,
+            ratio * budget.noise,
+            ratio * budget.background,
+            ratio * budget.reference,
+            ratio * budget.lidar_ratio + self.lidar_ratio_standard_error * self.backscatter,
+            ratio * budget.molecular,
         )
 
     @property
     def scattering_ratio(self) -> Array:
-        """Backscatter of particles and air over that of the air; NaN where there is no air."""
-        return 1.0 + self.backscatter * self._per_air()
+        """Total backscatter over molecular backscatter; NaN where the latter is 0."""
+        return 1.0 + self.backscatter * self._inverse_molecular()
 
     @property
     def scattering_ratio_budget(self) -> ErrorBudget:
-        """Of `scattering_ratio`."""
-        air, part = self._per_air(), self.budget
+        """Errors of `scattering_ratio`."""
+        inverse, budget = self._inverse_molecular(), self.budget
         return ErrorBudget(
-            air * part.noise,
-            air * part.background,
-            air * part.reference,
-            air * part.lidar_ratio,
-            air * (part.molecular - self.molecular_relative_error * self.backscatter),
+            inverse * budget.noise,
+            inverse * budget.background,
+            inverse * budget.reference,
+            inverse * budget.lidar_ratio,
+            inverse * (budget.molecular - self.molecular_relative_error * self.backscatter),
         )
 
-    def _per_air(self) -> Array:
+    def _inverse_molecular(self) -> Array:
         return 1.0 / np.where(self.molecular_backscatter > 0.0, self.molecular_backscatter, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
 class MonteCarlo:
-    """Spread of perturbed solutions, for the errors of `ElasticResult` without linearisation."""
+    """Spread of perturbed solutions: the errors of `ElasticResult` without linearisation."""
 
     budget: ErrorBudget
-    """m-1 sr-1, of the backscatter of particles, each cause alone, with the sign of its effect."""
+    """m-1 sr-1, of particle backscatter, for each cause alone, with the sign of its effect."""
     standard_error: Array
-    """m-1 sr-1, of the backscatter of particles by all causes at once."""
+    """m-1 sr-1, of particle backscatter, for all causes together."""
     bias: Array
-    """m-1 sr-1, mean of the solutions with all causes less the unperturbed solution."""
+    """m-1 sr-1, mean of the solutions with all causes minus the unperturbed solution."""
     lidar_constant_standard_error: Array
     solved: Array
     """Share of the samples of all causes that have a solution."""
@@ -160,7 +163,7 @@ class MonteCarlo:
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """The arguments as the kernel wants them: rows of profiles, ascending in range."""
+    """Arguments in the layout of the kernel: rows of profiles, ascending in range."""
 
     grid: inputs.RangeGrid
     leading: tuple[int, ...]
@@ -168,13 +171,13 @@ class _Problem:
     variance: Array | None
     window: Mask
     air: tuple[Array, Array, Array]
-    """Backscatter and extinction of the air, lidar ratio."""
+    """Molecular backscatter and extinction, lidar ratio of the particles."""
     outlying: Mask
     scattering_ratio: Array
     errors: tuple[Array, Array]
-    """Of the lidar ratio, of the air."""
+    """Standard error of the lidar ratio, relative one of the air density."""
     causes: Array
-    """Standard error of the background, relative one of the scattering ratio."""
+    """Standard error of the background, relative one of the scattering ratio, for each profile."""
 
 
 def invert_elastic(
@@ -192,7 +195,7 @@ def invert_elastic(
     reference_relative_error: npt.ArrayLike = 0.0,
     molecular_relative_error: npt.ArrayLike = 0.0,
 ) -> ElasticResult:
-    r"""Invert elastic profiles for the backscatter of particles, without iteration.
+    r"""Return particle backscatter and extinction of elastic profiles, without iteration.
 
     With :math:`g = R^2 \exp 2 \int (\alpha_m - S \beta_m)`, :math:`q = g P` and the bin
     :math:`R_c` in the middle of the reference window, the total backscatter is
@@ -200,20 +203,21 @@ def invert_elastic(
     .. math:: \beta = \frac{q}{D_c - 2 \int_{R_c}^R S q},
         \quad D_c = \frac{\sum P}{\sum \beta_0 \exp(-2 \int_{R_c}^R S \beta_0) / g},
 
-    the sums over all bins of the window, in which :math:`\beta_0` is the molecular backscatter
-    times the scattering ratio there. Integrals are trapezoids, so that signals of either sign
-    count alike: a bin is off by less than 1e-4 where scattering changes over 100 m or more and
-    bins are 7.5 m apart. Errors are of first order, those by noise widened where the reference is
-    noisy (`SKEWED`); noise is taken as independent from bin to bin, and carried through integrals
-    and window as they correlate it. A lone bin that its variance does not explain is bridged.
+    where the sums run over the bins of the window and :math:`\beta_0` is the molecular
+    backscatter times the scattering ratio there. Integrals are trapezoidal, so signals of either
+    sign have the same weight. The relative error of the trapezoids is below 1e-4 where scattering
+    changes over 100 m or more and bins are 7.5 m apart. Errors are of first order; noise errors
+    are widened where the reference is noisy (`SKEWED`). Noise is taken as independent from bin
+    to bin, and its correlation through the integrals and the window is propagated. An isolated
+    bin that its variance does not explain is interpolated from its neighbours.
 
     Parameters
     ----------
     power : (..., range) float
-        Any unit, free of background, not corrected for range; NaN where missing or where the
+        Any unit, background subtracted, not range-corrected; NaN where missing or where the
         overlap is incomplete. Negative values are used as they are.
     range : (range,) float
-        m, of the centres of the bins.
+        m, bin centres.
     molecular_backscatter : (..., range) float
         m-1 sr-1, broadcast against `power`.
     molecular_extinction : (..., range) float
@@ -221,41 +225,41 @@ def invert_elastic(
     lidar_ratio : float or (..., range) float
         Of particles, sr.
     reference : (bottom, top) or (..., range) bool
-        m, numbers or one for each profile (NaN: none for this profile); or the bins themselves.
+        Edges in m, one pair or one for each profile (NaN: none for that profile); or a mask of
+        the bins.
     reference_scattering_ratio : float or (...) float
         In the reference window; 1 is air free of particles.
     variance : (..., range) float, optional
-        Of the noise of a bin, in the square of the power's unit, broadcast against `power`.
-        Where not given, the noise is unknown and so are the total errors.
+        Noise variance of a bin, in the square of the power's unit, broadcast against `power`.
+        Without it, the noise error and the total errors are NaN.
     background_standard_error : float or (...) float
-        In the unit of `power`: one error for all bins of a profile.
+        In the unit of `power`; one error common to all bins of a profile.
     lidar_ratio_standard_error : float or (..., range) float
-        sr; one error of this shape along range.
+        sr; one error of this shape, common to all bins.
     reference_relative_error : float or (...) float
-        Standard error of the scattering ratio in the reference window over that ratio. Nothing
-        else covers particles there that fall off with height nearly as air does, which no test
-        of the signal tells: with 0.02, 12 percent of the values are off by more than 4 standard
-        errors where such haze scatters 0.35 to 35 percent of what air does at 7 km, and 0.001
-        percent where it is a tenth of that (`lidarops bench stability`).
+        Relative standard error of the scattering ratio in the reference window. It alone covers
+        particles whose backscatter falls with height nearly as that of air, which no test of the
+        signal reveals. With 0.02, 12 percent of the values are off by more than 4 standard errors
+        where such haze scatters 0.35 to 35 percent of the molecular backscatter at 7 km, and
+        0.001 percent where it scatters a tenth of that (`lidarops bench stability`).
     molecular_relative_error : float or (..., range) float
-        Standard error of the density of the air over that density; one error of this shape
-        along range.
+        Relative standard error of the air density; one error of this shape, common to all bins.
 
     Returns
     -------
     ElasticResult
-        Nothing is solved where the reference window has no positive signal (`calibrated`),
+        There is no value where the reference window has no positive signal (`calibrated`),
         beyond a gap of `LONGEST_GAP`, and where the denominator is below `LEAST_DENOMINATOR`
-        of its value at the reference or `LEAST_CERTAINTY` of its standard errors
-        (`unstable`); away from the lidar all farther bins are withheld with such a one.
-        The lidar constant and what rests on it take the extinction by particles of the nearest
-        solved bin to hold down to the lidar. The errors of the attenuated backscatter leave
-        out that the noise of a bin is part of the constant too.
+        of its value at the reference or `LEAST_CERTAINTY` of its standard errors (`unstable`).
+        Beyond the reference, no bin farther than an unstable one has a value. The lidar constant
+        and quantities derived from it assume the particle extinction of the nearest solved bin
+        from there down to the lidar. The errors of the attenuated backscatter neglect that the
+        noise of a bin also enters the lidar constant.
 
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right, among them units other than m.
+        For invalid arguments, among them units other than m.
 
     References
     ----------
@@ -292,16 +296,16 @@ def monte_carlo(
     samples: int = 200,
     seed: int,
 ) -> MonteCarlo:
-    """Solve perturbed profiles, for errors that are too large for those of first order.
+    """Return errors from perturbed solutions, where errors are too large for first order.
 
     Normal deviates perturb the power, its background, the scattering ratio of the reference, the
-    lidar ratio and the air, each alone and all at once. All profiles get the same deviates, so
-    that a profile's result does not depend on its neighbours in the array.
+    lidar ratio and the air density, each alone and all together. All profiles get the same
+    deviates, so the result of a profile does not depend on the other profiles in the array.
 
     Parameters
     ----------
     power, range, variance
-        As in `invert_elastic`, but the variance is needed.
+        As in `invert_elastic`, but the variance is required.
     molecular_backscatter, molecular_extinction, lidar_ratio
         As in `invert_elastic`.
     reference, reference_scattering_ratio
@@ -311,14 +315,14 @@ def monte_carlo(
     reference_relative_error, molecular_relative_error
         As in `invert_elastic`.
     samples : int
-        At least 2; a standard error from n of them is good to 1 / sqrt(2 n).
+        At least 2; the relative error of a standard error from n samples is 1 / sqrt(2 n).
     seed : int
         The same seed gives the same result.
 
     Returns
     -------
     MonteCarlo
-        NaN where `invert_elastic` has no value, or where less than 95 percent of the samples have one.
+        NaN where `invert_elastic` has no value, or less than 95 percent of the samples have one.
 
     Raises
     ------
@@ -342,30 +346,29 @@ def monte_carlo(
 
 def _sample(problem: _Problem, samples: int, rng: np.random.Generator) -> MonteCarlo:
     solution, scalars, _ = _invert(problem, problem.power)
-    true, constant = solution[_fernald.BACKSCATTER], scalars[:, _fernald.CONSTANT]
-    spreads = [_Spread.like(true) for _ in _CAUSES]
-    together, of_constant = _Spread.like(true), _Spread.like(constant)
+    backscatter, constant = solution[_fernald.BACKSCATTER], scalars[:, _fernald.CONSTANT]
+    spreads = [_Spread.like(backscatter) for _ in _CAUSES]
+    total_spread, constant_spread = _Spread.like(backscatter), _Spread.like(constant)
     for _ in range(samples):
         noise, deviates = rng.standard_normal(problem.grid.size), rng.standard_normal(4)
         for cause, spread in enumerate(spreads):
-            chosen = np.where(np.arange(4) == cause - 1, deviates, 0.0)
-            found, _ = _perturbed(problem, noise if cause == 0 else 0.0 * noise, chosen)
-            spread.add(found - true, float(deviates[cause - 1]) if cause else 0.0)
-        found, its_constant = _perturbed(problem, noise, deviates)
-        together.add(found - true, 0.0)
-        of_constant.add(its_constant - constant, 0.0)
+            cause_deviate = np.where(np.arange(4) == cause - 1, deviates, 0.0)
+            sample, _ = _perturbed(problem, noise if cause == 0 else 0.0 * noise, cause_deviate)
+            spread.add(sample - backscatter, float(deviates[cause - 1]) if cause else 0.0)
+        sample, sample_constant = _perturbed(problem, noise, deviates)
+        total_spread.add(sample - backscatter, 0.0)
+        constant_spread.add(sample_constant - constant, 0.0)
     shape = (*problem.leading, problem.grid.size)
 
-    def turned(rows: Array) -> Array:
+    def as_profiles(rows: Array) -> Array:
         return np.asarray(problem.grid.turn(rows.reshape(shape)))
 
-    parts = [turned(spread.signed_error()) for spread in spreads]
     return MonteCarlo(
-        budget=ErrorBudget(*parts),
-        standard_error=turned(together.error()),
-        bias=turned(together.mean()),
-        lidar_constant_standard_error=of_constant.error().reshape(problem.leading),
-        solved=turned(together.count / samples),
+        budget=ErrorBudget(*(as_profiles(spread.signed_error()) for spread in spreads)),
+        standard_error=as_profiles(total_spread.error()),
+        bias=as_profiles(total_spread.mean()),
+        lidar_constant_standard_error=constant_spread.error().reshape(problem.leading),
+        solved=as_profiles(total_spread.count / samples),
     )
 
 
@@ -380,23 +383,23 @@ class _Spread:
     count: Array
     total: Array
     square: Array
-    tilt: Array
-    """Deviations times the deviates that caused them."""
+    product: Array
+    """Of the deviations and the deviates that caused them; its sign is that of the effect."""
     samples: int = 0
 
     @classmethod
     def like(cls, values: Array) -> _Spread:
-        count, total, square, tilt = np.zeros((4, *values.shape))
-        return cls(count, total, square, tilt)
+        count, total, square, product = np.zeros((4, *values.shape))
+        return cls(count, total, square, product)
 
     def add(self, deviation: Array, deviate: float) -> None:
         solved = np.isfinite(deviation)
-        part = np.where(solved, deviation, 0.0)
+        finite_deviation = np.where(solved, deviation, 0.0)
         self.samples += 1
         self.count += solved
-        self.total += part
-        self.square += part * part
-        self.tilt += deviate * part
+        self.total += finite_deviation
+        self.square += finite_deviation * finite_deviation
+        self.product += deviate * finite_deviation
 
     def mean(self) -> Array:
         enough = self.count >= max(_LEAST_SOLVED * self.samples, 2.0)
@@ -407,16 +410,16 @@ class _Spread:
         return np.asarray(np.sqrt(np.maximum(square, 0.0) / np.maximum(self.count - 1.0, 1.0)))
 
     def signed_error(self) -> Array:
-        return np.asarray(np.where(self.tilt < 0.0, -1.0, 1.0) * self.error())
+        return np.asarray(np.where(self.product < 0.0, -1.0, 1.0) * self.error())
 
 
 def _perturbed(problem: _Problem, noise: Array, deviates: Array) -> tuple[Array, Array]:
-    """Return backscatter and lidar constant with the noise and the causes so many errors off."""
+    """Return backscatter and lidar constant with each cause off by its deviate times its error."""
     background, reference, ratio, air = deviates
     variance = problem.variance if problem.variance is not None else np.zeros((1, 1))
     power = problem.power + noise * np.sqrt(variance) + background * problem.causes[:, :1]
     scale = 1.0 + air * problem.errors[1]
-    wrong = replace(
+    perturbed = replace(
         problem,
         variance=None,
         air=(
@@ -428,13 +431,13 @@ def _perturbed(problem: _Problem, noise: Array, deviates: Array) -> tuple[Array,
         errors=(np.zeros((1, problem.grid.size)), np.zeros((1, problem.grid.size))),
         causes=np.zeros((1, 2)),
     )
-    out, scalars, _ = _invert(wrong, power)
+    out, scalars, _ = _invert(perturbed, power)
     return out[_fernald.BACKSCATTER], scalars[:, _fernald.CONSTANT]
 
 
 def _invert(problem: _Problem, power: inputs.Floats) -> tuple[Array, Array, _fernald.Codes]:
     count, bins = power.shape
-    known = problem.variance is not None
+    noise_known = problem.variance is not None
     out = np.empty((_fernald.FIELDS, count, bins))
     scalars = np.empty((count, _fernald.SCALARS))
     state = np.empty((count, bins), dtype=np.uint8)
@@ -453,7 +456,7 @@ def _invert(problem: _Problem, power: inputs.Floats) -> tuple[Array, Array, _fer
         scalars,
         state,
     )
-    if not known:
+    if not noise_known:
         out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
         scalars[:, _fernald.CONSTANT_ERROR] = np.nan
     return out, scalars, state
@@ -463,10 +466,10 @@ def _result(problem: _Problem, out: Array, scalars: Array, state: _fernald.Codes
     shape = (*problem.leading, problem.grid.size)
 
     def profiles(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        whole = rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
-        return problem.grid.turn(whole)
+        values = rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
+        return problem.grid.turn(values)
 
-    fields = [profiles(part) for part in out]
+    fields = [profiles(rows) for rows in out]
     return ElasticResult(
         backscatter=fields[_fernald.BACKSCATTER],
         budget=ErrorBudget(*fields[_fernald.NOISE : _fernald.MOLECULAR + 1]),
@@ -500,10 +503,10 @@ def _prepare(
     backscatter = inputs.noise_rows(air[0], "molecular_backscatter", grid, leading)
     extinction = inputs.noise_rows(air[1], "molecular_extinction", grid, leading)
     lidar_ratio = inputs.noise_rows(air[2], "lidar_ratio", grid, leading)
-    _require_air(backscatter, "molecular_backscatter", LARGEST_BACKSCATTER)
-    _require_air(extinction, "molecular_extinction", 10.0 * LARGEST_BACKSCATTER)
+    _require_molecular(backscatter, "molecular_backscatter", LARGEST_BACKSCATTER)
+    _require_molecular(extinction, "molecular_extinction", 10.0 * LARGEST_BACKSCATTER)
     _require(lidar_ratio > 0.0, lidar_ratio, "lidar_ratio", "give positive sr")
-    ratio = _per_profile(scattering_ratio, "reference_scattering_ratio", leading)
+    ratio = _profile_values(scattering_ratio, "reference_scattering_ratio", leading)
     _require(
         ratio > 0.0, ratio, "reference_scattering_ratio", "give 1 where air is free of particles"
     )
@@ -532,7 +535,7 @@ def _causes(causes: tuple[npt.ArrayLike, npt.ArrayLike], leading: tuple[int, ...
     names = ("background_standard_error", "reference_relative_error")
     columns = []
     for values, name in zip(causes, names, strict=True):
-        column = _per_profile(values, name, leading)
+        column = _profile_values(values, name, leading)
         _require((column >= 0.0) | np.isnan(column), column, name, "give a standard error")
         columns.append(column)
     return np.ascontiguousarray(np.stack(np.broadcast_arrays(*columns), axis=-1))
@@ -546,20 +549,20 @@ def _errors(
     return rows
 
 
-def _require_air(rows: Array, name: str, largest: float) -> None:
-    _require(rows >= 0.0, rows, name, "give values of the air for every bin")
+def _require_molecular(rows: Array, name: str, largest: float) -> None:
+    _require(rows >= 0.0, rows, name, "give a molecular value of 0 or more for every bin")
     _require(rows < largest, rows, name, "give m-1, not km-1")
 
 
-def _require(fine: Mask, values: Array, name: str, remedy: str) -> None:
-    # The comparison is False for NaN, infinities are no values either.
-    wrong = ~fine | np.isinf(values)
-    if np.any(wrong):
-        raise RetrievalInputError(f"holds {values[wrong][0]:g}", field=name, remedy=remedy)
+def _require(acceptable: Mask, values: Array, name: str, remedy: str) -> None:
+    # Comparisons are False for NaN; infinities are refused as well.
+    invalid = ~acceptable | np.isinf(values)
+    if np.any(invalid):
+        raise RetrievalInputError(f"holds {values[invalid][0]:g}", field=name, remedy=remedy)
 
 
-def _per_profile(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
-    """Return one value a profile as (profile or 1,); NaN stays."""
+def _profile_values(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
+    """Return one value per profile as (profile or 1,), with NaN kept."""
     array = inputs.real_array(values, name).astype(np.float64, copy=False)
     if array.size == 1:
         return array.reshape(1)
@@ -584,7 +587,7 @@ def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ..
             field="reference",
             remedy="give (bottom, top) in m",
         )
-    bottom, top = (_per_profile(edge, "reference", leading) for edge in reference)
+    bottom, top = (_profile_values(edge, "reference", leading) for edge in reference)
     if np.any(bottom >= top):
         raise RetrievalInputError(
             "ends before it begins", field="reference", remedy="give (bottom, top) in m"

@@ -1,4 +1,7 @@
-"""The elastic inversion over xarray: background, clouds, reference and inversion of means."""
+"""The elastic retrieval of mean profiles in xarray.
+
+In this order: outlying bins, background, clouds, reference window, inversion, quality flags.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +23,24 @@ from lidarops.retrieve.background import cubic_and_tail as _background
 from lidarops.retrieve.background import known_shape as _known_shape
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic import layers as _layers
-from lidarops.retrieve.elastic import outlying_bins as _lone_bins
+from lidarops.retrieve.elastic import outlying_bins as _outlying_bins
 from lidarops.retrieve.elastic import reference_window as _reference
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
 CLOUD_MARGIN: Final = 300.0
-"""m beyond the last bin of a cloud: its thin edge reaches farther than it appears."""
+"""m beyond the last bin of a cloud; its thin edge extends beyond its apparent top."""
 LEAST_SHARE: Final = 0.1
-"""Of the bins, that must lie beyond a cloud for the background to be fitted there."""
-UNSEEN: Final = 1.5
-"""Standard errors of the window's mean that particles in it may add unseen: 3 in one of 20."""
+"""Least share of the bins that must lie beyond a cloud for a fit of the background there."""
+UNDETECTED_PARTICLES: Final = 1.5
+"""Standard errors of the window's mean by which undetected particles may raise it. They raise it
+by 3 in one of 20 profiles."""
 STEPS_PER_WINDOW: Final = 4
-"""Candidates that begin within the width of one."""
+"""Candidate windows that start within the width of one."""
 
 _CONTRAST_WAVELENGTH: Final = 532e-9
-"""m, for which `lidarops.retrieve.elastic.layers.CLOUD_CONTRAST` is meant."""
+"""m; wavelength of `lidarops.retrieve.elastic.layers.CLOUD_CONTRAST`."""
 
 _CARRIED: Final = int(
     Quality.INPUT_MISSING
@@ -53,23 +57,25 @@ _OUTLIER: Final = np.int32(Quality.OUTLIER)
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Where to look for air without aerosol, and what is assumed of it."""
+    """Search range of the reference window, and the scattering ratio assumed in it."""
 
     lowest: float
-    """m along the beam, as the others."""
+    """m along the beam."""
     highest: float
+    """m along the beam."""
     width: float
+    """m along the beam."""
     scattering_ratio: float
     relative_error: float
-    """Standard error of the scattering ratio over it."""
+    """Relative standard error of the scattering ratio."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Air:
-    """Molecules along the beam."""
+    """Molecular optical properties along the beam, (range,)."""
 
     backscatter: Array
-    """m-1 sr-1, over range, as the others."""
+    """m-1 sr-1."""
     extinction: Array
     """m-1."""
     shape: Array
@@ -77,8 +83,8 @@ class _Air:
 
 
 @dataclass(frozen=True, slots=True)
-class _Clear:
-    """Profiles without background, and what is known of it."""
+class _Signal:
+    """Profiles without background, the background and its standard error."""
 
     power: Array
     background: Array
@@ -99,7 +105,7 @@ def invert_elastic(
     known_shape: bool = True,
     overlap: Array | None = None,
 ) -> xr.Dataset:
-    """Retrieve backscatter and extinction of aerosol from mean profiles.
+    """Return aerosol backscatter and extinction of mean profiles.
 
     Parameters
     ----------
@@ -115,60 +121,63 @@ def invert_elastic(
     lidar_ratio, lidar_ratio_standard_error : float
         sr, of the aerosol.
     molecular_relative_error : float
-        Standard error of the density of the air over it.
+        Relative standard error of the air density.
     reference : Reference
     known_shape : bool
-        Whether the background is fitted together with the shape of clean air to the far range
-        (`lidarops.retrieve.background.known_shape`); else it is the mean of the last tenth of the bins.
+        If true, fit the background together with the shape of clean air to the far range
+        (`lidarops.retrieve.background.known_shape`); else use the mean of the last tenth of the
+        bins.
     overlap : (range,) float, optional
-        By which the signal is divided; NaN where it is not known.
+        Overlap function, by which the signal is divided; NaN where it is not known.
 
     Returns
     -------
     xr.Dataset
-        In memory: the variables of the ``elastic`` product. Values are NaN where a bit of
-        ``quality_flag`` says why.
+        In memory: the variables of the ``elastic`` product. Where a value is NaN, a bit of
+        ``quality_flag`` gives the reason.
 
     Raises
     ------
     RetrievalInputError
-        Where arguments cannot be right.
+        For invalid arguments.
     """
     climb = float(np.cos(np.deg2rad(averages["zenith_angle"])))
     distance = averages["range"].to_numpy().astype(np.float64)
-    # Ranges behind the lidar, which an offset may give, hold no light, and those above the
-    # atmosphere no air.
+    # An offset may give negative ranges, without light; above the atmosphere there is no air.
     inside = (distance > 0) & (station_altitude + climb * distance < HIGHEST)
     averages, distance = averages.isel(range=inside), distance[inside]
     overlap = None if overlap is None else overlap[inside]
     air = _air(molecules, station_altitude + climb * distance, distance, wavelength)
     quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
-    prepared = _Prepared(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
-    clear, clouds = _cleared(prepared, known_shape=known_shape)
-    power, variance = clear.power, prepared.variance
-    window = _window(power, distance, variance, air, reference, clouds.mask)
+    means = _Means(averages, distance, air, quality, overlap, _cloud_contrast(wavelength))
+    signal, clouds = _signal_and_clouds(means, known_shape=known_shape)
+    window = _window(signal.power, distance, means.variance, air, reference, clouds.mask)
     if not known_shape:
-        clear = _left_in_tail(clear, window, air)
-    found = _elastic.invert_elastic(
-        power,
+        signal = _mark_biased_backgrounds(signal, window, air)
+    solution = _elastic.invert_elastic(
+        signal.power,
         distance,
         molecular_backscatter=air.backscatter,
         molecular_extinction=air.extinction,
         lidar_ratio=lidar_ratio,
         reference=window.edges,
         reference_scattering_ratio=reference.scattering_ratio,
-        variance=variance,
-        background_standard_error=clear.background_standard_error,
+        variance=means.variance,
+        background_standard_error=signal.background_standard_error,
         lidar_ratio_standard_error=lidar_ratio_standard_error,
         reference_relative_error=_reference_error(window, reference),
         molecular_relative_error=molecular_relative_error,
     )
-    quality = prepared.quality
-    quality |= _judged(found, window, clear, quality) | _clouded(distance, window, clouds)
-    bins = {name: np.where(found.valid, v, np.nan) for name, v in _bins(found).items()}
+    quality = means.quality
+    quality |= _solution_flags(solution, window, signal, quality)
+    quality |= _cloud_flags(distance, window, clouds)
+    profiles = {
+        name: np.where(solution.valid, values, np.nan)
+        for name, values in _profile_variables(solution).items()
+    }
     return xr.Dataset(
         {
-            **{name: (("time", "range"), values) for name, values in bins.items()},
+            **{name: (("time", "range"), values) for name, values in profiles.items()},
             "molecular_backscatter": ("range", air.backscatter),
             "molecular_extinction": ("range", air.extinction),
             "lidar_ratio": ((), np.float64(lidar_ratio)),
@@ -176,8 +185,8 @@ def invert_elastic(
             "reference_bottom": ("time", window.bottom),
             "reference_top": ("time", window.top),
             "cloud_base_range": ("time", clouds.cloud_base_range),
-            "background": ("time", clear.background),
-            "background_standard_error": ("time", clear.background_standard_error),
+            "background": ("time", signal.background),
+            "background_standard_error": ("time", signal.background_standard_error),
             "quality_flag": (("time", "range"), quality),
             "profiles": averages["profiles"],
             "shots": averages["shots"],
@@ -193,8 +202,8 @@ def _air(molecules: MolecularProfile, altitude: Array, distance: Array, waveleng
     return _Air(backscatter, extinction, shape)
 
 
-class _Prepared:
-    """Mean profiles as they are before the background is known."""
+class _Means:
+    """Mean profiles with their background, outlying bins replaced."""
 
     def __init__(
         self,
@@ -210,26 +219,26 @@ class _Prepared:
         partial = np.where(np.isnan(self.overlap), int(Quality.INCOMPLETE_OVERLAP), 0)
         self.quality = quality | partial.astype(np.int32)
         self.raw, self.noise = averages["power"].to_numpy(), averages["variance"].to_numpy()
-        self._bridge_lone_bins()
+        self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
 
-    def _bridge_lone_bins(self) -> None:
-        """Replace bins that lie off on their own before backgrounds and windows rest on them."""
+    def _bridge_outliers(self) -> None:
+        """Replace outlying bins before the background and the window depend on them."""
         rough = _background.tail_mean(self.raw, self.distance, variance=self.noise).background
-        used = np.where((self.quality & _WITHHELD) != 0, np.nan, self.raw)
-        bridged = _lone_bins.bridge_outliers(
-            used, self.distance, self.noise, background=np.nan_to_num(rough, nan=0.0)
+        usable = np.where((self.quality & _WITHHELD) != 0, np.nan, self.raw)
+        bridged = _outlying_bins.bridge_outliers(
+            usable, self.distance, self.noise, background=np.nan_to_num(rough, nan=0.0)
         )
-        self.raw = np.where(bridged.found, bridged.power, self.raw)
-        self.noise = np.where(bridged.found, bridged.variance, self.noise)
-        self.quality = self.quality | np.where(bridged.found, _OUTLIER, np.int32(0))
+        self.raw = np.where(bridged.outlying, bridged.power, self.raw)
+        self.noise = np.where(bridged.outlying, bridged.variance, self.noise)
+        self.quality = self.quality | np.where(bridged.outlying, _OUTLIER, np.int32(0))
 
-    def without(self, background: Array) -> Array:
-        """Return the signal without background, as with full overlap."""
+    def minus(self, background: Array) -> Array:
+        """Return the signal without background, corrected for overlap."""
         power = (self.raw - background[:, np.newaxis]) / self.overlap
         return np.where((self.quality & _WITHHELD) != 0, np.nan, power)
 
-    def screened(self, power: Array) -> _layers.Layers:
+    def find_clouds(self, power: Array) -> _layers.Layers:
         """Return the clouds of a signal without background."""
         return _layers.find_layers(
             power,
@@ -240,57 +249,59 @@ class _Prepared:
         )
 
 
-def _cleared(prepared: _Prepared, *, known_shape: bool) -> tuple[_Clear, _layers.Layers]:
+def _signal_and_clouds(means: _Means, *, known_shape: bool) -> tuple[_Signal, _layers.Layers]:
     """Return signals without background, and their clouds."""
-    clear = _without_background(prepared, np.ones_like(prepared.raw, bool), known_shape=known_shape)
-    clouds = prepared.screened(clear.power)
+    signal = _subtract_background(means, np.ones_like(means.raw, bool), known_shape=known_shape)
+    clouds = means.find_clouds(signal.power)
     if not known_shape or not clouds.cloudy.any():
-        return clear, clouds
-    # What lies beyond a cloud has the shape of air again, but not what holds the cloud.
-    step = float(np.median(np.diff(prepared.distance)))
+        return signal, clouds
+    # Only beyond the cloud does the signal have the shape of air: fit the background there.
+    step = float(np.median(np.diff(means.distance)))
     hidden = np.zeros_like(clouds.mask)
     margin = min(round(CLOUD_MARGIN / step), hidden.shape[1])
     hidden[:, margin:] = clouds.mask[:, : hidden.shape[1] - margin]
     hidden |= clouds.mask
     beyond = ~np.logical_or.accumulate(hidden[:, ::-1], axis=-1)[:, ::-1]
-    enough = beyond.sum(axis=-1) >= LEAST_SHARE * prepared.distance.size
-    again = clouds.cloudy & enough
-    clear = _without_background(prepared, beyond | ~again[:, np.newaxis], known_shape=True)
-    return clear, prepared.screened(clear.power)
+    enough = beyond.sum(axis=-1) >= LEAST_SHARE * means.distance.size
+    refitted = clouds.cloudy & enough
+    signal = _subtract_background(means, beyond | ~refitted[:, np.newaxis], known_shape=True)
+    return signal, means.find_clouds(signal.power)
 
 
-def _without_background(
-    prepared: _Prepared, usable: npt.NDArray[np.bool_], *, known_shape: bool
-) -> _Clear:
-    raw, noise, r = prepared.raw, prepared.noise, prepared.distance
+def _subtract_background(
+    means: _Means, usable: npt.NDArray[np.bool_], *, known_shape: bool
+) -> _Signal:
+    raw, noise, r = means.raw, means.noise, means.distance
     tail = _background.tail_mean(raw, r, variance=noise)
     background, error = tail.background, tail.background_standard_error
     uncertain = np.zeros(background.shape, dtype=bool)
     if known_shape:
-        fit = _known_shape.fit_known_shape(raw, r, prepared.air.shape, variance=noise, mask=usable)
-        found = ~fit.singular & np.isfinite(fit.background)
-        background = np.where(found, fit.background, background)
-        # Noise that neighbouring bins share is larger than their differences tell.
+        fit = _known_shape.fit_known_shape(raw, r, means.air.shape, variance=noise, mask=usable)
+        fitted = ~fit.singular & np.isfinite(fit.background)
+        background = np.where(fitted, fit.background, background)
+        # Differences of neighbouring bins underestimate noise that is correlated between them.
         excess = fit.chi2 / np.maximum(fit.degrees_of_freedom, 1)
         scale = np.sqrt(np.maximum(np.nan_to_num(excess, nan=1.0), 1.0))
-        error = np.where(found, fit.background_standard_error * scale, error)
-        uncertain = ~found | fit.poor_fit
-    return _Clear(prepared.without(background), background, error, uncertain)
+        error = np.where(fitted, fit.background_standard_error * scale, error)
+        uncertain = ~fitted | fit.poor_fit
+    return _Signal(means.minus(background), background, error, uncertain)
 
 
-def _left_in_tail(clear: _Clear, window: _reference.ReferenceWindow, air: _Air) -> _Clear:
-    """Doubt backgrounds of whose bins air alone makes more than their standard error."""
+def _mark_biased_backgrounds(
+    signal: _Signal, window: _reference.ReferenceWindow, air: _Air
+) -> _Signal:
+    """Mark a background as uncertain if the signal of air in its bins exceeds its error."""
     shape = air.shape[-max(air.shape.size // 10, 1) :].mean()
     with np.errstate(invalid="ignore"):
-        biased = window.scale * shape > clear.background_standard_error
-    return replace(clear, uncertain=clear.uncertain | biased)
+        biased = window.scale * shape > signal.background_standard_error
+    return replace(signal, uncertain=signal.uncertain | biased)
 
 
 def _reference_error(window: _reference.ReferenceWindow, reference: Reference) -> Array:
-    """Return the relative error of the scattering ratio: assumed, and of particles not seen."""
+    """Return the relative error of the scattering ratio: assumed, and by undetected particles."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        unseen = UNSEEN * window.scale_standard_error / window.scale
-    return np.hypot(reference.relative_error, np.nan_to_num(unseen, nan=0.0))
+        undetected = UNDETECTED_PARTICLES * window.scale_standard_error / window.scale
+    return np.hypot(reference.relative_error, np.nan_to_num(undetected, nan=0.0))
 
 
 def _window(
@@ -317,32 +328,34 @@ def _window(
 
 
 def _cloud_contrast(wavelength: float) -> float:
-    """Return the contrast that is no aerosol: scaled as aerosol over air is, with lambda^3."""
+    """Return the least contrast of a cloud; aerosol over air scales with lambda^3."""
     scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
     return max(1.0 + (_layers.CLOUD_CONTRAST - 1.0) * scaled, 2.0)
 
 
-def _judged(
-    found: _elastic.ElasticResult,
+def _solution_flags(
+    solution: _elastic.ElasticResult,
     window: _reference.ReferenceWindow,
-    clear: _Clear,
+    signal: _Signal,
     quality: Flags,
 ) -> Flags:
-    """Return what speaks against each value."""
-    bits = np.zeros(found.valid.shape, dtype=np.int32)
+    """Return the bits of reference, background, outlying bins and inversion."""
+    bits = np.zeros(solution.valid.shape, dtype=np.int32)
     bits[~window.chosen] |= np.int32(Quality.NO_REFERENCE)
-    bits[clear.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
-    bits[found.outlying] |= np.int32(Quality.OUTLIER)
-    lost = window.chosen[:, np.newaxis] & ~found.valid & ((quality & _WITHHELD) == 0)
-    bits[lost] |= np.int32(Quality.UNSTABLE_INVERSION)
+    bits[signal.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
+    bits[solution.outlying] |= np.int32(Quality.OUTLIER)
+    unsolved = window.chosen[:, np.newaxis] & ~solution.valid & ((quality & _WITHHELD) == 0)
+    bits[unsolved] |= np.int32(Quality.UNSTABLE_INVERSION)
     return bits
 
 
-def _clouded(distance: Array, window: _reference.ReferenceWindow, clouds: _layers.Layers) -> Flags:
-    """Return CLOUD for what lies in a cloud, or beyond one as seen from the reference window.
+def _cloud_flags(
+    distance: Array, window: _reference.ReferenceWindow, clouds: _layers.Layers
+) -> Flags:
+    """Return CLOUD for bins in a cloud, or beyond one as seen from the reference window.
 
-    The inversion starts in the window, and what it meets behind a cloud rests on the lidar ratio
-    of aerosol in the cloud.
+    The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol
+    that was assumed in the cloud.
     """
     bottom = np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
     near, far = distance < bottom, distance >= bottom
@@ -351,19 +364,19 @@ def _clouded(distance: Array, window: _reference.ReferenceWindow, clouds: _layer
     return (above | below).astype(np.int32) * np.int32(Quality.CLOUD)
 
 
-def _bins(found: _elastic.ElasticResult) -> dict[str, Array]:
-    budget: Any = found.budget
+def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
+    budget: Any = solution.budget
     return {
-        "backscatter": found.backscatter,
+        "backscatter": solution.backscatter,
         "backscatter_standard_error": budget.total,
         **{
             f"backscatter_error_{cause}": getattr(budget, cause)
             for cause in ("noise", "background", "reference", "lidar_ratio", "molecular")
         },
-        "extinction": found.extinction,
-        "extinction_standard_error": found.extinction_budget.total,
-        "scattering_ratio": found.scattering_ratio,
-        "scattering_ratio_standard_error": found.scattering_ratio_budget.total,
-        "attenuated_backscatter": found.attenuated_backscatter,
-        "attenuated_backscatter_standard_error": found.attenuated_backscatter_standard_error,
+        "extinction": solution.extinction,
+        "extinction_standard_error": solution.extinction_budget.total,
+        "scattering_ratio": solution.scattering_ratio,
+        "scattering_ratio_standard_error": solution.scattering_ratio_budget.total,
+        "attenuated_backscatter": solution.attenuated_backscatter,
+        "attenuated_backscatter_standard_error": solution.attenuated_backscatter_standard_error,
     }

@@ -1,4 +1,4 @@
-"""Clouds, and other layers with a steep base, in profiles of a lidar."""
+"""Detection of clouds and other layers with a steep base."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 DEFAULT_SCALES: Final = (60.0, 120.0, 240.0, 480.0)
-"""m, over which signals are averaged below and above a base."""
+"""m; lengths of the windows in which signals are averaged below and above a base."""
 
 CLOUD_CONTRAST: Final = 3.0
-"""At visible wavelengths aerosol rarely rises by this factor over air within 500 m; thin cirrus
-does. In the near infrared, where air scatters little, choose a larger one."""
+"""Factor of the rise. At visible wavelengths the scattering ratio of aerosol rarely rises by this
+factor within 500 m; that of thin cirrus does. In the near infrared, where air scatters little,
+choose a larger one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,19 +33,19 @@ class Layers:
     cloud_base_range: Array
     """m, of the first bin of the lowest layer; NaN where there is none."""
     cloud_top_range: Array
-    """m, of its last bin, as it appears: where the signal has fallen to what it was below the
-    base. In a layer that attenuates much this is below the true top."""
+    """m, apparent top: its last bin before the signal is back at its level below the base. In a
+    layer that attenuates strongly this is below the true top."""
     contrast: Array
-    """Power over the molecular shape above the base over that below, of the lowest layer."""
+    """Ratio of the power to the molecular shape above the base over that below, lowest layer."""
     significance: Array
-    """Standard errors by which the rise exceeds the asked factor, of the lowest layer."""
+    """Standard errors by which the rise exceeds the requested factor, of the lowest layer."""
     mask: Mask
     """(..., range): bins from base to apparent top, of all layers."""
     cloudy: Mask
     opaque: Mask
-    """Air is not seen far above the highest layer (3 standard errors, and 1 percent of the level
-    below the lowest layer), in the farthest window where a tenth of that level would be seen; or
-    nothing could be seen there."""
+    """No signal of air above the highest layer: it is below 3 standard errors, or below 1 percent
+    of the level below the lowest layer, in the farthest window where noise would let a tenth of
+    that level be seen, or there is no such window."""
 
 
 def find_layers(
@@ -57,27 +58,27 @@ def find_layers(
     scales: npt.ArrayLike = DEFAULT_SCALES,
     false_alarm: float = 0.01,
 ) -> Layers:
-    r"""Find layers at whose base the backscatter over that of air rises by more than a factor.
+    r"""Return layers at whose base the scattering ratio rises by more than a factor.
 
-    With the ratio :math:`\rho = \sum P / \sum \phi` of the power to the molecular shape in two
-    adjoining windows, below and above a bin, a base is there where
+    Let :math:`\rho = \sum P / \sum \phi` be the ratio of the power to the molecular shape in two
+    adjoining windows, below and above a bin. The bin is a base where
 
     .. math:: \frac{\rho_+ - c \rho_-}{\sqrt{\sigma_+^2 + c^2 \sigma_-^2}} > t
 
     for at least one length of the windows. This tests the hypothesis that the ratio rises by no
-    more than the factor :math:`c`: whatever the aerosol, if it nowhere does, a profile is flagged
-    with a probability below `false_alarm`, as :math:`t` is the quantile of the normal
-    distribution for `false_alarm` over the number of bins and lengths (the bound of
-    Bonferroni). The base is where the statistic peaks, the top where the mean of the next
-    window is within 2 standard errors of the level below the base again.
+    more than the factor :math:`c`. If that holds everywhere, whatever the aerosol, a profile is
+    flagged with a probability below `false_alarm`, because :math:`t` is the quantile of the
+    normal distribution for `false_alarm` over the number of bins and lengths (Bonferroni bound).
+    The base is where the statistic peaks. The top is where the mean of the next window is again
+    within 2 standard errors of the level below the base.
 
-    A layer that begins within one window of the first bin is not seen: look at `opaque` and at
-    the signal. With a `contrast` of 1 all layers are found that rise significantly.
+    A layer that begins within one window of the first bin is not detected. With a `contrast` of
+    1 all layers are detected that rise significantly.
 
     Parameters
     ----------
     power : (..., range) float
-        Any unit, free of background, not corrected for range; NaN where missing or where the
+        Any unit, background subtracted, not range-corrected; NaN where missing or where the
         overlap is incomplete.
     range : (range,) float
         m, uniform or nearly so.
@@ -87,11 +88,11 @@ def find_layers(
         The shape :math:`\phi = \beta_m T_m^2 / R^2` times any constant, broadcast against
         `power`.
     contrast : float
-        The factor, at least 1.
+        The factor :math:`c`, at least 1.
     scales : (scale,) float
-        m, lengths of the windows; at least two bins are taken.
+        m, lengths of the windows; a window has at least two bins.
     false_alarm : float
-        Probability for a whole profile.
+        Probability of a false detection in a whole profile.
 
     Returns
     -------
@@ -100,7 +101,7 @@ def find_layers(
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right.
+        For invalid arguments.
 
     References
     ----------
@@ -125,7 +126,7 @@ def find_layers(
     lengths = _lengths(scales, grid)
     mask = np.zeros(rows.shape, dtype=np.bool_)
     opaque = np.zeros(rows.shape[0], dtype=np.bool_)
-    found = np.full((rows.shape[0], _layer_search.FIELDS), np.nan)
+    lowest_layer = np.full((rows.shape[0], _layer_search.FIELDS), np.nan)
     threshold = -float(ndtri(false_alarm / (grid.size * lengths.size)))
     _layer_search.detect_rises(
         frozen(rows),
@@ -135,17 +136,17 @@ def find_layers(
         float(contrast),
         threshold,
         mask,
-        found,
+        lowest_layer,
         opaque,
     )
-    cloudy = np.isfinite(found[:, _layer_search.BASE])
-    first = np.where(cloudy, found[:, _layer_search.BASE], 0.0).astype(np.int64)
-    stop = np.where(cloudy, found[:, _layer_search.TOP], 1.0).astype(np.int64)
+    cloudy = np.isfinite(lowest_layer[:, _layer_search.BASE])
+    first = np.where(cloudy, lowest_layer[:, _layer_search.BASE], 0.0).astype(np.int64)
+    stop = np.where(cloudy, lowest_layer[:, _layer_search.TOP], 1.0).astype(np.int64)
     return Layers(
         cloud_base_range=np.where(cloudy, grid.values[first], np.nan).reshape(leading),
         cloud_top_range=np.where(cloudy, grid.values[stop - 1], np.nan).reshape(leading),
-        contrast=found[:, _layer_search.CONTRAST].reshape(leading),
-        significance=found[:, _layer_search.SIGNAL].reshape(leading),
+        contrast=lowest_layer[:, _layer_search.CONTRAST].reshape(leading),
+        significance=lowest_layer[:, _layer_search.SIGNAL].reshape(leading),
         mask=grid.turn(mask.reshape(*leading, grid.size)),
         cloudy=cloudy.reshape(leading),
         opaque=opaque.reshape(leading),

@@ -1,4 +1,4 @@
-"""The reference window of an elastic inversion: where a profile has the shape of clean air."""
+"""Choice of the reference window: where a profile has the shape of particle-free air."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ Codes = npt.NDArray[np.int32]
 
 FEWEST_BINS: Final = 8
 LEAST_SHARE: Final = 0.5
-"""Of the bins of a window that must be usable."""
+"""Share of the bins of a window that must hold data."""
 _MOST_WINDOWS: Final = 10_000
 
 
 class Rejection(IntFlag):
-    """Why a candidate window is no reference."""
+    """Reason for which a candidate window is rejected."""
 
     TOO_FEW_BINS = 1 << 0
-    """Fewer than 8 bins, or than half of the window, hold data."""
+    """Fewer than 8 bins, or less than half of the window, hold data."""
     EXCLUDED = 1 << 1
     """A layer or another excluded bin lies in the window."""
     LOW_SIGNAL = 1 << 2
-    """The mean of the window is not known well enough."""
+    """The signal-to-noise ratio of the mean of the window is too low."""
     SLOPE = 1 << 3
     """The ratio to the air changes linearly along the window."""
     CURVATURE = 1 << 4
     """The ratio to the air is curved along the window."""
     SCATTER = 1 << 5
-    """The ratio to the air scatters more than its noise."""
+    """The ratio to the air scatters more than its noise explains."""
     MORE_PARTICLES = 1 << 6
-    """Another window that passes all tests has less backscatter over that of air."""
+    """Another window that passes all tests has a lower ratio to the air."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceWindow:
     """The chosen window of each profile, with the leading axes of the power.
 
-    What is told of the window is NaN, and `index` is -1, where no candidate passes.
+    Where no candidate passes, floats are NaN and `index` is -1.
     """
 
     chosen: Mask
@@ -56,7 +56,7 @@ class ReferenceWindow:
     top: Array
     """m."""
     index: npt.NDArray[np.int64]
-    """Of the candidate."""
+    """Index of the chosen candidate."""
     scale: Array
     """Power over the molecular shape, averaged over the window with inverse variances."""
     scale_standard_error: Array
@@ -64,25 +64,25 @@ class ReferenceWindow:
     """m-1, of the logarithm of the power over the molecular shape."""
     slope_standard_error: Array
     curvature: Array
-    """In its standard errors."""
+    """Of the ratio to the molecular shape, in standard errors."""
     reduced_chi_square: Array
     """Of the power against the molecular shape alone."""
     rejections: Codes
-    """(..., candidate): bits of `Rejection`; 0 for the chosen one and its equals."""
+    """(..., candidate): bits of `Rejection`; 0 for the chosen one and those equally clean."""
 
     @property
     def edges(self) -> tuple[Array, Array]:
-        """Bottom and top, as `lidarops.retrieve.elastic.inversion.invert_elastic` takes them."""
+        """Bottom and top in m, the `reference` of `inversion.invert_elastic`."""
         return self.bottom, self.top
 
 
 def candidate_windows(lowest: float, highest: float, width: float, step: float) -> Array:
-    """Return windows of one width at regular distances.
+    """Return windows of equal width at regular steps.
 
     Parameters
     ----------
     lowest, highest : float
-        m, within which all windows lie.
+        m; all windows lie between them.
     width, step : float
         m.
 
@@ -124,11 +124,11 @@ def choose_reference(
     most_deviation: float = 3.0,
     least_signal: float = 20.0,
 ) -> ReferenceWindow:
-    r"""Choose the window in which a profile has the shape of air best known to hold few particles.
+    r"""Return the cleanest window, of equally clean ones the one that is known best.
 
-    In each candidate the power is compared with the molecular shape :math:`\phi` by weighted
-    least squares: :math:`P = \phi (a_0 + a_1 p_1(R) + a_2 p_2(R))` with polynomials that are
-    orthogonal under the noise, so that the three tests are independent. A candidate passes where
+    In each candidate the power is fitted with the molecular shape :math:`\phi` by weighted
+    least squares: :math:`P = \phi (a_0 + a_1 p_1(R) + a_2 p_2(R))`, with polynomials that are
+    orthogonal under the noise, so the three tests are independent. A candidate passes where
 
     - at least 8 bins and half of the window hold data, and none is excluded;
     - :math:`a_0` exceeds `least_signal` of its standard errors;
@@ -136,20 +136,21 @@ def choose_reference(
     - chi-square of the power against :math:`\phi a_0` is less than `most_deviation` standard
       deviations above its mean (as Gaussian: :math:`\chi^2/\nu < 1 + k \sqrt{2/\nu}`).
 
-    Of those that pass, the one with the least upper bound of :math:`a_0`, at `most_deviation`
-    standard errors, is the anchor; those within `most_deviation` of the difference's standard
-    errors of it count as equally clean, and of these the one with the smallest standard error
-    of :math:`a_0` is chosen, the nearest one in a tie. That error follows from the variances
-    and not from the power, so that the choice favours no fluctuation; the tests do a little, as
-    they keep windows whose noise looks flat. In simulations the scale of the chosen window is
-    0.1 standard errors too low (where `variance` is not taken from the noisy power itself), and
-    particles raise it by less than 3 standard errors in 95 percent of layered profiles: no test
-    of shape finds a tenuous layer that the noise hides. Carry it as an error of the reference.
+    The anchor is the passing window with the lowest upper bound of :math:`a_0`, at
+    `most_deviation` standard errors. Windows whose :math:`a_0` differs from it by less than
+    `most_deviation` standard errors of the difference count as equally clean. Of these, the one
+    with the smallest standard error of :math:`a_0` is chosen, the nearest one in a tie. That
+    error follows from the variances and not from the power, so the choice favours no
+    fluctuation. The tests favour one slightly, because they keep windows whose noise looks flat.
+    In simulations the scale of the chosen window is 0.1 standard errors too low (where `variance`
+    is not estimated from the noisy power itself). Particles raise it by less than 3 standard
+    errors in 95 percent of layered profiles: no test of shape detects a thin layer that the
+    noise hides. Include this in the error of the reference.
 
     Parameters
     ----------
     power : (..., range) float
-        Any unit, free of background; NaN where missing.
+        Any unit, background subtracted; NaN where missing.
     range : (range,) float
         m.
     variance : (..., range) float
@@ -160,21 +161,21 @@ def choose_reference(
     candidates : (candidate, 2) float
         m, bottom and top of each window; see `candidate_windows`.
     exclude : (..., range) bool, optional
-        Bins that no window may hold, as the mask of `lidarops.retrieve.elastic.layers.find_layers`.
+        Bins that no window may contain, such as the mask of `layers.find_layers`.
     most_deviation : float
-        Standard errors.
+        Largest deviation from the molecular shape, in standard errors.
     least_signal : float
-        Ratio of signal to noise of the mean of a window.
+        Least signal-to-noise ratio of the mean of a window.
 
     Returns
     -------
     ReferenceWindow
-        Nothing is chosen where no candidate passes; `rejections` tells why for each.
+        No window is chosen where no candidate passes; `rejections` gives the reasons.
 
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right, among them candidates outside the range.
+        For invalid arguments, among them candidates outside the range.
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
@@ -190,7 +191,7 @@ def choose_reference(
             "must be positive", field="most_deviation" if least_signal > 0.0 else "least_signal"
         )
     windows, edges = _edges(candidates, grid)
-    found = np.full((rows.shape[0], windows.shape[0], _window_tests.FIELDS), np.nan)
+    statistics = np.full((rows.shape[0], windows.shape[0], _window_tests.FIELDS), np.nan)
     _window_tests.compare_with_air(
         frozen(rows),
         frozen(inputs.variance_rows(variance, grid, leading)),
@@ -198,11 +199,11 @@ def choose_reference(
         frozen(grid.values),
         frozen(_excluded(exclude, grid, leading)),
         edges,
-        found,
+        statistics,
     )
-    rejections = _judge(found, np.diff(edges)[:, 0], most_deviation, least_signal)
-    index = _pick(found, rejections, most_deviation)
-    return _result(found, rejections, index, windows, leading)
+    rejections = _rejections(statistics, np.diff(edges)[:, 0], most_deviation, least_signal)
+    index = _pick(statistics, rejections, most_deviation)
+    return _result(statistics, rejections, index, windows, leading)
 
 
 def _edges(
@@ -241,17 +242,17 @@ def _excluded(
     return inputs.noise_rows(mask.astype(np.float64), "exclude", grid, leading) > 0.0
 
 
-def _judge(
-    found: Array, lengths: npt.NDArray[np.int64], most_deviation: float, least_signal: float
+def _rejections(
+    statistics: Array, lengths: npt.NDArray[np.int64], most_deviation: float, least_signal: float
 ) -> Codes:
-    """Return why each window is rejected, 0 for the windows that pass all tests."""
-    f = np.moveaxis(found, -1, 0)
+    """Return the bits of `Rejection` of each window; 0 for those that pass all tests."""
+    f = np.moveaxis(statistics, -1, 0)
     count = np.nan_to_num(f[_window_tests.COUNT])
     freedom = np.maximum(count - 1.0, 1.0)
     fewest = np.maximum(FEWEST_BINS, LEAST_SHARE * lengths)
     passes = {
         Rejection.TOO_FEW_BINS: count >= fewest,
-        Rejection.EXCLUDED: ~(f[_window_tests.TAKEN_OUT] > 0.0),
+        Rejection.EXCLUDED: ~(f[_window_tests.EXCLUDED_BINS] > 0.0),
         Rejection.LOW_SIGNAL: f[_window_tests.SCALE] >= least_signal * f[_window_tests.SCALE_ERROR],
         Rejection.SLOPE: np.abs(f[_window_tests.SLOPE])
         <= most_deviation * f[_window_tests.SLOPE_ERROR],
@@ -262,29 +263,29 @@ def _judge(
     rejections = np.zeros(count.shape, dtype=np.int32)
     for reason, passed in passes.items():
         rejections[~passed] |= np.int32(reason)
-    # Tests of a shape that too few bins tell nothing about were not made.
+    # Too few bins do not define a shape; the tests of the shape do not apply.
     few = (rejections & np.int32(Rejection.TOO_FEW_BINS)) != 0
     rejections[few] &= np.int32(Rejection.TOO_FEW_BINS | Rejection.EXCLUDED)
     return rejections
 
 
-def _pick(found: Array, rejections: Codes, most_deviation: float) -> npt.NDArray[np.int64]:
-    """Return the index of the chosen window or -1, and note which ones hold more particles."""
-    scale, error = found[..., _window_tests.SCALE], found[..., _window_tests.SCALE_ERROR]
+def _pick(statistics: Array, rejections: Codes, most_deviation: float) -> npt.NDArray[np.int64]:
+    """Return the index of the chosen window or -1; mark those with more particles as rejected."""
+    scale, error = statistics[..., _window_tests.SCALE], statistics[..., _window_tests.SCALE_ERROR]
     passed = rejections == 0
     upper = np.where(passed, scale + most_deviation * error, np.inf)
     anchor = np.argmin(upper, axis=-1)[:, np.newaxis]
     lowest = np.take_along_axis(scale, anchor, axis=-1)
     least = np.take_along_axis(error, anchor, axis=-1)
-    dirtier = passed & (scale - lowest > most_deviation * np.hypot(error, least))
-    rejections[dirtier] |= np.int32(Rejection.MORE_PARTICLES)
+    has_more_particles = passed & (scale - lowest > most_deviation * np.hypot(error, least))
+    rejections[has_more_particles] |= np.int32(Rejection.MORE_PARTICLES)
     precision = np.where(rejections == 0, error, np.inf)
     best = np.argmin(precision, axis=-1)
     return np.where(np.any(passed, axis=-1), best, -1).astype(np.int64)
 
 
 def _result(
-    found: Array,
+    statistics: Array,
     rejections: Codes,
     index: npt.NDArray[np.int64],
     windows: Array,
@@ -293,19 +294,19 @@ def _result(
     chosen = index >= 0
     rows = np.arange(index.size)
 
-    def told(field: int) -> Array:
-        return np.where(chosen, found[rows, index, field], np.nan).reshape(leading)
+    def chosen_value(field: int) -> Array:
+        return np.where(chosen, statistics[rows, index, field], np.nan).reshape(leading)
 
     return ReferenceWindow(
         chosen=chosen.reshape(leading),
         bottom=np.where(chosen, windows[index, 0], np.nan).reshape(leading),
         top=np.where(chosen, windows[index, 1], np.nan).reshape(leading),
         index=index.reshape(leading),
-        scale=told(_window_tests.SCALE),
-        scale_standard_error=told(_window_tests.SCALE_ERROR),
-        slope=told(_window_tests.SLOPE),
-        slope_standard_error=told(_window_tests.SLOPE_ERROR),
-        curvature=told(_window_tests.CURVATURE),
-        reduced_chi_square=told(_window_tests.SCATTER),
+        scale=chosen_value(_window_tests.SCALE),
+        scale_standard_error=chosen_value(_window_tests.SCALE_ERROR),
+        slope=chosen_value(_window_tests.SLOPE),
+        slope_standard_error=chosen_value(_window_tests.SLOPE_ERROR),
+        curvature=chosen_value(_window_tests.CURVATURE),
+        reduced_chi_square=chosen_value(_window_tests.SCATTER),
         rejections=rejections.reshape(*leading, windows.shape[0]),
     )

@@ -1,4 +1,4 @@
-"""What is withheld because its error is not of first order, and what is not."""
+"""Bins are withheld where their error is not of first order, and only there."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ RANGE = 7.5 * (np.arange(1400) + 0.5)[20:]
 
 @pytest.mark.parametrize("wavelength", [355e-9, 532e-9])
 @pytest.mark.parametrize("ratio_error", [0.0, 10.0, 25.0])
-def test_a_doubtful_lidar_ratio_does_not_withhold_clean_air(wavelength, ratio_error):
-    # Clean air does not depend on the lidar ratio of particles, however far the reference is.
+def test_an_uncertain_lidar_ratio_does_not_withhold_clean_air(wavelength, ratio_error):
+    # Clean air does not depend on the lidar ratio of particles, wherever the reference is.
     backscatter, extinction = AIR.backscatter(RANGE, wavelength), AIR.extinction(RANGE, wavelength)
     depth = np.cumsum(extinction) * 7.5
     power = 1e12 * backscatter * np.exp(-2.0 * depth) / RANGE**2
-    found = invert_elastic(
+    result = invert_elastic(
         power,
         RANGE,
         molecular_backscatter=backscatter,
@@ -32,16 +32,16 @@ def test_a_doubtful_lidar_ratio_does_not_withhold_clean_air(wavelength, ratio_er
         variance=(0.01 * power) ** 2,
     )
     near = RANGE < 8e3
-    assert found.valid[near].all()
-    assert np.abs(found.budget.lidar_ratio[near] / backscatter[near]).max() < 0.01
+    assert result.valid[near].all()
+    assert np.abs(result.budget.lidar_ratio[near] / backscatter[near]).max() < 0.01
 
 
-def test_a_thick_layer_of_doubtful_lidar_ratio_is_withheld_behind_it():
+def test_bins_beyond_a_thick_layer_of_uncertain_lidar_ratio_are_withheld():
     backscatter, extinction = AIR.backscatter(RANGE, 532e-9), AIR.extinction(RANGE, 532e-9)
     layer = np.where((RANGE > 4e3) & (RANGE < 5e3), 2e-5, 0.0)
     depth = np.cumsum(extinction + 50.0 * layer) * 7.5
     power = 1e14 * (backscatter + layer) * np.exp(-2.0 * depth) / RANGE**2
-    found = invert_elastic(
+    result = invert_elastic(
         power,
         RANGE,
         molecular_backscatter=backscatter,
@@ -51,6 +51,6 @@ def test_a_thick_layer_of_doubtful_lidar_ratio_is_withheld_behind_it():
         reference=(2e3, 3e3),
         variance=(0.001 * power) ** 2,
     )
-    # Away from the lidar the solution divides by what the layer has left of the denominator.
-    assert found.valid[RANGE < 4e3].all()
-    assert found.unstable[RANGE > 5.1e3].all()
+    # Beyond the reference the layer reduces the denominator of the solution.
+    assert result.valid[RANGE < 4e3].all()
+    assert result.unstable[RANGE > 5.1e3].all()

@@ -1,4 +1,4 @@
-"""The elastic inversion of published simulations, the intercomparisons of EARLINET."""
+"""The elastic inversion of published simulations: the EARLINET algorithm intercomparisons."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def boeckmann(data_root):
 
 
 @pytest.mark.parametrize("level", [0, 2, 4, 6, 8])
-def test_boeckmann_set_is_found_or_said_to_be_uncertain(boeckmann, level):
+def test_boeckmann_set_is_retrieved_or_reported_as_uncertain(boeckmann, level):
     folder, r, clear, clean, setup = boeckmann
     truth = invert_elastic(clean, r, **setup).backscatter
     assert np.all(np.isfinite(truth[r > 400.0]))
@@ -72,35 +72,35 @@ def test_boeckmann_set_is_found_or_said_to_be_uncertain(boeckmann, level):
     raw = green_counts(folder / f"background_1e{level}.licel")
     total = raw / raw.max() * (GREEN_MAXIMUM + 10.0**level)
     power = np.where(r > 400.0, total, np.nan)
-    # Weights that follow from a model, not from each bin's own noise.
+    # Weights from a model, not from the noise of the single bin.
     variance = (np.nan_to_num(clean) + 10.0**level) / 1000.0
     far = r > 9e3
     phi = clear_shape(clear, r)
-    found_line, covariance = line(phi[far] / phi[far].mean(), power[far], variance[far])
+    fitted_line, covariance = line(phi[far] / phi[far].mean(), power[far], variance[far])
     background_error = np.sqrt(covariance[0, 0])
-    assert abs(found_line[0] - true_background(r, clean, total, level)) < max(
+    assert abs(fitted_line[0] - true_background(r, clean, total, level)) < max(
         1.0, 3.5 * background_error
     )
 
-    found = invert_elastic(
-        power - found_line[0], r, **setup, variance=variance,
+    result = invert_elastic(
+        power - fitted_line[0], r, **setup, variance=variance,
         background_standard_error=background_error,
     )  # fmt: skip
     near = within(r, (500.0, 6e3))
     if level <= 5:
-        assert np.all(found.valid[near])
-        bias = np.mean(found.backscatter[near] - truth[near]) / np.mean(truth[near])
+        assert np.all(result.valid[near])
+        bias = np.mean(result.backscatter[near] - truth[near]) / np.mean(truth[near])
         assert abs(bias) < 0.01
-    deviation = (found.backscatter - truth) / found.backscatter_standard_error
-    told = near & found.valid
-    if np.any(told):
-        assert np.sqrt(np.mean(deviation[told] ** 2)) < 2.0
+    deviation = (result.backscatter - truth) / result.backscatter_standard_error
+    solved = near & result.valid
+    if np.any(solved):
+        assert np.sqrt(np.mean(deviation[solved] ** 2)) < 2.0
     if level == 8:
-        assert np.all(found.unstable[within(r, (7e3, 8e3))])
+        assert np.all(result.unstable[within(r, (7e3, 8e3))])
 
 
 def true_background(r, clean, total, level):
-    """The background of a file by the noise-free signal, as the scale is not known exactly."""
+    """Return the background of a file, fitted with the noise-free signal of unknown scale."""
     use = np.arange(r.size) >= 60
     variance = (clean + 10.0**level)[use] / 1000.0
     return line(clean[use], total[use], variance)[0][0]
@@ -122,7 +122,7 @@ def pappalardo(data_root):
 
 
 def test_pappalardo_files_agree_within_their_errors(pappalardo):
-    """Each file against the mean of all others, whose noise is 3.7 times less."""
+    """Compare each file with the mean of all others, whose noise is 3.7 times less."""
     r, counts, setup = pappalardo
     near = within(r, (500.0, 5e3))
     x = np.where(r > 300.0, counts, np.nan)
@@ -130,15 +130,17 @@ def test_pappalardo_files_agree_within_their_errors(pappalardo):
     for k in range(len(x)):
         others = np.delete(x, k, axis=0).mean(axis=0)
         variance = np.maximum(np.nan_to_num(others), 1.0 / (len(x) - 1))
-        one = invert_elastic(x[k], r, **setup, variance=variance)
-        rest = invert_elastic(others, r, **setup, variance=variance / (len(x) - 1))
-        assert np.all(one.valid[near])
-        error = np.hypot(one.backscatter_standard_error, rest.backscatter_standard_error)
-        deviations.append(((one.backscatter - rest.backscatter) / error)[near])
+        single = invert_elastic(x[k], r, **setup, variance=variance)
+        mean_of_others = invert_elastic(others, r, **setup, variance=variance / (len(x) - 1))
+        assert np.all(single.valid[near])
+        error = np.hypot(
+            single.backscatter_standard_error, mean_of_others.backscatter_standard_error
+        )
+        deviations.append(((single.backscatter - mean_of_others.backscatter) / error)[near])
     deviations = np.array(deviations)
     assert np.mean(np.abs(deviations) < 3.0) > 0.994
     assert 0.95 < np.std(deviations) < 1.05
-    # The mean of each file is as good as its own error of the reference allows.
+    # The mean of each file is within the error of its reference.
     assert np.max(np.abs(deviations.mean(axis=1))) < 3.0
 
 

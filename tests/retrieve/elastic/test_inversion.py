@@ -1,4 +1,4 @@
-"""The elastic inversion: the lidar equation by other means, its error budget by perturbation."""
+"""The elastic inversion against the lidar equation, and its error budget against perturbations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def air(r):
 
 
 def particles(r):
-    """Backscatter of a mixed layer with a soft top and of a layer aloft, clean from 6 km on."""
+    """Return backscatter of a mixed layer with a soft top and a layer aloft, clean from 6 km."""
     r = np.asarray(r, dtype=float)
     mixed = 3e-6 / (1.0 + np.exp((r - 1500.0) / 120.0))
     return mixed + 1.2e-6 * np.exp(-0.5 * ((r - 3200.0) / 250.0) ** 2)
@@ -39,8 +39,8 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 def signal(r, lidar_ratio=lambda r: 50.0, constant=1e12, backscatter=particles):
-    """Power by the lidar equation; the optical depth by Gauss quadrature from bin to bin."""
-    # The way to the first bin in small steps too.
+    """Return power by the lidar equation; optical depth by Gauss quadrature from bin to bin."""
+    # Small steps up to the first bin too.
     edges = np.concatenate([np.linspace(0.0, r[0], 40), r[1:]])
     half = np.diff(edges)[:, np.newaxis] / 2.0
     z = edges[:-1, np.newaxis] + half * (1.0 + NODES)
@@ -74,15 +74,17 @@ def noisy_setup(power, r, **changes):
 
 @pytest.mark.parametrize("reference", [CLEAN, (6.5 * KM, 7.5 * KM), (11.0 * KM, 11.9 * KM)])
 def test_closed_loop_on_the_lidar_equation(reference):
-    found = invert_elastic(FINE_POWER, FINE, **air(FINE), lidar_ratio=50.0, reference=reference)
+    result = invert_elastic(FINE_POWER, FINE, **air(FINE), lidar_ratio=50.0, reference=reference)
     total = particles(FINE) + AIR.backscatter(FINE, GREEN)
-    assert np.all(found.valid)
-    assert np.max(np.abs(found.backscatter - particles(FINE)) / total) < 1e-4
-    assert found.lidar_constant == pytest.approx(1e12, rel=1e-4)
-    np.testing.assert_allclose(found.extinction, 50.0 * found.backscatter, rtol=1e-12)
-    np.testing.assert_allclose(found.attenuated_backscatter, FINE_POWER * FINE**2 / 1e12, rtol=1e-4)
+    assert np.all(result.valid)
+    assert np.max(np.abs(result.backscatter - particles(FINE)) / total) < 1e-4
+    assert result.lidar_constant == pytest.approx(1e12, rel=1e-4)
+    np.testing.assert_allclose(result.extinction, 50.0 * result.backscatter, rtol=1e-12)
     np.testing.assert_allclose(
-        found.scattering_ratio, total / AIR.backscatter(FINE, GREEN), rtol=1e-4
+        result.attenuated_backscatter, FINE_POWER * FINE**2 / 1e12, rtol=1e-4
+    )
+    np.testing.assert_allclose(
+        result.scattering_ratio, total / AIR.backscatter(FINE, GREEN), rtol=1e-4
     )
 
 
@@ -91,18 +93,22 @@ def test_closed_loop_with_a_lidar_ratio_that_changes_with_range():
         return 30.0 + 40.0 * np.exp(-(((np.asarray(r) - 3000.0) / 900.0) ** 2))
 
     power = signal(FINE, lidar_ratio)
-    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=lidar_ratio(FINE), reference=CLEAN)
+    result = invert_elastic(
+        power, FINE, **air(FINE), lidar_ratio=lidar_ratio(FINE), reference=CLEAN
+    )
     total = particles(FINE) + AIR.backscatter(FINE, GREEN)
-    assert np.max(np.abs(found.backscatter - particles(FINE)) / total) < 1e-4
-    assert found.lidar_constant == pytest.approx(1e12, rel=1e-4)
+    assert np.max(np.abs(result.backscatter - particles(FINE)) / total) < 1e-4
+    assert result.lidar_constant == pytest.approx(1e12, rel=1e-4)
 
 
 def test_trapezoids_converge_with_the_square_of_the_bin():
     def error(step):
         r = 300.0 + step * np.arange(int(9000 / step))
-        found = invert_elastic(signal(r), r, **air(r), lidar_ratio=50.0, reference=(8000.0, 8200.0))
+        result = invert_elastic(
+            signal(r), r, **air(r), lidar_ratio=50.0, reference=(8000.0, 8200.0)
+        )
         below = r < 5000.0
-        return np.max(np.abs(found.backscatter - particles(r))[below])
+        return np.max(np.abs(result.backscatter - particles(r))[below])
 
     coarse, fine = error(60.0), error(30.0)
     assert 3.0 < coarse / fine < 5.0
@@ -122,7 +128,7 @@ def test_any_signal_obeys_the_differential_equation(start):
         return y * (gradient + 2.0 * (lidar_ratio * y + alpha - lidar_ratio * beta))
 
     total = 1.6 * float(AIR.backscatter(start, GREEN))
-    found = invert_elastic(
+    result = invert_elastic(
         1e6 * np.exp(log_corrected(r)) / r**2,
         r,
         **air(r),
@@ -138,28 +144,28 @@ def test_any_signal_obeys_the_differential_equation(start):
             slope, (start, end), [total], t_eval=at[:: 1 if end > start else -1], rtol=1e-10,
             atol=1e-20,
         )  # fmt: skip
-        mine = np.interp(path.t, r, found.backscatter + AIR.backscatter(r, GREEN))
-        np.testing.assert_allclose(mine, path.y[0], rtol=3e-6)
+        values = np.interp(path.t, r, result.backscatter + AIR.backscatter(r, GREEN))
+        np.testing.assert_allclose(values, path.y[0], rtol=3e-6)
 
 
-def test_scattering_ratio_of_the_window_is_what_is_given():
+def test_scattering_ratio_of_the_window_is_the_given_one():
     inside = (FINE >= 3000.0) & (FINE <= 3400.0)
     ratio = 1.0 + particles(FINE) / AIR.backscatter(FINE, GREEN)
     mean = float(np.mean(ratio[inside]))
-    found = invert_elastic(
+    result = invert_elastic(
         FINE_POWER, FINE, **air(FINE), lidar_ratio=50.0, reference=(3000.0, 3400.0),
         reference_scattering_ratio=mean,
     )  # fmt: skip
-    assert np.mean(found.scattering_ratio[inside]) == pytest.approx(mean, rel=5e-3)
+    assert np.mean(result.scattering_ratio[inside]) == pytest.approx(mean, rel=5e-3)
     total = particles(FINE) + AIR.backscatter(FINE, GREEN)
-    assert np.max(np.abs(found.backscatter - particles(FINE)) / total) < 5e-3
+    assert np.max(np.abs(result.backscatter - particles(FINE)) / total) < 5e-3
 
 
 # The error budget ---------------------------------------------------------------------------
 
 
 def gappy(power):
-    """Two bins without data, one of them in the window."""
+    """Remove two bins, one of them in the window."""
     power = power.copy()
     power[[30, 118]] = np.nan
     return power
@@ -186,33 +192,33 @@ def setup(request):
 
 
 def slopes(function, steps):
-    """Central differences of a function of one number, for numbers of very different size."""
+    """Return central differences of a function of one number for several steps."""
     return np.stack([(function(step) - function(-step)) / (2.0 * step) for step in steps])
 
 
 @pytest.mark.parametrize("spoil", [np.copy, gappy])
-def test_noise_propagates_as_the_jacobian_says(setup, spoil):
+def test_noise_propagates_with_the_jacobian(setup, spoil):
     power = spoil(COARSE_POWER)
     variance = setup["variance"]
-    found = changed(setup, power)
+    result = changed(setup, power)
 
-    def of_bin(i, field):
+    def derivative_to_bin(i, field):
         def perturbed(step):
-            moved = power.copy()
-            moved[i] += step
-            return np.asarray(getattr(changed(setup, moved), field))
+            changed_power = power.copy()
+            changed_power[i] += step
+            return np.asarray(getattr(changed(setup, changed_power), field))
 
         return slopes(perturbed, [1e-4 * COARSE_POWER[i]])[0]
 
     bins = np.flatnonzero(np.isfinite(power))
-    jacobian = np.stack([of_bin(i, "backscatter") for i in bins], axis=-1)
+    jacobian = np.stack([derivative_to_bin(i, "backscatter") for i in bins], axis=-1)
     exact = np.sqrt(np.sum(jacobian**2 * variance[bins], axis=-1))
-    np.testing.assert_allclose(found.budget.noise, exact, rtol=1e-6)
-    np.testing.assert_array_equal(np.isnan(found.budget.noise), np.isnan(power))
+    np.testing.assert_allclose(result.budget.noise, exact, rtol=1e-6)
+    np.testing.assert_array_equal(np.isnan(result.budget.noise), np.isnan(power))
 
-    gradient = np.array([of_bin(i, "lidar_constant") for i in bins])
+    gradient = np.array([derivative_to_bin(i, "lidar_constant") for i in bins])
     exact = np.sqrt(np.sum(gradient**2 * variance[bins]))
-    assert found.lidar_constant_standard_error == pytest.approx(exact, rel=1e-6)
+    assert result.lidar_constant_standard_error == pytest.approx(exact, rel=1e-6)
 
 
 def cause(setup, name, step):
@@ -243,24 +249,24 @@ ERRORS = {
 
 
 @pytest.mark.parametrize("name", ["background", "reference", "lidar_ratio", "molecular"])
-def test_each_cause_propagates_as_differences_say(setup, name):
-    found = changed(setup | ERRORS)
+def test_each_cause_propagates_as_finite_differences(setup, name):
+    result = changed(setup | ERRORS)
 
     def perturbed(step, field):
-        moved, power = cause(setup, name, step)
-        return np.asarray(getattr(changed(moved, power), field))
+        changed_setup, power = cause(setup, name, step)
+        return np.asarray(getattr(changed(changed_setup, power), field))
 
     for field in ("backscatter", "extinction", "scattering_ratio"):
-        part = "budget" if field == "backscatter" else f"{field}_budget"
+        budget = "budget" if field == "backscatter" else f"{field}_budget"
         exact = slopes(lambda step, field=field: perturbed(step, field), [1e-4])[0]
         size = np.max(np.abs(exact))
         np.testing.assert_allclose(
-            getattr(getattr(found, part), name), exact, rtol=1e-5, atol=1e-8 * size
+            getattr(getattr(result, budget), name), exact, rtol=1e-5, atol=1e-8 * size
         )
 
 
 def test_errors_of_the_lidar_constant_add_up_to_those_of_its_causes(setup):
-    found = changed(setup | ERRORS)
+    result = changed(setup | ERRORS)
     alone = changed(setup).lidar_constant_standard_error
     square = float(alone) ** 2
     for name in ("background", "reference", "lidar_ratio", "molecular"):
@@ -273,12 +279,12 @@ def test_errors_of_the_lidar_constant_add_up_to_those_of_its_causes(setup):
             )[0]
             ** 2
         )
-    assert found.lidar_constant_standard_error == pytest.approx(np.sqrt(square), rel=1e-5)
+    assert result.lidar_constant_standard_error == pytest.approx(np.sqrt(square), rel=1e-5)
 
 
 def test_attenuated_backscatter_has_the_errors_of_its_factors():
     offset = POWER_OFFSET
-    found = changed(noisy_setup(COARSE_POWER, COARSE, background_standard_error=offset))
+    result = changed(noisy_setup(COARSE_POWER, COARSE, background_standard_error=offset))
     moved = changed(noisy_setup(COARSE_POWER, COARSE), COARSE_POWER + 1e-4 * offset)
     still = changed(noisy_setup(COARSE_POWER, COARSE))
     common = (moved.attenuated_backscatter - still.attenuated_backscatter) / 1e-4
@@ -286,31 +292,37 @@ def test_attenuated_backscatter_has_the_errors_of_its_factors():
     own = 0.02 * still.attenuated_backscatter
     square = own**2 + common**2 + (constant * still.attenuated_backscatter) ** 2
     np.testing.assert_allclose(
-        found.attenuated_backscatter_standard_error, np.sqrt(square), rtol=1e-4
+        result.attenuated_backscatter_standard_error, np.sqrt(square), rtol=1e-4
     )
 
 
 def test_total_is_the_quadrature_of_the_budget_and_unknown_noise_stays_unknown():
-    found = changed(noisy_setup(COARSE_POWER, COARSE) | ERRORS)
-    part = found.budget
-    parts = [part.noise, part.background, part.reference, part.lidar_ratio, part.molecular]
-    np.testing.assert_allclose(part.total, np.sqrt(np.sum(np.square(parts), axis=0)), rtol=1e-14)
-    np.testing.assert_array_equal(found.backscatter_standard_error, part.total)
+    result = changed(noisy_setup(COARSE_POWER, COARSE) | ERRORS)
+    budget = result.budget
+    errors = [
+        budget.noise,
+        budget.background,
+        budget.reference,
+        budget.lidar_ratio,
+        budget.molecular,
+    ]
+    np.testing.assert_allclose(budget.total, np.sqrt(np.sum(np.square(errors), axis=0)), rtol=1e-14)
+    np.testing.assert_array_equal(result.backscatter_standard_error, budget.total)
     unknown = changed({**noisy_setup(COARSE_POWER, COARSE), "variance": None} | ERRORS)
     assert np.all(np.isnan(unknown.budget.total))
     assert np.isnan(unknown.lidar_constant_standard_error)
     assert np.all(np.isnan(unknown.attenuated_backscatter_standard_error))
-    np.testing.assert_array_equal(unknown.budget.reference, part.reference)
-    np.testing.assert_array_equal(unknown.backscatter, found.backscatter)
+    np.testing.assert_array_equal(unknown.budget.reference, budget.reference)
+    np.testing.assert_array_equal(unknown.backscatter, result.backscatter)
 
 
 # Statistics ---------------------------------------------------------------------------------
 
 
 def campaign(count, seed, noise=0.03):
-    """Return noisy powers and settings, with every cause of error drawn anew for each profile.
+    """Return noisy powers, range, truth and settings, with random errors of every cause.
 
-    The truth is what stands in the air of the retrieval plus its errors, and so on.
+    The true air density, lidar ratio and reference are those of the retrieval plus an error.
     """
     rng = np.random.default_rng(seed)
     r = 30.0 * (np.arange(300) + 0.5)[5:]
@@ -321,7 +333,7 @@ def campaign(count, seed, noise=0.03):
         density = 1.0 + 0.01 * drawn[3, k, 0]
         ratio = 50.0 + 4.0 * drawn[2, k, 0]
         beta = density * clear["molecular_backscatter"]
-        # The scattering ratio of the window is 1.05, told with an error of 1 percent.
+        # The stated scattering ratio of the window is 1.05, with an error of 1 percent.
         excess = 1.05 / (1.0 + 0.01 * drawn[1, k, 0]) - 1.0
         total = particles(r) + excess * beta
         extinction = ratio * total + density * clear["molecular_extinction"]
@@ -348,49 +360,49 @@ def campaign(count, seed, noise=0.03):
     return measured, r, truth, setup
 
 
-def coverage(found, truth):
-    deviation = np.abs(found.backscatter - truth) / found.backscatter_standard_error
-    solved = found.valid & (np.isfinite(deviation))
+def coverage(result, truth):
+    deviation = np.abs(result.backscatter - truth) / result.backscatter_standard_error
+    solved = result.valid & (np.isfinite(deviation))
     return np.mean(np.where(solved, deviation <= 1.96, False), axis=0) / np.mean(solved, axis=0)
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.03, 0.15])
 def test_intervals_cover_the_truth(noise):
     measured, r, truth, setup = campaign(1500, 11, noise)
-    found = invert_elastic(measured, r, **setup)
-    assert np.mean(found.valid) > 0.99
-    covered = coverage(found, truth)
+    result = invert_elastic(measured, r, **setup)
+    assert np.mean(result.valid) > 0.99
+    covered = coverage(result, truth)
     assert 0.935 < np.mean(covered) < 0.965
-    # Of single bins, with the scatter of 1500 profiles.
+    # In single bins, with the scatter of 1500 profiles.
     assert np.all((covered > 0.92) & (covered < 0.98))
 
 
 def test_lidar_constants_are_covered_too():
     measured, r, _, setup = campaign(1500, 12)
-    found = invert_elastic(measured, r, **setup)
-    deviation = (found.lidar_constant - 1e12) / found.lidar_constant_standard_error
+    result = invert_elastic(measured, r, **setup)
+    deviation = (result.lidar_constant - 1e12) / result.lidar_constant_standard_error
     assert 0.93 < np.mean(np.abs(deviation) < 1.96) < 0.97
 
 
 def test_monte_carlo_agrees_with_the_first_order_where_errors_are_small():
     measured, r, _, setup = campaign(3, 13, 0.01)
     setup["lidar_ratio_standard_error"] = 1.0
-    found = invert_elastic(measured, r, **setup)
+    result = invert_elastic(measured, r, **setup)
     sampled = monte_carlo(measured, r, **setup, samples=1000, seed=4)
     assert np.all(sampled.solved == 1.0)
     for name in ("noise", "background", "reference", "lidar_ratio", "molecular"):
-        linear, drawn = getattr(found.budget, name), getattr(sampled.budget, name)
+        linear, drawn = getattr(result.budget, name), getattr(sampled.budget, name)
         size = np.max(np.abs(linear))
-        # 1000 samples are good to 2.2 percent.
+        # The error of 1000 samples is 2.2 percent.
         np.testing.assert_allclose(drawn, linear, rtol=0.12, atol=2e-3 * size)
-    np.testing.assert_allclose(sampled.standard_error, found.budget.total, rtol=0.12)
+    np.testing.assert_allclose(sampled.standard_error, result.budget.total, rtol=0.12)
     np.testing.assert_allclose(
-        sampled.lidar_constant_standard_error, found.lidar_constant_standard_error, rtol=0.12
+        sampled.lidar_constant_standard_error, result.lidar_constant_standard_error, rtol=0.12
     )
-    assert np.all(np.abs(sampled.bias) < 0.2 * found.budget.total)
+    assert np.all(np.abs(sampled.bias) < 0.2 * result.budget.total)
 
 
-def test_monte_carlo_repeats_itself_and_knows_no_neighbours():
+def test_monte_carlo_is_reproducible_and_independent_of_other_profiles():
     measured, r, _, setup = campaign(4, 14)
     one = monte_carlo(measured, r, **setup, samples=5, seed=1)
     again = monte_carlo(measured, r, **setup, samples=5, seed=1)
@@ -401,37 +413,37 @@ def test_monte_carlo_repeats_itself_and_knows_no_neighbours():
     assert not np.array_equal(one.standard_error, other.standard_error)
 
 
-# What is withheld, and why ------------------------------------------------------------------
+# Bins without a value -----------------------------------------------------------------------
 
 
-def test_short_gaps_are_bridged_and_nothing_is_told_beyond_long_ones():
+def test_short_gaps_are_bridged_and_long_ones_end_the_solution():
     power = FINE_POWER.copy()
-    short = (FINE > 2000.0) & (FINE < 2000.0 + LONGEST_GAP - 10.0)
-    power[short] = np.nan
-    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
+    short_gap = (FINE > 2000.0) & (FINE < 2000.0 + LONGEST_GAP - 10.0)
+    power[short_gap] = np.nan
+    result = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
     total = particles(FINE) + AIR.backscatter(FINE, GREEN)
-    assert np.array_equal(found.valid, ~short)
-    assert np.nanmax(np.abs(found.backscatter - particles(FINE)) / total) < 5e-4
+    assert np.array_equal(result.valid, ~short_gap)
+    assert np.nanmax(np.abs(result.backscatter - particles(FINE)) / total) < 5e-4
 
-    long = (FINE > 2000.0) & (FINE < 2000.0 + LONGEST_GAP + 10.0)
-    power[long] = np.nan
-    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
-    assert np.array_equal(found.valid, ~long & (FINE > 2000.0))
-    assert not np.any(found.unstable)
-    # The calibration stands: what is attenuated needs no inversion.
-    assert np.array_equal(np.isfinite(found.attenuated_backscatter), ~long)
+    long_gap = (FINE > 2000.0) & (FINE < 2000.0 + LONGEST_GAP + 10.0)
+    power[long_gap] = np.nan
+    result = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
+    assert np.array_equal(result.valid, ~long_gap & (FINE > 2000.0))
+    assert not np.any(result.unstable)
+    # The calibration holds; attenuated backscatter needs no inversion.
+    assert np.array_equal(np.isfinite(result.attenuated_backscatter), ~long_gap)
 
 
 def test_grids_coarser_than_a_gap_have_no_gaps():
     r = 200.0 + 2.0 * LONGEST_GAP * np.arange(40)
-    found = invert_elastic(signal(r), r, **air(r), lidar_ratio=50.0, reference=CLEAN)
-    assert np.all(found.valid)
+    result = invert_elastic(signal(r), r, **air(r), lidar_ratio=50.0, reference=CLEAN)
+    assert np.all(result.valid)
 
 
 def test_profiles_without_data_or_reference_stay_empty():
     power = np.stack([FINE_POWER, np.full_like(FINE_POWER, np.nan), FINE_POWER, -FINE_POWER])
     bottom, top = np.array([8e3, 8e3, np.nan, 8e3]), np.array([9e3, 9e3, np.nan, 9e3])
-    found = invert_elastic(
+    result = invert_elastic(
         power,
         FINE,
         **air(FINE),
@@ -439,16 +451,16 @@ def test_profiles_without_data_or_reference_stay_empty():
         reference=(bottom, top),
         variance=1e-4 * power**2,
     )
-    assert found.calibrated.tolist() == [True, False, False, False]
-    assert np.all(found.valid[0])
-    assert not np.any(found.valid[1:])
+    assert result.calibrated.tolist() == [True, False, False, False]
+    assert np.all(result.valid[0])
+    assert not np.any(result.valid[1:])
     for values in (
-        found.backscatter, found.attenuated_backscatter, found.budget.total, found.extinction,
-        found.attenuated_backscatter_standard_error, found.budget.molecular,
+        result.backscatter, result.attenuated_backscatter, result.budget.total, result.extinction,
+        result.attenuated_backscatter_standard_error, result.budget.molecular,
     ):  # fmt: skip
         assert np.all(np.isnan(values[1:]))
         assert np.all(np.isfinite(values[0]))
-    assert np.all(np.isnan(found.lidar_constant[1:]))
+    assert np.all(np.isnan(result.lidar_constant[1:]))
 
 
 def test_integration_away_from_the_lidar_through_a_cloud_is_withheld():
@@ -459,49 +471,51 @@ def test_integration_away_from_the_lidar_through_a_cloud_is_withheld():
     window = (2200.0, 2400.0)
     mean = 1.0 + float(np.mean(particles(np.linspace(*window)) / AIR.backscatter(2300.0, GREEN)))
     setup = {**air(FINE), "lidar_ratio": 52.0, "reference": window}
-    found = invert_elastic(power, FINE, **setup, reference_scattering_ratio=mean)
-    first = FINE[np.argmax(found.unstable)]
+    result = invert_elastic(power, FINE, **setup, reference_scattering_ratio=mean)
+    first = FINE[np.argmax(result.unstable)]
     # The transmission squared is 0.05 where 2 * 50 sr * beta integrates to 3.
     assert 4950.0 < first < 5100.0
-    assert np.all(found.unstable[first <= FINE])
-    assert np.all(np.isnan(found.backscatter[found.unstable]))
-    assert np.all(found.valid[first > FINE])
+    assert np.all(result.unstable[first <= FINE])
+    assert np.all(np.isnan(result.backscatter[result.unstable]))
+    assert np.all(result.valid[first > FINE])
 
 
-def test_a_reference_of_noise_is_withheld_until_the_signal_decides():
+def test_a_noisy_reference_is_withheld_but_the_near_range_is_not():
     rng = np.random.default_rng(3)
     spread = np.full(FINE.size, FINE_POWER[(FINE > 8e3) & (FINE < 9e3)].mean() * 3.0)
     power = FINE_POWER + spread * rng.standard_normal((300, FINE.size))
-    found = invert_elastic(
+    result = invert_elastic(
         power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN, variance=spread**2
     )
-    # 134 bins of a signal of a third of the noise: the mean is known to a quarter.
+    # 134 bins with a signal of a third of the noise: the error of the mean is a quarter.
     inside = within(FINE, CLEAN)
-    assert np.mean(found.unstable[:, inside]) > 0.5
-    covered = np.abs(found.backscatter - particles(FINE)) <= 1.96 * found.backscatter_standard_error
+    assert np.mean(result.unstable[:, inside]) > 0.5
+    covered = (
+        np.abs(result.backscatter - particles(FINE)) <= 1.96 * result.backscatter_standard_error
+    )
     near = (FINE > 500.0) & (FINE < 2000.0)
-    assert 0.92 < np.mean(covered[:, near][found.valid[:, near]]) < 0.98
+    assert 0.92 < np.mean(covered[:, near][result.valid[:, near]]) < 0.98
 
 
 def test_negative_powers_are_neither_clipped_nor_refused():
     power = FINE_POWER.copy()
     power[-1] *= -1.0
-    found = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
-    air_there = AIR.backscatter(FINE[-1], GREEN)
-    assert found.valid[-1]
-    assert found.backscatter[-1] < -1.9 * air_there
+    result = invert_elastic(power, FINE, **air(FINE), lidar_ratio=50.0, reference=CLEAN)
+    molecular = AIR.backscatter(FINE[-1], GREEN)
+    assert result.valid[-1]
+    assert result.backscatter[-1] < -1.9 * molecular
 
 
 # Shapes and orders --------------------------------------------------------------------------
 
 
-def fields(found):
-    budget = found.budget
+def fields(result):
+    budget = result.budget
     return [
-        found.backscatter, found.attenuated_backscatter, budget.noise, budget.background,
-        budget.lidar_ratio, budget.molecular, budget.reference, found.lidar_constant,
-        found.lidar_constant_standard_error, found.valid, found.unstable,
-        found.attenuated_backscatter_standard_error,
+        result.backscatter, result.attenuated_backscatter, budget.noise, budget.background,
+        budget.lidar_ratio, budget.molecular, budget.reference, result.lidar_constant,
+        result.lidar_constant_standard_error, result.valid, result.unstable,
+        result.attenuated_backscatter_standard_error,
     ]  # fmt: skip
 
 
@@ -519,9 +533,9 @@ def test_batches_do_not_change_a_bit():
                 name: value[cut] if np.ndim(value) == 2 and len(value) == 12 else value
                 for name, value in variant.items()
             }
-            part = invert_elastic(measured[cut], r, **shared)
-            for mine, all_of_them in zip(fields(part), fields(whole), strict=True):
-                np.testing.assert_array_equal(mine, all_of_them[cut])
+            batch = invert_elastic(measured[cut], r, **shared)
+            for values, expected in zip(fields(batch), fields(whole), strict=True):
+                np.testing.assert_array_equal(values, expected[cut])
 
 
 def test_layout_and_order_of_the_arrays_do_not_matter():
@@ -535,9 +549,9 @@ def test_layout_and_order_of_the_arrays_do_not_matter():
     back = fields(
         invert_elastic(np.asfortranarray(measured[:, ::-1]).astype(">f8"), r[::-1], **turned)
     )
-    for mine, in_cube, in_back in zip(whole, cube, back, strict=True):
-        np.testing.assert_array_equal(in_cube.reshape(mine.shape), mine)
-        np.testing.assert_array_equal(in_back[..., ::-1] if mine.ndim == 2 else in_back, mine)
+    for values, in_cube, in_back in zip(whole, cube, back, strict=True):
+        np.testing.assert_array_equal(in_cube.reshape(values.shape), values)
+        np.testing.assert_array_equal(in_back[..., ::-1] if values.ndim == 2 else in_back, values)
     single = invert_elastic(measured[0], r, **setup)
     np.testing.assert_array_equal(single.backscatter, whole[0][0])
     assert single.lidar_constant.shape == ()
@@ -555,17 +569,17 @@ def test_float32_is_solved_in_double_precision():
 def test_windows_can_be_given_as_bins_or_for_each_profile():
     power = np.stack([FINE_POWER, FINE_POWER])
     setup = {**air(FINE), "lidar_ratio": 50.0}
-    one = invert_elastic(power, FINE, **setup, reference=CLEAN)
+    common = invert_elastic(power, FINE, **setup, reference=CLEAN)
     mask = within(FINE, CLEAN)
     np.testing.assert_array_equal(
-        invert_elastic(power, FINE, **setup, reference=mask).backscatter, one.backscatter
+        invert_elastic(power, FINE, **setup, reference=mask).backscatter, common.backscatter
     )
-    two = invert_elastic(
+    individual = invert_elastic(
         power, FINE, **setup, reference=(np.array([8e3, 7e3]), np.array([9e3, 8e3]))
     )
-    np.testing.assert_array_equal(two.backscatter[0], one.backscatter[0])
+    np.testing.assert_array_equal(individual.backscatter[0], common.backscatter[0])
     np.testing.assert_array_equal(
-        two.backscatter[1],
+        individual.backscatter[1],
         invert_elastic(FINE_POWER, FINE, **setup, reference=(7e3, 8e3)).backscatter,
     )
 
@@ -619,31 +633,31 @@ def test_one_sample_is_no_spread():
         monte_carlo(COARSE_POWER, COARSE, **setup, samples=1, seed=0)
 
 
-# Wild bins ----------------------------------------------------------------------------------
+# Outlying bins ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("window", [True, False], ids=["in the window", "elsewhere"])
 @pytest.mark.parametrize("size", [30.0, 1000.0, -1000.0])
-def test_a_bin_that_lies_off_leaves_the_errors_honest(window, size):
+def test_errors_hold_with_an_outlying_bin(window, size):
     rng = np.random.default_rng(31)
     deviation = np.sqrt(1e-4 * FINE_POWER.max() * FINE_POWER / 100.0 + FINE_POWER[-1] ** 2 / 100.0)
     power = FINE_POWER + deviation * rng.normal(size=(200, FINE.size))
-    given = {
+    setup = {
         **air(FINE), "lidar_ratio": 50.0, "reference": CLEAN, "variance": deviation**2,
         "reference_relative_error": 0.01,
     }  # fmt: skip
-    clean = invert_elastic(power, FINE, **given)
+    clean = invert_elastic(power, FINE, **setup)
     assert not clean.outlying.any()
     bins = np.flatnonzero(within(FINE, CLEAN) if window else (FINE > KM) & (FINE < 7.5 * KM))
     at = rng.choice(bins, 200)
-    wild = power.copy()
-    wild[np.arange(200), at] += size * deviation[at]
-    found = invert_elastic(wild, FINE, **given)
-    assert found.outlying[np.arange(200), at].all()
-    assert found.outlying.sum() == 200
-    assert np.array_equal(found.valid, clean.valid)
-    off = (found.backscatter - particles(FINE)) / found.backscatter_standard_error
-    assert np.mean(np.abs(off[found.valid]) > 4.0) < 1e-3
-    # Without a variance, nobody knows what noise explains.
-    blind = invert_elastic(wild, FINE, **{**given, "variance": None})
-    assert not blind.outlying.any()
+    with_outliers = power.copy()
+    with_outliers[np.arange(200), at] += size * deviation[at]
+    result = invert_elastic(with_outliers, FINE, **setup)
+    assert result.outlying[np.arange(200), at].all()
+    assert result.outlying.sum() == 200
+    assert np.array_equal(result.valid, clean.valid)
+    deviation_in_errors = (result.backscatter - particles(FINE)) / result.backscatter_standard_error
+    assert np.mean(np.abs(deviation_in_errors[result.valid]) > 4.0) < 1e-3
+    # Without a variance, no bin is tested.
+    without_variance = invert_elastic(with_outliers, FINE, **{**setup, "variance": None})
+    assert not without_variance.outlying.any()

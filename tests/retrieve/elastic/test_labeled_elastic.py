@@ -1,4 +1,4 @@
-"""The elastic inversion of mean profiles: a simulated truth comes back within its errors."""
+"""The elastic retrieval of mean profiles returns a simulated truth within its errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BRIGHT = 3e12
 SKY = 0.5
 """MHz."""
 EXPOSURE = 9000.0
-"""Counts a MHz: 10 minutes at 30 Hz and 7.5 m."""
+"""Counts per MHz: 10 minutes at 30 Hz and 7.5 m."""
 BITS = {bit: np.int32(bit) for bit in Quality}
 distance = 7.5 * (np.arange(1600) + 0.5)
 
@@ -37,7 +37,7 @@ def particles(altitude):
 
 
 def light(r, *, zenith=0.0, backscatter=particles, ratio=LIDAR_RATIO, constant=BRIGHT, air=AIR):
-    """Power in MHz without sky; the optical depth by Gauss quadrature from bin to bin."""
+    """Return the power in MHz without sky; optical depth by Gauss quadrature from bin to bin."""
     climb = np.cos(np.deg2rad(zenith))
     nodes, weights = np.polynomial.legendre.leggauss(6)
     edges = np.concatenate([np.linspace(0.0, r[0], 20), r[1:]])
@@ -69,7 +69,7 @@ def averages(power, variance, r=distance, *, zenith=0.0, quality=None):
 
 
 def counted(signal, draws=1, *, seed=0, r=distance, exposure=EXPOSURE, **changes):
-    """Poisson noise over a sky."""
+    """Return averages with a sky background and Poisson noise."""
     rng = np.random.default_rng(seed)
     rate = signal + SKY
     power = rng.poisson(np.broadcast_to(rate * exposure, (draws, rate.size))) / exposure
@@ -93,8 +93,8 @@ def noiseless(signal, r=distance, **changes):
     return averages(signal + SKY, 1e-8 * (signal + SKY) / EXPOSURE, r, **changes)
 
 
-def has(found, bit):
-    return (found["quality_flag"].to_numpy() & BITS[bit]) != 0
+def has(retrieved, bit):
+    return (retrieved["quality_flag"].to_numpy() & BITS[bit]) != 0
 
 
 def between(low, high, r=distance):
@@ -116,21 +116,21 @@ def many():
 
 
 def test_noise_free_profiles_give_the_truth():
-    found = solved(noiseless(truth()))
+    retrieved = solved(noiseless(truth()))
     inside = between(200.0, 4500.0)
     true = particles(STATION + distance)
     np.testing.assert_allclose(
-        found["backscatter"].to_numpy()[0, inside], true[inside], atol=2e-3 * true.max()
+        retrieved["backscatter"].to_numpy()[0, inside], true[inside], atol=2e-3 * true.max()
     )
-    assert float(found["background"][0]) == pytest.approx(SKY, abs=1e-6)
-    assert not found["quality_flag"].to_numpy()[0, inside].any()
+    assert float(retrieved["background"][0]) == pytest.approx(SKY, abs=1e-6)
+    assert not retrieved["quality_flag"].to_numpy()[0, inside].any()
     air = AIR.backscatter(STATION + distance, GREEN)
-    np.testing.assert_allclose(found["molecular_backscatter"], air, rtol=1e-12)
+    np.testing.assert_allclose(retrieved["molecular_backscatter"], air, rtol=1e-12)
     np.testing.assert_allclose(
-        found["molecular_extinction"], AIR.extinction(STATION + distance, GREEN), rtol=1e-12
+        retrieved["molecular_extinction"], AIR.extinction(STATION + distance, GREEN), rtol=1e-12
     )
     np.testing.assert_allclose(
-        found["attenuated_backscatter"].to_numpy()[0, inside],
+        retrieved["attenuated_backscatter"].to_numpy()[0, inside],
         (truth() * distance**2 / BRIGHT)[inside],
         rtol=5e-3,
     )
@@ -146,32 +146,36 @@ def test_noise_free_profiles_give_the_truth():
 )
 @pytest.mark.parametrize("edges", [(300, 1000), (1000, 2000), (2000, 4000), (4000, 6000)])
 def test_noisy_profiles_scatter_as_stated(name, true, edges):
-    found = many()
-    score = (found[name] - true(STATION + distance)) / found[f"{name}_standard_error"]
-    score = score.where(found["quality_flag"] == 0).to_numpy()[:, between(*edges)]
+    retrieved = many()
+    score = (retrieved[name] - true(STATION + distance)) / retrieved[f"{name}_standard_error"]
+    score = score.where(retrieved["quality_flag"] == 0).to_numpy()[:, between(*edges)]
     assert np.isfinite(score).mean() > 0.95
     # Errors allow for particles in the reference window, of which this truth has none.
     assert 0.5 < np.sqrt(np.nanmean(score**2)) < 1.15
     assert abs(np.nanmean(score)) < 0.25
 
 
-def from_noise(found):
+def from_noise(retrieved):
     """Deviation of the backscatter from the truth in standard errors of noise and background."""
-    error = np.hypot(found["backscatter_error_noise"], found["backscatter_error_background"])
-    score = (found["backscatter"] - particles(STATION + distance)) / error
-    return score.where(found["quality_flag"] == 0).to_numpy()
+    error = np.hypot(
+        retrieved["backscatter_error_noise"], retrieved["backscatter_error_background"]
+    )
+    score = (retrieved["backscatter"] - particles(STATION + distance)) / error
+    return score.where(retrieved["quality_flag"] == 0).to_numpy()
 
 
-def test_a_background_that_is_not_known_moves_the_far_range():
-    found = many()
+def test_the_error_of_the_background_moves_the_far_range():
+    retrieved = many()
     at = int(np.searchsorted(distance, 10_000.0))
-    error = found["backscatter_error_background"][:, at] / found["molecular_backscatter"][at]
-    expected = found["background_standard_error"] / truth()[at]
-    # Less what the same error does to the calibration, where the signal is five times as large.
+    error = (
+        retrieved["backscatter_error_background"][:, at] / retrieved["molecular_backscatter"][at]
+    )
+    expected = retrieved["background_standard_error"] / truth()[at]
+    # Minus its effect on the calibration, where the signal is five times as large.
     assert float(np.abs(error / expected).median()) == pytest.approx(0.8, abs=0.15)
 
 
-def test_particles_that_noise_hides_in_the_window_are_allowed_for():
+def test_the_reference_error_covers_particles_hidden_by_noise():
     error = np.abs(many()["backscatter_error_reference"].to_numpy())[:, between(300, 1000)]
     assert (error > 0).all()
 
@@ -185,26 +189,30 @@ def test_noise_and_background_make_the_scatter(edges):
 
 
 def test_the_background_scatters_as_stated():
-    found = many()
-    score = (found["background"] - SKY) / found["background_standard_error"]
+    retrieved = many()
+    score = (retrieved["background"] - SKY) / retrieved["background_standard_error"]
     assert abs(float(score.mean())) < 0.35
     assert 0.8 < float(score.std()) < 1.25
 
 
-def test_quantities_are_those_that_their_names_say():
-    found = many().isel(time=slice(5)).where(lambda f: f["quality_flag"] == 0)
-    np.testing.assert_allclose(found["extinction"], LIDAR_RATIO * found["backscatter"], rtol=1e-12)
+def test_derived_quantities_follow_from_the_backscatter():
+    retrieved = many().isel(time=slice(5)).where(lambda f: f["quality_flag"] == 0)
     np.testing.assert_allclose(
-        found["scattering_ratio"],
-        1.0 + found["backscatter"] / found["molecular_backscatter"],
+        retrieved["extinction"], LIDAR_RATIO * retrieved["backscatter"], rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        retrieved["scattering_ratio"],
+        1.0 + retrieved["backscatter"] / retrieved["molecular_backscatter"],
         rtol=1e-12,
     )
     causes = ("noise", "background", "reference", "lidar_ratio", "molecular")
-    squares = sum(found[f"backscatter_error_{cause}"] ** 2 for cause in causes)
-    np.testing.assert_allclose(found["backscatter_standard_error"], np.sqrt(squares), rtol=1e-12)
+    squares = sum(retrieved[f"backscatter_error_{cause}"] ** 2 for cause in causes)
+    np.testing.assert_allclose(
+        retrieved["backscatter_standard_error"], np.sqrt(squares), rtol=1e-12
+    )
 
 
-def test_each_error_of_the_budget_is_what_its_cause_does():
+def test_each_error_of_the_budget_is_the_effect_of_its_cause():
     """One cause off by one standard error moves the backscatter by the stated error."""
     signal, inside = noiseless(truth()), between(300.0, 2000.0)
     stated = solved(
@@ -225,7 +233,7 @@ def test_each_error_of_the_budget_is_what_its_cause_does():
         np.testing.assert_allclose(moved, error, rtol=0.06, atol=2e-10, err_msg=cause)
 
 
-def test_a_slanted_beam_sees_what_a_vertical_one_sees():
+def test_a_slant_beam_gives_the_profile_of_a_vertical_one():
     climb = np.cos(np.deg2rad(30.0))
     slanted = distance / climb
     vertical = solved(noiseless(truth()))
@@ -249,7 +257,7 @@ def test_a_profile_does_not_depend_on_its_neighbours():
         xr.testing.assert_identical(solved(data.isel(time=[k])), together.isel(time=[k]))
 
 
-# What speaks against values --------------------------------------------------------------------
+# Quality flags ---------------------------------------------------------------------------------
 
 
 def cloud(height, strength, width=60.0):
@@ -259,61 +267,61 @@ def cloud(height, strength, width=60.0):
     return backscatter
 
 
-def test_a_cloud_below_the_reference_is_flagged_with_all_that_rests_on_it():
+def test_a_cloud_below_the_reference_is_flagged_with_all_bins_below_it():
     signal = light(distance, backscatter=cloud(3500.0 + STATION, 2e-5))
-    found = solved(counted(signal, 20, exposure=100 * EXPOSURE))
-    base = found["cloud_base_range"].to_numpy()
+    retrieved = solved(counted(signal, 20, exposure=100 * EXPOSURE))
+    base = retrieved["cloud_base_range"].to_numpy()
     assert np.all((base > 3250.0) & (base < 3500.0))
-    bottom = found["reference_bottom"].to_numpy()
+    bottom = retrieved["reference_bottom"].to_numpy()
     assert np.all(bottom >= 5000.0)
-    flagged = has(found, Quality.CLOUD)
-    # The inversion comes from above: what lies below the cloud rests on its lidar ratio.
+    flagged = has(retrieved, Quality.CLOUD)
+    # The inversion starts above: values below the cloud depend on its lidar ratio.
     assert flagged[:, distance < 3550.0].all()
     assert not flagged[:, between(5000.0, 9000.0)].any()
 
 
-def test_a_cloud_above_the_reference_flags_what_lies_behind_it():
+def test_a_cloud_above_the_reference_flags_the_bins_beyond_it():
     signal = light(distance, backscatter=cloud(8000.0 + STATION, 2e-5))
     window = Reference(5000.0, 7500.0, 1000.0, 1.0, 0.0)
-    found = solved(counted(signal, 10, exposure=100 * EXPOSURE), reference=window)
-    flagged = has(found, Quality.CLOUD)
-    assert np.all(np.isfinite(found["reference_bottom"]))
+    retrieved = solved(counted(signal, 10, exposure=100 * EXPOSURE), reference=window)
+    flagged = has(retrieved, Quality.CLOUD)
+    assert np.all(np.isfinite(retrieved["reference_bottom"]))
     assert flagged[:, distance > 8100.0].all()
     assert not flagged[:, distance < 7700.0].any()
     inside = between(300.0, 2000.0)
     true = particles(STATION + distance)[inside]
-    apart = (found["backscatter"].to_numpy()[:, inside] - true).mean(axis=0)
-    assert np.abs(apart).max() < 0.05 * true.max()
+    deviation = (retrieved["backscatter"].to_numpy()[:, inside] - true).mean(axis=0)
+    assert np.abs(deviation).max() < 0.05 * true.max()
 
 
-def test_behind_either_of_two_clouds_values_are_flagged():
+def test_values_beyond_either_of_two_clouds_are_flagged():
     def both(z):
         upper = cloud(9000.0 + STATION, 2e-5)(z) - particles(z)
         return cloud(3500.0 + STATION, 1e-5)(z) + upper
 
     window = Reference(5000.0, 8200.0, 1000.0, 1.0, 0.0)
-    found = solved(counted(light(distance, backscatter=both), 5), reference=window)
-    assert np.all(found["cloud_base_range"] < 3600.0)
-    assert np.all(np.isfinite(found["reference_bottom"]))
-    flagged = has(found, Quality.CLOUD)
+    retrieved = solved(counted(light(distance, backscatter=both), 5), reference=window)
+    assert np.all(retrieved["cloud_base_range"] < 3600.0)
+    assert np.all(np.isfinite(retrieved["reference_bottom"]))
+    flagged = has(retrieved, Quality.CLOUD)
     assert flagged[:, distance < 3550.0].all()
     assert not flagged[:, between(5000.0, 8200.0)].any()
     assert flagged[:, distance > 9100.0].all()
 
 
-def test_a_cirrus_costs_no_profile():
-    """The background is found beyond a cloud as well as below it."""
+def test_a_profile_with_cirrus_is_retrieved():
+    """The background is fitted beyond the cloud."""
     signal = light(distance, backscatter=cloud(9000.0 + STATION, 2e-5))
     window = Reference(5000.0, 8200.0, 1000.0, 1.0, 0.0)
-    found = solved(counted(signal, 20, exposure=100 * EXPOSURE), reference=window)
-    assert np.isfinite(found["reference_bottom"]).all()
-    score = (found["background"] - SKY) / found["background_standard_error"]
+    retrieved = solved(counted(signal, 20, exposure=100 * EXPOSURE), reference=window)
+    assert np.isfinite(retrieved["reference_bottom"]).all()
+    score = (retrieved["background"] - SKY) / retrieved["background_standard_error"]
     assert float(np.abs(score).max()) < 4.0
-    assert np.sqrt(np.nanmean(from_noise(found)[:, between(300.0, 2000.0)] ** 2)) < 2.0
+    assert np.sqrt(np.nanmean(from_noise(retrieved)[:, between(300.0, 2000.0)] ** 2)) < 2.0
 
 
 def test_no_reference_window_holds_a_cloud():
-    """Clouds everywhere in the permitted range but one gap."""
+    """Two clouds in the search range leave gaps between them."""
 
     def broken(z):
         return particles(z) + 2e-5 * sum(
@@ -321,58 +329,60 @@ def test_no_reference_window_holds_a_cloud():
         )
 
     signal = light(distance, backscatter=broken)
-    found = solved(counted(signal, 10, exposure=300 * EXPOSURE))
-    bottom, top = (found[f"reference_{end}"].to_numpy() for end in ("bottom", "top"))
+    retrieved = solved(counted(signal, 10, exposure=300 * EXPOSURE))
+    bottom, top = (retrieved[f"reference_{end}"].to_numpy() for end in ("bottom", "top"))
     chosen = np.isfinite(bottom)
     assert chosen.any()
     for height in (5400.0, 7000.0):
         assert not np.any((bottom < height) & (top > height))
 
 
-def test_behind_an_opaque_cloud_there_is_no_reference():
+def test_an_opaque_cloud_leaves_no_reference():
     signal = light(distance, backscatter=cloud(2500.0, 2e-3, 100.0))
-    found = solved(counted(signal, 10))
-    assert has(found, Quality.NO_REFERENCE).all()
-    assert has(found, Quality.CLOUD)[:, between(2500.0, 12_000.0)].all()
-    assert np.isnan(found["backscatter"]).all()
+    retrieved = solved(counted(signal, 10))
+    assert has(retrieved, Quality.NO_REFERENCE).all()
+    assert has(retrieved, Quality.CLOUD)[:, between(2500.0, 12_000.0)].all()
+    assert np.isnan(retrieved["backscatter"]).all()
     for end in ("reference_bottom", "reference_top"):
-        assert np.isnan(found[end]).all()
+        assert np.isnan(retrieved[end]).all()
 
 
 def test_aerosol_in_the_far_range_makes_the_background_uncertain():
     def aloft(z):
         return particles(z) + 3e-7 * np.exp(-0.5 * ((z - 9500.0) / 800.0) ** 2)
 
-    found = solved(counted(light(distance, backscatter=aloft), 10, exposure=300 * EXPOSURE))
-    assert has(found, Quality.BACKGROUND_UNCERTAIN).mean() > 0.9
+    retrieved = solved(counted(light(distance, backscatter=aloft), 10, exposure=300 * EXPOSURE))
+    assert has(retrieved, Quality.BACKGROUND_UNCERTAIN).mean() > 0.9
     clean = solved(counted(truth(), 50, exposure=EXPOSURE, seed=9))
     assert has(clean, Quality.BACKGROUND_UNCERTAIN).mean() < 0.05
 
 
 class TestTailMean:
-    def test_it_takes_the_light_of_air_for_background(self):
+    def test_the_signal_of_air_biases_the_background(self):
         data = counted(truth(), 50, seed=4)
         tail, shape = solved(data, known_shape=False), solved(data)
-        left = truth()[-160:].mean()
-        above = float(tail["background"].mean()) - SKY
-        assert above == pytest.approx(left, rel=0.1)
-        assert abs(float(shape["background"].mean()) - SKY) < 0.1 * left
+        signal_of_air = truth()[-160:].mean()
+        excess = float(tail["background"].mean()) - SKY
+        assert excess == pytest.approx(signal_of_air, rel=0.1)
+        assert abs(float(shape["background"].mean()) - SKY) < 0.1 * signal_of_air
 
-    def test_values_that_it_biases_are_flagged(self):
-        found = solved(counted(truth(), 100, seed=4), known_shape=False)
-        score = (found["backscatter"] - particles(STATION + distance)) / found[
+    def test_biased_values_are_flagged(self):
+        retrieved = solved(counted(truth(), 100, seed=4), known_shape=False)
+        score = (retrieved["backscatter"] - particles(STATION + distance)) / retrieved[
             "backscatter_standard_error"
         ]
-        unflagged = score.where(found["quality_flag"] == 0).to_numpy()[:, between(300.0, 2000.0)]
-        some = unflagged[np.isfinite(unflagged)]
-        assert some.size == 0 or np.mean(np.abs(some) < 3.0) > 0.9
+        unflagged = score.where(retrieved["quality_flag"] == 0).to_numpy()[
+            :, between(300.0, 2000.0)
+        ]
+        finite = unflagged[np.isfinite(unflagged)]
+        assert finite.size == 0 or np.mean(np.abs(finite) < 3.0) > 0.9
 
 
 class TestOverlap:
     at = np.where(distance < 150.0, np.nan, np.clip(distance / 800.0, 0.0, 1.0) ** 2)
     seen = np.where(np.isnan(at), 0.0, at)
 
-    def test_a_given_function_frees_the_near_range_of_bias(self):
+    def test_dividing_by_the_overlap_removes_the_bias_of_the_near_range(self):
         data = noiseless(truth() * self.seen)
         corrected = solved(data, overlap=self.at)
         plain = solved(data)
@@ -380,32 +390,32 @@ class TestOverlap:
         np.testing.assert_allclose(
             corrected["backscatter"].to_numpy()[0, inside], true[inside], rtol=4e-3
         )
-        missed = np.abs(plain["backscatter"].to_numpy()[0, inside] / true[inside] - 1.0)
-        assert not (missed < 0.1).any()
+        bias = np.abs(plain["backscatter"].to_numpy()[0, inside] / true[inside] - 1.0)
+        assert not (bias < 0.1).any()
 
     def test_bins_without_overlap_are_flagged_and_withheld(self):
-        found = solved(noiseless(truth() * self.seen), overlap=self.at)
+        retrieved = solved(noiseless(truth() * self.seen), overlap=self.at)
         near = distance < 150.0
-        np.testing.assert_array_equal(has(found, Quality.INCOMPLETE_OVERLAP)[0], near)
-        assert np.isnan(found["backscatter"].to_numpy()[0, near]).all()
+        np.testing.assert_array_equal(has(retrieved, Quality.INCOMPLETE_OVERLAP)[0], near)
+        assert np.isnan(retrieved["backscatter"].to_numpy()[0, near]).all()
 
     def test_noise_grows_as_the_signal_is_divided(self):
-        # So little overlap that a bin's own noise exceeds that of the reference.
+        # The overlap is so small that the noise of a bin exceeds that of the reference.
         at = np.clip(distance / 800.0, 0.0, 1.0) ** 6
-        found = solved(counted(truth() * at, 200, seed=5), overlap=at)
-        near = from_noise(found)[:, between(180.0, 240.0)]
+        retrieved = solved(counted(truth() * at, 200, seed=5), overlap=at)
+        near = from_noise(retrieved)[:, between(180.0, 240.0)]
         assert 0.9 < np.sqrt(np.mean(near**2)) < 1.1
 
-    def test_bins_behind_the_lidar_shift_nothing(self):
+    def test_bins_at_negative_ranges_change_nothing(self):
         whole = noiseless(truth() * self.seen)
         longer = 7.5 * (np.arange(-8, 1600) + 0.5)
         power = np.concatenate([np.full(8, 1e3), whole["power"].to_numpy()[0]])
         variance = np.concatenate([np.ones(8), whole["variance"].to_numpy()[0]])
         at = np.concatenate([np.full(8, np.nan), self.at])
-        found = solved(averages(power, variance, longer), overlap=at)
+        retrieved = solved(averages(power, variance, longer), overlap=at)
         expected = solved(whole, overlap=self.at)
-        np.testing.assert_array_equal(found["range"], distance)
-        np.testing.assert_array_equal(found["backscatter"], expected["backscatter"])
+        np.testing.assert_array_equal(retrieved["range"], distance)
+        np.testing.assert_array_equal(retrieved["backscatter"], expected["backscatter"])
 
 
 BINS = [
@@ -422,19 +432,19 @@ BINS = [
 ]
 
 
-def assert_missing_is_flagged(found):
-    judged = found["quality_flag"].to_numpy()
+def assert_missing_is_flagged(retrieved):
+    flags = retrieved["quality_flag"].to_numpy()
     for name in BINS:
-        values = found[name].to_numpy()
+        values = retrieved[name].to_numpy()
         assert not np.isinf(values).any(), name
-        assert (judged[np.isnan(values)] != 0).all(), name
-    rejected = (judged & int(Quality.NO_REFERENCE | labeled._WITHHELD)) != 0
-    assert np.isnan(found["backscatter"].to_numpy()[rejected]).all()
-    assert not (judged & ~np.int32(FLAGS)).any()
+        assert (flags[np.isnan(values)] != 0).all(), name
+    rejected = (flags & int(Quality.NO_REFERENCE | labeled._WITHHELD)) != 0
+    assert np.isnan(retrieved["backscatter"].to_numpy()[rejected]).all()
+    assert not (flags & ~np.int32(FLAGS)).any()
 
 
 def messy(seed=0):
-    """Profiles with all that can be wrong of them, and the bits that tell it."""
+    """Return profiles with every kind of fault, each marked in ``quality``."""
     data = counted(truth(), 12, seed=seed)
     power, quality = data["power"].to_numpy(), data["quality"].to_numpy()
 
@@ -460,77 +470,77 @@ def messy(seed=0):
 @pytest.mark.parametrize("known_shape", [True, False])
 @pytest.mark.parametrize("seed", range(3))
 def test_every_missing_value_carries_a_bit(known_shape, seed):
-    found = solved(messy(seed), known_shape=known_shape)
-    assert_missing_is_flagged(found)
+    retrieved = solved(messy(seed), known_shape=known_shape)
+    assert_missing_is_flagged(retrieved)
     both = BITS[Quality.INPUT_MISSING] | BITS[Quality.NO_REFERENCE]
-    assert ((found["quality_flag"].to_numpy()[0] & both) == both).all()
+    assert ((retrieved["quality_flag"].to_numpy()[0] & both) == both).all()
     for k in (4, 8, 9, 10):
-        assert has(found, Quality.NO_REFERENCE)[k].all()
-    # What is withheld for a cause of its own is not unstable too.
-    assert has(found, Quality.SATURATED)[1, :40].all()
-    assert not has(found, Quality.UNSTABLE_INVERSION)[1, :40].any()
-    # A hole of 75 m is bridged, one of 300 m parts the profile from its reference.
-    assert np.isfinite(found["backscatter"][5, 100:290]).all()
-    assert np.isnan(found["backscatter"][6, :300]).all()
-    assert has(found, Quality.UNSTABLE_INVERSION)[6, :300].all()
-    # Of a profile without its last tenth only the fit of a shape finds the background.
-    assert np.isfinite(found["backscatter"][7, 100:1000]).all() == known_shape
+        assert has(retrieved, Quality.NO_REFERENCE)[k].all()
+    # Bins withheld for another reason are not marked as unstable.
+    assert has(retrieved, Quality.SATURATED)[1, :40].all()
+    assert not has(retrieved, Quality.UNSTABLE_INVERSION)[1, :40].any()
+    # The integration continues over a gap of 75 m, and ends at one of 300 m.
+    assert np.isfinite(retrieved["backscatter"][5, 100:290]).all()
+    assert np.isnan(retrieved["backscatter"][6, :300]).all()
+    assert has(retrieved, Quality.UNSTABLE_INVERSION)[6, :300].all()
+    # Without the last tenth of the bins, only the fit of a shape gives a background.
+    assert np.isfinite(retrieved["backscatter"][7, 100:1000]).all() == known_shape
 
 
-def test_nothing_but_missing_profiles_is_no_error():
+def test_a_scene_of_missing_profiles_is_no_error():
     data = counted(truth(), 3)
     data["power"][:] = np.nan
     data["variance"][:] = np.nan
     data["quality"][:] = int(Quality.INPUT_MISSING)
     for known_shape in (True, False):
-        found = solved(data, known_shape=known_shape)
-        assert_missing_is_flagged(found)
-        assert np.isnan(found["backscatter"]).all()
-        assert np.isnan(found["background"]).all()
-        assert np.isnan(found["cloud_base_range"]).all()
+        retrieved = solved(data, known_shape=known_shape)
+        assert_missing_is_flagged(retrieved)
+        assert np.isnan(retrieved["backscatter"]).all()
+        assert np.isnan(retrieved["background"]).all()
+        assert np.isnan(retrieved["cloud_base_range"]).all()
 
 
 def test_every_bit_of_the_product_occurs():
-    seen = np.bitwise_or.reduce(solved(messy())["quality_flag"].to_numpy(), axis=None)
+    bits = np.bitwise_or.reduce(solved(messy())["quality_flag"].to_numpy(), axis=None)
     cloudy = light(distance, backscatter=cloud(3600.0, 2e-5))
-    seen |= np.bitwise_or.reduce(
+    bits |= np.bitwise_or.reduce(
         solved(counted(cloudy, exposure=100 * EXPOSURE))["quality_flag"].to_numpy(), axis=None
     )
     far = light(distance, backscatter=cloud(9500.0, 3e-7, 800.0))
-    seen |= np.bitwise_or.reduce(
+    bits |= np.bitwise_or.reduce(
         solved(counted(far, exposure=300 * EXPOSURE))["quality_flag"].to_numpy(), axis=None
     )
-    wild = counted(light(distance))
-    wild["power"][:, 300] *= 2.0
-    seen |= np.bitwise_or.reduce(solved(wild)["quality_flag"].to_numpy(), axis=None)
-    assert Quality(int(seen)) == FLAGS
+    outlying = counted(light(distance))
+    outlying["power"][:, 300] *= 2.0
+    bits |= np.bitwise_or.reduce(solved(outlying)["quality_flag"].to_numpy(), axis=None)
+    assert Quality(int(bits)) == FLAGS
 
 
 def test_an_inversion_away_from_the_reference_stops_where_it_is_unstable():
-    """Behind a dense layer above the window the denominator dies away."""
+    """Beyond a dense layer above the window the denominator vanishes."""
     signal = light(distance, backscatter=cloud(6900.0, 3e-4, 80.0))
     window = Reference(5000.0, 6500.0, 1000.0, 1.0, 0.0)
-    found = solved(counted(signal, 5, exposure=100 * EXPOSURE), reference=window)
-    assert np.isfinite(found["reference_bottom"]).all()
-    assert has(found, Quality.UNSTABLE_INVERSION)[:, distance > 7100.0].all()
-    assert has(found, Quality.CLOUD)[:, distance > 7100.0].all()
-    assert_missing_is_flagged(found)
+    retrieved = solved(counted(signal, 5, exposure=100 * EXPOSURE), reference=window)
+    assert np.isfinite(retrieved["reference_bottom"]).all()
+    assert has(retrieved, Quality.UNSTABLE_INVERSION)[:, distance > 7100.0].all()
+    assert has(retrieved, Quality.CLOUD)[:, distance > 7100.0].all()
+    assert_missing_is_flagged(retrieved)
 
 
 def test_bins_beyond_the_atmosphere_are_left_out():
     r = 7.5 * (np.arange(16_380) + 0.5)
-    found = solved(noiseless(light(r), r))
-    assert float(found["range"][-1]) < 84_000.0 < float(found["range"][-1]) + STATION + 7.5
-    assert_missing_is_flagged(found)
+    retrieved = solved(noiseless(light(r), r))
+    assert float(retrieved["range"][-1]) < 84_000.0 < float(retrieved["range"][-1]) + STATION + 7.5
+    assert_missing_is_flagged(retrieved)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.999])
-def test_bins_that_end_where_a_window_would_end_are_no_error(fraction):
-    """The farthest window ends with the last bin at the earliest."""
+def test_the_farthest_window_may_end_with_the_last_bin(fraction):
+    """The window ends with the last bin or less than one metre beyond."""
     last = float(distance[-1])
     window = Reference(last - 1000.0 - fraction, last, 1000.0, 1.0, 0.0)
-    found = solved(counted(truth(), 2, exposure=1e3 * EXPOSURE), reference=window)
-    assert found.sizes["time"] == 2
+    retrieved = solved(counted(truth(), 2, exposure=1e3 * EXPOSURE), reference=window)
+    assert retrieved.sizes["time"] == 2
 
 
 def test_a_wavelength_without_air_is_refused_by_name():
@@ -538,8 +548,8 @@ def test_a_wavelength_without_air_is_refused_by_name():
         solved(counted(truth()), wavelength=5.32e-4)
 
 
-def test_a_bin_that_lies_off_is_bridged_and_said_so():
-    """In the far range, which tells the background, in the window, and below it."""
+def test_an_outlying_bin_is_bridged_and_flagged():
+    """In the far range, which determines the background, in the window, and below it."""
     data = counted(light(distance), draws=8, seed=9)
     clean = solved(data)
     places = [300, 1000, 1500]
@@ -547,17 +557,19 @@ def test_a_bin_that_lies_off_is_bridged_and_said_so():
     power = data["power"].to_numpy().copy()
     for at in places:
         power[:, at] += 1000.0 * deviation[:, at]
-    wild = solved(data.assign(power=(data["power"].dims, power)))
-    flagged = (wild["quality_flag"].to_numpy() & BITS[Quality.OUTLIER]) != 0
+    bridged = solved(data.assign(power=(data["power"].dims, power)))
+    flagged = (bridged["quality_flag"].to_numpy() & BITS[Quality.OUTLIER]) != 0
     assert flagged[:, places].all()
     assert flagged.sum() == 8 * len(places)
     assert not ((clean["quality_flag"].to_numpy() & BITS[Quality.OUTLIER]) != 0).any()
     for name in ("background", "reference_bottom"):
         error = clean["background_standard_error"].to_numpy()
-        moved = np.abs(wild[name].to_numpy() - clean[name].to_numpy())
+        moved = np.abs(bridged[name].to_numpy() - clean[name].to_numpy())
         assert np.all(moved <= (2.0 * error if name == "background" else 0.0))
-    both = np.isfinite(clean["backscatter"].to_numpy())
-    assert np.array_equal(np.isfinite(wild["backscatter"].to_numpy()), both)
-    off = wild["backscatter"] - particles(STATION + distance)
-    far = np.abs(off / wild["backscatter_standard_error"]).to_numpy()[both] > 4.0
-    assert far.mean() < 1e-3
+    solved_bins = np.isfinite(clean["backscatter"].to_numpy())
+    assert np.array_equal(np.isfinite(bridged["backscatter"].to_numpy()), solved_bins)
+    deviation = bridged["backscatter"] - particles(STATION + distance)
+    beyond_four_errors = (
+        np.abs(deviation / bridged["backscatter_standard_error"]).to_numpy()[solved_bins] > 4.0
+    )
+    assert beyond_four_errors.mean() < 1e-3

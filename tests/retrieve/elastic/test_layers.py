@@ -1,4 +1,4 @@
-"""Layers: clouds are found where they are, aerosol and noise are not taken for them."""
+"""Clouds are detected where they are; aerosol and noise are not mistaken for them."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ def between(bottom, top):
 
 
 def attenuated(particles, cloud=None, lidar_ratio=50.0):
-    """Power over the constant; the cloud as base, depth (m) and extinction (m-1)."""
+    """Return power over the lidar constant; cloud: base, thickness (m), extinction (m-1)."""
     extinction = EXTINCTION + lidar_ratio * particles
     total = BACKSCATTER + particles
     if cloud is not None:
-        base, depth, its_extinction = cloud
-        inside = np.where(between(base, base + depth), its_extinction, 0.0)
+        base, thickness, cloud_extinction = cloud
+        inside = np.where(between(base, base + thickness), cloud_extinction, 0.0)
         extinction, total = extinction + inside, total + inside / 20.0
-    way = np.cumsum(extinction, axis=-1) * 15.0 - 0.5 * extinction * 15.0
-    return total * np.exp(-2.0 * way) / RANGE**2
+    optical_depth = np.cumsum(extinction, axis=-1) * 15.0 - 0.5 * extinction * 15.0
+    return total * np.exp(-2.0 * optical_depth) / RANGE**2
 
 
 def counted(expected, background, rng):
-    """Photon counts less their background, and their variance."""
+    """Return photon counts minus their background, and their variance."""
     counts = rng.poisson(expected + background)
     return counts - background, np.broadcast_to(expected + background, counts.shape)
 
 
-def found_in(power, variance, **settings):
+def detect(power, variance, **settings):
     return find_layers(power, RANGE, variance, molecular_attenuated=SHAPE, **settings)
 
 
@@ -68,135 +68,135 @@ CLOUDS = {
 
 @pytest.mark.parametrize("cloud", CLOUDS)
 @pytest.mark.parametrize(("scale", "background"), [(1e18, 1.0), (1e18, 100.0), (1e20, 1e3)])
-def test_clear_clouds_are_found_where_they_are(cloud, scale, background):
+def test_clouds_are_detected_where_they_are(cloud, scale, background):
     rng = np.random.default_rng(1)
     base, depth, _ = CLOUDS[cloud]
     power, variance = counted(scale * attenuated(aerosol(200, rng), CLOUDS[cloud]), background, rng)
-    found = found_in(power, variance)
-    assert np.mean(found.cloudy) >= 0.99
-    off = (found.cloud_base_range - base)[found.cloudy]
-    assert np.mean(np.abs(off) <= 30.0) > 0.95
-    # As it appears: never much above the true top, where the air beyond is seen.
-    assert np.median(found.cloud_top_range) <= base + depth + 45.0
+    layers = detect(power, variance)
+    assert np.mean(layers.cloudy) >= 0.99
+    deviation = (layers.cloud_base_range - base)[layers.cloudy]
+    assert np.mean(np.abs(deviation) <= 30.0) > 0.95
+    # The apparent top is never far above the true one.
+    assert np.median(layers.cloud_top_range) <= base + depth + 45.0
     if cloud != "stratus":
-        assert np.median(found.cloud_top_range) >= base + 0.5 * depth
+        assert np.median(layers.cloud_top_range) >= base + 0.5 * depth
     inside = between(base + 30.0, base + 60.0)
-    assert np.mean(found.mask[found.cloudy][:, inside]) > 0.95
-    assert np.all(found.contrast[found.cloudy] > CLOUD_CONTRAST)
+    assert np.mean(layers.mask[layers.cloudy][:, inside]) > 0.95
+    assert np.all(layers.contrast[layers.cloudy] > CLOUD_CONTRAST)
 
 
 @pytest.mark.parametrize(("scale", "background"), [(1e16, 10.0), (1e18, 1.0), (1e20, 1e3)])
 def test_aerosol_is_not_taken_for_cloud(scale, background):
     rng = np.random.default_rng(2)
     power, variance = counted(scale * attenuated(aerosol(3000, rng)), background, rng)
-    found = found_in(power, variance)
-    assert np.mean(found.cloudy) <= 0.01
-    empty = ~found.cloudy
-    assert np.all(np.isnan(found.cloud_base_range[empty]))
-    assert np.all(np.isnan(found.cloud_top_range[empty]))
-    assert not np.any(found.mask[empty])
-    assert not np.any(found.opaque[empty])
+    layers = detect(power, variance)
+    assert np.mean(layers.cloudy) <= 0.01
+    empty = ~layers.cloudy
+    assert np.all(np.isnan(layers.cloud_base_range[empty]))
+    assert np.all(np.isnan(layers.cloud_top_range[empty]))
+    assert not np.any(layers.mask[empty])
+    assert not np.any(layers.opaque[empty])
 
 
 @pytest.mark.parametrize("false_alarm", [0.01, 0.2])
 @pytest.mark.parametrize("contrast", [1.0, 3.0])
-def test_noise_is_not_taken_for_layers_more_often_than_is_stated(contrast, false_alarm):
+def test_noise_makes_layers_at_most_at_the_stated_rate(contrast, false_alarm):
     rng = np.random.default_rng(3)
     spread = np.sqrt(SHAPE * SHAPE[300])
     power = SHAPE + spread * rng.standard_normal((4000, RANGE.size))
-    found = found_in(power, spread**2, contrast=contrast, false_alarm=false_alarm)
-    assert np.mean(found.cloudy) <= false_alarm + 3.0 * np.sqrt(false_alarm / 4000)
+    layers = detect(power, spread**2, contrast=contrast, false_alarm=false_alarm)
+    assert np.mean(layers.cloudy) <= false_alarm + 3.0 * np.sqrt(false_alarm / 4000)
     if contrast == 1.0 and false_alarm == 0.2:
-        # The bound is not so loose that it says nothing.
-        assert np.mean(found.cloudy) > 0.02
+        # The bound is not too loose to be useful.
+        assert np.mean(layers.cloudy) > 0.02
 
 
 def test_power_of_the_test_is_what_gaussian_noise_allows():
-    """A step that exceeds the factor by so many errors is found as often as its tail says."""
+    """A step beyond the factor is detected with the probability of the Gaussian tail."""
     rng = np.random.default_rng(4)
     bins, contrast = 32, 2.0
     ratio = np.where(RANGE > 5000.0, 2.6, 1.0)
     spread = 0.6 * SHAPE
     power = SHAPE * ratio + spread * rng.standard_normal((2000, RANGE.size))
-    found = found_in(power, spread**2, contrast=contrast, scales=bins * 15.0, false_alarm=0.05)
+    layers = detect(power, spread**2, contrast=contrast, scales=bins * 15.0, false_alarm=0.05)
     threshold = stats.norm.isf(0.05 / RANGE.size)
     expected = (2.6 - contrast) / (0.6 * np.sqrt((1.0 + contrast**2) / bins))
     alone = stats.norm.sf(threshold - expected)
-    # Bins beside the step try too.
-    assert alone <= np.mean(found.cloudy) < alone + 0.25
+    # Bins beside the step may detect it too.
+    assert alone <= np.mean(layers.cloudy) < alone + 0.25
 
 
-def test_opaque_clouds_are_told_and_transparent_ones_are_not():
+def test_only_opaque_clouds_are_reported_as_opaque():
     rng = np.random.default_rng(5)
     opaque = attenuated(aerosol(100, rng), (2000.0, 400.0, 2e-2))
     clear = attenuated(aerosol(100, rng), (9000.0, 1000.0, 1e-4))
-    assert np.mean(found_in(*counted(1e18 * opaque, 20.0, rng)).opaque) > 0.97
-    assert not np.any(found_in(*counted(1e18 * clear, 20.0, rng)).opaque)
+    assert np.mean(detect(*counted(1e18 * opaque, 20.0, rng)).opaque) > 0.97
+    assert not np.any(detect(*counted(1e18 * clear, 20.0, rng)).opaque)
 
 
-def test_all_layers_are_masked_and_the_lowest_is_told():
+def test_all_layers_are_masked_and_the_lowest_is_reported():
     particles = np.zeros(RANGE.size)
     power = 1e18 * attenuated(particles, (3000.0, 200.0, 1e-3))
     second = (RANGE >= 8000.0) & (RANGE < 8500.0)
     power[second] *= 10.0
-    found = found_in(power, power)
-    assert found.cloud_base_range == pytest.approx(3000.0, abs=16.0)
-    assert found.cloud_top_range == pytest.approx(3200.0, abs=31.0)
-    assert np.all(found.mask[second])
-    assert not np.any(found.mask[(RANGE > 3300.0) & (RANGE < 7900.0)])
-    assert not found.opaque
+    layers = detect(power, power)
+    assert layers.cloud_base_range == pytest.approx(3000.0, abs=16.0)
+    assert layers.cloud_top_range == pytest.approx(3200.0, abs=31.0)
+    assert np.all(layers.mask[second])
+    assert not np.any(layers.mask[(RANGE > 3300.0) & (RANGE < 7900.0)])
+    assert not layers.opaque
 
 
-def test_noise_free_profiles_are_screened_too():
-    found = found_in(attenuated(aerosol(1, np.random.default_rng(0))[0]), 0.0)
-    assert not found.cloudy
-    assert not found.opaque
-    found = found_in(attenuated(np.zeros(RANGE.size), (4000.0, 300.0, 1e-3)), 0.0)
-    assert found.cloudy
-    assert not found.opaque
+def test_noise_free_profiles_are_tested_too():
+    layers = detect(attenuated(aerosol(1, np.random.default_rng(0))[0]), 0.0)
+    assert not layers.cloudy
+    assert not layers.opaque
+    layers = detect(attenuated(np.zeros(RANGE.size), (4000.0, 300.0, 1e-3)), 0.0)
+    assert layers.cloudy
+    assert not layers.opaque
 
 
 def test_air_without_noise_has_no_layers_however_sensitive_the_test():
     r = 7.5 * (np.arange(10_000) + 0.5)[20:]
     extinction = AIR.extinction(r, 532e-9)
     shape = AIR.backscatter(r, 532e-9) * np.exp(-15.0 * np.cumsum(extinction)) / r**2
-    found = find_layers(1e9 * shape, r, 0.0, molecular_attenuated=shape, contrast=1.0)
-    assert not found.cloudy
+    layers = find_layers(1e9 * shape, r, 0.0, molecular_attenuated=shape, contrast=1.0)
+    assert not layers.cloudy
 
 
 def test_clouds_are_kept_out_of_the_reference():
     rng = np.random.default_rng(6)
     true = attenuated(aerosol(100, rng), (7000.0, 600.0, 2e-4))
     power, variance = counted(1e18 * true, 5.0, rng)
-    layers = found_in(power, variance)
+    layers = detect(power, variance)
     window = choose_reference(
         power, RANGE, variance, molecular_attenuated=SHAPE, exclude=layers.mask,
         candidates=candidate_windows(5e3, 12e3, 1e3, 250.0),
     )  # fmt: skip
     within = (window.top > 7015.0) & (window.bottom < 7500.0)
     assert not np.any(within)
-    barred = (window.rejections & Rejection.EXCLUDED) != 0
-    assert np.all(np.any(barred, axis=-1))
+    excluded = (window.rejections & Rejection.EXCLUDED) != 0
+    assert np.all(np.any(excluded, axis=-1))
 
 
-def test_missing_data_hide_layers_and_invent_none():
+def test_missing_data_hide_layers_and_make_none():
     rng = np.random.default_rng(7)
     power, variance = counted(1e18 * attenuated(np.zeros(RANGE.size), CLOUDS["cirrus"]), 1.0, rng)
     power = np.stack([power, power, power]).astype(float)
     power[0] = np.nan
     power[1, (RANGE > 5000.0) & (RANGE < 5200.0)] = np.nan
     power[2, RANGE > 8000.0] = np.nan
-    found = found_in(power, variance)
-    assert found.cloudy.tolist() == [False, True, False]
-    assert found.cloud_base_range[1] == pytest.approx(9000.0, abs=16.0)
+    layers = detect(power, variance)
+    assert layers.cloudy.tolist() == [False, True, False]
+    assert layers.cloud_base_range[1] == pytest.approx(9000.0, abs=16.0)
 
 
-def test_profiles_are_screened_alone_in_any_layout():
+def test_profiles_are_tested_independently_in_any_layout():
     rng = np.random.default_rng(8)
     true = attenuated(aerosol(12, rng), CLOUDS["cumulus"])
     power, variance = counted(1e17 * true, 5.0, rng)
-    whole = found_in(power, variance)
-    cube = found_in(power.reshape(3, 4, -1).astype(np.float32), variance.reshape(3, 4, -1))
+    whole = detect(power, variance)
+    cube = detect(power.reshape(3, 4, -1).astype(np.float32), variance.reshape(3, 4, -1))
     turned = find_layers(
         power[:, ::-1], RANGE[::-1], variance[:, ::-1], molecular_attenuated=SHAPE[::-1]
     )
@@ -204,7 +204,7 @@ def test_profiles_are_screened_alone_in_any_layout():
     np.testing.assert_array_equal(cube.cloud_base_range.ravel(), whole.cloud_base_range)
     np.testing.assert_array_equal(turned.cloud_top_range, whole.cloud_top_range)
     np.testing.assert_array_equal(turned.mask[:, ::-1], whole.mask)
-    alone = found_in(power[5], variance[5])
+    alone = detect(power[5], variance[5])
     assert alone.cloud_base_range == whole.cloud_base_range[5]
     assert alone.significance == whole.significance[5]
 

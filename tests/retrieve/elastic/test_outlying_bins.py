@@ -1,4 +1,4 @@
-"""Bins that lie off on their own are bridged; noise, layers and clouds are left as they are."""
+"""Isolated outlying bins are replaced; noise, layers and clouds are left unchanged."""
 
 from __future__ import annotations
 
@@ -20,132 +20,132 @@ def noisy(signal, ratio, profiles=1, *, seed=1):
     return signal + deviation * rng.normal(size=(profiles, RANGE.size)), deviation**2
 
 
-# What is found ------------------------------------------------------------------------------
+# Detected -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [15.0, 100.0, 1e4, -15.0, -1e4])
-def test_a_bin_that_lies_off_gets_what_its_neighbours_say(size):
+def test_an_outlying_bin_is_interpolated_from_its_neighbours(size):
     power, variance = noisy(AIR, 50.0, 400)
     at = np.random.default_rng(2).integers(10, RANGE.size - 10, 400)
     rows = np.arange(400)
     power[rows, at] += size * np.sqrt(variance[at])
-    found = bridge_outliers(power, RANGE, variance)
-    assert np.mean(found.found[rows, at]) > 0.97
-    assert found.found.sum() == found.found[rows, at].sum()
-    told = found.found[rows, at]
-    off = (found.power[rows, at] - AIR[at])[told] / np.sqrt(variance[at][told])
+    bridged = bridge_outliers(power, RANGE, variance)
+    assert np.mean(bridged.outlying[rows, at]) > 0.97
+    assert bridged.outlying.sum() == bridged.outlying[rows, at].sum()
+    detected = bridged.outlying[rows, at]
+    deviation = (bridged.power[rows, at] - AIR[at])[detected] / np.sqrt(variance[at][detected])
     # The mean of two bins, each with the noise of one.
-    assert np.std(off) == pytest.approx(np.sqrt(0.5), rel=0.1)
-    assert abs(np.mean(off)) < 0.15
-    assert np.array_equal(found.power[~found.found], power[~found.found])
+    assert np.std(deviation) == pytest.approx(np.sqrt(0.5), rel=0.1)
+    assert abs(np.mean(deviation)) < 0.15
+    assert np.array_equal(bridged.power[~bridged.outlying], power[~bridged.outlying])
 
 
 def test_sums_over_a_bridged_bin_have_the_variance_that_is_stated():
     power, variance = noisy(AIR, 50.0, 20_000)
-    at = slice(399, 402)
+    bins = slice(399, 402)
     power[:, 400] += 100.0 * np.sqrt(variance[400])
-    found = bridge_outliers(power[:, 380:420], RANGE[380:420], variance[380:420])
-    total = found.power[:, 19:22].sum(axis=1)
-    stated = np.median(found.variance[:, 19:22].sum(axis=1))
+    bridged = bridge_outliers(power[:, 380:420], RANGE[380:420], variance[380:420])
+    total = bridged.power[:, 19:22].sum(axis=1)
+    stated = np.median(bridged.variance[:, 19:22].sum(axis=1))
     assert np.var(total) == pytest.approx(stated, rel=0.04)
-    assert stated > 1.4 * variance[at].sum()
+    assert stated > 1.4 * variance[bins].sum()
 
 
-def test_two_close_ones_are_found_although_each_is_a_neighbour_of_the_other():
+def test_two_outliers_within_reach_of_each_other_are_both_detected():
     power, variance = noisy(AIR, 50.0, 100)
     for at in (300, 303):
         power[:, at] += 40.0 * np.sqrt(variance[at])
-    found = bridge_outliers(power, RANGE, variance).found
-    assert found[:, [300, 303]].all()
-    assert found.sum() == 200
+    outlying = bridge_outliers(power, RANGE, variance).outlying
+    assert outlying[:, [300, 303]].all()
+    assert outlying.sum() == 200
 
 
-def test_missing_bins_are_passed_over():
+def test_missing_bins_are_skipped():
     power, variance = noisy(AIR, 50.0, 50)
     power[:, 500] += 40.0 * np.sqrt(variance[500])
     power[:, [498, 501]] = np.nan
-    found = bridge_outliers(power, RANGE, variance)
-    assert found.found[:, 500].all()
-    assert np.isnan(found.power[:, [498, 501]]).all()
-    off = (found.power[:, 500] - AIR[500]) / np.sqrt(variance[500])
-    assert abs(np.mean(off)) < 0.5
+    bridged = bridge_outliers(power, RANGE, variance)
+    assert bridged.outlying[:, 500].all()
+    assert np.isnan(bridged.power[:, [498, 501]]).all()
+    deviation = (bridged.power[:, 500] - AIR[500]) / np.sqrt(variance[500])
+    assert abs(np.mean(deviation)) < 0.5
 
 
-def test_a_background_changes_nothing_but_itself():
+def test_a_background_is_restored():
     power, variance = noisy(AIR, 50.0, 20)
     power[:, 500] += 40.0 * np.sqrt(variance[500])
     plain = bridge_outliers(power, RANGE, variance)
-    over = bridge_outliers(power + 64.0, RANGE, variance, background=np.full(20, 64.0))
-    assert np.array_equal(over.found, plain.found)
-    np.testing.assert_allclose(over.power - 64.0, plain.power, rtol=1e-9)
+    offset = bridge_outliers(power + 64.0, RANGE, variance, background=np.full(20, 64.0))
+    assert np.array_equal(offset.outlying, plain.outlying)
+    np.testing.assert_allclose(offset.power - 64.0, plain.power, rtol=1e-9)
 
 
 def test_descending_ranges_give_the_same():
     power, variance = noisy(AIR, 50.0, 20)
     power[:, 500] += 40.0 * np.sqrt(variance[500])
     plain = bridge_outliers(power, RANGE, variance)
-    turned = bridge_outliers(power[:, ::-1], RANGE[::-1], variance[::-1])
-    assert plain.found.any()
-    assert np.array_equal(turned.power[:, ::-1], plain.power)
-    assert np.array_equal(turned.variance[:, ::-1], plain.variance)
+    reversed_ = bridge_outliers(power[:, ::-1], RANGE[::-1], variance[::-1])
+    assert plain.outlying.any()
+    assert np.array_equal(reversed_.power[:, ::-1], plain.power)
+    assert np.array_equal(reversed_.variance[:, ::-1], plain.variance)
 
 
-# What is left -------------------------------------------------------------------------------
+# Left unchanged -----------------------------------------------------------------------------
 
 
-def test_normal_noise_is_left():
+def test_normal_noise_is_left_unchanged():
     power, variance = noisy(AIR, 50.0, 5000)
-    assert not bridge_outliers(power, RANGE, variance).found.any()
+    assert not bridge_outliers(power, RANGE, variance).outlying.any()
 
 
 @pytest.mark.parametrize("mean", [0.01, 0.1, 3.0])
-def test_single_counts_among_none_are_left(mean):
+def test_single_counts_among_empty_bins_are_left_unchanged(mean):
     counts = np.random.default_rng(3).poisson(mean, (3000, RANGE.size))
-    assert bridge_outliers(counts - mean, RANGE, np.full(RANGE.size, mean)).found.sum() <= 2
+    assert bridge_outliers(counts - mean, RANGE, np.full(RANGE.size, mean)).outlying.sum() <= 2
 
 
 @pytest.mark.parametrize("width", [2.0, 3.0, 5.0], ids="{:g} bins".format)
 @pytest.mark.parametrize("peak", [3.0, 100.0])
-def test_thin_layers_are_left(width, peak):
-    """Wherever between two bins their middle lies."""
+def test_thin_layers_are_left_unchanged(width, peak):
+    """The middle of the layer lies anywhere between two bins."""
     at = np.random.default_rng(4).uniform(50.0, 750.0, (500, 1))
     layer = peak * np.exp(-4.0 * np.log(2.0) * ((PLACE - at) / width) ** 2)
     power, variance = noisy(AIR * (1.0 + layer), 50.0, 500)
-    assert not bridge_outliers(power, RANGE, variance).found.any()
+    assert not bridge_outliers(power, RANGE, variance).outlying.any()
 
 
 @pytest.mark.parametrize("bins", [1, 2, 8])
 @pytest.mark.parametrize("depth", [0.1, 1.0, 5.0])
-def test_clouds_are_left_even_of_one_bin(bins, depth):
-    """Behind them there is less light."""
+def test_clouds_of_any_width_are_left_unchanged(bins, depth):
+    """The signal behind a cloud is attenuated."""
     at = np.random.default_rng(5).integers(50, 750, (500, 1))
     inside = (at <= PLACE) & (at + bins > PLACE)
     behind = np.exp(-2.0 * depth * np.clip((PLACE - at + 1) / bins, 0.0, 1.0))
     power, variance = noisy(AIR * (1.0 + 200.0 * inside) * behind, 200.0, 500)
-    assert not bridge_outliers(power, RANGE, variance).found.any()
+    assert not bridge_outliers(power, RANGE, variance).outlying.any()
 
 
-def test_noise_larger_than_stated_is_no_lone_bin():
+def test_noise_larger_than_stated_makes_few_outliers():
     power, variance = noisy(AIR, 50.0, 1000)
-    assert bridge_outliers(power, RANGE, variance / 100.0).found.mean() < 1e-3
+    assert bridge_outliers(power, RANGE, variance / 100.0).outlying.mean() < 1e-3
 
 
 @pytest.mark.parametrize("step", [3.75, 15.0])
-def test_rounding_makes_no_lone_bins_where_no_noise_is_stated(step):
-    """Times the square of its range, a signal of 1 / R^2 is the same in all bins but for that."""
+def test_rounding_makes_no_outliers_where_the_noise_is_zero(step):
+    """Range-corrected, a signal of 1 / R^2 is the same in all bins up to rounding."""
     place = step * np.arange(1, 1001)
     power = 1e12 / place**2
     power[500] *= 3.0
-    assert np.flatnonzero(bridge_outliers(power, place, 0.0).found).tolist() == [500]
+    assert np.flatnonzero(bridge_outliers(power, place, 0.0).outlying).tolist() == [500]
 
 
-def test_profiles_without_data_stay_so():
+def test_profiles_without_data_stay_unchanged():
     power, variance = noisy(AIR, 50.0, 3)
     power[0], power[1, 4:] = np.nan, np.inf
-    found = bridge_outliers(power, RANGE, variance)
-    assert not found.found.any()
-    assert np.array_equal(found.power, power, equal_nan=True)
-    assert bridge_outliers(power[:, :3], RANGE[:3], variance[:3]).found.shape == (3, 3)
+    bridged = bridge_outliers(power, RANGE, variance)
+    assert not bridged.outlying.any()
+    assert np.array_equal(bridged.power, power, equal_nan=True)
+    assert bridge_outliers(power[:, :3], RANGE[:3], variance[:3]).outlying.shape == (3, 3)
 
 
 def test_negative_variances_are_refused():

@@ -1,4 +1,4 @@
-"""The reference window: found in clean air, refused with reasons, not drawn by fluctuations."""
+"""The reference window lies in clean air, does not follow noise; rejections give reasons."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def layered(count, rng):
 
 
 def counted(expected, background, rng):
-    """Photon counts less their background, and their variance."""
+    """Return photon counts minus their background, and their variance."""
     counts = rng.poisson(expected + background)
     return counts - background, np.broadcast_to(expected + background, counts.shape)
 
@@ -52,32 +52,32 @@ def mean_over(values, window):
 @pytest.mark.parametrize("counts", [1e17, 1e18, 1e19])
 def test_chosen_windows_hold_few_particles(counts):
     rng = np.random.default_rng(1)
-    true = attenuated(layered(600, rng))
-    found = choose_reference(*three(counted(counts * true, 2.0, rng)), **CLEAN)
-    assert np.all(found.chosen)
-    ratio = true / SHAPE
+    signal = attenuated(layered(600, rng))
+    window = choose_reference(*with_range(counted(counts * signal, 2.0, rng)), **CLEAN)
+    assert np.all(window.chosen)
+    ratio = signal / SHAPE
     clean = mean_over(ratio, (11e3, 12e3))
     excess = [
-        mean_over(one, (a, b)) / c - 1.0
-        for one, a, b, c in zip(ratio, found.bottom, found.top, clean, strict=True)
+        mean_over(profile_ratio, (a, b)) / c - 1.0
+        for profile_ratio, a, b, c in zip(ratio, window.bottom, window.top, clean, strict=True)
     ]
-    # What is left cannot be told from air by the power of the windows.
-    relative = found.scale_standard_error / found.scale
+    # The remaining particles are within the noise of the windows.
+    relative = window.scale_standard_error / window.scale
     assert np.percentile(excess / relative, 95) < 3.0
     assert np.percentile(excess, 95) < 0.01
 
 
-def three(powers):
+def with_range(powers):
     return powers[0], RANGE, powers[1]
 
 
-def test_choice_is_hardly_drawn_by_fluctuations():
+def test_noise_hardly_biases_the_choice():
     rng = np.random.default_rng(2)
     expected = np.broadcast_to(3e17 * SHAPE, (4000, RANGE.size))
-    found = choose_reference(*three(counted(expected, 5.0, rng)), **CLEAN)
-    assert np.mean(found.chosen) > 0.999
-    deviation = (found.scale / 3e17 - 1.0) / (found.scale_standard_error / found.scale)
-    usable = deviation[found.chosen]
+    window = choose_reference(*with_range(counted(expected, 5.0, rng)), **CLEAN)
+    assert np.mean(window.chosen) > 0.999
+    deviation = (window.scale / 3e17 - 1.0) / (window.scale_standard_error / window.scale)
+    usable = deviation[window.chosen]
     assert abs(np.mean(usable)) < 0.15
     assert np.std(usable) < 1.1
 
@@ -85,16 +85,16 @@ def test_choice_is_hardly_drawn_by_fluctuations():
 def test_scale_and_slope_are_those_of_a_weighted_fit():
     rng = np.random.default_rng(3)
     power, variance = counted(1e18 * SHAPE, 30.0, rng)
-    found = choose_reference(
+    window = choose_reference(
         power, RANGE, variance, molecular_attenuated=SHAPE, candidates=[[6e3, 8e3]]
     )
     inside = (RANGE >= 6e3) & (RANGE <= 8e3)
     p, phi, v, z = power[inside], SHAPE[inside], variance[inside], RANGE[inside] - 7e3
     flat = np.sum(p * phi / v) / np.sum(phi**2 / v)
-    assert found.scale == pytest.approx(flat, rel=1e-10)
-    assert found.scale_standard_error == pytest.approx(np.sum(phi**2 / v) ** -0.5, rel=1e-10)
+    assert window.scale == pytest.approx(flat, rel=1e-10)
+    assert window.scale_standard_error == pytest.approx(np.sum(phi**2 / v) ** -0.5, rel=1e-10)
     chi_square = np.sum((p - flat * phi) ** 2 / v)
-    assert found.reduced_chi_square == pytest.approx(chi_square / (p.size - 1), rel=1e-9)
+    assert window.reduced_chi_square == pytest.approx(chi_square / (p.size - 1), rel=1e-9)
 
     def fit(powers):
         design = (phi[:, np.newaxis] * z[:, np.newaxis] ** powers) / np.sqrt(v)[:, np.newaxis]
@@ -102,26 +102,26 @@ def test_scale_and_slope_are_those_of_a_weighted_fit():
         return covariance @ (design.T @ (p / np.sqrt(v))), covariance
 
     coefficients, covariance = fit(np.arange(2))
-    assert found.slope == pytest.approx(coefficients[1] / flat, rel=1e-8)
-    assert found.slope_standard_error == pytest.approx(covariance[1, 1] ** 0.5 / flat, rel=1e-8)
+    assert window.slope == pytest.approx(coefficients[1] / flat, rel=1e-8)
+    assert window.slope_standard_error == pytest.approx(covariance[1, 1] ** 0.5 / flat, rel=1e-8)
     coefficients, covariance = fit(np.arange(3))
-    assert found.curvature == pytest.approx(coefficients[2] / covariance[2, 2] ** 0.5, rel=1e-6)
+    assert window.curvature == pytest.approx(coefficients[2] / covariance[2, 2] ** 0.5, rel=1e-6)
 
 
 def test_clean_windows_pass_at_the_rate_of_the_tests():
     rng = np.random.default_rng(4)
     spread = 0.05 * SHAPE
     power = SHAPE + spread * rng.standard_normal((4000, RANGE.size))
-    found = choose_reference(
+    window = choose_reference(
         power, RANGE, spread**2, molecular_attenuated=SHAPE, candidates=[[6e3, 7e3]],
         most_deviation=2.0,
     )  # fmt: skip
     for reason in (Rejection.SLOPE, Rejection.CURVATURE):
-        rate = np.mean((found.rejections[:, 0] & reason) != 0)
+        rate = np.mean((window.rejections[:, 0] & reason) != 0)
         assert rate == pytest.approx(2.0 * stats.norm.sf(2.0), abs=0.012)
     freedom = 66 - 1
     expected = stats.chi2.sf(freedom * (1.0 + 2.0 * np.sqrt(2.0 / freedom)), freedom)
-    rate = np.mean((found.rejections[:, 0] & Rejection.SCATTER) != 0)
+    rate = np.mean((window.rejections[:, 0] & Rejection.SCATTER) != 0)
     assert rate == pytest.approx(expected, abs=0.012)
 
 
@@ -135,44 +135,44 @@ def test_clean_windows_pass_at_the_rate_of_the_tests():
         (lambda z: np.where(z > 6.45e3, np.nan, 1.0), Rejection.TOO_FEW_BINS),
     ],
 )
-def test_each_fault_is_told_and_nothing_is_chosen(spoil, reason):
+def test_each_fault_is_reported_and_no_window_chosen(spoil, reason):
     rng = np.random.default_rng(5)
     spread = 0.03 * SHAPE
     power = SHAPE * spoil(RANGE) + spread * rng.standard_normal(RANGE.size)
-    found = choose_reference(
+    window = choose_reference(
         power, RANGE, spread**2, molecular_attenuated=SHAPE, candidates=[6e3, 7e3 + 900]
     )
-    assert not found.chosen
-    assert found.index == -1
-    assert found.rejections[0] & reason
-    for value in (found.bottom, found.top, found.scale, found.slope, found.curvature):
+    assert not window.chosen
+    assert window.index == -1
+    assert window.rejections[0] & reason
+    for value in (window.bottom, window.top, window.scale, window.slope, window.curvature):
         assert np.isnan(value)
 
 
-def test_excluded_bins_bar_their_windows():
+def test_windows_with_excluded_bins_are_rejected():
     power = 1e18 * SHAPE
     exclude = (RANGE > 3.5e3) & (RANGE < 5e3)
     free = choose_reference(power, RANGE, power, **CLEAN)
-    barred = choose_reference(power, RANGE, power, **CLEAN, exclude=exclude)
+    restricted = choose_reference(power, RANGE, power, **CLEAN, exclude=exclude)
     assert free.bottom == 3e3
-    assert barred.bottom == 5e3
+    assert restricted.bottom == 5e3
     touched = (WINDOWS[:, 0] < 5e3) & (WINDOWS[:, 1] > 3.5e3)
-    assert np.array_equal((barred.rejections & Rejection.EXCLUDED) != 0, touched)
+    assert np.array_equal((restricted.rejections & Rejection.EXCLUDED) != 0, touched)
 
 
-def test_a_window_in_a_steady_layer_gives_way_to_cleaner_air():
+def test_cleaner_air_is_preferred_to_a_uniform_layer():
     # Backscatter of air times 1.2 from 3 to 6 km has the shape of air but for its extinction.
     particles = np.where((RANGE > 3e3) & (RANGE < 6e3), 0.2 * BACKSCATTER, 0.0)
     true = 1e19 * attenuated(particles, lidar_ratio=8.4)
     rng = np.random.default_rng(6)
-    found = choose_reference(*three(counted(true, 1.0, rng)), **CLEAN, most_deviation=4.0)
-    assert found.bottom >= 6e3
+    window = choose_reference(*with_range(counted(true, 1.0, rng)), **CLEAN, most_deviation=4.0)
+    assert window.bottom >= 6e3
     inside = WINDOWS[:, 1] <= 6e3
-    told = found.rejections[inside]
-    assert np.all(told != 0)
+    rejections = window.rejections[inside]
+    assert np.all(rejections != 0)
 
 
-def test_profiles_are_chosen_alone_and_their_windows_fit_the_inversion():
+def test_profiles_are_independent_and_their_windows_fit_the_inversion():
     rng = np.random.default_rng(7)
     true = attenuated(layered(20, rng))
     power, variance = counted(1e19 * true, 2.0, rng)
@@ -193,11 +193,11 @@ def test_profiles_are_chosen_alone_and_their_windows_fit_the_inversion():
     )  # fmt: skip
     assert turned.scale == alone.scale
 
-    found = invert_elastic(
+    solution = invert_elastic(
         power, RANGE, molecular_backscatter=BACKSCATTER, molecular_extinction=EXTINCTION,
         lidar_ratio=50.0, reference=tuple(edge.reshape(20) for edge in whole.edges),
     )  # fmt: skip
-    assert np.array_equal(found.calibrated, whole.chosen.reshape(20))
+    assert np.array_equal(solution.calibrated, whole.chosen.reshape(20))
 
 
 def test_candidates_are_made_within_their_bounds():
