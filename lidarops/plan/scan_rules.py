@@ -35,7 +35,7 @@ def _scanned(case: ChannelCase) -> MultiAngleSettings | None:
     return None if no_scan(case) else case.multiangle
 
 
-def heights(step: float, highest: float) -> Array:
+def altitude_steps(step: float, highest: float) -> Array:
     """Return the altitudes of a multi-angle product, m above the station."""
     return np.arange(step, highest + 1e-6, step)
 
@@ -77,12 +77,12 @@ def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: flo
     except RetrievalInputError:
         # The retrieval tells what is wrong with them.
         return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
-    altitude = heights(step, highest)
-    up = slant_paths.rising(found.zenith_angle, altitude)
+    altitude = altitude_steps(step, highest)
+    up = slant_paths.rising_beams(found.zenith_angle, altitude)
     if up.size == 0:
         return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
     leaning = slant_paths.make_scan(found.zenith_angle[up], altitude, found.azimuth[up]).leaning
-    free = math.degrees(slant_paths.free_turn(leaning))
+    free = math.degrees(slant_paths.widest_azimuth_gap(leaning))
     return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(leaning))
 
 

@@ -14,8 +14,8 @@ from dask.base import compute
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.flags import Quality
 from lidarops.plan import scan_rules
-from lidarops.plan.preview import WITHOUT
-from lidarops.plan.signal_rules import GLUED, WHOLE, StepName, parts_of
+from lidarops.plan.preview import OMITTED
+from lidarops.plan.signal_rules import GLUED, WHOLE, StepName, glued_parts
 from lidarops.records import Plan, ProductKind, Step
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import Definition
@@ -37,7 +37,7 @@ Array = npt.NDArray[np.float64]
 FULL_OVERLAP: Final = 0.99
 """Overlap from which on a homogeneous section may begin."""
 
-AT_ONCE: Final = 2_000_000
+IN_MEMORY: Final = 2_000_000
 """Bytes of counts up to which a scene is read before it is worked on: to put off so little costs
 more than to do it, and of more the arrays would leave the cache."""
 _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
@@ -81,8 +81,8 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
     """
     steps = bench.steps(channel)
     if _is_read(steps):
-        bench = at_hand(bench, parts_of(channel) if channel.startswith(GLUED) else (channel,))
-    source = source_of(bench, channel)
+        bench = load_small(bench, glued_parts(channel) if channel.startswith(GLUED) else (channel,))
+    source = channel_source(bench, channel)
     lazy: dict[ProductKind, xr.Dataset] = {}
     if StepName.SIGNAL in steps:
         lazy[ProductKind.SIGNAL] = _signal(source, steps, bench.ancillaries)
@@ -116,10 +116,10 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
     return found
 
 
-def at_hand(bench: Bench, channels: Sequence[str]) -> Bench:
+def load_small(bench: Bench, channels: Sequence[str]) -> Bench:
     """Return a bench with the counts of channels in memory, where they are few."""
     counts = bench.archive[[name for name in channels if name in bench.archive]]
-    small = counts.nbytes <= AT_ONCE
+    small = counts.nbytes <= IN_MEMORY
     return replace(bench, archive=bench.archive.assign(counts.compute())) if small else bench
 
 
@@ -128,24 +128,24 @@ def _is_read(steps: Mapping[str, Step]) -> bool:
     if any(name in steps for name in WHOLE):
         return True
     settings = steps[StepName.HOMOGENEOUS].settings if StepName.HOMOGENEOUS in steps else {}
-    return len(settings.get(WITHOUT, ())) < len(settings.get("sections", ()))
+    return len(settings.get(OMITTED, ())) < len(settings.get("sections", ()))
 
 
-def source_of(bench: Bench, channel: str) -> Plain | Glued:
+def channel_source(bench: Bench, channel: str) -> FileChannel | GluedChannel:
     """Return what gives the profiles of a channel."""
-    return Glued(bench, channel) if channel.startswith(GLUED) else Plain(bench, channel)
+    return GluedChannel(bench, channel) if channel.startswith(GLUED) else FileChannel(bench, channel)
 
 
-class Plain:
+class FileChannel:
     """A channel of the files."""
 
     def __init__(self, bench: Bench, channel: str) -> None:
         self._channel = channel
         archive, steps = bench.archive, bench.steps(channel)
-        self._dark: labeled_signal.Dark | None = None
+        self._dark: labeled_signal.DarkSignals | None = None
         if bench.dark is not None and StepName.DARK in steps:
             method = steps[StepName.DARK].settings["method"]
-            self._dark = labeled_signal.dark_of(bench.dark, channel, method=method)
+            self._dark = labeled_signal.read_dark(bench.dark, channel, method=method)
         self._archive = archive
         self._settings = {
             "dead_time": _setting(steps, StepName.DEAD_TIME, "dead_time"),
@@ -163,7 +163,7 @@ class Plain:
 
     def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
         """Return range-corrected signals without background of every profile."""
-        return labeled_signal.signals(
+        return labeled_signal.range_corrected_signals(
             self._archive, self._channel, background_range=background_range, **self._settings
         )
 
@@ -186,14 +186,14 @@ class Plain:
         return averages
 
 
-class Glued:
+class GluedChannel:
     """A channel made of an analog and a photon counting one."""
 
     def __init__(self, bench: Bench, channel: str) -> None:
         steps = bench.steps(channel)
         parts = steps[StepName.GLUE].settings
-        self._analog = Plain(bench, parts["analog"])
-        self._photon = Plain(bench, parts["photon"])
+        self._analog = FileChannel(bench, parts["analog"])
+        self._photon = FileChannel(bench, parts["photon"])
         self.geometry, self.shots = self._photon.geometry, self._photon.shots
         self._lag = self._find_lag(steps.get(StepName.LAG))
 
@@ -204,7 +204,7 @@ class Glued:
     def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
         """Return range-corrected signals without background of every profile."""
         joined = self.profiles()
-        return labeled_signal.corrected(joined, background_range).assign(_gluing(joined))
+        return labeled_signal.correct_for_range(joined, background_range).assign(_gluing(joined))
 
     def averages(self, seconds: float) -> xr.Dataset:
         """Return means over intervals of the clock, of every part of the channel."""
@@ -237,7 +237,7 @@ class Glued:
         if step is not None and step.settings["method"] == "estimate":
             return labeled_gluing.estimate_lag(*parts)
         # A lag that is given has moved the ranges of the analog part.
-        return labeled_gluing.told_lag(*parts)
+        return labeled_gluing.range_lag(*parts)
 
 
 def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
@@ -246,7 +246,7 @@ def _setting(steps: Mapping[str, Step], name: StepName, key: str) -> Any:
 
 
 def _signal(
-    source: Plain | Glued, steps: Mapping[str, Step], ancillaries: Ancillaries
+    source: FileChannel | GluedChannel, steps: Mapping[str, Step], ancillaries: Ancillaries
 ) -> xr.Dataset:
     start, stop = steps[StepName.BACKGROUND].settings["range"]
     result = source.signals((start, stop))
@@ -267,17 +267,17 @@ def _gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
     return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}
 
 
-def _homogeneous(bench: Bench, channel: str, source: Plain | Glued) -> xr.Dataset:
+def _homogeneous(bench: Bench, channel: str, source: FileChannel | GluedChannel) -> xr.Dataset:
     steps = bench.steps(channel)
     settings = steps[StepName.HOMOGENEOUS].settings
-    absent = {(near, far): Quality[bit] for near, far, bit in settings.get(WITHOUT, ())}
+    absent = {(near, far): Quality[bit] for near, far, bit in settings.get(OMITTED, ())}
     sections = [(near, far) for near, far in settings["sections"]]
     kept = [section for section in sections if section not in absent]
     parts = []
     if kept:
         parts.append(_retrieved(source.profiles(), kept, steps, bench.ancillaries))
     if absent:
-        unit = labeled_signal.unit_of(bench.archive, channel)
+        unit = labeled_signal.channel_unit(bench.archive, channel)
         parts.append(_absent(source.shots, unit, absent))
     result = parts[0]
     if len(parts) > 1:
@@ -362,17 +362,16 @@ def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> x
     return found.assign(_gluing(averages))
 
 
-def _beams(source: Plain | Glued, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
+def _beams(source: FileChannel | GluedChannel, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
     """Return the beams of every scan cycle on common altitudes, lazy."""
     settings = steps[StepName.MULTIANGLE].settings
     profiles, geometry = source.profiles(), source.geometry
     near, far = settings["background_range"]
-    heights = scan_rules.heights(settings["step"], settings["highest"])
+    heights = scan_rules.altitude_steps(settings["step"], settings["highest"])
     return labeled_altitudes.on_altitudes(
         profiles,
         zenith_angle=geometry["zenith_angle"].to_numpy(),
         azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
-        time=geometry["time"].to_numpy(),
         time_bnds=geometry["time_bnds"].to_numpy(),
         shots=source.shots.to_numpy(),
         altitude_grid=bench.station_altitude + heights,

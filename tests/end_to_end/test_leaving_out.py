@@ -17,7 +17,7 @@ from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.flags import Quality
 from lidarops.plan import product_dependence
-from lidarops.plan.preview import GAP, WITHOUT, refine_plan
+from lidarops.plan.preview import GAP, OMITTED, refine_plan
 from lidarops.plan.rule_table import RULES
 from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW, plan_scene
 from lidarops.plan.scenes import cut_scenes
@@ -52,7 +52,7 @@ def decided(made: Plan, rule: str) -> tuple[list[str], list[str]]:
 
 def test_rules_have_names_and_questions():
     assert len({rule.name for rule in RULES}) == len(RULES)
-    assert all(rule.asks.endswith("?") for rule in RULES)
+    assert all(rule.question.endswith("?") for rule in RULES)
     assert {CHANNEL, RANGE_WINDOW, *PRODUCTS} <= set(RULES)
 
 
@@ -376,7 +376,7 @@ def looked(profiles, count=600):
 
 def absent(made):
     (step,) = (step for step in made.steps if step.name == "homogeneous")
-    return step.settings.get(WITHOUT, [])
+    return step.settings.get(OMITTED, [])
 
 
 def test_sixteen_profiles_with_light_are_enough():
@@ -471,7 +471,7 @@ def test_a_left_out_section_tells_which_profiles_have_no_shots(tmp_path, monkeyp
     campaign = archive(tmp_path, products=products)
     scene = catalogued_scenes(campaign)[0]
     made = plan_scene(scene, campaign)
-    absent = {WITHOUT: [[700.0, 1500.0, "LOW_SIGNAL"]]}
+    absent = {OMITTED: [[700.0, 1500.0, "LOW_SIGNAL"]]}
     told = [
         replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
         for step in made.steps
@@ -500,7 +500,7 @@ def test_products_are_the_same_bits_read_at_once_and_bit_by_bit(
     scene = catalogued_scenes(campaign)[0]
     job = Job(campaign, scene, plan_scene(scene, campaign))
     usual = [product.sha256 for product in process_scene(job).products]
-    monkeypatch.setattr(channel_steps, "AT_ONCE", bytes_at_once)
+    monkeypatch.setattr(channel_steps, "IN_MEMORY", bytes_at_once)
     assert [product.sha256 for product in process_scene(job).products] == usual
 
 
@@ -551,7 +551,7 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
 
 def test_what_was_asked_for_is_told_first_where_there_is_nothing_to_do(tmp_path):
     campaign = archive(tmp_path, facts=[{"zenith_angle": 0.0}])
-    (reason,) = bring_up_to_date(campaign).barren.values()
+    (reason,) = bring_up_to_date(campaign).empty_scenes.values()
     assert reason.startswith("nothing to do: homogeneous of photon_532o: section 750-4500 m")
     assert "no product of the campaign asks" not in reason
 

@@ -14,6 +14,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from support.angle_scenes import retrieve_scan
 from support.made_products import (
     MAKERS,
     PLACED,
@@ -32,7 +33,7 @@ from lidarops.netcdf.build import bitround, product_path
 from lidarops.netcdf.global_attributes import _duration
 from lidarops.products.layouts import LAYOUTS, build_product
 from lidarops.records import DetectionMode, ProductKind
-from lidarops.retrieve.multiangle import labeled
+from lidarops.retrieve.multiangle.labeled_altitudes import Background
 
 KINDS = list(MAKERS)
 
@@ -444,7 +445,7 @@ def test_layers_of_a_scan_reach_from_the_station_upwards():
 
 def test_a_product_tells_the_steps_of_its_retrieval():
     product = build_product(multiangle(), context(ProductKind.MULTIANGLE))
-    assert product.attrs["lidarops_steps"] == "joint: extinction is wanted"
+    assert product.attrs["lidarops_steps"] == "joint: extinction is requested"
     assert "lidarops_steps" not in build_product(homogeneous(), context()).attrs
 
 
@@ -560,7 +561,7 @@ def test_a_scan_goes_from_profiles_to_a_product():
     starts = np.datetime64("2026-03-01T10:00:00", "ns") + np.arange(12) * np.timedelta64(60, "s")
     ends = starts + np.timedelta64(60, "s")
     dims = ("time", "range")
-    found = labeled.retrieve_scan(
+    found = retrieve_scan(
         xr.Dataset(
             {
                 "power": (dims, power + noise),
@@ -571,12 +572,11 @@ def test_a_scan_goes_from_profiles_to_a_product():
         ),
         zenith_angle=zenith,
         azimuth=np.full(12, 90.0),
-        time=starts + (ends - starts) // 2,
         time_bnds=np.stack([starts, ends], axis=-1),
         shots=np.full(12, 600),
         altitude_grid=STATION.altitude + 60.0 * np.arange(1, 60),
         station_altitude=STATION.altitude,
-        background=labeled.Background((5400.0, 6000.0)),
+        background=Background((5400.0, 6000.0)),
     )
     product = decoded(found, ProductKind.MULTIANGLE)
     assert {"time": 3, "altitude": 59, "beam": 4}.items() <= product.sizes.items()

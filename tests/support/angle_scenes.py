@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
+from lidarops.retrieve.multiangle import labeled, labeled_altitudes
 from lidarops.retrieve.multiangle.vertical.smooth_profile import (
     ResidualMoments,
     residual_moments,
@@ -154,6 +155,21 @@ def kano_hamilton(scene, logarithm, variance):
     squares = np.broadcast_to(between, share.shape)
     moments = residual_moments(residual, w, leverage, squares, share)
     return Estimates(-0.5 * slope[:, 0], 4.0 * square[:, 0], moments, slant)
+
+
+def retrieve_scan(conditioned, *, station_altitude, **arguments):
+    """Return the multiangle product of conditioned profiles, in memory."""
+    method = {
+        name: arguments.pop(name)
+        for name in ("method", "largest_gradient", "layers")
+        if name in arguments
+    }
+    beams = labeled_altitudes.on_altitudes(
+        conditioned, station_altitude=station_altitude, **arguments
+    )
+    return labeled.retrieve_optical_depth(
+        beams.compute(), station_altitude=station_altitude, **method
+    )
 
 
 def estimates(scene, profiles, rng, correlation=0.0, *, outliers=0.0):

@@ -268,7 +268,7 @@ def multiangle(
             "beam": ("beam", np.arange(angles.size, dtype=np.int32)),
             "altitude": ("altitude", STATION.altitude + 60.0 * np.arange(1, levels + 1)),
         },
-        attrs={"steps": "joint: extinction is wanted"},
+        attrs={"steps": "joint: extinction is requested"},
     )
     return with_layers(found) if layers else found
 

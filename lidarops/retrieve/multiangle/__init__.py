@@ -1,1 +1,25 @@
-"""Optical depth and extinction from scans at several zenith angles."""
+"""Multi-angle retrieval: optical depth and extinction from scans at several zenith angles.
+
+A scan passes through these modules in order:
+
+1. `labeled_altitudes.on_altitudes` takes the conditioned profiles of a scene. `scan_cycles` groups
+   them into directions and cycles. The background is subtracted, and `_common_altitude`
+   interpolates each beam to the common altitudes.
+2. `optical_depth.retrieve_optical_depth` solves the cycles in blocks. `_methods` carries out one
+   block. `_sample_mask` takes the logarithms, and `_block` with `_kano_hamilton` fits them against
+   the slant path (`slant_paths`) at each altitude. `robust_weights` gives outliers less weight.
+3. Method "joint": `vertical` combines the optical depths of single altitudes into one profile
+   with smooth extinction. Methods "mld" and "mld_prior": `mld` differentiates the logarithm along
+   the slant path with regularisation (the historical method), each altitude on its own.
+4. `_methods` adds extinction, errors and flags. `_neighbours` and `_path_variation` test whether
+   the air is horizontally stratified.
+5. `labeled.retrieve_optical_depth` turns the result into the ``multiangle`` product.
+"""
+
+from lidarops.retrieve.multiangle.optical_depth import (
+    MultiAngleMethod,
+    MultiAngleResult,
+    retrieve_optical_depth,
+)
+
+__all__ = ["MultiAngleMethod", "MultiAngleResult", "retrieve_optical_depth"]

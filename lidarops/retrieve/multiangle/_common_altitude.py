@@ -1,4 +1,4 @@
-"""Slant signals on common altitudes: each beam is interpolated where it crosses them."""
+"""Interpolation of each beam of a scan to common altitudes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from lidarops.retrieve.multiangle import slant_paths
 
 Array = npt.NDArray[np.float64]
 
-
 _CLEAR: Final = 30.0
-"""Signal over noise from which on the logarithm is interpolated. The mean of a logarithm is that of
-noise too; below, interpolating the signal itself errs by far less than its noise."""
+"""Signal over noise from which on the logarithm is interpolated. Noise shifts the mean of a
+logarithm; below, the error of interpolating the signal itself is far less than its noise."""
 
 
 class AltitudeInterpolation(StrEnum):
@@ -36,8 +35,8 @@ class CommonAltitude:
     """A scan on common altitudes, (..., angle, altitude)."""
 
     signal: Array
-    """In the unit given; NaN where the beam does not reach the altitude, or a bin beside it is
-    missing."""
+    """In the unit of the input; NaN where the beam does not reach the altitude, or a bin beside it
+    is missing."""
     variance: Array
     """In the square of that unit."""
 
@@ -54,14 +53,15 @@ def to_altitude(
 ) -> CommonAltitude:
     r"""Interpolate range-corrected signals of a scan to common altitudes.
 
-    The altitude z is crossed at the range :math:`R = x(z) z` (`lidarops.retrieve.multiangle.slant_paths`).
-    Between the bins i and i + 1, the logarithm is a sum over the bins beside,
+    The beam crosses the altitude z at the range :math:`R = x(z) z`
+    (`lidarops.retrieve.multiangle.slant_paths`). Between the bins i and i + 1, the logarithm is a
+    sum over the bins beside,
 
     .. math:: \ln S(R) = \sum_j c_j \ln S_j, \qquad
               \sigma_S^2(R) = S^2 \sum_j c_j^2 \sigma_j^2 / S_j^2 ,
 
     with Lagrange's coefficients. Altitudes that share a bin have correlated noise. Where a bin is
-    less than 30 times its noise, S itself is interpolated, so that noise keeps its mean.
+    less than 30 times its noise, S itself is interpolated, so that its mean remains unbiased.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def to_altitude(
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right.
+        For invalid arguments.
     """
     cubic = (
         inputs.choice(interpolation, AltitudeInterpolation, "interpolation")
@@ -100,10 +100,9 @@ def to_altitude(
     shape = (*values.shape[:-1], height.size)
     out, spread = np.full(shape, np.nan), np.full(shape, np.nan)
     for a in np.flatnonzero(scan.usable):
-        one = _along_beam(
+        out[..., a, :], spread[..., a, :] = _along_beam(
             values[..., a, :], noise[..., a, :], grid[a], scan.path[a] * height, cubic
         )
-        out[..., a, :], spread[..., a, :] = one
     return CommonAltitude(out, spread)
 
 
@@ -111,19 +110,19 @@ def _along_beam(
     values: Array,
     noise: Array,
     grid: Array,
-    wanted: Array,
+    target: Array,
     cubic: bool,  # noqa: FBT001 - private
 ) -> tuple[Array, Array]:
-    """Return signal and variance of one beam at the wanted ranges."""
-    inside = (wanted >= grid[0]) & (wanted <= grid[-1])
-    beside = np.clip(np.searchsorted(grid, wanted, side="right") - 1, 0, grid.size - 2)
-    signal = np.full((*values.shape[:-1], wanted.size), np.nan)
+    """Return signal and variance of one beam at the target ranges (m)."""
+    inside = (target >= grid[0]) & (target <= grid[-1])
+    beside = np.clip(np.searchsorted(grid, target, side="right") - 1, 0, grid.size - 2)
+    signal = np.full((*values.shape[:-1], target.size), np.nan)
     spread = signal.copy()
     bins = [np.stack([beside, beside + 1])]
     if cubic and grid.size >= 4:
         bins.append(np.clip(beside - 1, 0, grid.size - 4) + np.arange(4)[:, np.newaxis])
     for nodes in bins:
-        coefficients = _lagrange(grid[nodes], wanted)
+        coefficients = _lagrange(grid[nodes], target)
         _overwrite(signal, spread, *_plain(values, noise, nodes, coefficients))
         _overwrite(signal, spread, *_logarithmic(values, noise, nodes, coefficients))
     signal[..., ~inside] = np.nan
@@ -131,13 +130,13 @@ def _along_beam(
     return signal, spread
 
 
-def _lagrange(nodes: Array, wanted: Array) -> Array:
-    """Return Lagrange's coefficients as (node, wanted)."""
+def _lagrange(nodes: Array, target: Array) -> Array:
+    """Return Lagrange's coefficients as (node, target)."""
     out = np.ones_like(nodes)
     for i, node in enumerate(nodes):
         for j, other in enumerate(nodes):
             if i != j:
-                out[i] *= (wanted - other) / (node - other)
+                out[i] *= (target - other) / (node - other)
     return out
 
 
@@ -154,7 +153,7 @@ def _plain(
 def _logarithmic(
     values: Array, noise: Array, bins: npt.NDArray[np.intp], coefficients: Array
 ) -> tuple[Array, Array]:
-    """Interpolate the logarithm; NaN where a bin in use is not well above its noise."""
+    """Interpolate the logarithm; NaN where a bin used is not well above its noise."""
     used = coefficients != 0.0
     nodes = values[..., bins]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):

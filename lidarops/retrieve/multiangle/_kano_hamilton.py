@@ -1,8 +1,8 @@
-r"""Compiled weighted regression of logarithms on slant path, one height at a time.
+r"""Compiled weighted regression of logarithms on slant path, one altitude at a time.
 
-The model is :math:`y_l = c - 2 x_l \tau + g \cdot d_l + e_l` with the slant path x, where beams
-lead to all sides also with a horizontal gradient g over the horizontal distance d, and with the
-variance :math:`v_l + s^2`: detector noise and what inhomogeneity of the air adds to it.
+The model is :math:`y_l = c - 2 x_l \tau + g \cdot d_l + e_l` with the slant path x and the error
+variance :math:`v_l + s^2` (detector noise and inhomogeneity of the air). A horizontal gradient g
+over the horizontal distance d is included only where beams point to all sides.
 """
 
 # ruff: noqa: FBT001, FBT003 - compiled functions take no keyword-only arguments
@@ -25,25 +25,29 @@ INTERCEPT_VARIANCE: Final = 3
 CHI2: Final = 4
 """Sum of the squared residuals over their variances."""
 FREEDOM: Final = 5
-"""Beams less unknowns; 0 where there is no fit."""
+"""Number of beams minus unknowns; 0 where there is no fit."""
 TRACE: Final = 6
-"""Sum over beams of weight times one less leverage: what inhomogeneity adds to chi2."""
+"""Sum over beams of weight times (1 - leverage): increase of chi2 per unit of inhomogeneity
+variance."""
 SPAN: Final = 7
-"""Largest less smallest slant path."""
+"""Largest minus smallest slant path."""
 SLOPE_EAST: Final = 8
-"""Change of the optical depth per unit of gradient that the fit does not know of."""
+"""Change of the optical depth per unit of a gradient to the east that is not fitted."""
 SLOPE_NORTH: Final = 9
 SIDES: Final = 10
-"""Gradients fitted along: 0, 1 or 2."""
+"""Number of fitted gradients: 0, 1 or 2."""
 SHARE: Final = 11
-"""What one unit of inhomogeneity variance is of the variance of the optical depth."""
+"""Share of the variance of the optical depth per unit of inhomogeneity variance."""
 EXPECTED: Final = 12
-"""Expectation of chi2: the degrees of freedom, less where weights are reduced."""
+"""Expectation of chi2: the degrees of freedom, fewer where weights are reduced."""
 COLUMNS: Final = 13
 
 TILE: Final = 256
+"""Altitudes processed together, so that their sums stay in the cache."""
 _SAME_PATH: Final = 1e-20
+"""Variance of slant paths up to which they count as equal."""
 _OPPOSITE: Final = 1e-6
+"""radian, rounding by which the gap between opposite azimuths may exceed half a turn."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -52,13 +56,13 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill_weights(
     noise: Array, keep: Array, inhomogeneity: Array, first: int, last: int, weights: Array
 ) -> None:
-    """Fill weights (angle, TILE) of the bins from `first` to before `last`."""
+    """Fill weights (angle, TILE) of the altitudes from `first` to before `last`."""
     angles, width = noise.shape[0], last - first
     added = inhomogeneity[first:last]
     for a in range(angles):
-        row, of = weights[a, :width], noise[a, first:last]
+        row, variance = weights[a, :width], noise[a, first:last]
         for j in range(width):
-            row[j] = 1.0 / (of[j] + added[j])
+            row[j] = 1.0 / (variance[j] + added[j])
         if keep.shape[0] > 0:
             kept = keep[a, first:last]
             for j in range(width):
@@ -67,7 +71,7 @@ def _fill_weights(
 
 @_compiled
 def _average_tile(y: Array, weights: Array, x: Array, first: int, last: int, sums: Array) -> None:
-    """Fill sums of weights, and weighted means of path and logarithm."""
+    """Fill the sums of weights, and the weighted means of path and logarithm."""
     width = last - first
     sw, mx, my = sums[0, :width], sums[1, :width], sums[2, :width]
     for j in range(width):
@@ -88,7 +92,7 @@ def _average_tile(y: Array, weights: Array, x: Array, first: int, last: int, sum
 def _fit_tile(
     y: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
 ) -> None:
-    """Fit the bins from `first` to before `last` with sums centred on the weighted means.
+    """Fit the altitudes from `first` to before `last` with sums centred on the weighted means.
 
     Parameters
     ----------
@@ -96,8 +100,8 @@ def _fit_tile(
     weights : (angle, TILE) float
     first, last : int
     sums : (8, TILE) float
-        Gets sums of weights, means of path and logarithm, the inverse of the weighted squares of
-        the path, the slope and the share of inhomogeneity.
+        Output: sums of weights, means of path and logarithm, the inverse of the weighted squares
+        of the path, the slope and the share of inhomogeneity.
     out : (COLUMNS, altitude) float
     """
     width = last - first
@@ -128,10 +132,10 @@ def _fit_tile(
 
 
 @_compiled
-def _judge_tile(
+def _chi2_tile(
     y: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
 ) -> None:
-    """Fill chi2 and what belongs to it from the sums that `_fit_tile` left.
+    """Fill CHI2, FREEDOM, EXPECTED and TRACE from the sums of `_fit_tile`.
 
     Parameters
     ----------
@@ -165,7 +169,7 @@ def _judge_tile(
 def _expect_tile(
     keep: Array, weights: Array, x: Array, first: int, last: int, sums: Array, out: Array
 ) -> None:
-    """Fill the expectation of chi2 with reduced weights, from what `_judge_tile` left."""
+    """Fill the expectation of chi2 with reduced weights, from the sums of `_chi2_tile`."""
     expected = out[EXPECTED, first:last]
     for j in range(last - first):
         if expected[j] > 0.0:
@@ -181,29 +185,29 @@ def _expect_tile(
 def fit_kano_hamilton(
     y: Array, noise: Array, keep: Array, inhomogeneity: Array, x: Array, out: Array
 ) -> None:
-    """Fit optical depth and intercept at every height of every profile.
+    """Fit optical depth and intercept at every altitude of every profile.
 
     Parameters
     ----------
     y, noise : (profile, angle, altitude) float
-        Logarithms and their variances; 0 and inf where there is none.
+        Logarithms and their variances; 0 and inf where there is no sample.
     keep : (profile, angle or 0, altitude) float
         Factors of the weights.
     inhomogeneity : (altitude,) float
-        Variance of the logarithms that comes on top of the noise.
+        Variance of the logarithms on top of the noise.
     x : (angle, altitude) float
         Slant path, finite.
     out : (profile, COLUMNS, altitude) float
-        Gets optical depth, information and the rest, but for what hangs on horizontal distance.
+        Output: all columns except those of `_geometry_tile`.
     """
-    count, angles, bins = y.shape
+    count, angles, altitudes = y.shape
     weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
     for t in range(count):
-        for first in range(0, bins, TILE):
-            last = min(first + TILE, bins)
+        for first in range(0, altitudes, TILE):
+            last = min(first + TILE, altitudes)
             _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
             _fit_tile(y[t], weights, x, first, last, sums, out[t])
-            _judge_tile(y[t], weights, x, first, last, sums, out[t])
+            _chi2_tile(y[t], weights, x, first, last, sums, out[t])
             if keep.shape[1] > 0:
                 _expect_tile(keep[t], weights, x, first, last, sums, out[t])
 
@@ -220,24 +224,24 @@ def fit_details(
     residuals: Array,
     leverages: Array,
 ) -> None:
-    """Fit as `fit_kano_hamilton`, with all that `fit_bins` gives where it fits no gradient.
+    """Fit as `fit_kano_hamilton`, with all outputs of `fit_levels` but no gradient.
 
     Parameters
     ----------
     y, noise, keep, inhomogeneity, x, out
         As in `fit_kano_hamilton`.
     d, residuals, leverages
-        As in `fit_bins`, with all profiles.
+        As in `fit_levels`, for all profiles.
     """
     fit_kano_hamilton(y, noise, keep, inhomogeneity, x, out)
-    count, angles, bins = y.shape
+    count, angles, altitudes = y.shape
     weights, sums = np.empty((angles, TILE)), np.empty((8, TILE))
     for t in range(count):
-        for first in range(0, bins, TILE):
-            last = min(first + TILE, bins)
+        for first in range(0, altitudes, TILE):
+            last = min(first + TILE, altitudes)
             _fill_weights(noise[t], keep[t], inhomogeneity, first, last, weights)
             _fit_tile(y[t], weights, x, first, last, sums, out[t])
-            _lever_tile(weights, x, d, first, last, sums, out[t])
+            _geometry_tile(weights, x, d, first, last, sums, out[t])
             for a in range(angles):
                 for k in range(first, last):
                     j = k - first
@@ -251,10 +255,10 @@ def fit_details(
 
 
 @_compiled
-def _lever_tile(
+def _geometry_tile(
     weights: Array, x: Array, d: Array, first: int, last: int, sums: Array, out: Array
 ) -> None:
-    """Fill what hangs on the beams alone: span of paths, and what a gradient would do."""
+    """Fill the span of slant paths and the effect of a gradient, which depend on geometry only."""
     for k in range(first, last):
         j = k - first
         low, high, east, north = np.inf, -np.inf, 0.0, 0.0
@@ -271,27 +275,27 @@ def _lever_tile(
 
 
 @_compiled
-def surrounds(weights: Array, design: Array) -> bool:
-    """Tell whether no half turn around the zenith is free of beams with weight.
+def _surrounds_zenith(weights: Array, design: Array) -> bool:
+    """Return whether every half turn around the zenith has a beam with weight.
 
     Parameters
     ----------
     weights : (angle,) float
     design : (4, angle) float
-        Of which the first two rows lead east and north.
+        The first two rows are the distances to the east and north.
     """
-    found = 0
-    turns = np.empty(weights.size)
+    tilted = 0
+    azimuths = np.empty(weights.size)
     for a in range(weights.size):
         if weights[a] > 0.0 and math.hypot(design[0, a], design[1, a]) > 1e-9:
-            turns[found] = math.atan2(design[0, a], design[1, a])
-            found += 1
-    if found < 2:
+            azimuths[tilted] = math.atan2(design[0, a], design[1, a])
+            tilted += 1
+    if tilted < 2:
         return False
-    turns = np.sort(turns[:found])
-    widest = turns[0] + 2.0 * math.pi - turns[found - 1]
-    for i in range(1, found):
-        widest = max(widest, turns[i] - turns[i - 1])
+    azimuths = np.sort(azimuths[:tilted])
+    widest = azimuths[0] + 2.0 * math.pi - azimuths[tilted - 1]
+    for i in range(1, tilted):
+        widest = max(widest, azimuths[i] - azimuths[i - 1])
     return bool(widest <= math.pi + _OPPOSITE)
 
 
@@ -307,7 +311,7 @@ def _dot(weights: Array, first: Array, second: Array) -> float:
 def _orthogonal(
     weights: Array, design: Array, sides: bool, q: Array, norm: Array, mean: Array
 ) -> int:
-    """Fill orthogonal columns of one bin, and where the model's zero lies on them.
+    """Fill orthogonal columns of one altitude, and the coordinates of the model's origin on them.
 
     Parameters
     ----------
@@ -317,14 +321,14 @@ def _orthogonal(
     sides : bool
         Whether to include the gradients.
     q : (3, angle) float
-        Gets the residuals of east, north and path, each after those before it; 0 if left out.
+        Output: east, north and path, each orthogonal to the columns before it; 0 if left out.
     norm, mean : (3,) float
-        Get the squared lengths and the coordinates of x = 0, d = 0.
+        Outputs: the squared lengths, and the coordinates of x = 0, d = 0.
 
     Returns
     -------
     int
-        Gradients included.
+        Number of gradients included.
     """
     ones = design[3]
     whole = _dot(weights, ones, ones)
@@ -366,7 +370,7 @@ def _span(weights: Array, path: Array) -> float:
 
 @_compiled
 def _slopes(weights: Array, design: Array, q: Array, norm: Array, mean: Array, out: Array) -> None:
-    """Fill what the fit of one bin says of the optical depth, its error and its leverage."""
+    """Fill the variances, gradient slopes and span of the fit of one altitude."""
     whole = _dot(weights, design[3], design[3])
     out[INTERCEPT_VARIANCE] = 1.0 / whole
     for c in range(3):
@@ -383,7 +387,7 @@ def _slopes(weights: Array, design: Array, q: Array, norm: Array, mean: Array, o
 
 
 @_compiled
-def fit_bin(
+def _fit_level(
     y: Array,
     weights: Array,
     keep: Array,
@@ -394,26 +398,28 @@ def fit_bin(
     hat: Array,
     out: Array,
 ) -> None:
-    """Fit one bin, with gradients where `sides`; fill residuals and leverages.
+    """Fit one altitude, with gradients if `sides`; fill residuals and leverages.
 
     Parameters
     ----------
     y : (angle,) float
-    weights, keep, residual, hat : (angle,) float
-        Weights, what they were reduced by; the latter two get values wherever there is a fit,
-        else NaN and 1.
+    weights, keep : (angle,) float
+        Weights, and the factors by which outliers reduced them.
     design : (4, angle) float
         East, north, path, ones.
     sides : bool
     q : (3, angle) float
-        Gets the orthogonal columns.
+        Output: the orthogonal columns.
+    residual, hat : (angle,) float
+        Outputs; NaN and 1 if there is no fit.
     out : (COLUMNS,) float
+        Output.
     """
     norm, mean = np.empty(3), np.empty(3)
     included = _orthogonal(weights, design, sides, q, norm, mean)
     beams = np.count_nonzero(weights)
     if included > 0 and beams <= 2 + included:
-        # Without a residual left, the gradient would cost the optical depth its check.
+        # With the gradient no residual would be left to check the optical depth.
         included = _orthogonal(weights, design, False, q, norm, mean)
     out[:] = 0.0
     out[TAU] = out[INTERCEPT] = out[INTERCEPT_VARIANCE] = np.nan
@@ -446,7 +452,7 @@ def fit_bin(
 
 
 @_compiled
-def fit_bins(
+def fit_levels(
     y: Array,
     noise: Array,
     keep: Array,
@@ -458,7 +464,7 @@ def fit_bins(
     residuals: Array,
     leverages: Array,
 ) -> None:
-    """Fit as `fit_kano_hamilton`, with gradients at bins whose beams surround the zenith.
+    """Fit as `fit_kano_hamilton`, with gradients at altitudes whose beams surround the zenith.
 
     Parameters
     ----------
@@ -467,12 +473,12 @@ def fit_bins(
     d : (2, angle, altitude) float
         Horizontal distance over altitude, eastward and northward.
     sides : bool
-        Whether the scan may know of gradients at all.
+        Whether all beams of the scan together surround the zenith.
     residuals, leverages : (profile or 0, angle, altitude) float
-        Get what the fit leaves of the logarithms (NaN where there is no sample) and the diagonal
-        of the hat matrix; not filled where they hold no profile.
+        Outputs: residuals of the logarithms (NaN where there is no sample) and the diagonal of the
+        hat matrix; not filled if they have no profile.
     """
-    count, angles, bins = y.shape
+    count, angles, altitudes = y.shape
     weights, before, kept, column = (
         np.empty(angles),
         np.empty(angles),
@@ -484,7 +490,7 @@ def fit_bins(
     for t in range(count):
         before[:] = 0.0
         around = False
-        for k in range(bins):
+        for k in range(altitudes):
             changed = False
             for a in range(angles):
                 weights[a] = 1.0 / (noise[t, a, k] + inhomogeneity[k])
@@ -496,8 +502,8 @@ def fit_bins(
                 column[a] = y[t, a, k]
                 design[0, a], design[1, a], design[2, a] = d[0, a, k], d[1, a, k], x[a, k]
             if sides and changed:
-                around = surrounds(weights, design)
-            fit_bin(column, weights, kept, design, around, q, residual, hat, row)
+                around = _surrounds_zenith(weights, design)
+            _fit_level(column, weights, kept, design, around, q, residual, hat, row)
             out[t, :, k] = row
             if residuals.shape[0] > 0:
                 for a in range(angles):

@@ -1,4 +1,4 @@
-"""Regularised differentiation of all altitudes of a block, whatever beams each of them has."""
+"""Method "mld" for all altitudes of a block, each with the beams that have a sample there."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class MldPrior:
-    """What is subtracted before: optical depths, or the answer at the altitude below."""
+    """Prior that is subtracted first: given optical depths, or the result at the altitude below."""
 
     optical_depth: Array | None
-    """(profile, altitude)."""
+    """(profile, altitude); None for the result at the altitude below."""
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """Optical depths and what they are made of, (profile, altitude); NaN where there is none."""
+class MldEstimates:
+    """Optical depths with errors and diagnostics, (profile, altitude); NaN where there is none."""
 
     optical_depth: Array
     standard_error: Array
     data_share: Array
     freedom: Array
+    """Degrees of freedom."""
     slopes: Array
-    """(2, profile, altitude): change per unit of gradient over altitude, east and north."""
+    """(2, profile, altitude): change of optical depth per unit of a gradient over altitude, to the
+    east and north."""
 
 
 def solve_mld_blocks(
@@ -39,27 +41,27 @@ def solve_mld_blocks(
     inhomogeneity: Array,
     regularisation: mld.Regularisation,
     prior: MldPrior | None,
-) -> Answer:
-    """Solve every altitude with the beams that it has.
+) -> MldEstimates:
+    """Solve every altitude with the beams that have a sample there.
 
     Parameters
     ----------
-    beams : Beams
+    beams : BeamBlock
     inhomogeneity : (altitude,) float
         Variance of the logarithms on top of the noise.
     regularisation : Regularisation
-    prior : Prior, optional
+    prior : MldPrior, optional
     """
-    profiles, _, bins = beams.noise.shape
-    out = np.full((profiles, bins, _ESTIMATES), np.nan)
+    profiles, _, altitudes = beams.noise.shape
+    out = np.full((profiles, altitudes, _ESTIMATES), np.nan)
     walk = prior is not None and prior.optical_depth is None
-    known = np.zeros((profiles, bins))
+    known = np.zeros((profiles, altitudes))
     if prior is not None and prior.optical_depth is not None:
         known = prior.optical_depth
-    # Bin by bin upwards, as the answer below may be the prior above.
+    # From below upwards, because the result at one altitude may be the prior of the next.
     below = np.zeros((profiles, 2))
     operators: dict[bytes, mld.Operator] = {}
-    for k in range(bins):
+    for k in range(altitudes):
         on = np.ascontiguousarray(beams.noise[:, :, k] < np.inf)
         patterns, which = _patterns(on)
         for number, pattern in enumerate(patterns):
@@ -70,7 +72,7 @@ def solve_mld_blocks(
             if key not in operators:
                 operators[key] = mld.make_operator(path, regularisation)
             members = np.flatnonzero(which == number)
-            _solve_bin(
+            _solve_altitude(
                 beams.logarithm[:, :, k],
                 beams.noise[:, :, k],
                 members,
@@ -87,9 +89,9 @@ def solve_mld_blocks(
                 out[:, k],
             )
         if walk:
-            found = np.isfinite(out[:, k, 0])
-            below[found] = out[found, k, :2]
-    return Answer(
+            solved = np.isfinite(out[:, k, 0])
+            below[solved] = out[solved, k, :2]
+    return MldEstimates(
         out[..., 0],
         np.sqrt(out[..., 1]),
         out[..., 2],
@@ -101,7 +103,7 @@ def solve_mld_blocks(
 def _patterns(on: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
     """Return the different sets of beams, and which of them each profile has."""
     if np.array_equal(on, np.broadcast_to(on[:1], on.shape)):
-        # As nearly everywhere; sorting costs more than solving a single profile.
+        # The usual case; sorting costs more than solving a single profile.
         return on[:1], np.zeros(len(on), dtype=np.intp)
     patterns, which = np.unique(on, axis=0, return_inverse=True)
     return patterns, which.reshape(-1)
@@ -113,7 +115,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
-def _solve_bin(
+def _solve_altitude(
     y: Array,
     noise: Array,
     members: npt.NDArray[np.intp],
@@ -148,7 +150,7 @@ def _solve_bin(
     prior : (profile, 2) float
         Optical depth and its variance.
     out : (profile, 6) float
-        Gets optical depth, variance, data share, degrees of freedom and slopes.
+        Output: optical depth, variance, data share, degrees of freedom and slopes.
     """
     count = beams.size
     left, variance, t = np.empty(count), np.empty(count), np.empty(count)

@@ -1,10 +1,10 @@
-"""Whether extinction varies along the paths of a scan: a test of how its beams scatter.
+"""Test whether extinction varies along the horizontal, from the scatter of the beams of a scan.
 
-Where the extinction of level air varies along the horizontal, what a beam has lost adds up on its
-way: it differs from that of other beams, the more the higher they are, and alike at neighbouring
-altitudes. Scatter of backscatter averages out over altitudes; this does not, and no smoothing over
-altitude takes it away. Scatter that grows by chance, by a gradient, by noise or by a few outliers
-must not pass for it.
+If extinction varies along the horizontal, the attenuation of beams differs. The difference
+accumulates along the path: it grows with altitude and is similar at neighbouring altitudes. Unlike
+scatter of backscatter, it does not average out over altitudes, and smoothing over altitude does not
+remove it. Scatter that grows by chance, a gradient, noise or a few outliers must not be mistaken
+for it.
 """
 
 from __future__ import annotations
@@ -22,107 +22,112 @@ from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
 
 Array = npt.NDArray[np.float64]
-Bins = npt.NDArray[np.intp]
+Indices = npt.NDArray[np.intp]
 
 GROWTH: Final = 1.5**2
-"""Ratio of the variances in the upper and the lower third below which they count as alike."""
+"""Ratio of the variances in the upper and the lower third, up to which they count as equal."""
 CERTAINTY: Final = 2.5
 """Standard errors by which the logarithm of that ratio must exceed zero. In simulated scenes
-without variation, 0.3 percent exceed both."""
-_FEWEST_BINS: Final = 6
+without variation, 0.3 percent exceed both limits."""
+_FEWEST_ALTITUDES: Final = 6
 _FEWEST_PROFILES: Final = 4
 _CLIP: Final = 3.0
-"""Standard errors to which residuals are cut, so that no outlier decides."""
+"""Standard errors to which residuals are clipped, so that no outlier dominates."""
 _DEPENDENT: Final = 1e-8
+"""Squared length of a column outside those before it, over its own, up to which it depends on
+them."""
 _LEAST_WEIGHT: Final = 1e-3
+"""Robust weight up to which a sample is left out."""
 _COLUMNS: Final = 4
+"""Constant, slant path, distance to the east and to the north."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def doubted_from(beams: BeamBlock, fit: Regression) -> int | None:
-    r"""Return the altitude from which on extinction varies along paths; None where it does not.
+def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
+    r"""Return the lowest altitude affected by extinction that varies along paths; None if none is.
 
-    With the inhomogeneity of the lower third of the altitudes, residuals are formed anew about a
-    constant, the slant path and the horizontal distances, which take a gradient away. Each beam is
-    averaged over the altitudes of a third, as far as inhomogeneity exceeds its noise; the sums of
-    squares Q of these means over beams and profiles are compared,
+    Residuals are formed about a constant, the slant path and the horizontal distances (which
+    removes a gradient), weighted with the inhomogeneity of the lower third of the altitudes. The
+    residuals of each beam are averaged over the altitudes of a third where inhomogeneity exceeds
+    noise. The sums of squares Q of these means over beams and profiles are compared,
 
     .. math:: \ln \frac{Q_u / \nu_u}{Q_l / \nu_l}, \qquad
               \sigma^2 = \psi'(\nu_u / 2) + \psi'(\nu_l / 2) ,
 
-    with the degrees of freedom :math:`\nu` that an altitude has, as a beam has one mean, however
-    its altitudes are correlated.
+    with the degrees of freedom :math:`\nu` of one altitude, because a beam has one mean, however
+    correlated its altitudes are.
 
-    Where this holds of what differs from profile to profile, all altitudes are doubted. What all
-    profiles of a block share may as well be an error of the instrument, as of a background,
-    which grows with the range; it counts for altitudes above the lower third.
+    If the deviations from the mean over profiles grow in this way, all altitudes are affected.
+    Growth common to all profiles of a block may also be an instrumental error that increases with
+    range, such as of the background; it affects altitudes above the lower third.
 
     Parameters
     ----------
-    beams : Beams
+    beams : BeamBlock
     fit : Regression
 
     Returns
     -------
     int, optional
-        Index.
+        Index of the altitude.
     """
-    seen = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
-    if seen.size < _FEWEST_BINS:
+    tested = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
+    if tested.size < _FEWEST_ALTITUDES:
         return None
-    third = seen.size // 3
-    thirds = seen[:third], seen[-third:]
+    third = tested.size // 3
+    thirds = tested[:third], tested[-third:]
     low = float(np.mean(fit.inhomogeneity[thirds[0]]))
-    lower, upper = (_beam_means(beams, fit, part, low) for part in thirds)
-    told = (lower.freedom > 0) & (upper.freedom > 0)
-    if not _grows(lower.of(told), upper.of(told)):
+    lower, upper = (_beam_means(beams, fit, altitudes, low) for altitudes in thirds)
+    known = (lower.freedom > 0) & (upper.freedom > 0)
+    lower, upper = lower.select(known), upper.select(known)
+    if not _grows(lower, upper):
         return None
-    if np.count_nonzero(told) < _FEWEST_PROFILES:
+    if np.count_nonzero(known) < _FEWEST_PROFILES:
         return 0
-    return (
-        0 if _grows(lower.of(told).varying(), upper.of(told).varying()) else int(thirds[0][-1]) + 1
-    )
+    return 0 if _grows(lower.deviations(), upper.deviations()) else int(thirds[0][-1]) + 1
 
 
 @dataclass(frozen=True, slots=True)
 class _Means:
-    """Means of beams over a third of the altitudes, in units that are 1 for white noise."""
+    """Means of beams over a third of the altitudes, scaled to variance 1 for white noise."""
 
     value: Array
     """(profile, beam)"""
     freedom: Array
     """(profile,)"""
 
-    def of(self, profiles: npt.NDArray[np.bool_]) -> _Means:
-        """Return those of some profiles."""
+    def select(self, profiles: npt.NDArray[np.bool_]) -> _Means:
+        """Return the means of some profiles."""
         return _Means(self.value[profiles], self.freedom[profiles])
 
-    def varying(self) -> _Means:
-        """Return what differs from profile to profile."""
-        there = self.value != 0.0
-        mean = self.value.sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    def deviations(self) -> _Means:
+        """Return the deviations from the mean over profiles."""
+        known = self.value != 0.0
+        mean = self.value.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
         left = 1.0 - 1.0 / self.freedom.size
-        return _Means(np.where(there, self.value - mean, 0.0), left * self.freedom)
+        return _Means(np.where(known, self.value - mean, 0.0), left * self.freedom)
 
 
 def _grows(lower: _Means, upper: _Means) -> bool:
-    squares = [float((one.value**2).sum()) for one in (lower, upper)]
-    freedom = [float(one.freedom.sum()) for one in (lower, upper)]
+    squares = [float((means.value**2).sum()) for means in (lower, upper)]
+    freedom = [float(means.freedom.sum()) for means in (lower, upper)]
     if min(squares + freedom) <= 0.0:
         return False
-    # White noise has 1: less is of an inhomogeneity that was told too large, and growth from
-    # there is that of the detector's noise.
+    # White noise has variance 1. A smaller one comes from an overestimated inhomogeneity, and
+    # growth from there to 1 is that of detector noise.
     growth = squares[1] / freedom[1] / max(squares[0] / freedom[0], 1.0)
-    spread = math.sqrt(sum(polygamma(1, 0.5 * one) for one in freedom))
+    spread = math.sqrt(sum(polygamma(1, 0.5 * count) for count in freedom))
     return growth > GROWTH and math.log(growth) > CERTAINTY * spread
 
 
-def _beam_means(beams: BeamBlock, fit: Regression, bins: Bins, inhomogeneity: float) -> _Means:
+def _beam_means(
+    beams: BeamBlock, fit: Regression, altitudes: Indices, inhomogeneity: float
+) -> _Means:
     """Average each beam of each profile over a third."""
     count, angles, _ = beams.noise.shape
-    residual = np.zeros((count * angles, bins.size))
-    freedom = np.zeros((count, bins.size))
+    residual = np.zeros((count * angles, altitudes.size))
+    freedom = np.zeros((count, altitudes.size))
     _standardise(
         beams.logarithm,
         beams.noise,
@@ -130,17 +135,17 @@ def _beam_means(beams: BeamBlock, fit: Regression, bins: Bins, inhomogeneity: fl
         inhomogeneity,
         beams.path,
         beams.distance,
-        bins,
+        altitudes,
         residual,
         freedom,
     )
     filled = np.count_nonzero(freedom > 0, axis=1)
-    # Fewer altitudes would be another third of another air.
-    on = 2 * filled >= bins.size
-    # Of white noise, too, all have one variance, however many altitudes they miss.
+    # With fewer altitudes the mean would not represent the third.
+    on = 2 * filled >= altitudes.size
+    # The root gives white noise variance 1, however many altitudes are missing.
     mean = residual.sum(axis=1).reshape(count, angles) / np.sqrt(np.maximum(filled, 1))[:, None]
-    each = freedom.sum(axis=1) / np.maximum(filled, 1)
-    return _Means(np.where(on[:, np.newaxis], mean, 0.0), np.where(on, each, 0.0))
+    mean_freedom = freedom.sum(axis=1) / np.maximum(filled, 1)
+    return _Means(np.where(on[:, np.newaxis], mean, 0.0), np.where(on, mean_freedom, 0.0))
 
 
 @_compiled
@@ -151,7 +156,7 @@ def _standardise(
     inhomogeneity: float,
     path: Array,
     distance: Array,
-    bins: Any,
+    altitudes: Any,
     residual: Array,
     freedom: Array,
 ) -> None:
@@ -165,19 +170,20 @@ def _standardise(
         Variance.
     path : (angle, altitude) float
     distance : (2, angle, altitude) float
-    bins : (bin,) int
-        Altitudes wanted.
-    residual : (profile * angle, bin) float
-        Zeros, where there is no sample they stay.
-    freedom : (profile, bin) float
+    altitudes : (selected,) int
+        Indices of the altitudes.
+    residual : (profile * angle, selected) float
+        Output; expected as zeros, which stay where there is no sample.
+    freedom : (profile, selected) float
+        Output.
     """
     profiles, angles, _ = noise.shape
     root, left = np.empty(angles), np.empty(angles)
     columns, basis = np.empty((_COLUMNS, angles)), np.empty((_COLUMNS, angles))
     beams = np.empty(angles, np.int64)
     for t in range(profiles):
-        for j in range(bins.size):
-            k = bins[j]
+        for j in range(altitudes.size):
+            k = altitudes[j]
             count = 0
             for a in range(angles):
                 kept = keep[t, a, k] if keep.shape[1] > 0 else 1.0
@@ -191,7 +197,7 @@ def _standardise(
                 columns[1, i] = path[beams[i], k] * root[i]
                 columns[2, i] = distance[0, beams[i], k] * root[i]
                 columns[3, i] = distance[1, beams[i], k] * root[i]
-            known = taken_away(columns, basis, count, left)
+            known = remove_columns(columns, basis, count, left)
             freedom[t, j] = max(count - known, 0)
             if count > known:
                 for i in range(count):
@@ -199,33 +205,36 @@ def _standardise(
 
 
 @_compiled
-def taken_away(columns: Array, basis: Array, count: int, left: Array) -> int:
-    """Take columns out of residuals, fill an orthonormal basis of them, and return its size."""
+def remove_columns(columns: Array, basis: Array, count: int, left: Array) -> int:
+    """Project residuals off the columns, fill an orthonormal basis of these, return its size."""
     known = 0
-    for one in columns:
-        basis[known] = one
+    for column in columns:
+        basis[known] = column
         known += 1 if _orthogonal(basis, known, count, left) else 0
     return known
 
 
 @_compiled
 def _orthogonal(basis: Array, known: int, count: int, left: Array) -> bool:
-    """Make a column orthogonal to those before, and take it out of what is left of the data."""
-    one = basis[known]
-    raw = _dot(one, one, count)
+    """Make a column orthonormal to those before and project the residuals off it.
+
+    Return False if the column depends on those before.
+    """
+    column = basis[known]
+    raw = _dot(column, column, count)
     for c in range(known):
-        share = _dot(basis[c], one, count)
+        share = _dot(basis[c], column, count)
         for i in range(count):
-            one[i] -= share * basis[c, i]
-    square = _dot(one, one, count)
+            column[i] -= share * basis[c, i]
+    square = _dot(column, column, count)
     if not square > _DEPENDENT * raw:
         return False
     norm = 1.0 / math.sqrt(square)
     for i in range(count):
-        one[i] *= norm
-    share = _dot(one, left, count)
+        column[i] *= norm
+    share = _dot(column, left, count)
     for i in range(count):
-        left[i] -= share * one[i]
+        left[i] -= share * column[i]
     return True
 
 

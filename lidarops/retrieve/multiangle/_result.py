@@ -1,4 +1,4 @@
-"""What a multi-angle retrieval returns."""
+"""Result of a multi-angle retrieval: profiles, flags and the record of steps."""
 
 from __future__ import annotations
 
@@ -14,33 +14,32 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class MultiAngleFlags:
-    """What is to be known of a value before it is used; each (..., altitude)."""
+    """Reasons to reject a value or to doubt its uncertainty; each (..., altitude)."""
 
     no_data: Mask
-    """No angle, or no two different ones, hold a signal at any altitude."""
+    """At no altitude do two different angles have a signal."""
     extrapolated: Mask
     """Beyond the reach: fewer beams than the method needs are left. Values are withheld."""
     interpolated: Mask
-    """No estimate at this altitude; bridged from those around."""
+    """No estimate at this altitude; interpolated from those around."""
     no_residual: Mask
-    """As many beams as unknowns in all profiles of the block, at all altitudes around: nothing
-    checks the model or tells the inhomogeneity."""
+    """As many unknowns as beams in all profiles of the block, at all altitudes around: the model
+    cannot be checked, and the inhomogeneity cannot be estimated."""
     low_leverage: Mask
-    """The slant paths differ by less than a tenth of the vertical one."""
+    """The slant paths differ by less than a tenth of the vertical path."""
     one_sided: Mask
-    """A half turn around the zenith is free of beams: a horizontal gradient is not seen."""
+    """A half turn around the zenith has no beam: a horizontal gradient cannot be detected."""
     gradient: Mask
     """The residuals show a horizontal gradient that the fit does not account for."""
     poor_stratification: Mask
-    """The mean scatter of beams over altitudes grows with altitude, more than noise, chance and a
-    gradient make it, as it does where extinction itself varies along the horizontal; or
-    neighbouring beams scatter alike, as in patches of air that are wider than beams are apart.
-    Extinction is withheld."""
+    """The beams scatter increasingly with altitude, by more than noise, chance and a gradient
+    explain, as when extinction varies along the horizontal; or neighbouring beams scatter alike,
+    as in patches of air wider than the distance of beams. Extinction is withheld."""
     prior_dominated: Mask
-    """Smoothness or a prior, not the data, decides on the value. Extinction is withheld where
-    the data share lies outside 0.9-1.1."""
+    """Smoothness or a prior, not the data, determines the value. Extinction is withheld where
+    the data share is outside 0.9-1.1."""
     saturated: Mask
-    """The data ask for no less smoothness than the least admitted."""
+    """The best fit has the largest smoothness that is allowed."""
     undersmoothed: Mask
     """More than 10 degrees of freedom and more than 0.4 per altitude: the standard error may be
     too small."""
@@ -48,10 +47,10 @@ class MultiAngleFlags:
     """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too
     small."""
     outlier: Mask
-    """At least one beam or estimate was weighted down as an outlier."""
+    """At least one beam or estimate got less weight as an outlier."""
 
     def doubtful(self) -> Mask:
-        """Return where a stated uncertainty is not to be relied on."""
+        """Return where the stated uncertainty may be too small."""
         return np.asarray(
             self.no_residual
             | self.gradient
@@ -78,52 +77,52 @@ class MultiAngleResult:
     optical_depth: Array
     """From the lidar to the altitude."""
     optical_depth_standard_error: Array
-    """Of noise and smoothing, without `optical_depth_gradient_error`."""
+    """Error from noise and smoothing, without `optical_depth_gradient_error`."""
     optical_depth_gradient_error: Array
-    """Systematic: the largest error that the declared horizontal gradient of backscatter makes."""
+    """Systematic: largest error caused by the declared horizontal gradient of backscatter."""
     extinction: Array
-    """m-1, mean of the layer between the altitude and the one below (the lidar, for the first)."""
+    """m-1, mean of the layer between the altitude and the next lower one (or the lidar)."""
     extinction_standard_error: Array
     """m-1."""
     extinction_gradient_error: Array
     """m-1, systematic."""
     log_intercept: Array
-    """ln of the range-corrected signal that an optical depth of zero would give."""
+    """ln of the range-corrected signal extrapolated to zero optical depth."""
     log_intercept_standard_error: Array
     effective_degrees_of_freedom: Array
-    """(...,): how many numbers of the profile come from the data."""
+    """(...,): effective number of independent values in the profile."""
     data_share: Array
-    """Share of the optical depth that the data give, 1 where no prior and no smoothing acts."""
+    """Share of the optical depth that comes from the data; 1 without prior and smoothing."""
     inhomogeneity: Array
     """Standard deviation of the logarithms of the signals on top of detector noise."""
     reduced_chi_square: Array
-    """Of the fit over angles; NaN where no beam is redundant."""
+    """Of the fit over angles; NaN where beams are not more than unknowns."""
     reach: Array
     """(...,) m, the highest altitude with an estimate; NaN where there is none."""
     layer_optical_depth: Array
-    """(..., layer): between the bounds of the layers asked for."""
+    """(..., layer): between the bounds of the requested layers."""
     layer_optical_depth_standard_error: Array
-    """(..., layer): random error; without smoothing over altitude, as if the errors of both
-    bounds were independent, which is too large where they go together."""
+    """(..., layer): random error. Methods without smoothing over altitude treat the errors of both
+    bounds as independent, which is too large if they are correlated."""
     layer_optical_depth_gradient_error: Array
     """(..., layer): systematic, as `optical_depth_gradient_error`."""
     residual: Array
-    """(..., angle, altitude): logarithms less their fit over angles; NaN where no sample."""
+    """(..., angle, altitude): logarithms minus their fit over angles; NaN without a sample."""
     flags: MultiAngleFlags
     quality: npt.NDArray[np.int32]
     """Bits of `lidarops.flags.Quality`."""
     steps: tuple[StepRecord, ...]
-    """What ran and what was left out, block by block."""
+    """Steps that ran or were left out, block by block."""
 
 
-def empty_flags(shape: tuple[int, ...]) -> dict[str, Mask]:
-    """Return a lowered array for every flag."""
+def _empty_flags(shape: tuple[int, ...]) -> dict[str, Mask]:
+    """Return an array of False for every flag."""
     return {field.name: np.zeros(shape, dtype=np.bool_) for field in fields(MultiAngleFlags)}
 
 
 @dataclass(slots=True)
 class Profiles:
-    """The results of profiles while blocks fill them in; (profile, altitude) unless stated."""
+    """Results that blocks fill in; arrays are (profile, altitude) unless stated."""
 
     optical_depth: Array
     optical_depth_standard_error: Array
@@ -151,29 +150,29 @@ class Profiles:
     flags: dict[str, Mask]
 
     @classmethod
-    def missing(cls, profiles: int, angles: int, bins: int, layers: int) -> Profiles:
-        """Return profiles of which nothing is known."""
+    def missing(cls, profiles: int, angles: int, altitudes: int, layers: int) -> Profiles:
+        """Return profiles that are NaN everywhere, without flags."""
         shapes: dict[str, tuple[int, ...]] = {
             "effective_degrees_of_freedom": (profiles,),
             "reach": (profiles,),
             "layer_optical_depth": (profiles, layers),
             "layer_optical_depth_standard_error": (profiles, layers),
             "layer_optical_depth_gradient_error": (profiles, layers),
-            "residual": (profiles, angles, bins),
+            "residual": (profiles, angles, altitudes),
         }
         values: dict[str, Any] = {
-            field.name: np.full(shapes.get(field.name, (profiles, bins)), np.nan)
+            field.name: np.full(shapes.get(field.name, (profiles, altitudes)), np.nan)
             for field in fields(cls)
             if field.name != "flags"
         }
-        return cls(**values, flags=empty_flags((profiles, bins)))
+        return cls(**values, flags=_empty_flags((profiles, altitudes)))
 
-    def put(self, rows: npt.NDArray[np.intp], part: Profiles) -> None:
-        """Write the profiles of one block."""
+    def put(self, rows: npt.NDArray[np.intp], block: Profiles) -> None:
+        """Copy the profiles of one block into these rows."""
         for field in fields(self):
             if field.name != "flags":
-                getattr(self, field.name)[rows] = getattr(part, field.name)
-        for name, mask in part.flags.items():
+                getattr(self, field.name)[rows] = getattr(block, field.name)
+        for name, mask in block.flags.items():
             self.flags[name][rows] = mask
 
     def result(

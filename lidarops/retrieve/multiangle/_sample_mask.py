@@ -1,7 +1,7 @@
-"""Compiled choice of the samples of a scan, and what their logarithms and variances are.
+"""Compiled selection of the samples of a scan, and their logarithms with variances.
 
-No choice here hangs on the sample that it admits: where the signal is weak, dropping low
-samples and keeping high ones is the largest error of all.
+The selection of a sample does not depend on its own value: where the signal is weak, dropping low
+samples and keeping high ones would be the largest error of all.
 """
 
 from __future__ import annotations
@@ -17,38 +17,42 @@ Array = npt.NDArray[np.float64]
 Ends = npt.NDArray[np.int32]
 
 LOWEST_SNR: Final = 3.0
-"""Signal over noise, as means over a wide window around a bin, below which a beam ends: the wider,
-the less a single sample has a say in its own admission."""
+"""Mean signal over noise in a window around an altitude, below which a beam ends. In a wide window
+a sample has little influence on its own selection."""
 AROUND: Final = 15
-"""Bins of that window."""
+"""Altitudes in that window."""
 SWALLOWED_SNR: Final = 2.0
-"""The same over a window from the bin upwards, below which a beam ends: the wide one would admit
-bins behind the point where a thick cloud has swallowed the beam."""
+"""The same in a window from the altitude upwards: the wide window would accept samples behind a
+thick cloud that attenuates the beam completely."""
 AHEAD: Final = 5
-"""Bins of that window."""
+"""Altitudes in that window."""
 LEAST_NOISE: Final = 1e-6
-"""Noise over signal that no lidar undercuts; keeps variances of zero from infinite weights."""
+"""Smallest noise over signal; no lidar has less, and a variance of zero would have an infinite
+weight."""
 _FARTHEST: Final = 3.0
+"""Standard deviations by which the expected signal may differ from the sample."""
 _HUGE: Final = 1e300
+"""Values from here on count as missing."""
 _LARGEST_RATIO: Final = 1.0 / LOWEST_SNR**2
+"""Largest variance over squared signal for which the moments of the logarithm are corrected."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
 def _clean(signal: Any, variance: Any, row: Array) -> None:
-    """Fill signal, variance and 1 of the bins that are given, zeros elsewhere."""
-    values, spread, given = row[0], row[1], row[2]
+    """Fill signal, variance and 1 at altitudes with data, zeros elsewhere."""
+    values, spread, count = row[0], row[1], row[2]
     for k in range(signal.size):
         on = abs(signal[k]) < _HUGE and 0.0 <= variance[k] < _HUGE
         values[k] = signal[k] if on else 0.0
         spread[k] = variance[k] if on else 0.0
-        given[k] = 1.0 if on else 0.0
+        count[k] = 1.0 if on else 0.0
 
 
 @_compiled
 def _window_sums(row: Array, size: int, sums: Array) -> None:
-    """Fill the sums of rows over windows by the bin at which they start."""
+    """Fill the sums of rows over windows, by the altitude at which a window starts."""
     starts = row.shape[1] - size + 1
     for i in range(row.shape[0]):
         total = sums[i, :starts]
@@ -61,34 +65,34 @@ def _window_sums(row: Array, size: int, sums: Array) -> None:
 
 @_compiled
 def _first_loss(row: Array, before: int, size: int, lowest: float, sums: Array) -> int:
-    """Return the first bin whose window has a mean of less than so much noise.
+    """Return the first altitude where the mean signal of the window is below `lowest` times noise.
 
-    The window begins `before` the bin, and is moved inside the grid.
+    The window begins `before` altitudes below, and is moved inside the grid.
     """
-    bins = row.shape[1]
-    size = min(size, bins)
+    altitudes = row.shape[1]
+    size = min(size, altitudes)
     _window_sums(row, size, sums)
-    for k in range(bins):
-        j = max(min(k - before, bins - size), 0)
+    for k in range(altitudes):
+        j = max(min(k - before, altitudes - size), 0)
         lost = not sums[0, j] > lowest * math.sqrt(sums[1, j] * sums[2, j])
         if lost and sums[2, j] > 0.0:
             return k
-    return int(bins)
+    return int(altitudes)
 
 
 @_compiled
 def _levels(row: Array, levels: Array, roots: Array) -> None:
     """Fill the means of neighbours and their square roots, 0 where not positive.
 
-    Entry k is that of the two bins below k, entry k + 3 that of the two above, as far as there
-    are bins and they are given.
+    Entry k is the mean of the two altitudes below k, entry k + 3 that of the two above, of those
+    that exist and have data.
     """
-    bins = row.shape[1]
-    for j in range(bins + 3):
+    altitudes = row.shape[1]
+    for j in range(altitudes + 3):
         total = count = 0.0
-        if 2 <= j <= bins + 1:
+        if 2 <= j <= altitudes + 1:
             total, count = total + row[0, j - 2], count + row[2, j - 2]
-        if 1 <= j <= bins:
+        if 1 <= j <= altitudes:
             total, count = total + row[0, j - 1], count + row[2, j - 1]
         levels[j] = total / count if total > 0.0 else 0.0
         roots[j] = math.sqrt(levels[j])
@@ -96,9 +100,9 @@ def _levels(row: Array, levels: Array, roots: Array) -> None:
 
 @_compiled
 def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
-    """Return the signal at a bin as its neighbours tell it, unless its own noise forbids that.
+    """Return the signal expected from the neighbours, within 3 standard deviations of the sample.
 
-    The geometric mean of both sides is right for an exponential decay.
+    The geometric mean of both sides is exact for an exponential decay.
     """
     guess = roots[k] * roots[k + 3]
     if guess == 0.0:
@@ -112,24 +116,25 @@ def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
 def take_logarithms(
     signal: Any, variance: Any, usable: Any, logarithm: Array, noise: Array, ends: Ends
 ) -> None:
-    r"""Take the logarithms of range-corrected signals, free of the bias that noise gives them.
+    r"""Take the logarithms of range-corrected signals without the bias caused by noise.
 
-    With the variance q of the signal over the square of its expectation, which the neighbouring
-    bins tell, the logarithm of a normal signal has the mean :math:`-q/2 - 3q^2/4` and the
-    variance :math:`q + 5q^2/2`, to second order.
+    With q the variance of the signal over the square of its expectation, which is estimated from
+    neighbouring altitudes, the logarithm of a normal signal over its expectation has the mean
+    :math:`-q/2 - 3q^2/4` and the variance :math:`q + 5q^2/2`, to second order.
 
     Parameters
     ----------
     signal, variance : (profile, angle, altitude) float
     usable : (angle,) bool
     logarithm, noise : (profile, angle, altitude) float64
-        Get the logarithms and their variances; 0 and inf where there is no sample.
+        Outputs: the logarithms and their variances; 0 and inf where there is no sample.
     ends : (profile, angle) int32
-        Gets the first bin of each beam that is lost in noise, the number of bins where none is.
+        Output: the first altitude of each beam that is lost in noise; the number of altitudes if
+        none is.
     """
-    count, angles, bins = signal.shape
-    row, sums = np.empty((3, bins)), np.empty((3, bins))
-    levels, roots = np.empty(bins + 3), np.empty(bins + 3)
+    count, angles, altitudes = signal.shape
+    row, sums = np.empty((3, altitudes)), np.empty((3, altitudes))
+    levels, roots = np.empty(altitudes + 3), np.empty(altitudes + 3)
     for t in range(count):
         for a in range(angles):
             _clean(signal[t, a], variance[t, a], row)
@@ -139,7 +144,7 @@ def take_logarithms(
                 end = min(end, _first_loss(row, AROUND // 2, AROUND, LOWEST_SNR, sums))
             ends[t, a] = end
             _levels(row, levels, roots)
-            for k in range(bins):
+            for k in range(altitudes):
                 logarithm[t, a, k] = 0.0
                 noise[t, a, k] = np.inf
                 if k < end and row[0, k] > 0.0:
@@ -147,7 +152,7 @@ def take_logarithms(
                         max(math.sqrt(row[1, k]) / _expected(row, levels, roots, k), LEAST_NOISE)
                         ** 2
                     )
-                    # The series of the logarithm's moments ends where it would diverge.
+                    # The series of the moments of the logarithm diverges for larger ratios.
                     known = min(ratio, _LARGEST_RATIO)
                     noise[t, a, k] = ratio * (1.0 + 2.5 * known)
                     logarithm[t, a, k] = math.log(row[0, k]) + known * (0.5 + 0.75 * known)

@@ -1,12 +1,12 @@
-r"""Regularised differentiation of the logarithm along the slant path (the historical method).
+r"""Method "mld": regularised differentiation of the logarithm along the slant path (historical).
 
 The slope of :math:`\ln S` over the slant path x is taken as constant between neighbouring beams,
-:math:`y_l - c = \int_{x_0}^{x_l} \varphi\,dx`, and kept small (order 0) or level (order 1) by a
+:math:`y_l - c = \int_{x_0}^{x_l} \varphi\,dx`, and kept small (order 0) or constant (order 1) by a
 penalty of strength :math:`\alpha`. Its mean over the path gives :math:`\tau = -\bar\varphi / 2`.
 
-With order 0, the answer is drawn to an optical depth of zero, or to a prior where one is
-subtracted first; how much of it comes from the data is the data share. With order 1 it lies
-between that of the end beams and that of the regression on the slant path.
+With order 0, the penalty pulls the optical depth towards zero, or towards a prior that is
+subtracted first; the data share is the part that comes from the data. With order 1, the optical
+depth lies between that of the end beams and that of the regression on the slant path.
 """
 
 from __future__ import annotations
@@ -25,30 +25,32 @@ from lidarops.retrieve.common import inputs
 Array = npt.NDArray[np.float64]
 
 STRENGTHS: Final[Array] = 10.0 ** np.linspace(-6.0, 6.0, 97)
-"""From which the strength is chosen; dimensionless, for paths scaled to a span of 1."""
+"""Strengths of the penalty to choose from; dimensionless, for paths scaled to a span of 1."""
 _SAME_NODE: Final = 1e-4
+"""Distance of scaled slant paths up to which beams share a node."""
 
 
 class StrengthChoice(StrEnum):
-    """How the strength of the penalty is found."""
+    """Rule by which the strength of the penalty is chosen."""
 
     DISCREPANCY = "discrepancy"
-    """The strongest with which the residuals are no larger than the noise."""
+    """Largest strength with residuals not larger than the noise."""
     CP = "cp"
-    """The least Mallows' Cp, for known noise."""
+    """Least Mallows' Cp, for known noise."""
     GCV = "gcv"
-    """The least generalised cross-validation score, for unknown noise."""
+    """Least score of generalised cross-validation, for unknown noise."""
     FIXED = "fixed"
+    """`Regularisation.strength`."""
 
 
 class Average(StrEnum):
-    """What mean of the slope gives the optical depth."""
+    """Mean of the slope that gives the optical depth."""
 
     PATH = "path"
     """Over the slant path."""
     ANGLES = "angles"
-    """Over the intervals between beams, however short; worse, as the tiny ones near the zenith
-    weigh as much as the long ones."""
+    """Over the intervals between beams; worse, because the short intervals near the zenith weigh
+    as much as the long ones."""
 
 
 class _Rule(IntEnum):
@@ -59,19 +61,22 @@ class _Rule(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Regularisation:
-    """Settings of the method.
+    """Settings of the methods "mld" and "mld_prior".
 
     Raises
     ------
     RetrievalInputError
-        For an order other than 0 and 1, or a strength that does not go with the choice.
+        For an order other than 0 and 1, or a strength that contradicts the choice.
     """
 
     order: int = 0
+    """0 keeps the slope small, 1 keeps it constant."""
     choice: str = "discrepancy"
+    """A `StrengthChoice`."""
     strength: float | None = None
-    """Of the penalty, for "fixed"."""
+    """Strength of the penalty, only with "fixed"."""
     average: str = "path"
+    """An `Average`."""
 
     def __post_init__(self) -> None:
         if self.order not in {0, 1}:
@@ -101,27 +106,27 @@ class Regularisation:
 
     @property
     def rule(self) -> int:
-        """Number of the rule of choice; of no effect where one strength is given."""
+        """Number of the rule of choice; without effect if one strength is given."""
         names = {StrengthChoice.CP: _Rule.CP, StrengthChoice.GCV: _Rule.GCV}
         return int(names.get(StrengthChoice(self.choice), _Rule.DISCREPANCY))
 
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """What the method does to the logarithms of one set of beams, up to the strength."""
+    """Linear operator from the logarithms of one set of beams to optical depth."""
 
     coordinates: Array
     """(component, beam): turns logarithms into uncorrelated coordinates b."""
     penalty: Array
-    """(component,): each is kept by the share f = 1 / (1 + strength * penalty)."""
+    """(component,): the regularisation keeps the share f = 1 / (1 + strength * penalty) of b."""
     gain: Array
     """(component,): optical depth = sum of gain * f * b."""
     condition: float
-    """Of the system that gives the slopes."""
+    """Condition number of the system for the slopes."""
 
 
 def make_operator(path: Array, regularisation: Regularisation) -> Operator:
-    """Decompose the method for beams that count alike.
+    """Return the operator for beams of equal weight.
 
     Parameters
     ----------
@@ -153,14 +158,16 @@ def make_operator(path: Array, regularisation: Regularisation) -> Operator:
 
 
 def _modes(rough: Array, free: Array) -> tuple[Array, Array]:
-    """Return what the penalty is of its own modes, and these; those that it leaves free first.
+    """Return the eigenvalues and eigenvectors of the penalty, those without penalty first.
 
-    Free modes are given, not found: a strong penalty would blow up what rounding leaves of them.
+    The free modes are an input: computed from the penalty, their eigenvalues would not be exactly
+    zero, and a large strength would amplify the rounding error.
 
     Parameters
     ----------
     rough : (row, component) float
     free : (component, 0 or 1) float
+        Modes without penalty.
     """
     whole = np.linalg.qr(np.hstack([free, np.eye(rough.shape[1])]))[0]
     bound = whole[:, free.shape[1] : rough.shape[1]]
@@ -186,7 +193,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @_compiled
 def _score(rss: float, freedom: float, beams: int, rule: int) -> float:
-    """Return what the strength is to make least; the discrepancy rule takes the last that is 0."""
+    """Return the score to minimise; the discrepancy rule takes the last strength with score 0."""
     if rule == 1:
         return rss + 2.0 * freedom
     if rule == 2:
@@ -199,17 +206,17 @@ def _score(rss: float, freedom: float, beams: int, rule: int) -> float:
 def choose_strength(
     b: Array, rest: float, penalty: Array, strengths: Array, beams: int, rule: int
 ) -> float:
-    """Return the strength that a rule picks from a grid.
+    """Return the strength that a rule chooses from a grid.
 
     Parameters
     ----------
     b : (component,) float
         Coordinates in units of their standard error.
     rest : float
-        Sum of squares, in the same units, that no component holds.
+        Sum of squares, in the same units, outside all components.
     penalty : (component,) float
     strengths : (strength,) float
-        Ascending; the first is taken where nothing better is found.
+        Ascending; the first is taken if no score is better.
     beams, rule : int
     """
     best, least = strengths[0], np.inf

@@ -1,4 +1,4 @@
-"""Optical depth and extinction from scans: one atmosphere seen along paths of several lengths."""
+"""Optical depth and extinction from scans: one atmosphere seen along paths of different lengths."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 LARGEST_GRADIENT: Final = 5e-5
-"""m-1, of ln backscatter along the horizontal, where the user declares none."""
+"""m-1, default horizontal gradient of ln backscatter covered by the gradient errors."""
 
 __all__ = [
     "LARGEST_GRADIENT",
@@ -41,21 +41,21 @@ __all__ = [
 
 
 class MultiAngleMethod(StrEnum):
-    """How optical depths are found."""
+    """Method of retrieving optical depths."""
 
     AUTO = "auto"
-    """`TWO_ANGLE` for two beams; `KANO_HAMILTON` where it is certain enough and no extinction is
-    wanted; else `JOINT`."""
+    """`TWO_ANGLE` for two beams; `KANO_HAMILTON` if it meets the tolerance and no extinction is
+    requested; else `JOINT`."""
     TWO_ANGLE = "two_angle"
-    """From the shortest and the longest path alone."""
+    """Only the shortest and the longest path."""
     KANO_HAMILTON = "kano_hamilton"
-    """Weighted regression on the slant path, each altitude by itself."""
+    """Weighted regression on the slant path, each altitude on its own."""
     JOINT = "joint"
-    """Kano-Hamilton, then one smooth profile through all altitudes."""
+    """`KANO_HAMILTON`, then one smooth profile through all altitudes."""
     MLD = "mld"
-    """Regularised differentiation of the logarithm along the slant path."""
+    """Regularised differentiation of the logarithm along the slant path, the historical method."""
     MLD_PRIOR = "mld_prior"
-    """The same of what is left after subtracting a prior."""
+    """`MLD` applied to the difference from a prior."""
 
 
 def retrieve_optical_depth(
@@ -76,68 +76,70 @@ def retrieve_optical_depth(
     prior_optical_depth: npt.ArrayLike | None = None,
     layers: Sequence[tuple[float, float]] = (),
 ) -> MultiAngleResult:
-    r"""Find optical depth and extinction from signals at several zenith angles.
+    r"""Retrieve optical depth and extinction from signals at several zenith angles.
 
-    In an atmosphere that is the same along the horizontal, the logarithm of the range-corrected
-    signal at an altitude z falls along the slant path x:
+    In a horizontally homogeneous atmosphere, the logarithm of the range-corrected signal at an
+    altitude z decreases linearly with the slant path x:
 
     .. math:: y_l(z) = c(z) - 2 x_l \tau(z) + g(z) \cdot d_l + e_l,
 
-    with detector noise and inhomogeneity in e (variance :math:`v_l + s^2`), and a horizontal
-    gradient g over the distance d, which is fitted at the altitudes where beams lead to all sides.
-    x is the secant up to 75 degrees and follows the curvature beyond; a beam with x > 10 is left
-    out. A beam ends where the mean signal of the 15 altitudes around is less than 3 times its
+    where e is detector noise and inhomogeneity (variance :math:`v_l + s^2`), and g a horizontal
+    gradient over the distance d, fitted at altitudes where beams point to all sides. x is the
+    secant up to 75 degrees and follows the curvature of the Earth beyond; a beam with x > 10 is
+    left out. A beam ends where the mean signal of the 15 altitudes around is less than 3 times its
     noise, or that of the next 5 less than twice.
 
     :math:`s^2` is the moment estimate of random-effects meta-analysis, pooled over the profiles of
-    a block and 15 altitudes. In a block with a residual that is too large for chance (beyond 4.5
-    standard errors, and with a probability of 1 percent in so many), outliers are weighted
-    down, starting from repeated medians and the pair of beams that most others agree
-    with. Nothing is iterated to convergence.
+    a block and 15 altitudes. If a residual of the block is too large for chance (beyond 4.5
+    standard errors, with a probability of 1 percent among all residuals), outliers get less
+    weight, starting from repeated medians and the pair of beams with which most others agree. The
+    number of passes is fixed.
 
-    Simulated scans of clear air and of a cloud, the air correlated by 0 to 0.9 at neighbouring
-    altitudes and up to 30 percent of the samples missing at random: with "joint", the errors of
-    optical depth are 0.93 to 1.1 times the stated ones in blocks of 32 profiles, those of
-    extinction 0.6 to 1.0 times. With gaps, a block of 8 profiles is told up to 15 percent too
-    uncertain.
+    In simulated scans of clear air and of a cloud (correlation of the air at neighbouring
+    altitudes 0 to 0.9, up to 30 percent of the samples missing at random), the errors of "joint"
+    in blocks of 32 profiles are 0.93 to 1.1 times the stated ones for optical depth and 0.6 to 1.0
+    times for extinction. With gaps, standard errors of a block of 8 profiles are up to 15 percent
+    too large.
 
     Parameters
     ----------
     signal : (..., angle, altitude) float
         Range-corrected, without background, in any unit, on common altitudes (see
-        `lidarops.retrieve.multiangle._common_altitude`); NaN where missing. From full overlap upwards.
+        `lidarops.retrieve.multiangle._common_altitude`), from full overlap upwards; NaN where
+        missing.
     zenith_angle : (angle,) float
-        degree, -90 to 90; a negative angle leads opposite to its azimuth.
+        degree, -90 to 90; a beam with a negative angle points opposite to its azimuth.
     altitude : (altitude,) float
         m, ascending, above `station_altitude`; uniform for "joint".
     variance : (..., angle, altitude) float
-        Of the signal, in the square of its unit, broadcast against it. Of the noise alone.
+        Variance of the noise alone, in the square of the unit of the signal, broadcast against it.
     azimuth : (angle,) float, optional
-        degree; one and the same for all angles where not given.
+        degree; the same for all angles if not given.
     method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
+        See `MultiAngleMethod`.
     block : (...) int, optional
-        Label of the block of each profile; inhomogeneity, correlation and smoothness are common
-        to a block and depend on nothing outside it. One block where not given.
+        Label of the block of each profile. Inhomogeneity, correlation and smoothness are common
+        to a block and independent of other blocks. All profiles are one block if not given.
     station_altitude : float
-        m, of the lidar, where the optical depth is zero.
+        m, altitude of the lidar, where the optical depth is zero.
     inhomogeneity : float, optional
-        Standard deviation of the logarithms on top of the noise; estimated where not given.
+        Standard deviation of the logarithms on top of the noise; estimated if not given.
     largest_gradient : float
-        m-1, of ln backscatter along the horizontal, which `optical_depth_gradient_error` and
-        `extinction_gradient_error` allow for.
+        m-1, horizontal gradient of ln backscatter covered by `optical_depth_gradient_error` and
+        `extinction_gradient_error`.
     robust : bool
-        Whether to look for outliers.
+        Whether to test for outliers.
     tolerance : float, optional
-        For "auto", the standard error of the optical depth that is small enough: give it where
-        no extinction is wanted, and blocks whose median is below it stay with "kano_hamilton".
+        Sufficient standard error of optical depth for "auto" if no extinction is requested. A
+        block with a smaller median standard error is solved by "kano_hamilton".
     regularisation : Regularisation, optional
         For "mld" and "mld_prior".
     prior_optical_depth : (..., altitude) float, optional
-        For "mld_prior", broadcast against the profiles; the optical depth of the altitude below
-        where not given.
+        For "mld_prior", broadcast against the profiles; the optical depth at the altitude below
+        if not given.
     layers : sequence of (float, float)
-        m, bottom and top of layers whose optical depth is wanted; moved to the nearest of the
-        altitudes and the station, by half the distance to the next one at most.
+        m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
+        altitudes and the station, by at most half the distance to the next one.
 
     Returns
     -------
@@ -146,14 +148,14 @@ def retrieve_optical_depth(
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right, or that the method does not take.
+        For invalid arguments, or arguments that the method does not accept.
 
     References
     ----------
     kano1968, hamilton1969, dersimonian1986, siegel1982.
     """
     chosen = inputs.choice(method, MultiAngleMethod, "method")
-    _require_known(chosen, tolerance, regularisation, prior_optical_depth)
+    _refuse_unused_options(chosen, tolerance, regularisation, prior_optical_depth)
     height = slant_paths.altitude_grid(altitude, station_altitude)
     scan = slant_paths.make_scan(zenith_angle, height, azimuth)
     rows, noise, leading = _cube(signal, variance, scan.path.shape)
@@ -171,18 +173,18 @@ def retrieve_optical_depth(
         _layers(layers, np.append(height, 0.0) + station_altitude),
     )
     prior = _prior(prior_optical_depth, leading, height.size)
-    angles, bins = scan.path.shape
-    profiles = Profiles.missing(rows.shape[0], angles, bins, len(settings.layers))
+    angles, altitudes = scan.path.shape
+    profiles = Profiles.missing(rows.shape[0], angles, altitudes, len(settings.layers))
     steps: list[StepRecord] = []
     for label in np.unique(labels):
         members = np.flatnonzero(labels == label)
-        part, done = _methods.solve_block(
+        solved, block_steps = _methods.solve_block(
             rows[members], noise[members], None if prior is None else prior[members], settings
         )
-        profiles.put(members, part)
-        steps += [StepRecord(int(label), *step) for step in done]
-    given = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
-    return profiles.result(leading, _quality(profiles, given), tuple(steps))
+        profiles.put(members, solved)
+        steps += [StepRecord(int(label), *step) for step in block_steps]
+    observed = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
+    return profiles.result(leading, _quality(profiles, observed), tuple(steps))
 
 
 def layer_bounds(
@@ -202,25 +204,25 @@ def layer_bounds(
     Returns
     -------
     (layer, 2) float
-        m, of the nearest of the altitudes and the station.
+        m, moved to the nearest of the altitudes and the station.
 
     Raises
     ------
     RetrievalInputError
-        For layers that hold no altitude, or reach beyond them.
+        For layers that contain no altitude of the grid, or extend beyond it.
     """
     height = slant_paths.altitude_grid(altitude, station_altitude)
     levels = np.append(height, 0.0) + station_altitude
     return levels[np.array(_layers(layers, levels), dtype=np.int64).reshape(-1, 2)]
 
 
-def _require_known(
+def _refuse_unused_options(
     method: MultiAngleMethod,
     tolerance: float | None,
     regularisation: Any,
     prior: npt.ArrayLike | None,
 ) -> None:
-    """Refuse options that the method would pass over in silence."""
+    """Raise for options that the method would silently ignore."""
     allowed = {
         "tolerance": (tolerance, (MultiAngleMethod.AUTO,)),
         "regularisation": (regularisation, (MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR)),
@@ -287,7 +289,7 @@ def _layers(layers: Sequence[tuple[float, float]], levels: Array) -> tuple[tuple
         raise RetrievalInputError(
             f"is {layers!r}", field="layers", remedy="give pairs (bottom, top) in m"
         )
-    found = []
+    indices = []
     order = np.sort(levels)
     for bottom, top in bounds:
         low, high = (int(np.argmin(np.abs(levels - level))) for level in (bottom, top))
@@ -296,12 +298,12 @@ def _layers(layers: Sequence[tuple[float, float]], levels: Array) -> tuple[tuple
             levels[low] >= levels[high]
         ):
             raise RetrievalInputError(
-                f"[{bottom:g}, {top:g}] m holds no altitude of the grid, or reaches beyond it",
+                f"[{bottom:g}, {top:g}] m contains no altitude of the grid, or extends beyond it",
                 field="layers",
                 remedy=f"give bounds from {order[0]:g} to {order[-1]:g} m, bottom first",
             )
-        found.append((-1 if low == levels.size - 1 else low, high))
-    return tuple(found)
+        indices.append((-1 if low == levels.size - 1 else low, high))
+    return tuple(indices)
 
 
 def _positive(value: float | None, name: str) -> float | None:
@@ -310,40 +312,40 @@ def _positive(value: float | None, name: str) -> float | None:
     return value
 
 
-def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], bins: int) -> Array | None:
+def _prior(values: npt.ArrayLike | None, leading: tuple[int, ...], altitudes: int) -> Array | None:
     if values is None:
         return None
     prior = inputs.real_array(values, "prior_optical_depth").astype(np.float64, copy=False)
     if not np.all(np.isfinite(prior)):
         raise RetrievalInputError(
-            "holds values that are not finite",
+            "has values that are not finite",
             field="prior_optical_depth",
             remedy="give a value for every altitude",
         )
     try:
-        return np.broadcast_to(prior, (*leading, bins)).reshape(-1, bins)
+        return np.broadcast_to(prior, (*leading, altitudes)).reshape(-1, altitudes)
     except ValueError:
         raise RetrievalInputError(
-            f"has the shape {prior.shape}, which does not broadcast to {(*leading, bins)}",
+            f"has the shape {prior.shape}, which does not broadcast to {(*leading, altitudes)}",
             field="prior_optical_depth",
         ) from None
 
 
-def _quality(profiles: Profiles, given: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
-    """Return the bits that every product knows; each missing optical depth has a rejecting one.
+def _quality(profiles: Profiles, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    """Return the common quality bits; each missing optical depth has a rejecting bit.
 
     Parameters
     ----------
     profiles : Profiles
-    given : (profile, altitude) bool
+    observed : (profile, altitude) bool
         Whether any angle has a signal and its variance.
     """
     quality = np.zeros(profiles.optical_depth.shape, dtype=np.int32)
-    quality[~given.any(axis=1)] |= np.int32(Quality.INPUT_MISSING)
+    quality[~observed.any(axis=1)] |= np.int32(Quality.INPUT_MISSING)
     lost = profiles.flags["extrapolated"] & ~profiles.flags["no_data"]
     quality[lost] |= np.int32(Quality.LOW_SIGNAL)
     quality[profiles.flags["outlier"]] |= np.int32(Quality.OUTLIER)
-    silent = np.isnan(profiles.optical_depth) & (quality & int(Quality.rejecting()) == 0)
-    quality[silent & ~given] |= np.int32(Quality.INPUT_MISSING)
-    quality[silent & given] |= np.int32(Quality.NO_LEVERAGE)
+    unexplained = np.isnan(profiles.optical_depth) & (quality & int(Quality.rejecting()) == 0)
+    quality[unexplained & ~observed] |= np.int32(Quality.INPUT_MISSING)
+    quality[unexplained & observed] |= np.int32(Quality.NO_LEVERAGE)
     return quality

@@ -1,7 +1,7 @@
-"""Compiled weights against outliers in a scan: a start that outliers cannot move, then two passes.
+"""Compiled weights against outliers in a scan: a start that resists outliers, then two passes.
 
-The start is the repeated median over pairs of beams (`siegel1982`), which stands up to half of
-the beams being wrong, then the pair that most other beams agree with; Tukey's bisquare of
+The start is the repeated median over pairs of beams (`siegel1982`), which withstands up to half
+of the beams being wrong, then the pair with which most other beams agree. Tukey's bisquare of
 studentised residuals follows. The number of passes is fixed.
 """
 
@@ -17,23 +17,29 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 START_WIDTH: Final = 5.0
-"""Standard errors beyond which a sample has no weight, about the start."""
+"""Standard errors from the start beyond which a sample has no weight."""
 PASS_WIDTH: Final = 7.0
-"""The same about a weighted fit."""
+"""Standard errors from a weighted fit beyond which a sample has no weight."""
 FEWEST_BEAMS: Final = 4
+"""Beams from which on one outlier can be identified."""
 _CLOSEST: Final = 1e-3
+"""Distance of two slant paths, over their span, below which they define no slope."""
 _KEPT: Final = 0.3
+"""Weight above which a beam counts as kept."""
 _FEWEST_KEPT: Final = 3
+"""Beams that must be kept; with fewer, all keep their full weight."""
 _GAUSS: Final = 1.4826
+"""Standard deviation over median absolute deviation of normal deviates."""
 _CLEAR: Final = 0.01
-"""Variance of a logarithm."""
+"""Variance of a logarithm (signal 10 times its noise) up to which its noise is well known."""
 _MEDIAN_OF: Final = 100_000
+"""Residuals that suffice for the median of their sizes."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 def clean_moments(width: float) -> tuple[float, float]:
-    """Return what the bisquare makes of normal residuals, so that it can be taken out.
+    """Return the factors by which the bisquare changes chi2 and information of normal residuals.
 
     Returns
     -------
@@ -50,7 +56,7 @@ def clean_moments(width: float) -> tuple[float, float]:
 
 @_compiled
 def _median(values: Array, count: int) -> float:
-    """Return the median of the first values, which get sorted; few, so by insertion."""
+    """Return the median of the first `count` values and sort these (insertion: they are few)."""
     for i in range(1, count):
         value = values[i]
         j = i - 1
@@ -66,8 +72,8 @@ def _median(values: Array, count: int) -> float:
 def _repeated_median(
     y: Array, x: Array, count: int, closest: float, work: Array, slopes: Array
 ) -> tuple[float, float]:
-    """Return slope and intercept of the line through the first points; NaN where undefined."""
-    found = 0
+    """Return slope and intercept of the line through the first points; NaN if undefined."""
+    medians = 0
     for i in range(count):
         pairs = 0
         for j in range(count):
@@ -75,11 +81,11 @@ def _repeated_median(
                 work[pairs] = (y[j] - y[i]) / (x[j] - x[i])
                 pairs += 1
         if pairs > 0:
-            slopes[found] = _median(work, pairs)
-            found += 1
-    if found == 0:
+            slopes[medians] = _median(work, pairs)
+            medians += 1
+    if medians == 0:
         return np.nan, np.nan
-    slope = _median(slopes, found)
+    slope = _median(slopes, medians)
     for i in range(count):
         work[i] = y[i] - slope * x[i]
     return slope, _median(work, count)
@@ -87,20 +93,21 @@ def _repeated_median(
 
 @_compiled
 def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
-    """Fill the residuals about repeated medians.
+    """Fill the residuals from the lines of repeated medians.
 
     Parameters
     ----------
     y, noise : (profile, angle, altitude) float
-        0 and inf where there is no sample.
+        Logarithms and their variances; 0 and inf where there is no sample.
     x : (angle, altitude) float
+        Slant path.
     residuals : (profile, angle, altitude) float
-        NaN where there is no sample, or fewer than 4 beams.
+        Output; NaN where there is no sample, or fewer than 4 beams.
     """
-    profiles, angles, bins = y.shape
+    profiles, angles, altitudes = y.shape
     ys, xs, work, slopes = np.empty(angles), np.empty(angles), np.empty(angles), np.empty(angles)
     for t in range(profiles):
-        for k in range(bins):
+        for k in range(altitudes):
             count = 0
             low, high = np.inf, -np.inf
             for a in range(angles):
@@ -119,7 +126,7 @@ def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
 
 @_compiled
 def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float) -> float:
-    """Return how far points are from the bounds of Tukey's bounded squares about a line."""
+    """Return the sum of (1 - square)^3 of Tukey's bounded squares about a line."""
     total = 0.0
     for i in range(y.size):
         share = ((y[i] - level - slope * x[i]) * per_width[i]) ** 2
@@ -130,7 +137,7 @@ def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float)
 
 @_compiled
 def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
-    """Return slope and level of the line with the least bounded sum: zero, or through two beams."""
+    """Return slope and level of the best of the zero line and the lines through two beams."""
     best, slope, level = _agreement(y, x, per_width, 0.0, 0.0), 0.0, 0.0
     closest = _CLOSEST * (np.max(x) - np.min(x))
     for i in range(y.size):
@@ -147,27 +154,28 @@ def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
 def pair_residuals(
     y: Array, noise: Array, x: Array, inhomogeneity: Array, residuals: Array
 ) -> None:
-    """Replace residuals by those about the pair of beams that most others agree with.
+    """Replace residuals by those from the line through the pair with which most beams agree.
 
-    Repeated medians hold, but long paths have a long lever: where their line is off by little, it
-    is off by much there. Of it and the lines through all pairs, the one with the least bounded sum
-    of squares is taken, which knows how large a deviation may be.
+    A small error of the repeated median grows along the slant path and is large at long paths. Of
+    that line and the lines through all pairs of beams, this takes the one with the least sum of
+    squares bounded at the expected deviation.
 
     Parameters
     ----------
     y, noise : (profile, angle, altitude) float
-        0 and inf where there is no sample.
+        Logarithms and their variances; 0 and inf where there is no sample.
     x : (angle, altitude) float
+        Slant path.
     inhomogeneity : (altitude,) float
         Variance on top of the noise.
     residuals : (profile, angle, altitude) float
-        About repeated medians; NaN where there is no sample, or fewer than 4 beams.
+        From repeated medians; NaN where there is no sample, or fewer than 4 beams.
     """
-    profiles, angles, bins = y.shape
+    profiles, angles, altitudes = y.shape
     beams = np.empty(angles, np.int64)
     all_y, all_x, all_per_width = np.empty(angles), np.empty(angles), np.empty(angles)
     for t in range(profiles):
-        for k in range(bins):
+        for k in range(altitudes):
             count = 0
             for a in range(angles):
                 if not math.isnan(residuals[t, a, k]):
@@ -185,18 +193,18 @@ def pair_residuals(
 
 
 @_compiled
-def median_variance(residuals: Array, noise: Array, out: Array, beams: Array) -> None:
-    """Fill the variance that median residuals tell, less that of the noise, bin by bin.
+def median_variance(residuals: Array, noise: Array, out: Array, samples: Array) -> None:
+    """Estimate the variance from median residuals, less that of the noise, at each altitude.
 
     Parameters
     ----------
     residuals, noise : (profile, angle, altitude) float
-    out, beams : (altitude,) float
-        The latter gets the number of samples; the former 0 where there is none.
+    out, samples : (altitude,) float
+        Outputs: the variance, 0 where there is no sample, and the number of samples.
     """
-    profiles, angles, bins = residuals.shape
+    profiles, angles, altitudes = residuals.shape
     sizes, variances = np.empty(profiles * angles), np.empty(profiles * angles)
-    for k in range(bins):
+    for k in range(altitudes):
         count = fitted = 0
         for t in range(profiles):
             before = count
@@ -206,7 +214,7 @@ def median_variance(residuals: Array, noise: Array, out: Array, beams: Array) ->
                     variances[count] = noise[t, a, k]
                     count += 1
             fitted += 1 if count > before else 0
-        beams[k] = count
+        samples[k] = count
         out[k] = 0.0
         if count > 2 * fitted:
             scale = _GAUSS * np.median(sizes[:count])
@@ -225,8 +233,7 @@ def fill_robust_weights(
 ) -> None:
     """Fill the bisquare of the studentised residuals; 1 where it would leave too few beams.
 
-    A logarithm is skewed where detector noise dominates; the residual is measured as a relative
-    one there.
+    Where detector noise dominates, a logarithm is skewed; the relative residual is used there.
 
     Parameters
     ----------
@@ -235,10 +242,11 @@ def fill_robust_weights(
     width : float
         Standard errors from which on the weight is 0.
     keep : (profile, angle, altitude) float
+        Output.
     """
-    profiles, angles, bins = residuals.shape
+    profiles, angles, altitudes = residuals.shape
     for t in range(profiles):
-        for k in range(bins):
+        for k in range(altitudes):
             kept = 0
             for a in range(angles):
                 size = residuals[t, a, k]
@@ -261,11 +269,11 @@ def fill_robust_weights(
 def largest_residual(
     residuals: Array, leverages: Array, noise: Array, inhomogeneity: Array
 ) -> tuple[float, int]:
-    """Return the largest studentised residual, in units that outliers do not stretch.
+    """Return the largest studentised residual, in a unit that outliers do not inflate.
 
-    Where detector noise dominates, of the relative residual, as `fill_robust_weights` takes it; of
-    samples less than 10 times their noise only where inhomogeneity exceeds that, as the noise of
-    others is not known well enough for what is rare.
+    Where detector noise dominates, the relative residual is used, as in `fill_robust_weights`.
+    Samples less than 10 times their noise count only where inhomogeneity exceeds the noise:
+    otherwise their noise is not known well enough to judge rare deviations.
 
     Parameters
     ----------
@@ -275,18 +283,18 @@ def largest_residual(
     Returns
     -------
     largest : float
-        0 where there is no residual.
+        0 if there is no residual.
     count : int
-        Residuals.
+        Number of residuals.
     """
-    profiles, angles, bins = residuals.shape
+    profiles, angles, altitudes = residuals.shape
     stride = max(residuals.size // _MEDIAN_OF, 1)
     sizes = np.empty(residuals.size // stride + 1)
     count = seen = 0
     largest = 0.0
     for t in range(profiles):
         for a in range(angles):
-            for k in range(bins):
+            for k in range(altitudes):
                 free = 1.0 - leverages[t, a, k]
                 clear = noise[t, a, k] < max(_CLEAR, inhomogeneity[k])
                 if free > 1e-9 and clear:

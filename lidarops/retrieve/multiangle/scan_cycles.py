@@ -1,4 +1,4 @@
-"""The cycles of a scan: which profiles belong together as one look at the same air."""
+"""Directions and cycles of a scan: which profiles see the same air along different paths."""
 
 from __future__ import annotations
 
@@ -19,52 +19,54 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 TOLERANCE: Final = 0.25
-"""degree, by which what the encoders tell of one direction may differ from the next."""
+"""degree, by which encoder readings of one direction may differ from each other."""
 WIDEST: Final = 3.0
-"""Tolerances over which the profiles of one direction may spread. Wider, they are a slow sweep,
-and told apart by a smaller tolerance."""
+"""Largest spread of the profiles of one direction, in tolerances. A wider group is a slow sweep,
+and a smaller tolerance splits it."""
 LONGEST_PAUSE: Final = 3.0
-"""Median intervals between profiles, beyond which a new cycle begins: more than two are lost."""
+"""Median intervals between profiles beyond which a pause starts a new cycle: more than two
+profiles are lost."""
 _LOST_DWELL: Final = 1.5
-"""Longest dwells in a direction; a pause must be longer too, as one lost file may be."""
+"""A pause must also be longer than this multiple of the longest dwell, which is one lost file."""
 _FINEST: Final = 0.01
-"""degree."""
+"""degree, smallest tolerance; encoders resolve no less."""
 _PLANES: Final = 1.0
-"""degree, by which azimuths of one vertical plane may differ from the next."""
+"""degree, by which neighbouring azimuths in one vertical plane may differ."""
 _UNKNOWN: Final = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Directions:
-    """The directions of a scan, and which of them each profile has.
+    """The directions of a scan, and the direction of each profile.
 
-    Ordered by vertical planes of rising azimuth (0 to 180 degree), from the horizon on the far
-    side of each plane over the zenith to the horizon at its azimuth; the zenith belongs to the
-    first plane.
+    Directions are ordered by vertical planes of rising azimuth (0 to 180 degree). Within a plane
+    they run from the horizon opposite to its azimuth through the zenith to the horizon at its
+    azimuth; the zenith belongs to the first plane.
     """
 
     index: Integers
-    """(profile,) into the directions; -1 where the direction of a profile is not known."""
+    """(profile,) into the directions; -1 if the direction of a profile is unknown."""
     zenith_angle: Array
-    """(direction,) degree, 0 to 180: the mean over its profiles."""
+    """(direction,) degree, 0 to 180: mean over the profiles."""
     azimuth: Array
-    """(direction,) degree, 0 to 360: the mean over its profiles; that of the first plane at the
-    zenith, 0 where none is known."""
+    """(direction,) degree, 0 to 360: mean over the profiles. The zenith has the azimuth of the
+    first plane, 0 if none is known."""
 
 
 def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None) -> Directions:
-    """Find the directions of a scan.
+    """Return the directions of a scan.
 
-    Profiles that look to within 0.25 degree of each other have the same direction, and so do
-    those that others between them join, as far as they spread by no more than 0.75 degree; where
-    they spread further, the tolerance is halved until they do not, or 0.01 degree is reached.
+    Profiles within 0.25 degree of each other have the same direction, and so have profiles linked
+    by others between them, if the group spreads by no more than 0.75 degree. If it spreads further,
+    the tolerance is halved until it does not, or until 0.01 degree is reached.
 
     Parameters
     ----------
     zenith_angle : (profile,) float
-        degree, 0 to 180; a negative angle leads opposite to its azimuth. NaN where not known.
+        degree, 0 to 180; a beam with a negative angle points opposite to its azimuth. NaN if
+        unknown.
     azimuth : (profile,) float, optional
-        degree; NaN where not known, which is the same as none where no profile has it.
+        degree; NaN if unknown. NaN for all profiles is the same as no azimuth.
 
     Returns
     -------
@@ -73,7 +75,7 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
     Raises
     ------
     RetrievalInputError
-        For angles that cannot be right, and negative ones without an azimuth.
+        For angles out of range, and negative angles without an azimuth.
     """
     zenith, heading = _angles(zenith_angle, azimuth)
     tilt = np.abs(zenith)
@@ -100,18 +102,20 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
 def cycles(
     zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None, time_bnds: npt.ArrayLike
 ) -> Integers:
-    """Tell which cycle of a scan each profile belongs to.
+    """Return the number of the cycle of each profile.
 
-    A cycle ends before the first direction that it holds already, and at a pause, from the end of
-    a profile to the start of the next, of more than 3 median intervals between starts and 1.5 of
-    the longest dwells in a direction. Profiles that follow each other in one direction are one
-    visit and stay together, but at a turning point: where as many as two visits have follow each
-    other between two visits of the same direction, the second half is the first visit of the way
-    back. A sweep over the zenith to the other side is one cycle; a scan that goes back and forth
-    has a cycle for each way, and a turning point that is visited once belongs to the way that
-    leads to it. Cycles that lack directions, at the ends or where files are missing, stay as they
-    are; where the first direction of a sweep is lost, the cycles after it begin with the second
-    one.
+    A cycle ends before the first direction that it already contains. It also ends at a pause (from
+    the end of a profile to the start of the next) of more than 3 median intervals between starts
+    and more than 1.5 times the longest dwell in a direction.
+
+    Successive profiles in one direction are one visit and stay together, except at a turning
+    point: a visit of at least twice the median length between two visits of the same direction is
+    split, and its second half starts the way back. A sweep across the zenith to the other side is
+    one cycle. A scan that goes back and forth has one cycle for each way; a turning point visited
+    once belongs to the way that leads to it.
+
+    Cycles that lack directions, at the ends or where files are missing, stay as they are. If the
+    first direction of a sweep is lost, the cycles after it begin with the second direction.
 
     Parameters
     ----------
@@ -123,23 +127,24 @@ def cycles(
     Returns
     -------
     (profile,) int
-        From 0, rising by 0 or 1; a profile of unknown direction has the number of the one before.
+        From 0, rising by 0 or 1; a profile of unknown direction has the number of the previous
+        profile.
 
     Raises
     ------
     RetrievalInputError
-        For angles that cannot be right, or times that do not rise.
+        For angles out of range, or times that do not rise.
     """
     index = directions(zenith_angle, azimuth).index
-    part = _parts(_bounds(time_bnds, index.size), index)
+    stretch = _stretches(_bounds(time_bnds, index.size), index)
     known = np.flatnonzero(index != _UNKNOWN)
-    numbers = _numbered(index[known], part[known])
-    first = np.searchsorted(known, np.arange(index.size), side="right") - 1
-    return np.append(numbers, 0)[np.maximum(first, 0)] if known.size else np.zeros_like(index)
+    numbers = _cycle_numbers(index[known], stretch[known])
+    previous = np.searchsorted(known, np.arange(index.size), side="right") - 1
+    return np.append(numbers, 0)[np.maximum(previous, 0)] if known.size else np.zeros_like(index)
 
 
 def _unit_vectors(tilt: Array, bearing: Array) -> Array:
-    """Return where profiles look to, as (profile, 3)."""
+    """Return the directions of profiles as unit vectors (profile, 3)."""
     theta, phi = np.radians(tilt), np.radians(bearing)
     flat = np.sin(theta)
     return np.stack([flat * np.sin(phi), flat * np.cos(phi), np.cos(theta)], axis=-1)
@@ -148,10 +153,10 @@ def _unit_vectors(tilt: Array, bearing: Array) -> Array:
 def _clusters(vectors: Array) -> Integers:
     """Return the number of the direction of each profile, from 0."""
     step = math.radians(_FINEST)
-    # Encoders repeat themselves: far fewer places than profiles.
+    # Encoder readings repeat: there are far fewer places than profiles.
     cells = np.unique(np.rint(vectors / step).astype(np.int64), axis=0, return_inverse=True)[1]
     cells = cells.reshape(-1)
-    sums = np.stack([np.bincount(cells, weights=one) for one in vectors.T], axis=-1)
+    sums = np.stack([np.bincount(cells, weights=axis) for axis in vectors.T], axis=-1)
     places = np.asarray(sums / np.bincount(cells)[:, np.newaxis], dtype=np.float64)
     label = np.zeros(len(places), dtype=np.int64)
     tolerance, wide = TOLERANCE, np.ones(len(places), dtype=np.bool_)
@@ -165,16 +170,16 @@ def _clusters(vectors: Array) -> Integers:
 
 
 def _linked(places: Array, tolerance: float) -> Integers:
-    """Return labels of places that links of at most the tolerance (degree) join."""
+    """Return labels of groups of places linked by steps within the tolerance (degree)."""
     reach = 2.0 * math.sin(0.5 * math.radians(tolerance))
     pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
-    one = np.ones(len(pairs), dtype=np.int8)
-    graph = coo_array((one, (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
+    links = np.ones(len(pairs), dtype=np.int8)
+    graph = coo_array((links, (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _spreads(places: Array, label: Integers) -> Array:
-    """Return over how many degrees the places of each label spread: sides of their box."""
+    """Return the spread of the places of each label, degree: the diagonal of their box."""
     order = np.argsort(label, kind="stable")
     first = np.flatnonzero(np.diff(label[order], prepend=-1))
     ordered = places[order]
@@ -192,7 +197,7 @@ def _mean_bearings(bearing: Array, label: Integers) -> Array:
 
 
 def _planes(bearing: Array, tilted: npt.NDArray[np.bool_]) -> tuple[Integers, Integers]:
-    """Return the plane of each direction, and 1 on the side to its azimuth, -1 on the other.
+    """Return the vertical plane of each direction, and its side: 1 at the plane's azimuth, or -1.
 
     Directions that are not tilted are in the first plane.
     """
@@ -204,7 +209,7 @@ def _planes(bearing: Array, tilted: npt.NDArray[np.bool_]) -> tuple[Integers, In
     folded = np.sort((bearing[members] - start) % 180.0)
     wide = np.diff(np.append(folded, folded[0] + 180.0)) > _PLANES
     if wide.any() and not wide[-1]:
-        # A plane just there would fall apart into the first and the last one.
+        # Otherwise a plane at the origin of azimuth would be split into the first and the last.
         start += folded[np.flatnonzero(wide)[-1] + 1] - 180.0 - 0.5 * _PLANES
     turned = (bearing[members] - start) % 360.0
     side[members] = np.where(turned < 180.0, 1, -1)
@@ -214,33 +219,33 @@ def _planes(bearing: Array, tilted: npt.NDArray[np.bool_]) -> tuple[Integers, In
     return plane, side
 
 
-def _numbered(index: Integers, part: Integers) -> Integers:
-    """Return cycles of profiles of known direction, whose parts no cycle crosses."""
+def _cycle_numbers(index: Integers, stretch: Integers) -> Integers:
+    """Return the cycles of profiles of known direction; no cycle crosses a long pause."""
     if index.size == 0:
         return np.empty(0, dtype=np.int64)
     begins = np.zeros(index.size, dtype=np.int64)
     seen: set[int] = set()
-    last = part[0]
-    for at in _visits(index, part):
-        direction = int(index[at])
-        if direction in seen or part[at] != last:
-            begins[at] = 1
+    last = stretch[0]
+    for profile in _visits(index, stretch):
+        direction = int(index[profile])
+        if direction in seen or stretch[profile] != last:
+            begins[profile] = 1
             seen.clear()
         seen.add(direction)
-        last = part[at]
+        last = stretch[profile]
     return np.cumsum(begins)
 
 
-def _visits(index: Integers, part: Integers) -> Integers:
+def _visits(index: Integers, stretch: Integers) -> Integers:
     """Return the first profile of each visit of a direction."""
-    fresh = np.append(True, (index[1:] != index[:-1]) | (part[1:] != part[:-1]))
-    first = np.flatnonzero(fresh)
+    changes = np.append(True, (index[1:] != index[:-1]) | (stretch[1:] != stretch[:-1]))
+    first = np.flatnonzero(changes)
     lengths = np.diff(np.append(first, index.size))
     inner = np.arange(1, first.size - 1)
     before, after = first[inner - 1], first[inner + 1]
     turning = (
         (index[before] == index[after])
-        & (part[before] == part[after])
+        & (stretch[before] == stretch[after])
         & (lengths[inner] >= 2.0 * np.median(lengths))
     )
     middle = first[inner[turning]] + lengths[inner[turning]] // 2
@@ -248,7 +253,7 @@ def _visits(index: Integers, part: Integers) -> Integers:
 
 
 def _bounds(time_bnds: npt.ArrayLike, profiles: int) -> Array:
-    """Return starts and ends as (profile, 2), in seconds after the first start or any unit."""
+    """Return starts and ends as (profile, 2), in seconds after the first start or in any unit."""
     bounds = np.asarray(time_bnds)
     if bounds.dtype.kind not in "iufM" or bounds.shape != (profiles, 2):
         raise RetrievalInputError(
@@ -263,17 +268,19 @@ def _bounds(time_bnds: npt.ArrayLike, profiles: int) -> Array:
     bounds = bounds.astype(np.float64)
     if not (np.all(np.diff(bounds[:, 0]) > 0) and np.all(bounds[:, 1] >= bounds[:, 0])):
         raise RetrievalInputError(
-            "do not rise", field="time_bnds", remedy="sort the profiles by time, start before end"
+            "are not ascending",
+            field="time_bnds",
+            remedy="sort the profiles by time, start before end",
         )
     return bounds
 
 
-def _parts(bounds: Array, index: Integers) -> Integers:
-    """Tell which stretch between long pauses each profile lies in."""
+def _stretches(bounds: Array, index: Integers) -> Integers:
+    """Return the number of the stretch between long pauses in which each profile lies."""
     if len(bounds) < 2:
         return np.zeros(len(bounds), dtype=np.int64)
     lengths = bounds[:, 1] - bounds[:, 0]
-    dwells = [float(np.median(lengths[index == one])) for one in np.unique(index)]
+    dwells = [float(np.median(lengths[index == number])) for number in np.unique(index)]
     longest = max(
         LONGEST_PAUSE * float(np.median(np.diff(bounds[:, 0]))), _LOST_DWELL * max(dwells)
     )
@@ -297,12 +304,12 @@ def _angles(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None) -> tuple
     for name, angles, limit in (("zenith_angle", zenith, 180.0), ("azimuth", heading, 360.0)):
         if np.any(np.abs(angles) > limit):
             raise RetrievalInputError(
-                f"holds angles beyond {limit:g} degree", field=name, remedy="give degree"
+                f"has angles beyond {limit:g} degree", field=name, remedy="give degree"
             )
     if not np.any(np.isfinite(heading)):
         if np.any(zenith < -0.5 * TOLERANCE):
             raise RetrievalInputError(
-                "is negative, and no azimuth tells where such angles lead",
+                "is negative, but no azimuth gives the direction",
                 field="zenith_angle",
                 remedy="state the azimuth of the instrument",
             )

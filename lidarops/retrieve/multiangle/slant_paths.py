@@ -1,4 +1,4 @@
-"""Slant paths of a scan: how much longer than the vertical one each is, and where they lead."""
+"""Slant paths of a scan: length of each beam over the vertical path, and its direction."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Integers = npt.NDArray[np.int64]
 EARTH_RADIUS: Final = 6_371_000.0
 """m, mean."""
 SPHERICAL_BEYOND: Final = 75.0
-"""degree. Up to here the secant errs by less than 0.3 percent of the optical depth."""
+"""degree. Up to here the error of the secant is less than 0.3 percent of the optical depth."""
 LONGEST: Final = 10.0
 """Slant over vertical path beyond which refraction and curvature make the model wrong."""
 _UPRIGHT: Final = 1e-9
-"""Horizontal distance over altitude up to which a beam has no azimuth."""
+"""Horizontal distance over altitude up to which a beam is vertical and has no azimuth."""
 _OPPOSITE: Final = 1e-6
-"""radian by which a gap between azimuths may exceed half a turn."""
+"""radian, rounding by which the gap between opposite azimuths may exceed half a turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,50 +38,50 @@ class Scan:
     north: Array
     """(angle, altitude): the same along azimuth 0."""
     azimuth: Array
-    """(angle,) radian, of where the beam leads (a negative zenith angle leads backwards)."""
+    """(angle,) radian; a beam with a negative zenith angle points opposite to its azimuth."""
     usable: Mask
     """(angle,): false for beams whose path is longer than ten times the vertical one."""
 
     @property
-    def leaning(self) -> Array:
-        """Azimuths of the usable beams that leave the zenith, radian."""
-        off = np.abs(self.east[:, 0]) + np.abs(self.north[:, 0]) > _UPRIGHT
-        return self.azimuth[self.usable & off]
+    def tilted_azimuths(self) -> Array:
+        """Azimuths of the usable beams that are not vertical, radian."""
+        tilted = np.abs(self.east[:, 0]) + np.abs(self.north[:, 0]) > _UPRIGHT
+        return self.azimuth[self.usable & tilted]
 
 
 def make_scan(
     zenith_angle: npt.ArrayLike, altitude: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
 ) -> Scan:
-    r"""Build the slant paths of a scan.
+    r"""Return the slant paths of a scan.
 
-    Up to 75 degrees :math:`x = \sec\theta`; beyond, the mean of the path through a spherical
-    atmosphere whose extinction does not change with altitude,
+    Up to 75 degrees :math:`x = \sec\theta`; beyond, the mean path through a spherical atmosphere
+    with constant extinction,
 
     .. math:: x(z) = \left[\sqrt{R^2\cos^2\theta + 2Rz + z^2} - R\cos\theta\right] / z .
 
     Parameters
     ----------
     zenith_angle : (angle,) float
-        degree, -90 to 90; negative ones lead opposite to their azimuth.
+        degree, -90 to 90; a beam with a negative angle points opposite to its azimuth.
     altitude : (altitude,) float
         m above the lidar, ascending.
     azimuth : (angle,) float, optional
-        degree; 0 where not given.
+        degree; 0 if not given.
 
     Returns
     -------
     Scan
-        Beams with x > 10 at any altitude, or whose angle is missing, are not usable.
+        Beams with x > 10 at any altitude, or with a missing angle, are not usable.
 
     Raises
     ------
     RetrievalInputError
-        For angles beyond the horizon or altitudes that are not positive and ascending.
+        For angles beyond the horizon, or altitudes that are not positive and ascending.
     """
     angle = _angles(zenith_angle, "zenith_angle")
     if np.any(np.abs(angle) > 90.0):
         raise RetrievalInputError(
-            "holds angles below the horizon", field="zenith_angle", remedy="give -90 to 90 degree"
+            "has angles below the horizon", field="zenith_angle", remedy="give -90 to 90 degree"
         )
     heading = np.zeros_like(angle) if azimuth is None else _angles(azimuth, "azimuth")
     if heading.shape != angle.shape:
@@ -94,8 +94,8 @@ def make_scan(
     return _scan(slant_path(np.abs(angle), height), angle, heading)
 
 
-def rising(zenith_angle: Array, altitude: Array) -> Integers:
-    """Return which beams lead up, and are usable at all altitudes.
+def rising_beams(zenith_angle: Array, altitude: Array) -> Integers:
+    """Return the indices of the beams that point upwards and are usable at all altitudes.
 
     Parameters
     ----------
@@ -109,11 +109,12 @@ def rising(zenith_angle: Array, altitude: Array) -> Integers:
 
 
 def slant_path(angle: Array, altitude: Array) -> Array:
-    """Return slant over vertical path of `make_scan` as (angle, altitude); inf at the horizon."""
+    """Return slant over vertical path, as in `make_scan`, (angle, altitude); inf at the horizon."""
     cosine = np.cos(np.radians(angle))[:, np.newaxis]
     with np.errstate(divide="ignore"):
         secant = np.where(cosine > 1e-12, 1.0 / cosine, np.inf)
-    # The textbook form subtracts two numbers of the Earth's size; this one keeps its digits.
+    # The textbook form subtracts two numbers of the size of the Earth's radius; this form keeps
+    # the digits.
     root = np.sqrt((EARTH_RADIUS * cosine) ** 2 + (2.0 * EARTH_RADIUS + altitude) * altitude)
     spherical = (2.0 * EARTH_RADIUS + altitude) / (root + EARTH_RADIUS * cosine)
     steep = angle[:, np.newaxis] <= SPHERICAL_BEYOND
@@ -121,25 +122,25 @@ def slant_path(angle: Array, altitude: Array) -> Array:
 
 
 def surrounds_zenith(azimuth: Array) -> bool:
-    """Tell whether no half turn is free of beams, so that a horizontal gradient can be found.
+    """Return whether beams point to all sides, so that a horizontal gradient can be estimated.
 
-    The zero vector lies inside the convex hull of the directions exactly then.
+    No half turn is free of beams: the zero vector lies inside the convex hull of their directions.
 
     Parameters
     ----------
     azimuth : (angle,) float
-        radian; only of beams that leave the zenith.
+        radian; only of beams that are not vertical.
     """
-    return free_turn(azimuth) <= np.pi + _OPPOSITE
+    return widest_azimuth_gap(azimuth) <= np.pi + _OPPOSITE
 
 
-def free_turn(azimuth: Array) -> float:
-    """Return the largest angle around the zenith that is free of beams, radian.
+def widest_azimuth_gap(azimuth: Array) -> float:
+    """Return the widest range of azimuths without a beam, radian.
 
     Parameters
     ----------
     azimuth : (angle,) float
-        radian; only of beams that leave the zenith.
+        radian; only of beams that are not vertical.
     """
     if azimuth.size == 0:
         return 2.0 * np.pi
@@ -148,17 +149,17 @@ def free_turn(azimuth: Array) -> float:
 
 
 def altitude_grid(altitude: npt.ArrayLike, station_altitude: float) -> Array:
-    """Check an altitude axis in m; return heights above the station.
+    """Validate an altitude axis (m) and return the heights above the station.
 
     Raises
     ------
     RetrievalInputError
-        Where it is not one-dimensional, finite, above the station and strictly ascending.
+        For an axis that is not one-dimensional, finite, above the station and strictly ascending.
     """
     grid = real_array(altitude, "altitude").astype(np.float64)
     if grid.ndim != 1 or grid.size == 0:
         raise RetrievalInputError(
-            f"has the shape {grid.shape}", field="altitude", remedy="give one value in m per bin"
+            f"has the shape {grid.shape}", field="altitude", remedy="give a list of values in m"
         )
     if not np.isfinite(station_altitude):
         raise RetrievalInputError(f"is {station_altitude}", field="station_altitude")
@@ -167,7 +168,7 @@ def altitude_grid(altitude: npt.ArrayLike, station_altitude: float) -> Array:
         raise RetrievalInputError(
             f"is not finite, strictly ascending and above the lidar at {station_altitude:g} m",
             field="altitude",
-            remedy="give m, and the lidar's altitude as station_altitude",
+            remedy="give m, and the altitude of the lidar as station_altitude",
         )
     return np.ascontiguousarray(height)
 

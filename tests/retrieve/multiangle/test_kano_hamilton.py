@@ -33,7 +33,7 @@ def fit(y, variance, path, distance=None, keep=None, *, sides=False, inhomogenei
     table = np.empty((profiles, kh.COLUMNS, bins))
     residual, leverage = np.empty(y.shape), np.empty(y.shape)
     added = np.full(bins, inhomogeneity)
-    kh.fit_bins(y, variance, keep, added, path, distance, sides, table, residual, leverage)
+    kh.fit_levels(y, variance, keep, added, path, distance, sides, table, residual, leverage)
     return table, residual, leverage
 
 

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from support.angle_scenes import retrieve_scan
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import labeled, labeled_altitudes
-from lidarops.retrieve.multiangle.labeled import Background
+from lidarops.retrieve.multiangle.labeled_altitudes import Background
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleMethod
 
 STATION = 120.0
@@ -84,7 +85,6 @@ def scan(
     return conditioned, {
         "zenith_angle": np.tile(np.abs(zenith), cycles),
         "azimuth": np.tile(np.where(np.asarray(zenith) < 0, 200.0, 20.0), cycles),
-        "time": starts + length // 2,
         "time_bnds": np.stack([starts, starts + length], axis=-1),
         "shots": np.full(cycles * beams, 600),
     }
@@ -95,7 +95,7 @@ def take(conditioned: xr.Dataset, pointing: dict[str, Any], kept) -> tuple[xr.Da
 
 
 def solve(conditioned: xr.Dataset, pointing: dict[str, Any], **changes: Any) -> xr.Dataset:
-    return labeled.retrieve_scan(conditioned, **(pointing | SETTINGS | changes))
+    return retrieve_scan(conditioned, **(pointing | SETTINGS | changes))
 
 
 def has(found: xr.Dataset, bit: Quality) -> np.ndarray:
@@ -354,8 +354,8 @@ def test_profiles_of_one_visit_are_averaged_by_their_shots():
     conditioned, pointing = scan(8, np.repeat(ONE_SIDE, 2))
     pointing["shots"][::2] = 1
     pointing["shots"][1::2] = 10**6
-    every = labeled.on_altitudes(conditioned, **(pointing | SETTINGS)).compute()
-    last = labeled.on_altitudes(
+    every = labeled_altitudes.on_altitudes(conditioned, **(pointing | SETTINGS)).compute()
+    last = labeled_altitudes.on_altitudes(
         *take(conditioned, pointing, slice(1, None, 2))[:1],
         **(take(conditioned, pointing, slice(1, None, 2))[1] | SETTINGS),
     ).compute()
@@ -409,7 +409,7 @@ def test_bins_that_no_beam_reaches_and_pieces_do_not_matter(monkeypatch):
 
 def test_beams_stay_lazy_until_they_are_wanted():
     conditioned, pointing = scan(3)
-    beams = labeled.on_altitudes(conditioned.chunk(time=10), **(pointing | SETTINGS))
+    beams = labeled_altitudes.on_altitudes(conditioned.chunk(time=10), **(pointing | SETTINGS))
     assert beams["signal"].chunks is not None
     assert beams["shots"].chunks is None
 

@@ -10,14 +10,14 @@ from scipy.special import erfc
 
 from lidarops.bench.accuracy import multiangle_cases as cases
 from lidarops.retrieve.multiangle import _block, slant_paths
-from lidarops.retrieve.multiangle._path_variation import GROWTH, doubted_from
+from lidarops.retrieve.multiangle._path_variation import GROWTH, path_variation_from
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 
 def varies(scan: cases.Scan) -> bool:
     grid = slant_paths.make_scan(scan.scene.zenith_angle, scan.scene.altitude)
     beams = _block.make_beam_block(scan.signal, scan.variance, grid)
-    found = doubted_from(beams, _block.regress(beams, inhomogeneity=None, robust=True))
+    found = path_variation_from(beams, _block.regress(beams, inhomogeneity=None, robust=True))
     return found is not None
 
 
@@ -100,9 +100,9 @@ def test_extinction_is_withheld_whatever_the_method():
 
 def test_robust_passes_run_by_chance_in_few_clean_blocks_and_wherever_outliers_are():
     """By a probability of 1 percent, however many residuals a block holds."""
-    assert _block.outlying(100) == _block.OUTLYING
+    assert _block.outlier_limit(100) == _block.OUTLYING
     counts = 10 ** np.arange(4, 9)
-    limits = np.array([_block.outlying(int(count)) for count in counts])
+    limits = np.array([_block.outlier_limit(int(count)) for count in counts])
     np.testing.assert_allclose(counts * erfc(limits / np.sqrt(2.0)), 0.01, rtol=1e-6)
 
     def ran(scene: cases.Scene, profiles: int, seed: int) -> bool:

@@ -29,7 +29,7 @@ def test_times_may_be_dates():
     bounds[5:] += np.timedelta64(120, "s")
     assert cycles([0.0, 10.0, *SWEEP[2:], *SWEEP], None, bounds).tolist() == [0] * 5 + [1] * 5
     bounds[3, 1] = np.datetime64("NaT")
-    with pytest.raises(RetrievalInputError, match="rise"):
+    with pytest.raises(RetrievalInputError, match="ascending"):
         cycles(SWEEP * 2, None, bounds)
 
 

@@ -74,7 +74,7 @@ class BlockNoise:
             return few
         bias = self.calibration.bias
         change = bias[:, upper] - np.where(lower >= 0, bias[:, np.maximum(lower, 0)], 0.0)
-        factor: Array = few * _calibration.ratio(self.calibration, upper, lower, change)
+        factor: Array = few * _calibration.variance_ratio(self.calibration, upper, lower, change)
         return factor
 
 
@@ -272,7 +272,7 @@ def _ratio(reduced: Array, whole: Array) -> Array:
 
 def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calibration:
     share = block.share * _ratio(fit.information, block.information)
-    information, share = _calibration.typical(fit.information, share)
+    information, share = _calibration.typical_profile(fit.information, share)
     smoothing = float(fit.pairs.smoothing[0])
     pilot = replace(fit.pairs, smoothing=fit.pairs.smoothing * _calibration.PILOT)
     right = _banded.multiply_rows(fit.bands, block.estimates)
@@ -327,7 +327,7 @@ def _block(
     correlation, amplitude, share = 0.0, 1.0, np.zeros_like(estimates)
     gaps = np.zeros(0, dtype=np.int64)
     if moments is not None:
-        correlation, amplitude = _correlation.fit(
+        correlation, amplitude = _correlation.fit_correlation(
             moments.lag_products[member], moments.lag_norms[member]
         )
         share = np.clip(moments.inhomogeneity_share[member] * amplitude, 0.0, 1.0)
@@ -355,8 +355,8 @@ def _solve_block(block: _Block, *, bin_pass: bool) -> _Fit:
     if not bin_pass:
         return _fit(block, block.information)
     screened = _outliers.screen_outliers(block.estimates, block.information)
-    fit = _fit(block, _outliers.believed(block.information, screened))
-    doubted = _outliers.doubted(
+    fit = _fit(block, _outliers.reduce_information(block.information, screened))
+    doubted = _outliers.downweight_outliers(
         block.estimates, block.information, block.share, fit.depth, fit.variance
     )
     return fit if doubted is None else _fit(block, doubted)

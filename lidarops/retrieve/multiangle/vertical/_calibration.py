@@ -160,7 +160,7 @@ def sandwich(
     return out
 
 
-def typical(information: Array, share: Array) -> tuple[Array, Array]:
+def typical_profile(information: Array, share: Array) -> tuple[Array, Array]:
     """Return mean information and share of the profiles of a block.
 
     Heights that few profiles have (less than half of the most) count as missing.
@@ -269,7 +269,9 @@ def _trust(signal: Array, variance: Array) -> Array:
     return share
 
 
-def ratio(calibration: Calibration, upper: Integers, lower: Integers, bias: Array) -> Array:
+def variance_ratio(
+    calibration: Calibration, upper: Integers, lower: Integers, bias: Array
+) -> Array:
     """Return calibrated over posterior variance of differences of optical depths.
 
     Parameters

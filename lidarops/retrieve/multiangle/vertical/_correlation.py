@@ -94,7 +94,7 @@ def lag_sums(
     return products, norms, freedom
 
 
-def fit(products: Array, norms: Array) -> tuple[float, float]:
+def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
     r"""Fit :math:`\phi \rho^h` to the pooled lag ratios of a block.
 
     Detector noise is not correlated along height, so :math:`\phi` may be less than 1. Below a

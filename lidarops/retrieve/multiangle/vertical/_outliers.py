@@ -77,7 +77,7 @@ def screen_outliers(estimates: Array, information: Array) -> Array:
     return out
 
 
-def doubted(
+def downweight_outliers(
     estimates: Array, information: Array, share: Array, depth: Array, variance: Array
 ) -> Array | None:
     """Return the information with outlying estimates weighted down; None where there is none.
@@ -104,10 +104,10 @@ def doubted(
     weight = (1.0 - np.minimum(square, 1.0)) ** 2 / USUAL_WEIGHT
     # What an estimate does is bounded, however far off it is.
     tail = np.maximum(LEAST_WEIGHT / np.maximum(square, 1.0), SMALLEST_WEIGHT)
-    return believed(information, information * np.maximum(weight, tail))
+    return reduce_information(information, information * np.maximum(weight, tail))
 
 
-def believed(information: Array, reduced: Array) -> Array:
+def reduce_information(information: Array, reduced: Array) -> Array:
     """Return the reduced information, but the whole one where most of a profile is doubted."""
     kept = (reduced > HALF * information).sum(axis=1)
     most = kept >= HALF * (information > 0.0).sum(axis=1)

@@ -20,7 +20,9 @@ _LEAST_SHARE: Final = 1e-6
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def between(there: Booleans, signal: npt.NDArray[np.floating], variance: Array) -> Booleans:
+def profiles_with_gaps(
+    there: Booleans, signal: npt.NDArray[np.floating], variance: Array
+) -> Booleans:
     """Tell which profiles miss samples between others of the same beam.
 
     Of weak light, a sample that noise made negative is not missing, though it is not used.

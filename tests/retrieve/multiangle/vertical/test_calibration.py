@@ -120,10 +120,12 @@ def test_rows_left_out_are_interpolated():
     c = replace(c, bands=np.ascontiguousarray(bands[:, 0]))
     for lower in (np.full(600, -1), every - 1):
         bias = c.bias - np.where(lower >= 0, c.bias[:, np.maximum(lower, 0)], 0.0)
-        thinned = _calibration.ratio(c, every, lower, bias)
+        thinned = _calibration.variance_ratio(c, every, lower, bias)
         exact = np.array(
             [
-                _calibration.ratio(c, every[k : k + 1], lower[k : k + 1], bias[:, k : k + 1])[:, 0]
+                _calibration.variance_ratio(
+                    c, every[k : k + 1], lower[k : k + 1], bias[:, k : k + 1]
+                )[:, 0]
                 for k in every
             ]
         ).T
@@ -136,7 +138,7 @@ def test_rows_left_out_are_interpolated():
 def test_typical_profile_leaves_out_what_few_have():
     information = np.array([[2.0, 4.0, 1.0], [4.0, 0.0, 0.0], [6.0, 8.0, 0.0]])
     share = np.array([[0.2, 0.4, 0.5], [0.4, 9.0, 9.0], [0.6, 0.8, 9.0]])
-    mean, part = _calibration.typical(information, share)
+    mean, part = _calibration.typical_profile(information, share)
     np.testing.assert_allclose(mean, [4.0, 6.0, 0.0])
     np.testing.assert_allclose(part, [0.4, 0.6, 0.5])
 
@@ -166,7 +168,7 @@ def test_little_optical_depth_does_not_make_the_smoothing_error_small():
 def test_smoothing_error_is_scaled_and_noise_is_not():
     c = replace(calibration(profiles=2), scale=np.array([1.0, 4.0]))
     bias = np.full((2, HEIGHTS), 5.0)
-    one, four = _calibration.ratio(c, EVERY, np.full(HEIGHTS, -1), bias)
+    one, four = _calibration.variance_ratio(c, EVERY, np.full(HEIGHTS, -1), bias)
     known = _calibration.sandwich(
         c.bands, c.information, c.share, 0.6, c.stiffness, c.smoothing, EVERY, np.full(HEIGHTS, -1)
     )

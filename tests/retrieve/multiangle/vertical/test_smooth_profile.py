@@ -610,7 +610,7 @@ def test_coherent_residuals_in_noise_are_no_correlation_of_the_air():
     residual += 0.5 * np.sqrt(noise) * (noise > 1e-3) * rng.normal(size=(30, 8, 1))
     weight = np.broadcast_to(1.0 / (noise + variance[0]), shape)
     moments = residual_moments(residual, weight, np.zeros(shape), variance, np.ones((30, 60)))
-    rho, _ = _correlation.fit(moments.lag_products, moments.lag_norms)
+    rho, _ = _correlation.fit_correlation(moments.lag_products, moments.lag_norms)
     assert rho < 0.1
 
 
@@ -651,7 +651,7 @@ def test_correlation_and_amplitude_follow_from_three_lags(ratios, expected):
     if np.isnan(ratios[2]):
         norms[:] = 0.0
     products = np.nan_to_num(np.array(ratios)) * norms
-    found = _correlation.fit(products, norms)
+    found = _correlation.fit_correlation(products, norms)
     assert found == pytest.approx(expected, abs=0.011)
 
 

@@ -130,7 +130,7 @@ def test_only_samples_missing_between_others_are_gaps():
     signal[5, 0, 2] = -1.0
     variance = np.full(signal.shape, 0.1)
     there = signal > 0.0
-    found = gaps.between(there, signal, variance)
+    found = gaps.profiles_with_gaps(there, signal, variance)
     np.testing.assert_array_equal(found, [False, True, False, False, False, False])
     variance[0, 1, 3], there[0, 1, 3] = np.nan, False
-    assert gaps.between(there, signal, variance)[0]
+    assert gaps.profiles_with_gaps(there, signal, variance)[0]
