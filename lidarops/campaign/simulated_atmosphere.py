@@ -1,7 +1,7 @@
-"""What a campaign file says of the air that simulated lidars look at.
+"""Settings of the atmosphere of a simulation.
 
-Extinction of particles is given in m-1 at 532 nm. Heights are metres above the ground of the
-origin, places metres east and north of it.
+Extinction of particles is in m-1 at 532 nm. Heights are in metres above the ground at the
+origin, positions in metres east and north of it.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from lidarops.campaign.simulation_base import (
 
 
 class Aerosol(SimulationModel):
-    """Optical properties that aerosol keeps."""
+    """Optical properties of an aerosol type."""
 
     lidar_ratio: float = Field(default=50.0, ge=5, le=150, description="sr")
     angstrom_exponent: float = Field(default=1.3, ge=-1, le=4, description="of extinction")
 
 
 class BoundaryLayer(SimulationModel):
-    """Aerosol that is well mixed from the ground to a top that follows the sun."""
+    """Aerosol, well mixed from the ground to a top that varies over the day."""
 
     aerosol: Aerosol = Aerosol()
     extinction: NotNegative = Field(default=1.0e-4, le=0.1, description="m-1 at 532 nm")
     height: DiurnalCourse = DiurnalCourse(minimum=500.0, maximum=1600.0, hour_of_maximum=14.0)
-    """m above the ground"""
+    """m above the ground."""
     entrainment_depth: float = Field(default=100.0, gt=0, le=2000, description="m")
 
 
 class Layer(Period):
-    """An elevated layer of Gaussian shape, present for part of the time."""
+    """Elevated layer of Gaussian shape that exists for a period."""
 
     name: str
     aerosol: Aerosol = Aerosol()
@@ -51,13 +51,13 @@ class Layer(Period):
 
 
 class Cloud(Period):
-    """A layer of constant extinction between a sharp base and top, for part of the time."""
+    """Layer of constant extinction between a sharp base and top that exists for a period."""
 
     name: str = "cloud"
     extinction: Extinction = Field(gt=0, description="m-1, the same at every wavelength")
     base: float = Field(ge=0, le=30_000, description="m above the ground")
     top: float = Field(gt=0, le=30_000, description="m above the ground")
-    lidar_ratio: float = Field(default=18.8, ge=5, le=150, description="sr; 18.8: water")
+    lidar_ratio: float = Field(default=18.8, ge=5, le=150, description="sr; 18.8 for water clouds")
 
     @model_validator(mode="after")
     def _upright(self) -> Self:
@@ -67,20 +67,20 @@ class Cloud(Period):
 
 
 class Gradient(SimulationModel):
-    """Aerosol that changes along a horizontal direction.
+    """Aerosol with a horizontal gradient.
 
-    Its extinction at the origin times exp(distance / scale), towards `azimuth`.
+    The extinction is that at the origin times exp(distance / scale) towards `azimuth`.
     """
 
     aerosol: Aerosol = Aerosol()
     extinction: Extinction = Field(gt=0, description="m-1 at 532 nm, at the origin")
-    azimuth: Azimuth = Field(default=90.0, description="degree, towards which it grows")
-    scale: Length = Field(description="m over which it grows by a factor e")
-    top: Length = Field(default=1e5, description="m above the ground, up to which it reaches")
+    azimuth: Azimuth = Field(default=90.0, description="degree, direction of increase")
+    scale: Length = Field(description="m, distance of an increase by a factor of e")
+    top: Length = Field(default=1e5, description="m above the ground")
 
 
 class Plume(SimulationModel):
-    """A Gaussian cloud of aerosol that the wind carries."""
+    """Gaussian cloud of aerosol that drifts with the wind."""
 
     aerosol: Aerosol = Aerosol()
     extinction: Extinction = Field(gt=0, description="m-1 at 532 nm, at the centre")
@@ -94,7 +94,7 @@ class Plume(SimulationModel):
 
 
 class Turbulence(SimulationModel):
-    """A log-normal factor on the aerosol, random in space and carried by the wind."""
+    """Log-normal random factor on the aerosol that drifts with the wind."""
 
     deviation: float = Field(gt=0, le=3, description="standard deviation of the logarithm")
     horizontal_length: Length = Field(description="m, correlation length")
@@ -107,31 +107,31 @@ class Profile(SimulationModel):
     """Aerosol extinction at given heights, linear between them and zero above the last."""
 
     aerosol: Aerosol = Aerosol()
-    height: list[NotNegative] = Field(min_length=2, description="m above the ground, rising")
+    height: list[NotNegative] = Field(min_length=2, description="m above the ground, ascending")
     extinction: list[Extinction] = Field(min_length=2, description="m-1 at 532 nm")
 
     @model_validator(mode="after")
-    def _rises(self) -> Self:
+    def _ascends(self) -> Self:
         if len(self.height) != len(self.extinction):
-            raise ValueError("height and extinction need as many values")
+            raise ValueError("height and extinction need equal numbers of values")
         if any(upper <= lower for lower, upper in pairwise(self.height)):
-            raise ValueError("height must rise")
+            raise ValueError("height must ascend")
         return self
 
 
 class Sounding(SimulationModel):
     """Pressure and temperature of the air, in place of the US Standard Atmosphere."""
 
-    altitude: list[float] = Field(min_length=2, description="m above mean sea level, rising")
+    altitude: list[float] = Field(min_length=2, description="m above mean sea level, ascending")
     pressure: list[float] = Field(min_length=2, description="Pa")
     temperature: list[float] = Field(min_length=2, description="K")
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
         if not len(self.altitude) == len(self.pressure) == len(self.temperature):
-            raise ValueError("altitude, pressure and temperature need as many values")
+            raise ValueError("altitude, pressure and temperature need equal numbers of values")
         if any(upper <= lower for lower, upper in pairwise(self.altitude)):
-            raise ValueError("altitude must rise")
+            raise ValueError("altitude must ascend")
         if not all(1e-3 <= p <= 1.2e5 for p in self.pressure):
             raise ValueError("pressure is in Pa: 101325, not 1013.25")
         if not all(100 <= t <= 350 for t in self.temperature):
@@ -140,14 +140,14 @@ class Sounding(SimulationModel):
 
 
 class Homogeneous(SimulationModel):
-    """Aerosol that is the same everywhere, and follows the hour of the day."""
+    """Aerosol that is the same everywhere and varies over the day."""
 
     aerosol: Aerosol = Aerosol()
     extinction: DiurnalCourse = Field(description="m-1 at 532 nm")
     molecules_constant: bool = Field(
         default=False,
-        description="whether molecules are everywhere as dense as at the origin, so that the air"
-        " is homogeneous at any height",
+        description="whether molecules have the density of the origin at any height, which makes"
+        " the air homogeneous",
     )
 
     @model_validator(mode="after")
@@ -158,7 +158,7 @@ class Homogeneous(SimulationModel):
 
 
 class AtmosphereSettings(SimulationModel):
-    """The air: molecules, and the sum of what is given here."""
+    """Atmosphere: molecules, and the sum of all aerosol and clouds given here."""
 
     homogeneous: Homogeneous | None = None
     boundary_layer: BoundaryLayer | None = None

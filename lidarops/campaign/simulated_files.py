@@ -1,4 +1,4 @@
-"""What a campaign file says of how simulated raw files are taken, headed and damaged."""
+"""Settings of simulated raw files: acquisition, pointing, header dialect and damage."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ DialectName = Literal["licel", "manaus", "saopaulo", "pilar", "golmud"]
 
 
 class Handling(StrEnum):
-    """What a correct chain does with a file."""
+    """Correct handling of a raw file by the processing."""
 
     KEEP = "keep"
-    """Use it: it is odd, and all right."""
+    """Use it: it is odd, but valid."""
     FLAG = "flag"
-    """Use it, and flag what it spoils."""
+    """Use it, and flag the affected values."""
     SET_ASIDE = "set_aside"
-    """Use one of the two files that hold the same."""
+    """Use one of two files with the same content."""
     REFUSE = "refuse"
     """Refuse it, with the reason."""
 
 
 class DamageKind(StrEnum):
-    """What is wrong with a simulated file."""
+    """Kind of damage of a simulated file."""
 
     TRUNCATED = "truncated"
     EMPTY = "empty"
@@ -60,7 +60,7 @@ class DamageKind(StrEnum):
 
     @property
     def handling(self) -> Handling:
-        """What a correct chain does with the file."""
+        """Correct handling of the file by the processing."""
         return _HANDLING.get(self, Handling.KEEP)
 
     @property
@@ -98,21 +98,21 @@ _HANDLING = {
 
 
 class Damage(SimulationModel):
-    """One file to be damaged."""
+    """Damage of one file."""
 
     kind: DamageKind
-    index: int = Field(ge=0, description="which signal file of the instrument, from 0")
+    index: int = Field(ge=0, description="index of the signal file of the instrument, from 0")
 
 
 class RandomDamage(SimulationModel):
-    """Damage to files that the seed of the simulation chooses."""
+    """Damage of files that the seed of the simulation selects."""
 
-    fraction: float = Field(gt=0, le=1, description="of the signal files")
+    fraction: float = Field(gt=0, le=1, description="share of the signal files")
     kinds: list[DamageKind] = Field(min_length=1)
 
 
 class Pointing(SimulationModel):
-    """Where the beam goes: the zenith angles of one cycle, one file each, again and again."""
+    """Pointing of the beam: zenith angles of one cycle, one per file, repeated."""
 
     zenith_angles: list[Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]] = Field(
         min_length=1, description="degree, 0 = up"
@@ -121,19 +121,19 @@ class Pointing(SimulationModel):
     two_sided: bool = Field(
         default=False,
         description="whether the scan starts on the other side of the zenith (azimuth + 180) and"
-        " comes over it",
+        " crosses it",
     )
 
     @model_validator(mode="after")
-    def _headers_can_say_it(self) -> Self:
+    def _fits_headers(self) -> Self:
         if any(round(value, 1) != value for value in (*self.zenith_angles, self.azimuth)):
-            raise ValueError("zenith_angles and azimuth have one decimal in the headers")
+            raise ValueError("zenith_angles and azimuth must have one decimal, as in the headers")
         if len(set(self.zenith_angles)) < len(self.zenith_angles):
-            raise ValueError("a zenith angle stands twice in one cycle")
+            raise ValueError("a zenith angle occurs twice in one cycle")
         return self
 
     def cycle(self) -> tuple[tuple[float, float], ...]:
-        """Return zenith angle and azimuth of every file of one cycle."""
+        """Return zenith angle and azimuth of every file of one cycle, degree."""
         this_side = [(zenith, self.azimuth) for zenith in self.zenith_angles]
         if not self.two_sided:
             return tuple(this_side)
@@ -143,14 +143,14 @@ class Pointing(SimulationModel):
 
 
 class ClockJump(SimulationModel):
-    """From a moment on the clock of the computer is off by a number of seconds."""
+    """From a given time on, the clock of the computer has this error."""
 
     at: Instant = Field(description="true time")
     offset: int = Field(ge=-86400, le=86400, description="s, clock minus true time")
 
 
 class Change(SimulationModel):
-    """From a moment on files are taken in another way."""
+    """From a given time on, files have other bins or shots."""
 
     at: Instant
     bins: int | None = Field(default=None, ge=16, le=16_384)
@@ -159,7 +159,7 @@ class Change(SimulationModel):
 
 
 class Acquisition(SimulationModel):
-    """How an instrument takes its files."""
+    """How an instrument records its files."""
 
     interval: float = Field(default=300.0, ge=1, le=86400, description="s from start to start")
     shots: int = Field(default=600, ge=1, le=999_999, description="laser shots in a file")
@@ -170,28 +170,30 @@ class Acquisition(SimulationModel):
         default=0,
         ge=0,
         le=100,
-        description="with the telescope covered: one half before the first file, one half after",
+        description="files with a covered telescope: half before the first signal file, half after",
     )
-    dialect: DialectName = Field(default="licel", description="whose headers the files have")
+    dialect: DialectName = Field(default="licel", description="header dialect")
     signs_lost: bool = Field(
         default=False, description="whether headers lack the minus signs of the position"
     )
-    gaps: tuple[Period, ...] = Field(default=(), description="when nothing was measured")
+    gaps: tuple[Period, ...] = Field(default=(), description="periods without measurement")
     clock: tuple[ClockJump, ...] = Field(default=(), description="jumps of the clock, in order")
-    changes: tuple[Change, ...] = Field(default=(), description="of bins and shots, in order")
+    changes: tuple[Change, ...] = Field(
+        default=(), description="changes of bins and shots, in order"
+    )
 
     @property
     def duration(self) -> float:
-        """Duration of a file, s; where the first shot falls on its start, from that shot on."""
+        """Duration of a file, s; 101 shots at 10 Hz count as 10 s, from first to last shot."""
         rate = self.repetition_rate
         return (self.shots - 1) / rate if self.shots % rate == 1 else self.shots / rate
 
     @model_validator(mode="after")
-    def _headers_can_say_it(self) -> Self:
+    def _fits_headers(self) -> Self:
         if self.interval % 1 or self.duration % 1:
             raise ValueError(
                 "interval and shots / repetition_rate must be whole seconds: the headers of raw"
-                f" files hold no fractions, and a file here lasts {self.duration:g} s"
+                f" files hold no fractions, and a file lasts {self.duration:g} s"
             )
         if self.repetition_rate % 1:
             raise ValueError("repetition_rate must be a whole number of Hz, as in the headers")
@@ -203,45 +205,45 @@ class Acquisition(SimulationModel):
         return self
 
     @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        for name, moments in (
+    def _ascends_in_time(self) -> Self:
+        for name, times in (
             ("clock", [jump.at for jump in self.clock]),
             ("changes", [change.at for change in self.changes]),
         ):
-            if moments != sorted(set(moments)):
-                raise ValueError(f"the moments of {name} must rise")
+            if times != sorted(set(times)):
+                raise ValueError(f"the times of {name} must ascend")
         if len(self.clock) > 99:
-            raise ValueError("clock has more than 99 jumps, which file names cannot tell apart")
+            raise ValueError("clock has more than 99 jumps, more than file names can number")
         return self
 
     @model_validator(mode="after")
     def _changes_are_possible(self) -> Self:
         for change in self.changes:
-            later = self.at(change.at)
-            if later.duration % 1 or later.duration > self.interval:
+            changed = self.at(change.at)
+            if changed.duration % 1 or changed.duration > self.interval:
                 raise ValueError(
                     f"with the change at {change.at:%Y-%m-%d %H:%M} a file lasts"
-                    f" {later.duration:g} s: it must be a whole number, at most the interval"
+                    f" {changed.duration:g} s: it must be a whole number, at most the interval"
                 )
         return self
 
     def at(self, moment: datetime) -> Acquisition:
-        """Return how a file is taken that starts at `moment`."""
-        told = {
+        """Return the settings that hold for a file that starts at `moment`."""
+        changes = {
             name: value
             for change in self.changes
             if change.at <= moment
             for name in ("bins", "bin_width", "shots")
             if (value := getattr(change, name)) is not None
         }
-        return self.model_copy(update=told) if told else self
+        return self.model_copy(update=changes) if changes else self
 
     def clock_error(self, moment: datetime) -> tuple[int, timedelta]:
-        """Return how often the clock has jumped by `moment`, and clock minus true time."""
+        """Return the number of jumps of the clock up to `moment`, and clock minus true time."""
         past = [jump.offset for jump in self.clock if jump.at <= moment]
         return len(past), timedelta(seconds=past[-1] if past else 0)
 
     def is_missing(self, start: datetime) -> bool:
-        """Whether nothing was measured when a file would start."""
+        """Return whether a file that would start at `start` falls into a gap."""
         stop = start + timedelta(seconds=self.at(start).duration)
         return any(gap.overlaps(start, stop) for gap in self.gaps)

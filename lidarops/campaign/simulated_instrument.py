@@ -1,4 +1,4 @@
-"""What a campaign file says of the light and the electronics of simulated lidars."""
+"""Settings of laser, optics and detectors of simulated lidars."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidarops.campaign.simulation_base import BinWidth, NotNegative, SimulationM
 
 
 class PhotonCounter(SimulationModel):
-    """The photon-counting output of a detector. Its dead time is a fact of the campaign."""
+    """Photon-counting output of a detector; its dead time is a fact of the campaign."""
 
     discriminator_level: int = Field(default=8, ge=1, le=63, description="Licel level")
     paralyzable: bool = Field(
@@ -20,21 +20,21 @@ class PhotonCounter(SimulationModel):
 
 
 class AnalogRecorder(SimulationModel):
-    """The analog output of a detector."""
+    """Analog output of a detector."""
 
     gain: float = Field(gt=0, le=100, description="mV per MHz of photoelectrons")
     excess_noise: float = Field(
         default=1.2,
         ge=1,
         le=10,
-        description="variance of the charge over that of equal pulses: 1 + relative variance",
+        description="mean square of the charge of a photoelectron over the square of its mean",
     )
     noise: float = Field(
         gt=0, le=1000, description="electronic noise of one sample of one shot, mV"
     )
-    dark_offset: NotNegative = Field(description="mV, without any light")
+    dark_offset: NotNegative = Field(description="mV, without light")
     dark_drift: float = Field(
-        default=0.0, ge=-100, le=100, description="mV per hour, of the dark offset"
+        default=0.0, ge=-100, le=100, description="mV per hour, drift of the dark offset"
     )
     adc_range: float = Field(default=500.0, ge=1, le=10_000, description="mV at full scale")
     adc_bits: int = Field(default=12, ge=8, le=16)
@@ -46,12 +46,12 @@ class AnalogRecorder(SimulationModel):
 
     @model_validator(mode="after")
     def _noise_dithers(self) -> Self:
-        # Below half a step, rounding does not average out over shots. That is simulated too, down
-        # to what its Fourier series can say.
+        # Below half a step, rounding does not average out over shots. The simulation covers this
+        # down to 0.02 steps, where its Fourier series ends.
         if self.noise < 0.02 * self.step:
             raise ValueError(
                 f"noise of {self.noise:g} mV is less than 0.02 digitiser steps"
-                f" of {self.step:g} mV: no recorder is so quiet"
+                f" of {self.step:g} mV: no recorder has so little noise"
             )
         if self.dark_offset < 6 * self.noise:
             raise ValueError(
@@ -62,7 +62,7 @@ class AnalogRecorder(SimulationModel):
 
 
 class Background(SimulationModel):
-    """Sky light on a detector."""
+    """Sky background on a detector."""
 
     night: NotNegative = Field(description="MHz of photoelectrons")
     day: NotNegative = Field(description="MHz of photoelectrons with the sun at the zenith")
@@ -75,7 +75,7 @@ class Background(SimulationModel):
 
 
 class Optics(SimulationModel):
-    """Laser and telescope, from which the strength of a signal follows."""
+    """Laser and telescope, which determine the strength of a signal."""
 
     energy: float = Field(gt=0, le=100, description="J, of one pulse")
     area: float = Field(gt=0, le=1000, description="m2, of the telescope")
@@ -84,7 +84,7 @@ class Optics(SimulationModel):
     )
 
     def signal_rate(self, wavelength: float) -> float:
-        r"""Return the rate from a backscatter of 1e-6 m-1 sr-1 at 1 km, MHz.
+        r"""Return the rate of photoelectrons from a backscatter of 1e-6 m-1 sr-1 at 1 km, MHz.
 
         Notes
         -----
@@ -95,7 +95,7 @@ class Optics(SimulationModel):
 
 
 class Detector(SimulationModel):
-    """One detector: one wavelength, read by an analog recorder, a photon counter or both."""
+    """Detector of one wavelength with an analog recorder, a photon counter or both."""
 
     wavelength: int = Field(ge=200, le=3000, description="nm, as in the headers")
     polarisation: Literal["o", "p", "s"] = "o"
@@ -108,12 +108,16 @@ class Detector(SimulationModel):
         description="MHz of photoelectrons from a backscatter coefficient of 1e-6 m-1 sr-1 at a"
         " range of 1 km, with full overlap and without extinction",
     )
-    optics: Optics | None = Field(default=None, description="in place of signal_rate")
+    optics: Optics | None = Field(default=None, description="alternative to signal_rate")
     background: Background
     photon: PhotonCounter | None = None
     analog: AnalogRecorder | None = None
-    bins: int | None = Field(default=None, ge=16, le=16_384, description="where not the others'")
-    bin_width: BinWidth | None = Field(default=None, description="m, where not the others'")
+    bins: int | None = Field(
+        default=None, ge=16, le=16_384, description="by default those of the acquisition"
+    )
+    bin_width: BinWidth | None = Field(
+        default=None, description="m; by default that of the acquisition"
+    )
 
     @property
     def label(self) -> str:
@@ -122,27 +126,27 @@ class Detector(SimulationModel):
 
     @property
     def strength(self) -> float:
-        """The signal rate: as given, or of the optics."""
+        """Signal rate, MHz: as given, or computed from the optics."""
         if self.optics is not None:
             return self.optics.signal_rate(self.wavelength)
         return self.signal_rate or math.nan
 
     @property
     def system_constant(self) -> float:
-        """K of P = K O(R) beta R^-2 T^2, in MHz m3 sr."""
+        """K of P = K O(R) beta R^-2 T^2, MHz m3 sr."""
         return self.strength * 1.0e3**2 / 1.0e-6
 
     @model_validator(mode="after")
-    def _is_read(self) -> Self:
+    def _has_output(self) -> Self:
         if self.photon is None and self.analog is None:
-            raise ValueError("needs 'photon', 'analog' or both, else nobody reads it")
+            raise ValueError("needs 'photon', 'analog' or both: without them it has no output")
         if (self.signal_rate is None) == (self.optics is None):
             raise ValueError("give either signal_rate or optics")
         return self
 
 
 class LaserDrift(SimulationModel):
-    """How the energy of the laser changes: steadily, from file to file, from shot to shot."""
+    """Changes of the laser energy: drift, and jitter from file to file and shot to shot."""
 
     per_hour: float = Field(
         default=0.0, ge=-0.5, le=0.5, description="relative change of the energy in an hour"
@@ -156,10 +160,7 @@ class LaserDrift(SimulationModel):
 
 
 class Pulse(SimulationModel):
-    """Shape of the laser pulse in time; short against a bin where not given.
-
-    Time zero is its centroid.
-    """
+    """Shape of the laser pulse in time; time zero is its centroid."""
 
     shape: Literal["rectangle", "gaussian", "exponential"] = "gaussian"
     width: float = Field(

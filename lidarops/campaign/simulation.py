@@ -1,9 +1,9 @@
-"""What a campaign file says of its simulation.
+"""Settings of a simulation in a campaign file.
 
-Only what the simulator invents is written here: the scene in front of each lidar and the
-strength, light and noise of its detectors. What a person knows of an instrument (dead time,
-zenith angle, full overlap, trigger delay) is taken from the `facts` of the campaign that are
-valid at the moment of a file, so that truth and retrieval can only differ by a wrong fact.
+They describe what the simulator invents: the air in front of each lidar, and the signal strength,
+background light and noise of its detectors. Known properties of an instrument (dead time, zenith
+angle, full overlap, trigger delay) come from the `facts` of the campaign that are valid at the
+time of a file, so truth and retrieval use the same facts.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ __all__ = [
 ]
 
 
-_NEEDED = {
+_DAMAGE_OF_OUTPUT = {
     "photon": {DamageKind.DEAD_PHOTON},
     "analog": {DamageKind.GLITCH, DamageKind.SATURATION},
 }
@@ -83,7 +83,7 @@ class _Instrument(SimulationModel):
     laser: LaserDrift = LaserDrift()
 
     @model_validator(mode="after")
-    def _told_apart(self) -> Self:
+    def _unique(self) -> Self:
         labels = [detector.label for detector in self.detectors]
         if len(set(labels)) < len(labels):
             raise ValueError(f"two detectors share wavelength and polarisation: {labels}")
@@ -93,13 +93,13 @@ class _Instrument(SimulationModel):
         return self
 
     @model_validator(mode="after")
-    def _can_be_damaged(self) -> Self:
+    def _damage_fits_detectors(self) -> Self:
         kinds = {damage.kind for damage in self.damage}
         if self.random_damage is not None:
             kinds |= set(self.random_damage.kinds)
-        for output, needing in _NEEDED.items():
-            if kinds & needing and not any(getattr(d, output) for d in self.detectors):
-                names = ", ".join(sorted(kinds & needing))
+        for output, damaging in _DAMAGE_OF_OUTPUT.items():
+            if kinds & damaging and not any(getattr(d, output) for d in self.detectors):
+                names = ", ".join(sorted(kinds & damaging))
                 raise ValueError(f"damage of kind {names} needs a detector with {output!r}")
         return self
 
@@ -116,7 +116,7 @@ class _Instrument(SimulationModel):
 
     @model_validator(mode="after")
     def _pulse_is_short(self) -> Self:
-        # c / 2 times the length of the pulse, against what the recorder sees.
+        # Length of the pulse in range, c / 2 times its duration, against the recorded range.
         shortest = min(
             (detector.bins or self.acquisition.bins)
             * (detector.bin_width or self.acquisition.bin_width)
@@ -132,17 +132,17 @@ class _Instrument(SimulationModel):
 
     @property
     def air(self) -> AtmosphereSettings | None:
-        """What it looks at; None for what all look at."""
+        """Air in front of the lidar; None for the shared atmosphere."""
         return None
 
     @property
     def pointing(self) -> Pointing | None:
-        """Where it looks; None where the facts of the campaign say it."""
+        """Pointing of the beam; None if the facts of the campaign give it."""
         return None
 
 
 class HorizontalPath(_Instrument):
-    """A lidar that looks along a homogeneous path."""
+    """Lidar on a homogeneous path."""
 
     kind: Literal["horizontal"]
     aerosol: Aerosol = Aerosol()
@@ -167,7 +167,7 @@ class HorizontalPath(_Instrument):
         wavelengths = {detector.wavelength for detector in self.detectors}
         if len(wavelengths) > 1:
             raise ValueError(
-                f"detectors at {sorted(wavelengths)} nm: a homogeneous path has one extinction a"
+                f"detectors at {sorted(wavelengths)} nm: a homogeneous path has one extinction per"
                 " file, so its detectors need one wavelength; give other wavelengths their own"
                 " instrument"
             )
@@ -175,7 +175,7 @@ class HorizontalPath(_Instrument):
 
 
 class VerticalColumn(_Instrument):
-    """A lidar that looks through a layered atmosphere."""
+    """Vertical lidar below a layered atmosphere."""
 
     kind: Literal["vertical"]
     boundary_layer: BoundaryLayer = BoundaryLayer()
@@ -183,29 +183,29 @@ class VerticalColumn(_Instrument):
 
     @property
     def air(self) -> AtmosphereSettings:
-        """The layers."""
+        """The layered atmosphere."""
         return AtmosphereSettings(boundary_layer=self.boundary_layer, layers=self.layers)
 
 
 class Lidar(_Instrument):
-    """A lidar that looks anywhere, into air of its own or the air that all share."""
+    """Lidar with any pointing, in its own atmosphere or in the shared one."""
 
     kind: Literal["lidar"]
     atmosphere: AtmosphereSettings | None = Field(
-        default=None, description="of its own; that of the simulation where not given"
+        default=None, description="its own atmosphere; by default that of the simulation"
     )
     scan: Pointing | None = Field(
-        default=None, description="zenith angles in turn; as the facts say where not given"
+        default=None, description="sequence of zenith angles; by default the pointing of the facts"
     )
 
     @property
     def air(self) -> AtmosphereSettings | None:
-        """What it looks at; None for what all look at."""
+        """Air in front of the lidar; None for the shared atmosphere."""
         return self.atmosphere
 
     @property
     def pointing(self) -> Pointing | None:
-        """Where it looks; None where the facts of the campaign say it."""
+        """Pointing of the beam; None if the facts of the campaign give it."""
         return self.scan
 
 
@@ -215,17 +215,20 @@ SimulatedInstrument = Annotated[
 
 
 class TruthSettings(SimulationModel):
-    """How much is told of the air on the beams."""
+    """Resolution of the true profiles along the beams."""
 
     cells: int | None = Field(
         default=None,
         ge=0,
         le=2048,
-        description="of range, equally long, in each of which the truth is a mean; where not given"
-        " 30 m long up to 12 km, and longer beyond",
+        description="number of range cells of equal length, with one mean each; by default cells of"
+        " 30 m up to 12 km and longer ones beyond",
     )
     profiles: int = Field(
-        default=512, ge=1, le=100_000, description="at most, of each instrument, evenly spread"
+        default=512,
+        ge=1,
+        le=100_000,
+        description="largest number of profiles per instrument, evenly spread in time",
     )
 
 
@@ -236,14 +239,16 @@ class SimulationSettings(SimulationModel):
     start: Instant
     duration: float = Field(gt=0, le=366 * 86400.0 * 30, description="s")
     atmosphere: AtmosphereSettings | None = Field(
-        default=None, description="that instruments of kind 'lidar' share"
+        default=None, description="shared by instruments of kind 'lidar'"
     )
     origin: str | None = Field(
         default=None,
-        description="station from which the shared air is described; the first of the campaign",
+        description="station at the origin of the shared atmosphere; by default the first of the"
+        " campaign",
     )
     fast: bool = Field(
-        default=False, description="whether noise is drawn in a fast way, for tests of big archives"
+        default=False,
+        description="whether noise is drawn in a fast, approximate way, for large archives",
     )
     truth: TruthSettings = TruthSettings()
     instruments: dict[str, SimulatedInstrument] = Field(min_length=1)
@@ -270,17 +275,17 @@ class SimulationSettings(SimulationModel):
         for key in self.instruments:
             if self.instruments[key].air is None and self.atmosphere is None:
                 raise ValueError(
-                    f"instruments.{key}: has no atmosphere: give one to it, or"
-                    " simulation.atmosphere to all"
+                    f"instruments.{key}: has no atmosphere: give it one, or give"
+                    " simulation.atmosphere for all"
                 )
         return self
 
     def air_of(self, key: str) -> AtmosphereSettings:
-        """Return what an instrument looks at."""
+        """Return the atmosphere of an instrument."""
         return self.instruments[key].air or self.atmosphere or AtmosphereSettings()
 
     def files(self, key: str) -> int:
-        """Return the number of signal files of an instrument: those that end in time."""
+        """Return the number of signal files of an instrument; all end within the campaign."""
         acquisition = self.instruments[key].acquisition
         return int((self.duration - acquisition.duration) // acquisition.interval) + 1
 
@@ -291,8 +296,8 @@ class SimulationSettings(SimulationModel):
     def start_of_dark(self, key: str, index: int) -> datetime:
         """Return when the dark file `index` starts.
 
-        One after another, the first half up to the start of the campaign, the others from its
-        end (rounded up to a whole second).
+        Dark files follow one another. The first half ends at the start of the campaign; the
+        others begin at its end, rounded up to a whole second.
         """
         acquisition = self.instruments[key].acquisition
         before = (acquisition.dark_files + 1) // 2

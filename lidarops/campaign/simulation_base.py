@@ -1,4 +1,4 @@
-"""What the models of a simulation share."""
+"""Base model and value types of the simulation settings."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def _whole_seconds(value: datetime) -> datetime:
     return value
 
 
-def _of_the_laser(value: datetime) -> datetime:
+def _laser_era(value: datetime) -> datetime:
     if not 1960 <= value.year <= 2200:
-        raise ValueError("is not of the age of lasers: give a year from 1960 to 2200")
+        raise ValueError("is outside of the age of lasers: give a year from 1960 to 2200")
     return value
 
 
@@ -37,27 +37,27 @@ Instant = Annotated[
     datetime,
     AfterValidator(_utc),
     AfterValidator(_whole_seconds),
-    AfterValidator(_of_the_laser),
+    AfterValidator(_laser_era),
 ]
 BinWidth = Annotated[float, Field(ge=0.5, le=150), AfterValidator(_four_characters)]
 """m."""
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Hour = Annotated[float, Field(ge=0, lt=24, allow_inf_nan=False)]
 Extinction = Annotated[float, Field(ge=0, le=1.0, allow_inf_nan=False)]
-"""m-1. A cloud has 0.1; 1 would be 1000 per km, so that a value in km-1 is found out."""
+"""m-1. A cloud has 0.1; the limit of 1 (1000 per km) catches values given in km-1."""
 Length = Annotated[float, Field(gt=0, le=1e7, allow_inf_nan=False)]
 Azimuth = Annotated[float, Field(ge=0, lt=360, allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 
 class SimulationModel(BaseModel):
-    """A part of the settings: frozen, and without keys that nobody knows."""
+    """Base of all simulation settings: frozen, and without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Period(SimulationModel):
-    """A time interval, from its start up to its stop."""
+    """Time interval from `start` to `stop`, without `stop`."""
 
     start: Instant
     stop: Instant
@@ -69,12 +69,12 @@ class Period(SimulationModel):
         return self
 
     def overlaps(self, start: datetime, stop: datetime) -> bool:
-        """Whether anything between `start` and `stop` lies in the period."""
+        """Return whether the interval from `start` to `stop` overlaps the period."""
         return start < self.stop and stop > self.start
 
 
 class DiurnalCourse(SimulationModel):
-    """A quantity that follows the hour of the day (UTC) as a cosine."""
+    """A quantity that varies with the hour of the day (UTC) as a cosine."""
 
     minimum: NotNegative
     maximum: NotNegative

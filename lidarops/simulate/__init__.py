@@ -1,1 +1,17 @@
-"""The lidar equation forward: simulated campaigns of raw files with known truth."""
+"""The lidar equation forward: raw files whose true extinction is known.
+
+The modules follow the light:
+
+1. Atmosphere: `atmosphere` (extinction and backscatter along a beam), `sun` (sky brightness),
+   `mie` (scattering by spheres).
+2. Signal: `overlap`, `signal` (short pulse), `pulse` (pulse of any shape), `echo` (the pulse of a
+   campaign file), `laser` (pulse energy), `lidar` (signal in W and MHz from physical units).
+3. Detectors: `photoelectrons`, then `counting` (photon counter with dead time) and `analog`
+   (digitiser).
+4. Raw files: `dialects` (headers of real stations), `damage` (truncated, foreign and odd files),
+   `site` (names, times and places of the files), `files` (one file and its truth), `truth` (table
+   of true values), `campaign` (all files of a campaign).
+
+Start with `campaign.simulate_campaign` for a whole campaign, or `pulse.pulsed_signal` for one
+signal.
+"""

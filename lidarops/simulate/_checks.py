@@ -1,4 +1,4 @@
-"""Refusal of input that no lidar has, by the name of the argument."""
+"""Checks of arguments: refuse values that no real lidar has, and name the argument."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lidarops.errors import LidarOpsError
 
 SHORTEST: Final = 1.0e-7
-"""m. Shorter wavelengths than 100 nm do not pass air."""
+"""m. Air absorbs light of less than 100 nm."""
 LONGEST: Final = 2.0e-5
 """m."""
 
@@ -21,25 +21,25 @@ class SimulationInputError(LidarOpsError, ValueError):
 
 
 def positive(field: str, value: float, unit: str = "") -> None:
-    """Refuse what is not a positive, finite number."""
+    """Raise unless `value` is positive and finite."""
     if not (math.isfinite(value) and value > 0.0):
         raise _refusal(field, value, unit, "be positive and finite")
 
 
 def not_negative(field: str, value: float, unit: str = "") -> None:
-    """Refuse what is negative or not finite."""
+    """Raise unless `value` is finite and not negative."""
     if not (math.isfinite(value) and value >= 0.0):
         raise _refusal(field, value, unit, "be finite and not negative")
 
 
 def between(field: str, value: float, low: float, high: float, unit: str = "") -> None:
-    """Refuse what is not from `low` to `high`."""
+    """Raise unless `value` lies between `low` and `high`, ends included."""
     if not low <= value <= high:
         raise _refusal(field, value, unit, f"lie between {low:g} and {high:g}")
 
 
 def wavelength_in_metres(field: str, value: float) -> None:
-    """Refuse wavelengths out of the optical window; most often they are in nm."""
+    """Raise unless a wavelength lies in the optical window; outside, it is mostly in nm."""
     if SHORTEST <= value <= LONGEST:
         return
     remedy = f"{value:g} nm are {value * 1e-9:g} m" if 100.0 <= value <= 20_000.0 else None
@@ -51,7 +51,7 @@ def wavelength_in_metres(field: str, value: float) -> None:
 
 
 def profile(field: str, values: NDArray[np.float64], shape: tuple[int, ...], unit: str) -> None:
-    """Refuse profiles of another shape, or with values that are negative or not finite."""
+    """Raise unless a profile has this shape and its values are finite and not negative."""
     if values.shape != shape:
         raise SimulationInputError(f"has shape {values.shape}, not {shape}", field=field)
     # NaN passes neither comparison.
@@ -61,11 +61,11 @@ def profile(field: str, values: NDArray[np.float64], shape: tuple[int, ...], uni
 
 
 def ascending(field: str, values: NDArray[np.float64]) -> None:
-    """Refuse a grid that does not ascend."""
+    """Raise unless a grid has one axis and at least two ascending values."""
     if values.ndim != 1 or values.size < 2 or not np.all(np.diff(values) > 0.0):
         raise SimulationInputError("must be one axis of at least 2 ascending values", field=field)
 
 
 def _refusal(field: str, value: Any, unit: str, rule: str) -> SimulationInputError:
-    told = f"{value:g} {unit}".rstrip()
-    return SimulationInputError(f"must {rule}, not {told}", field=field)
+    text = f"{value:g} {unit}".rstrip()
+    return SimulationInputError(f"must {rule}, not {text}", field=field)

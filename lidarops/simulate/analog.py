@@ -1,4 +1,4 @@
-r"""Digitisers: what is recorded of the photoelectrons, in steps.
+r"""Analog recorders: from photoelectrons to digitiser steps.
 
 One sample of one shot is the charge of its photoelectrons, an offset and electronic noise,
 rounded to a step. For a voltage v (in steps) with the characteristic function
@@ -9,8 +9,8 @@ rounded to a step. For a voltage v (in steps) with the characteristic function
           E[v e] = \sum_k \frac{(-1)^k}{\pi k} \Im(-i \phi'(2 \pi k))
 
 (`widrow2008`). Here phi is that of a compound Poisson distribution of gamma-distributed charges
-plus Gaussian noise, so the moments hold for few photoelectrons and for noise far below a step,
-where the steps do not average out over shots.
+plus Gaussian noise. The moments therefore hold for few photoelectrons and for noise far below a
+step, where rounding errors do not average out over shots.
 """
 
 from __future__ import annotations
@@ -25,28 +25,26 @@ from numpy.typing import NDArray
 
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, possible_rate
+from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, limited_rate
 
 FastCounts = NDArray[np.int32]
 
 LEAST_NOISE: Final = 0.02
-"""Steps. With less, the sums over shots would need more harmonics than they have digits."""
+"""Steps. Less noise would need more harmonics than double precision resolves."""
 _NEGLIGIBLE: Final = 20.0
-"""Of a harmonic: exp(-20) = 2e-9 steps."""
+"""Harmonics of less than exp(-20) = 2e-9 steps are left out."""
 _NEGLIGIBLE_FAST: Final = 9.2
-"""1e-4 steps."""
-_HIGHEST: Final = 1.0e6
-"""mV, of anything electronic."""
+"""The same for `digitise_fast`: 1e-4 steps."""
 _LARGEST: Final = 2**31 - 1
-"""Of 32 bits."""
+"""Largest signed integer of 32 bits."""
 _FAR: Final = 8.0
-"""Deviations from the ends of the scale at which nothing is clipped."""
+"""Standard deviations from the ends of the scale beyond which no sample is clipped."""
 _MANY: Final = 50.0
-"""Photoelectrons in a sample whose sum of charges is as good as normal."""
+"""Photoelectrons in a sample above which the sum of their charges is normal."""
 
 
 class Recorder(Protocol):
-    """An analog recorder: `Digitiser`, or the settings of one."""
+    """An analog recorder: `Digitiser`, or the settings of a campaign file."""
 
     @property
     def gain(self) -> float:
@@ -62,7 +60,7 @@ class Recorder(Protocol):
 
     @property
     def excess_noise(self) -> float:
-        """Mean square of the charge over the square of its mean."""
+        """Mean square of the charge of a photoelectron over the square of its mean."""
 
     @property
     def dark_offset(self) -> float:
@@ -70,7 +68,7 @@ class Recorder(Protocol):
 
     @property
     def adc_bits(self) -> int:
-        """Of the digitiser."""
+        """Resolution of the digitiser, bits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,8 +83,6 @@ class Digitiser:
     """mV, without any light."""
     excess_noise: float = 1.2
     """Mean square of the charge over the square of its mean, at least 1."""
-    dark_drift: float = 0.0
-    """mV per hour, of the dark offset."""
     adc_range: float = 500.0
     """mV at full scale."""
     adc_bits: int = 12
@@ -96,7 +92,6 @@ class Digitiser:
         _checks.not_negative("noise", self.noise, "mV")
         _checks.not_negative("dark_offset", self.dark_offset, "mV")
         _checks.between("excess_noise", self.excess_noise, 1.0, 10.0)
-        _checks.between("dark_drift", self.dark_drift, -1e3, 1e3, "mV h-1")
         _checks.positive("adc_range", self.adc_range, "mV")
         _checks.between("adc_bits", self.adc_bits, 4, 20)
 
@@ -105,55 +100,20 @@ class Digitiser:
         """Least significant bit, mV."""
         return self.adc_range / 2.0**self.adc_bits
 
-    def offset_at(self, hours: float) -> float:
-        """Return the dark offset (mV) some hours after the start, not below 0."""
-        return max(self.dark_offset + self.dark_drift * hours, 0.0)
-
-
-def slow_baseline(bins: int, bin_time: float, *, amplitude: float, decay: float) -> Array:
-    """Return the recovery of the electronics from the flash, mV, shape (bins,).
-
-    Parameters
-    ----------
-    bins : int
-    bin_time : float, s
-    amplitude : float, mV
-        At the start of the recorder; negative for an undershoot.
-    decay : float, s
-        In which it falls to 1/e.
-
-    Notes
-    -----
-    It is in dark files as in others, so it leaves with their subtraction; the mean of the last
-    bins leaves a distortion of the near ones.
-    """
-    _checks.positive("bin_time", bin_time, "s")
-    _checks.positive("decay", decay, "s")
-    _checks.between("amplitude", amplitude, -_HIGHEST, _HIGHEST, "mV")
-    time = (np.arange(bins, dtype=np.float64) + 0.5) * bin_time
-    baseline: Array = amplitude * np.exp(-time / decay)
-    return baseline
-
 
 def digitise(
     released: Photoelectrons,
     recorder: Recorder,
     *,
     random: np.random.Generator,
-    offset: float | None = None,
-    baseline: Array | None = None,
 ) -> Counts:
-    r"""Return the sum over shots of what a digitiser makes of the photoelectrons.
+    r"""Draw the samples of a digitiser, summed over shots.
 
     Parameters
     ----------
     released : Photoelectrons
     recorder : Recorder
     random : numpy.random.Generator
-    offset : float, mV, optional
-        Dark offset in place of the recorder's, where it drifts.
-    baseline : ndarray, mV, shape (bins,), optional
-        Added to the dark offset; see `slow_baseline`.
 
     Returns
     -------
@@ -163,31 +123,30 @@ def digitise(
     Raises
     ------
     SimulationInputError
-        Where the electronic noise is less than `LEAST_NOISE` steps, or offset or baseline are
-        not finite.
+        If the electronic noise is less than `LEAST_NOISE` steps.
 
     Notes
     -----
-    One sample of one shot has the mean "gain times rate plus dark offset" plus the bias of the
-    rounding. Its noise is the shot noise of the photoelectrons (the same that the counter sees),
-    the spread of their charge (`excess_noise`), electronic noise and that of the rounding, with
-    which the sum is regressed on the photoelectrons. Samples are clipped at both ends of the
-    scale one by one: near them the mean and the variance are those of a censored normal
-    distribution, or of a mixture of them over the numbers of photoelectrons where these are few,
+    The mean of one sample of one shot is gain times rate, plus the dark offset, plus the bias of
+    the rounding. Its noise is the shot noise of the photoelectrons (the same as in the photon
+    counter), the spread of their charge (`excess_noise`), electronic noise and rounding noise;
+    the sum is regressed on the photoelectrons. Every sample is clipped at both ends of the scale.
+    Near the ends, mean and variance are those of a censored normal distribution, or of a mixture
+    of such distributions over the numbers of photoelectrons where these are few,
 
     .. math:: \mathrm{E}[\min(v, F)] = \mu \Phi(z) + F (1 - \Phi(z)) - s \phi(z),
               \quad z = (F - \mu) / s
 
-    so that a bin of which only some shots are clipped is too low, as in a real instrument,
-    though its sum is below full scale.
+    Where only some shots are clipped, the sum is too low although it is below full scale, as in
+    a real instrument.
     """
     if released.shots == 0:
         return np.zeros(released.number.shape, dtype=np.int64)
-    sample = _sample(recorder, released.bin_time)
-    dark = _dark(recorder, released.rate.shape, offset, baseline)
+    sample = _sample_parameters(recorder, released.bin_time)
+    dark = _dark(recorder, released.rate.shape)
     top = 2**recorder.adc_bits - 1
     noise = random.standard_normal(released.rate.size)
-    total: Counts = _recorded(
+    total: Counts = _sum_samples(
         released.rate, released.number, noise, dark, *sample, float(released.shots), float(top)
     )
     return total
@@ -200,10 +159,8 @@ def digitise_fast(
     shots: int,
     bin_time: float,
     random: np.random.Generator,
-    offset: float | None = None,
-    baseline: Array | None = None,
 ) -> FastCounts:
-    """Return sums over shots of the same mean and variance with Gaussian noise, one draw a bin.
+    """Draw sums over shots with the mean and variance of `digitise`, one Gaussian draw per bin.
 
     Parameters
     ----------
@@ -214,18 +171,16 @@ def digitise_fast(
     bin_time : float, s
         For which a bin is open after one shot.
     random : numpy.random.Generator
-    offset, baseline
-        As of `digitise`.
 
     Raises
     ------
     SimulationInputError
-        As of `digitise`, and where a rate, a time or the number of shots is negative or NaN, or
-        the sums do not fit into 32 bits.
+        As `digitise`; or if a rate, a time or the number of shots is negative or NaN, or the sums
+        do not fit into 32 bits.
 
     Notes
     -----
-    The bias of the rounding is right to 1e-4 steps.
+    The bias of the rounding is accurate to 1e-4 steps.
     """
     rate = _checked(rate, bin_time)
     _checks.not_negative("shots", shots)
@@ -239,64 +194,47 @@ def digitise_fast(
             remedy="take fewer shots, or digitise",
         )
     noise = random.standard_normal(rate.size, dtype=np.float32)
-    dark = _dark(recorder, rate.shape, offset, baseline)
-    total: FastCounts = _drawn(
-        rate, noise, dark, *_sample(recorder, bin_time, _NEGLIGIBLE_FAST), float(shots), float(top)
+    dark = _dark(recorder, rate.shape)
+    total: FastCounts = _draw_sums(
+        rate,
+        noise,
+        dark,
+        *_sample_parameters(recorder, bin_time, _NEGLIGIBLE_FAST),
+        float(shots),
+        float(top),
     )
     return total
 
 
-def sample_moments(
-    rate: Array, recorder: Recorder, *, bin_time: float, baseline: Array | None = None
-) -> tuple[Array, Array]:
-    """Return mean and variance of one sample of one shot, steps, before it is clipped.
+def sample_moments(rate: Array, recorder: Recorder, *, bin_time: float) -> tuple[Array, Array]:
+    """Return mean and variance of one sample of one shot before clipping, steps.
 
     Parameters
     ----------
     rate : ndarray, MHz, shape (bins,)
     recorder : Recorder
     bin_time : float, s
-    baseline : ndarray, mV, shape (bins,), optional
     """
     rate = _checked(rate, bin_time)
-    dark = _dark(recorder, rate.shape, None, baseline)
-    both = _moments_of(rate, dark, *_sample(recorder, bin_time))
+    dark = _dark(recorder, rate.shape)
+    both = _moments_of(rate, dark, *_sample_parameters(recorder, bin_time))
     return both[0], both[1]
-
-
-def sum_voltage(total: NDArray[Any], recorder: Recorder, *, shots: int) -> Array:
-    """Return sums over shots as a voltage, mV: NaN without shots, when nothing was measured."""
-    if shots <= 0:
-        return np.full(total.shape, np.nan)
-    voltage: Array = total * (recorder.step / shots)
-    return voltage
 
 
 def _checked(rate: Array, bin_time: float) -> Array:
     _checks.positive("bin_time", bin_time, "s")
-    return possible_rate(rate)
+    return limited_rate(rate)
 
 
-def _dark(
-    recorder: Recorder, shape: tuple[int, ...], offset: float | None, baseline: Array | None
-) -> Array:
+def _dark(recorder: Recorder, shape: tuple[int, ...]) -> Array:
     """Return the voltage without light, steps."""
-    if offset is not None:
-        _checks.between("offset", offset, -_HIGHEST, _HIGHEST, "mV")
-    dark = np.full(shape, recorder.dark_offset if offset is None else offset)
-    if baseline is not None:
-        if baseline.shape != shape:
-            raise SimulationInputError(f"has shape {baseline.shape}, not {shape}", field="baseline")
-        if not np.all(np.abs(baseline) <= _HIGHEST):
-            raise SimulationInputError("is not finite", field="baseline")
-        dark += baseline
-    return dark / recorder.step
+    return np.full(shape, recorder.dark_offset) / recorder.step
 
 
-def _sample(
+def _sample_parameters(
     recorder: Recorder, bin_time: float, negligible: float = _NEGLIGIBLE
 ) -> tuple[float, float, float, float, NDArray[np.float64], NDArray[np.complex128]]:
-    """Return what is the same for all bins, with the harmonics of one photoelectron's charge."""
+    """Return the parameters that all bins share, with the harmonics of a photoelectron's charge."""
     unit = recorder.gain / recorder.step / (bin_time * 1e6)
     spread, still = recorder.excess_noise - 1.0, recorder.noise / recorder.step
     if still < LEAST_NOISE:
@@ -340,7 +278,7 @@ def _rounded(
             continue
         angle = events * charge.imag + 2.0 * order * dark
         real, imag = size * cos(angle), size * sin(angle)
-        # d ln phi / d omega, of which -i times phi is E[v exp(i omega v)].
+        # d ln phi / d omega; times -i phi it is E[v exp(i omega v)].
         along = events * harmonics[1, k].real - 2.0 * order * still * still
         across = events * harmonics[1, k].imag + dark
         bias += sign / order * imag
@@ -380,7 +318,7 @@ def _censored(mean: float, deviation: float, top: float) -> tuple[float, float]:
 def _mixed(
     events: float, dark: float, unit: float, spread: float, still: float, top: float
 ) -> tuple[float, float]:
-    """Return mean and variance of a clipped voltage of few photoelectrons, number by number."""
+    """Return mean and variance of a clipped voltage, summed over numbers of photoelectrons."""
     mean, square = 0.0, 0.0
     chance = exp(-events)
     for number in range(int(events + 10.0 * sqrt(events)) + 12):
@@ -403,9 +341,9 @@ def _clipped(
     still: float,
     top: float,
 ) -> tuple[float, float]:
-    """Return the mean of a sample clipped to 0..top, and the part of its deviation that stays."""
+    """Return the mean of a sample clipped to 0..top, and the remaining share of its deviation."""
     reach = _FAR * sqrt(rounded)
-    # Photoelectrons only add to the voltage in the dark.
+    # Photoelectrons only add to the dark voltage.
     above, below = mean + reach > top, dark < _FAR * still + 0.5 and mean < reach + 0.5
     if not (above or below):
         return mean, 1.0
@@ -420,7 +358,7 @@ def _clipped(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _recorded(
+def _sum_samples(
     rate: Any,
     number: Any,
     noise: Any,
@@ -450,7 +388,7 @@ def _recorded(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _drawn(
+def _draw_sums(
     rate: Any,
     noise: Any,
     dark: Any,

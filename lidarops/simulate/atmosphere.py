@@ -1,4 +1,4 @@
-"""The air of a simulation, as a campaign file describes it, along a beam."""
+"""The air that a campaign file describes: extinction and backscatter along a beam."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from lidarops.retrieve.air.molecular import (
 Array = NDArray[np.float64]
 
 REFERENCE_WAVELENGTH: Final = 532e-9
-"""m, at which the settings give the extinction of aerosol."""
+"""m, wavelength of the extinction of aerosol in the settings."""
 
 _MODES: Final = 256
-"""Plane waves that make up the turbulence."""
+"""Number of plane waves in the turbulence."""
 
 
 class Beam(NamedTuple):
-    """A straight line from a lidar."""
+    """Line of sight of a lidar."""
 
     east: float
-    """m from the origin of the air."""
+    """m from the origin."""
     north: float
     height: float
-    """m above the ground of the origin."""
+    """m above the ground at the origin."""
     zenith_angle: float
     """degree, 0 = up."""
     azimuth: float
@@ -48,7 +48,7 @@ class Beam(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class BeamPath:
     """Optical properties along a beam."""
 
     extinction: Array
@@ -58,7 +58,7 @@ class Path:
 
     @property
     def homogeneous(self) -> bool:
-        """Whether both are the same at every range, but for rounding."""
+        """Whether both are the same at every range, except for rounding."""
         return all(
             float(np.ptp(values)) <= 1e-9 * float(values[0])
             for values in (self.extinction, self.backscatter)
@@ -71,8 +71,8 @@ class _Points(NamedTuple):
     height: Array
 
 
-def diurnal(course: DiurnalCourse, moment: datetime) -> float:
-    """Return the value of a diurnal course: a cosine with its maximum at a given hour (UTC)."""
+def _diurnal(course: DiurnalCourse, moment: datetime) -> float:
+    """Return the value of a diurnal course: a cosine that peaks at a given hour (UTC)."""
     midnight = moment.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
     hours = (moment - midnight) / timedelta(hours=1)
     phase = math.cos(2.0 * math.pi * (hours - course.hour_of_maximum) / 24.0)
@@ -80,23 +80,24 @@ def diurnal(course: DiurnalCourse, moment: datetime) -> float:
 
 
 class Air:
-    """What simulated lidars look at.
+    """The atmosphere of simulated lidars.
 
     Parameters
     ----------
     settings : AtmosphereSettings
     altitude : float, m
-        Of the ground of the origin above mean sea level.
+        Of the ground at the origin, above mean sea level.
     start : datetime
-        From which plumes and turbulence drift.
+        When the drift of plumes and turbulence begins.
     seed : int
         Of the turbulence.
 
     Notes
     -----
-    The Earth is flat here, and refraction is left out. Extinction and backscatter add up the
-    molecules (US Standard Atmosphere, or the sounding and the standard scaled to meet its ends)
-    and everything that the settings name; turbulence multiplies all particles but clouds.
+    The Earth is flat, and refraction is neglected. Extinction and backscatter are the sums over
+    molecules (US Standard Atmosphere; or a sounding, continued by the standard scaled to meet
+    its ends) and all particles in the settings. Turbulence multiplies all particles except
+    clouds.
     """
 
     def __init__(
@@ -106,30 +107,30 @@ class Air:
         self._altitude = altitude
         self._start = start
         self._sounding = None if settings.sounding is None else _profile(settings.sounding)
-        self._eddies = None if settings.turbulence is None else Eddies(settings.turbulence, seed)
+        self._eddies = None if settings.turbulence is None else _Eddies(settings.turbulence, seed)
 
     def state(self, moment: datetime) -> tuple[object, ...]:
-        """Return what the air depends on at a moment: equal states are the same air."""
-        told = self._settings
-        courses = (told.homogeneous and told.homogeneous.extinction) or None
-        heights = (told.boundary_layer and told.boundary_layer.height) or None
-        moving = told.plumes or told.turbulence
+        """Return what the air depends on at a moment; equal states mean the same air."""
+        air = self._settings
+        extinction = (air.homogeneous and air.homogeneous.extinction) or None
+        height = (air.boundary_layer and air.boundary_layer.height) or None
+        moving = air.plumes or air.turbulence
         return (
-            None if courses is None else diurnal(courses, moment),
-            None if heights is None else diurnal(heights, moment),
-            tuple(layer.start <= moment < layer.stop for layer in told.layers),
-            tuple(cloud.start <= moment < cloud.stop for cloud in told.clouds),
+            None if extinction is None else _diurnal(extinction, moment),
+            None if height is None else _diurnal(height, moment),
+            tuple(layer.start <= moment < layer.stop for layer in air.layers),
+            tuple(cloud.start <= moment < cloud.stop for cloud in air.clouds),
             moment if moving else None,
         )
 
-    def along(self, beam: Beam, distance: Array, moment: datetime, wavelength: float) -> Path:
-        """Return what a beam passes through.
+    def along(self, beam: Beam, distance: Array, moment: datetime, wavelength: float) -> BeamPath:
+        """Return extinction and backscatter along a beam.
 
         Parameters
         ----------
         beam : Beam
         distance : ndarray, m, shape (bins,)
-            From the lidar; points before it (negative) see what it sees itself.
+            From the lidar; negative distances get the air at the lidar.
         moment : datetime
             With time zone.
         wavelength : float, m
@@ -140,18 +141,18 @@ class Air:
         backscatter = molecular / molecular_lidar_ratio(wavelength)
         factor = 1.0 if self._eddies is None else self._eddies.at(points, self._seconds(moment))
         for aerosol, at_reference in self._particles(points, moment):
-            part = factor * at_reference * _spectral(aerosol, wavelength)
-            extinction += part
-            backscatter += part / aerosol.lidar_ratio
+            particles = factor * at_reference * _spectral(aerosol, wavelength)
+            extinction += particles
+            backscatter += particles / aerosol.lidar_ratio
         for cloud in self._settings.clouds:
             if cloud.start <= moment < cloud.stop:
                 inside = (points.height >= cloud.base) & (points.height < cloud.top)
                 extinction += inside * cloud.extinction
                 backscatter += inside * (cloud.extinction / cloud.lidar_ratio)
-        return Path(extinction, backscatter)
+        return BeamPath(extinction, backscatter)
 
     def molecules(self, height: Array, wavelength: float) -> Array:
-        """Return the extinction by molecules at heights above the ground, m-1."""
+        """Return the molecular extinction at heights above the ground, m-1."""
         constant = self._settings.homogeneous is not None and (
             self._settings.homogeneous.molecules_constant
         )
@@ -167,29 +168,29 @@ class Air:
         return (moment - self._start).total_seconds()
 
     def _particles(self, points: _Points, moment: datetime) -> Iterator[tuple[Aerosol, Array]]:
-        told = self._settings
-        if told.homogeneous is not None:
-            everywhere = np.full_like(points.height, diurnal(told.homogeneous.extinction, moment))
-            yield told.homogeneous.aerosol, everywhere
-        if told.boundary_layer is not None:
-            mixed = told.boundary_layer
-            rise = (diurnal(mixed.height, moment) - points.height) / mixed.entrainment_depth
-            yield mixed.aerosol, mixed.extinction * expit(rise)
-        for layer in told.layers:
-            if layer.start <= moment < layer.stop:
-                rise = (points.height - layer.height) / layer.depth
-                yield layer.aerosol, layer.extinction * np.exp(-0.5 * rise**2)
-        for profile in told.profiles:
+        air = self._settings
+        if air.homogeneous is not None:
+            everywhere = np.full_like(points.height, _diurnal(air.homogeneous.extinction, moment))
+            yield air.homogeneous.aerosol, everywhere
+        if air.boundary_layer is not None:
+            layer = air.boundary_layer
+            rise = (_diurnal(layer.height, moment) - points.height) / layer.entrainment_depth
+            yield layer.aerosol, layer.extinction * expit(rise)
+        for elevated in air.layers:
+            if elevated.start <= moment < elevated.stop:
+                rise = (points.height - elevated.height) / elevated.depth
+                yield elevated.aerosol, elevated.extinction * np.exp(-0.5 * rise**2)
+        for profile in air.profiles:
             values = np.interp(points.height, profile.height, profile.extinction, right=0.0)
             yield profile.aerosol, values
-        for gradient in told.gradients:
-            yield gradient.aerosol, _sloping(gradient, points)
-        for plume in told.plumes:
-            yield plume.aerosol, _carried(plume, points, self._seconds(moment))
+        for gradient in air.gradients:
+            yield gradient.aerosol, _gradient_extinction(gradient, points)
+        for plume in air.plumes:
+            yield plume.aerosol, _plume_extinction(plume, points, self._seconds(moment))
 
 
-class Eddies:
-    r"""A log-normal random field of mean 1, carried by the wind.
+class _Eddies:
+    r"""Turbulence: a log-normal random field of mean 1 that drifts with the wind.
 
     Parameters
     ----------
@@ -199,9 +200,9 @@ class Eddies:
     Notes
     -----
     :math:`\exp(s g - s^2 / 2)` with :math:`g = \sqrt{2 / M} \sum_m \cos(k_m x + \phi_m)`: plane
-    waves of random phase, whose wave numbers are normal with standard deviation 1 / L, so that
-    the correlation of g is :math:`\exp(-x^2 / 2 L^2)` in every direction. It needs no grid, and
-    any lidar that looks at the same place and time sees the same air.
+    waves of random phase with normally distributed wave numbers of standard deviation 1 / L. The
+    correlation of g is therefore :math:`\exp(-x^2 / 2 L^2)` in every direction. No grid is
+    needed, and all lidars see the same air at the same place and time.
     """
 
     def __init__(self, settings: Turbulence, seed: int) -> None:
@@ -215,20 +216,20 @@ class Eddies:
 
     def at(self, points: _Points, seconds: float) -> Array:
         """Return the factor at points, `seconds` after the start."""
-        told = self._settings
+        settings = self._settings
         total = np.zeros_like(points.height)
-        east = points.east - told.wind_east * seconds
-        north = points.north - told.wind_north * seconds
+        east = points.east - settings.wind_east * seconds
+        north = points.north - settings.wind_north * seconds
         for (k_east, k_north, k_up), phase in zip(self._wave_numbers, self._phases, strict=True):
             total += np.cos(k_east * east + k_north * north + k_up * points.height + phase)
         normal = math.sqrt(2.0 / _MODES) * total
-        factor: Array = np.exp(told.deviation * normal - 0.5 * told.deviation**2)
+        factor: Array = np.exp(settings.deviation * normal - 0.5 * settings.deviation**2)
         return factor
 
 
 def _points(beam: Beam, distance: Array) -> _Points:
     zenith, azimuth = math.radians(beam.zenith_angle), math.radians(beam.azimuth)
-    # Exactly level, so that a horizontal beam stays in one layer at any range.
+    # Exactly 0, so a horizontal beam stays in its layer at any range.
     rise = 0.0 if beam.zenith_angle == 90.0 else math.cos(zenith)
     level = math.sin(zenith) * distance
     return _Points(
@@ -242,16 +243,16 @@ def _spectral(aerosol: Aerosol, wavelength: float) -> float:
     return float((wavelength / REFERENCE_WAVELENGTH) ** -aerosol.angstrom_exponent)
 
 
-def _sloping(gradient: Gradient, points: _Points) -> Array:
+def _gradient_extinction(gradient: Gradient, points: _Points) -> Array:
     azimuth = math.radians(gradient.azimuth)
     along = points.east * math.sin(azimuth) + points.north * math.cos(azimuth)
-    # Cut at a thousandfold, far beyond what is meant, so that nothing overflows.
+    # Growth is cut at a factor of 1000, far above any real gradient, against overflow.
     growth = np.exp(np.minimum(along / gradient.scale, math.log(1e3)))
     values: Array = gradient.extinction * growth * (points.height <= gradient.top)
     return values
 
 
-def _carried(plume: Plume, points: _Points, seconds: float) -> Array:
+def _plume_extinction(plume: Plume, points: _Points, seconds: float) -> Array:
     east = (points.east - plume.east - plume.wind_east * seconds) / plume.horizontal_depth
     north = (points.north - plume.north - plume.wind_north * seconds) / plume.horizontal_depth
     rise = (points.height - plume.height) / plume.vertical_depth

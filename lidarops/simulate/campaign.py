@@ -1,4 +1,4 @@
-"""A simulated campaign: raw Licel files in an archive, and the truth behind them."""
+"""Simulate a campaign: write raw Licel files into an archive, and return their truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lidarops.campaign.simulation import DamageKind, SimulationSettings
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator
-from lidarops.simulate.site import Order, Site, channel_name, dead_time
+from lidarops.simulate.site import PlannedFile, Site, channel_name, photon_dead_time
 from lidarops.simulate.truth import FileTruth, TruthTable
 
 if TYPE_CHECKING:
@@ -30,17 +30,17 @@ _BATCH: Final = 64
 """Files that one worker writes at a time."""
 
 _QUEUE: Final = 4
-"""Batches that wait for each worker: the work to come is never listed as a whole."""
+"""Batches submitted ahead per worker; the others are created when needed."""
 
-_FLAT: Final = 300e3
-"""m, up to which stations may share air that changes along the ground."""
+_FLAT_EARTH_LIMIT: Final = 300e3
+"""m, largest distance of a station from the origin in horizontally varying air."""
 
 _PATTERN = re.compile(r"(?P<folder>(?:[^*?\[\]/]+/)*)(?P<prefix>[A-Za-z][A-Za-z_]{0,9})\*")
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedCampaign:
-    """What a simulation wrote."""
+    """Files and truth that a simulation wrote."""
 
     archive: Path
     paths: tuple[str, ...]
@@ -48,7 +48,7 @@ class SimulatedCampaign:
     size: int
     """Bytes of the files."""
     truth: xr.Dataset
-    """What a perfect retrieval would find; see `simulate_campaign`."""
+    """True values of every signal file; see `simulate_campaign`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +57,10 @@ class SimulationPlan:
 
     campaign: Campaign
     sites: tuple[Site, ...]
-    orders: tuple[tuple[Order, ...], ...]
-    """Of each site, dark files first, then in time."""
+    files: tuple[tuple[PlannedFile, ...], ...]
+    """Files of each site: dark files first, then signal files in time."""
     paths: tuple[str, ...]
-    """In the archive, by site and in the same order."""
+    """Paths in the archive, in the same order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +68,14 @@ class _Batch:
     """Files of one instrument that are written together, and their rows in the truth."""
 
     site: Site
-    orders: tuple[Order, ...]
+    files: tuple[PlannedFile, ...]
     rows: tuple[int | None, ...]
     """None for dark files."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Written:
-    """What became of a batch."""
+class _BatchResult:
+    """Result of one batch."""
 
     files: int
     size: int
@@ -93,57 +93,55 @@ def simulate_campaign(
         With a `simulation`. Each simulated instrument needs ``files: <folder>/<prefix>*`` (and
         such `dark_files`, where it has any): folder and prefix name the files to be written.
     client : distributed.Client, optional
-        Whose workers write the files, all into the same folder; this process where not given.
+        Its workers write the files into the same folder; by default this process does.
     progress : callable, optional
-        Called with the number of files done since the last call.
+        Called with the number of files written since the last call.
 
     Returns
     -------
     SimulatedCampaign
-        Its `truth` has one row (dimension ``granule``) for each signal file, damaged ones
-        included:
+        Its `truth` has one row (dimension ``granule``) per signal file, damaged files included:
 
-        - ``path``, ``instrument``, ``time`` (middle of the file, UTC, by the true time);
+        - ``path``, ``instrument``, ``time`` (middle of the file, true UTC);
         - ``zenith_angle``, ``azimuth`` (degree), ``clock_error`` (s), ``energy`` (of the laser,
           relative);
-        - ``extinction`` (m-1; NaN where the path is not homogeneous, or not the same for all
-          channels), ``homogeneous`` (0 or 1);
-        - ``damage`` (empty for good files), ``handling`` (what a correct chain does with it),
-          ``refused`` (1 where a correct reader must refuse);
+        - ``extinction`` (m-1; NaN if the path is not homogeneous, or channels differ),
+          ``homogeneous`` (0 or 1);
+        - ``damage`` (empty for good files), ``handling`` (correct handling of the damage),
+          ``refused`` (1 if a correct reader must refuse the file);
         - per channel ``background_<channel>`` (sky light, MHz before dead time, or mV without
           the dark offset), ``amplitude_<channel>`` (B of P = P* + B R^-2 exp(-2 sigma R), MHz m2
-          or mV m2) and for analog ``dark_offset_<channel>`` (mV): P* is the background where
-          dark files were subtracted, background plus dark offset where not. NaN where the
-          instrument has no such channel or the path is not homogeneous;
-        - for instruments that do not look along homogeneous paths ``profile_extinction_<key>``,
+          or mV m2) and for analog ``dark_offset_<channel>`` (mV): P* is the background if dark
+          files were subtracted, else background plus dark offset. NaN if the instrument has no
+          such channel or the path is not homogeneous;
+        - for paths that are not homogeneous ``profile_extinction_<key>``,
           ``profile_backscatter_<key>`` and ``profile_optical_depth_<key>`` (profile, wavelength,
-          range), with the rows they belong to in ``profile_granule_<key>``.
+          range), with their rows in ``profile_granule_<key>``.
 
     Raises
     ------
     CampaignError
-        If the campaign has no simulation, the simulation contradicts the campaign, or the
-        archive is no local folder or holds files that the campaign would read, but that are
-        not of this simulation.
+        If the campaign has no simulation, the simulation contradicts the campaign, the archive
+        is not a local folder, or it holds other files that the campaign would read.
 
     Notes
     -----
-    A file of the same name is overwritten, complete under its final name or not at all. Nothing
-    is removed: files of other names that match the patterns of a simulated instrument would mix
-    with the simulation unseen, so the archive is refused. The bytes of a file depend on the seed,
-    its instrument and its number alone, never on order, batches or workers. Memory holds the
-    names of the files and their truth.
+    A file of the same name is replaced as a whole or not at all. Nothing is removed. An archive
+    with other files that match the patterns of a simulated instrument is refused, because they
+    would mix with the simulated ones unnoticed. The bytes of a file depend only on the seed, its
+    instrument and its number, not on order, batches or workers. Memory holds the names of the
+    files and their truth.
     """
     return write_simulation(plan_simulation(campaign), client=client, progress=progress)
 
 
 def plan_simulation(campaign: Campaign) -> SimulationPlan:
-    """Return which files `simulate_campaign` would write, after checking that it can.
+    """Return the files that `simulate_campaign` would write, after all checks.
 
     Raises
     ------
     CampaignError
-        As `simulate_campaign`, but for what is in the archive.
+        As `simulate_campaign`, except for the content of the archive.
     """
     if "://" in campaign.archive:
         raise CampaignError(
@@ -153,37 +151,37 @@ def plan_simulation(campaign: Campaign) -> SimulationPlan:
             remedy="give a path",
         )
     sites = _sites(campaign)
-    orders = tuple(tuple(site.orders()) for site in sites)
-    for site, own in zip(sites, orders, strict=True):
+    files = tuple(tuple(site.planned_files()) for site in sites)
+    for site, planned_files in zip(sites, files, strict=True):
         _check_air(site)
-        _check_facts(site, own)
-    return SimulationPlan(campaign, tuple(sites), orders, _paths(sites, orders))
+        _check_facts(site, planned_files)
+    return SimulationPlan(campaign, tuple(sites), files, _paths(sites, files))
 
 
 def write_simulation(
-    planned: SimulationPlan, *, client: Client | None = None, progress: Progress | None = None
+    plan: SimulationPlan, *, client: Client | None = None, progress: Progress | None = None
 ) -> SimulatedCampaign:
     """Write the files of a plan; see `simulate_campaign`."""
-    archive = Path(planned.campaign.archive)
-    _refuse_strangers(archive, planned.sites, frozenset(planned.paths))
-    for folder in {path.rpartition("/")[0] for path in planned.paths}:
-        _make(archive / folder)
-    rows = sum(order.role is Role.SIGNAL for own in planned.orders for order in own)
-    table = TruthTable(rows, {site.key: Simulator(site).grid for site in planned.sites})
+    archive = Path(plan.campaign.archive)
+    _refuse_foreign_files(archive, plan.sites, frozenset(plan.paths))
+    for folder in {path.rpartition("/")[0] for path in plan.paths}:
+        _make_folder(archive / folder)
+    rows = sum(planned.role is Role.SIGNAL for files in plan.files for planned in files)
+    table = TruthTable(rows, {site.key: Simulator(site).grid for site in plan.sites})
     size = 0
-    work = _batches(planned)
-    done = _serial(work, archive) if client is None else _distributed(work, archive, client)
-    for written in done:
-        size += written.size
-        for row, truth in written.truths:
-            table.add(row, truth)
+    work = _batches(plan)
+    results = _serial(work, archive) if client is None else _distributed(work, archive, client)
+    for result in results:
+        size += result.size
+        for row, file_truth in result.truths:
+            table.add(row, file_truth)
         if progress:
-            progress(written.files)
-    told = table.dataset(planned.campaign.name)
-    return SimulatedCampaign(archive, planned.paths, size, told)
+            progress(result.files)
+    truth = table.dataset(plan.campaign.name)
+    return SimulatedCampaign(archive, plan.paths, size, truth)
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -195,28 +193,28 @@ def _make(folder: Path) -> None:
         ) from error
 
 
-def _batches(planned: SimulationPlan) -> Iterator[_Batch]:
+def _batches(plan: SimulationPlan) -> Iterator[_Batch]:
     row = 0
-    for site, orders in zip(planned.sites, planned.orders, strict=True):
-        for first in range(0, len(orders), _BATCH):
-            chosen = orders[first : first + _BATCH]
+    for site, files in zip(plan.sites, plan.files, strict=True):
+        for first in range(0, len(files), _BATCH):
+            batch = files[first : first + _BATCH]
             rows: list[int | None] = []
-            for order in chosen:
-                rows.append(row if order.role is Role.SIGNAL else None)
-                row += order.role is Role.SIGNAL
-            yield _Batch(site, chosen, tuple(rows))
+            for planned in batch:
+                rows.append(row if planned.role is Role.SIGNAL else None)
+                row += planned.role is Role.SIGNAL
+            yield _Batch(site, batch, tuple(rows))
 
 
-def _serial(work: Iterable[_Batch], archive: Path) -> Iterator[_Written]:
+def _serial(work: Iterable[_Batch], archive: Path) -> Iterator[_BatchResult]:
     simulator: Simulator | None = None
     for batch in work:
         if simulator is None or simulator.site is not batch.site:
             simulator = Simulator(batch.site)
-        for order, row in zip(batch.orders, batch.rows, strict=True):
-            yield _write(simulator, [(order, row)], archive)
+        for planned, row in zip(batch.files, batch.rows, strict=True):
+            yield _write(simulator, [(planned, row)], archive)
 
 
-def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Iterator[_Written]:
+def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Iterator[_BatchResult]:
     from distributed import as_completed  # noqa: PLC0415 - takes a second to import
 
     workers = max(1, len(client.scheduler_info()["workers"]))
@@ -233,27 +231,27 @@ def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Itera
         client.cancel(list(stream.futures))
 
 
-def _submit(client: Client, batch: _Batch, archive: Path) -> Future[_Written]:
+def _submit(client: Client, batch: _Batch, archive: Path) -> Future[_BatchResult]:
     return client.submit(_write_batch, batch, archive, pure=False)
 
 
-def _write_batch(batch: _Batch, archive: Path) -> _Written:
-    work = list(zip(batch.orders, batch.rows, strict=True))
+def _write_batch(batch: _Batch, archive: Path) -> _BatchResult:
+    work = list(zip(batch.files, batch.rows, strict=True))
     return _write(Simulator(batch.site), work, archive)
 
 
 def _write(
-    simulator: Simulator, work: Sequence[tuple[Order, int | None]], archive: Path
-) -> _Written:
+    simulator: Simulator, work: Sequence[tuple[PlannedFile, int | None]], archive: Path
+) -> _BatchResult:
     size = 0
     truths = []
-    for order, row in work:
-        content, truth = simulator.file(order)
-        _place(archive / truth.path, content)
+    for planned, row in work:
+        content, truth = simulator.simulate(planned)
+        _write_whole(archive / truth.path, content)
         size += len(content)
         if row is not None:
             truths.append((row, truth))
-    return _Written(len(work), size, tuple(truths))
+    return _BatchResult(len(work), size, tuple(truths))
 
 
 def _sites(campaign: Campaign) -> list[Site]:
@@ -265,18 +263,18 @@ def _sites(campaign: Campaign) -> list[Site]:
             remedy="see catalogs/demo.yaml for an example",
         )
     sites = [_site(campaign, settings, key) for key in settings.instruments]
-    taken: dict[str, str] = {}
+    owners: dict[str, str] = {}
     for site in sites:
         for role, folder in site.folder.items():
             stem = folder + site.prefix[role]
-            rival = next((key for other, key in taken.items() if _clash(stem, other)), None)
-            if rival is not None:
+            owner = next((key for other, key in owners.items() if _clash(stem, other)), None)
+            if owner is not None:
                 raise CampaignError(
-                    f"its files {stem}* would be taken for those of {rival}",
+                    f"its files {stem}* would be taken for those of {owner}",
                     field=f"instruments.{site.key}.files",
                     remedy="give every kind of file a folder or prefix of its own",
                 )
-            taken[stem] = f"{site.key} ({role.value})"
+            owners[stem] = f"{site.key} ({role.value})"
     return sites
 
 
@@ -298,7 +296,7 @@ def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Site:
     patterns = {Role.SIGNAL: instrument.files}
     if simulated.acquisition.dark_files:
         patterns[Role.DARK] = instrument.dark_files
-    places = {role: _place_of(key, role, given) for role, given in patterns.items()}
+    places = {role: _place_of(key, role, globs) for role, globs in patterns.items()}
     station = campaign.stations[instrument.station]
     return Site(
         key=key,
@@ -326,53 +324,53 @@ def _origin(campaign: Campaign, settings: SimulationSettings) -> Station:
 def _check_air(site: Site) -> None:
     air = site.settings.air_of(site.key)
     east, north, _ = site.position
-    away = math.hypot(east, north)
-    if away > _FLAT and (air.gradients or air.plumes or air.turbulence):
+    distance = math.hypot(east, north)
+    if distance > _FLAT_EARTH_LIMIT and (air.gradients or air.plumes or air.turbulence):
         raise CampaignError(
-            f"stands {away / 1e3:.0f} km from the origin of air that changes along the ground:"
-            f" the Earth is flat here, which holds up to {_FLAT / 1e3:.0f} km",
+            f"stands {distance / 1e3:.0f} km from the origin of horizontally varying air: the"
+            f" simulation takes the Earth as flat, up to {_FLAT_EARTH_LIMIT / 1e3:.0f} km",
             field=f"simulation.instruments.{site.key}",
-            remedy="give it an atmosphere of its own, or simulation.origin a nearer station",
+            remedy="give it an atmosphere of its own, or a nearer station as simulation.origin",
         )
 
 
-def _check_facts(site: Site, orders: Iterable[Order]) -> None:
-    """Say all that can be wrong with the facts before the first file is written."""
+def _check_facts(site: Site, files: Iterable[PlannedFile]) -> None:
+    """Check the facts at every file before the first file is written."""
     field = f"instruments.{site.key}.facts"
     if site.simulated.pointing is not None:
         if not site.dialect.holds_azimuth:
             raise CampaignError(
-                f"headers of the {site.simulated.acquisition.dialect} dialect do not hold where"
-                " a scan looks",
+                f"headers of the {site.simulated.acquisition.dialect} dialect do not hold the"
+                " azimuth of a scan",
                 field=f"simulation.instruments.{site.key}.acquisition.dialect",
-                remedy="scan with the dialect licel",
+                remedy="use the dialect licel for scans",
             )
         if any(fact.zenith_angle is not None for fact in site.instrument.facts):
             raise CampaignError(
-                "give one zenith angle for a lidar that scans, and the facts win over headers",
+                "give one zenith angle for a scanning lidar, and facts override headers",
                 field=f"{field}.zenith_angle",
-                remedy="leave zenith_angle and azimuth out",
+                remedy="leave zenith_angle and azimuth out of the facts",
             )
     counted = [
         channel_name(DetectionMode.PHOTON, detector)
         for detector in site.simulated.detectors
         if detector.photon is not None
     ]
-    for order in orders:
-        start = site.start_of(order.role, order.index)
+    for planned in files:
+        start = site.start_of(planned.role, planned.index)
         for name in counted:
-            dead_time(site, start, name)
-        if site.damage_of(order.index) is DamageKind.ZENITH_MINUS_90:
-            _check_vertical(site, order)
+            photon_dead_time(site, start, name)
+        if site.damage_of(planned.index) is DamageKind.ZENITH_MINUS_90:
+            _check_vertical(site, planned)
 
 
-def _check_vertical(site: Site, order: Order) -> None:
-    facts = site.instrument.facts_at(site.start_of(order.role, order.index))
-    if site.pointing_of(order, facts)[0] and facts.zenith_angle is None:
+def _check_vertical(site: Site, planned: PlannedFile) -> None:
+    facts = site.instrument.facts_at(site.start_of(planned.role, planned.index))
+    if site.pointing_of(planned, facts)[0] and facts.zenith_angle is None:
         raise CampaignError(
-            f"file {order.index} does not look up: zenith_minus_90 would make it wrong unseen",
+            f"file {planned.index} is not vertical: zenith_minus_90 would falsify it unnoticed",
             field=f"simulation.instruments.{site.key}.damage",
-            remedy="damage a vertical file in this way, or give zenith_angle in the facts",
+            remedy="use this damage on vertical files, or give zenith_angle in the facts",
         )
 
 
@@ -388,38 +386,38 @@ def _place_of(key: str, role: Role, patterns: list[str]) -> tuple[str, str]:
     return match["folder"], match["prefix"]
 
 
-def _paths(sites: Sequence[Site], orders: Sequence[Sequence[Order]]) -> tuple[str, ...]:
+def _paths(sites: Sequence[Site], files: Sequence[Sequence[PlannedFile]]) -> tuple[str, ...]:
     paths: dict[str, None] = {}
-    for site, own in zip(sites, orders, strict=True):
-        for order in own:
-            path = site.path_of(order)
+    for site, planned_files in zip(sites, files, strict=True):
+        for planned in planned_files:
+            path = site.path_of(planned)
             if path in paths:
                 raise CampaignError(
                     f"two files of {site.key} would have the name {path}",
                     field=f"simulation.instruments.{site.key}.acquisition",
-                    remedy="take files at longer intervals, or let the clock jump by another step",
+                    remedy="take files at longer intervals, or change the jumps of the clock",
                 )
             paths[path] = None
     return tuple(paths)
 
 
-def _refuse_strangers(archive: Path, sites: Sequence[Site], expected: frozenset[str]) -> None:
+def _refuse_foreign_files(archive: Path, sites: Sequence[Site], expected: frozenset[str]) -> None:
     for site in sites:
         for role, folder in site.folder.items():
-            found = (archive / folder).glob(f"{site.prefix[role]}*")
-            names = {folder + path.name for path in found if path.is_file()}
-            strangers = sorted(names - expected)
-            if strangers:
+            matches = (archive / folder).glob(f"{site.prefix[role]}*")
+            names = {folder + path.name for path in matches if path.is_file()}
+            foreign = sorted(names - expected)
+            if foreign:
                 raise CampaignError(
-                    f"holds {len(strangers)} files that are not of this simulation, such as"
-                    f" {strangers[0]}",
+                    f"holds {len(foreign)} files that this simulation does not write, such as"
+                    f" {foreign[0]}",
                     file=archive,
                     remedy="remove them, or choose an empty archive",
                 )
 
 
-def _place(path: Path, content: bytes) -> None:
-    # No fsync: a simulated file that a power cut loses is written again, byte for byte.
+def _write_whole(path: Path, content: bytes) -> None:
+    # No fsync: a file that a power cut loses can be simulated again, byte for byte.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
     try:
         temporary.write_bytes(content)

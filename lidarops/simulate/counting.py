@@ -1,4 +1,4 @@
-"""Photon counters with dead time: what is counted of the photoelectrons."""
+"""Photon counters with dead time: from photoelectrons to counts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, possible_rate
+from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, limited_rate
 
 FastCounts = NDArray[np.int32]
 
 _LARGEST: Final = 2**31 - 1
-"""Of 32 bits."""
+"""Largest signed integer of 32 bits."""
 _FAINT: Final = 1.0e-5
-"""Events in a dead time, below which the digits of a variance cancel."""
+"""Events per dead time; with fewer, the digits of the variance cancel."""
 
 
 def count_photons(
@@ -28,7 +28,7 @@ def count_photons(
     random: np.random.Generator,
     paralyzable: bool = False,
 ) -> Counts:
-    r"""Return what a counter with dead time counts of the photoelectrons.
+    r"""Draw the counts of a counter with dead time.
 
     Parameters
     ----------
@@ -36,41 +36,41 @@ def count_photons(
     dead_time : float, s
     random : numpy.random.Generator
     paralyzable : bool
-        Whether a lost photoelectron prolongs the dead time. Such a counter counts fewer above a
-        rate of 1 / dead_time, so that two rates give the same counts.
+        Whether a lost photoelectron prolongs the dead time. The counts of such a counter fall
+        above a rate of 1 / dead_time, so two rates give the same counts.
 
     Returns
     -------
     ndarray of int, shape (bins,)
-        Counts summed over shots; 0 where there were no shots.
+        Counts summed over shots; 0 without shots.
 
     Notes
     -----
-    Of N events in the exposure T each finds on average :math:`x_0 = (N - 1) \tau / T` others in
-    a dead time. Of that before it, a = tau / 2 t lies in the bin before if a bin lasts t, with
-    :math:`N_-` events of which :math:`C_-` were counted. What counts is
+    Of N events in the exposure T, each meets on average :math:`x_0 = (N - 1) \tau / T` others in
+    one dead time. For bins of length t, the share a = tau / 2 t of the dead time before an event
+    lies in the previous bin, with :math:`N_-` events of which :math:`C_-` were counted. The
+    effective load is
 
     .. math:: x = \frac{(1 - a) x_0 + a r}{1 - a r}, \quad r = C_- \tau / T
 
-    for a non-paralyzable counter, which is blind after what it counted, and
+    for a non-paralyzable counter, which is blind after a counted event, and
 
     .. math:: e^{-x} = (1 - 2 a) e^{-x_0} + 2 a \frac{e^{-x_-} - e^{-x_0}}{x_0 - x_-},
               \quad x_- = N_- \tau / T
 
-    for a paralyzable one, which is so after every event; in steady light both are that of one
-    bin alone. The number of lost events is drawn as
+    for a paralyzable counter, which is blind after every event. In steady light both equal the
+    load of one bin alone. The number of lost events is drawn from
     :math:`L \sim \mathrm{Binomial}(m, p)` with the mean :math:`m p = N x / (1 + x)`, or
-    :math:`N (1 - e^{-x})`, m rounded up or down at random so that it is right. The chance p
-    follows from the variance that the counts must have in steady light beyond what N and the
-    bin before give them: for a paralyzable counter
+    :math:`N (1 - e^{-x})`; m is rounded up or down at random, so the mean is exact. The chance p
+    follows from the variance of the counts in steady light that N and the previous bin leave to
+    explain: for a paralyzable counter
 
     .. math:: p = 1 - e^{-x} + (1 - 2 a + 2 a^2) \frac{x^2 e^{-2 x}}{1 - e^{-x}}
 
-    So from five shots on mean and variance are those of `counter_moments` within 0.5 percent;
-    of a single shot, whose N scatters, 1.5 percent too many are counted at 100 MHz with 4 ns.
-    Counts are integers from 0 to N at any rate, where a rounded Gaussian would lose the dead
-    time of weak signals in the rounding.
-    Dead times longer than a bin reach back by one bin only.
+    From five shots on, mean and variance agree with `counter_moments` within 0.5 percent. For a
+    single shot, whose N scatters, counts are 1.5 percent too high at 100 MHz with 4 ns. Counts
+    are integers from 0 to N at any rate; a rounded Gaussian would lose the dead time of weak
+    signals in the rounding. Dead times longer than a bin reach back by one bin only.
 
     References
     ----------
@@ -80,7 +80,7 @@ def count_photons(
     if released.shots == 0 or dead_time == 0.0:
         return released.number.copy()
     exposure = released.exposure * 1e-6
-    counted: Counts = _registered(
+    counted: Counts = _count_events(
         released.number, dead_time / exposure, _before(dead_time, released.bin_time), paralyzable,
         random,
     )  # fmt: skip
@@ -96,7 +96,7 @@ def count_fast(
     random: np.random.Generator,
     paralyzable: bool = False,
 ) -> FastCounts:
-    """Return counts of the right mean and variance with Gaussian noise, one draw a bin.
+    """Draw counts with the right mean and variance from Gaussian noise, one draw per bin.
 
     Parameters
     ----------
@@ -112,13 +112,13 @@ def count_fast(
     Raises
     ------
     SimulationInputError
-        Where a rate, a time or the number of shots is negative or NaN, or the counts do not fit
-        into 32 bits.
+        If a rate, a time or the number of shots is negative or NaN, or the counts do not fit into
+        32 bits.
 
     Notes
     -----
-    For many counts; few have the right mean and variance but are not Poisson, and none are
-    shared with an analog recorder.
+    Meant for many counts: few counts have the right mean and variance, but are not Poisson. The
+    noise is not shared with an analog recorder.
     """
     rate = _checked(rate, bin_time, dead_time)
     _checks.not_negative("shots", shots)
@@ -132,7 +132,7 @@ def count_fast(
         )
     noise = random.standard_normal(rate.size, dtype=np.float32)
     before = 2.0 * _before(dead_time, bin_time)
-    counts: FastCounts = _drawn(rate, noise, exposure, dead_time * 1e6, before, paralyzable)
+    counts: FastCounts = _draw_counts(rate, noise, exposure, dead_time * 1e6, before, paralyzable)
     return counts
 
 
@@ -144,17 +144,16 @@ def counter_moments(
     Parameters
     ----------
     rate : ndarray, MHz, shape (bins,)
-        Steady from bin to bin.
+        The same in neighbouring bins.
     bin_time, dead_time : float, s
     paralyzable : bool
 
     Notes
     -----
-    With x = n tau and y = 1 + x, in a bin that lasts t, :math:`n t / y` and
-    :math:`n t / y^3 + x^2 (y^2 + 2 y + 3) / 6 y^4` for a non-paralyzable counter, the variance
-    to the constant of its expansion for long t; :math:`n t e^{-x}` and
-    :math:`n t e^{-x} (1 - 2 x e^{-x} (1 - \tau / 2 t))` for a paralyzable one, exact for
-    :math:`\tau \le t`.
+    With x = n tau, y = 1 + x and bins of length t. Non-paralyzable: :math:`n t / y` and
+    :math:`n t / y^3 + x^2 (y^2 + 2 y + 3) / 6 y^4`, the variance up to the constant term of its
+    expansion for long t. Paralyzable: :math:`n t e^{-x}` and
+    :math:`n t e^{-x} (1 - 2 x e^{-x} (1 - \tau / 2 t))`, exact for :math:`\tau \le t`.
 
     References
     ----------
@@ -166,23 +165,14 @@ def counter_moments(
     return both[0], both[1]
 
 
-def count_rate(counts: NDArray[Any], *, shots: int, bin_time: float) -> Array:
-    """Return counts as a rate, MHz: NaN without shots, when nothing was measured."""
-    exposure = shots * bin_time * 1e6
-    if exposure <= 0.0:
-        return np.full(counts.shape, np.nan)
-    rate: Array = counts / exposure
-    return rate
-
-
 def _checked(rate: Array, bin_time: float, dead_time: float) -> Array:
     _checks.positive("bin_time", bin_time, "s")
     _checks.not_negative("dead_time", dead_time, "s")
-    return possible_rate(rate)
+    return limited_rate(rate)
 
 
 def _before(dead_time: float, bin_time: float) -> float:
-    """Return the part of the dead time before an event that lies in the bin before."""
+    """Return the share of the dead time before an event that lies in the previous bin."""
     return 0.5 * min(dead_time / bin_time, 1.0)
 
 
@@ -203,21 +193,21 @@ def _loss(x: float, before: float, paralyzable: Any) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _busy(own: float, previous: float, part: float) -> float:
-    """Return -ln of the chance that no event was in the dead time before, `part` of a bin."""
+def _busy(own: float, previous: float, share: float) -> float:
+    """Return -ln of the chance of no event in the dead time before, `share` of a bin."""
     low, step = min(own, previous), abs(own - previous)
     mean = -expm1(-step) / step if step > _FAINT else 1.0 - 0.5 * step
-    return low - log((1.0 - part) * exp(low - own) + part * mean)
+    return low - log((1.0 - share) * exp(low - own) + share * mean)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _registered(number: Any, per: float, before: float, paralyzable: Any, random: Any) -> Any:
+def _count_events(number: Any, per: float, before: float, paralyzable: Any, random: Any) -> Any:
     counted = np.empty_like(number)
     for i in range(number.size):
         released = number[i]
         counted[i] = released
         x = per * max(released - 1, 0)
-        # The bin before the first is taken to be as bright.
+        # The bin before the first is taken to be as bright as the first.
         if i > 0 and paralyzable:
             x = _busy(x, per * number[i - 1], 2.0 * before)
         elif i > 0:
@@ -238,7 +228,7 @@ def _moments(rate: float, dead_time: float, before: float, paralyzable: Any) -> 
     x = rate * dead_time
     if paralyzable:
         mean = rate * exp(-x)
-        # An event in the window of length t sees those before it in pairs within t only.
+        # Within a window of length t, only pairs of events less than t apart count.
         return mean, mean * (1.0 - 2.0 * x * exp(-x) * (1.0 - 0.5 * before))
     y = 1.0 + x
     edge = before * x * (y * y + 2.0 * y + 3.0) / (6.0 * y**4)
@@ -257,7 +247,7 @@ def _moments_of(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _drawn(
+def _draw_counts(
     rate: Any, noise: Any, exposure: float, dead_time: float, before: float, paralyzable: Any
 ) -> Any:  # fmt: skip
     counts = np.empty(rate.size, np.int32)

@@ -1,4 +1,4 @@
-"""Files as archives hold them: truncated, empty, foreign, absurd, or merely odd."""
+"""_Edit of raw files as in real archives: truncated, empty, foreign, wrong, or merely odd."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from lidarops.raw.licel import Dataset, parse_header
 from lidarops.records import DetectionMode
 
 FOREIGN_NAME: Final = "log.txt"
-"""What follows the prefix of the raw files in the name of a foreign file."""
+"""End of the name of a foreign file, after the prefix of the raw files."""
 
-Damage = Callable[[bytes, np.random.Generator], bytes]
+_Edit = Callable[[bytes, np.random.Generator], bytes]
 
 _LOG: Final = "".join(
     f"2000-01-01 {hour:02d}:00:00 laser energy {150 - hour:d} mJ, room {20 + hour % 3:d} C\r\n"
@@ -29,17 +29,17 @@ _SURPLUS: Final = 1000
 _LONG_SITE: Final = b"Demonstration site"
 
 
-def damaged(kind: DamageKind, content: bytes, random: np.random.Generator) -> bytes:
-    """Return the bytes of a raw file after damage.
+def damage_file(kind: DamageKind, content: bytes, random: np.random.Generator) -> bytes:
+    """Return the bytes of a damaged raw file.
 
     Parameters
     ----------
     kind : DamageKind
-        What only concerns names (renamed, duplicate, foreign) leaves a good file as it is.
+        Kinds that only change names (renamed, duplicate) leave the bytes unchanged.
     content : bytes
-        Of a good Licel file.
+        A good Licel file.
     random : numpy.random.Generator
-        For garbage, and for where a glitch is.
+        For garbage and the bin of a glitch.
     """
     return _DAMAGE[kind](content, random)
 
@@ -72,8 +72,8 @@ def _unchanged(content: bytes, _: np.random.Generator) -> bytes:
     return content
 
 
-def _in_header(edit: Callable[[bytes], bytes]) -> Damage:
-    """Return a damage that changes the text of the header and nothing else."""
+def _in_header(edit: Callable[[bytes], bytes]) -> _Edit:
+    """Return an edit of the file that changes the header text only."""
 
     def change(content: bytes, _: np.random.Generator) -> bytes:
         start = parse_header(content).data_start
@@ -87,10 +87,10 @@ def _negative_bins(header: bytes) -> bytes:
 
 
 def _too_many_bins(header: bytes) -> bytes:
-    def twice(match: re.Match[bytes]) -> bytes:
+    def doubled(match: re.Match[bytes]) -> bytes:
         return b"%s%05d " % (match[1], 2 * int(match[2]))
 
-    return re.sub(rb"(\r\n [01] \d \d )(\d{5}) ", twice, header, count=1)
+    return re.sub(rb"(\r\n [01] \d \d )(\d{5}) ", doubled, header, count=1)
 
 
 def _impossible_position(header: bytes) -> bytes:
@@ -114,8 +114,8 @@ def _wide_line(header: bytes) -> bytes:
     def widened(match: re.Match[bytes]) -> bytes:
         after = match[4].split()
         weather = b" 30.0 1013.0" if after else b" 00 30.0 1013.0"
-        told = match[4].rstrip() + (b"" if len(after) > 1 else weather)
-        return b"%s %s %s%s" % (match[1], match[2], match[3], told.ljust(30))
+        values = match[4].rstrip() + (b"" if len(after) > 1 else weather)
+        return b"%s %s %s%s" % (match[1], match[2], match[3], values.ljust(30))
 
     return _PLACE.sub(widened, header, count=1)
 
@@ -126,10 +126,10 @@ def _decimal_comma(header: bytes) -> bytes:
 
 
 def _zero_voltage(header: bytes) -> bytes:
-    return _datasets(header, 5, b"0000")
+    return _replace_token(header, 5, b"0000")
 
 
-def _datasets(header: bytes, column: int, token: bytes) -> bytes:
+def _replace_token(header: bytes, column: int, token: bytes) -> bytes:
     """Replace one value of every dataset line by another of the same length."""
 
     def change(match: re.Match[bytes]) -> bytes:
@@ -140,8 +140,8 @@ def _datasets(header: bytes, column: int, token: bytes) -> bytes:
     return _DATASET.sub(change, header)
 
 
-def _in_counts(edit: Callable[[Dataset, NDArray[np.int32], np.random.Generator], None]) -> Damage:
-    """Return a damage that changes the counts of channels and nothing else."""
+def _in_counts(edit: Callable[[Dataset, NDArray[np.int32], np.random.Generator], None]) -> _Edit:
+    """Return an edit of the file that changes the counts of channels only."""
 
     def change(content: bytes, random: np.random.Generator) -> bytes:
         changed = bytearray(content)
@@ -160,15 +160,15 @@ def _channels(content: bytearray) -> Iterator[tuple[Dataset, NDArray[np.int32]]]
 
 def _glitch(dataset: Dataset, counts: NDArray[np.int32], random: np.random.Generator) -> None:
     if dataset.full_scale is not None:
-        counts[_somewhere(counts, random)] = min(3 * dataset.full_scale, np.iinfo(np.int32).max)
+        counts[_random_bin(counts, random)] = min(3 * dataset.full_scale, np.iinfo(np.int32).max)
 
 
 def _largest(_: Dataset, counts: NDArray[np.int32], random: np.random.Generator) -> None:
-    counts[_somewhere(counts, random)] = np.iinfo(np.int32).max
+    counts[_random_bin(counts, random)] = np.iinfo(np.int32).max
 
 
-def _somewhere(counts: NDArray[np.int32], random: np.random.Generator) -> int:
-    # In the part of the range that retrievals look at.
+def _random_bin(counts: NDArray[np.int32], random: np.random.Generator) -> int:
+    # Within the range that retrievals use.
     return int(random.integers(counts.size // 10, counts.size // 4))
 
 
@@ -182,16 +182,16 @@ def _saturation(dataset: Dataset, counts: NDArray[np.int32], _: np.random.Genera
         counts[: counts.size // 4] = dataset.full_scale
 
 
-def _nothing(_: Dataset, counts: NDArray[np.int32], __: np.random.Generator) -> None:
+def _zero_counts(_: Dataset, counts: NDArray[np.int32], __: np.random.Generator) -> None:
     counts[:] = 0
 
 
 def _zero_shots(content: bytes, random: np.random.Generator) -> bytes:
-    without = _in_counts(_nothing)(content, random)
-    return _in_header(lambda header: _datasets(header, 13, b"000000"))(without, random)
+    without = _in_counts(_zero_counts)(content, random)
+    return _in_header(lambda header: _replace_token(header, 13, b"000000"))(without, random)
 
 
-_DAMAGE: Final[Mapping[DamageKind, Damage]] = {
+_DAMAGE: Final[Mapping[DamageKind, _Edit]] = {
     DamageKind.TRUNCATED: _truncated,
     DamageKind.EMPTY: _empty,
     DamageKind.GARBAGE: _garbage,

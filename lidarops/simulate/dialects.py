@@ -1,8 +1,8 @@
-"""How the headers of real stations deviate from each other: sites, zenith angles, bin widths.
+"""Header dialects of real stations: sites, zenith angles, bin widths.
 
-Every deviation here was seen in files of that station. A header is built by the project's own
-writer, its text is changed as the station writes it, and it is parsed again, so that a `Header`
-never differs from what a reader will find.
+Every deviation was seen in files of that station. A header is built by `lidarops.raw`, its text
+is changed as the station writes it, and the result is parsed again. A `Header` therefore always
+agrees with its text.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ class Dialect:
     """How one station writes its headers."""
 
     layout: Literal["classic", "extended", "raymetrics"] | None = None
-    """None: extended where the azimuth is known."""
+    """None: extended if the azimuth is known."""
     site: Literal["key", "cut", "whole"] = "key"
-    """Key of the station in the campaign, its name cut at 8 characters, or its whole name."""
+    """Key of the station in the campaign, its name cut to 8 characters, or its whole name."""
     minus_90: bool = False
     """Whether vertical is written as -90."""
     whole_bin_widths: bool = False
     """Whether bin widths are written as whole metres in four digits: 0015."""
     both_lasers: bool = False
-    """Whether line 3 gives shots and rate for both lasers, whichever fires."""
+    """Whether line 3 gives shots and rate for both lasers, although one fires."""
     second_laser: bool = False
-    """Whether the datasets belong to laser 2, of which line 3 gives the shots."""
+    """Whether the datasets belong to laser 2, whose shots line 3 gives."""
     tens: bool = False
-    """Whether the file name ends in minutes and tens of seconds: ``mmX``."""
+    """Whether the file name ends in minutes and tens of seconds, ``mmX``."""
 
     @property
     def holds_azimuth(self) -> bool:
-        """Whether the headers can say where a scan looks."""
+        """Whether headers hold the azimuth of a scan."""
         return self.layout in {None, "extended"}
 
     @property
@@ -62,82 +62,86 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where and how a lidar stands, as its header says it."""
+    """Name and position of a lidar, as in its headers."""
 
     key: str
-    """Of the station in the campaign."""
+    """Key of the station in the campaign."""
     name: str
     altitude: float
     """m above the geoid."""
     first: float
-    """degree: the coordinate that the instrument writes first, the longitude for most."""
+    """degree; the coordinate that the instrument writes first, mostly the longitude."""
     second: float
-    """degree"""
+    """degree."""
 
 
 @dataclass(frozen=True, slots=True)
-class Occasion:
-    """What differs from file to file."""
+class Measurement:
+    """Header values that differ from file to file."""
 
     start: datetime
-    """As the clock of the computer has it."""
+    """By the clock of the computer."""
     stop: datetime
     zenith_angle: float
     """degree, 0 = up."""
     azimuth: float | None
-    """degree; None where nobody knows it."""
+    """degree; None if unknown."""
     shots: int
     repetition_rate: float
-    """Hz"""
+    """Hz."""
     temperature: float = 303.15
     """K at the ground, for dialects that write it."""
     pressure: float = 1.013e5
-    """Pa"""
+    """Pa."""
 
 
-def tail(dialect: Dialect, stop: datetime, jumps: int = 0) -> str:
+def name_suffix(dialect: Dialect, stop: datetime, jumps: int = 0) -> str:
     """Return the end of a file name: minutes and seconds of the stop time.
 
-    The hundredths of a second tell files apart that were written before and after a jump of the
-    clock.
+    The last two digits count the jumps of the clock, so files from before and after a jump have
+    different names.
     """
     if dialect.tens:
         return f"{stop:%M}{stop.second // 10:d}"
     return f"{stop:%M%S}{jumps:02d}"
 
 
-def header_of(
-    dialect: Dialect, name: str, place: Place, occasion: Occasion, datasets: tuple[Dataset, ...]
+def make_header(
+    dialect: Dialect,
+    name: str,
+    place: Place,
+    measurement: Measurement,
+    datasets: tuple[Dataset, ...],
 ) -> Header:
     """Return the header of one file in a station's dialect.
 
     Raises
     ------
     RawFormatError
-        Where a number or text does not fit the dialect.
+        If a number or text does not fit the dialect.
     """
     weather = dialect.layout == "raymetrics"
-    vertical = occasion.zenith_angle == 0.0
+    vertical = measurement.zenith_angle == 0.0
     return new_header(
         name=name,
         site=_site(dialect, place),
-        start=occasion.start,
-        stop=occasion.stop,
+        start=measurement.start,
+        stop=measurement.stop,
         altitude=place.altitude,
         longitude=place.first,
         latitude=place.second,
-        zenith_angle=-90.0 if dialect.minus_90 and vertical else occasion.zenith_angle,
-        azimuth=occasion.azimuth if dialect.holds_azimuth else None,
-        temperature=occasion.temperature if weather else None,
-        pressure=occasion.pressure if weather else None,
+        zenith_angle=-90.0 if dialect.minus_90 and vertical else measurement.zenith_angle,
+        azimuth=measurement.azimuth if dialect.holds_azimuth else None,
+        temperature=measurement.temperature if weather else None,
+        pressure=measurement.pressure if weather else None,
         datasets=datasets,
-        lasers=_lasers(dialect, occasion),
+        lasers=_lasers(dialect, measurement),
         dialect=dialect.layout,
     )
 
 
-def spelled(dialect: Dialect, dataset: Dataset) -> Dataset:
-    """Return a dataset line as the station spells it."""
+def dataset_in_dialect(dialect: Dialect, dataset: Dataset) -> Dataset:
+    """Return a dataset line as the station writes it."""
     if not dialect.whole_bin_widths:
         return dataset
     tokens = dataset.line.decode("latin-1").split()
@@ -152,10 +156,10 @@ def _site(dialect: Dialect, place: Place) -> str:
     return place.name[:8].strip() if dialect.site == "cut" else place.name
 
 
-def _lasers(dialect: Dialect, occasion: Occasion) -> tuple[Laser, Laser]:
-    fires = Laser(occasion.shots, occasion.repetition_rate)
+def _lasers(dialect: Dialect, measurement: Measurement) -> tuple[Laser, Laser]:
+    firing = Laser(measurement.shots, measurement.repetition_rate)
     if dialect.both_lasers:
-        return fires, fires
+        return firing, firing
     if dialect.second_laser:
-        return Laser(0, occasion.repetition_rate), fires
-    return fires, Laser(0, 0.0)
+        return Laser(0, measurement.repetition_rate), firing
+    return firing, Laser(0, 0.0)

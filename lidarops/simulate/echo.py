@@ -1,4 +1,4 @@
-"""The signal of the pulse that a campaign file describes."""
+"""Signal of the laser pulse that a campaign file describes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lidarops.campaign.simulation import Pulse
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate import pulse as shapes
-from lidarops.simulate.atmosphere import Path
+from lidarops.simulate.atmosphere import BeamPath
 from lidarops.simulate.signal import bin_centres
 
 Array = NDArray[np.float64]
@@ -19,26 +19,26 @@ _RECTANGLE: Final = "rectangle"
 _GAUSSIAN: Final = "gaussian"
 
 
-def echo(
+def pulse_echo(
     distance: Array,
-    path: Path,
+    path: BeamPath,
     pulse: Pulse,
     *,
     system_constant: float,
     full_overlap_range: float,
 ) -> Array:
-    """Return the rate of photoelectrons of a bin, MHz: the mean while it is open.
+    """Return the mean rate of photoelectrons while each bin is open, MHz.
 
     Parameters
     ----------
     distance : ndarray, m, shape (bins,)
         Range of the bin centres, equally spaced; time zero is the centroid of the pulse.
-    path : Path
-        At the bin centres, straight between them.
+    path : BeamPath
+        Optical properties at the bin centres, linear between them.
     pulse : Pulse
     system_constant : float, MHz m3 sr
     full_overlap_range : float, m
-        Positive: light from where the pulse still leaves is infinite without overlap.
+        Must be positive: without overlap the signal at the lidar is infinite.
 
     Raises
     ------

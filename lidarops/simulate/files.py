@@ -1,4 +1,4 @@
-"""One simulated raw file: its bytes and the truth behind it."""
+"""Simulate raw files: the bytes of each file, and its truth."""
 
 from __future__ import annotations
 
@@ -22,40 +22,51 @@ from lidarops.campaign.simulation import (
 from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSECOND
 from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset
 from lidarops.records import DetectionMode, Role
-from lidarops.simulate.atmosphere import Air, Beam, Path
-from lidarops.simulate.damage import damaged
-from lidarops.simulate.dialects import Occasion, header_of, spelled
-from lidarops.simulate.echo import echo
-from lidarops.simulate.instrument import (
+from lidarops.simulate.analog import digitise, digitise_fast
+from lidarops.simulate.atmosphere import Air, Beam, BeamPath
+from lidarops.simulate.counting import count_fast, count_photons
+from lidarops.simulate.damage import damage_file
+from lidarops.simulate.dialects import Measurement, dataset_in_dialect, make_header
+from lidarops.simulate.echo import pulse_echo
+from lidarops.simulate.laser import laser_energy
+from lidarops.simulate.photoelectrons import (
     BRIGHTEST,
-    Laser,
     Photoelectrons,
-    count_fast,
-    count_photons,
-    digitise,
-    digitise_fast,
+    delay_recorder,
     release,
-    seen_from,
 )
 from lidarops.simulate.signal import backscatter_signal, bin_centres
-from lidarops.simulate.site import Order, Site, channel_name, dead_time, modes, random_stream
+from lidarops.simulate.site import (
+    PlannedFile,
+    Site,
+    channel_name,
+    modes,
+    photon_dead_time,
+    random_stream,
+)
 from lidarops.simulate.sun import sky_brightness, solar_elevation
-from lidarops.simulate.truth import ChannelTruth, FileTruth, Grid, ProfileTruth, cell_stops
+from lidarops.simulate.truth import (
+    ChannelTruth,
+    FileTruth,
+    ProfileTruth,
+    TruthGrid,
+    cell_stops,
+)
 
 Array = NDArray[np.float64]
 AnyCounts = NDArray[np.signedinteger[Any]]
 Key = tuple[object, ...]
-Kept = TypeVar("Kept")
+Cached = TypeVar("Cached")
 
-_KEPT: Final = 64
-"""Paths that are kept for the files to come."""
+_CACHED: Final = 64
+"""Entries of a cache; a full cache is emptied."""
 
-_STEP: Final = timedelta(minutes=10)
-"""In which the air changes where an archive is simulated fast."""
+_AIR_STEP: Final = timedelta(minutes=10)
+"""Interval at which the air changes in a fast simulation."""
 
 
-class _Ranges(NamedTuple):
-    """The bins of a channel; see `bin_centres`."""
+class _BinGrid(NamedTuple):
+    """Range bins of a channel; see `bin_centres`."""
 
     bins: int
     bin_width: float
@@ -63,10 +74,10 @@ class _Ranges(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class _Moment:
-    """What is the same for all channels of one file."""
+class _Conditions:
+    """Conditions that all channels of one file share."""
 
-    order: Order
+    planned: PlannedFile
     acquisition: Acquisition
     start: datetime
     middle: datetime
@@ -76,19 +87,18 @@ class _Moment:
     sun: float
     """Elevation of the sun, degree."""
     energy: float
-    """Of the laser, relative."""
+    """Laser energy, relative to the nominal energy."""
     hours: float
-    """Since the start of the campaign."""
-    line: Beam
-    air: datetime
-    """When the air is as the file sees it."""
-    state: tuple[object, ...]
-    """Of the air."""
+    """Hours since the start of the campaign."""
+    beam: Beam
+    air_time: datetime
+    """Time at which the air is evaluated."""
+    air_state: tuple[object, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class _Light:
-    """What falls on a detector, in MHz of photoelectrons."""
+    """Light on a detector, in MHz of photoelectrons."""
 
     rate: Array
     sky: float
@@ -97,21 +107,21 @@ class _Light:
     bin_time: float
     """s for which a bin is open after one shot."""
     electrons: Photoelectrons | None
-    """None where they are not drawn one by one."""
+    """None in a fast simulation."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Beam:
-    """The signal of a laser at full energy, MHz of photoelectrons."""
+class _LaserSignal:
+    """Signal at nominal laser energy, MHz of photoelectrons."""
 
-    signal: Array
+    rate: Array
     extinction: float
-    """m-1; NaN where the path is not homogeneous."""
+    """m-1; NaN if the path is not homogeneous."""
     amplitude: float
 
 
 class Simulator:
-    """Simulates the files of one instrument.
+    """Simulator of the files of one instrument.
 
     Parameters
     ----------
@@ -121,8 +131,8 @@ class Simulator:
     def __init__(self, site: Site) -> None:
         self.site = site
         self._datasets: dict[tuple[int, float, int], tuple[Dataset, ...]] = {}
-        self._paths: dict[Key, Path] = {}
-        self._beams: dict[Key, _Beam] = {}
+        self._paths: dict[Key, BeamPath] = {}
+        self._signals: dict[Key, _LaserSignal] = {}
         self._position = site.position
         self._air = Air(
             site.settings.air_of(site.key),
@@ -130,64 +140,64 @@ class Simulator:
             start=site.settings.start,
             seed=site.settings.seed,
         )
-        self.grid = _grid(site)
+        self.grid = _truth_grid(site)
 
-    def file(self, order: Order) -> tuple[bytes, FileTruth]:
+    def simulate(self, planned: PlannedFile) -> tuple[bytes, FileTruth]:
         """Simulate one raw file.
 
         Parameters
         ----------
-        order : Order
-            A dark file has the telescope covered: offset and noise only.
+        planned : PlannedFile
+            A dark file is taken with a covered telescope: offset and noise only.
 
         Returns
         -------
         content : bytes
-            The same whichever other files are simulated before, beside or without this one.
+            They do not depend on any other file.
         truth : FileTruth
 
         Raises
         ------
         CampaignError
-            Where the campaign gives no dead time for a photon counter.
+            If the campaign gives no dead time for a photon counter.
         RawFormatError
-            Where a number does not fit the headers of raw files.
+            If a number does not fit the headers of raw files.
         """
         site = self.site
-        random = random_stream(site.settings.seed, site.key, order.role, order.index)
-        moment = self._moment(order, random)
+        random = random_stream(site.settings.seed, site.key, planned.role, planned.index)
+        conditions = self._conditions(planned, random)
         channels: dict[str, tuple[AnyCounts, ChannelTruth]] = {}
         for detector in site.simulated.detectors:
-            channels |= self._read_out(moment, detector, random)
-        header = self._header(moment)
+            channels |= self._read_out(conditions, detector, random)
+        header = self._header(conditions)
         content = encode(header, {name: counts for name, (counts, _) in channels.items()})
-        damage = site.damage_of(order.index) if order.role is Role.SIGNAL else None
+        damage = site.damage_of(planned.index) if planned.role is Role.SIGNAL else None
         if damage is not None:
-            content = damaged(damage, content, random)
+            content = damage_file(damage, content, random)
         return content, FileTruth(
-            path=site.path_of(order),
+            path=site.path_of(planned),
             instrument=site.key,
-            time=moment.middle,
-            zenith_angle=moment.zenith_angle,
-            azimuth=math.nan if moment.azimuth is None else moment.azimuth,
-            clock_error=site.simulated.acquisition.clock_error(moment.start)[1].total_seconds(),
-            energy=moment.energy,
-            channels={name: known for name, (_, known) in channels.items()},
-            damage=damage if order.twin or damage is not DamageKind.DUPLICATE else None,
-            profile=self._profile(moment, [known for _, known in channels.values()]),
+            time=conditions.middle,
+            zenith_angle=conditions.zenith_angle,
+            azimuth=math.nan if conditions.azimuth is None else conditions.azimuth,
+            clock_error=site.simulated.acquisition.clock_error(conditions.start)[1].total_seconds(),
+            energy=conditions.energy,
+            channels={name: values for name, (_, values) in channels.items()},
+            damage=damage if planned.copy or damage is not DamageKind.DUPLICATE else None,
+            profile=self._profile(conditions, [values for _, values in channels.values()]),
         )
 
-    def _moment(self, order: Order, random: np.random.Generator) -> _Moment:
+    def _conditions(self, planned: PlannedFile, random: np.random.Generator) -> _Conditions:
         site = self.site
-        start = site.start_of(order.role, order.index)
-        middle = start + site.duration_of(order) / 2
+        start = site.start_of(planned.role, planned.index)
+        middle = start + site.duration_of(planned) / 2
         hours = (middle - site.settings.start).total_seconds() / 3600.0
         facts = site.instrument.facts_at(start)
-        acquisition = site.acquisition_of(order.role, order.index)
-        zenith, azimuth = site.pointing_of(order, facts)
-        air = self._when(middle)
-        return _Moment(
-            order=order,
+        acquisition = site.acquisition_of(planned.role, planned.index)
+        zenith, azimuth = site.pointing_of(planned, facts)
+        air_time = self._air_time(middle)
+        return _Conditions(
+            planned=planned,
             acquisition=acquisition,
             start=start,
             middle=middle,
@@ -195,36 +205,31 @@ class Simulator:
             zenith_angle=zenith,
             azimuth=azimuth,
             sun=solar_elevation(middle, site.station.latitude, site.station.longitude),
-            energy=self._energy(hours, acquisition.shots, random),
+            energy=laser_energy(site.simulated.laser, hours, acquisition.shots, random),
             hours=hours,
-            line=Beam(*self._position, zenith, azimuth or 0.0),
-            air=air,
-            state=self._air.state(air),
+            beam=Beam(*self._position, zenith, azimuth or 0.0),
+            air_time=air_time,
+            air_state=self._air.state(air_time),
         )
 
-    def _energy(self, hours: float, shots: int, random: np.random.Generator) -> float:
-        drift = self.site.simulated.laser
-        laser = Laser(
-            per_hour=drift.per_hour, file_jitter=drift.jitter, shot_jitter=drift.shot_jitter
-        )
-        return laser.energy(hours, shots, random)
-
-    def _header(self, moment: _Moment) -> Header:
-        site, acquisition = self.site, moment.acquisition
-        _, error = site.simulated.acquisition.clock_error(moment.start)
-        start = moment.start + error
-        occasion = Occasion(
+    def _header(self, conditions: _Conditions) -> Header:
+        site, acquisition = self.site, conditions.acquisition
+        _, error = site.simulated.acquisition.clock_error(conditions.start)
+        start = conditions.start + error
+        measurement = Measurement(
             start=start,
-            stop=start + site.duration_of(moment.order),
-            zenith_angle=moment.zenith_angle,
-            azimuth=moment.azimuth,
+            stop=start + site.duration_of(conditions.planned),
+            zenith_angle=conditions.zenith_angle,
+            azimuth=conditions.azimuth,
             shots=acquisition.shots,
             repetition_rate=acquisition.repetition_rate,
         )
-        name = site.name_of(moment.order)
-        return header_of(site.dialect, name, site.place, occasion, self._lines(acquisition))
+        name = site.name_of(conditions.planned)
+        return make_header(
+            site.dialect, name, site.place, measurement, self._dataset_lines(acquisition)
+        )
 
-    def _lines(self, acquisition: Acquisition) -> tuple[Dataset, ...]:
+    def _dataset_lines(self, acquisition: Acquisition) -> tuple[Dataset, ...]:
         key = acquisition.bins, acquisition.bin_width, acquisition.shots
         if key not in self._datasets:
             self._datasets[key] = tuple(
@@ -235,21 +240,21 @@ class Simulator:
         return self._datasets[key]
 
     def _read_out(
-        self, moment: _Moment, detector: Detector, random: np.random.Generator
+        self, conditions: _Conditions, detector: Detector, random: np.random.Generator
     ) -> dict[str, tuple[AnyCounts, ChannelTruth]]:
-        lights = self._lights(moment, detector, random)
+        lights = self._lights(conditions, detector, random)
         channels = {}
         for mode in modes(detector):
             name = channel_name(mode, detector)
-            light = lights[_offset(moment, name)]
+            light = lights[_offset(conditions, name)]
             if mode is DetectionMode.ANALOG and detector.analog is not None:
-                recorder = _drifted(detector.analog, moment.hours)
-                counts = self._digitised(light, recorder, moment, random)
+                recorder = _drifted(detector.analog, conditions.hours)
+                counts = self._digitised(light, recorder, conditions, random)
                 unit, dark_offset = recorder.gain, recorder.dark_offset
             else:
-                lost = dead_time(self.site, moment.start, name)
+                seconds = photon_dead_time(self.site, conditions.start, name)
                 counter = detector.photon or PhotonCounter()
-                counts = self._counted(light, counter, lost, moment, random)
+                counts = self._counted(light, counter, seconds, conditions, random)
                 unit, dark_offset = 1.0, math.nan
             channels[name] = (
                 counts,
@@ -263,42 +268,46 @@ class Simulator:
         return channels
 
     def _lights(
-        self, moment: _Moment, detector: Detector, random: np.random.Generator
+        self, conditions: _Conditions, detector: Detector, random: np.random.Generator
     ) -> dict[float, _Light]:
-        """Return what falls on the recorders of a detector, by their range offset.
+        """Return the light on the recorders of a detector, by range offset.
 
-        They see the same photoelectrons, each in its own bins.
+        All recorders of a detector share its photoelectrons, each in its own bins.
         """
         offsets = sorted(
-            {_offset(moment, channel_name(mode, detector)) for mode in modes(detector)}
+            {_offset(conditions, channel_name(mode, detector)) for mode in modes(detector)}
         )
-        bins, bin_width = grid_of(moment.acquisition, detector)
-        first, fast_mode = offsets[0], self.site.settings.fast
-        if len(offsets) == 1 or fast_mode:
+        bins, bin_width = _grid_of(conditions.acquisition, detector)
+        first = offsets[0]
+        if len(offsets) == 1 or self.site.settings.fast:
             return {
-                offset: self._light(moment, detector, _Ranges(bins, bin_width, offset), random)
+                offset: self._light(conditions, detector, _BinGrid(bins, bin_width, offset), random)
                 for offset in offsets
             }
-        more = math.ceil((offsets[-1] - first) / bin_width) + 1
-        whole = self._light(moment, detector, _Ranges(bins + more, bin_width, first), random)
+        extra = math.ceil((offsets[-1] - first) / bin_width) + 1
+        common = self._light(conditions, detector, _BinGrid(bins + extra, bin_width, first), random)
         lights = {}
         for offset in offsets:
             start = (offset - first) / bin_width
-            electrons = seen_from(
-                cast("Photoelectrons", whole.electrons), start, bins, random=random
+            electrons = delay_recorder(
+                cast("Photoelectrons", common.electrons), start, bins, random=random
             )
-            lights[offset] = replace(whole, rate=electrons.rate, electrons=electrons)
+            lights[offset] = replace(common, rate=electrons.rate, electrons=electrons)
         return lights
 
     def _digitised(
-        self, light: _Light, recorder: AnalogRecorder, moment: _Moment, random: np.random.Generator
+        self,
+        light: _Light,
+        recorder: AnalogRecorder,
+        conditions: _Conditions,
+        random: np.random.Generator,
     ) -> AnyCounts:
         if light.electrons is not None:
             return digitise(light.electrons, recorder, random=random)
         return digitise_fast(
             light.rate,
             recorder,
-            shots=moment.acquisition.shots,
+            shots=conditions.acquisition.shots,
             bin_time=light.bin_time,
             random=random,
         )
@@ -307,53 +316,61 @@ class Simulator:
         self,
         light: _Light,
         counter: PhotonCounter,
-        lost: float,
-        moment: _Moment,
+        dead_time: float,
+        conditions: _Conditions,
         random: np.random.Generator,
     ) -> AnyCounts:
         if light.electrons is not None:
             return count_photons(
-                light.electrons, dead_time=lost, random=random, paralyzable=counter.paralyzable
+                light.electrons, dead_time=dead_time, random=random, paralyzable=counter.paralyzable
             )
         return count_fast(
             light.rate,
-            shots=moment.acquisition.shots,
+            shots=conditions.acquisition.shots,
             bin_time=light.bin_time,
-            dead_time=lost,
+            dead_time=dead_time,
             random=random,
             paralyzable=counter.paralyzable,
         )
 
     def _light(
-        self, moment: _Moment, detector: Detector, ranges: _Ranges, random: np.random.Generator
+        self,
+        conditions: _Conditions,
+        detector: Detector,
+        grid: _BinGrid,
+        random: np.random.Generator,
     ) -> _Light:
-        bins, bin_width, _ = ranges
-        shots = moment.acquisition.shots
-        if moment.order.role is Role.DARK:
-            rate, glow, extinction, amplitude = np.zeros(bins), 0.0, math.nan, math.nan
+        bins, bin_width, _ = grid
+        shots = conditions.acquisition.shots
+        if conditions.planned.role is Role.DARK:
+            rate, sky, extinction, amplitude = np.zeros(bins), 0.0, math.nan, math.nan
         else:
-            beam = self._beam(moment, detector, ranges)
-            sky = detector.background
-            glow = sky.night + (sky.day - sky.night) * sky_brightness(moment.sun)
-            rate = np.minimum(moment.energy * beam.signal + glow, BRIGHTEST)
-            extinction, amplitude = beam.extinction, moment.energy * beam.amplitude
+            signal = self._laser_signal(conditions, detector, grid)
+            background = detector.background
+            sky = background.night + (background.day - background.night) * sky_brightness(
+                conditions.sun
+            )
+            rate = np.minimum(conditions.energy * signal.rate + sky, BRIGHTEST)
+            extinction, amplitude = signal.extinction, conditions.energy * signal.amplitude
         electrons = None
         if not self.site.settings.fast:
             electrons = release(rate, shots=shots, bin_width=bin_width, random=random)
         bin_time = bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
-        return _Light(rate, glow, extinction, amplitude, bin_time, electrons)
+        return _Light(rate, sky, extinction, amplitude, bin_time, electrons)
 
-    def _beam(self, moment: _Moment, detector: Detector, ranges: _Ranges) -> _Beam:
-        full = moment.facts.full_overlap_range
-        key = detector.label, full, ranges, moment.line, moment.state
-        if key in self._beams:
-            return self._beams[key]
-        path = self._path(moment, detector.wavelength * 1e-9, ranges)
-        distance = bin_centres(*ranges)
+    def _laser_signal(
+        self, conditions: _Conditions, detector: Detector, grid: _BinGrid
+    ) -> _LaserSignal:
+        full = conditions.facts.full_overlap_range
+        key = detector.label, full, grid, conditions.beam, conditions.air_state
+        if key in self._signals:
+            return self._signals[key]
+        path = self._path(conditions, detector.wavelength * 1e-9, grid)
+        distance = bin_centres(*grid)
         constant = detector.system_constant
         pulse = self.site.simulated.pulse
         if pulse is None:
-            signal = backscatter_signal(
+            rate = backscatter_signal(
                 distance,
                 extinction=path.extinction,
                 backscatter=path.backscatter,
@@ -361,43 +378,49 @@ class Simulator:
                 full_overlap_range=full,
             )
         else:
-            signal = echo(distance, path, pulse, system_constant=constant, full_overlap_range=full)
-        told = math.nan, math.nan
+            rate = pulse_echo(
+                distance, path, pulse, system_constant=constant, full_overlap_range=full
+            )
+        extinction = amplitude = math.nan
         if path.homogeneous:
-            told = float(path.extinction[0]), constant * float(path.backscatter[0])
-        return _kept(self._beams, key, _Beam(signal, *told))
+            extinction = float(path.extinction[0])
+            amplitude = constant * float(path.backscatter[0])
+        return _cache(self._signals, key, _LaserSignal(rate, extinction, amplitude))
 
-    def _path(self, moment: _Moment, wavelength: float, ranges: _Ranges) -> Path:
-        key = wavelength, ranges, moment.line, moment.state
+    def _path(self, conditions: _Conditions, wavelength: float, grid: _BinGrid) -> BeamPath:
+        key = wavelength, grid, conditions.beam, conditions.air_state
         if key in self._paths:
             return self._paths[key]
-        path = self._air.along(moment.line, bin_centres(*ranges), moment.air, wavelength)
-        return _kept(self._paths, key, path)
+        path = self._air.along(conditions.beam, bin_centres(*grid), conditions.air_time, wavelength)
+        return _cache(self._paths, key, path)
 
-    def _when(self, middle: datetime) -> datetime:
+    def _air_time(self, middle: datetime) -> datetime:
         start = self.site.settings.start
         if not self.site.settings.fast:
             return middle
-        return start + (middle - start) // _STEP * _STEP
+        return start + (middle - start) // _AIR_STEP * _AIR_STEP
 
-    def _profile(self, moment: _Moment, channels: Sequence[ChannelTruth]) -> ProfileTruth | None:
-        order, grid = moment.order, self.grid
-        told = all(math.isfinite(channel.extinction) for channel in channels)
-        if order.role is Role.DARK or told or order.index % grid.every or grid.stops.size < 2:
+    def _profile(
+        self, conditions: _Conditions, channels: Sequence[ChannelTruth]
+    ) -> ProfileTruth | None:
+        planned, grid = conditions.planned, self.grid
+        homogeneous = all(math.isfinite(channel.extinction) for channel in channels)
+        skipped = planned.role is Role.DARK or planned.index % grid.stride
+        if skipped or homogeneous or grid.stops.size < 2:
             return None
-        ranges = _Ranges(int(grid.stops[-1]), grid.bin_width, 0.0)
-        paths = [self._path(moment, wavelength, ranges) for wavelength in grid.wavelengths]
+        bins = _BinGrid(int(grid.stops[-1]), grid.bin_width, 0.0)
+        paths = [self._path(conditions, wavelength, bins) for wavelength in grid.wavelengths]
         extinction = np.stack([path.extinction for path in paths])
         backscatter = np.stack([path.backscatter for path in paths])
         return ProfileTruth(grid.mean(extinction), grid.mean(backscatter), grid.depth(extinction))
 
 
-def _offset(moment: _Moment, channel: str) -> float:
-    return channel_facts(moment.facts, channel).range_offset or 0.0
+def _offset(conditions: _Conditions, channel: str) -> float:
+    return channel_facts(conditions.facts, channel).range_offset or 0.0
 
 
-def _kept(cache: dict[Key, Kept], key: Key, value: Kept) -> Kept:
-    if len(cache) >= _KEPT:
+def _cache(cache: dict[Key, Cached], key: Key, value: Cached) -> Cached:
+    if len(cache) >= _CACHED:
         cache.clear()
     cache[key] = value
     return value
@@ -410,22 +433,22 @@ def _drifted(recorder: AnalogRecorder, hours: float) -> AnalogRecorder:
     return recorder.model_copy(update={"dark_offset": offset})
 
 
-def grid_of(acquisition: Acquisition, detector: Detector) -> tuple[int, float]:
+def _grid_of(acquisition: Acquisition, detector: Detector) -> tuple[int, float]:
     """Return bins and bin width (m) of a detector."""
     return detector.bins or acquisition.bins, detector.bin_width or acquisition.bin_width
 
 
-def _grid(site: Site) -> Grid:
+def _truth_grid(site: Site) -> TruthGrid:
     settings, acquisition = site.settings, site.simulated.acquisition
-    grids = [grid_of(acquisition, detector) for detector in site.simulated.detectors]
+    grids = [_grid_of(acquisition, detector) for detector in site.simulated.detectors]
     bin_width = min(width for _, width in grids)
     bins = int(max(bins * width for bins, width in grids) // bin_width)
-    return Grid(
+    return TruthGrid(
         instrument=site.key,
         wavelengths=tuple(sorted({d.wavelength * 1e-9 for d in site.simulated.detectors})),
         bin_width=bin_width,
         stops=cell_stops(bins, bin_width, settings.truth.cells),
-        every=-(-settings.files(site.key) // settings.truth.profiles),
+        stride=-(-settings.files(site.key) // settings.truth.profiles),
     )
 
 
@@ -434,7 +457,7 @@ def _dataset(
 ) -> Dataset:
     analog = detector.analog if mode is DetectionMode.ANALOG else None
     level = 0 if detector.photon is None else detector.photon.discriminator_level
-    bins, bin_width = grid_of(acquisition, detector)
+    bins, bin_width = _grid_of(acquisition, detector)
     dataset = new_dataset(
         kind=DatasetKind.PHOTON if analog is None else DatasetKind.ANALOG,
         wavelength=detector.wavelength * 1e-9,
@@ -449,4 +472,4 @@ def _dataset(
         discriminator=level * LICEL_DISCRIMINATOR_STEP,
         device=f"BC{number}" if analog is None else f"BT{number}",
     )
-    return spelled(site.dialect, dataset)
+    return dataset_in_dialect(site.dialect, dataset)

@@ -1,4 +1,4 @@
-"""What a lidar sees: from laser, telescope and detector to the rate of photoelectrons."""
+"""A lidar in physical units: from laser, telescope and detector to power and photoelectrons."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from lidarops.constants import LICEL_RANGE_PER_MICROSECOND, SPEED_OF_LIGHT
 from lidarops.simulate import _checks
 from lidarops.simulate.overlap import Overlap, SineOverlap
 from lidarops.simulate.pulse import Pulse, pulsed_signal
-from lidarops.simulate.sun import sky_radiance
 
 Array = NDArray[np.float64]
 
@@ -28,29 +27,23 @@ class Lidar:
     Raises
     ------
     SimulationInputError
-        Where a number is not one of a lidar: no aperture, wavelengths in nm, efficiencies above 1.
+        If a number is impossible: no aperture, wavelengths in nm, an efficiency above 1.
     """
 
     energy: float
     """J, of one pulse."""
-    repetition_rate: float
-    """Hz."""
     aperture_diameter: float
     """m, of the telescope."""
     wavelength: float
     """m, of the laser."""
     optical_efficiency: float
-    """Part of the photons on the aperture, within the field of view, that reach the detector."""
+    """Share of the photons on the aperture, within the field of view, that reach the detector."""
     quantum_efficiency: float
     """Photoelectrons per photon on the detector."""
     bin_width: float
     """m."""
     full_overlap_range: float = 0.0
-    """m, where no overlap is given."""
-    field_of_view: float
-    """rad, full angle."""
-    filter_bandwidth: float
-    """m, of the interference filter."""
+    """m; used where no overlap is given."""
     pulse: Pulse | None = None
     """None for a pulse without length."""
     overlap: Overlap | None = None
@@ -61,8 +54,6 @@ class Lidar:
 
     def __post_init__(self) -> None:
         _checks.between("energy", self.energy, 1e-12, 1e3, "J")
-        _checks.between("repetition_rate", self.repetition_rate, 1e-3, 1e7, "Hz")
-        _checks.positive("aperture_diameter", self.aperture_diameter, "m")
         _checks.between("aperture_diameter", self.aperture_diameter, 1e-3, 50.0, "m")
         _checks.wavelength_in_metres("wavelength", self.wavelength)
         if self.detected_wavelength is not None:
@@ -72,8 +63,6 @@ class Lidar:
             _checks.between(name, getattr(self, name), 0.0, 1.0)
         _checks.between("bin_width", self.bin_width, 1e-3, 1e4, "m")
         _checks.not_negative("full_overlap_range", self.full_overlap_range, "m")
-        _checks.between("field_of_view", self.field_of_view, 1e-6, 0.5, "rad")
-        _checks.between("filter_bandwidth", self.filter_bandwidth, 1e-13, 1e-6, "m")
         limit = self.aperture_diameter * (1.0 - 1e-9)
         _checks.between("obstruction_diameter", self.obstruction_diameter, 0.0, limit, "m")
 
@@ -83,14 +72,9 @@ class Lidar:
         return 0.25 * math.pi * (self.aperture_diameter**2 - self.obstruction_diameter**2)
 
     @property
-    def returning_wavelength(self) -> float:
-        """Wavelength at the detector, m."""
-        return self.detected_wavelength or self.wavelength
-
-    @property
     def photon_energy(self) -> float:
         """Energy of a photon at the detector, J."""
-        return PLANCK * SPEED_OF_LIGHT / self.returning_wavelength
+        return PLANCK * SPEED_OF_LIGHT / (self.detected_wavelength or self.wavelength)
 
     @property
     def power_constant(self) -> float:
@@ -100,48 +84,12 @@ class Lidar:
     @property
     def system_constant(self) -> float:
         """K of the rate of photoelectrons, MHz m3 sr."""
-        return self.power_constant * self.photoelectrons_per_joule * 1e-6
-
-    @property
-    def photoelectrons_per_joule(self) -> float:
-        """Photoelectrons for the energy of light on the detector, J-1."""
-        return self.quantum_efficiency / self.photon_energy
+        return self.power_constant * (self.quantum_efficiency / self.photon_energy) * 1e-6
 
     @property
     def bin_time(self) -> float:
         """Time for which a bin is open after one shot, s, at 150 m per microsecond."""
         return self.bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
-
-    def shots(self, duration: float) -> int:
-        """Return the number of shots in a time (s)."""
-        _checks.not_negative("duration", duration, "s")
-        return int(duration * self.repetition_rate + 1e-9)
-
-    def background_rate(self, radiance: float) -> float:
-        r"""Return the rate of photoelectrons from the sky, MHz.
-
-        Parameters
-        ----------
-        radiance : float, W m-2 sr-1 m-1
-            Spectral radiance of the sky at the detected wavelength, per metre of wavelength.
-
-        Notes
-        -----
-        :math:`L A \pi (\theta / 2)^2 \Delta\lambda \eta / (h c / \lambda)`.
-        """
-        _checks.not_negative("radiance", radiance, "W m-2 sr-1 m-1")
-        solid_angle = math.pi * (0.5 * self.field_of_view) ** 2
-        power = radiance * self.area * solid_angle * self.filter_bandwidth * self.optical_efficiency
-        return power * self.photoelectrons_per_joule * 1e-6
-
-    def sky_rate(self, solar_elevation: float) -> float:
-        """Return the rate of photoelectrons from the clear zenith sky, MHz, right to a factor of 3.
-
-        Parameters
-        ----------
-        solar_elevation : float, degree
-        """
-        return self.background_rate(sky_radiance(solar_elevation, self.returning_wavelength))
 
     def rate(
         self,
@@ -170,7 +118,7 @@ class Lidar:
     ) -> Array:
         """Return the mean power on the detector in the bins, W; see `pulsed_signal`.
 
-        Times `bin_time` it is the energy of `vasylkivskyi2022`, equation 14.
+        Power times `bin_time` is the energy of `vasylkivskyi2022`, equation 14.
         """
         return self.power_constant * self._signal(
             distance, extinction, backscatter, returning_extinction, path, resolution

@@ -1,4 +1,4 @@
-"""How much of the beam the telescope sees: overlap functions, 0 at the lidar."""
+"""Overlap functions: the share of the beam that the telescope sees, 0 at the lidar."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ANGLES: Final = 12
 
 
 class Overlap(Protocol):
-    """Part of the light from a range R (m) that reaches the detector, 0 for R <= 0."""
+    """Share of the light from range R that reaches the detector; 0 for R <= 0."""
 
     def __call__(self, distance: Array, /) -> Array:
         """Return the overlap, 1, of the shape of `distance` (m)."""
@@ -30,7 +30,7 @@ class Overlap(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SineOverlap:
-    r"""A smooth overlap with a range from which on it is complete.
+    r"""Smooth overlap that is complete from a given range on.
 
     Notes
     -----
@@ -54,48 +54,20 @@ class SineOverlap:
 
 
 @dataclass(frozen=True)
-class TabulatedOverlap:
-    """A measured overlap, monotone between its points.
-
-    Between the lidar and the first point it grows with the square of the range; beyond the last
-    point it stays.
-    """
-
-    ranges: tuple[float, ...]
-    """m, ascending, positive."""
-    values: tuple[float, ...]
-    """1, from 0 to 1."""
-    _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        ranges, values = np.array(self.ranges, dtype=float), np.array(self.values, dtype=float)
-        _checks.ascending("ranges", ranges)
-        _checks.positive("ranges[0]", float(ranges[0]), "m")
-        _checks.profile("values", values, ranges.shape, "")
-        _checks.between("values", float(values.max()), 0.0, 1.0)
-        object.__setattr__(self, "_curve", PchipInterpolator(ranges, values))
-
-    def __call__(self, distance: Array, /) -> Array:
-        """Return the overlap, 1, of the shape of `distance` (m)."""
-        first = self.ranges[0]
-        inside = np.clip(distance, first, self.ranges[-1])
-        rise = np.clip(distance / first, 0.0, 1.0) ** 2
-        values: Array = self._curve(inside) * rise
-        return values
-
-
-@dataclass(frozen=True)
 class GeometricalOverlap:
-    r"""The overlap of a Gaussian beam and a telescope with a round field stop in its focus.
+    r"""Overlap of a Gaussian beam and a telescope with a round field stop in its focus.
 
     Notes
     -----
     Light from a point x of the beam passes the field stop through those points y of the aperture
     for which :math:`|x - y| < R \theta / 2`, with the full field of view :math:`\theta`. The
-    overlap is the mean over the aperture of the part of the beam within that distance: the
-    distribution function of a noncentral chi-square variable of two degrees of freedom. It is
-    of second order at R = 0 for every telescope, so the signal is finite there, and is
-    multiplied by no central obstruction other than the aperture's own.
+    overlap is the mean over the aperture of the share of the beam within that distance: the
+    distribution function of a noncentral chi-square variable of two degrees of freedom. For
+    every telescope it is of second order at R = 0, so the signal is finite there.
+
+    References
+    ----------
+    `vasylkivskyi2022`, equation 8, with an overlap of 1 inside the field of view and 0 outside.
     """
 
     aperture_radius: float
@@ -111,7 +83,7 @@ class GeometricalOverlap:
     tilt: float = 0.0
     """rad, of the laser towards the axis of the telescope."""
     obstruction_radius: float = 0.0
-    """m, of the secondary mirror."""
+    """m, of the secondary mirror, which shades the aperture."""
     _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
     _reach: tuple[float, float] = field(init=False, repr=False, compare=False)
 
@@ -123,7 +95,7 @@ class GeometricalOverlap:
         _checks.not_negative("separation", self.separation, "m")
         _checks.between("tilt", self.tilt, -0.1, 0.1, "rad")
         _checks.between("obstruction_radius", self.obstruction_radius, 0.0, self.aperture_radius)
-        # From where the field of view is a hundredth of the aperture to the far field.
+        # From where the field of view covers a hundredth of the aperture up to the far field.
         size = self.aperture_radius + self.separation + self.beam_radius
         near, far = 0.02 * self.aperture_radius / self.field_of_view, 300.0 * size
         knots = np.geomspace(near, far / self.field_of_view, _KNOTS)
@@ -141,8 +113,8 @@ class GeometricalOverlap:
         away = along**2 + (rings[:, None] * np.sin(angles)) ** 2
         spread = (0.25 * (self.beam_radius**2 + (self.divergence * distance) ** 2))[:, None, None]
         seen = (0.5 * self.field_of_view * distance)[:, None, None] ** 2
-        part = chndtr(seen / spread, 2.0, away / spread)
-        mean: Array = np.einsum("ijk,j->i", part, 0.5 * weights) / _ANGLES
+        share = chndtr(seen / spread, 2.0, away / spread)
+        mean: Array = np.einsum("ijk,j->i", share, 0.5 * weights) / _ANGLES
         return mean
 
     def __call__(self, distance: Array, /) -> Array:
@@ -155,7 +127,7 @@ class GeometricalOverlap:
 
 
 def vanishes(shape: Overlap) -> bool:
-    """Return whether O / R^2 stays finite at the lidar, without which near signals do not."""
+    """Return whether O / R^2, and so the signal, stays finite at the lidar."""
     near = np.array([1e-3, 1e-2])
     values = shape(near)
     if values[1] == 0.0:

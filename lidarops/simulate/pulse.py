@@ -1,12 +1,12 @@
-r"""Signals of laser pulses of any shape and length, seen by a detector that integrates over bins.
+r"""Signal of a laser pulse of any shape and length, on a detector that integrates over bins.
 
-A pulse of power E F(t) returns from a range R at the time t = 2 R / c of the clock, together
-with the light of its later parts from nearer ranges:
+A pulse of power E F(t) returns from range R at the time t = 2 R / c. Light of its later parts,
+from nearer ranges, arrives at the same time:
 
 .. math:: P(R) = K \int \beta(R') T(R') O(R') F(2 (R - R') / c) \frac{dR'}{R'^2} \frac{2}{c}
 
-(`vasylkivskyi2022`, 20, with K = E A eta c / 2). A detector that integrates over a bin makes the
-pulse longer by the bin. The integral is a sum over cells of the pulse; each cell from R_a to R_b
+(`vasylkivskyi2022`, 20, with K = E A eta c / 2). A detector that integrates over a bin acts
+like a longer pulse. The integral is a sum over cells of the pulse. Each cell from R_a to R_b
 is taken at the geometric mean of its edges with the weight :math:`(R_b - R_a) / (R_a R_b)`, which
 is the integral of :math:`R^{-2}` itself: a rectangular pulse gives the near-range factor
 :math:`(c \tau / 2) / [R (R - c \tau / 2)]` to the last digits, at any range behind the pulse.
@@ -15,14 +15,13 @@ is the integral of :math:`R^{-2}` itself: a rectangular pulse gives the near-ran
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, Protocol
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PPoly
 from scipy.special import ndtr
 
 from lidarops.constants import SPEED_OF_LIGHT
@@ -40,14 +39,14 @@ _DECAYS: Final = 16.0
 
 
 class Origin(Enum):
-    """To what of the pulse the time zero of the recorder, and so the range, belongs."""
+    """Point of the pulse at time zero of the recorder, and so at range 0."""
 
     LEADING_EDGE = "leading edge"
     PEAK = "peak"
 
 
 class Pulse(Protocol):
-    """Power of a laser pulse over time, of unit energy, in a clock whose zero is range 0."""
+    """Power of a laser pulse of unit energy over time; time zero is range 0."""
 
     @property
     def start(self) -> float:
@@ -58,7 +57,7 @@ class Pulse(Protocol):
         """Time after which no energy leaves, s."""
 
     def passed(self, time: Array) -> Array:
-        """Return the part of the energy that has left by a time (s), from 0 to 1."""
+        """Return the share of the energy that has left by a time (s), from 0 to 1."""
 
     def passed_integral(self, time: Array) -> Array:
         """Return the integral of `passed` up to a time, s."""
@@ -66,7 +65,7 @@ class Pulse(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RectangularPulse:
-    """Constant power for a time; its leading edge leaves at time zero."""
+    """Constant power for a given time; the leading edge leaves at time zero."""
 
     duration: float
     """s."""
@@ -85,7 +84,7 @@ class RectangularPulse:
         return self.duration
 
     def passed(self, time: Array) -> Array:
-        """Return the part of the energy that has left by a time (s)."""
+        """Return the share of the energy that has left by a time (s)."""
         return np.clip(time / self.duration, 0.0, 1.0)
 
     def passed_integral(self, time: Array) -> Array:
@@ -97,7 +96,7 @@ class RectangularPulse:
 
 @dataclass(frozen=True, slots=True)
 class GaussianPulse:
-    """A Gaussian, cut at `reach` standard deviations from its peak on both sides."""
+    """Gaussian power, cut at `reach` standard deviations on both sides of its peak."""
 
     fwhm: float
     """s, full width at half maximum of the power."""
@@ -131,11 +130,11 @@ class GaussianPulse:
         return self.peak + self.reach * self.deviation
 
     def passed(self, time: Array) -> Array:
-        """Return the part of the energy that has left by a time (s)."""
+        """Return the share of the energy that has left by a time (s)."""
         z = np.clip((time - self.peak) / self.deviation, -self.reach, self.reach)
         cut = ndtr(-self.reach)
-        part: Array = (ndtr(z) - cut) / (1.0 - 2.0 * cut)
-        return part
+        share: Array = (ndtr(z) - cut) / (1.0 - 2.0 * cut)
+        return share
 
     def passed_integral(self, time: Array) -> Array:
         """Return the integral of `passed` up to a time, s."""
@@ -149,7 +148,7 @@ class GaussianPulse:
 
 @dataclass(frozen=True, slots=True)
 class ExponentialPulse:
-    """Full power at time zero, exponential decay from there on, cut after 16 decay times."""
+    """Full power at time zero, then exponential decay, cut after 16 decay times."""
 
     decay: float
     """s, in which the power falls to 1/e."""
@@ -168,10 +167,10 @@ class ExponentialPulse:
         return _DECAYS * self.decay
 
     def passed(self, time: Array) -> Array:
-        """Return the part of the energy that has left by a time (s)."""
+        """Return the share of the energy that has left by a time (s)."""
         u = np.clip(time / self.decay, 0.0, _DECAYS)
-        part: Array = np.expm1(-u) / math.expm1(-_DECAYS)
-        return part
+        share: Array = np.expm1(-u) / math.expm1(-_DECAYS)
+        return share
 
     def passed_integral(self, time: Array) -> Array:
         """Return the integral of `passed` up to a time, s."""
@@ -181,59 +180,14 @@ class ExponentialPulse:
         return whole
 
 
-@dataclass(frozen=True)
-class TabulatedPulse:
-    """A measured pulse: power straight between its points, in any unit, nothing outside."""
-
-    times: tuple[float, ...]
-    """s, ascending, in the clock whose zero is range 0."""
-    power: tuple[float, ...]
-    """Not negative; scaled to unit energy."""
-    _passed: PPoly = field(init=False, repr=False, compare=False)
-    _integral: PPoly = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        times, power = np.array(self.times, dtype=float), np.array(self.power, dtype=float)
-        _checks.ascending("times", times)
-        _checks.profile("power", power, times.shape, "")
-        energy = np.trapezoid(power, times)
-        _checks.positive("power", float(energy))
-        _checks.between("times", float(times[-1] - times[0]), 1e-15, 1e-3, "s")
-        slope = np.diff(power) / np.diff(times)
-        passed = PPoly(np.stack([slope, power[:-1]]) / energy, times).antiderivative()
-        object.__setattr__(self, "_passed", passed)
-        object.__setattr__(self, "_integral", passed.antiderivative())
-
-    @property
-    def start(self) -> float:
-        """Time before which no energy leaves, s."""
-        return self.times[0]
-
-    @property
-    def stop(self) -> float:
-        """Time after which no energy leaves, s."""
-        return self.times[-1]
-
-    def passed(self, time: Array) -> Array:
-        """Return the part of the energy that has left by a time (s)."""
-        part: Array = self._passed(np.clip(time, self.start, self.stop))
-        return part
-
-    def passed_integral(self, time: Array) -> Array:
-        """Return the integral of `passed` up to a time, s."""
-        inside = self._integral(np.clip(time, self.start, self.stop))
-        whole: Array = inside + np.clip(time - self.stop, 0.0, None)
-        return whole
-
-
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What a pulse and a bin make of a point at range 0, in cells."""
+    """Signal of a point scatterer at range 0: pulse and bin convolved, in cells."""
 
     edges: Array
-    """m behind the range of the clock, ascending, shape (cells + 1,)."""
+    """m behind the range of the time, ascending, shape (cells + 1,)."""
     density: Array
-    """m-1, of the energy in each cell; the sum of density times cell is 1."""
+    """m-1, energy in each cell over its length; the sum of density times length is 1."""
 
 
 def response(
@@ -246,15 +200,15 @@ def response(
     pulse : Pulse, optional
         None for a pulse without length.
     bin_width : float, m, optional
-        Over which the detector integrates, centred on the range; None for the power of the
-        moment.
+        Over which the detector integrates, centred on the range; None for the instantaneous
+        power.
     resolution : float, m, optional
-        Longest cell; a fifth of the bin, or 1/32 of the pulse, where not given.
+        Longest cell; by default a fifth of the bin, or 1/32 of the pulse without a bin.
 
     Raises
     ------
     SimulationInputError
-        Where there is neither pulse nor bin, or a length is not positive.
+        If there is neither pulse nor bin, or a length is not positive.
     """
     start, stop = (0.0, 0.0) if pulse is None else (pulse.start, pulse.stop)
     start, stop = 0.5 * SPEED_OF_LIGHT * start, 0.5 * SPEED_OF_LIGHT * stop
@@ -267,7 +221,7 @@ def response(
         resolution = bin_width / _CELLS_OF_BIN if bin_width else (stop - start) / _CELLS_OF_PULSE
     _checks.positive("resolution", resolution, "m")
     span = stop - start + 2.0 * half
-    # A pulse of whole cells must not get one more for the last digit of its length.
+    # Rounding must not add a cell to a pulse of a whole number of cells.
     cells = max(math.ceil(span / resolution * (1.0 - 1e-12)), 1)
     _checks.between("resolution", cells, 1, _MOST_CELLS, "cells")
     edges = np.linspace(start - half, stop + half, cells + 1)
@@ -275,18 +229,18 @@ def response(
 
 
 def _passed(pulse: Pulse | None, edges: Array, half: float) -> Array:
-    """Return the part of the energy of pulse and bin in front of each edge."""
+    """Return the share of the energy of pulse and bin in front of each edge."""
     to_time = 2.0 / SPEED_OF_LIGHT
     if pulse is None:
-        part: Array = (edges - edges[0]) / (edges[-1] - edges[0])
+        share: Array = (edges - edges[0]) / (edges[-1] - edges[0])
     elif half == 0.0:
-        part = pulse.passed(edges * to_time)
+        share = pulse.passed(edges * to_time)
     else:
         after = pulse.passed_integral((edges + half) * to_time)
         before = pulse.passed_integral((edges - half) * to_time)
-        part = (after - before) / (2.0 * half * to_time)
-    part[0], part[-1] = 0.0, 1.0
-    return part
+        share = (after - before) / (2.0 * half * to_time)
+    share[0], share[-1] = 0.0, 1.0
+    return share
 
 
 def pulsed_signal(
@@ -308,7 +262,7 @@ def pulsed_signal(
     Parameters
     ----------
     distance : ndarray, m, shape (bins,)
-        Ranges (c / 2 times the time) at which the signal is wanted: bin centres.
+        Ranges (c / 2 times the time) of the signal: bin centres.
     extinction : ndarray, m-1, shape (points,)
         At the wavelength of the laser.
     backscatter : ndarray, m-1 sr-1, shape (points,)
@@ -316,24 +270,24 @@ def pulsed_signal(
     pulse : Pulse, optional
         None for a pulse without length.
     bin_width : float, m, optional
-        Over which the detector takes the mean; None for the power at the range itself.
+        Over which the detector averages; None for the power at the range itself.
     full_overlap_range : float, m
-        Of `SineOverlap`, where no overlap is given.
+        Of `SineOverlap`; used where no overlap is given.
     overlap : Overlap, optional
     returning_extinction : ndarray, m-1, shape (points,), optional
-        At the wavelength of the detector (Raman); that of the laser where not given.
+        At the wavelength of the detector (Raman); by default that of the laser.
     path : ndarray, m, shape (points,), optional
-        Ranges of the optical properties, straight between them and constant outside; `distance`
-        where not given.
+        Ranges of the optical properties, which are linear between them and constant outside;
+        by default `distance`.
     resolution : float, m, optional
-        Longest cell of the quadrature, see `response`.
+        Longest cell of the quadrature; see `response`.
 
     Raises
     ------
     SimulationInputError
-        Where a property is negative, the pulse is as long as the range, or the pulse still
-        leaves while light returns from ranges where the overlap does not vanish with the square
-        of the range, so that the signal would be infinite.
+        If a property is negative, the pulse is as long as the range, or the signal would be
+        infinite: light returns while the pulse still leaves, and the overlap does not vanish
+        with the square of the range.
 
     References
     ----------
@@ -349,7 +303,7 @@ def pulsed_signal(
         full, seen = shape.full_overlap_range, np.empty((0, 0))
     else:
         full, seen = math.nan, shape(_positions(distance, cells.edges))
-    signal: Array = _summed(distance, cells.edges, cells.density, *points, full, seen)
+    signal: Array = _sum_cells(distance, cells.edges, cells.density, *points, full, seen)
     return system_constant * signal
 
 
@@ -374,7 +328,7 @@ def _refuse_near(distance: Array, cells: Response, shape: Overlap) -> None:
 def _points(
     path: Array, extinction: Array, backscatter: Array, returning: Array | None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return range, extinction both ways, optical depth both ways and backscatter from R = 0."""
+    """Return range, two-way extinction, two-way optical depth and backscatter from R = 0 on."""
     _checks.ascending("path", path)
     _checks.profile("extinction", extinction, path.shape, "m-1")
     _checks.profile("backscatter", backscatter, path.shape, "m-1 sr-1")
@@ -391,7 +345,7 @@ def _points(
 
 
 def _positions(distance: Array, edges: Array) -> Array:
-    """Return where `_summed` takes each cell, shape (bins, cells)."""
+    """Return the range at which `_sum_cells` evaluates each cell, m, shape (bins, cells)."""
     far = distance[:, None] - edges[:-1]
     near = distance[:, None] - edges[1:]
     return np.where(near > 0.0, np.sqrt(np.abs(near * far)), 0.5 * np.maximum(far, 0.0))
@@ -403,7 +357,7 @@ def _density(z: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _summed(
+def _sum_cells(
     distance: Any,
     edges: Any,
     density: Any,
@@ -427,7 +381,7 @@ def _summed(
             if near > 0.0:
                 square = near * far
                 r, weight = math.sqrt(square), (edges[i + 1] - edges[i]) / square
-            else:  # the lidar lies in the cell: overlap over R^2 is even there
+            else:  # the lidar lies in the cell, where overlap over R^2 is constant
                 r = 0.5 * far
                 weight = far / r**2
             while k < last and grid[k + 1] < r:
@@ -435,11 +389,11 @@ def _summed(
             while k > 0 and grid[k] > r:
                 k -= 1
             x = r - grid[k]
-            part = min(x * inverse[k], 1.0)
+            share = min(x * inverse[k], 1.0)
             inside = min(x, grid[k + 1] - grid[k])
             slope = both[k + 1] - both[k]
-            tau = depth[k] + inside * (both[k] + 0.5 * slope * part) + (x - inside) * both[k + 1]
-            value = backscatter[k] + (backscatter[k + 1] - backscatter[k]) * part
+            tau = depth[k] + inside * (both[k] + 0.5 * slope * share) + (x - inside) * both[k + 1]
+            value = backscatter[k] + (backscatter[k + 1] - backscatter[k]) * share
             if seen.size:
                 value *= seen[j, i]
             elif r < full:

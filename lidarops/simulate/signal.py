@@ -1,7 +1,6 @@
-"""The lidar equation forward: optical properties along a beam to photoelectron rate.
+"""The lidar equation for a short pulse: from optical properties along a beam to a signal.
 
-Signals here belong to a pulse that is short against the bin; `lidarops.simulate.pulse` has those
-of a pulse of any length and shape.
+`lidarops.simulate.pulse` computes the signal of a pulse of any length and shape.
 """
 
 from __future__ import annotations
@@ -18,24 +17,19 @@ from lidarops.simulate.overlap import Overlap, SineOverlap
 Array = NDArray[np.float64]
 
 _FARTHEST: Final = 1.0e9
-"""m, of any lidar: the Moon."""
+"""m: the Moon is nearer, and no lidar reaches farther."""
 
 
 def bin_centres(bins: int, bin_width: float, offset: float = 0.0) -> Array:
     """Return the range of the centres of bins, m: (j + 1/2) bin_width + offset.
 
-    A bin holds what returns while it is open, so its signal belongs to its centre; at its start
-    the lidar equation would be off by bin_width / R.
+    A bin holds the light that returns while it is open, so its signal belongs to its centre. At
+    the start of the bin the lidar equation would be off by bin_width / R.
     """
     _checks.not_negative("bins", bins)
     _checks.positive("bin_width", bin_width, "m")
     _checks.between("offset", offset, -_FARTHEST, _FARTHEST, "m")
     return (np.arange(bins, dtype=np.float64) + 0.5) * bin_width + offset
-
-
-def overlap(distance: Array, full_overlap_range: float) -> Array:
-    """Return the overlap of beam and field of view: see `SineOverlap`."""
-    return SineOverlap(full_overlap_range)(distance)
 
 
 def optical_depth(distance: Array, extinction: Array) -> Array:
@@ -50,8 +44,8 @@ def optical_depth(distance: Array, extinction: Array) -> Array:
 
     Notes
     -----
-    The extinction is taken as constant within a bin and, from the lidar to the first bin, as in
-    that bin: exact where it is constant. Nothing attenuates before the pulse leaves (R <= 0).
+    The extinction is taken as constant within a bin, and as that of the first bin from the lidar
+    to there: exact for constant extinction. Nothing attenuates before the pulse leaves (R <= 0).
     """
     edges = np.concatenate([[0.0], 0.5 * (distance[1:] + distance[:-1])])
     before = np.clip(edges, 0.0, None)
@@ -62,7 +56,7 @@ def optical_depth(distance: Array, extinction: Array) -> Array:
 
 
 def transmission(distance: Array, extinction: Array) -> Array:
-    """Return the one-way transmission to each bin centre by the law of Beer and Lambert, 1.
+    """Return the one-way transmission to each bin centre (Beer-Lambert law), 1.
 
     References
     ----------
@@ -73,7 +67,7 @@ def transmission(distance: Array, extinction: Array) -> Array:
 
 
 def isotropic_backscatter(number_density: Array | float, cross_section: float) -> Array:
-    r"""Return the backscatter of isotropic scatterers of one kind, m-1 sr-1.
+    r"""Return the backscatter coefficient of isotropic scatterers of one kind, m-1 sr-1.
 
     Parameters
     ----------
@@ -110,39 +104,39 @@ def backscatter_signal(
     Parameters
     ----------
     distance : ndarray, m, shape (bins,)
-        Range of the bin centres. Bins at or before the lidar (R <= 0) hold no signal.
+        Range of the bin centres. Bins at R <= 0 hold no signal.
     extinction : ndarray, m-1, shape (bins,)
         At the wavelength of the laser.
     backscatter : ndarray, m-1 sr-1, shape (bins,)
-        From the wavelength of the laser into that of the detector.
+        From the laser wavelength into the detected wavelength.
     system_constant : float, MHz m3 sr
-        Or W m3 sr, for a power; see `lidarops.simulate.lidar.Lidar`.
+        Or W m3 sr for a power; see `lidarops.simulate.lidar.Lidar`.
     full_overlap_range : float, m
-        Of `SineOverlap`, where no overlap is given.
+        Of `SineOverlap`; used where no overlap is given.
     overlap : Overlap, optional
     returning_extinction : ndarray, m-1, shape (bins,), optional
-        At the wavelength of the detector, where the scattering changes it (Raman); that of the
-        laser where not given.
+        At the detected wavelength, where scattering changes it (Raman); by default that of the
+        laser.
 
     Raises
     ------
     SimulationInputError
-        Where a property is negative or not finite, or the ranges do not ascend.
+        If a property is negative or not finite, or the ranges do not ascend.
 
     Notes
     -----
     .. math:: P(R) = K O(R) \beta(R) R^{-2} \exp(-\tau_L(R) - \tau_\lambda(R))
 
-    at the bin centre, for a pulse that is short against the bin. Against the mean over the bin
-    it is low by :math:`((1/R + \sigma)^2 + 1/(2 R^2)) \Delta R^2 / 6` of itself: 1.6e-4 at 300 m
+    at the bin centre, for a pulse that is short against the bin. It is less than the mean over
+    the bin by the fraction :math:`((1/R + \sigma)^2 + 1/(2 R^2)) \Delta R^2 / 6`: 1.6e-4 at 300 m
     for bins of 7.5 m.
 
     References
     ----------
-    `vasylkivskyi2022`, equations 15 and 22 (23, where both wavelengths are one), attached to the
+    `vasylkivskyi2022`, equations 15 and 22 (23 where both wavelengths are equal), taken at the
     bin centre.
     """
-    _refuse_axis(distance)
+    _check_ranges(distance)
     _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
     _checks.profile("extinction", extinction, distance.shape, "m-1")
     _checks.profile("backscatter", backscatter, distance.shape, "m-1 sr-1")
@@ -151,13 +145,13 @@ def backscatter_signal(
     both_ways = extinction + (extinction if returning_extinction is None else returning_extinction)
     positive = distance > 0.0
     safe = np.where(positive, distance, 1.0)
-    shape = overlap or SineOverlap(full_overlap_range)
-    gathered = shape(distance) * backscatter / safe**2
+    overlap = overlap or SineOverlap(full_overlap_range)
+    gathered = overlap(distance) * backscatter / safe**2
     transmitted = np.exp(-optical_depth(distance, both_ways))
     return np.where(positive, system_constant * gathered * transmitted, 0.0)
 
 
-def _refuse_axis(distance: Array) -> None:
+def _check_ranges(distance: Array) -> None:
     if distance.ndim != 1 or distance.size > 1:
         _checks.ascending("distance", distance)
     if not np.all(np.abs(distance[-1:]) <= _FARTHEST):

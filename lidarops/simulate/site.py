@@ -1,4 +1,4 @@
-"""One simulated instrument: what is simulated, where it stands, and which files it writes."""
+"""One simulated instrument: its settings and place, and the files that it writes."""
 
 from __future__ import annotations
 
@@ -23,59 +23,59 @@ from lidarops.campaign.simulation import (
 from lidarops.errors import CampaignError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.damage import FOREIGN_NAME
-from lidarops.simulate.dialects import DIALECTS, Dialect, Place, tail
+from lidarops.simulate.dialects import DIALECTS, Dialect, Place, name_suffix
 
 EARTH_RADIUS: Final = 6_371_008.8
 """m, mean radius."""
 
 _MASK: Final = (1 << 64) - 1
 
-TWIN: Final = ".copy"
-"""What follows the name of a file in the name of its duplicate."""
+_COPY_SUFFIX: Final = ".copy"
+"""End of the name of a duplicate, after the name of the file."""
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """One file to be written."""
+class PlannedFile:
+    """One file that will be written."""
 
     role: Role
     index: int
-    """From 0, among the files of that role."""
-    twin: bool = False
-    """Whether it is the copy of a file under another name."""
+    """Index from 0 among the files of that role."""
+    copy: bool = False
+    """Whether it is a copy of a file under another name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """One simulated instrument: what is simulated, what the campaign knows of it, where it is."""
+    """One simulated instrument: its simulation settings, campaign facts and place."""
 
     key: str
-    """Of the instrument in the campaign."""
+    """Key of the instrument in the campaign."""
     settings: SimulationSettings
     instrument: Instrument
     station: Station
     origin: Station
-    """Of the frame in which the air in front of it is described."""
+    """Origin of the coordinates of the air."""
     folder: Mapping[Role, str]
-    """Folder of the files in the archive, with a final slash where it is not the root."""
+    """Folder of the files in the archive, with a final slash unless it is the root."""
     prefix: Mapping[Role, str]
     """First letters of the file names."""
     damage: Mapping[int, DamageKind]
-    """What is wrong with signal files, as far as it was said file by file."""
+    """Damage of single signal files, by index; random damage is not included."""
 
     @property
     def simulated(self) -> SimulatedInstrument:
-        """What is simulated."""
+        """Simulation settings of the instrument."""
         return self.settings.instruments[self.key]
 
     @property
     def dialect(self) -> Dialect:
-        """Whose headers the files have."""
+        """Dialect of the headers."""
         return DIALECTS[self.simulated.acquisition.dialect]
 
     @property
     def place(self) -> Place:
-        """Where the instrument stands, as its headers say it."""
+        """Name and position of the instrument, as in its headers."""
         station = self.station
         pair = station.longitude, station.latitude
         if self.instrument.header_position == "latitude_first":
@@ -86,12 +86,12 @@ class Site:
 
     @property
     def position(self) -> tuple[float, float, float]:
-        r"""Metres east, north and above the origin: flat, as fits a network of lidars.
+        r"""Position east, north and above the origin, m, on a flat Earth.
 
         Notes
         -----
-        East at the middle latitude :math:`r (\lambda - \lambda_0) \cos((\phi + \phi_0) / 2)`,
-        north :math:`r (\phi - \phi_0)`, on a sphere.
+        East, at the middle latitude, :math:`r (\lambda - \lambda_0) \cos((\phi + \phi_0) / 2)`,
+        north :math:`r (\phi - \phi_0)`, with the mean radius r of the Earth.
         """
         middle = math.radians(0.5 * (self.station.latitude + self.origin.latitude))
         turn = (self.station.longitude - self.origin.longitude + 180.0) % 360.0 - 180.0
@@ -100,70 +100,72 @@ class Site:
         return east, north, self.station.altitude - self.origin.altitude
 
     def damage_of(self, index: int) -> DamageKind | None:
-        """Return what is wrong with the signal file `index`."""
-        chance = self.simulated.random_damage
-        if index in self.damage or chance is None:
+        """Return the damage of the signal file `index`; None for a good file."""
+        random_damage = self.simulated.random_damage
+        if index in self.damage or random_damage is None:
             return self.damage.get(index)
-        lot, kind = _words(self.settings.seed, f"{self.key}/damage", index)
-        if lot >= chance.fraction * 2.0**32:
+        draw, kind = _random_words(self.settings.seed, f"{self.key}/damage", index)
+        if draw >= random_damage.fraction * 2.0**32:
             return None
-        return chance.kinds[kind % len(chance.kinds)]
+        return random_damage.kinds[kind % len(random_damage.kinds)]
 
     def start_of(self, role: Role, index: int) -> datetime:
-        """Return when a file starts, by the true time."""
+        """Return the start of a file in true time."""
         if role is Role.DARK:
             return self.settings.start_of_dark(self.key, index)
         return self.settings.start_of(self.key, index)
 
     def acquisition_of(self, role: Role, index: int) -> Acquisition:
-        """Return how a file is taken: dark files as those of the start or of the end."""
+        """Return the acquisition settings of a file, dark files included."""
         return self.simulated.acquisition.at(self.start_of(role, index))
 
-    def orders(self) -> Iterator[Order]:
-        """Yield every file of the instrument: dark ones, then signal ones in time."""
+    def planned_files(self) -> Iterator[PlannedFile]:
+        """Yield every file of the instrument: dark files first, then signal files in time."""
         acquisition = self.simulated.acquisition
         for index in range(acquisition.dark_files):
-            yield Order(Role.DARK, index)
+            yield PlannedFile(Role.DARK, index)
         for index in range(self.settings.files(self.key)):
             if acquisition.is_missing(self.start_of(Role.SIGNAL, index)):
                 continue
-            yield Order(Role.SIGNAL, index)
+            yield PlannedFile(Role.SIGNAL, index)
             if self.damage_of(index) is DamageKind.DUPLICATE:
-                yield Order(Role.SIGNAL, index, twin=True)
+                yield PlannedFile(Role.SIGNAL, index, copy=True)
 
-    def path_of(self, order: Order) -> str:
+    def path_of(self, planned: PlannedFile) -> str:
         """Return the path of a file in the archive.
 
-        Names are Licel's: prefix, two digits of the year, month in hexadecimal, day, hour, and
+        Names follow Licel: prefix, two digits of the year, month in hexadecimal, day, hour, and
         after the point minute, second and hundredths of a second, all of the stop time.
         """
-        folder, prefix = self.folder[order.role], self.prefix[order.role]
-        kind = self.damage_of(order.index) if order.role is Role.SIGNAL else None
+        folder, prefix = self.folder[planned.role], self.prefix[planned.role]
+        kind = self.damage_of(planned.index) if planned.role is Role.SIGNAL else None
         if kind is DamageKind.FOREIGN:
-            return f"{folder}{prefix}{order.index}{FOREIGN_NAME}"
-        name = self.name_of(order)
+            return f"{folder}{prefix}{planned.index}{FOREIGN_NAME}"
+        name = self.name_of(planned)
         if kind is DamageKind.RENAMED:
             name = f"{prefix}_{name}"
-        return folder + name + (TWIN if order.twin else "")
+        return folder + name + (_COPY_SUFFIX if planned.copy else "")
 
-    def name_of(self, order: Order) -> str:
-        """Return the name of a file as its header has it."""
-        start = self.start_of(order.role, order.index)
+    def name_of(self, planned: PlannedFile) -> str:
+        """Return the name of a file in its header."""
+        start = self.start_of(planned.role, planned.index)
         jumps, error = self.simulated.acquisition.clock_error(start)
-        stop = start + self.duration_of(order) + error
-        end = tail(self.dialect, stop, jumps)
-        return f"{self.prefix[order.role]}{stop:%y}{stop.month:X}{stop:%d%H}.{end}"
+        stop = start + self.duration_of(planned) + error
+        suffix = name_suffix(self.dialect, stop, jumps)
+        return f"{self.prefix[planned.role]}{stop:%y}{stop.month:X}{stop:%d%H}.{suffix}"
 
-    def duration_of(self, order: Order) -> timedelta:
-        """Return how long a file takes."""
-        return timedelta(seconds=self.acquisition_of(order.role, order.index).duration)
+    def duration_of(self, planned: PlannedFile) -> timedelta:
+        """Return the duration of a file."""
+        return timedelta(seconds=self.acquisition_of(planned.role, planned.index).duration)
 
-    def pointing_of(self, order: Order, facts: InstrumentFacts) -> tuple[float, float | None]:
-        """Return zenith angle and azimuth of a file, degree; None where nobody knows it."""
+    def pointing_of(
+        self, planned: PlannedFile, facts: InstrumentFacts
+    ) -> tuple[float, float | None]:
+        """Return zenith angle and azimuth of a file, degree; the azimuth is None if unknown."""
         scan = self.simulated.pointing
         if scan is not None:
             cycle = scan.cycle()
-            return cycle[order.index % len(cycle)]
+            return cycle[planned.index % len(cycle)]
         if facts.zenith_angle is not None:
             return facts.zenith_angle, facts.azimuth
         level = isinstance(self.simulated, HorizontalPath)
@@ -171,43 +173,43 @@ class Site:
 
 
 def channel_name(mode: DetectionMode, detector: Detector) -> str:
-    """Return the name of a channel, as the reader of raw files makes it from the header."""
+    """Return the name of a channel, as the reader of raw files derives it from the header."""
     return f"{mode.value}_{detector.label}"
 
 
 def modes(detector: Detector) -> tuple[DetectionMode, ...]:
-    """Return how a detector is read, in the order of the datasets in a file."""
+    """Return the detection modes of a detector, in the order of the datasets in a file."""
     analog = () if detector.analog is None else (DetectionMode.ANALOG,)
     photon = () if detector.photon is None else (DetectionMode.PHOTON,)
     return analog + photon
 
 
-def dead_time(site: Site, start: datetime, channel: str) -> float:
+def photon_dead_time(site: Site, start: datetime, channel: str) -> float:
     """Return the dead time of a photon counter at the start of a file, s, from the campaign.
 
     Raises
     ------
     CampaignError
-        Where the facts of the instrument give none.
+        If the facts of the instrument give none.
     """
-    known = channel_facts(site.instrument.facts_at(start), channel).dead_time
-    if known is None:
+    seconds = channel_facts(site.instrument.facts_at(start), channel).dead_time
+    if seconds is None:
         raise CampaignError(
             f"the facts give no dead time at {start:%Y-%m-%d %H:%M} UTC",
             field=f"instruments.{site.key}.facts.channels.{channel}.dead_time",
-            remedy="give one, in s: the simulation takes it from the facts",
+            remedy="give one in s: the simulation takes it from the facts",
         )
-    return known
+    return seconds
 
 
 def random_stream(seed: int, key: str, role: Role, index: int) -> np.random.Generator:
-    """Return the random numbers of one file: the same whatever else is simulated, and when."""
+    """Return the random generator of one file; it depends on no other file."""
     words = [seed, zlib.crc32(f"{key}/{role.value}".encode()), index]
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
 
 
-def _words(seed: int, purpose: str, index: int) -> tuple[int, int]:
-    """Return two numbers of 32 bits (splitmix64), in a fraction of the time of a generator."""
+def _random_words(seed: int, purpose: str, index: int) -> tuple[int, int]:
+    """Return two random numbers of 32 bits (splitmix64), much faster than a generator."""
     word = (seed ^ zlib.crc32(purpose.encode()) << 32) + (index + 1) * 0x9E3779B97F4A7C15
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):
         word &= _MASK

@@ -1,4 +1,4 @@
-"""What a perfect retrieval would find in a simulated campaign, column by column."""
+"""Truth of a simulated campaign: the values that a perfect retrieval would return."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from lidarops.records import DetectionMode
 Array = NDArray[np.float64]
 
 _SAME = 1e-9
-"""Relative difference below which two extinctions are the same."""
+"""Relative difference below which two extinctions count as equal."""
 _FINE = 30.0
-"""m, longest of the cells near the lidar: an optical depth between their ends, taken linearly, is
-off by less than the extinction changes within one times an eighth of that."""
+"""m, longest cell near the lidar. Linear interpolation of the optical depth within a cell errs by
+less than an eighth of the cell times the change of extinction across it."""
 _FINE_UP_TO = 12_000.0
-"""m, from the lidar: beyond, an elastic signal seldom tells more than means over some 100 m."""
+"""m from the lidar. Beyond, an elastic signal seldom resolves less than some 100 m."""
 _COARSE = 64
-"""Most cells beyond."""
+"""Largest number of cells beyond."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelTruth:
-    """What a retrieval should find in one channel of one file."""
+    """True values of one channel of one file."""
 
     extinction: float
-    """m-1; NaN where the path is not homogeneous."""
+    """m-1; NaN if the path is not homogeneous."""
     background: float
     """Sky light: MHz before dead time, or mV without the dark offset."""
     amplitude: float
-    """B of P = P* + B R^-2 exp(-2 sigma R), MHz m2 or mV m2; NaN where not homogeneous."""
+    """B of P = P* + B R^-2 exp(-2 sigma R), MHz m2 or mV m2; NaN if not homogeneous."""
     dark_offset: float
     """mV; NaN for photon counting."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProfileTruth:
-    """The air on the beam of one file, coarse in range."""
+    """The air along the beam of one file, in coarse range cells."""
 
     extinction: NDArray[np.float32]
     """m-1, mean over each cell, shape (wavelengths, cells)."""
@@ -55,7 +55,7 @@ class ProfileTruth:
 
 @dataclass(frozen=True, slots=True)
 class FileTruth:
-    """What is known of one simulated file."""
+    """True values of one simulated file."""
 
     path: str
     """In the archive, with forward slashes."""
@@ -63,19 +63,20 @@ class FileTruth:
     time: datetime
     """Middle of the file, by the true time."""
     zenith_angle: float
+    """degree."""
     azimuth: float
-    """NaN where nobody knows it."""
+    """degree; NaN if unknown."""
     clock_error: float
     """s, clock of the computer minus true time."""
     energy: float
-    """Of the laser, relative to its energy at the start."""
+    """Laser energy relative to its energy at the start."""
     channels: Mapping[str, ChannelTruth]
     damage: DamageKind | None
     profile: ProfileTruth | None = None
 
     @property
     def extinction(self) -> float:
-        """The extinction, m-1, that all channels see; NaN where they do not see one."""
+        """Extinction that all channels share, m-1; NaN if they do not share one."""
         values = [channel.extinction for channel in self.channels.values()]
         first = values[0]
         alike = all(abs(value - first) <= _SAME * first for value in values)
@@ -83,55 +84,55 @@ class FileTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
-    """Where the truth of an instrument's profiles is told."""
+class TruthGrid:
+    """Range cells and files of the true profiles of an instrument."""
 
     instrument: str
     wavelengths: tuple[float, ...]
-    """m"""
+    """m."""
     bin_width: float
-    """m, of the bins that the cells are made of."""
+    """m, of the bins within the cells."""
     stops: NDArray[np.intp]
-    """Where cells start and end, in bins from 0, shape (cells + 1,)."""
-    every: int
-    """A profile of every how many files."""
+    """Edges of the cells, in bins from 0, shape (cells + 1,)."""
+    stride: int
+    """A profile is stored for every `stride`-th file."""
 
     @property
     def suffix(self) -> str:
-        """The instrument in the names of variables, which hold no hyphens."""
+        """The instrument in variable names, without hyphens."""
         return self.instrument.replace("-", "_")
 
     @property
     def edges(self) -> Array:
-        """Where cells start and end, m."""
+        """Edges of the cells, m."""
         return self.stops.astype(np.float64) * self.bin_width
 
     def mean(self, values: Array) -> NDArray[np.float32]:
-        """Return the mean over every cell of values in bins, shape (wavelengths, bins)."""
+        """Return the mean over each cell of values in bins, shape (wavelengths, bins)."""
         sums = np.add.reduceat(values, self.stops[:-1], axis=-1)
         return (sums / np.diff(self.stops)).astype(np.float32)
 
     def depth(self, extinction: Array) -> NDArray[np.float32]:
-        """Return the optical depth from the lidar to the end of every cell."""
+        """Return the optical depth from the lidar to the far end of each cell."""
         depth = np.cumsum(extinction * self.bin_width, axis=-1)
         return depth[:, self.stops[1:] - 1].astype(np.float32)
 
 
 def cell_stops(bins: int, bin_width: float, cells: int | None) -> NDArray[np.intp]:
-    """Return where the cells of a truth start and end.
+    """Return the edges of the range cells of the truth.
 
     Parameters
     ----------
     bins : int
-    bin_width : float
-        m.
+    bin_width : float, m
     cells : int or None
-        Equally long, to a bin, and no more than bins. Where None, cells of 30 m (to the bin
-        below; one bin, where bins are longer) up to 12 km and at most 64 longer ones beyond.
+        Number of cells of equal length (to a bin), at most one per bin. None: cells of 30 m,
+        rounded down to whole bins but at least one bin, up to 12 km, and at most 64 longer cells
+        beyond.
 
     Returns
     -------
-    (cells + 1,) int
+    ndarray of int, shape (cells + 1,)
         Bins from 0.
     """
     if cells is not None:
@@ -148,17 +149,17 @@ def _evenly(start: int, stop: int, cells: int) -> NDArray[np.intp]:
 
 
 class TruthTable:
-    """The truth of a campaign: one row a granule, filled in any order.
+    """Truth of a campaign: one row per granule, filled in any order.
 
     Parameters
     ----------
     rows : int
-        Granules.
-    grids : sequence of Grid
-        Of the instruments.
+        Number of granules.
+    grids : mapping of str to TruthGrid
+        By instrument.
     """
 
-    def __init__(self, rows: int, grids: Mapping[str, Grid]) -> None:
+    def __init__(self, rows: int, grids: Mapping[str, TruthGrid]) -> None:
         self._grids = grids
         self._paths = np.full(rows, "", dtype=object)
         self._instruments = np.full(rows, "", dtype=object)
@@ -176,9 +177,9 @@ class TruthTable:
         self._times[row] = np.datetime64(truth.time.replace(tzinfo=None), "ns")
         for name, column in self._facts.items():
             column[row] = getattr(truth, name)
-        for channel, known in truth.channels.items():
+        for channel, values in truth.channels.items():
             for quantity in _quantities(channel):
-                self._column(channel, quantity)[row] = getattr(known, quantity)
+                self._column(channel, quantity)[row] = getattr(values, quantity)
         if truth.profile is not None:
             self._profiles[truth.instrument][row] = truth.profile
 
@@ -192,7 +193,7 @@ class TruthTable:
         """Return the truth as a dataset; see `lidarops.simulate.campaign.simulate_campaign`."""
         handling = {"": ""} | {kind.value: kind.handling.value for kind in DamageKind}
         extinction = self._facts["extinction"]
-        told = [handling[str(kind)] for kind in self._damage]
+        handled = [handling[str(kind)] for kind in self._damage]
         truth = xr.Dataset(
             {
                 "path": _row(self._text(self._paths), "path of the raw file in the archive"),
@@ -204,28 +205,28 @@ class TruthTable:
                     if name == "extinction" or np.isfinite(self._facts[name]).any()
                 },
                 "homogeneous": _row(
-                    np.isfinite(extinction).astype(np.int8), "1 where the path is homogeneous", "1"
+                    np.isfinite(extinction).astype(np.int8), "1 if the path is homogeneous", "1"
                 ),
                 "damage": _row(
                     self._text(self._damage),
-                    "what is wrong with the raw file; empty where nothing is",
+                    "kind of damage of the raw file; empty for good files",
                 ),
                 "handling": _row(
-                    self._text(np.array(told, dtype=object)),
-                    "what a correct chain does with a damaged raw file: "
+                    self._text(np.array(handled, dtype=object)),
+                    "correct handling of the damaged raw file: "
                     + ", ".join(handling.value for handling in Handling),
                 ),
                 "refused": _row(
-                    np.array([each == Handling.REFUSE for each in told], dtype=np.int8),
-                    "1 where a correct reader must refuse the raw file",
+                    np.array([action == Handling.REFUSE for action in handled], dtype=np.int8),
+                    "1 if a correct reader must refuse the raw file",
                     "1",
                 ),
             },
             attrs={
                 "title": f"Truth of the simulated campaign {campaign}",
                 "comment": "P = P* + B R^-2 exp(-2 sigma R) beyond full overlap, with sigma in"
-                " extinction and B in amplitude. P* is the background (sky light) where dark files"
-                " were subtracted, background plus dark_offset where not. Photon counting: rates"
+                " extinction and B in amplitude. P* is the background (sky light) if dark files"
+                " were subtracted, else background plus dark_offset. Photon counting: rates"
                 " before dead time.",
             },
         )
@@ -242,7 +243,7 @@ class TruthTable:
 
 
 _FACTS = {
-    "extinction": ("extinction coefficient of air, all of the homogeneous path", "m-1"),
+    "extinction": ("extinction coefficient of the air on a homogeneous path", "m-1"),
     "zenith_angle": ("zenith angle of the beam, 0 = up", "degree"),
     "azimuth": ("azimuth of the beam, clockwise from north", "degree"),
     "clock_error": ("clock of the instrument minus true time", "s"),
@@ -254,41 +255,45 @@ def _quantities(channel: str) -> dict[str, tuple[str, str]]:
     mode, _, label = channel.partition("_")
     analog = mode == DetectionMode.ANALOG
     units = "mV" if analog else "MHz"
-    told = {
+    quantities = {
         "extinction": (f"extinction coefficient of the homogeneous path, {label}", "m-1"),
         "background": (f"sky light, {mode} {label}", units),
         "amplitude": (f"amplitude B of the backscattered signal, {mode} {label}", f"{units} m2"),
     }
-    dark = {"dark_offset": (f"signal without any light, {mode} {label}", units)}
-    return told | dark if analog else told
+    dark = {"dark_offset": (f"signal without light, {mode} {label}", units)}
+    return quantities | dark if analog else quantities
 
 
-def _profiles(grid: Grid, profiles: Mapping[int, ProfileTruth]) -> xr.Dataset:
+def _profiles(grid: TruthGrid, profiles: Mapping[int, ProfileTruth]) -> xr.Dataset:
     rows = sorted(profiles)
-    about = grid.suffix
-    dims = (f"profile_{about}", f"wavelength_{about}", f"range_{about}")
+    suffix = grid.suffix
+    dims = (f"profile_{suffix}", f"wavelength_{suffix}", f"range_{suffix}")
     coordinates = {
-        f"wavelength_{about}": (dims[1], np.array(grid.wavelengths), _told("wavelength", "m")),
-        f"range_{about}": (
+        f"wavelength_{suffix}": (
+            dims[1],
+            np.array(grid.wavelengths),
+            _attributes("wavelength", "m"),
+        ),
+        f"range_{suffix}": (
             dims[2],
             0.5 * (grid.edges[1:] + grid.edges[:-1]),
-            _told("middle of a range cell, from the lidar", "m"),
+            _attributes("middle of a range cell, from the lidar", "m"),
         ),
     }
     far = "far end of a range cell, from the lidar"
     return xr.Dataset(
         {
-            f"profile_granule_{about}": (
+            f"profile_granule_{suffix}": (
                 dims[0],
                 np.array(rows, dtype=np.int32),
-                _told("which granule the profile belongs to, from 0", "1"),
+                _attributes("index of the granule of the profile, from 0", "1"),
             ),
-            f"range_end_{about}": (dims[2], grid.edges[1:], _told(far, "m")),
+            f"range_end_{suffix}": (dims[2], grid.edges[1:], _attributes(far, "m")),
             **{
-                f"profile_{name}_{about}": (
+                f"profile_{name}_{suffix}": (
                     dims,
                     np.stack([getattr(profiles[row], name) for row in rows]),
-                    _told(long_name, units),
+                    _attributes(long_name, units),
                 )
                 for name, (long_name, units) in _PROFILES.items()
             },
@@ -304,7 +309,7 @@ _PROFILES = {
 }
 
 
-def _told(long_name: str, units: str) -> dict[str, str]:
+def _attributes(long_name: str, units: str) -> dict[str, str]:
     return {"long_name": long_name, "units": units}
 
 

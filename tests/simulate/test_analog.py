@@ -16,8 +16,6 @@ from lidarops.simulate.analog import (
     digitise,
     digitise_fast,
     sample_moments,
-    slow_baseline,
-    sum_voltage,
 )
 from lidarops.simulate.photoelectrons import release
 
@@ -207,34 +205,6 @@ def test_a_signal_below_a_step_is_still_in_the_mean():
     assert summed.mean() / 2000 == pytest.approx(10.3 + 1e-3, abs=4.5 * error)
 
 
-def test_offset_and_baseline_are_electronic():
-    bins, shots = 4000, 400
-    baseline = slow_baseline(bins, BIN_TIME, amplitude=2.0, decay=20e-6)
-    assert baseline[0] == pytest.approx(2.0, rel=2e-3)
-    assert baseline[400] == pytest.approx(2.0 * np.exp(-400.5 * 50e-9 / 20e-6))
-    random = np.random.default_rng(71)
-    light = release(np.zeros(bins), shots=shots, bin_width=BIN_WIDTH, random=random)
-    summed = digitise(light, RECORDER, random=random, offset=1.0, baseline=baseline)
-    voltage = sum_voltage(summed, RECORDER, shots=shots)
-    noise = RECORDER.noise / np.sqrt(shots)
-    residual = voltage - 1.0 - baseline
-    assert residual.std() == pytest.approx(noise, rel=0.1)
-    assert residual.reshape(20, -1).mean(axis=1) == pytest.approx(0, abs=4.5 * noise / 200**0.5)
-    fast = digitise_fast(
-        light.rate, RECORDER, shots=shots, bin_time=BIN_TIME, random=random, offset=1.0,
-        baseline=baseline,
-    )  # fmt: skip
-    assert (fast - summed).mean() * RECORDER.step / shots == pytest.approx(0, abs=noise / 8)
-    with pytest.raises(SimulationInputError, match="baseline"):
-        digitise(light, RECORDER, random=random, baseline=np.zeros(3))
-
-
-def test_the_dark_offset_drifts_in_time_but_not_below_zero():
-    recorder = Digitiser(gain=1.0, noise=0.3, dark_offset=3.0, dark_drift=-0.5)
-    assert recorder.offset_at(2.0) == pytest.approx(2.0)
-    assert recorder.offset_at(50.0) == 0.0
-
-
 def test_without_shots_nothing_is_measured():
     random = np.random.default_rng(0)
     light = release(np.full(20, 5.0), shots=0, bin_width=BIN_WIDTH, random=random)
@@ -242,7 +212,6 @@ def test_without_shots_nothing_is_measured():
     fast = digitise_fast(light.rate, RECORDER, shots=0, bin_time=BIN_TIME, random=random)
     assert not summed.any()
     assert not fast.any()
-    assert np.all(np.isnan(sum_voltage(summed, RECORDER, shots=0)))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.counting import count_fast, count_photons, count_rate, counter_moments
+from lidarops.simulate.counting import count_fast, count_photons, counter_moments
 from lidarops.simulate.photoelectrons import BRIGHTEST, release
 
 BIN_WIDTH = 7.5
@@ -177,12 +177,10 @@ def test_without_shots_nothing_is_measured():
     light = release(np.full(100, 50.0), shots=0, bin_width=BIN_WIDTH, random=random)
     counted = count_photons(light, dead_time=DEAD_TIME, random=random)
     assert not counted.any()
-    assert np.all(np.isnan(count_rate(counted, shots=0, bin_time=BIN_TIME)))
     fast = count_fast(
         np.full(9, 3.0), shots=0, bin_time=BIN_TIME, dead_time=DEAD_TIME, random=random
     )
     assert not fast.any()
-    assert count_rate(np.array([3]), shots=10, bin_time=BIN_TIME)[0] == pytest.approx(6.0)
 
 
 def test_absurd_light_is_refused_by_name():

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
+from lidarops.campaign.simulation import LaserDrift
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.instrument import (
-    Digitiser,
-    Laser,
-    count_photons,
-    digitise,
-    release,
-    seen_from,
-)
+from lidarops.simulate.analog import Digitiser, digitise
+from lidarops.simulate.counting import count_photons
+from lidarops.simulate.laser import laser_energy
+from lidarops.simulate.photoelectrons import delay_recorder, release
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 BIN_WIDTH = 7.5
@@ -80,8 +78,8 @@ def test_the_lag_of_two_recorders_is_in_their_noise(lag):
     photon, analog = [], []
     for _ in range(files):
         light = release(axis, shots=shots, bin_width=BIN_WIDTH, random=random)
-        early = seen_from(light, lead, bins, random=random)
-        late = seen_from(light, lead - lag, bins, random=random)
+        early = delay_recorder(light, lead, bins, random=random)
+        late = delay_recorder(light, lead - lag, bins, random=random)
         photon.append(count_photons(early, dead_time=DEAD_TIME, random=random))
         analog.append(digitise(late, RECORDER, random=random))
     found = _lag(np.array(photon, float), np.array(analog, float), bins)
@@ -93,7 +91,7 @@ def test_the_lag_of_two_recorders_is_in_their_noise(lag):
 def test_a_cut_bin_loses_no_photoelectrons(first, seed):
     random = np.random.default_rng(seed)
     light = release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=random)
-    seen = seen_from(light, first, 40, random=random)
+    seen = delay_recorder(light, first, 40, random=random)
     assert seen.number.shape == seen.rate.shape == (40,)
     assert np.all(seen.number >= 0)
     whole = int(np.floor(first + 1e-9))
@@ -113,7 +111,7 @@ def test_a_shifted_recorder_sees_the_light_of_its_own_bins():
     axis, own = _profile(400), _profile(400, offset=0.35 * BIN_WIDTH)[20 : 20 + bins]
     for _ in range(400):
         light = release(axis, shots=600, bin_width=BIN_WIDTH, random=random)
-        seen = seen_from(light, first, bins, random=random)
+        seen = delay_recorder(light, first, bins, random=random)
         total += seen.number
     expected = own * 400 * 600 * 0.05
     error = (total - expected) / np.sqrt(expected)
@@ -129,8 +127,8 @@ def test_recorders_off_the_axis_are_refused_by_name():
     light = release(np.ones(50), shots=5, bin_width=BIN_WIDTH, random=random)
     for first, bins in ((-0.5, 10), (41, 10), (40.5, 10), (0, 0), (np.nextafter(40, 50), 11)):
         with pytest.raises(SimulationInputError, match="first"):
-            seen_from(light, first, bins, random=random)
-    assert seen_from(light, 40, 10, random=random).number.size == 10
+            delay_recorder(light, first, bins, random=random)
+    assert delay_recorder(light, 40, 10, random=random).number.size == 10
 
 
 def test_a_whole_lag_draws_nothing():
@@ -138,7 +136,7 @@ def test_a_whole_lag_draws_nothing():
     light = release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=random)
     release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=other)
     np.testing.assert_array_equal(
-        seen_from(light, 7.0, 40, random=random).number, light.number[7:47]
+        delay_recorder(light, 7.0, 40, random=random).number, light.number[7:47]
     )
     assert random.random() == other.random()
 
@@ -146,7 +144,7 @@ def test_a_whole_lag_draws_nothing():
 def _file(seed):
     random = np.random.default_rng(seed)
     light = release(_profile(400), shots=600, bin_width=BIN_WIDTH, random=random)
-    first, second = (seen_from(light, start, 350, random=random) for start in (12.0, 3.4))
+    first, second = (delay_recorder(light, start, 350, random=random) for start in (12.0, 3.4))
     counts = count_photons(first, dead_time=DEAD_TIME, random=random)
     return counts.tobytes() + digitise(second, RECORDER, random=random).tobytes()
 
@@ -161,17 +159,19 @@ def test_the_same_seed_gives_the_same_bytes_on_any_thread():
 
 def test_the_energy_of_a_laser_drifts_and_jitters():
     random = np.random.default_rng(81)
-    assert Laser(per_hour=-0.1).energy(2.0, 600, random) == pytest.approx(0.8)
-    assert Laser(per_hour=-0.1).energy(20.0, 600, random) == 0.0
-    energies = [Laser(shot_jitter=0.1).energy(0.0, 100, random) for _ in range(4000)]
+    drift = LaserDrift(per_hour=-0.1)
+    assert laser_energy(drift, 2.0, 600, random) == pytest.approx(0.8)
+    assert laser_energy(drift, 20.0, 600, random) == 0.0
+    shots = LaserDrift(shot_jitter=0.1)
+    energies = [laser_energy(shots, 0.0, 100, random) for _ in range(4000)]
     assert np.mean(energies) == pytest.approx(1.0, abs=4.5 * 0.01 / 4000**0.5)
     assert np.std(energies) == pytest.approx(0.01, rel=0.06)
-    both = Laser(shot_jitter=0.1, file_jitter=0.03)
-    energies = [both.energy(0.0, 100, random) for _ in range(4000)]
+    both = LaserDrift(shot_jitter=0.1, jitter=0.03)
+    energies = [laser_energy(both, 0.0, 100, random) for _ in range(4000)]
     assert np.std(energies) == pytest.approx(np.hypot(0.01, 0.03), rel=0.06)
-    for change in ({"per_hour": np.nan}, {"file_jitter": -0.1}, {"shot_jitter": 3.0}):
-        with pytest.raises(SimulationInputError, match=next(iter(change))):
-            Laser(**change)
+    for change in ({"per_hour": np.nan}, {"jitter": -0.1}, {"shot_jitter": 3.0}):
+        with pytest.raises(ValidationError, match=next(iter(change))):
+            LaserDrift(**change)
 
 
 def test_jitter_of_shots_is_one_factor_for_a_file():
@@ -180,8 +180,8 @@ def test_jitter_of_shots_is_one_factor_for_a_file():
     shots, files, mean, jitter = 50, 4000, np.array([40.0, 15.0]), 0.2
     energy = 1 + jitter * random.standard_normal((files, shots, 1))
     single = random.poisson(np.maximum(energy, 0) * mean).sum(axis=1)
-    laser = Laser(shot_jitter=jitter)
-    rate = [laser.energy(0.0, shots, random) * mean / 0.05 for _ in range(files)]
+    drift = LaserDrift(shot_jitter=jitter)
+    rate = [laser_energy(drift, 0.0, shots, random) * mean / 0.05 for _ in range(files)]
     ours = np.array([
         release(r, shots=shots, bin_width=BIN_WIDTH, random=random).number for r in rate
     ])  # fmt: skip

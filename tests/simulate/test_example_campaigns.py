@@ -126,12 +126,12 @@ def test_an_archive_of_four_stations(repository, tmp_path):
     [
         (lambda t: t["simulation"].update(origin="nowhere"), "nowhere"),
         (lambda t: t["stations"]["north"].update(latitude=-47), "flat"),
-        (lambda t: t["instruments"]["west-lidar"]["facts"][0].update(zenith_angle=90), "scans"),
+        (lambda t: t["instruments"]["west-lidar"]["facts"][0].update(zenith_angle=90), "scanning"),
         (
             lambda t: t["simulation"]["instruments"]["west-lidar"]["acquisition"].update(
                 dialect="pilar"
             ),
-            "where a scan looks",
+            "azimuth of a scan",
         ),
     ],
 )

@@ -13,7 +13,7 @@ from lidarops.campaign.simulation import AtmosphereSettings, SimulationSettings
 from lidarops.errors import CatalogError
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.analog import Digitiser, digitise_fast, slow_baseline
+from lidarops.simulate.analog import Digitiser, digitise_fast
 from lidarops.simulate.atmosphere import Air
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.counting import count_fast, counter_moments
@@ -86,8 +86,6 @@ def test_ranges_that_are_none_are_refused():
     r = bin_centres(10, 7.5)
     with pytest.raises(SimulationInputError, match="distance"):
         backscatter_signal(r[::-1], extinction=r * 0, backscatter=r * 0, system_constant=1.0)
-    with pytest.raises(SimulationInputError, match="amplitude"):
-        slow_baseline(10, BIN_TIME, amplitude=np.nan, decay=1e-5)
 
 
 def test_air_beyond_the_sounding_thins_as_the_standard_does():

@@ -321,7 +321,7 @@ def test_a_vertical_sign_on_a_level_path_is_refused(small):
         for facts in tree["instruments"]["coast-lidar"]["facts"]:
             del facts["zenith_angle"]
 
-    with pytest.raises(CampaignError, match="does not look up"):
+    with pytest.raises(CampaignError, match="is not vertical"):
         simulate_campaign(small(level))
 
 

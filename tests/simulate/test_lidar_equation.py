@@ -1,4 +1,4 @@
-"""The lidar equation forward, the sun and the sky against independent formulas."""
+"""The lidar equation, overlap and the sun against independent formulas."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from hypothesis import strategies as st
 
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.lidar import Lidar
-from lidarops.simulate.overlap import GeometricalOverlap, SineOverlap, TabulatedOverlap, vanishes
+from lidarops.simulate.overlap import GeometricalOverlap, SineOverlap, vanishes
 from lidarops.simulate.pulse import GaussianPulse, RectangularPulse
 from lidarops.simulate.signal import (
     backscatter_signal,
     bin_centres,
     isotropic_backscatter,
     optical_depth,
-    overlap,
     transmission,
 )
-from lidarops.simulate.sun import sky_brightness, sky_radiance, solar_elevation
+from lidarops.simulate.sun import sky_brightness, solar_elevation
 
 
 @pytest.mark.parametrize("extinction", [1e-5, 2e-4, 2e-3])
@@ -59,7 +58,7 @@ def test_light_that_changes_its_wavelength_is_attenuated_by_both():
     np.testing.assert_allclose(raman / elastic, np.exp(1e-4 * distance), rtol=1e-12)
     np.testing.assert_allclose(
         elastic,
-        1e12 * overlap(distance, 200.0) / distance**2 * transmission(distance, out) ** 2,
+        1e12 * SineOverlap(200.0)(distance) / distance**2 * transmission(distance, out) ** 2,
         rtol=1e-12,
     )
 
@@ -117,13 +116,13 @@ def test_a_trigger_delay_moves_the_signal_but_not_the_path(offset, extinction):
 
 def test_overlap_is_complete_at_the_stated_range_and_not_before():
     distance = np.array([-10.0, 0.0, 1.0, 250.0, 499.9, 500.0, 900.0])
-    values = overlap(distance, 500.0)
+    values = SineOverlap(500.0)(distance)
     assert np.all(np.diff(values) >= 0)
     assert values[1] == 0
     assert values[3] == pytest.approx(0.5)
     assert values[4] < 1
     assert np.all(values[5:] == 1.0)
-    np.testing.assert_array_equal(overlap(distance, 0.0), [0, 0, 1, 1, 1, 1, 1])
+    np.testing.assert_array_equal(SineOverlap(0.0)(distance), [0, 0, 1, 1, 1, 1, 1])
 
 
 TELESCOPES = {
@@ -159,7 +158,6 @@ def test_the_geometrical_overlap_is_that_of_single_beams(telescope):
     "shape",
     [
         SineOverlap(300.0),
-        TabulatedOverlap((50.0, 90.0, 300.0), (0.1, 0.6, 1.0)),
         *(
             GeometricalOverlap(0.1, 1e-3, 0.01, 2e-4, **{"separation": 0.0} | TELESCOPES[name])
             for name in TELESCOPES
@@ -179,33 +177,16 @@ def test_every_overlap_vanishes_with_the_square_of_the_range(shape):
     assert not vanishes(SineOverlap(0.0))
 
 
-def test_a_measured_overlap_goes_through_its_points():
-    ranges, values = (50.0, 90.0, 300.0), (0.1, 0.6, 1.0)
-    shape = TabulatedOverlap(ranges, values)
-    np.testing.assert_allclose(shape(np.array(ranges)), values)
-    assert shape(np.array([25.0]))[0] == pytest.approx(0.025)
-    assert shape(np.array([5000.0]))[0] == pytest.approx(1.0, rel=1e-12)
-    for wrong in (
-        ((50.0, 40.0), (0.1, 1.0)), ((-5.0, 40.0), (0.1, 1.0)), ((5.0, 40.0), (0.1, 1.1)),
-        ((5.0, 40.0), (-0.1, 1.0)), ((5.0,), (1.0,)), ((5.0, 40.0), (0.1, 0.5, 1.0)),
-    ):  # fmt: skip
-        with pytest.raises(SimulationInputError):
-            TabulatedOverlap(*wrong)
-
-
 def _lidar(**changes):
     return Lidar(
         **{
             "energy": 0.1,
-            "repetition_rate": 10.0,
             "aperture_diameter": 0.3,
             "wavelength": 532e-9,
             "optical_efficiency": 0.3,
             "quantum_efficiency": 0.2,
             "bin_width": 7.5,
             "full_overlap_range": 400.0,
-            "field_of_view": 1e-3,
-            "filter_bandwidth": 1e-9,
         }
         | changes
     )
@@ -227,7 +208,6 @@ def test_the_photons_of_a_lidar_are_those_of_its_laser():
         np.array([1000.0, 1007.5]), extinction=np.zeros(2), backscatter=np.full(2, 1e-6)
     )
     assert power[0] == pytest.approx(rate[0] * 1e6 / 0.2 * 3.7339e-19, rel=1e-4)
-    assert lidar.shots(60.0) == 600
     # Equation 23 for a rectangular pulse: power times duration times c / 2.
     pulse = RectangularPulse(20e-9)
     peak = 0.1 / pulse.duration * area * 0.3 * 299_792_458.0 * pulse.duration / 2
@@ -243,12 +223,6 @@ def test_what_a_lidar_sees_scales_as_it_must():
     # More photons of less energy come back.
     raman = _lidar(detected_wavelength=607e-9)
     assert raman.system_constant == pytest.approx(base * 607 / 532)
-    sky = _lidar().background_rate(1e8)
-    assert _lidar(field_of_view=2e-3).background_rate(1e8) == pytest.approx(4 * sky)
-    assert _lidar(filter_bandwidth=0.5e-9).background_rate(1e8) == pytest.approx(sky / 2)
-    # 0.1 W m-2 sr-1 nm-1 on 0.0707 m2 and 7.85e-7 sr, of which 6 per cent are counted.
-    expected = 0.1 * 0.070686 * 7.854e-7 * 0.06 / 3.7339e-19 * 1e-6
-    assert sky == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_pulse_of_a_lidar_smears_a_cloud():
@@ -273,9 +247,6 @@ def test_a_pulse_of_a_lidar_smears_a_cloud():
         ({"quantum_efficiency": 20.0}, "quantum_efficiency"),
         ({"optical_efficiency": 0.0}, "optical_efficiency"),
         ({"bin_width": 0.0}, "bin_width"),
-        ({"field_of_view": 1.0}, "field_of_view"),
-        ({"filter_bandwidth": 1.0}, "filter_bandwidth"),
-        ({"repetition_rate": 0.0}, "repetition_rate"),
         ({"full_overlap_range": -1.0}, "full_overlap_range"),
         ({"obstruction_diameter": 0.3}, "obstruction_diameter"),
         ({"energy": math.nan}, "energy"),
@@ -330,38 +301,3 @@ def test_the_sky_is_brightest_at_the_zenith_and_falls_through_twilight():
     assert np.all(np.diff(brightness) > 0)
     # No step at the horizon.
     assert sky_brightness(1e-9) == pytest.approx(sky_brightness(-1e-9), rel=1e-6)
-
-
-@pytest.mark.parametrize("wavelength", [355e-9, 532e-9, 1064e-9])
-def test_the_radiance_of_the_sky_is_one_of_clear_days(wavelength):
-    # Integrated over layers: what each sends down, after the sun and before the ground.
-    elevation, aerosol = 40.0, 0.1
-    mu = math.sin(math.radians(elevation))
-    inverse = (wavelength * 1e6) ** -2
-    air = 0.008569 * inverse**2 * (1 + 0.0113 * inverse + 0.00013 * inverse**2)
-    # Optical depths of air as of other fits.
-    assert air == pytest.approx({355e-9: 0.594, 532e-9: 0.1113, 1064e-9: 0.00674}[wavelength], 0.01)
-    depth = (np.arange(20_000) + 0.5) / 20_000 * (air + aerosol)
-    down = np.exp(-depth / mu) * np.exp(-(air + aerosol - depth))
-    henyey = (1 - 0.65**2) / (1 + 0.65**2 - 1.3 * mu) ** 1.5
-    phase = (0.75 * (1 + mu**2) * air + henyey * aerosol) / (air + aerosol) / (4 * math.pi)
-    # The black body's part of the 1361 W m-2 of the Sun.
-    x = 0.014387769 / (wavelength * 5772.0)
-    sun = 1361.0 * 15 / math.pi**4 * x**4 / math.expm1(x) / wavelength
-    expected = sun * phase * down.mean() * (air + aerosol)
-    assert sky_radiance(elevation, wavelength) == pytest.approx(expected, rel=0.01)
-    # 0.005 to 0.2 W m-2 sr-1 nm-1 by day.
-    assert 3e6 < sky_radiance(elevation, wavelength) < 2e8
-
-
-def test_the_radiance_follows_the_sun_without_steps():
-    elevations = np.linspace(-20, 90, 1101)
-    radiance = np.array([sky_radiance(e, 532e-9) for e in elevations])
-    assert np.all(np.diff(radiance) > 0)
-    assert np.all(np.diff(np.log(radiance)) < 0.3)
-    assert sky_radiance(-18, 532e-9) < 1e-5 * sky_radiance(30, 532e-9)
-    assert _lidar().sky_rate(-18) < 1e-3
-    assert 1 < _lidar().sky_rate(30) < 1000
-    for wrong in ((100.0, 532e-9), (10.0, 532.0), (math.nan, 532e-9)):
-        with pytest.raises(SimulationInputError):
-            sky_radiance(*wrong)

@@ -1,12 +1,11 @@
-"""Mie scattering against an independent series, published fractions and the study's figures."""
+"""Mie scattering against an independent series."""
 
 import numpy as np
 import pytest
 from scipy.special import spherical_jn, spherical_yn
 
-from lidarops.errors import RetrievalInputError
-from lidarops.simulate import aerosol
-from lidarops.simulate.mie import Lognormal, default_angles, lognormal_scattering, mixed
+from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.mie import Lognormal, lognormal_scattering, tropospheric_scattering
 
 
 def series(index, x):
@@ -42,13 +41,13 @@ def test_narrow_distribution_is_a_sphere(index, x):
     radius = 0.5e-6
     wavelength = 2.0 * np.pi * radius / x
     width = 1.0 + 1e-6
-    found = lognormal_scattering(Lognormal(radius, width), index, wavelength)
+    sphere = lognormal_scattering(Lognormal(radius, width), index, wavelength)
     extinction, scattering, back = series(index, x)
     area = np.pi * radius**2
-    assert found.extinction == pytest.approx(area * extinction, rel=1e-4)
-    assert found.scattering == pytest.approx(area * scattering, rel=1e-4)
+    assert sphere.extinction == pytest.approx(area * extinction, rel=1e-4)
+    assert sphere.scattering == pytest.approx(area * scattering, rel=1e-4)
     expected = 4.0 * np.pi * extinction / back
-    assert found.lidar_ratio == pytest.approx(expected, rel=1e-3)
+    assert sphere.lidar_ratio == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -60,49 +59,26 @@ def test_narrow_distribution_is_a_sphere(index, x):
     ],
 )
 def test_lognormal_aerosol_at_532_nm(radius, index, asymmetry, albedo, back, ratio):
-    found = lognormal_scattering(Lognormal(radius, 1.5), index, 532e-9)
-    assert found.asymmetry == pytest.approx(asymmetry, abs=1e-3)
-    assert found.single_scattering_albedo == pytest.approx(albedo, abs=1e-3)
-    assert found.phase_function[-1] == pytest.approx(back, rel=0.03)
-    assert found.lidar_ratio == pytest.approx(ratio, rel=0.03)
-    cosine = np.cos(found.angle)
-    whole = -0.5 * np.trapezoid(found.phase_function, cosine)
+    scattering = lognormal_scattering(Lognormal(radius, 1.5), index, 532e-9)
+    assert scattering.asymmetry == pytest.approx(asymmetry, abs=1e-3)
+    assert scattering.single_scattering_albedo == pytest.approx(albedo, abs=1e-3)
+    assert scattering.phase_function[-1] == pytest.approx(back, rel=0.03)
+    assert scattering.lidar_ratio == pytest.approx(ratio, rel=0.03)
+    cosine = np.cos(scattering.angle)
+    whole = -0.5 * np.trapezoid(scattering.phase_function, cosine)
     assert whole == pytest.approx(1.0, abs=1e-3)
-    mean = -0.5 * np.trapezoid(found.phase_function * cosine, cosine)
-    assert mean == pytest.approx(found.asymmetry, abs=2e-3)
+    mean = -0.5 * np.trapezoid(scattering.phase_function * cosine, cosine)
+    assert mean == pytest.approx(scattering.asymmetry, abs=2e-3)
 
 
-def test_number_fractions_are_the_published_ones():
-    expected = {
-        "continental": {"water_soluble": 0.937437, "soot": 0.0625607},
-        "urban": {"soot": 0.411069, "dust_like": 1.64128e-7},
-        "maritime": {"water_soluble": 0.999573},
-    }
-    for mixture, parts in expected.items():
-        found = aerosol.number_fractions(mixture)
-        assert sum(found.values()) == pytest.approx(1.0, rel=1e-14)
-        for part, fraction in parts.items():
-            assert found[aerosol.Component(part)] == pytest.approx(fraction, rel=5e-6)
-
-
-def test_urban_aerosol_absorbs_and_maritime_does_not():
-    urban = aerosol.mixture_scattering("urban", 550e-9)
-    assert urban.single_scattering_albedo == pytest.approx(0.66, abs=0.02)
-    assert urban.asymmetry == pytest.approx(0.593, abs=0.01)
-    assert urban.lidar_ratio == pytest.approx(47.0, rel=0.04)
-
-
-def test_mixing_weighs_by_what_is_scattered():
-    one = aerosol.tropospheric_scattering(532e-9)
-    other = lognormal_scattering(Lognormal(0.1e-6, 1.5), 1.5 - 0.1j, 532e-9)
-    both = mixed([(1.0, one), (3.0, other)])
-    assert both.extinction == pytest.approx((one.extinction + 3.0 * other.extinction) / 4.0)
-    back = (
-        one.scattering * one.phase_function[-1]
-        + 3.0 * other.scattering * (other.phase_function[-1])
-    )
-    ratio = 4.0 * np.pi * (one.extinction + 3.0 * other.extinction) / back
-    assert both.lidar_ratio == pytest.approx(ratio)
+def test_tropospheric_aerosol_of_one_micrometre():
+    scattering = tropospheric_scattering(532e-9)
+    # Median diameter 1 micrometre: forward peak, and the values of the first case above.
+    assert scattering.asymmetry == pytest.approx(0.719, abs=1e-3)
+    assert scattering.lidar_ratio == pytest.approx(28.7, rel=0.03)
+    assert scattering.phase_function[0] > 100 * scattering.phase_function[-1]
+    with pytest.raises(SimulationInputError, match="wavelength"):
+        tropospheric_scattering(532.0)
 
 
 @pytest.mark.parametrize(
@@ -112,20 +88,18 @@ def test_mixing_weighs_by_what_is_scattered():
         ((Lognormal(0.5e-6, 1.5), 1.45 + 0.005j, 532e-9), "refractive_index"),
     ],
 )
-def test_absurd_input_is_refused(arguments, field):
-    with pytest.raises(RetrievalInputError) as caught:
+def test_impossible_input_is_refused(arguments, field):
+    with pytest.raises(SimulationInputError) as caught:
         lognormal_scattering(*arguments)
     assert caught.value.field == field
 
 
-def test_absurd_sizes_and_names_are_refused():
-    with pytest.raises(RetrievalInputError, match="metres"):
+def test_impossible_sizes_and_angles_are_refused():
+    with pytest.raises(SimulationInputError, match="metres"):
         Lognormal(0.5, 1.5)
-    with pytest.raises(RetrievalInputError, match="between 1 and 5"):
+    with pytest.raises(SimulationInputError, match="between 1 and 5"):
         Lognormal(0.5e-6, 0.5)
-    with pytest.raises(RetrievalInputError, match="continental"):
-        aerosol.number_fractions("rural")
-    with pytest.raises(RetrievalInputError, match="0 to pi"):
+    with pytest.raises(SimulationInputError, match="0 to pi"):
         lognormal_scattering(
-            Lognormal(0.5e-6, 1.5), 1.4 - 0j, 532e-9, angle=np.degrees(default_angles())
+            Lognormal(0.5e-6, 1.5), 1.4 - 0j, 532e-9, angle=np.linspace(0.0, 180.0, 181)
         )

@@ -14,13 +14,12 @@ from scipy.integrate import quad
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.errors import LidarOpsError
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.overlap import SineOverlap, TabulatedOverlap
+from lidarops.simulate.overlap import SineOverlap
 from lidarops.simulate.pulse import (
     ExponentialPulse,
     GaussianPulse,
     Origin,
     RectangularPulse,
-    TabulatedPulse,
     pulsed_signal,
     response,
 )
@@ -33,7 +32,6 @@ SHAPES = {
     "gauss": GaussianPulse(8e-9),
     "peak": GaussianPulse(8e-9, origin=Origin.PEAK, reach=5.0),
     "exponential": ExponentialPulse(4e-9),
-    "table": TabulatedPulse((0.0, 2e-9, 5e-9, 30e-9), (0.0, 3.0, 1.0, 0.0)),
 }
 
 
@@ -152,10 +150,7 @@ def _power(name, time):
         if abs(z) > reach:
             return 0.0
         return math.exp(-z * z / 2) / (s * math.sqrt(2 * math.pi) * math.erf(reach / 2**0.5))
-    if name == "exponential":
-        return math.exp(-time / 4e-9) / 4e-9 if time >= 0 else 0.0
-    times, power = (0.0, 2e-9, 5e-9, 30e-9), (0.0, 3.0, 1.0, 0.0)
-    return np.interp(time, times, power, 0, 0) / np.trapezoid(power, times)
+    return math.exp(-time / 4e-9) / 4e-9 if time >= 0 else 0.0
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -317,10 +312,6 @@ def test_absurd_input_is_refused_by_name(change, name):
         lambda: GaussianPulse(math.nan),
         lambda: GaussianPulse(1e-9, reach=0.0),
         lambda: ExponentialPulse(0.0),
-        lambda: TabulatedPulse((0.0, 1e-9), (0.0, 0.0)),
-        lambda: TabulatedPulse((0.0, 1e-9), (-1.0, 1.0)),
-        lambda: TabulatedPulse((1e-9, 0.0), (1.0, 1.0)),
-        lambda: TabulatedPulse((0.0, 5.0), (1.0, 1.0)),
     ],
 )
 def test_pulses_of_no_laser_are_refused(make):
@@ -330,23 +321,14 @@ def test_pulses_of_no_laser_are_refused(make):
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(50, 800), st.floats(3, 30), st.booleans())
-def test_any_overlap_object_gives_what_its_formula_gives(full, width, tabulated):
+def test_any_overlap_object_gives_what_its_formula_gives(full, width, exponential):
     # The same overlap by the built-in formula and evaluated from outside.
     class Outside:
         def __call__(self, distance):
             return SineOverlap(full)(distance)
 
     distance = bin_centres(150, width)
-    pulse = ExponentialPulse(5e-9) if tabulated else GaussianPulse(12e-9)
+    pulse = ExponentialPulse(5e-9) if exponential else GaussianPulse(12e-9)
     inside = _homogeneous(distance, 3e-4, pulse, full_overlap_range=full, bin_width=width)
     outside = _homogeneous(distance, 3e-4, pulse, overlap=Outside(), bin_width=width)
     np.testing.assert_allclose(outside, inside, rtol=1e-12, atol=1e-300)
-
-
-def test_the_near_signal_of_a_table_is_finite():
-    shape = TabulatedOverlap((100.0, 200.0, 400.0), (0.2, 0.7, 1.0))
-    signal = _homogeneous(
-        bin_centres(100, 7.5), 1e-4, GaussianPulse(10e-9), overlap=shape, bin_width=7.5
-    )
-    assert np.all(np.isfinite(signal))
-    assert signal[2] == pytest.approx(0.2 / 100**2, rel=0.02)

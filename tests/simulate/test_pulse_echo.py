@@ -8,9 +8,9 @@ from scipy.stats import expon, norm, uniform
 
 from lidarops.campaign.simulation import Pulse
 from lidarops.constants import SPEED_OF_LIGHT
-from lidarops.simulate.atmosphere import Path
+from lidarops.simulate.atmosphere import BeamPath
 from lidarops.simulate.campaign import simulate_campaign
-from lidarops.simulate.echo import echo
+from lidarops.simulate.echo import pulse_echo
 from lidarops.simulate.signal import backscatter_signal
 
 STEP = 7.5
@@ -18,11 +18,11 @@ DISTANCE = (np.arange(400) + 0.5) * STEP
 
 
 def _path(sigma, distance=DISTANCE):
-    return Path(np.full_like(distance, sigma), np.full_like(distance, 1e-6))
+    return BeamPath(np.full_like(distance, sigma), np.full_like(distance, 1e-6))
 
 
 def _echo(sigma, shape, width, full=10.0):
-    return echo(
+    return pulse_echo(
         DISTANCE,
         _path(sigma),
         Pulse(shape=shape, width=width),

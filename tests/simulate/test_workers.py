@@ -64,11 +64,11 @@ def test_any_order_gives_the_same_files(small):
     written = _contents(campaign.archive)
     for site in module._sites(campaign):
         simulator = Simulator(site)
-        for order in reversed(list(site.orders())):
-            content, truth = simulator.file(order)
+        for planned in reversed(list(site.planned_files())):
+            content, truth = simulator.simulate(planned)
             assert content == written[truth.path]
             # The same once more, from the same simulator.
-            assert simulator.file(order)[0] == content
+            assert simulator.simulate(planned)[0] == content
 
 
 def test_the_files_are_known_before(small):
