@@ -1,6 +1,6 @@
-"""The signal chain of `lidarops.retrieve.signal.counts_to_signal` in plain numpy: slow, and easy to read.
+"""`lidarops.retrieve.signal.counts_to_signal` in plain numpy: slow, and easy to read.
 
-Sums over windows are differences of running sums, with what that loses of the digits.
+Sums over windows are differences of running sums, with the rounding errors of these.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ def analog(
     power[clipped] = np.nan
     quality[clipped] |= np.int32(Quality.SATURATED)
     if noise_variance is None:
-        again = clipped.any(axis=-1)
-        variance[again] = difference_variance(power, range)[again]
+        with_clipping = clipped.any(axis=-1)
+        variance[with_clipping] = difference_variance(power, range)[with_clipping]
         return Signal(power, rounded(variance, whole, fired), quality)
     known = rounded(np.full(power.shape, noise_variance), whole, fired)
     return Signal(power, known + dark_variance, quality)
 
 
 def rounded(variance, step, shots):
-    """Return the variance of a mean of shots that a digitiser rounds one by one, in steps."""
+    """Return the variance of a mean of shots, each rounded by the digitiser to whole steps."""
     result = variance.copy()
     for row, size, fired in zip(result, step[:, 0], shots[:, 0], strict=True):
         if fired == 0:
@@ -83,7 +83,7 @@ def photon(counts, shots, range, *, bin_width, dead_time=None, full_overlap_rang
         correction = load / (1.0 - np.minimum(load, counts_to_signal.PARALYSIS))
         quality[load > counts_to_signal.PARALYSIS] |= np.int32(Quality.SATURATED)
         limit = (
-            counts_to_signal.PILE_UP_LEFT
+            counts_to_signal.UNCORRECTED_PILE_UP
             if dead_time is None
             else counts_to_signal.PILE_UP_CORRECTION
         )
@@ -157,7 +157,7 @@ def line(x, y, weight, floor):
     square = (weight * from_mean**2).sum(axis=-1, keepdims=True)
     slope = (weight * from_mean * (y - y_mean)).sum(axis=-1, keepdims=True) / square
     x_square = (weight * x**2).sum(axis=-1, keepdims=True)
-    # Values of x that differ by rounding alone tell no slope.
+    # Values of x that differ only by rounding define no slope.
     slope = np.where((slope > 0) & (square > 1e-24 * x_square), slope, 0.0)
     lowest = y_mean - slope * (x_mean - floor)
     above = np.where(weight > 0.0, x - floor, 0.0)

@@ -11,13 +11,13 @@ from lidarops.bench.stability.stiff_cases import (
     Answer,
     Array,
     Between,
-    Honest,
+    CoveredByErrors,
     Missing,
     Near,
-    Raised,
+    Flagged,
     Refused,
     Retrieval,
-    Stands,
+    NotRejected,
     StiffCase,
 )
 from lidarops.errors import RetrievalInputError
@@ -114,44 +114,44 @@ def _analog_cases() -> tuple[StiffCase, ...]:
     noisy = partial(_steady, 100.3, 2.0)
     return (
         _case("analog, noise of 2 steps", build=noisy, solve=analog,
-              expected=(Stands(), Honest("power", _level(100.3), errors=5.0))),
+              expected=(NotRejected(), CoveredByErrors("power", _level(100.3), errors=5.0))),
         *(
             _case(f"B d analog, noise of {noise:g} steps at {steps:g}: rounding stays",
                   build=partial(_steady, steps, noise), solve=analog,
-                  expected=(Honest("power", _level(steps), valued=1.0),))
+                  expected=(CoveredByErrors("power", _level(steps), valued=1.0),))
             for steps, noise in ((100.3, 0.0), (100.3, 0.05), (100.45, 0.05), (100.4, 0.1),
                                  (100.25, 0.2), (100.25, 0.3), (100.25, 0.4))
         ),
         _case("B e analog without shots", build=lambda: _empty(0), solve=analog,
-              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING), Missing("power"))),
         _case("analog of zeros alone", build=_empty, solve=analog,
-              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING), Missing("power"))),
         _case("B f one bin at the largest integer", build=partial(_single_extreme, 2**31 - 1),
               solve=partial(_at, slice(50, 51)),
-              expected=(Raised(Quality.INPUT_MISSING | Quality.SATURATED), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING | Quality.SATURATED), Missing("power"))),
         _case("B f its neighbours", build=partial(_single_extreme, 2**31 - 1),
               solve=partial(_at, slice(51, 200)),
-              expected=(Stands(), Honest("power", _level(100.0), errors=5.0))),
+              expected=(NotRejected(), CoveredByErrors("power", _level(100.0), errors=5.0))),
         _case("one bin at full scale", build=partial(_single_extreme, _TOP),
               solve=partial(_at, slice(50, 51)),
-              expected=(Raised(Quality.SATURATED), Missing("power"))),
+              expected=(Flagged(Quality.SATURATED), Missing("power"))),
         _case("one bin above full scale", build=partial(_single_extreme, _TOP + 5),
               solve=partial(_at, slice(50, 51)),
-              expected=(Raised(Quality.SATURATED), Missing("power"))),
+              expected=(Flagged(Quality.SATURATED), Missing("power"))),
         _case("profile above full scale",
               build=lambda: {"counts": np.full((2, 200), 2 * _TOP, np.int32)}, solve=analog,
-              expected=(Raised(Quality.SATURATED), Missing("power"))),
+              expected=(Flagged(Quality.SATURATED), Missing("power"))),
         _case("some shots clipped: 2 steps below full scale, noise of 5",
               build=lambda: {"counts": np.minimum(_steady(4093.0, 5.0)["counts"], _TOP)},
-              solve=analog, expected=(Raised(Quality.SATURATED),)),
+              solve=analog, expected=(Flagged(Quality.SATURATED),)),
         _case("analog without an input range",
               build=lambda: noisy() | {"input_range": np.full(4, np.nan)}, solve=analog,
-              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING), Missing("power"))),
         _case("analog, one bin", build=lambda: {"counts": np.full((2, 1), 9000, np.int32)},
               solve=analog, expected=(Near("power", _level(15.0), 1e-12),)),
         _case("dark signal missing in one bin", solve=partial(_at, slice(3, 4)),
               build=lambda: noisy() | {"dark": np.where(np.arange(200) == 3, np.nan, 1.0)},
-              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING), Missing("power"))),
         _case("counts as floats with fractions", build=lambda: {"counts": np.full((2, 200), 0.5)},
               solve=analog, expected=(Refused(RetrievalInputError, "counts"),)),
         _case("counts that are true or false",
@@ -173,30 +173,30 @@ def _photon_cases() -> tuple[StiffCase, ...]:
     return (
         *(
             _case(f"photon counting, {rate:g} MHz", build=partial(_rate_counts, rate),
-                  solve=photon, expected=(Stands(), Honest("power", rate, errors=5.5)))
+                  solve=photon, expected=(NotRejected(), CoveredByErrors("power", rate, errors=5.5)))
             for rate in (1.0, 20.0, 100.0)
         ),
         _case("200 MHz: the counter is nearly half paralysed",
               build=partial(_rate_counts, 200.0), solve=photon,
-              expected=(Raised(_FOLDED), Honest("power", 200.0, errors=5.5))),
+              expected=(Flagged(_FOLDED), CoveredByErrors("power", 200.0, errors=5.5))),
         _case("600 MHz: above half of the time dead", build=partial(_rate_counts, 600.0),
-              solve=photon, expected=(Raised(Quality.SATURATED), Missing("power"))),
+              solve=photon, expected=(Flagged(Quality.SATURATED), Missing("power"))),
         _case("B c 600 MHz, paralyzable, folded back",
               build=partial(_rate_counts, 600.0, paralyzable=True), solve=photon,
-              expected=(Raised(_FOLDED),)),
+              expected=(Flagged(_FOLDED),)),
         _case("unknown dead time, 100 MHz", solve=photon,
               build=lambda: _rate_counts(100.0) | {"dead_time": None},
-              expected=(Raised(_FOLDED),)),
+              expected=(Flagged(_FOLDED),)),
         _case("B e photon counting without shots", build=lambda: _empty(0), solve=photon,
-              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING), Missing("power"))),
         _case("photon counting of zeros alone", build=_empty, solve=photon,
-              expected=(Raised(Quality.INPUT_MISSING), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING), Missing("power"))),
         _case("one count in a profile: no bin is known without error", solve=photon,
               build=lambda: {"counts": np.eye(1, RANGE.size, 700, dtype=np.int32)},
               expected=(Between("power_standard_error", 1e-6, 1.0),)),
         _case("the largest integer in all bins", solve=photon,
               build=lambda: {"counts": np.full((1, 200), 2**31 - 1, np.int32)},
-              expected=(Raised(Quality.INPUT_MISSING | Quality.SATURATED), Missing("power"))),
+              expected=(Flagged(Quality.INPUT_MISSING | Quality.SATURATED), Missing("power"))),
         _case("photon counts that are true or false", solve=photon,
               build=lambda: {"counts": np.ones((2, 200), dtype=np.bool_)},
               expected=(Refused(RetrievalInputError, "counts"),)),
@@ -280,7 +280,7 @@ def _lag(shift: int | None) -> Answer:
     common = rng.standard_normal((40, 1200))
     other = rng.standard_normal((40, 1200)) if shift is None else np.roll(common, shift, axis=-1)
     found = lag.estimate_lag(other + 0.5 * rng.standard_normal(common.shape), common)
-    unfound = np.where(found.found, np.int32(0), np.int32(Quality.NO_GLUING))
+    unfound = np.where(found.significant, np.int32(0), np.int32(Quality.NO_GLUING))
     values = {"lag": found.lag, "lag_standard_error": found.standard_error}
     return Answer(values, np.atleast_1d(unfound).astype(np.int32))
 
@@ -291,10 +291,10 @@ def _rest() -> tuple[StiffCase, ...]:
     return (
         _case("mean of the tail, all NaN",
               build=lambda: {"power": np.full((2, 300), np.nan), "range": RANGE[:300]},
-              solve=tail, expected=(Raised(Quality.INPUT_MISSING), Missing("background"))),
+              solve=tail, expected=(Flagged(Quality.INPUT_MISSING), Missing("background"))),
         _case("mean of the tail, one bin",
               build=lambda: {"power": [[5.0]], "range": [200.0], "variance": 1.0}, solve=tail,
-              expected=(Raised(Quality.TOO_FEW_BINS), Near("background", 5.0, 0.0))),
+              expected=(Flagged(Quality.TOO_FEW_BINS), Near("background", 5.0, 0.0))),
         _case("mean of the tail of a background of 1e30", solve=tail,
               build=lambda: {"power": np.full((2, 300), 1e30), "range": RANGE[:300]},
               expected=(Near("background", 1e30, 1e-15),)),
@@ -305,26 +305,26 @@ def _rest() -> tuple[StiffCase, ...]:
         *(
             _case(f"known shape, background {level:g} times the noise",
                   build=partial(_shaped, level), solve=shaped,
-                  expected=(Honest("background", level, valued=0.9),))
+                  expected=(CoveredByErrors("background", level, valued=0.9),))
             for level in (0.0, 1.0, 1e5, 1e8)
         ),
         *(
             _case(f"known shape, signals times {scale:g}", build=partial(_shaped, 10.0, scale),
-                  solve=shaped, expected=(Honest("background", 10.0 * scale, valued=0.9),))
+                  solve=shaped, expected=(CoveredByErrors("background", 10.0 * scale, valued=0.9),))
             for scale in (1e-30, 1e30, 1e-150, 1e150)
         ),
         _case("known shape without noise", solve=shaped,
               build=lambda: _shaped(10.0, noise=0.0, variance=1e-12),
               expected=(Near("background", 10.0, 1e-9),)),
         _case("known shape, all NaN", build=lambda: _shaped(10.0, np.nan, variance=1.0),
-              solve=shaped, expected=(Raised(Quality.INPUT_MISSING), Missing("background"))),
+              solve=shaped, expected=(Flagged(Quality.INPUT_MISSING), Missing("background"))),
         _case("known shape, constant profile, no variance", solve=shaped,
               build=lambda: _shaped(1.0) | {"power": np.full(_FAR.size, 7.0), "variance": None},
-              expected=(Raised(Quality.NO_SIGNAL),)),
+              expected=(Flagged(Quality.NO_SIGNAL),)),
         _case("known shape in 10 far bins", solve=shaped,
               build=lambda: {"power": _shaped(1.0)["power"][:, -10:], "range": _FAR[-10:],
                              "shape": _molecules()[-10:], "variance": 1.0},
-              expected=(Honest("background", 1.0),)),
+              expected=(CoveredByErrors("background", 1.0),)),
         _case("mean of profiles, all NaN", build=lambda: {"profiles": gapped}, solve=_mean,
               expected=(Missing("mean"),)),
         _case("mean of profiles of which one is there", build=lambda: {"profiles": one_left},
@@ -334,15 +334,15 @@ def _rest() -> tuple[StiffCase, ...]:
               build=lambda: {"profiles": np.full((1_000_000, 1), 0.1), "variance": 1.0},
               expected=(Near("mean", 0.1, 1e-10), Near("mean_standard_error", 1e-3, 1e-12))),
         _case("gluing, 30 MHz at 300 m", build=partial(_channels, 30.0), solve=_glue,
-              expected=(Honest("slope", 2.0, valued=0.9),)),
+              expected=(CoveredByErrors("slope", 2.0, valued=0.9),)),
         _case("gluing, nothing is bright enough", build=partial(_channels, 0.05), solve=_glue,
-              expected=(Raised(Quality.NO_GLUING), Missing("power"))),
+              expected=(Flagged(Quality.NO_GLUING), Missing("power"))),
         _case("gluing of an inverted analog channel", build=partial(_channels, 30.0, -0.5),
-              solve=_glue, expected=(Raised(Quality.NO_GLUING),)),
+              solve=_glue, expected=(Flagged(Quality.NO_GLUING),)),
         _case("lag of 9 bins", build=lambda: {"shift": 9}, solve=_lag,
-              expected=(Stands(), Near("lag", 9.0, 0.2, relative=False))),
+              expected=(NotRejected(), Near("lag", 9.0, 0.2, relative=False))),
         _case("lag of channels with independent noise", build=lambda: {"shift": None}, solve=_lag,
-              expected=(Raised(Quality.NO_GLUING),)),
+              expected=(Flagged(Quality.NO_GLUING),)),
     )  # fmt: skip
 
 

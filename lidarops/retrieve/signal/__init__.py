@@ -1,1 +1,46 @@
-"""Raw counts to signals: dead time, dark signal, lag, gluing, averaging."""
+"""Raw counts to signals with known noise.
+
+In this order:
+
+1. `dark_profile` gives the dark signal of analog channels at the time of each profile.
+2. `analog_signal` converts ADC counts to mV and subtracts the dark signal. `photon_signal`
+   converts photon counts to MHz and corrects for dead time: here and nowhere else.
+3. `estimate_lag` and `shift_signal` align analog with photon counting.
+4. `glue` joins analog (near) and photon counting (far).
+5. `time_mean` averages profiles.
+6. `range_corrected` subtracts the background and multiplies with the square of range.
+
+`labeled`, `labeled_gluing` and `labeled_averaging` do the same on `xarray` data; import them as
+modules, so that the numerics stay free of xarray.
+"""
+
+from lidarops.retrieve.signal.averaging import Averages, time_mean
+from lidarops.retrieve.signal.counts_to_signal import (
+    Signal,
+    analog_signal,
+    difference_variance,
+    photon_signal,
+    range_corrected,
+    smooth_signal,
+)
+from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
+from lidarops.retrieve.signal.gluing import GluedSignal, glue
+from lidarops.retrieve.signal.lag import LagEstimate, estimate_lag, shift_signal
+
+__all__ = [
+    "Averages",
+    "DarkProfile",
+    "GluedSignal",
+    "LagEstimate",
+    "Signal",
+    "analog_signal",
+    "dark_profile",
+    "difference_variance",
+    "estimate_lag",
+    "glue",
+    "photon_signal",
+    "range_corrected",
+    "shift_signal",
+    "smooth_signal",
+    "time_mean",
+]

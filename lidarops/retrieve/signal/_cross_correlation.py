@@ -1,4 +1,4 @@
-"""Compiled correlation of two noises over many lags."""
+"""Compiled correlation of the noise of two signals at many lags."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ def add_products(
     edges: npt.NDArray[np.intp],
     sums: Array,
 ) -> None:
-    """Add the products of `first`, moved by each lag, and `second` to the sums of their parts.
+    """Add the products of `second` and of `first` shifted by each lag, by parts of the range.
 
     Parameters
     ----------
     first, second : (channel, time, bin) float64
     reach : int
-        Lags from minus this to this, in bins.
+        Largest lag to either side, in bins.
     edges : (part + 1,) int
         Bins of `second` where the parts begin and end, at least `reach` from both ends.
     sums : (channel, part, lag) float64
+        The sums to which the products are added.
     """
     for c in range(first.shape[0]):
         for t in range(first.shape[1]):

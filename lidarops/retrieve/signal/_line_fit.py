@@ -1,4 +1,4 @@
-"""Compiled straight lines through points with noise in both coordinates."""
+"""Compiled fit of straight lines to points with noise in both coordinates, for gluing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ Indices = npt.NDArray[np.intp]
 
 HUGE: Final = 1e150
 PASSES: Final = 4
-"""Each leaves of the error of the slope about the share of noise in the spread of x."""
+"""Iterations; each multiplies the error of the slope by about the share of noise in the spread of
+x."""
 
 SLOPE: Final = 0
 INTERCEPT: Final = 1
@@ -30,7 +31,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @_compiled
 def running_means(values: Array, half: int, out: Array) -> None:
-    """Average over windows of 2 half + 1 bins, cut at the ends, passing over what is not finite.
+    """Average over windows of 2 half + 1 bins, shorter at the ends, skipping non-finite values.
 
     Parameters
     ----------
@@ -53,13 +54,13 @@ def running_means(values: Array, half: int, out: Array) -> None:
 
 
 @_compiled
-def longest_runs(good: npt.NDArray[np.bool_], first: Indices, past: Indices) -> None:
-    """Find the longest run of each row, the nearest of equally long ones; (0, 0) for none."""
-    for k in range(good.shape[0]):
+def longest_runs(valid: npt.NDArray[np.bool_], first: Indices, past: Indices) -> None:
+    """Write the longest run of true bins of each row, the first of equals; (0, 0) for none."""
+    for k in range(valid.shape[0]):
         start = best = 0
         first[k] = past[k] = 0
-        for i in range(good.shape[1]):
-            if not good[k, i]:
+        for i in range(valid.shape[1]):
+            if not valid[k, i]:
                 start = i + 1
             elif i + 1 - start > best:
                 best = i + 1 - start
@@ -101,9 +102,9 @@ def _centroid(
 def _moments(
     x: Array, y: Array, xv: Array, yv: Array, rows: Indices, window: Any, line: Any, means: Any
 ) -> Any:
-    """Return the sums of York's equations: of y, x, the adjusted x and its square, and misfit."""
+    """Return the sums of York's equations: for y, x, the adjusted x, its square, and chi-square."""
     slope, correlation = line
-    up = across = shift = square = chi2 = 0.0
+    y_sum = x_sum = shift = square = chi2 = 0.0
     for k in rows:
         for i in range(window[0], window[1]):
             if not _usable(x[k, i], y[k, i], xv[k, i], yv[k, i]):
@@ -112,17 +113,17 @@ def _moments(
             common = correlation * math.sqrt(xv[k, i] * yv[k, i])
             u, v = x[k, i] - means[0], y[k, i] - means[1]
             beta = weight * (u * yv[k, i] + slope * v * xv[k, i] - (slope * u + v) * common)
-            up += weight * beta * v
-            across += weight * beta * u
+            y_sum += weight * beta * v
+            x_sum += weight * beta * u
             shift += weight * beta
             square += weight * beta * beta
             chi2 += weight * (v - slope * u) ** 2
-    return up, across, shift, square, chi2
+    return y_sum, x_sum, shift, square, chi2
 
 
 @_compiled
 def _first_slope(x: Array, y: Array, xv: Array, yv: Array, rows: Indices, window: Any) -> float:
-    """Return the ratio of the spreads of y and x, which noise in either moves little."""
+    """Return the ratio of the spreads of y and x, which depends little on noise in either."""
     points, x_mean, y_mean = 0, 0.0, 0.0
     for k in rows:
         for i in range(window[0], window[1]):
@@ -152,18 +153,18 @@ def fit_lines(
     past: Indices,
     out: Array,
 ) -> None:
-    """Fit one line to the windows of all profiles of each block.
+    """Fit one line to each block of profiles, within the window of the block.
 
     Parameters
     ----------
     x, y, x_variance, y_variance : (profile, bin) float64
-        Points where one is not finite, or a variance not positive, are passed over.
+        Points with a non-finite value or a variance that is not positive are skipped.
     correlation : float
-        Of the noise of both coordinates.
+        Correlation of the noise of both coordinates.
     order : (profile,) int
-        Profiles, block by block.
+        Indices of the profiles, sorted by block.
     starts : (block + 1,) int
-        Where each block begins in `order`.
+        Start of each block in `order`.
     first, past : (block,) int
         Window of each block.
     out : (block, COLUMNS) float64
@@ -182,10 +183,10 @@ def fit_lines(
         if points < 3:
             continue
         for _ in range(PASSES):
-            up, across, _, _, _ = _moments(
+            y_sum, x_sum, _, _, _ = _moments(
                 x, y, x_variance, y_variance, rows, window, (slope, correlation), (x_mean, y_mean)
             )
-            slope = up / across
+            slope = y_sum / x_sum
             total, x_mean, y_mean, points = _centroid(
                 x, y, x_variance, y_variance, rows, window, (slope, correlation)
             )
@@ -201,7 +202,7 @@ def fit_lines(
 
 @_compiled
 def _analog_share(x: float, y: float, x_variance: float, y_variance: float) -> float:
-    """Return what the scaled analog counts by inverse variances; all of it where alone."""
+    """Return the inverse-variance weight of scaled analog; 1 or 0 where only one is finite."""
     if not abs(y) < HUGE:
         return 1.0
     return y_variance / (y_variance + x_variance) if abs(x) < HUGE else 0.0
@@ -220,20 +221,20 @@ def combine(
     past: Indices,
     out: Array,
 ) -> None:
-    """Scale x to y before the windows, keep y behind them, and average both inside.
+    """Take scaled x before the windows, y beyond them, and their weighted mean inside.
 
     Parameters
     ----------
     x, y, x_variance, y_variance : (profile, bin) float64
     correlation : float
-        Of the noise of both.
+        Correlation of the noise of both.
     lines : (block, COLUMNS) float64
         From `fit_lines`.
     block : (profile,) int
     first, past : (block,) int
     out : (3, profile, bin) float64
-        Gets the mean, the variance of its noise and the variance from the error of the line; NaN
-        where there is no line that rises.
+        Output: the mean, its noise variance and its variance by the error of the line; NaN
+        without a line of positive slope.
     """
     for k in range(x.shape[0]):
         line = lines[block[k]]
@@ -245,7 +246,7 @@ def combine(
             if first[block[k]] <= i < past[block[k]]:
                 share = _analog_share(x[k, i], y[k, i], xv, yv)
             mean = variance = systematic = 0.0 * slope
-            # What counts nothing must not spoil a bin by being NaN.
+            # NaN times a weight of 0 must not reach the mean.
             if share > 0.0:
                 mean += share * (slope * x[k, i] + line[INTERCEPT])
                 variance += share * share * xv

@@ -1,15 +1,16 @@
-"""Counts to signals with known noise, one profile at a time, in a few passes within the cache.
+"""Compiled conversion of counts to signals with known noise, one profile at a time.
 
-What is smoothed along range is a sum over a window that grows with range. Differences of one
-running sum would lose, in the far range, the digits that the near range took: the light falls by
-six orders of magnitude between them. So the running sums start anew every `BLOCK` bins, and a
-window is the tail of its first block, the whole blocks within, and the head of its last one. No
-window is shorter than a block, so that these three do not overlap, and only the sums of whole
-blocks, which carry what rounding took from them, are differences. The error of an average stays
-below ``(BLOCK + 3) 2^-53`` of the mean of absolute values within the window, plus
-``(bins / BLOCK)^2 2^-106`` of the sum of those of the profile over the bins of the window.
+Smoothing along range sums over a window that grows with range. Differences of one running sum
+would lose precision in the far range, because the light falls by six orders of magnitude along a
+profile. The running sums therefore restart every `BLOCK` bins, and a window is the tail of its
+first block, the whole blocks within, and the head of its last block. No window is shorter than a
+block, so these three do not overlap. Only the sums of whole blocks are differences, with their
+rounding errors compensated. The error of an average is below ``(BLOCK + 3) 2^-53`` of the mean of
+absolute values within the window, plus ``(bins / BLOCK)^2 2^-106`` of the sum of absolute values
+of the profile over the number of bins of the window.
 
-Every sum has a fixed order within its profile: the bits of a result depend on nothing else.
+The order of every sum is fixed within its profile, so the bits of a result depend on the profile
+alone.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -29,12 +30,12 @@ Flags = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.uint32]
 
 BLOCK: Final = 16
-"""Bins between two starts of the running sums; windows have at least one more."""
+"""Bins between two restarts of the running sums; windows have at least one bin more."""
 
 _LOWEST: Final = np.iinfo(np.int32).min
 _HIGHEST: Final = np.iinfo(np.int32).max
 _FLAT: Final = 1e-12
-"""Relative spread below which values differ by rounding alone."""
+"""Relative spread below which values differ only by rounding."""
 _MISSING: Final = int(Quality.INPUT_MISSING)
 _SATURATED: Final = int(Quality.SATURATED)
 _PILE_UP: Final = int(Quality.PILE_UP)
@@ -51,20 +52,20 @@ class Windows(NamedTuple):
 
     first: Indices
     past: Indices
-    """Behind the last bin; where that is the last of the profile, the end of its block."""
+    """One past the last bin; for the last bin of the profile, the end of its block."""
     bins: Array
     """Number of values in the window of a profile without gaps."""
 
 
 class NoiseModel(NamedTuple):
-    """What the noise model needs to know of the range grid."""
+    """Windows and limits of the noise model on a range grid."""
 
     narrow: Windows
-    """In which the signal is smoothed."""
+    """For smoothing the signal."""
     wide: Windows
-    """In which squared third differences are."""
+    """For smoothing squared third differences."""
     leak: Array
-    """Root of the least variance at which the fall of a signal of 1 may pass for noise."""
+    """Least noise per unit signal at which third differences may neglect the fall of the signal."""
 
 
 class _Sums(NamedTuple):
@@ -72,23 +73,23 @@ class _Sums(NamedTuple):
 
     values: Array
     head: Array
-    """From the start of the block to before the bin."""
+    """Sum from the start of the block to before the bin."""
     tail: Array
-    """From the bin to the end of the block."""
+    """Sum from the bin to the end of the block."""
     high: Array
-    """Over the blocks before this one."""
+    """Sum over the blocks before this one."""
     low: Array
-    """What rounding took from `high`."""
+    """Rounding error of `high`."""
     finite: npt.NDArray[np.int64]
-    """1 where `values` counts."""
+    """1 where `values` is valid."""
     counts: npt.NDArray[np.int64]
-    """Photons, or finite values, before the bin."""
+    """Number of photons, or of finite values, before the bin."""
     bins: Array
     """Number of finite values in the window, where the profile has gaps."""
 
 
 class SignalScratch(NamedTuple):
-    """Memory for one profile, which stays in the cache."""
+    """Work arrays for one profile, small enough for the processor cache."""
 
     sums: _Sums
     mean: Array
@@ -97,7 +98,7 @@ class SignalScratch(NamedTuple):
 
 
 def scratch(bins: int) -> SignalScratch:
-    """Return memory for profiles of that many bins."""
+    """Return work arrays for profiles of that many bins."""
     blocks = -(-bins // BLOCK)
     padded = blocks * BLOCK
     sums = _Sums(
@@ -115,31 +116,31 @@ def scratch(bins: int) -> SignalScratch:
 
 @_compiled
 def _load(values: Array, s: _Sums) -> bool:
-    """Take what is finite of a profile; return whether all is."""
-    found = 0
+    """Load the finite values of a profile; return whether all are finite."""
+    count = 0
     for i in range(values.size):
         finite = abs(values[i]) < math.inf
         s.values[i] = values[i] if finite else 0.0
         s.finite[i] = 1 if finite else 0
-        found += s.finite[i]
-    return bool(found == values.size)
+        count += s.finite[i]
+    return bool(count == values.size)
 
 
 @_compiled
 def _load_squares(power: Array, s: _Sums) -> bool:
-    """Take the third differences, squared and scaled to the variance of white noise."""
+    """Load squared third differences, scaled to the variance of white noise."""
     for i in (0, max(power.size - 2, 0), power.size - 1):
         s.values[i] = 0.0
         s.finite[i] = 0
-    found = 0
+    count = 0
     for i in range(power.size - 3):
         third = power[i + 3] - 3.0 * power[i + 2] + 3.0 * power[i + 1] - power[i]
         square = third * third / 20.0
         finite = square < math.inf
         s.values[i + 1] = square if finite else 0.0
         s.finite[i + 1] = 1 if finite else 0
-        found += s.finite[i + 1]
-    return bool(found == power.size - 3)
+        count += s.finite[i + 1]
+    return bool(count == power.size - 3)
 
 
 @_compiled
@@ -149,17 +150,17 @@ def _accumulate(s: _Sums) -> None:
     for block in range(s.high.size - 1):
         start = block * BLOCK
         end = start + BLOCK - 1
-        total = back = 0.0
+        total = reverse = 0.0
         for i in range(BLOCK):
             s.head[start + i] = total
             total += s.values[start + i]
-            back += s.values[end - i]
-            s.tail[end - i] = back
+            reverse += s.values[end - i]
+            s.tail[end - i] = reverse
         s.high[block], s.low[block] = high, low
-        # What the addition rounds off, exactly (Knuth).
+        # The exact rounding error of the addition (Knuth's two-sum).
         summed = high + total
-        part = summed - high
-        low += (high - (summed - part)) + (total - part)
+        rounded = summed - high
+        low += (high - (summed - rounded)) + (total - rounded)
         high = summed
     s.high[-1], s.low[-1] = high, low
 
@@ -188,7 +189,7 @@ def _window_sum(s: _Sums, first: np.uint32, past: np.uint32) -> float:
 
 @_compiled
 def _averages(s: _Sums, windows: Windows, complete: bool, out: Array) -> None:
-    """Average the loaded values over windows."""
+    """Write averages of the loaded values over windows."""
     _accumulate(s)
     if complete:
         for i in range(out.size):
@@ -223,9 +224,9 @@ def _weigh(s: SignalScratch, leak: Array) -> None:
     """Weight squared differences by the inverse square of their mean, at most 1."""
     for i in range(leak.size):
         mean, local = s.mean[i], s.local[i]
-        faked = leak[i] * mean
+        signal_fall = leak[i] * mean
         usable = (s.sums.finite[i] != 0) & (abs(mean) < math.inf) & (local > 0.0)
-        s.weight[i] = local if usable & (faked * faked < local) else math.inf
+        s.weight[i] = local if usable & (signal_fall * signal_fall < local) else math.inf
     lowest = _lowest(s.weight)
     for i in range(leak.size):
         share = lowest / s.weight[i]
@@ -234,13 +235,13 @@ def _weigh(s: SignalScratch, leak: Array) -> None:
 
 @_summing
 def _means(x: Array, y: Array, weight: Array) -> tuple[float, float]:
-    total = of_x = of_y = 0.0
+    total = x_sum = y_sum = 0.0
     for i in range(weight.size):
         w = weight[i]
         total += w
-        of_x += w * (x[i] if w > 0.0 else 0.0)
-        of_y += w * y[i]
-    return of_x / total, of_y / total
+        x_sum += w * (x[i] if w > 0.0 else 0.0)
+        y_sum += w * y[i]
+    return x_sum / total, y_sum / total
 
 
 @_summing
@@ -263,7 +264,7 @@ def _moments(
 
 @_compiled
 def _floor(x: Array, weight: Array) -> float:
-    """Return the least x that has a weight."""
+    """Return the least x with a positive weight."""
     lowest = math.inf
     for i in range(x.size):
         if weight[i] > 0.0 and x[i] < lowest:
@@ -273,7 +274,7 @@ def _floor(x: Array, weight: Array) -> float:
 
 @_compiled
 def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float]:
-    """Return y at the floor of x and its slope, neither below zero; NaN without weights."""
+    """Return y at the floor of x and the slope, neither below zero; NaN without weights."""
     x_mean, y_mean = _means(x, y, weight)
     moments = _moments(x, y, weight, x_mean, y_mean, floor)
     square, product, from_zero, from_floor, through = moments
@@ -282,7 +283,7 @@ def _line(x: Array, y: Array, weight: Array, floor: float) -> tuple[float, float
         slope = 0.0
     lowest = y_mean - slope * (x_mean - floor)
     if lowest < 0.0:
-        # From the floor up, where the fit would have the noise vanish above it.
+        # A negative value at the floor: fit the slope through zero at the floor instead.
         return 0.0, through / from_floor
     return lowest, slope
 
@@ -294,22 +295,19 @@ def _estimate(power: Array, noise: NoiseModel, s: SignalScratch, out: Array) -> 
     complete = _load_squares(power, s.sums)
     _averages(s.sums, noise.wide, complete, s.local)
     _weigh(s, noise.leak)
-    # Light is what exceeds the lowest level: an offset of the electronics makes no noise.
+    # Light is the excess over the lowest level: an offset of the electronics makes no noise.
     floor = _floor(s.mean, s.weight)
     a, b = _line(s.mean, s.sums.values[: power.size], s.weight, floor)
     for i in range(power.size):
         light = s.mean[i] - floor
         variance = a + b * (0.0 if light < 0.0 else light)
-        # Too few differences for a line, or a signal without noise: what there is, locally.
+        # Too few differences for a line, or no noise: use the local mean of the squares.
         out[i] = variance if (variance > 0.0) & (variance < math.inf) else s.local[i]
 
 
 @_compiled
 def _is_off(counts: npt.NDArray[np.int32]) -> bool:
-    """Return whether there is not a single count.
-
-    A recorder that is off writes zeros; light and electronics never do over a whole profile.
-    """
+    """Return whether all counts are zero, as those of a recorder that is off."""
     bits = np.int32(0)
     for i in range(counts.size):
         bits |= counts[i]
@@ -348,19 +346,19 @@ def voltage_profiles(
     power: Array,
     quality: Flags,
 ) -> None:
-    """Turn summed ADC counts into voltage.
+    """Convert summed ADC counts to voltage.
 
     Parameters
     ----------
     counts : (profile, bin) int32
     shots, step, full : (profile,) float64
-        mV per count, and the count from which the digitiser is at full scale.
+        Number of shots; mV per count; count at full scale.
     dark : (profile or 1, bin) float64
         mV.
     overlap : (bin,) int32
         INCOMPLETE_OVERLAP or 0.
     power, quality : (profile, bin)
-        Get the signal.
+        Output.
     """
     for k in range(counts.shape[0]):
         missing = (not shots[k] > 0.0) | _is_off(counts[k])
@@ -370,15 +368,15 @@ def voltage_profiles(
 
 @_compiled
 def noise_profiles(power: Array, noise: NoiseModel, s: SignalScratch, out: Array) -> None:
-    """Estimate the noise variance of every profile from third differences.
+    """Estimate the noise variance of each profile from third differences.
 
     Parameters
     ----------
     power : (profile, bin) float64
-    noise : Noise
-    s : Scratch
+    noise : NoiseModel
+    s : SignalScratch
     out : (profile, bin) float64
-        Gets the variance.
+        Output: the variance.
     """
     for k in range(power.shape[0]):
         _estimate(power[k], noise, s, out[k])
@@ -386,15 +384,15 @@ def noise_profiles(power: Array, noise: NoiseModel, s: SignalScratch, out: Array
 
 @_compiled
 def smooth_profiles(values: Array, windows: Windows, s: SignalScratch, out: Array) -> None:
-    """Average every profile over windows.
+    """Average each profile over windows.
 
     Parameters
     ----------
     values : (profile, bin) float64
     windows : Windows
-    s : Scratch
+    s : SignalScratch
     out : (profile, bin) float64
-        Gets the averages of what is finite.
+        Output: the averages of finite values.
     """
     for k in range(values.shape[0]):
         complete = _load(values[k], s.sums)
@@ -402,16 +400,16 @@ def smooth_profiles(values: Array, windows: Windows, s: SignalScratch, out: Arra
 
 
 class Counter(NamedTuple):
-    """How a photon counter answers to light."""
+    """Dead time of a photon counter, and the limits of its flags."""
 
     dead_time: float
-    """Microseconds; 0 corrects nothing."""
-    judged: float
-    """Dead time by which pile-up and paralysis are judged."""
+    """Microseconds; with 0 nothing is corrected."""
+    assumed_dead_time: float
+    """Microseconds; dead time for the flags PILE_UP and SATURATED."""
     paralysis: float
-    """Measured rate times dead time above which the counter is SATURATED."""
+    """Measured rate times dead time above which a bin is SATURATED."""
     pile_up: float
-    """Relative correction above which there is PILE_UP."""
+    """Relative correction above which a bin has PILE_UP."""
 
 
 @_compiled
@@ -425,29 +423,29 @@ def _rate(
     power: Array,
     quality: Flags,
 ) -> bool:
-    """Fill power and quality of a profile, and load it; return whether it has no gaps."""
-    found = 0
+    """Write power and quality of a profile, and load it; return whether it has no gaps."""
+    valid_bins = 0
     for i in range(counts.size):
         count = counts[i]
         rate = count / exposure
-        load = rate * counter.judged
+        load = rate * counter.assumed_dead_time
         saturated = load > counter.paralysis
         piled = load / (1.0 - (counter.paralysis if saturated else load)) > counter.pile_up
         lost = missing | (count < 0) | (count == _HIGHEST)
-        bad = lost | saturated
+        invalid = lost | saturated
         value = rate / (1.0 - rate * counter.dead_time)
-        power[i] = math.nan if bad else value
-        s.values[i] = 0.0 if bad else value
-        s.finite[i] = 0 if bad else 1
-        found += s.finite[i]
+        power[i] = math.nan if invalid else value
+        s.values[i] = 0.0 if invalid else value
+        s.finite[i] = 0 if invalid else 1
+        valid_bins += s.finite[i]
         bits = overlap[i] | (_MISSING if lost else 0) | (_SATURATED if saturated else 0)
         quality[i] = bits | (_PILE_UP if piled else 0)
-    return bool(found == counts.size)
+    return bool(valid_bins == counts.size)
 
 
 @_compiled
 def _photons(counts: npt.NDArray[np.int32], windows: Windows, s: _Sums, out: Array) -> None:
-    """Count what is not masked in each window, which is exact."""
+    """Count the photons of valid bins in each window, in exact integer sums."""
     before = 0
     for i in range(counts.size):
         s.counts[i] = before
@@ -462,11 +460,11 @@ def _photon_variance(
     exposure: float, dead_time: float, photons: Array, bins: Array, mean: Array, out: Array
 ) -> None:
     for i in range(out.size):
-        # A window without a single count has a rate below one count, not a certain zero.
-        one = 1.0 / (exposure * bins[i])
-        measured = photons[i] * one
+        # A window without counts has a rate below that of one count, not exactly zero.
+        one_count = 1.0 / (exposure * bins[i])
+        measured = photons[i] * one_count
         rate = mean[i] if dead_time > 0.0 else measured
-        expected = one if one > rate else rate
+        expected = one_count if one_count > rate else rate
         out[i] = expected / (exposure * (1.0 - measured * dead_time))
 
 
@@ -483,20 +481,20 @@ def photon_profiles(
     variance: Array,
     quality: Flags,
 ) -> None:
-    """Turn summed photon counts into a count rate with known noise.
+    """Convert summed photon counts to a count rate, corrected for dead time, with its variance.
 
     Parameters
     ----------
     counts : (profile, bin) int32
     shots, exposure : (profile,) float64
-        Microseconds of a bin, over all shots.
+        Number of shots; duration of a bin over all shots in microseconds.
     counter : Counter
     overlap : (bin,) int32
         INCOMPLETE_OVERLAP or 0.
     windows : Windows
-    s : Scratch
+    s : SignalScratch
     power, variance, quality : (profile, bin)
-        Get the signal.
+        Output.
     """
     for k in range(counts.shape[0]):
         missing = (not shots[k] > 0.0) | _is_off(counts[k])
@@ -529,7 +527,7 @@ def range_corrected_profiles(
     square : (bin,) float64
         m^2.
     out_power, out_variance : (profile, bin) float32 or float64
-        Get the result.
+        Output.
     """
     for k in range(power.shape[0]):
         level, spread = background[k], background_variance[k]

@@ -1,4 +1,4 @@
-"""Compiled weighted sums of profiles with gaps, in the order of time."""
+"""Compiled weighted sums of profiles with gaps, in time order."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def _add(
     total, value, noise, systematic = sums
     for i in range(values.size):
         x = np.float64(values[i])
-        good = abs(x) < HUGE
-        total[i] += weight if good else 0.0
-        value[i] += weight * x if good else 0.0
-        noise[i] += weight * weight * variance[i] if good else 0.0
-        systematic[i] += weight * math.sqrt(shared[i]) if good else 0.0
-        count[i] += 1 if good else 0
+        valid = abs(x) < HUGE
+        total[i] += weight if valid else 0.0
+        value[i] += weight * x if valid else 0.0
+        noise[i] += weight * weight * variance[i] if valid else 0.0
+        systematic[i] += weight * math.sqrt(shared[i]) if valid else 0.0
+        count[i] += 1 if valid else 0
 
 
 @_compiled
@@ -46,57 +46,29 @@ def add_profiles(
     sums: Array,
     count: npt.NDArray[np.int64],
 ) -> None:
-    """Add every profile to the sums of its group.
+    """Add each profile to the sums of its group.
 
     Parameters
     ----------
     values : (outer, time, inner) float32 or float64
-        What is not finite is passed over.
+        Values that are not finite are skipped.
     variance, shared : (outer or 1, time or 1, inner) float64
     weights : (outer or 1, time or 1) float64
-        A profile is passed over where it is not positive.
+        A profile is skipped where it is not positive.
     group : (time,) int
-        A profile is passed over where it is negative.
+        A profile is skipped where it is negative.
     sums : (4, outer, group, inner) float64
-        Gets the sums of weights, of weighted values, of squared weights times variance, and of
-        weighted roots of the shared variance added.
+        Input and output: sums of weights, of weighted values, of squared weights times variance,
+        and of weighted roots of the shared variance.
     count : (outer, group, inner) int64
-        Gets the number of finite values added.
+        Input and output: number of finite values.
     """
     for k in range(values.shape[0]):
         for t in range(values.shape[1]):
             weight, g = weights[k % weights.shape[0], t % weights.shape[1]], group[t]
             if g < 0 or not 0.0 < weight < HUGE:
                 continue
-            parts = (sums[0, k, g], sums[1, k, g], sums[2, k, g], sums[3, k, g])
+            group_sums = (sums[0, k, g], sums[1, k, g], sums[2, k, g], sums[3, k, g])
             own = variance[k % variance.shape[0], t % variance.shape[1]]
             common = shared[k % shared.shape[0], t % shared.shape[1]]
-            _add(values[k, t], own, common, weight, parts, count[k, g])
-
-
-@_compiled
-def add_bins(
-    values: Any,
-    variance: Array,
-    shared: Array,
-    weights: Array,
-    group: npt.NDArray[np.intp],
-    sums: Array,
-    count: npt.NDArray[np.int64],
-) -> None:
-    """Do what `add_profiles` does, where the inner axis is 1 long: faster there."""
-    for k in range(values.shape[0]):
-        weight, x = weights[k % weights.shape[0]], values[k, :, 0]
-        own, common = variance[k % variance.shape[0], :, 0], shared[k % shared.shape[0], :, 0]
-        total, value, noise, systematic = sums[0, k], sums[1, k], sums[2, k], sums[3, k]
-        counted = count[k]
-        step = min(weight.size - 1, 1), min(own.size - 1, 1), min(common.size - 1, 1)
-        for t in range(group.size):
-            w, g = weight[t * step[0]], group[t]
-            if g < 0 or not 0.0 < w < HUGE or not abs(x[t]) < HUGE:
-                continue
-            total[g, 0] += w
-            value[g, 0] += w * x[t]
-            noise[g, 0] += w * w * own[t * step[1]]
-            systematic[g, 0] += w * math.sqrt(common[t * step[2]])
-            counted[g, 0] += 1
+            _add(values[k, t], own, common, weight, group_sums, count[k, g])

@@ -1,9 +1,12 @@
-"""From raw counts to a clean signal with known noise: arrays in, arrays out.
+"""Raw counts to signals with known noise.
 
-The last axis is range, the one before it time. Signals are in mV (analog) and MHz (photon
-counting), as the field has them; everything else is SI. Any layout, byte order and type of
-integers or floats is taken; masked entries are missing. A profile gives the same bits whatever
-profiles come with it.
+`analog_signal` converts ADC counts to mV and subtracts the dark signal. `photon_signal` converts
+photon counts to MHz and corrects for dead time, which is done nowhere else. `range_corrected`
+subtracts the background and multiplies with the square of range.
+
+The last axis is range, the one before it time. Quantities other than the signals are in SI units.
+Arrays may have any memory layout, byte order and integer or float type; masked entries are
+missing. The result of a profile does not depend on the other profiles, to the last bit.
 """
 
 from __future__ import annotations
@@ -27,26 +30,27 @@ Flags = npt.NDArray[np.int32]
 
 PILE_UP_CORRECTION = 0.1
 """Relative dead-time correction above which `Quality.PILE_UP` is raised."""
-PILE_UP_LEFT = 0.01
-"""The same where no dead time is known, so that nothing is corrected."""
+UNCORRECTED_PILE_UP = 0.01
+"""Relative correction above which PILE_UP is raised where the dead time is unknown, so that
+nothing is corrected."""
 NEAR_FULL_SCALE = 0.5
-"""Share of full scale from which on a bin is looked at for shots that were clipped."""
+"""Share of full scale above which a bin is tested for clipped shots."""
 CLIPPING = 3.5
-"""Standard deviations of a shot below full scale within which clipping shifts a mean: there by
-6e-5 of that deviation."""
+"""Standard deviations of a shot by which the mean must lie below full scale. Clipping shifts the
+mean by 6e-5 of that deviation there, and by more above."""
 PARALYSIS = 0.5
 """Measured rate times dead time above which a rate cannot be corrected (`Quality.SATURATED`)."""
 NOISE_WINDOW = 0.1
 """Half-width, relative to range, of the window in which noise is smoothed."""
 WEIGHT_WINDOW = 0.3
-"""The same for the weights of the noise model."""
+"""Half-width, relative to range, of the window for the weights of the noise model."""
 MIN_NOISE_BINS = kernels.BLOCK
 """Smallest half-width of such a window in bins: 16."""
 _FINE = 0.5
-"""Variance of a shot in squares of a digitiser step above which rounding needs no thought: there
-the error that does not average out is below 1e-4 steps."""
+"""Variance of a shot in squared digitiser steps above which rounding is neglected. The error that
+does not average out is below 1e-4 steps there."""
 LEAK = 0.05
-"""Largest share of the noise that the fall of the signal may fake in a third difference."""
+"""Largest share of a squared third difference that may come from the fall of the signal."""
 
 _Number = TypeVar("_Number", bound=np.generic)
 _COUNT_LIMITS = np.iinfo(np.int32)
@@ -59,7 +63,7 @@ class Signal:
     power: Floats
     """mV or MHz; NaN where `quality` holds INPUT_MISSING or SATURATED."""
     variance: Floats
-    """Of the noise, in the square of the signal's unit."""
+    """Noise variance in the square of the signal's unit."""
     quality: Flags
     """Bits of `lidarops.flags.Quality`."""
 
@@ -76,20 +80,21 @@ def analog_signal(
     noise_variance: float | None = None,
     full_overlap_range: float = 0.0,
 ) -> Signal:
-    r"""Turn summed ADC counts into voltage with known noise.
+    r"""Return the voltage and its noise variance of summed ADC counts.
 
     .. math:: U = \frac{n \cdot 1000\, U_{max}}{N \, 2^{b}} - D
 
     with counts :math:`n`, shots :math:`N`, bits :math:`b`, input range :math:`U_{max}` in V and
-    dark signal :math:`D` in mV. A bin at full scale, :math:`n \ge N (2^b - 1)`, is SATURATED, and
-    one so near to it that single shots reached it: within 3.5 standard deviations of a shot. A
-    bin at an extreme of the integer type, or of a profile without shots or of zeros alone, or
-    without a finite input range or dark signal, is INPUT_MISSING.
+    dark signal :math:`D` in mV. A bin is SATURATED at full scale, :math:`n \ge N (2^b - 1)`, and
+    within 3.5 standard deviations of a shot below it, where single shots were clipped. A bin is
+    INPUT_MISSING at an extreme of the integer type, in a profile without shots or of zeros only,
+    and without a finite input range or dark signal.
 
-    Each shot is rounded to whole steps of the digitiser. Where the noise of a shot is above half
-    a step, that averages out and is part of the noise that is seen; below, all shots err to one
-    side, by up to half a step however many there are, and the variance is raised to cover it. That
-    part of the error is the same in neighbouring bins: a mean over bins does not reduce it.
+    Each shot is rounded to whole steps of the digitiser. Where the noise of a shot exceeds half
+    a step, rounding errors average out and are part of the measured noise. Where it is less, all
+    shots err to one side, by up to half a step for any number of shots, and the variance is
+    raised to cover this. That part of the error is the same in neighbouring bins: a mean over
+    bins does not reduce it.
 
     Parameters
     ----------
@@ -102,10 +107,10 @@ def analog_signal(
     input_range : (..., time) float
         V.
     dark, dark_variance : (range,) or (..., time, range) float, optional
-        Mean of the dark files in mV, and the variance of that mean in mV^2; one for all profiles,
-        or one for each.
+        Mean of the dark files in mV, and the variance of that mean in mV^2; common to all
+        profiles, or one for each.
     noise_variance : float, optional
-        mV^2, of one profile; estimated from the profile (`difference_variance`) where absent.
+        mV^2, of one profile; where not given, estimated from the profile (`difference_variance`).
     full_overlap_range : float
         m; nearer bins are INCOMPLETE_OVERLAP.
 
@@ -117,8 +122,8 @@ def analog_signal(
     Raises
     ------
     RetrievalInputError
-        For counts that are no 32-bit integers, shapes that do not fit, a range that is not finite
-        or has a bin twice, a noise variance that is negative or not finite.
+        For counts that are not 32-bit integers, shapes that do not match, a range that is not
+        finite or repeats a bin, a noise variance that is negative or not finite.
 
     References
     ----------
@@ -144,83 +149,81 @@ def analog_signal(
     scale = _Scale(summed, step, fired * (2.0**adc_bits - 1.0), fired)
     if noise_variance is None:
         variance = _estimated_variance(power, grid)
-        again = _flag_clipped(power, quality, scale, variance)
-        if again.size:
-            # Clipped bins are less noisy than others, and have drawn the estimate down.
-            _rows(variance)[again] = _estimated_variance(_rows(power)[again], grid)
-        return Signal(power, _with_rounding(variance, scale), quality)
-    _refuse_unless(
-        0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2"
-    )
-    known = np.full(power.shape, noise_variance)
-    of_dark = _per_bin(dark_variance, "dark_variance", summed.shape)
-    _flag_clipped(power, quality, scale, (_rows(known) + of_dark).reshape(power.shape))
-    variance = _rows(_with_rounding(known, scale)) + of_dark
+        clipped = _flag_clipped(power, quality, scale, variance)
+        if clipped.size:
+            # Clipped bins are less noisy than others and lowered the estimate.
+            _rows(variance)[clipped] = _estimated_variance(_rows(power)[clipped], grid)
+        return Signal(power, _add_rounding(variance, scale), quality)
+    _require(0.0 <= noise_variance < np.inf, noise_variance, "noise_variance", "a variance in mV^2")
+    noise = np.full(power.shape, noise_variance)
+    dark_noise = _per_bin(dark_variance, "dark_variance", summed.shape)
+    _flag_clipped(power, quality, scale, (_rows(noise) + dark_noise).reshape(power.shape))
+    variance = _rows(_add_rounding(noise, scale)) + dark_noise
     return Signal(power, variance.reshape(power.shape), quality)
 
 
 class _Scale(NamedTuple):
-    """Summed counts of profiles, and what they are counted against."""
+    """Summed counts of profiles, and their conversion to mV."""
 
     counts: npt.NDArray[np.int32]
     """(..., time, range)"""
     step: Array
-    """(profile,), mV of the mean for one count of the sum."""
+    """(profile,), mV of the mean per count of the sum."""
     top: Array
     """(profile,), counts at full scale."""
     shots: Array
     """(profile,)"""
 
 
-def _with_rounding(variance: Array, scale: _Scale) -> Array:
-    """Return variances of the noise as seen, raised by what rounding does unseen.
+def _add_rounding(variance: Array, scale: _Scale) -> Array:
+    """Return the noise variances plus that of rounding errors which the scatter does not show.
 
-    Each shot is rounded on its own. Noise of half a step or more makes that a noise of 1 / 12,
-    which is part of what is seen and averages out. Less noise leaves all shots on the same side:
-    an error that no number of shots takes away and that no scatter tells, uniform within half a
-    step where there is no noise at all. In between, shots fall on two steps with variance
-    m (1 - m), and their mean m may be off by sqrt(1/4 - m (1 - m)); above a variance of 1/4 the
-    first harmonic of the error is left. The variance of a bin scatters, that of the middle one of
-    a profile does not: the smaller of the two is asked.
+    Each shot is rounded separately. With noise of half a step or more, rounding adds a variance
+    of 1 / 12 squared steps, which is part of the measured noise and averages out. With less
+    noise, the shots err to one side: an error that neither decreases with the number of shots nor
+    shows in the scatter, uniform within half a step where there is no noise at all. In between,
+    shots fall on two steps with variance m (1 - m), and their mean m may be off by
+    sqrt(1/4 - m (1 - m)); above a variance of 1/4 the first harmonic of the error remains. The
+    variance of a bin scatters, the median of a profile does not: the smaller of the two decides.
     """
-    found = variance.copy()
-    rows = _rows(found)
-    # Without a shot, nothing is known.
+    raised_variance = variance.copy()
+    rows = _rows(raised_variance)
+    # Without a shot, the noise is unknown.
     rows[scale.shots <= 0] += np.inf
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         unit = (scale.step**2 * scale.shots)[:, np.newaxis]
         coarse = np.flatnonzero((rows < _FINE * unit).any(axis=-1))
         unit, shots = unit[coarse], scale.shots[coarse, np.newaxis]
-        seen = rows[coarse] / unit
-        middle = np.sort(seen, axis=-1)[:, (seen.shape[-1] - 1) // 2, np.newaxis]
-        least = np.fmin(seen, middle)
+        measured = rows[coarse] / unit
+        median = np.sort(measured, axis=-1)[:, (measured.shape[-1] - 1) // 2, np.newaxis]
+        least = np.fmin(measured, median)
         harmonic = np.exp(-4.0 * np.pi**2 * np.maximum(least - 1.0 / 12.0, 0.0)) / (2.0 * np.pi**2)
         common = np.maximum((0.25 - least) / 3.0, harmonic)
-        raised = unit * (np.maximum(seen, 1.0 / 12.0) + shots * common)
-    rows[coarse] = np.where(seen >= _FINE, rows[coarse], raised)
-    return found
+        raised = unit * (np.maximum(measured, 1.0 / 12.0) + shots * common)
+    rows[coarse] = np.where(measured >= _FINE, rows[coarse], raised)
+    return raised_variance
 
 
 def _flag_clipped(
     power: Array, quality: Flags, scale: _Scale, variance: Array
 ) -> npt.NDArray[np.intp]:
-    """Mark the bins of which some shots reached full scale though their mean did not.
+    """Mark bins in which single shots were clipped although their mean is below full scale.
 
     Returns
     -------
     (profile,) int
-        Those with such bins.
+        Indices of the profiles with such bins.
     """
     rows, noise = _rows(scale.counts), _rows(variance)
     fired = (scale.shots > 0)[:, np.newaxis]
     profile, bins = np.nonzero(fired & (rows > NEAR_FULL_SCALE * scale.top[:, np.newaxis]))
-    one_shot = np.sqrt(noise[profile, bins] * scale.shots[profile])
-    room = (scale.top[profile] - rows[profile, bins]) * scale.step[profile]
-    clipped = room < CLIPPING * one_shot
-    where = profile[clipped], bins[clipped]
-    _rows(power)[where] = np.nan
-    _rows(quality)[where] |= np.int32(Quality.SATURATED)
-    return np.unique(where[0])
+    shot_deviation = np.sqrt(noise[profile, bins] * scale.shots[profile])
+    margin = (scale.top[profile] - rows[profile, bins]) * scale.step[profile]
+    clipped = margin < CLIPPING * shot_deviation
+    indices = profile[clipped], bins[clipped]
+    _rows(power)[indices] = np.nan
+    _rows(quality)[indices] |= np.int32(Quality.SATURATED)
+    return np.unique(indices[0])
 
 
 def photon_signal(
@@ -232,18 +235,18 @@ def photon_signal(
     dead_time: float | None = None,
     full_overlap_range: float = 0.0,
 ) -> Signal:
-    r"""Turn summed photon counts into a count rate with known noise.
+    r"""Return the count rate, corrected for dead time, and its noise variance of photon counts.
 
     The measured rate is :math:`m = n / (N T)`, with the nominal bin time :math:`T` = bin width
-    / 150 m per microsecond; a non-paralysable dead time :math:`\tau` is undone by
+    / 150 m per microsecond. It is corrected for a non-paralysable dead time :math:`\tau` by
 
     .. math:: r = \frac{m}{1 - m \tau}, \qquad \mathrm{var}(r) = \frac{r}{N T (1 - m \tau)}
 
-    (renewal statistics: :math:`\mathrm{var}(n) = n (1 - m\tau)^2`). The variance is evaluated on
-    the rate smoothed over +- 10 % of range, so that the weights made of it do not follow the
-    noise of the single bin. PILE_UP where the correction exceeds 10 %, SATURATED where
-    :math:`m \tau > 0.5`. Where no dead time is known nothing is corrected; both are judged with
-    4 ns then, and PILE_UP is raised where 1 % is left uncorrected.
+    (renewal statistics: :math:`\mathrm{var}(n) = n (1 - m\tau)^2`). The variance is that of the
+    rate smoothed over +- 10 % of range, so that weights derived from it do not follow the noise
+    of the single bin. PILE_UP is raised where the correction exceeds 10 %, SATURATED where
+    :math:`m \tau > 0.5`. Without a dead time nothing is corrected: 4 ns are assumed for the
+    flags, and PILE_UP is raised where more than 1 % is left uncorrected.
 
     Parameters
     ----------
@@ -267,8 +270,8 @@ def photon_signal(
     Raises
     ------
     RetrievalInputError
-        For counts that are no 32-bit integers, shapes that do not fit, a range that is not finite
-        or has a bin twice, a bin width or dead time that cannot be right.
+        For counts that are not 32-bit integers, shapes that do not match, a range that is not
+        finite or repeats a bin, an invalid bin width or dead time.
 
     References
     ----------
@@ -278,9 +281,9 @@ def photon_signal(
     summed = _counts(counts, grid, shots)
     leading = summed.shape[:-1]
     fired = _per_profile(shots, "shots", leading)
-    _refuse_unless(0.0 < bin_width < np.inf, bin_width, "bin_width", "a positive width in m")
+    _require(0.0 < bin_width < np.inf, bin_width, "bin_width", "a positive width in m")
     dead = 0.0 if dead_time is None else dead_time
-    _refuse_unless(0.0 <= dead < np.inf, dead, "dead_time", "a time in s")
+    _require(0.0 <= dead < np.inf, dead, "dead_time", "a time in s")
     power, variance = np.empty(summed.shape), np.empty(summed.shape)
     quality = np.empty(summed.shape, np.int32)
     kernels.photon_profiles(
@@ -289,9 +292,9 @@ def photon_signal(
         frozen(fired * (bin_width / LICEL_RANGE_PER_MICROSECOND)),
         kernels.Counter(
             dead_time=dead * 1e6,
-            judged=(dead or DEFAULT_DEAD_TIME) * 1e6,
+            assumed_dead_time=(dead or DEFAULT_DEAD_TIME) * 1e6,
             paralysis=PARALYSIS,
-            pile_up=PILE_UP_LEFT if dead_time is None else PILE_UP_CORRECTION,
+            pile_up=UNCORRECTED_PILE_UP if dead_time is None else PILE_UP_CORRECTION,
         ),
         _overlap_bits(grid, full_overlap_range),
         _windows(grid, NOISE_WINDOW),
@@ -303,9 +306,9 @@ def photon_signal(
     return Signal(power, variance, quality)
 
 
-def _refuse_unless(good: bool, value: float, name: str, wanted: str) -> None:  # noqa: FBT001
-    if not good:
-        raise RetrievalInputError(f"is {value}", field=name, remedy=f"give {wanted}")
+def _require(valid: bool, value: float, name: str, expected: str) -> None:  # noqa: FBT001
+    if not valid:
+        raise RetrievalInputError(f"is {value}", field=name, remedy=f"give {expected}")
 
 
 def _grid(range: npt.ArrayLike) -> Array:  # noqa: A002 - the field's word
@@ -316,29 +319,29 @@ def _grid(range: npt.ArrayLike) -> Array:  # noqa: A002 - the field's word
         )
     if not np.isfinite(grid).all() or not np.diff(grid).all():
         raise RetrievalInputError(
-            "is not finite, or two bins have the same", field="range", remedy="give centres in m"
+            "is not finite, or repeats a bin", field="range", remedy="give bin centres in m"
         )
     return grid
 
 
 def _counts(counts: npt.ArrayLike, grid: Array, shots: npt.ArrayLike) -> npt.NDArray[np.int32]:
-    """Return counts as they are, but of the one type that the kernels know."""
+    """Return counts as int32, the type of the kernels; masked ones as the lowest integer."""
     if isinstance(counts, np.ma.MaskedArray):
         masked = np.ma.getmaskarray(counts)
         counts = np.where(masked, _COUNT_LIMITS.min, counts.data.astype(np.int64))
     array = np.asarray(counts)
     if array.shape[-1:] != grid.shape or array.shape[:-1] != np.shape(shots):
         raise RetrievalInputError(
-            f"counts {array.shape}, shots {np.shape(shots)} and range {grid.shape} do not fit",
+            f"counts {array.shape}, shots {np.shape(shots)} and range {grid.shape} do not match",
             field="counts",
             remedy="counts are (..., time, range), shots (..., time), range (range,)",
         )
-    # Other integers pass where no count is too large.
+    # Other integer types are accepted if no count exceeds 32 bits.
     if array.dtype.kind not in "iu" or not (
         np.can_cast(array.dtype, np.int32) or np.array_equal(array, array.astype(np.int32))
     ):
         raise RetrievalInputError(
-            f"holds {array.dtype} that is no 32-bit count",
+            f"holds {array.dtype}, not 32-bit counts",
             field="counts",
             remedy="open the archive with mask_and_scale=False",
         )
@@ -346,7 +349,7 @@ def _counts(counts: npt.ArrayLike, grid: Array, shots: npt.ArrayLike) -> npt.NDA
 
 
 def _per_profile(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
-    """Return one value for every profile, flat."""
+    """Return one value for each profile, (profile,)."""
     array = np.require(inputs.real_array(values, name), np.float64, "A")
     try:
         return np.broadcast_to(array, leading).reshape(-1)
@@ -359,7 +362,7 @@ def _per_profile(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> 
 
 
 def _per_bin(values: npt.ArrayLike | None, name: str, shape: tuple[int, ...]) -> Array:
-    """Return one value for every bin, (profile or 1, bin); zeros for None."""
+    """Return one value for each bin, (profile or 1, bin); zeros for None."""
     if values is None:
         return np.zeros((1, shape[-1]))
     array = np.require(inputs.real_array(values, name), np.float64, "A")
@@ -389,15 +392,13 @@ def _rows(array: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
 
 
 def _overlap_bits(grid: Array, full_overlap_range: float) -> Flags:
-    _refuse_unless(
-        full_overlap_range < np.inf, full_overlap_range, "full_overlap_range", "a range in m"
-    )
+    _require(full_overlap_range < np.inf, full_overlap_range, "full_overlap_range", "a range in m")
     near = grid < full_overlap_range
     return frozen(np.where(near, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0)))
 
 
 def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kernels.Windows:
-    """Return the smoothing window of each bin; `ends` are bins that never hold a value."""
+    """Return the smoothing window of each bin; `ends` bins at either end never hold a value."""
     size = grid.size
     index = np.arange(size)
     steps = np.abs(np.diff(grid))
@@ -405,8 +406,8 @@ def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kern
     with np.errstate(over="ignore", invalid="ignore"):
         reach = np.nan_to_num(np.abs(grid) * (window / spacing))
     half = np.clip(reach, MIN_NOISE_BINS, max(size, MIN_NOISE_BINS)).astype(np.intp)
-    begin, end = _stretch(steps > MIN_NOISE_BINS * spacing)
-    # Symmetric up to the ends, so that a steep signal is not smoothed to one side.
+    begin, end = _gap_free_stretch(steps > MIN_NOISE_BINS * spacing)
+    # Windows stay symmetric near the ends; a one-sided one would bias a steep signal.
     half = np.minimum(half, np.maximum(np.minimum(index - begin, end - 1 - index), MIN_NOISE_BINS))
     first, past = np.maximum(index - half, begin), np.minimum(index + half + 1, end)
     bins = np.minimum(past, size - ends[1]) - np.maximum(first, ends[0])
@@ -418,24 +419,26 @@ def _windows(grid: Array, window: float, ends: tuple[int, int] = (0, 0)) -> kern
     )
 
 
-def _stretch(gaps: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Return, for each bin, the first bin of its stretch without a gap and the one past its last.
+def _gap_free_stretch(
+    gaps: npt.NDArray[np.bool_],
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Return the first and past-the-last bin of the stretch without a gap that holds each bin.
 
-    Light on the two sides of a gap, where bins were left on disk, has nothing in common.
+    A gap is where bins were not read. No window may extend across it.
     """
     edges = np.concatenate([[0], np.flatnonzero(gaps) + 1, [gaps.size + 1]])
     lengths = np.diff(edges)
     return np.repeat(edges[:-1], lengths), np.repeat(edges[1:], lengths)
 
 
-def _noise(grid: Array) -> kernels.NoiseModel:
+def _noise_model(grid: Array) -> kernels.NoiseModel:
     spacing = np.abs(np.gradient(grid)) if grid.size > 1 else np.ones(1)
     with np.errstate(divide="ignore"):
         # The third difference of R^-2 is 24 (h / R)^3 of the signal.
         leak = 24.0 * (spacing / grid) ** 3 / np.sqrt(20.0 * LEAK)
     return kernels.NoiseModel(
         narrow=_windows(grid, NOISE_WINDOW),
-        # A third difference needs a bin before and two behind.
+        # A third difference takes one bin before and two after.
         wide=_windows(grid, WEIGHT_WINDOW, ends=(1, 2)),
         leak=frozen(leak),
     )
@@ -443,7 +446,9 @@ def _noise(grid: Array) -> kernels.NoiseModel:
 
 def _estimated_variance(power: Array, grid: Array) -> Array:
     rows, variance = _rows(power), np.empty(power.shape)
-    kernels.noise_profiles(frozen(rows), _noise(grid), kernels.scratch(grid.size), _rows(variance))
+    kernels.noise_profiles(
+        frozen(rows), _noise_model(grid), kernels.scratch(grid.size), _rows(variance)
+    )
     return variance
 
 
@@ -453,7 +458,7 @@ def smooth_signal(
     *,
     window: float = NOISE_WINDOW,
 ) -> Array:
-    """Average over a window that grows with range, at least 33 bins, passing over NaN.
+    """Return averages over a window that grows with range, of at least 33 bins, ignoring NaN.
 
     Parameters
     ----------
@@ -466,17 +471,18 @@ def smooth_signal(
     Returns
     -------
     (..., range) float
-        NaN where the window holds no finite value. Good to some 20 roundings of the mean of
-        absolute values within the window, whatever the near range holds.
+        NaN where the window holds no finite value. The rounding error is about 20 units in the
+        last place of the mean of absolute values within the window, however large the signal of
+        the near range is.
 
     Raises
     ------
     RetrievalInputError
-        For shapes that do not fit, a range that is not finite or has a bin twice, a window that
+        For shapes that do not match, a range that is not finite or repeats a bin, a window that
         is negative or not finite.
     """
     grid = _grid(range)
-    _refuse_unless(0.0 <= window < np.inf, window, "window", "a share of range")
+    _require(0.0 <= window < np.inf, window, "window", "a share of range")
     rows = _profiles(values, "values", grid.size)
     averages = np.empty(rows.shape)
     kernels.smooth_profiles(
@@ -486,24 +492,25 @@ def smooth_signal(
 
 
 def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - the field's word
-    r"""Estimate the noise variance of an analog signal from third differences along range.
+    r"""Return the noise variance of an analog signal, estimated from third differences along range.
 
-    Electronic noise is constant and shot noise follows the light, so that
+    Electronic noise is constant and shot noise is proportional to the light, so
 
     .. math:: v(R) = a + b \, (\overline{P}(R) - \overline{P}_{min}), \qquad
               \left\langle \frac{(P_{i-1} - 3 P_i + 3 P_{i+1} - P_{i+2})^2}{20} \right\rangle
               = v(R_i)
 
-    over the lowest level (an offset of the electronics makes no noise) is fitted by weighted
-    least squares with :math:`a, b \ge 0`, one pair a profile: weights made of two
-    well-determined numbers do not follow the noise of the single bin. Exact for noise that is
-    white along range; noise that is correlated from bin to bin is underestimated. Bins so near
-    that the fall of the signal itself would be taken for noise are left out of the fit.
+    is fitted by weighted least squares with :math:`a, b \ge 0`, one pair per profile. The lowest
+    level :math:`\overline{P}_{min}` is subtracted because an offset of the electronics makes no
+    noise. Weights that derive from two well-determined numbers do not follow the noise of the
+    single bin. The estimate is exact for white noise along range and too small for noise that is
+    correlated from bin to bin. Near bins in which the fall of the signal would count as noise
+    are excluded from the fit.
 
     Parameters
     ----------
     power : (..., range) float
-        NaN where unusable; differences that touch NaN are passed over.
+        NaN where unusable; differences that include NaN are ignored.
     range : (range,) float
         m.
 
@@ -515,7 +522,7 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
     Raises
     ------
     RetrievalInputError
-        For shapes that do not fit, a range that is not finite or has a bin twice.
+        For shapes that do not match, a range that is not finite or repeats a bin.
     """
     grid = _grid(range)
     rows = _profiles(power, "power", grid.size)
@@ -530,7 +537,7 @@ def range_corrected(
     background_variance: npt.ArrayLike,
     dtype: npt.DTypeLike = np.float64,
 ) -> Signal:
-    r"""Subtract the background and multiply with the square of range.
+    r"""Return the signal minus the background, multiplied with the square of range.
 
     .. math:: X = (P - P^*) R^2, \qquad \mathrm{var}(X) = (v_P + v_{P^*}) R^4
 
@@ -543,17 +550,17 @@ def range_corrected(
     background, background_variance : (...) float
         In the unit of the signal and its square.
     dtype : {float64, float32}
-        Of power and variance; the arithmetic is that of float64.
+        Type of power and variance of the result; the arithmetic is that of float64.
 
     Returns
     -------
     Signal
-        In mV m2 or MHz m2. Negative values stay: clipping would bias every mean.
+        In mV m2 or MHz m2. Negative values are kept: clipping would bias every mean.
 
     Raises
     ------
     RetrievalInputError
-        For shapes that do not fit, a range that is not finite or has a bin twice, another dtype.
+        For shapes that do not match, a range that is not finite or repeats a bin, another dtype.
     """
     grid = _grid(range)
     kind = np.dtype(dtype)

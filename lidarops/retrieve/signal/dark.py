@@ -1,4 +1,4 @@
-"""The dark signal of analog channels at the time of each profile, from files with a shut lid."""
+"""Dark signals of analog channels at the times of profiles, from files with the telescope shut."""
 
 from __future__ import annotations
 
@@ -15,41 +15,43 @@ from lidarops.retrieve.common import inputs
 Array = npt.NDArray[np.float64]
 
 SESSION_GAP: Final = 1800.0
-"""s between dark files from which on they belong to different sessions."""
+"""s; dark files farther apart belong to different sessions."""
 VARIANCE_WINDOW: Final = 65
 """Bins over which the scatter of repeats is averaged: that of 3 repeats alone is off by 100 %."""
 FAR_SHARE: Final = 0.5
-"""Share of the bins, from the far end, that tells the noise of a file without repeats."""
-_KNOWN_ROUGHNESS: Final = 6.0
+"""Share of the bins, from the far end, that gives the noise of a file without repeats."""
+_SECOND_DIFFERENCE_VARIANCE: Final = 6.0
+"""Variance of a second difference of white noise over that of the noise."""
 
 
 class DarkMethod(StrEnum):
-    """Which dark files tell the dark signal of a profile."""
+    """How the dark signal of a profile follows from the dark sessions."""
 
     NEAREST = "nearest"
     """The session nearest in time."""
     INTERPOLATED = "interpolated"
-    """The sessions before and after, by time; the nearest one where there is only one side."""
+    """Linear in time between the sessions before and after; before the first and after the last
+    session, that session."""
 
 
 @dataclass(frozen=True, slots=True)
 class DarkProfile:
-    """Dark signals, one for every time asked for."""
+    """Dark signals, one for each requested time."""
 
     dark: Array
     """(..., time, range), in the unit of the dark signals; NaN where no file is finite."""
     variance: Array
-    """(..., time, range) of its noise, independent from bin to bin. Profiles with the same dark
+    """(..., time, range), noise variance, independent from bin to bin. Profiles with the same dark
     files share that noise: it does not average down over them."""
     level_variance: Array
-    """(...) of the level of the single dark file, which wanders: an error that all bins share and
-    that does not average down, but goes with the background where one is fitted. NaN where fewer
-    than two files tell it."""
+    """(...), variance of the level of a single dark file, which drifts. This error is common to
+    all bins and does not average down, but subtracting a fitted background removes it. NaN for
+    fewer than two files."""
     weights: Array
-    """(time, dark): what each dark file counts in each dark signal; a row sums to 1. A file that
-    was not used has 0."""
+    """(time, dark), weight of each dark file in each dark signal; rows sum to 1, unused files
+    have 0."""
     age: Array
-    """(time,) s from each time to the nearest dark file that was used."""
+    """(time,), s between each time and the nearest dark file that was used."""
 
 
 def dark_profile(
@@ -61,10 +63,10 @@ def dark_profile(
     session_gap: float = SESSION_GAP,
     smoothing: int = 1,
 ) -> DarkProfile:
-    r"""Find the dark signal of each profile from the dark files.
+    r"""Return the dark signal of each profile from the dark files.
 
-    Dark files that follow each other within `session_gap` are one session, whose mean
-    :math:`\bar D_s` stands at its mean time. Between two sessions,
+    Consecutive dark files within `session_gap` form a session, with mean :math:`\bar D_s` at its
+    mean time. Between two sessions,
 
     .. math:: D(t) = (1 - u) \bar D_1 + u \bar D_2, \quad u = \frac{t - t_1}{t_2 - t_1}, \qquad
               v = (1 - u)^2 v_1 + u^2 v_2
@@ -72,7 +74,7 @@ def dark_profile(
     Parameters
     ----------
     dark_signals : (..., dark, range) float
-        mV; NaN is passed over.
+        mV; NaN is skipped.
     dark_times : (dark,) float in s, or datetime64
         Middle of each dark file, in any order.
     times : (time,) float in s, or datetime64
@@ -81,45 +83,45 @@ def dark_profile(
     session_gap : float
         s.
     smoothing : int
-        Bins, odd, over which the dark signal is averaged along range, fewer towards the ends
-        (a window always stays symmetric). It divides the variance by as much where the noise of
-        the bins is independent, makes that of neighbours alike, and rounds off what is narrower
-        in the dark signal; 1 for none.
+        Odd number of bins over which the dark signal is averaged along range, fewer towards the
+        ends (the window stays symmetric); 1 for no smoothing. For noise that is independent from
+        bin to bin this divides the variance by that number and correlates neighbouring bins.
+        Narrower features of the dark signal are smoothed out.
 
     Returns
     -------
     DarkProfile
-        The variance is that of the scatter of the files of a session about its mean, less the
-        level of each file, over 65 neighbouring bins. A session of one file has the scatter of
-        files in other sessions; where there is none, that of neighbouring bins over the far half
-        of the range.
+        The variance is the scatter of the files of a session about their mean, after removing
+        the level of each file, averaged over 65 neighbouring bins. A session of one file gets the
+        scatter of files in other sessions; without any, that between neighbouring bins in the
+        far half of the range.
 
     Raises
     ------
     RetrievalInputError
-        Where there is no dark file, a time is not known, or the arguments do not fit.
+        For no dark file, an unknown time, or shapes that do not match.
     """
     chosen = inputs.choice(method, DarkMethod, "method")
     signals = _signals(dark_signals)
-    moments, wanted = _seconds(dark_times, times)
-    if signals.shape[-2] != moments.size:
+    dark_seconds, seconds = _seconds(dark_times, times)
+    if signals.shape[-2] != dark_seconds.size:
         raise RetrievalInputError(
-            f"have the shape {signals.shape} for {moments.size} times",
+            f"have the shape {signals.shape} for {dark_seconds.size} times",
             field="dark_signals",
             remedy="the axis before the last is that of dark_times",
         )
     _check_settings(session_gap, smoothing, signals.shape[-1])
-    sessions = _sessions(moments, session_gap)
+    sessions = _sessions(dark_seconds, session_gap)
     means, variances = _means(signals, sessions)
     if smoothing > 1:
         means, variances = _smooth(means, variances, smoothing)
-    shares = _shares(moments, sessions, wanted, chosen)
+    shares = _shares(dark_seconds, sessions, seconds, chosen)
     return DarkProfile(
-        _mixed(shares, means),
-        _mixed(shares**2, variances),
+        _weighted_sum(shares, means),
+        _weighted_sum(shares**2, variances),
         _level_variance(signals),
         _file_weights(shares, sessions),
-        _age(shares, sessions, moments, wanted),
+        _age(shares, sessions, dark_seconds, seconds),
     )
 
 
@@ -154,16 +156,16 @@ def _seconds(dark_times: npt.ArrayLike, times: npt.ArrayLike) -> tuple[Array, Ar
             remedy="give both as datetime64, or both in s",
         )
     if both[0].dtype.kind == "M":
-        # NaT has no number: it must become NaN before it becomes a float.
+        # Division makes NaT a NaN; a cast to float would make it a number.
         origin = both[0][:1].astype("M8[ns]")
         both = [(array.astype("M8[ns]") - origin) / np.timedelta64(1, "s") for array in both]
-    moments, wanted = (array.astype(np.float64) for array in both)
-    for name, array in (("dark_times", moments), ("times", wanted)):
+    dark_seconds, seconds = (array.astype(np.float64) for array in both)
+    for name, array in (("dark_times", dark_seconds), ("times", seconds)):
         if not np.all(np.isfinite(array)):
             raise RetrievalInputError(
                 "are not all known", field=name, remedy="leave those profiles out"
             )
-    return moments, wanted
+    return dark_seconds, seconds
 
 
 def _check_settings(session_gap: float, smoothing: int, bins: int) -> None:
@@ -177,24 +179,24 @@ def _check_settings(session_gap: float, smoothing: int, bins: int) -> None:
         )
 
 
-def _sessions(moments: Array, gap: float) -> list[npt.NDArray[np.intp]]:
-    """Return the dark files of each session, in the order of time."""
-    order = np.argsort(moments, kind="stable")
-    breaks = np.flatnonzero(np.diff(moments[order]) > gap) + 1
-    return [np.sort(part) for part in np.split(order, breaks)]
+def _sessions(dark_seconds: Array, gap: float) -> list[npt.NDArray[np.intp]]:
+    """Return the indices of the dark files of each session, in time order."""
+    order = np.argsort(dark_seconds, kind="stable")
+    breaks = np.flatnonzero(np.diff(dark_seconds[order]) > gap) + 1
+    return [np.sort(files) for files in np.split(order, breaks)]
 
 
 def _means(signals: Array, sessions: list[npt.NDArray[np.intp]]) -> tuple[Array, Array]:
-    """Return mean and variance of the mean of every session, (..., session, range)."""
+    """Return mean and variance of the mean of each session, (..., session, range)."""
     means, counts, squares, freedoms = [], [], [], []
     for files in sessions:
-        part = signals[..., files, :]
-        finite = np.isfinite(part)
+        session_signals = signals[..., files, :]
+        finite = np.isfinite(session_signals)
         count = finite.sum(axis=-2)
-        mean = _over(np.where(finite, part, 0.0).sum(axis=-2), count)
-        residual = np.where(finite, part - mean[..., np.newaxis, :], 0.0)
-        # The level wanders from file to file: that is no noise of the single bin.
-        level = _over(residual.sum(axis=-1, keepdims=True), finite.sum(axis=-1, keepdims=True))
+        mean = _ratio(np.where(finite, session_signals, 0.0).sum(axis=-2), count)
+        residual = np.where(finite, session_signals - mean[..., np.newaxis, :], 0.0)
+        # The level drifts from file to file, which is no noise of the single bin.
+        level = _ratio(residual.sum(axis=-1, keepdims=True), finite.sum(axis=-1, keepdims=True))
         residual = np.where(finite, residual - level, 0.0)
         means.append(mean)
         counts.append(count)
@@ -202,49 +204,49 @@ def _means(signals: Array, sessions: list[npt.NDArray[np.intp]]) -> tuple[Array,
         freedoms.append(np.maximum(count - 1, 0))
     all_squares = np.stack([*squares, sum(squares)], axis=-2)
     all_freedoms = np.stack([*freedoms, sum(freedoms)], axis=-2).astype(np.float64)
-    scatter = _over(
+    scatter = _ratio(
         _window_sum(all_squares, VARIANCE_WINDOW), _window_sum(all_freedoms, VARIANCE_WINDOW)
     )
-    own, pooled = scatter[..., :-1, :], scatter[..., -1:, :]
-    single = np.where(np.isfinite(own), own, pooled)
-    single = np.where(np.isfinite(single), single, _roughness(signals))
-    variance = _over(single, np.stack(counts, axis=-2))
+    session_scatter, pooled = scatter[..., :-1, :], scatter[..., -1:, :]
+    file_variance = np.where(np.isfinite(session_scatter), session_scatter, pooled)
+    file_variance = np.where(np.isfinite(file_variance), file_variance, _far_variance(signals))
+    variance = _ratio(file_variance, np.stack(counts, axis=-2))
     stacked = np.stack(means, axis=-2)
     return stacked, np.where(np.isfinite(stacked), variance, np.nan)
 
 
-def _roughness(signals: Array) -> Array:
-    """Return the variance of files by the second differences of their far bins, (..., 1, 1)."""
+def _far_variance(signals: Array) -> Array:
+    """Return the noise variance from second differences of the far bins, (..., 1, 1)."""
     far = signals[..., int(signals.shape[-1] * (1.0 - FAR_SHARE)) :]
-    second = np.diff(far, n=2, axis=-1) ** 2 / _KNOWN_ROUGHNESS
+    second = np.diff(far, n=2, axis=-1) ** 2 / _SECOND_DIFFERENCE_VARIANCE
     finite = np.isfinite(second)
     total = np.where(finite, second, 0.0).sum(axis=(-2, -1), keepdims=True)
-    return _over(total, finite.sum(axis=(-2, -1), keepdims=True))
+    return _ratio(total, finite.sum(axis=(-2, -1), keepdims=True))
 
 
 def _level_variance(signals: Array) -> Array:
     """Return the variance of the levels of the files about their mean, (...)."""
     finite = np.isfinite(signals)
-    mean = _over(
+    mean = _ratio(
         np.where(finite, signals, 0.0).sum(axis=-2, keepdims=True),
         finite.sum(axis=-2, keepdims=True),
     )
-    levels = _over(np.where(finite, signals - mean, 0.0).sum(axis=-1), finite.sum(axis=-1))
+    levels = _ratio(np.where(finite, signals - mean, 0.0).sum(axis=-1), finite.sum(axis=-1))
     known = np.isfinite(levels)
     count = known.sum(axis=-1)
     levels = np.where(known, levels, 0.0)
-    levels -= _over(levels.sum(axis=-1), count)[..., np.newaxis]
-    return _over((np.where(known, levels, 0.0) ** 2).sum(axis=-1), count - 1)
+    levels -= _ratio(levels.sum(axis=-1), count)[..., np.newaxis]
+    return _ratio((np.where(known, levels, 0.0) ** 2).sum(axis=-1), count - 1)
 
 
-def _over(total: Array, count: npt.NDArray[np.int64] | Array) -> Array:
+def _ratio(total: Array, count: npt.NDArray[np.int64] | Array) -> Array:
     """Return the ratio, NaN where the count is not positive."""
     counted = np.where(count > 0, count, np.nan)
     return np.asarray(total / counted, dtype=np.float64)
 
 
 def _window_sum(values: Array, window: int) -> Array:
-    """Sum over windows of so many bins, symmetric and therefore shorter at the ends."""
+    """Return sums over symmetric windows of that many bins, shorter towards the ends."""
     index = np.arange(values.shape[-1])
     half = np.minimum(np.minimum(index, index[::-1]), window // 2)
     sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
@@ -256,39 +258,39 @@ def _window_sum(values: Array, window: int) -> Array:
 def _smooth(means: Array, variances: Array, window: int) -> tuple[Array, Array]:
     finite = np.isfinite(means) & np.isfinite(variances)
     count = _window_sum(finite.astype(np.float64), window)
-    # Sums of deviations, so that the rounding of a cumulative sum is that of the noise.
+    # Deviations from the level keep the rounding error of cumulative sums below the noise.
     level = np.where(finite, means, 0.0).mean(axis=-1, keepdims=True)
-    smooth = level + _over(_window_sum(np.where(finite, means - level, 0.0), window), count)
-    variance = _over(_window_sum(np.where(finite, variances, 0.0), window), count**2)
+    smooth = level + _ratio(_window_sum(np.where(finite, means - level, 0.0), window), count)
+    variance = _ratio(_window_sum(np.where(finite, variances, 0.0), window), count**2)
     return np.where(finite, smooth, np.nan), np.where(finite, variance, np.nan)
 
 
 def _shares(
-    moments: Array, sessions: list[npt.NDArray[np.intp]], wanted: Array, method: DarkMethod
+    dark_seconds: Array, sessions: list[npt.NDArray[np.intp]], seconds: Array, method: DarkMethod
 ) -> Array:
-    """Return what each session counts at each time, (time, session)."""
-    middles = np.array([moments[files].mean() for files in sessions])
-    shares = np.zeros((wanted.size, middles.size))
-    rows = np.arange(wanted.size)
+    """Return the weight of each session at each time, (time, session)."""
+    middles = np.array([dark_seconds[files].mean() for files in sessions])
+    shares = np.zeros((seconds.size, middles.size))
+    rows = np.arange(seconds.size)
     if method is DarkMethod.NEAREST:
         distances = np.stack(
-            [np.abs(moments[files] - wanted[:, np.newaxis]).min(axis=1) for files in sessions]
+            [np.abs(dark_seconds[files] - seconds[:, np.newaxis]).min(axis=1) for files in sessions]
         )
         shares[rows, np.argmin(distances, axis=0)] = 1.0
         return shares
-    after = np.clip(np.searchsorted(middles, wanted), 1, max(middles.size - 1, 1))
+    after = np.clip(np.searchsorted(middles, seconds), 1, max(middles.size - 1, 1))
     before = after - 1
     after = np.minimum(after, middles.size - 1)
     span = middles[after] - middles[before]
     with np.errstate(invalid="ignore", divide="ignore"):
-        part = np.clip(np.where(span > 0, (wanted - middles[before]) / span, 0.0), 0.0, 1.0)
-    shares[rows, before] = 1.0 - part
-    shares[rows, after] += part
+        fraction = np.clip(np.where(span > 0, (seconds - middles[before]) / span, 0.0), 0.0, 1.0)
+    shares[rows, before] = 1.0 - fraction
+    shares[rows, after] += fraction
     return shares
 
 
-def _mixed(shares: Array, values: Array) -> Array:
-    """Return the sums of sessions by their shares, (..., time, range), in the order of time."""
+def _weighted_sum(shares: Array, values: Array) -> Array:
+    """Return the weighted sums of the sessions, (..., time, range)."""
     total = np.zeros((*values.shape[:-2], len(shares), values.shape[-1]))
     for session in range(shares.shape[1]):
         share = shares[:, session]
@@ -305,10 +307,10 @@ def _file_weights(shares: Array, sessions: list[npt.NDArray[np.intp]]) -> Array:
 
 
 def _age(
-    shares: Array, sessions: list[npt.NDArray[np.intp]], moments: Array, wanted: Array
+    shares: Array, sessions: list[npt.NDArray[np.intp]], dark_seconds: Array, seconds: Array
 ) -> Array:
-    age = np.full(wanted.size, np.inf)
+    age = np.full(seconds.size, np.inf)
     for session, files in enumerate(sessions):
-        distance = np.abs(moments[files] - wanted[:, np.newaxis]).min(axis=1)
+        distance = np.abs(dark_seconds[files] - seconds[:, np.newaxis]).min(axis=1)
         age = np.where(shares[:, session] > 0, np.minimum(age, distance), age)
     return age

@@ -1,4 +1,4 @@
-"""Gluing of analog and photon-counting signals where both are linear."""
+"""Gluing of analog and photon-counting signals in the range where both are linear."""
 
 from __future__ import annotations
 
@@ -21,45 +21,49 @@ Indices = npt.NDArray[np.intp]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 COUNT_RATES: Final = (0.5, 20.0)
-"""MHz between which photon counting is linear after its dead time, and above its noise."""
+"""MHz; between them photon counting, corrected for dead time, is linear and above its noise."""
 LEAST_SNR: Final = 10.0
+"""Least signal-to-noise ratio of the analog signal in the window."""
 FEWEST_BINS: Final = 8
+"""Fewest bins of a window."""
 LEAST_FALL: Final = 1.5
 """Factor by which the smoothed count rate must fall within a window."""
 SMOOTHING: Final = 31
-"""Bins over which signals are averaged before the window is sought in them: ends of a window
-that follow the noise of single bins would bias the slope."""
+"""Bins over which signals are averaged before the window is chosen. Edges that follow the noise
+of single bins would bias the slope."""
 LEAST_SLOPE: Final = 5.0
-"""Standard errors by which a slope must stand out."""
+"""Standard errors by which the slope must exceed 0."""
 _LARGEST_MISFIT: Final = 1.5
+"""Largest chi-square of the line over its degrees of freedom, for many bins."""
 _FALSE_ALARM: Final = 1e-4
+"""Probability with which noise exceeds the largest chi-square, for few bins."""
 
 
 class HandOver(StrEnum):
-    """How the glued signal goes from analog to photon counting."""
+    """Transition of the glued signal from analog to photon counting."""
 
     BLEND = "blend"
-    """Within the window, the mean of both by their inverse variances."""
+    """Inverse-variance mean of both within the window."""
     SWITCH = "switch"
-    """In the middle of the window, at once."""
+    """Abrupt, in the middle of the window."""
 
 
 @dataclass(frozen=True, slots=True)
 class GluedSignal:
-    """Glued signals, and the line that glues them, one for every profile."""
+    """Glued signals, and the line that scales analog to photon counting, for each profile."""
 
     power: Array
     """(..., range), MHz: analog near, photon counting far; NaN where there is no line."""
     variance: Array
-    """(..., range), MHz2, of the noise."""
+    """(..., range), MHz2, noise variance."""
     systematic_variance: Array
-    """(..., range), MHz2, from the error of the line: it has the same cause in all bins and all
-    profiles of a block and does not average down."""
+    """(..., range), MHz2, by the error of the line: common to all bins and profiles of a block,
+    so it does not average down."""
     slope: Array
     """(...), MHz mV-1."""
     slope_standard_error: Array
     intercept: Array
-    """(...), MHz: 0 within its error where both backgrounds are right."""
+    """(...), MHz: 0 within its error if both backgrounds are right."""
     intercept_standard_error: Array
     chi2: Array
     """(...), of the line."""
@@ -69,12 +73,13 @@ class GluedSignal:
     stop: Array
     """(...), m: last bin of the window."""
     no_window: Booleans
-    """(...): fewer than 8 neighbouring bins are within both limits, or the count rate changes by
-    less than a factor of 1.5 within them, which is too little for a line."""
+    """(...): fewer than 8 consecutive bins are within the limits, or the count rate changes by
+    less than a factor of 1.5 within them, which is too little to define a line."""
     poor_fit: Booleans
-    """(...): the slope is not 5 standard errors above 0, or the residuals are half as large again
-    as noise allows: one channel is not linear there (dead time, saturation), or both see different
-    light (overlap, fields of view). A wrong lag need not show: it scales a signal that falls."""
+    """(...): the slope is less than 5 standard errors above 0, or chi-square exceeds 1.5 times the
+    expected one. A channel is then not linear (dead time, saturation), or the channels receive
+    different light (overlap, fields of view). A wrong lag may pass: it only scales a falling
+    signal."""
 
 
 def glue(
@@ -91,39 +96,41 @@ def glue(
     correlation: float = 0.0,
     hand_over: str = "blend",
 ) -> GluedSignal:
-    r"""Scale analog to photon counting by a line through the bins where both are linear.
+    r"""Return analog signals scaled to photon counting by a line, joined with photon counting.
 
     The line :math:`y = s x + a` minimises
 
     .. math:: \chi^2 = \sum \frac{(y_i - s x_i - a)^2}
                     {v_{y,i} + s^2 v_{x,i} - 2 s \rho \sqrt{v_{x,i} v_{y,i}}}
 
-    by 4 fixed passes of the equations of york2004 from the ratio of the spreads: a slope from
-    a regression on noisy analog values would be too small. The window is the longest run of
-    bins in which the smoothed mean of a block has a count rate within `count_rate_window`, and
-    an analog value of at least `least_snr` times the noise of one bin of one profile.
+    by 4 iterations of the equations of york2004, starting with the ratio of the spreads. A
+    regression on noisy analog values would give too small a slope. The window is the longest run
+    of bins in which the smoothed mean of a block has a count rate within `count_rate_window`,
+    and an analog value of at least `least_snr` times the noise of one bin of one profile.
 
     Parameters
     ----------
     analog : (..., range) float
-        mV, dark and background subtracted, aligned with photon counting (`lidarops.retrieve.signal.lag`).
+        mV, dark signal and background subtracted, aligned with photon counting (`lag`).
     photon_counting : (..., range) float
         MHz, corrected for dead time, background subtracted.
     range : (range,) float
         m.
     analog_variance, photon_variance : (..., range) float
-        mV2, MHz2, of the noise; broadcast. They must not follow the noise of the single bin.
+        mV2, MHz2, noise variances; broadcast. They must not follow the noise of the single bin.
     count_rate_window : (float, float)
-        MHz; the upper limit holds for signal and background together.
+        MHz; the upper limit applies to signal plus background.
     least_snr : float
+        Least signal-to-noise ratio of the analog signal.
     photon_background : (...) float
-        MHz that were subtracted from photon counting.
+        MHz, the background that was subtracted from photon counting.
     block : (...) int, optional
-        Profiles of equal number share a window and a line; every profile has its own where not
-        given.
+        Profiles with equal numbers share a window and a line. Where not given, each profile has
+        its own.
     correlation : float
-        Of the noise of both in a bin, from -1 to 1: shot noise is common to them. With 0 the
-        standard errors are too large where it is not, and the variance of a blend too small.
+        Correlation of the noise of both in a bin, from -1 to 1, because shot noise is common. If
+        noise is correlated, 0 makes the standard errors too large and the variance of a blend
+        too small.
     hand_over : {"blend", "switch"}
 
     Returns
@@ -133,39 +140,39 @@ def glue(
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right.
+        For invalid arguments.
 
     References
     ----------
     york2004, licel2023
     """
     grid = inputs.range_grid(range)
-    way = inputs.choice(hand_over, HandOver, "hand_over")
+    transition = inputs.choice(hand_over, HandOver, "hand_over")
     _check_limits(count_rate_window, least_snr, correlation)
     x, leading = _rows(analog, "analog", grid)
-    y, other = _rows(photon_counting, "photon_counting", grid)
-    if other != leading:
+    y, photon_leading = _rows(photon_counting, "photon_counting", grid)
+    if photon_leading != leading:
         raise RetrievalInputError(
-            f"has the leading shape {other}, analog {leading}", field="photon_counting"
+            f"has the leading shape {photon_leading}, analog {leading}", field="photon_counting"
         )
     xv = _variance(analog_variance, "analog_variance", grid, leading)
     yv = _variance(photon_variance, "photon_variance", grid, leading)
     sky = inputs.profile_values(photon_background, "photon_background", leading)
-    inverse = _blocks(block, leading)
-    number = int(inverse.max(initial=-1)) + 1
+    block_index = _blocks(block, leading)
+    blocks = int(block_index.max(initial=-1)) + 1
     top = np.full(len(x), count_rate_window[1]) - (0.0 if sky is None else sky)
-    first, past = _search(x, y, xv, inverse, top, count_rate_window[0], least_snr)
-    lines = np.full((number, _line_fit.COLUMNS), np.nan)
-    order = np.argsort(inverse, kind="stable")
-    starts = np.searchsorted(inverse[order], np.arange(number + 1))
+    first, past = _search(x, y, xv, block_index, top, count_rate_window[0], least_snr)
+    lines = np.full((blocks, _line_fit.COLUMNS), np.nan)
+    order = np.argsort(block_index, kind="stable")
+    starts = np.searchsorted(block_index[order], np.arange(blocks + 1))
     _line_fit.fit_lines(x, y, xv, yv, float(correlation), order, starts, first, past, lines)
     near, far = first, past
-    if way is HandOver.SWITCH:
+    if transition is HandOver.SWITCH:
         near = far = (first + past) // 2
     glued = np.empty((3, *x.shape))
-    _line_fit.combine(x, y, xv, yv, float(correlation), lines, inverse, near, far, glued)
+    _line_fit.combine(x, y, xv, yv, float(correlation), lines, block_index, near, far, glued)
     bounds = _bounds(grid.values, first, past)
-    return _result(lines, inverse, bounds, glued, leading, grid)
+    return _result(lines, block_index, bounds, glued, leading, grid)
 
 
 def _check_limits(rates: tuple[float, float], least_snr: float, correlation: float) -> None:
@@ -206,7 +213,7 @@ def _variance(
 
 
 def _blocks(block: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:
-    """Return the number of the block of each profile, counted from 0."""
+    """Return the index of the block of each profile."""
     count = int(np.prod(leading, dtype=np.int64))
     if block is None:
         return np.arange(count)
@@ -228,22 +235,22 @@ def _search(
     x: Array,
     y: Array,
     xv: Array,
-    inverse: Indices,
+    block_index: Indices,
     top: Array,
     bottom: float,
     least_snr: float,
 ) -> tuple[Indices, Indices]:
     """Return first and past-the-last bin of the window of each block, (0, 0) for none."""
-    analog = averaging.time_mean(x, xv, groups=inverse)
-    rate = _smooth(averaging.time_mean(y, 0.0, groups=inverse).values)
+    analog = averaging.time_mean(x, xv, groups=block_index)
+    rate = _smooth(averaging.time_mean(y, 0.0, groups=block_index).values)
     highest = np.full(len(rate), np.inf)
-    np.minimum.at(highest, inverse, top)
+    np.minimum.at(highest, block_index, top)
     with np.errstate(invalid="ignore"):
         noise = np.sqrt(_smooth(analog.variance * analog.count))
-        bright = _smooth(analog.values) >= least_snr * noise
-        good = (rate >= bottom) & (rate <= highest[:, np.newaxis]) & bright
-    first, past = (np.zeros(len(good), dtype=np.intp) for _ in (0, 1))
-    _line_fit.longest_runs(good, first, past)
+        above_noise = _smooth(analog.values) >= least_snr * noise
+        usable_bins = (rate >= bottom) & (rate <= highest[:, np.newaxis]) & above_noise
+    first, past = (np.zeros(len(usable_bins), dtype=np.intp) for _ in (0, 1))
+    _line_fit.longest_runs(usable_bins, first, past)
     index = np.arange(rate.shape[1])
     inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
     most = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
@@ -253,7 +260,7 @@ def _search(
 
 
 def _smooth(values: Array) -> Array:
-    """Average over `SMOOTHING` bins, fewer at the ends, passing over NaN."""
+    """Return averages over `SMOOTHING` bins, fewer at the ends, skipping NaN."""
     smooth = np.empty(values.shape)
     _line_fit.running_means(frozen(values), SMOOTHING // 2, smooth)
     return smooth
@@ -269,7 +276,7 @@ def _bounds(range_: Array, first: Indices, past: Indices) -> tuple[Array, Array]
 
 def _result(
     lines: Array,
-    inverse: Indices,
+    block_index: Indices,
     bounds: tuple[Array, Array],
     glued: Array,
     leading: tuple[int, ...],
@@ -283,26 +290,26 @@ def _result(
     )
     largest = np.maximum(_LARGEST_MISFIT * freedom, special.chdtri(freedom, _FALSE_ALARM))
     with np.errstate(invalid="ignore"):
-        poor = (chi2 > largest) | ~(slope >= LEAST_SLOPE * slope_error)
+        poor_fit = (chi2 > largest) | ~(slope >= LEAST_SLOPE * slope_error)
     empty = np.isnan(bounds[0])
-    whole = (*leading, grid.size)
+    shape = (*leading, grid.size)
 
-    def each(values: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
-        return values[inverse].reshape(leading)
+    def per_profile(values: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
+        return values[block_index].reshape(leading)
 
-    power, variance, systematic = (grid.turn(values.reshape(whole)) for values in glued)
+    power, variance, systematic = (grid.turn(values.reshape(shape)) for values in glued)
     return GluedSignal(
         power=power,
         variance=variance,
         systematic_variance=systematic,
-        slope=each(slope),
-        slope_standard_error=each(slope_error),
-        intercept=each(lines[:, _line_fit.INTERCEPT]),
-        intercept_standard_error=each(intercept_error),
-        chi2=each(chi2),
-        degrees_of_freedom=each(freedom),
-        start=each(bounds[0]),
-        stop=each(bounds[1]),
-        no_window=each(empty),
-        poor_fit=each(poor & ~empty),
+        slope=per_profile(slope),
+        slope_standard_error=per_profile(slope_error),
+        intercept=per_profile(lines[:, _line_fit.INTERCEPT]),
+        intercept_standard_error=per_profile(intercept_error),
+        chi2=per_profile(chi2),
+        degrees_of_freedom=per_profile(freedom),
+        start=per_profile(bounds[0]),
+        stop=per_profile(bounds[1]),
+        no_window=per_profile(empty),
+        poor_fit=per_profile(poor_fit & ~empty),
     )

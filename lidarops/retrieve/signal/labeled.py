@@ -1,4 +1,9 @@
-"""The signal chain over xarray: `lidarops.retrieve.signal.counts_to_signal` mapped along time."""
+"""Counts of one channel to signals in xarray: `counts_to_signal` applied to all profiles.
+
+`condition` corrects for dead time (photon counting) or subtracts the dark signal (analog), and
+estimates the noise. `correct_for_range` then subtracts the background and corrects for range.
+`range_corrected_signals` does both in one pass.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +24,13 @@ from lidarops.retrieve.signal.dark import DarkProfile, dark_profile
 
 _Block = npt.NDArray[Any]
 
-_PARTS = ("power", "variance", "quality")
-_DTYPES: Final[list[np.dtype[Any]]] = [
+_SIGNAL_NAMES = ("power", "variance", "quality")
+_SIGNAL_DTYPES: Final[list[np.dtype[Any]]] = [
     np.dtype(np.float64),
     np.dtype(np.float64),
     np.dtype(np.int32),
 ]
-_OF_SIGNAL: Final[list[np.dtype[Any]]] = [
+_RANGE_CORRECTED_DTYPES: Final[list[np.dtype[Any]]] = [
     np.dtype(np.float32),
     np.dtype(np.float32),
     np.dtype(np.int32),
@@ -33,11 +38,11 @@ _OF_SIGNAL: Final[list[np.dtype[Any]]] = [
     np.dtype(np.float64),
 ]
 _FEWEST: Final = 8
-"""Bins before the tail that tell whether the signal still falls."""
+"""Fewest bins before the tail for a test of whether the signal still falls."""
 _FALLS: Final = 4.0
-"""Standard errors by which it then exceeds the tail."""
-_AT_ONCE: Final = 64
-"""Profiles that are worked on together: their arrays stay in the cache."""
+"""Standard errors by which the mean of these bins must exceed that of the tail."""
+_PROFILES_IN_CACHE: Final = 64
+"""Profiles processed together; their arrays fit the processor cache."""
 
 
 def condition(
@@ -46,24 +51,24 @@ def condition(
     *,
     dead_time: float | None = None,
     noise_variance: float | None = None,
-    dark: Dark | None = None,
+    dark: DarkSignals | None = None,
     range_offset: float = 0.0,
     full_overlap_range: float = 0.0,
 ) -> xr.Dataset:
-    """Turn the raw counts of one channel into a signal with known noise.
+    """Return the signal of one channel from its raw counts, with noise variance and quality.
 
     Parameters
     ----------
     archive : xr.Dataset
-        As `lidarops.open_archive(..., mask_and_scale=False)` gives it; may be dask-backed.
+        From `lidarops.open_archive(..., mask_and_scale=False)`; may be dask-backed.
     channel : str
         Name of the channel.
     dead_time : float, optional
-        s; photon counting only.
+        s; photon counting only, corrected here.
     noise_variance : float, optional
         mV^2; analog only.
     dark : Dark, optional
-        From `dark_of`; analog only.
+        From `read_dark`; analog only.
     range_offset : float
         m, added to the range of every bin.
     full_overlap_range : float
@@ -84,9 +89,9 @@ def condition(
         range_offset=range_offset,
         full_overlap_range=full_overlap_range,
     )
-    parts = source.mapped(_conditioned, ranged=3, plain=0, dtypes=_DTYPES)
-    # With the coordinates that they share, which need not be compared.
-    variables = {name: part.variable for name, part in zip(_PARTS, parts, strict=True)}
+    parts = source.mapped(_conditioned, ranged=3, plain=0, dtypes=_SIGNAL_DTYPES)
+    # All parts have the same coordinates; passing them avoids a comparison.
+    variables = {name: part.variable for name, part in zip(_SIGNAL_NAMES, parts, strict=True)}
     result = xr.Dataset(variables, coords=parts[0].coords)
     result["power"].attrs = {"units": source.unit}
     result["variance"].attrs = {"units": f"{source.unit}2"}
@@ -94,32 +99,33 @@ def condition(
     return result
 
 
-def signals(
+def range_corrected_signals(
     archive: xr.Dataset,
     channel: str,
     *,
     background_range: tuple[float, float],
     dead_time: float | None = None,
     noise_variance: float | None = None,
-    dark: Dark | None = None,
+    dark: DarkSignals | None = None,
     range_offset: float = 0.0,
     full_overlap_range: float = 0.0,
 ) -> xr.Dataset:
-    """Turn the raw counts of one channel into range-corrected signals without background.
+    """Return range-corrected signals without background of one channel from its raw counts.
 
-    The same as `condition` and then `corrected`, to the last bit, in one pass over the counts.
+    Equal to `condition` and then `correct_for_range`, to the last bit, in one pass over the
+    counts.
 
     Parameters
     ----------
     background_range : (float, float)
-        m; as of `corrected`.
+        m; as in `correct_for_range`.
     archive, channel, dead_time, noise_variance, dark, range_offset, full_overlap_range
-        As of `condition`.
+        As in `condition`.
 
     Returns
     -------
     xr.Dataset
-        As of `corrected`.
+        As from `correct_for_range`.
     """
     source = _Source(
         archive,
@@ -131,13 +137,17 @@ def signals(
         full_overlap_range=full_overlap_range,
     )
     parts = source.mapped(
-        _signals, ranged=3, plain=2, dtypes=_OF_SIGNAL, background_range=background_range
+        _signals,
+        ranged=3,
+        plain=2,
+        dtypes=_RANGE_CORRECTED_DTYPES,
+        background_range=background_range,
     )
     return _named(parts)
 
 
-def corrected(conditioned: xr.Dataset, background_range: tuple[float, float]) -> xr.Dataset:
-    """Subtract the mean of far bins as background and correct for range.
+def correct_for_range(conditioned: xr.Dataset, background_range: tuple[float, float]) -> xr.Dataset:
+    """Return signals minus the mean of far bins, multiplied with the square of range.
 
     Parameters
     ----------
@@ -151,12 +161,12 @@ def corrected(conditioned: xr.Dataset, background_range: tuple[float, float]) ->
     xr.Dataset
         ``signal``, ``signal_standard_error`` (mV m2 or MHz m2, float32) and ``quality_flag``
         over (time, range), ``background`` and ``background_standard_error`` over time.
-        INPUT_MISSING where there is no background, BACKGROUND_UNCERTAIN where the bins before
-        those are brighter by 4 standard errors: signal is left in them.
+        INPUT_MISSING without a background. BACKGROUND_UNCERTAIN where the bins before those are
+        brighter by 4 standard errors, which means that the background contains signal.
     """
     parts = xr.apply_ufunc(
         _corrected,
-        *(conditioned[name] for name in _PARTS),
+        *(conditioned[name] for name in _SIGNAL_NAMES),
         input_core_dims=[["range"]] * 3,
         output_core_dims=[["range"]] * 3 + [[]] * 2,
         kwargs={
@@ -164,13 +174,13 @@ def corrected(conditioned: xr.Dataset, background_range: tuple[float, float]) ->
             "background_range": background_range,
         },
         dask="parallelized",
-        output_dtypes=_OF_SIGNAL,
+        output_dtypes=_RANGE_CORRECTED_DTYPES,
     )
     return _named(parts)
 
 
-def unit_of(archive: xr.Dataset, channel: str) -> str:
-    """Return the unit of the power of a channel: MHz of photon counting, mV of analog ones."""
+def channel_unit(archive: xr.Dataset, channel: str) -> str:
+    """Return the unit of the power of a channel: MHz for photon counting, mV for analog."""
     return "MHz" if archive[channel].attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
 
 
@@ -181,7 +191,7 @@ def _named(parts: Sequence[xr.DataArray]) -> xr.Dataset:
 
 
 class _Source:
-    """The counts of one channel, and what turns them into a signal."""
+    """The counts of one channel, and the settings of their conversion to a signal."""
 
     def __init__(
         self,
@@ -190,7 +200,7 @@ class _Source:
         *,
         dead_time: float | None,
         noise_variance: float | None,
-        dark: Dark | None,
+        dark: DarkSignals | None,
         range_offset: float,
         full_overlap_range: float,
     ) -> None:
@@ -207,7 +217,7 @@ class _Source:
             "full_overlap_range": full_overlap_range,
         }
         self.inputs = [counts, archive[f"{channel}_shots"]]
-        self.unit = unit_of(archive, channel)
+        self.unit = channel_unit(archive, channel)
         self.photon = self.unit == "MHz"
         if self.photon:
             self.settings |= {"bin_width": counts.attrs["bin_width"], "dead_time": dead_time}
@@ -227,7 +237,7 @@ class _Source:
         dtypes: Sequence[np.dtype[Any]],
         **settings: Any,
     ) -> tuple[xr.DataArray, ...]:
-        """Map a function that gives so many arrays over range, and so many over time alone."""
+        """Apply a function that returns `ranged` arrays over range and `plain` without range."""
         outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
             function,
             *self.inputs,
@@ -241,8 +251,8 @@ class _Source:
 
 
 @dataclass(frozen=True, slots=True)
-class Dark:
-    """The dark signals of one analog channel, and how they serve a profile."""
+class DarkSignals:
+    """The dark files of one analog channel, and the method that gives dark signals at times."""
 
     signals: npt.NDArray[np.float64]
     """(dark, range), mV."""
@@ -251,7 +261,7 @@ class Dark:
     method: str
 
     def at(self, times: npt.NDArray[np.datetime64]) -> DarkProfile:
-        """Return dark signal and variance at times; see `lidarops.retrieve.signal.dark.dark_profile`."""
+        """Return dark signal and variance at times (`dark_profile`)."""
         return dark_profile(self.signals, self.times, times, method=self.method)
 
     def variance(self, times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.float64]:
@@ -259,13 +269,13 @@ class Dark:
         return self.at(times).variance
 
 
-def dark_of(archive: xr.Dataset, channel: str, *, method: str) -> Dark:
+def read_dark(archive: xr.Dataset, channel: str, *, method: str) -> DarkSignals:
     """Read the dark files of one analog channel.
 
     Parameters
     ----------
     archive : xr.Dataset
-        The dark files, as `lidarops.open_archive(..., mask_and_scale=False)` gives them.
+        The dark files, from `lidarops.open_archive(..., mask_and_scale=False)`.
     channel : str
         Name of the channel.
     method : {"nearest", "interpolated"}
@@ -277,7 +287,7 @@ def dark_of(archive: xr.Dataset, channel: str, *, method: str) -> Dark:
         In memory.
     """
     power = condition(archive, channel, noise_variance=0.0)["power"]
-    return Dark(power.to_numpy(), archive["time"].to_numpy(), method)
+    return DarkSignals(power.to_numpy(), archive["time"].to_numpy(), method)
 
 
 def _conditioned(*inputs: _Block, photon: bool, **settings: Any) -> tuple[_Block, _Block, _Block]:
@@ -290,21 +300,21 @@ def _analog(
     input_range: _Block,
     times: _Block | None = None,
     *,
-    dark: Dark | None = None,
+    dark: DarkSignals | None = None,
     **settings: Any,
 ) -> tuple[_Block, _Block, _Block]:
     if dark is None or times is None:
         return _tuple(
             counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
         )
-    found = dark.at(times.astype("datetime64[ns]"))
+    dark_at_times = dark.at(times.astype("datetime64[ns]"))
     return _tuple(
         counts_to_signal.analog_signal(
             counts,
             shots,
             input_range=input_range,
-            dark=found.dark,
-            dark_variance=found.variance,
+            dark=dark_at_times.dark,
+            dark_variance=dark_at_times.variance,
             **settings,
         )
     )
@@ -341,7 +351,7 @@ def _corrected(
     lost = np.where(np.isnan(tail.background), np.int32(Quality.INPUT_MISSING), np.int32(0))
     falling = _still_falls(power, variance, range, background_range, tail)
     lost |= np.where(falling, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
-    # The noise is far above the 24 bits of float32, and a day of profiles fits in memory.
+    # Noise is far above the precision of float32, which halves the memory of a day of profiles.
     return (
         result.power,
         np.sqrt(result.variance, out=result.variance),
@@ -358,7 +368,7 @@ def _still_falls(
     background_range: tuple[float, float],
     tail: cubic_and_tail.BackgroundResult,
 ) -> _Block:
-    """Return which profiles are brighter in the bins before the tail, as far as it is long."""
+    """Return which profiles are brighter in as many bins before the tail as it has."""
     start, stop = background_range
     first, past = np.searchsorted(range, (2.0 * start - stop, start))
     if past - first < _FEWEST:
@@ -380,15 +390,15 @@ def _signals(
     background_range: tuple[float, float],
     **settings: Any,
 ) -> tuple[_Block, ...]:
-    parts = [
+    chunks = [
         _corrected(
             *_conditioned(
-                counts[some], *(array[some] for array in others), range=range, **settings
+                counts[rows], *(array[rows] for array in others), range=range, **settings
             ),
             range=range,
             background_range=background_range,
         )
-        for first in np.arange(0, max(len(counts), 1), _AT_ONCE)
-        for some in [slice(first, first + _AT_ONCE)]
+        for first in np.arange(0, max(len(counts), 1), _PROFILES_IN_CACHE)
+        for rows in [slice(first, first + _PROFILES_IN_CACHE)]
     ]
-    return tuple(np.concatenate(pieces) for pieces in zip(*parts, strict=True))
+    return tuple(np.concatenate(pieces) for pieces in zip(*chunks, strict=True))

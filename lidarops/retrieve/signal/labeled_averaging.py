@@ -1,4 +1,4 @@
-"""Averages over time of labelled profiles: blocks of the clock, never of dask."""
+"""Averages of profiles in xarray over intervals of the clock, for any chunks of dask."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lidarops.flags import Quality
 from lidarops.retrieve.signal import averaging
 
 _BATCH: Final = 256
-"""Profiles that one task averages, unless one mean takes more."""
-_AT_ONCE: Final = 32
-"""Profiles that are averaged together, unless one mean takes more: they stay in the cache."""
+"""Profiles per task, unless one mean needs more."""
+_PROFILES_IN_CACHE: Final = 32
+"""Profiles averaged together, unless one mean needs more; they fit the processor cache."""
 
 Shared = Callable[[npt.NDArray[np.datetime64]], npt.NDArray[np.float64]]
 
@@ -31,29 +31,29 @@ def clock_average(
     shots: xr.DataArray,
     shared_variance: Shared | None = None,
 ) -> xr.Dataset:
-    """Average profiles over intervals of the clock (UTC), weighted by their shots.
+    """Return means of profiles over intervals of the clock (UTC), weighted by their shots.
 
     Parameters
     ----------
     conditioned : xr.Dataset
         ``power``, ``variance`` and ``quality`` over (time, range), from
         `lidarops.retrieve.signal.labeled.condition`, with the coordinates ``time`` and
-        ``time_bnds``; rising in time. May be dask-backed, chunked in any way.
+        ``time_bnds``; ascending in time. May be dask-backed, with any chunks.
     seconds : float
-        Length of an interval; it divides a day.
+        Length of an interval; it must divide a day.
     shots : xr.DataArray, (time,)
     shared_variance : callable, optional
-        Gives the part of ``variance`` that neighbouring profiles have in common at times, (time,
-        range), as that of a dark signal: it does not average down.
+        Returns the part of ``variance`` that neighbouring profiles have in common at given
+        times, (time, range), such as that of a dark signal. It does not average down.
 
     Returns
     -------
     xr.Dataset
         ``power``, ``variance`` (of the mean, with the shared part) and ``quality`` over (time,
-        range), ``shots`` (sum), ``profiles`` (number) over time, with ``time`` in the middle of
-        ``time_bnds``, which span the profiles of the interval; the same to the last bit for
-        any chunking. Intervals without a profile are left out. A mean carries every bit of its
-        profiles, but INPUT_MISSING only where none is left.
+        range), ``shots`` (sum), ``profiles`` (number) over time. ``time`` is the middle of
+        ``time_bnds``, which span the profiles of the interval. Chunks do not change a bit of the
+        result. Intervals without a profile are omitted. A mean has all quality bits of its
+        profiles, but INPUT_MISSING only if no profile has data.
 
     Raises
     ------
@@ -62,11 +62,13 @@ def clock_average(
     """
     if not 0 < seconds <= 86400 or 86400 % seconds:
         raise RetrievalInputError(
-            f"is {seconds:g} s", field="average", remedy="give a part of a day: 600, 1800, 3600"
+            f"is {seconds:g} s",
+            field="average",
+            remedy="give seconds that divide a day: 600, 1800, 3600",
         )
     bounds = conditioned["time_bnds"].to_numpy()
-    moments = conditioned["time"].to_numpy()
-    interval = (moments - np.datetime64("1970-01-01")) // np.timedelta64(round(seconds * 1e9), "ns")
+    times = conditioned["time"].to_numpy()
+    interval = (times - np.datetime64("1970-01-01")) // np.timedelta64(round(seconds * 1e9), "ns")
     first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
     past = np.append(first[1:], interval.size)
     starts, stops = bounds[first, 0], np.maximum.reduceat(bounds[:, 1], first)
@@ -93,7 +95,7 @@ def clock_average(
 
 
 def _batches(first: npt.NDArray[np.intp], past: npt.NDArray[np.intp]) -> Iterator[tuple[int, int]]:
-    """Give runs of whole intervals of about `_BATCH` profiles."""
+    """Yield runs of whole intervals of about `_BATCH` profiles, as (first, past)."""
     low = 0
     for high in range(1, first.size + 1):
         if high == first.size or past[high] - first[low] > _BATCH:
@@ -108,9 +110,9 @@ def _packed(
     first: npt.NDArray[np.intp],
     past: npt.NDArray[np.intp],
 ) -> da.Array:
-    """Return power, variance and bits of the means, (interval, 3, range).
+    """Return power, variance and quality bits of the means in one array, (interval, 3, range).
 
-    In one array, and from arrays cut alike, so that what they are made of is computed once.
+    A common array from inputs with equal chunks lets dask compute the inputs only once.
     """
     batches = list(_batches(first, past))
     profiles = tuple(int(past[high - 1] - first[low]) for low, high in batches)
@@ -149,24 +151,24 @@ def _averaged(
     shared: npt.NDArray[np.float64],
 ) -> _Block:
     ends = np.flatnonzero(np.diff(group, append=group[-1] + 1)) + 1
-    parts = []
+    pieces = []
     first, low = 0, 0
     for high, end in enumerate(map(int, ends), start=1):
-        # In pieces of whole intervals whose arrays stay in the cache.
-        if high == ends.size or ends[high] - first > _AT_ONCE:
-            part = slice(first, end)
-            parts.append(
+        # Average in pieces of whole intervals that fit the cache.
+        if high == ends.size or ends[high] - first > _PROFILES_IN_CACHE:
+            rows = slice(first, end)
+            pieces.append(
                 _averaged_piece(
-                    power[part],
-                    variance[part],
-                    quality[part],
-                    weights[part],
-                    group[part] - group[first],
+                    power[rows],
+                    variance[rows],
+                    quality[rows],
+                    weights[rows],
+                    group[rows] - group[first],
                     shared[low:high],
                 )
             )
             first, low = end, high
-    return np.concatenate(parts)
+    return np.concatenate(pieces)
 
 
 def _averaged_piece(
@@ -174,19 +176,19 @@ def _averaged_piece(
     variance: _Block,
     quality: _Block,
     weights: npt.NDArray[np.float64],
-    own: npt.NDArray[np.intp],
+    interval: npt.NDArray[np.intp],
     shared: npt.NDArray[np.float64],
 ) -> _Block:
-    common = shared[own]
+    common = shared[interval]
     means = averaging.time_mean(
         power,
         np.maximum(variance - common, 0.0),
-        groups=own,
+        groups=interval,
         weights=weights,
         shared_variance=common,
         axis=0,
     )
-    first = np.flatnonzero(np.diff(own, prepend=-1))
+    first = np.flatnonzero(np.diff(interval, prepend=-1))
     missing = np.int32(Quality.INPUT_MISSING)
     bits = np.bitwise_or.reduceat(quality & ~missing, first, axis=0)
     bits[~np.isfinite(means.values)] |= missing

@@ -1,4 +1,4 @@
-"""Gluing of analog and photon counting channels over xarray."""
+"""Lag correction and gluing of an analog and a photon counting channel in xarray."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidarops.retrieve.signal import lag as _lag
 _Block = npt.NDArray[Any]
 
 LAG_PROFILES: Final = 256
-"""Profiles, the first of a scene, from which a lag is estimated."""
+"""Number of profiles, the first of a scene, from which the lag is estimated."""
 
 _PARTS: Final = ("power", "variance", "quality")
 _LINE: Final = {"glue_slope": "MHz mV-1", "glue_slope_standard_error": "MHz mV-1"}
@@ -24,14 +24,14 @@ _WINDOW: Final = {"glue_bottom": "m", "glue_top": "m"}
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
 
-def told_lag(analog: xr.Dataset, photon: xr.Dataset) -> float:
-    """Return by how many bins analog lies farther than photon counting, as their ranges say."""
-    here, there = photon["range"].to_numpy(), analog["range"].to_numpy()
-    return float((here[0] - there[0]) / (here[1] - here[0]))
+def range_lag(analog: xr.Dataset, photon: xr.Dataset) -> float:
+    """Return the lag of analog behind photon counting in bins, as given by their ranges."""
+    photon_range, analog_range = photon["range"].to_numpy(), analog["range"].to_numpy()
+    return float((photon_range[0] - analog_range[0]) / (photon_range[1] - photon_range[0]))
 
 
 def estimate_lag(analog: xr.Dataset, photon: xr.Dataset) -> float:
-    """Return by how many bins analog lies farther than photon counting, as their noise says.
+    """Return the lag of analog behind photon counting in bins, estimated from their noise.
 
     Parameters
     ----------
@@ -41,23 +41,23 @@ def estimate_lag(analog: xr.Dataset, photon: xr.Dataset) -> float:
     Returns
     -------
     float
-        Bins; what the ranges say where noise shows no common cause
-        (`lidarops.retrieve.signal.lag.estimate_lag`).
+        Bins; where the correlation is not significant
+        (`lidarops.retrieve.signal.lag.estimate_lag`), `range_lag`.
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
-    some = {"time": slice(LAG_PROFILES), "range": slice(bins)}
-    found = _lag.estimate_lag(
-        analog["power"].isel(some).to_numpy(), photon["power"].isel(some).to_numpy()
+    selection = {"time": slice(LAG_PROFILES), "range": slice(bins)}
+    estimate = _lag.estimate_lag(
+        analog["power"].isel(selection).to_numpy(), photon["power"].isel(selection).to_numpy()
     )
-    return float(found.lag) if found.found else told_lag(analog, photon)
+    return float(estimate.lag) if estimate.significant else range_lag(analog, photon)
 
 
 def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Dataset:
-    """Join the profiles of two channels that record the same light.
+    """Return the glued profiles of two channels that record the same light.
 
-    Analog signals are moved by the lag, the mean of the last tenth of the bins is subtracted
-    from both, and every profile is glued by its own line (`lidarops.retrieve.signal.gluing.glue`). The
-    background of photon counting is left in the result.
+    Analog signals are shifted by the lag, the mean of the last tenth of the bins is subtracted
+    from both, and each profile is glued by its own line (`lidarops.retrieve.signal.gluing.glue`).
+    Photon counting is corrected for dead time before. Its background remains in the result.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Data
         ``power``, ``variance``, ``quality`` over (time, range), of the same profiles and bins of
         the same width; may be dask-backed.
     lag : float
-        Bins by which analog lies farther (`told_lag`, `estimate_lag`).
+        Lag of analog behind photon counting in bins (`range_lag`, `estimate_lag`).
 
     Returns
     -------
@@ -76,7 +76,7 @@ def glue(analog: xr.Dataset, photon: xr.Dataset, *, lag: float = 0.0) -> xr.Data
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
-    inputs = [part[name] for part in (analog, photon) for name in _PARTS]
+    inputs = [channel[name] for channel in (analog, photon) for name in _PARTS]
     settings = {
         "lag": lag,
         "distance": photon["range"].to_numpy().astype(np.float64),
@@ -112,63 +112,63 @@ def _glue(
     lag: float,
     distance: npt.NDArray[np.float64],
 ) -> tuple[_Block, ...]:
-    # What lies behind the lidar holds no light, and gluing looks for none there.
+    # Bins at negative ranges hold no light and are not glued.
     ahead = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
     r = distance[ahead]
     if lag:
         analog, analog_variance = _lag.shift_signal(analog, lag, variance=analog_variance)
-        analog_quality = _moved(analog_quality, lag)
+        analog_quality = _shifted_quality(analog_quality, lag)
     dark, sky = (
         cubic_and_tail.tail_mean(power[..., ahead], r).background for power in (analog, photon)
     )
-    found = gluing.glue(
+    glued = gluing.glue(
         (analog - dark[..., np.newaxis])[..., ahead],
         (photon - sky[..., np.newaxis])[..., ahead],
         r,
         analog_variance=np.nan_to_num(analog_variance[..., ahead]),
         photon_variance=np.nan_to_num(photon_variance[..., ahead]),
         photon_background=np.nan_to_num(sky),
-        # Both record the same photoelectrons: a mean of the two has more noise than it seems.
+        # Their noise is correlated: a blend would have more noise than its variance states.
         hand_over="switch",
     )
     power, variance = (np.full(photon.shape, np.nan) for _ in range(2))
-    power[..., ahead] = found.power + sky[..., np.newaxis]
-    variance[..., ahead] = found.variance + found.systematic_variance
-    quality = _quality(found, analog_quality, photon_quality, distance)
+    power[..., ahead] = glued.power + sky[..., np.newaxis]
+    variance[..., ahead] = glued.variance + glued.systematic_variance
+    quality = _quality(glued, analog_quality, photon_quality, distance)
     power[(quality & int(Quality.NO_GLUING | Quality.INPUT_MISSING)) != 0] = np.nan
     return (
         power,
         variance,
         quality,
-        found.slope,
-        found.slope_standard_error,
-        found.start,
-        found.stop,
+        glued.slope,
+        glued.slope_standard_error,
+        glued.start,
+        glued.stop,
     )
 
 
 def _quality(
-    found: gluing.GluedSignal,
+    glued: gluing.GluedSignal,
     analog: _Block,
     photon: _Block,
     distance: npt.NDArray[np.float64],
 ) -> _Block:
-    """Return the bits of that part of which a bin is made; in the window, of both."""
-    near = distance <= found.stop[..., np.newaxis]
-    far = distance >= found.start[..., np.newaxis]
-    lost = (found.no_window | found.poor_fit)[..., np.newaxis]
+    """Return the bits of the signal that a bin comes from; in the window, those of both."""
+    near = distance <= glued.stop[..., np.newaxis]
+    far = distance >= glued.start[..., np.newaxis]
+    not_glued = (glued.no_window | glued.poor_fit)[..., np.newaxis]
     bits = np.where(near, analog, 0) | np.where(far, photon, 0)
-    bits |= np.where(lost, int(Quality.NO_GLUING), 0)
+    bits |= np.where(not_glued, int(Quality.NO_GLUING), 0)
     bits |= np.where(distance <= 0.0, _MISSING, 0)
     return bits.astype(np.int32)
 
 
-def _moved(quality: _Block, lag: float) -> _Block:
-    """Return the bits of both bins from which a shifted one is read."""
+def _shifted_quality(quality: _Block, lag: float) -> _Block:
+    """Return the bits of the two bins from which a shifted bin is interpolated."""
     index = np.arange(quality.shape[-1])
-    moved = np.zeros_like(quality)
+    shifted = np.zeros_like(quality)
     for place in (index + int(np.floor(lag)), index + int(np.ceil(lag))):
         inside = (place >= 0) & (place < index.size)
-        taken = quality[..., np.clip(place, 0, index.size - 1)]
-        moved |= np.where(inside, taken, _MISSING).astype(quality.dtype)
-    return moved
+        bits = quality[..., np.clip(place, 0, index.size - 1)]
+        shifted |= np.where(inside, bits, _MISSING).astype(quality.dtype)
+    return shifted

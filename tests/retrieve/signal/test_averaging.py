@@ -1,4 +1,4 @@
-"""Averages: weights, gaps, variances that average down and such that do not."""
+"""Means over time: weights, gaps, and variances that do or do not average down."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.signal import averaging
@@ -14,16 +13,16 @@ from lidarops.retrieve.signal import averaging
 
 def by_hand(values, variance, shared, weights):
     """Return the averages of one bin, by the formulas of the docstring."""
-    good = np.isfinite(values) & (weights > 0)
-    w = weights[good]
-    if not good.any():
+    valid = np.isfinite(values) & (weights > 0)
+    w = weights[valid]
+    if not valid.any():
         return np.nan, np.nan, np.nan, 0
     total = w.sum()
     return (
-        (w * values[good]).sum() / total,
-        (w**2 * variance[good]).sum() / total**2,
-        ((w * np.sqrt(shared[good])).sum() / total) ** 2,
-        int(good.sum()),
+        (w * values[valid]).sum() / total,
+        (w**2 * variance[valid]).sum() / total**2,
+        ((w * np.sqrt(shared[valid])).sum() / total) ** 2,
+        int(valid.sum()),
     )
 
 
@@ -44,13 +43,13 @@ def test_mean_follows_its_formulas(seed, length, bins):
         expected = by_hand(
             values[k, inside, i], variance[k, inside, i], shared[k, inside, i], weights[k, inside]
         )
-        found = (
+        actual = (
             result.values[k, g, i],
             result.variance[k, g, i],
             result.shared_variance[k, g, i],
             result.count[k, g, i],
         )
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-14)
 
 
 def test_noise_averages_down_and_shared_errors_do_not():
@@ -63,14 +62,14 @@ def test_noise_averages_down_and_shared_errors_do_not():
     result = averaging.time_mean(
         profiles, noise[:, np.newaxis] ** 2, weights=shots, shared_variance=0.25
     )
-    off = result.values - 7.0
-    assert np.var(off) == pytest.approx(result.standard_error[0, 0, 0] ** 2, rel=0.05)
+    deviation = result.values - 7.0
+    assert np.var(deviation) == pytest.approx(result.standard_error[0, 0, 0] ** 2, rel=0.05)
     assert result.variance[0, 0, 0] == pytest.approx(9.0 / shots.sum(), rel=1e-12)
     assert result.shared_variance[0, 0, 0] == pytest.approx(0.25, rel=1e-12)
-    assert np.var(off - dark) == pytest.approx(9.0 / shots.sum(), rel=0.05)
+    assert np.var(deviation - dark) == pytest.approx(9.0 / shots.sum(), rel=0.05)
 
 
-def test_gaps_keep_the_mean_unbiased_and_its_variance_honest():
+def test_gaps_bias_neither_the_mean_nor_its_variance():
     rng = np.random.default_rng(2)
     profiles = rng.normal(5.0, 1.0, (3000, 8, 4))
     profiles[:, :5, 1] = np.nan
@@ -87,7 +86,7 @@ def test_gaps_keep_the_mean_unbiased_and_its_variance_honest():
         assert result.values[..., i].std() == pytest.approx(spread, rel=0.06)
 
 
-def test_least_count_turns_thin_means_into_gaps():
+def test_means_of_too_few_values_are_gaps():
     profiles = np.ones((5, 2))
     profiles[:3, 1] = np.nan
     result = averaging.time_mean(profiles, 1.0, least_count=3)
@@ -117,9 +116,9 @@ def test_no_bit_depends_on_the_chunks(dtype):
         (slice(2, 5), slice(7, 8)),
         (slice(5, 6), slice(1, 32, 3)),
     ):
-        part = averaging.time_mean(profiles[rows, :, bins], variance[rows, :, bins], groups=groups)
-        np.testing.assert_array_equal(whole.values[rows, :, bins], part.values)
-        np.testing.assert_array_equal(whole.variance[rows, :, bins], part.variance)
+        chunk = averaging.time_mean(profiles[rows, :, bins], variance[rows, :, bins], groups=groups)
+        np.testing.assert_array_equal(whole.values[rows, :, bins], chunk.values)
+        np.testing.assert_array_equal(whole.variance[rows, :, bins], chunk.variance)
     for g in range(5):
         inside = groups == g
         alone = averaging.time_mean(profiles[:, inside], variance[:, inside])
@@ -146,44 +145,6 @@ def test_no_profiles_give_gaps():
     assert np.isnan(dark.values).all()
 
 
-def test_times_are_sorted_into_bins():
-    edges = np.array([0.0, 10.0, 30.0])
-    groups = averaging.time_groups([-1.0, 0.0, 9.9, 10.0, 29.0, 30.0, np.nan], edges)
-    np.testing.assert_array_equal(groups, [-1, 0, 0, 1, 1, -1, -1])
-    moments = np.array(["2024-01-01T00:05", "2024-01-01T00:15", "NaT"], "M8[s]")
-    bounds = np.array(["2024-01-01T00:00", "2024-01-01T00:10", "2024-01-01T00:20"], "M8[s]")
-    np.testing.assert_array_equal(averaging.time_groups(moments, bounds), [0, 1, -1])
-
-
-@given(hnp.arrays(np.float64, (2, 23), elements=st.floats(-1e6, 1e6)), st.integers(1, 23))
-@settings(max_examples=50, deadline=None)
-def test_range_mean_of_full_bins_is_that_of_numpy(values, factor):
-    result = averaging.range_mean(values, 2.0, factor, shared_variance=0.5)
-    number = 23 // factor
-    blocks = values[:, : number * factor].reshape(2, number, factor)
-    np.testing.assert_allclose(result.values, blocks.mean(axis=-1), rtol=1e-12, atol=1e-9)
-    np.testing.assert_allclose(result.variance, 2.0 / factor)
-    np.testing.assert_allclose(result.shared_variance, 0.5)
-
-
-def test_range_mean_needs_all_bins_unless_told_otherwise():
-    values = np.array([1.0, 2.0, np.nan, 4.0, 5.0, 6.0, 7.0])
-    strict = averaging.range_mean(values, 1.0, 2)
-    np.testing.assert_array_equal(strict.values, [1.5, np.nan, 5.5])
-    loose = averaging.range_mean(values, 1.0, 2, least_count=1)
-    np.testing.assert_array_equal(loose.values, [1.5, 4.0, 5.5])
-    np.testing.assert_array_equal(loose.count, [2, 1, 2])
-    np.testing.assert_array_equal(loose.variance, [0.5, 1.0, 0.5])
-
-
-def test_range_mean_of_a_background_error_does_not_average_down():
-    rng = np.random.default_rng(5)
-    offset = rng.normal(0.0, 0.3, (5000, 1))
-    profiles = offset + rng.normal(0.0, 1.0, (5000, 16))
-    result = averaging.range_mean(profiles, 1.0, 16, shared_variance=0.09)
-    assert np.var(result.values) == pytest.approx(result.standard_error[0, 0] ** 2, rel=0.08)
-
-
 @pytest.mark.parametrize(
     ("change", "field"),
     [
@@ -204,14 +165,3 @@ def test_impossible_arguments_are_refused(change, field):
     with pytest.raises(RetrievalInputError) as error:
         averaging.time_mean(arguments.pop("profiles"), arguments.pop("variance"), **arguments)
     assert error.value.field == field
-
-
-def test_impossible_cuts_are_refused():
-    for factor in (0, 5, 1.5):
-        with pytest.raises(RetrievalInputError, match="factor"):
-            averaging.range_mean(np.ones((2, 4)), 1.0, factor)
-    for edges in ([0.0, 0.0], [1.0], [2.0, 1.0], [0.0, np.nan]):
-        with pytest.raises(RetrievalInputError, match="edges"):
-            averaging.time_groups([0.0], edges)
-    with pytest.raises(RetrievalInputError, match="edges"):
-        averaging.time_groups(np.array(["2024-01-01"], "M8[s]"), [0.0, 1.0])

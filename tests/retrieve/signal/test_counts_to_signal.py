@@ -1,4 +1,4 @@
-"""Counts to signals: by hand, by Monte Carlo, and against plain numpy and exact sums."""
+"""Counts to signals against hand calculation, Monte Carlo, plain numpy and exact sums."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_full_scale_and_integer_extremes_are_masked() -> None:
     assert np.isfinite(result.power[0, [1, 4]]).all()
 
 
-def test_a_mean_of_shots_of_which_some_were_clipped_is_masked() -> None:
+def test_a_mean_with_clipped_shots_is_masked() -> None:
     rng = np.random.default_rng(8)
     shots, top, spread = 400, 4095.0, 200.0
     level = np.full(1200, 2000.0)
@@ -60,8 +60,8 @@ def test_a_mean_of_shots_of_which_some_were_clipped_is_masked() -> None:
         input_range=np.array([0.5]),
     )
     # 2.5, 4.5 and 10 deviations of a shot below full scale.
-    for part, clipped in ((slice(420), True), (slice(420, 780), False), (slice(820, None), False)):
-        saturated = (result.quality[0, part] & Quality.SATURATED) != 0
+    for bins, clipped in ((slice(420), True), (slice(420, 780), False), (slice(820, None), False)):
+        saturated = (result.quality[0, bins] & Quality.SATURATED) != 0
         assert saturated.mean() > 0.9 if clipped else not saturated.any()
     step = 500.0 / 4096.0
     bias = np.nanmean(result.power[0, 420:780]) / step - 3200.0
@@ -76,12 +76,12 @@ def test_rounding_of_each_shot_is_covered_at_every_level(noise: float, shots: in
     sums = np.zeros((41, 400))
     for _ in range(shots):
         sums += np.rint(level + noise * rng.standard_normal(sums.shape))
-    found = counts_to_signal.analog_signal(
+    result = counts_to_signal.analog_signal(
         sums.astype(np.int32), np.full(41, shots), RANGE, adc_bits=12, input_range=np.full(41, 0.5)
     )
     step = 500.0 / 4096.0
-    error = np.sqrt(found.variance)
-    assert np.abs((found.power - level * step) / error).max() < 5.0
+    error = np.sqrt(result.variance)
+    assert np.abs((result.power - level * step) / error).max() < 5.0
     if noise >= 0.5:
         ideal = step * np.sqrt((noise**2 + 1.0 / 12.0) / shots)
         assert np.median(error) == pytest.approx(ideal, rel=0.1)
@@ -89,21 +89,21 @@ def test_rounding_of_each_shot_is_covered_at_every_level(noise: float, shots: in
         assert error == pytest.approx(step * np.sqrt((1.0 + 1.0 / shots) / 12.0))
 
 
-def test_the_stated_noise_is_raised_by_rounding_and_that_of_the_dark_signal_is_not() -> None:
+def test_rounding_raises_the_stated_noise_but_not_that_of_the_dark_signal() -> None:
     settings = {"adc_bits": 12, "input_range": np.array([0.5])}
     step = 500.0 / 4096.0
     counts = np.full((1, 400), 60_200, np.int32)
     quiet = counts_to_signal.analog_signal(counts, SHOTS, RANGE, noise_variance=0.0, **settings)
     assert quiet.variance == pytest.approx(step**2 * (1.0 + 1.0 / 600.0) / 12.0)
-    loud = counts_to_signal.analog_signal(
+    noisy = counts_to_signal.analog_signal(
         counts, SHOTS, RANGE, noise_variance=step**2 / 600.0, **settings
     )
-    assert loud.variance == pytest.approx(step**2 / 600.0)
+    assert noisy.variance == pytest.approx(step**2 / 600.0)
     dark = {"dark": np.zeros(400), "dark_variance": np.full(400, 7.0)}
-    both = counts_to_signal.analog_signal(
+    with_dark = counts_to_signal.analog_signal(
         counts, SHOTS, RANGE, noise_variance=0.0, **dark, **settings
     )
-    assert both.variance == pytest.approx(quiet.variance + 7.0)
+    assert with_dark.variance == pytest.approx(quiet.variance + 7.0)
 
 
 def test_no_shots_is_missing_input_not_infinity() -> None:
@@ -115,9 +115,9 @@ def test_no_shots_is_missing_input_not_infinity() -> None:
 
 
 @given(rate=st.floats(0.01, 100.0), dead_time=st.floats(1e-9, 4e-9))
-def test_dead_time_is_undone(rate: float, dead_time: float) -> None:
+def test_dead_time_is_corrected(rate: float, dead_time: float) -> None:
     assume(abs(rate * dead_time * 1e6 - 0.1) > 1e-6)
-    # A non-paralysable counter shows r / (1 + r tau); counts are scaled so that rounding is nil.
+    # A non-paralysable counter records r / (1 + r tau); many shots make rounding negligible.
     shots = np.array([10_000_000])
     measured = rate / (1.0 + rate * dead_time * 1e6)
     counts = np.full((1, 400), round(measured * shots[0] * 0.05), np.int32)
@@ -135,18 +135,18 @@ def test_photon_variance_matches_the_scatter_of_poisson_counts() -> None:
     counts = rng.poisson(truth * 30.0, (4000, 400)).astype(np.int32)
     result = counts_to_signal.photon_signal(counts, np.full(4000, 600), RANGE, bin_width=7.5)
     ratio = result.power.var(axis=0) / result.variance.mean(axis=0)
-    # 4000 draws: 2.2 % a bin; smoothing over 10 % of range biases the variance by 1-3 %.
+    # 4000 draws: 2.2 % per bin; smoothing over 10 % of range biases the variance by 1-3 %.
     assert np.abs(ratio[120:] - 1.0).max() < 0.12
     assert ratio[120:].mean() == pytest.approx(1.0, abs=0.02)
 
 
-def test_zero_counts_do_not_claim_certainty() -> None:
+def test_zero_counts_have_a_variance() -> None:
     counts = np.zeros((2, 400), np.int32)
     counts[0, 7] = 1
     result = counts_to_signal.photon_signal(counts, np.full(2, 600), RANGE, bin_width=7.5)
     assert (result.variance[0] > 0).all()
     assert not result.quality[0].any()
-    # Not a single count in a profile: the recorder was off.
+    # A profile without counts: the recorder was off.
     assert (result.quality[1] == Quality.INPUT_MISSING).all()
     assert np.isnan(result.power[1]).all()
 
@@ -158,14 +158,14 @@ def test_paralysed_counters_are_masked() -> None:
     assert np.isnan(result.power).all()
 
 
-def test_noise_of_an_analog_signal_is_found() -> None:
+def test_noise_of_an_analog_signal_is_estimated() -> None:
     rng = np.random.default_rng(5)
     far = (np.arange(2000) + 60.5) * 7.5
     light = 0.5 + 300.0 * (450.0 / far) ** 2
     truth = 0.02 + 0.01 * light
     profiles = light + rng.normal(0, 1, (400, 2000)) * np.sqrt(truth)
     variance = counts_to_signal.difference_variance(profiles, far)
-    # At the first bins the smoothing window has no near half.
+    # The smoothing window of the first bins has no near half.
     assert (variance.mean(axis=0) / truth)[40:] == pytest.approx(1.0, abs=0.08)
     assert (variance.std(axis=0) / truth)[40:].max() < 0.15
 
@@ -196,18 +196,18 @@ def test_estimated_noise_serves_a_retrieval_as_well_as_known_noise(
     profiles = 0.1 + 0.15 * shape + rng.normal(0, 0.007, (2000, 2000))
     inside = (distance >= section[0]) & (distance < section[1])
     variance = counts_to_signal.difference_variance(profiles, distance)[:, inside]
-    found = path_fit.fit_homogeneous_path(
+    result = path_fit.fit_homogeneous_path(
         profiles[:, inside], distance[inside], weights=1.0 / variance
     )
-    good = found.quality == 0
-    score = (found.extinction - 2e-4) / found.extinction_standard_error
-    assert good.mean() > 0.995
+    accepted = result.quality == 0
+    score = (result.extinction - 2e-4) / result.extinction_standard_error
+    assert accepted.mean() > 0.995
     # 2000 draws: the spread is known to 1.6 percent.
-    assert score[good].std() == pytest.approx(1.0, abs=0.05)
-    assert abs(score[good].mean()) < 0.1
+    assert score[accepted].std() == pytest.approx(1.0, abs=0.05)
+    assert abs(score[accepted].mean()) < 0.1
 
 
-def test_smoothing_keeps_constants_and_passes_over_nan() -> None:
+def test_smoothing_keeps_constants_and_skips_nan() -> None:
     values = np.full((2, 400), 3.0)
     values[0, 50:60] = np.nan
     assert counts_to_signal.smooth_signal(values, RANGE) == pytest.approx(3.0)
@@ -225,14 +225,14 @@ def _photon(counts, shots, range=RANGE, **settings):  # noqa: A002
     return counts_to_signal.photon_signal(counts, shots, range, bin_width=7.5, **settings)
 
 
-def _assert_same_bits(one, other) -> None:
-    np.testing.assert_array_equal(one.power, other.power)
-    np.testing.assert_array_equal(one.variance, other.variance)
-    np.testing.assert_array_equal(one.quality, other.quality)
+def _assert_same_bits(result, other) -> None:
+    np.testing.assert_array_equal(result.power, other.power)
+    np.testing.assert_array_equal(result.variance, other.variance)
+    np.testing.assert_array_equal(result.quality, other.quality)
 
 
 def _damaged(counts, rng):
-    """Strike out bins, stretches of bins and whole profiles."""
+    """Make bins, stretches of bins and whole profiles missing."""
     counts = np.asarray(counts, np.int32)
     counts[0, rng.integers(0, counts.shape[1], 9)] = 2**31 - 1
     counts[1, 7:60] = -(2**31)
@@ -249,7 +249,7 @@ def _light(range):  # noqa: A002
 @given(
     seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 7), dead_time=st.sampled_from([None, 3e-9])
 )
-def test_bits_depend_neither_on_neighbours_nor_on_order(seed, cut, dead_time) -> None:
+def test_a_profile_depends_neither_on_others_nor_on_order(seed, cut, dead_time) -> None:
     rng = np.random.default_rng(seed)
     counts = _damaged(rng.poisson(600 * 0.05 * (1 + 20 * _light(RANGE)), (7, 400)), rng)
     shots = rng.integers(0, 4, 7) * 300
@@ -311,7 +311,7 @@ def test_photon_agrees_with_plain_numpy(bins: int, dead_time: float | None) -> N
 
 
 @pytest.mark.parametrize("decades", [0, 6, 9])
-def test_near_range_does_not_take_the_digits_of_the_far_range(decades: int) -> None:
+def test_the_near_range_does_not_degrade_sums_of_the_far_range(decades: int) -> None:
     rng = np.random.default_rng(decades)
     distance = (np.arange(4096) + 0.5) * 7.5
     values = rng.normal(1.0, 1.0, 4096) * 10.0 ** np.linspace(decades, 0.0, 4096)
@@ -324,13 +324,13 @@ def test_near_range_does_not_take_the_digits_of_the_far_range(decades: int) -> N
     whole = (4096 / kernels.BLOCK) ** 2 * 2.0**-106 * np.abs(values).sum() / (past - first)
     assert (error <= (kernels.BLOCK + 3) * 2.0**-53 * size + whole).all()
     if decades > 0:
-        # What differences of one running sum, as in the oracle, would lose.
+        # Differences of one running sum, as in the oracle, lose these digits.
         lost = np.abs(oracle_signal.smooth(values, distance) - exact)
         assert lost.max() > 1e-10 * size[np.argmax(lost)]
 
 
-def test_noise_of_light_that_stands_still_has_no_slope() -> None:
-    # 18 bins: every window with a difference holds all of them, so that one mean is fitted.
+def test_a_constant_signal_has_no_noise_slope() -> None:
+    # 18 bins: every window with a difference holds all of them, so one mean is fitted.
     power = np.random.default_rng(2).normal(5.0, 1.0, (20, 18))
     variance = counts_to_signal.difference_variance(power, RANGE[:18])
     assert (np.ptp(variance, axis=-1) == 0.0).all()
@@ -353,17 +353,17 @@ def test_windows_do_not_reach_over_bins_that_were_left_on_disk() -> None:
     settings = {"bin_width": 7.5, "dead_time": 3e-9}
     parts = [slice(0, 700), slice(2400, 2900), slice(3500, 4000)]
     kept = np.r_[tuple(parts)]
-    found = counts_to_signal.photon_signal(counts[:, kept], shots, distance[kept], **settings)
+    result = counts_to_signal.photon_signal(counts[:, kept], shots, distance[kept], **settings)
     whole = counts_to_signal.photon_signal(counts, shots, distance, **settings)
-    np.testing.assert_array_equal(found.power, whole.power[:, kept])
+    np.testing.assert_array_equal(result.power, whole.power[:, kept])
     place = 0
     for part in parts:
         here = slice(place, place + part.stop - part.start)
         alone = counts_to_signal.photon_signal(counts[:, part], shots, distance[part], **settings)
-        np.testing.assert_allclose(found.variance[:, here], alone.variance, rtol=1e-12)
+        np.testing.assert_allclose(result.variance[:, here], alone.variance, rtol=1e-12)
         place = here.stop
     # Light falls by nine decades over the gap: a window over it would take that for noise.
-    np.testing.assert_allclose(found.variance, whole.variance[:, kept], rtol=0.2)
+    np.testing.assert_allclose(result.variance, whole.variance[:, kept], rtol=0.2)
 
 
 def test_every_layout_of_the_input_gives_the_same_bits() -> None:
@@ -396,7 +396,7 @@ def test_every_layout_of_the_input_gives_the_same_bits() -> None:
             counts_to_signal.smooth_signal(values, RANGE),
             counts_to_signal.smooth_signal(power, RANGE),
         )
-    # Else users would wait for the compiler again and again.
+    # One signature each: otherwise users would wait for repeated compilation.
     assert len(kernels.voltage_profiles.signatures) == 1
     assert len(kernels.photon_profiles.signatures) == 1
     assert len(kernels.noise_profiles.signatures) == 1
@@ -413,24 +413,24 @@ def test_leading_axes_are_kept() -> None:
         assert convert(counts[:0], np.zeros((0, 3))).power.shape == (0, 3, 400)
 
 
-def test_each_profile_may_have_a_dark_signal_of_its_own() -> None:
+def test_each_profile_may_have_its_own_dark_signal() -> None:
     rng = np.random.default_rng(10)
     counts = rng.poisson(3000, (2, 3, 400)).astype(np.int32)
     dark, spread = rng.random((2, 3, 400)) * 1e-3, rng.random((2, 3, 400))
     for known in ({}, {"noise_variance": 1e-3}):
         shots = np.full((2, 3), 600)
         whole = _analog(counts, shots, dark=dark, dark_variance=spread, **known)
-        one = _analog(
+        single = _analog(
             counts[1, 2], np.array(600), dark=dark[1, 2], dark_variance=spread[1, 2], **known
         )
         _assert_same_bits(
-            one,
+            single,
             counts_to_signal.Signal(whole.power[1, 2], whole.variance[1, 2], whole.quality[1, 2]),
         )
     np.testing.assert_array_equal(whole.variance, np.maximum(1e-3 + spread, whole.variance.min()))
 
 
-def test_nothing_is_missing_without_a_flag() -> None:
+def test_every_missing_value_has_a_flag() -> None:
     counts = np.full((2, 400), 1000, np.int32)
     dark = np.zeros(400)
     dark[5] = np.nan
@@ -451,7 +451,7 @@ def test_range_correction_carries_both_variances() -> None:
     result = counts_to_signal.range_corrected(
         raw, RANGE, background=np.array([40.0]), background_variance=np.array([0.25])
     )
-    # 30 MHz less 40 MHz: negative, and not clipped.
+    # 30 MHz minus 40 MHz: negative, and not clipped.
     assert result.power[0] == pytest.approx(-10.0 * RANGE**2)
     assert result.variance[0] == pytest.approx((raw.variance[0] + 0.25) * RANGE**4)
 
@@ -514,27 +514,27 @@ _COUNTS = np.ones((1, 400), np.int32)
         ),
     ],
 )
-def test_what_cannot_be_right_is_refused(field, call) -> None:
+def test_invalid_arguments_are_refused(field, call) -> None:
     with pytest.raises(RetrievalInputError) as refused:
         call()
     assert refused.value.field == field
 
 
-def test_shapes_that_do_not_fit_are_named() -> None:
+def test_shapes_that_do_not_match_are_named() -> None:
     with pytest.raises(RetrievalInputError, match="counts"):
         counts_to_signal.photon_signal(np.zeros((1, 399), np.int32), SHOTS, RANGE, bin_width=7.5)
 
 
 @pytest.mark.parametrize("offset", [-40.0, 0.0, 3.0, 40.0])
 def test_an_offset_of_the_electronics_makes_no_noise(offset):
-    """Shot noise follows the light and not the voltage, whatever the zero is."""
+    """Shot noise follows the light and not the voltage, whatever the offset is."""
     rng = np.random.default_rng(5)
     distance = 7.5 * np.arange(20, 4020)
     light = 60.0 * (1500.0 / distance) ** 2 + 0.02
     variance = 1e-4 + 2e-3 * light
     power = light + offset + rng.normal(0.0, np.sqrt(variance), (20, distance.size))
-    found = counts_to_signal.difference_variance(power, distance)
+    result = counts_to_signal.difference_variance(power, distance)
     for low, high in ((1000, 2000), (3000, 5000), (8000, 12_000), (20_000, 28_000)):
         part = (distance > low) & (distance < high)
-        ratio = np.mean(found[:, part] / variance[part])
+        ratio = np.mean(result[:, part] / variance[part])
         assert 0.93 < ratio < 1.07

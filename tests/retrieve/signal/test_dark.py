@@ -35,8 +35,8 @@ def test_nearest_is_the_mean_of_the_session_nearest_in_time():
 def test_interpolated_lies_between_the_sessions_and_is_nearest_outside():
     signals, times = sessions(np.random.default_rng(2))
     first, second = 120.0, HOUR + 90.0
-    asked = np.array([0.0, first, first + 0.25 * (second - first), second, 9e3])
-    result = dark.dark_profile(signals, times, asked, method="interpolated")
+    requested = np.array([0.0, first, first + 0.25 * (second - first), second, 9e3])
+    result = dark.dark_profile(signals, times, requested, method="interpolated")
     before, after = signals[:5].mean(axis=0), signals[5:].mean(axis=0)
     expected = [before, before, 0.75 * before + 0.25 * after, after, after]
     np.testing.assert_allclose(result.dark, expected, rtol=1e-13)
@@ -46,7 +46,7 @@ def test_interpolated_lies_between_the_sessions_and_is_nearest_outside():
 
 @pytest.mark.parametrize("method", ["nearest", "interpolated"])
 def test_variance_is_that_of_the_mean(method):
-    """Over many realisations the scatter of the dark signal is what the variance says."""
+    """Over many realisations the scatter of the dark signal matches the stated variance."""
     rng = np.random.default_rng(3)
     darks, variances = [], []
     for _ in range(60):
@@ -59,7 +59,7 @@ def test_variance_is_that_of_the_mean(method):
     assert ratio == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_wandering_level_is_told_apart_from_noise():
+def test_a_drifting_level_is_separated_from_noise():
     rng = np.random.default_rng(4)
     noise, levels = [], []
     for _ in range(200):
@@ -72,7 +72,7 @@ def test_a_wandering_level_is_told_apart_from_noise():
     assert np.mean(levels) == pytest.approx(2.0**2, rel=0.2)
 
 
-def test_a_single_file_is_judged_by_its_far_bins():
+def test_the_noise_of_a_single_file_is_that_of_its_far_bins():
     rng = np.random.default_rng(5)
     signal = rng.normal(0.0, 0.3, (1, 4000)) + 1.0
     signal[0, :200] += 50.0 * np.exp(-np.arange(200) / 40.0)
@@ -107,7 +107,7 @@ def test_smoothing_divides_the_variance_and_keeps_a_straight_dark():
     np.testing.assert_allclose(exact.dark[0], straight, rtol=1e-13)
 
 
-def test_gaps_are_passed_over_and_nothing_is_invented():
+def test_gaps_are_skipped_and_not_filled():
     signals, times = sessions(np.random.default_rng(8))
     signals[0, 10] = np.nan
     signals[:5, 20] = np.inf
@@ -116,29 +116,29 @@ def test_gaps_are_passed_over_and_nothing_is_invented():
     assert np.isnan(result.dark[0, 20])
     assert np.isnan(result.variance[0, 20])
     assert np.isfinite(result.dark[1, 20])
-    gone = dark.dark_profile(np.full((3, 50), np.nan), [0.0, 1.0, 2.0], [0.0])
-    assert np.isnan(gone.dark).all()
-    assert np.isnan(gone.variance).all()
-    assert np.isnan(gone.level_variance)
+    empty = dark.dark_profile(np.full((3, 50), np.nan), [0.0, 1.0, 2.0], [0.0])
+    assert np.isnan(empty.dark).all()
+    assert np.isnan(empty.variance).all()
+    assert np.isnan(empty.level_variance)
 
 
 def test_leading_axes_order_and_cutting_change_nothing():
     rng = np.random.default_rng(9)
     signals, times = sessions(rng)
-    asked = np.linspace(-100.0, 5000.0, 13)
+    requested = np.linspace(-100.0, 5000.0, 13)
     order = rng.permutation(times.size)
     both = np.stack([signals, 2.0 * signals])
-    whole = dark.dark_profile(both[:, order], times[order], asked, method="interpolated")
-    alone = dark.dark_profile(signals, times, asked[4:6], method="interpolated")
+    whole = dark.dark_profile(both[:, order], times[order], requested, method="interpolated")
+    alone = dark.dark_profile(signals, times, requested[4:6], method="interpolated")
     np.testing.assert_allclose(whole.dark[0, 4:6], alone.dark, rtol=1e-14)
     np.testing.assert_allclose(whole.dark[1], 2.0 * whole.dark[0], rtol=1e-14)
-    cut = dark.dark_profile(both[:, order], times[order], asked[4:6], method="interpolated")
+    cut = dark.dark_profile(both[:, order], times[order], requested[4:6], method="interpolated")
     np.testing.assert_array_equal(whole.dark[:, 4:6], cut.dark)
     np.testing.assert_array_equal(whole.variance[:, 4:6], cut.variance)
-    moments = np.datetime64("2024-10-02T00:00:00") + (times * 1e9).astype("m8[ns]")
-    wanted = np.datetime64("2024-10-02T00:00:00") + (asked * 1e9).astype("m8[ns]")
-    dated = dark.dark_profile(signals, moments, wanted, method="interpolated")
-    plain = dark.dark_profile(signals, times, asked, method="interpolated")
+    dark_dates = np.datetime64("2024-10-02T00:00:00") + (times * 1e9).astype("m8[ns]")
+    requested_dates = np.datetime64("2024-10-02T00:00:00") + (requested * 1e9).astype("m8[ns]")
+    dated = dark.dark_profile(signals, dark_dates, requested_dates, method="interpolated")
+    plain = dark.dark_profile(signals, times, requested, method="interpolated")
     np.testing.assert_allclose(dated.dark, plain.dark, rtol=1e-12)
 
 
@@ -170,8 +170,8 @@ def _channel(folder, name):
 
 
 @pytest.mark.parametrize("wavelength", ["1064", "532", "355"])
-def test_the_far_range_of_a_real_station_holds_sky_alone(data_root, wavelength):
-    """Sao Paulo: what the dark leaves of the offset is the sky that photon counting sees."""
+def test_the_far_range_of_a_real_station_holds_only_sky(data_root, wavelength):
+    """Sao Paulo: without the dark signal, the offset is the sky seen by photon counting."""
     folder = data_root / "saopaulo" / "20170928"
     signals, times = _channel(folder / "signals", f"analog_{wavelength}o")
     rates, _ = _channel(folder / "signals", f"photon_{wavelength}o")
@@ -180,7 +180,7 @@ def test_the_far_range_of_a_real_station_holds_sky_alone(data_root, wavelength):
     clean = (signals - result.dark).mean(axis=0)
     rate = rates.mean(axis=0)
     gain = (clean[near].mean() - clean[far].mean()) / (rate[near].mean() - rate[far].mean())
-    left = clean[far].mean() - gain * rate[far].mean()
+    residual = clean[far].mean() - gain * rate[far].mean()
     assert signals[:, far].mean() > 2.0
-    assert abs(left) < 2.5 * np.sqrt(result.level_variance)
+    assert abs(residual) < 2.5 * np.sqrt(result.level_variance)
     assert np.sqrt(result.level_variance) < 0.1

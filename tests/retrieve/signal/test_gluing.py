@@ -1,4 +1,4 @@
-"""Gluing: the line against an independent solver, bias and errors against simulations."""
+"""Gluing: the line against an independent solver, its bias and errors against simulations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarops.retrieve.signal.gluing import glue
 RANGE = (np.arange(800) + 0.5) * 15.0
 SLOPE = 12.0
 EXPOSURE = 60.0
-"""Microseconds a bin was open."""
+"""Exposure of a bin in microseconds."""
 ANALOG_NOISE = 0.02
 """mV."""
 
@@ -26,7 +26,7 @@ def truth(brightness=2e8):
 
 
 def measured(rng, count, *, rate=None, offset=0.0, noise=ANALOG_NOISE):
-    """Return analog, photon counting and their variances, as they are, not as they came out."""
+    """Return analog, photon counting and the variances of the true rate."""
     rate = truth() if rate is None else rate
     analog = rate / SLOPE - offset + rng.normal(0.0, noise, (count, rate.size))
     photon = rng.poisson(rate * EXPOSURE, (count, rate.size)) / EXPOSURE
@@ -45,13 +45,13 @@ def window(result, k):
 
 
 def test_the_line_minimises_its_misfit():
-    """Four fixed passes end where a general minimiser does."""
+    """Four iterations reach the minimum of a general minimiser."""
     rng = np.random.default_rng(1)
     for noise in (0.01, 0.1, 0.3):
         analog, photon, variances = measured(rng, 3, noise=noise, offset=0.05)
-        found = glue(analog, photon, RANGE, **variances, least_snr=1.0)
+        result = glue(analog, photon, RANGE, **variances, least_snr=1.0)
         for k in range(3):
-            inside = window(found, k)
+            inside = window(result, k)
             x, y = analog[k, inside], photon[k, inside]
             v = variances["photon_variance"][inside]
 
@@ -59,10 +59,10 @@ def test_the_line_minimises_its_misfit():
                 return (y - line[0] * x - line[1]) / np.sqrt(v + (line[0] * noise) ** 2)
 
             best = optimize.least_squares(misfit, [SLOPE, 0.0], xtol=1e-14, ftol=1e-14)
-            assert abs(found.slope[k] - best.x[0]) < 0.02 * found.slope_standard_error[k]
-            assert abs(found.intercept[k] - best.x[1]) < 0.02 * found.intercept_standard_error[k]
-            assert found.chi2[k] == pytest.approx(2.0 * best.cost, rel=1e-6)
-            assert found.degrees_of_freedom[k] == inside.sum() - 2
+            assert abs(result.slope[k] - best.x[0]) < 0.02 * result.slope_standard_error[k]
+            assert abs(result.intercept[k] - best.x[1]) < 0.02 * result.intercept_standard_error[k]
+            assert result.chi2[k] == pytest.approx(2.0 * best.cost, rel=1e-6)
+            assert result.degrees_of_freedom[k] == inside.sum() - 2
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.05])
@@ -71,18 +71,18 @@ def test_slope_and_glued_signal_are_unbiased(noise, hand_over):
     rng = np.random.default_rng(2)
     count = 1500
     analog, photon, variances = measured(rng, count, noise=noise, offset=0.05)
-    found = glue(analog, photon, RANGE, **variances, hand_over=hand_over)
-    assert not found.no_window.any()
-    assert found.poor_fit.mean() < 0.01
-    off = (found.slope - SLOPE) / found.slope_standard_error
-    assert abs(off.mean()) < 4.0 / np.sqrt(count)
-    assert off.std() == pytest.approx(1.0, abs=0.07)
-    shift = (found.intercept - SLOPE * 0.05) / found.intercept_standard_error
+    result = glue(analog, photon, RANGE, **variances, hand_over=hand_over)
+    assert not result.no_window.any()
+    assert result.poor_fit.mean() < 0.01
+    deviation = (result.slope - SLOPE) / result.slope_standard_error
+    assert abs(deviation.mean()) < 4.0 / np.sqrt(count)
+    assert deviation.std() == pytest.approx(1.0, abs=0.07)
+    shift = (result.intercept - SLOPE * 0.05) / result.intercept_standard_error
     assert abs(shift.mean()) < 4.0 / np.sqrt(count)
     assert shift.std() == pytest.approx(1.0, abs=0.07)
-    error = (found.power - truth()) / np.sqrt(found.variance + found.systematic_variance)
-    # The line and the noise of the window it came from are not independent of each other.
-    near, far = found.start.min() - 30.0 > RANGE, found.stop.max() + 30.0 < RANGE
+    error = (result.power - truth()) / np.sqrt(result.variance + result.systematic_variance)
+    # The line depends on the noise of its window, so that window is tested separately.
+    near, far = result.start.min() - 30.0 > RANGE, result.stop.max() + 30.0 < RANGE
     for bins in (near, far):
         assert abs(error[:, bins].mean()) < 0.05
         assert error[:, bins].std() == pytest.approx(1.0, abs=0.05)
@@ -92,23 +92,23 @@ def test_slope_and_glued_signal_are_unbiased(noise, hand_over):
 
 
 def test_ordinary_regression_would_be_biased():
-    """What the errors in both variables are for."""
+    """A fit without errors in the analog signal has too small a slope."""
     rng = np.random.default_rng(3)
     analog, photon, variances = measured(rng, 400, noise=0.15)
-    found = glue(analog, photon, RANGE, **variances, least_snr=2.0)
-    inside = window(found, 0)
+    result = glue(analog, photon, RANGE, **variances, least_snr=2.0)
+    inside = window(result, 0)
     slopes = [np.polyfit(x[inside], y[inside], 1)[0] for x, y in zip(analog, photon, strict=True)]
-    standard = found.slope.std() / np.sqrt(400)
+    standard = result.slope.std() / np.sqrt(400)
     assert np.mean(slopes) < SLOPE - 15.0 * standard
-    assert abs(found.slope.mean() - SLOPE) < 0.2 * found.slope.std()
+    assert abs(result.slope.mean() - SLOPE) < 0.2 * result.slope.std()
 
 
-def test_a_window_sought_in_single_bins_would_bias():
-    """What the smoothing before the search is for: its ends do not follow the noise."""
+def test_a_window_chosen_in_single_bins_would_bias():
+    """After smoothing, the edges of the window do not follow the noise."""
     rng = np.random.default_rng(4)
     analog, photon, variances = measured(rng, 2000)
-    found = glue(analog, photon, RANGE, **variances)
-    ends = np.searchsorted(RANGE, found.stop)
+    result = glue(analog, photon, RANGE, **variances)
+    ends = np.searchsorted(RANGE, result.stop)
     rows = np.arange(2000)
     sigma = np.sqrt(variances["photon_variance"])
     last = (photon[rows, ends] - truth()[ends]) / sigma[ends]
@@ -118,7 +118,7 @@ def test_a_window_sought_in_single_bins_would_bias():
     assert beyond.mean() < -1.0
 
 
-def test_a_block_shares_one_line_that_knows_more():
+def test_a_block_shares_one_line_with_a_smaller_error():
     rng = np.random.default_rng(5)
     analog, photon, variances = measured(rng, 12)
     block = np.array([7, 7, 3, 3, 3, 7, 3, 7, 3, 3, 7, 7])
@@ -145,26 +145,30 @@ def test_common_shot_noise_is_accounted_for():
     analog = rate / SLOPE + sx * first
     photon = rate + sy * (rho * first + np.sqrt(1 - rho**2) * second)
     variances = {"analog_variance": sx**2, "photon_variance": sy**2}
-    told = glue(analog, photon, RANGE, **variances, correlation=rho)
-    off = (told.slope - SLOPE) / told.slope_standard_error
-    assert abs(off.mean()) < 4.0 / np.sqrt(count)
-    assert off.std() == pytest.approx(1.0, abs=0.07)
-    assert np.mean(told.chi2 / told.degrees_of_freedom) == pytest.approx(1.0, abs=0.02)
-    not_told = glue(analog, photon, RANGE, **variances)
-    assert np.mean(not_told.chi2 / not_told.degrees_of_freedom) < 0.8
-    middle = window(told, 0)
-    error = (told.power - rate)[:, middle] / np.sqrt(told.variance[:, middle])
+    with_correlation = glue(analog, photon, RANGE, **variances, correlation=rho)
+    deviation = (with_correlation.slope - SLOPE) / with_correlation.slope_standard_error
+    assert abs(deviation.mean()) < 4.0 / np.sqrt(count)
+    assert deviation.std() == pytest.approx(1.0, abs=0.07)
+    assert np.mean(with_correlation.chi2 / with_correlation.degrees_of_freedom) == pytest.approx(
+        1.0, abs=0.02
+    )
+    without_correlation = glue(analog, photon, RANGE, **variances)
+    assert np.mean(without_correlation.chi2 / without_correlation.degrees_of_freedom) < 0.8
+    middle = window(with_correlation, 0)
+    error = (with_correlation.power - rate)[:, middle] / np.sqrt(
+        with_correlation.variance[:, middle]
+    )
     assert error.std() == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_window_lies_where_both_are_linear():
     rate = truth()
     analog = rate / SLOPE
-    found = glue(analog, rate, RANGE, analog_variance=1e-8, photon_variance=rate / 1e6)
-    inside = (found.start <= RANGE) & (found.stop >= RANGE)
+    result = glue(analog, rate, RANGE, analog_variance=1e-8, photon_variance=rate / 1e6)
+    inside = (result.start <= RANGE) & (result.stop >= RANGE)
     assert rate[inside].max() <= 20.5
     assert rate[inside].min() >= 0.45
-    assert rate[found.start > RANGE].min() >= 19.0
+    assert rate[result.start > RANGE].min() >= 19.0
     noisy = glue(analog, rate, RANGE, analog_variance=0.01, photon_variance=rate / 1e6)
     inside = (noisy.start <= RANGE) & (noisy.stop >= RANGE)
     assert (analog[inside] / 0.1).min() == pytest.approx(10.0, rel=0.05)
@@ -176,32 +180,32 @@ def test_the_window_lies_where_both_are_linear():
     assert rate[inside].max() <= 5.2
 
 
-def test_too_short_a_fall_is_no_window():
-    """Where 8 bins pass but hold no line, their slope would be that of their noise."""
+def test_too_small_a_fall_gives_no_window():
+    """Eight bins without a sufficient fall would give the slope of their noise."""
     rng = np.random.default_rng(10)
     analog, photon, variances = measured(rng, 300, noise=0.15)
-    found = glue(analog, photon, RANGE, **variances)
-    assert found.no_window.all()
-    assert np.isnan(found.power).all()
+    result = glue(analog, photon, RANGE, **variances)
+    assert result.no_window.all()
+    assert np.isnan(result.power).all()
 
 
-def test_what_has_no_window_is_not_glued():
+def test_profiles_without_window_are_not_glued():
     rate = truth()
     rows = np.stack([rate, rate, 1e4 + rate, rate * 1e-6])
     analog = rows / SLOPE
     analog[1] = np.nan
-    found = glue(analog, rows, RANGE, analog_variance=1e-8, photon_variance=1e-4)
-    np.testing.assert_array_equal(found.no_window, [False, True, True, True])
-    assert np.isnan(found.power[1:]).all()
-    assert np.isnan(found.variance[1:]).all()
-    assert np.isnan(found.start[1:]).all()
-    assert np.isfinite(found.power[0]).all()
+    result = glue(analog, rows, RANGE, analog_variance=1e-8, photon_variance=1e-4)
+    np.testing.assert_array_equal(result.no_window, [False, True, True, True])
+    assert np.isnan(result.power[1:]).all()
+    assert np.isnan(result.variance[1:]).all()
+    assert np.isnan(result.start[1:]).all()
+    assert np.isfinite(result.power[0]).all()
     hot = glue(analog[0], rows[0], RANGE, analog_variance=1e-8, photon_variance=1e-4,
                photon_background=111.0)  # fmt: skip
     assert hot.no_window
 
 
-def test_channels_that_see_different_light_are_told():
+def test_channels_that_receive_different_light_are_reported():
     rng = np.random.default_rng(7)
     analog, photon, variances = measured(rng, 4)
     fine = glue(analog, photon, RANGE, **variances)
@@ -221,12 +225,12 @@ def test_gaps_are_filled_by_the_other_channel_only_where_both_are_linear():
     middle = (first + last) // 2
     analog[0, [5, middle, 790]] = np.nan
     photon[0, [6, middle + 1, 791]] = np.nan
-    found = glue(analog, photon, RANGE, **variances)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.power[0])), [5, 791])
-    assert found.power[0, middle] == photon[0, middle]
-    assert found.systematic_variance[0, middle] == 0.0
-    assert found.systematic_variance[0, 10] > 0.0
-    assert found.power[0, 790] == photon[0, 790]
+    result = glue(analog, photon, RANGE, **variances)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(result.power[0])), [5, 791])
+    assert result.power[0, middle] == photon[0, middle]
+    assert result.systematic_variance[0, middle] == 0.0
+    assert result.systematic_variance[0, 10] > 0.0
+    assert result.power[0, 790] == photon[0, 790]
 
 
 def test_no_bit_depends_on_batch_or_layout():
@@ -236,14 +240,14 @@ def test_no_bit_depends_on_batch_or_layout():
     for k in (0, 5, 11):
         alone = glue(analog[k], photon[k], RANGE, **variances)
         np.testing.assert_array_equal(alone.power, whole.power.reshape(12, -1)[k])
-    turned = glue(
+    reversed_ = glue(
         np.asfortranarray(analog[:, ::-1].astype(">f8")),
         photon[:, ::-1],
         RANGE[::-1],
         analog_variance=variances["analog_variance"][::-1],
         photon_variance=variances["photon_variance"][::-1],
     )
-    np.testing.assert_array_equal(turned.power[:, ::-1], whole.power.reshape(12, -1))
+    np.testing.assert_array_equal(reversed_.power[:, ::-1], whole.power.reshape(12, -1))
     empty = glue(np.empty((0, 800)), np.empty((0, 800)), RANGE, **variances)
     assert empty.power.shape == (0, 800)
 
@@ -279,14 +283,14 @@ def test_impossible_arguments_are_refused(change, field):
     assert error.value.field == field
 
 
-def test_limits_are_those_of_the_field():
+def test_default_limits_are_the_usual_ones():
     assert gluing.COUNT_RATES == (0.5, 20.0)
     assert gluing.LEAST_SNR == 10.0
 
 
 @pytest.mark.parametrize("wavelength", ["355", "532"])
-def test_a_real_station_is_glued_once_its_lag_is_gone(data_root, wavelength):
-    """Sao Paulo: with the lag of its recorders the slope wanders and the line does not fit."""
+def test_a_real_station_is_glued_after_lag_correction(data_root, wavelength):
+    """Sao Paulo: without lag correction the slope varies and the line does not fit."""
     folder = data_root / "saopaulo" / "20170928"
     names = [f"analog_{wavelength}o", f"photon_{wavelength}o"]
     files, darks = (sorted((folder / kind).iterdir()) for kind in ("signals", "dark"))
@@ -295,9 +299,9 @@ def test_a_real_station_is_glued_once_its_lag_is_gone(data_root, wavelength):
     range_ = (np.arange(4000) + 0.5) * 7.5
     clean = analog - dark.mean(axis=0)
     sky = photon[:, 3500:3950].mean(axis=1)
-    found = lag.estimate_lag(analog, photon)
+    estimate = lag.estimate_lag(analog, photon)
     results = []
-    for bins in (0.0, found.lag):
+    for bins in (0.0, estimate.lag):
         moved, _ = lag.shift_signal(clean, bins)
         results.append(
             glue(

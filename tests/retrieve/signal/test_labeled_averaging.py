@@ -1,4 +1,4 @@
-"""Means over intervals of the clock: numpy by hand, the same bits for any chunks, honest errors."""
+"""Means over intervals of the clock: numpy by hand, any chunks, errors that match the scatter."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.signal.dark import dark_profile
-from lidarops.retrieve.signal.labeled import Dark
+from lidarops.retrieve.signal.labeled import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import clock_average
 
 BINS = 16
@@ -22,7 +22,7 @@ SECOND = np.timedelta64(1_000_000_000, "ns")
 
 
 def made(minutes, *, seed=0, length=60):
-    """Conditioned profiles that start so many minutes after midnight, and their shots."""
+    """Return conditioned profiles that start at these minutes after midnight, and their shots."""
     rng = np.random.default_rng(seed)
     starts = MIDNIGHT + (np.asarray(minutes) * 60e9).astype("timedelta64[ns]")
     size = (starts.size, BINS)
@@ -42,7 +42,7 @@ def made(minutes, *, seed=0, length=60):
 
 
 def by_hand(conditioned, shots, members):
-    """Mean, variance and bits of some profiles, bin by bin in plain Python."""
+    """Return mean, variance and bits of some profiles, bin by bin in plain Python."""
     mean, variance, bits = (np.zeros(BINS) for _ in range(3))
     for i in range(BINS):
         used = [t for t in members if np.isfinite(conditioned["power"].to_numpy()[t, i])]
@@ -62,7 +62,7 @@ def by_hand(conditioned, shots, members):
 
 
 def spoiled(conditioned):
-    """Bins that are missing in one, in all profiles, and saturated ones."""
+    """Return the profiles with bins missing in one, in all profiles, and saturated bins."""
     changed = conditioned.copy(deep=True)
     for where, bit in (
         ((1, slice(0, 3)), Quality.INPUT_MISSING),
@@ -79,98 +79,98 @@ def spoiled(conditioned):
 def test_means_are_those_by_hand():
     conditioned, shots = made([0, 1, 4, 5, 7, 14.5])
     conditioned = spoiled(conditioned)
-    found = clock_average(conditioned, seconds=300, shots=shots).compute()
+    result = clock_average(conditioned, seconds=300, shots=shots).compute()
     for k, members in enumerate([(0, 1, 2), (3, 4), (5,)]):
         mean, variance, bits = by_hand(conditioned, shots, members)
-        np.testing.assert_allclose(found["power"][k], mean, rtol=1e-14)
-        np.testing.assert_allclose(found["variance"][k], variance, rtol=1e-14)
-        np.testing.assert_array_equal(found["quality"][k], bits)
-    np.testing.assert_array_equal(found["profiles"], [3, 2, 1])
+        np.testing.assert_allclose(result["power"][k], mean, rtol=1e-14)
+        np.testing.assert_allclose(result["variance"][k], variance, rtol=1e-14)
+        np.testing.assert_array_equal(result["quality"][k], bits)
+    np.testing.assert_array_equal(result["profiles"], [3, 2, 1])
     np.testing.assert_array_equal(
-        found["shots"], [int(shots[:3].sum()), int(shots[3:5].sum()), int(shots[5])]
+        result["shots"], [int(shots[:3].sum()), int(shots[3:5].sum()), int(shots[5])]
     )
-    assert found["power"].attrs == {"units": "mV"}
-    assert found["variance"].attrs == {"units": "mV2"}
-    assert found["range"].attrs == {"units": "m"}
+    assert result["power"].attrs == {"units": "mV"}
+    assert result["variance"].attrs == {"units": "mV2"}
+    assert result["range"].attrs == {"units": "m"}
 
 
 def test_a_saturated_profile_flags_the_mean_and_a_missing_one_does_not():
     conditioned, shots = made([0, 1, 2])
-    found = clock_average(spoiled(conditioned), seconds=300, shots=shots)
-    quality = found["quality"].to_numpy()[0]
+    result = clock_average(spoiled(conditioned), seconds=300, shots=shots)
+    quality = result["quality"].to_numpy()[0]
     assert quality[6] == Quality.SATURATED
     assert quality[8] == Quality.PILE_UP
     assert not quality[:3].any()
     assert quality[4] == Quality.INPUT_MISSING
-    assert np.isnan(found["power"].to_numpy()[0]).tolist() == (quality == 1).tolist()
+    assert np.isnan(result["power"].to_numpy()[0]).tolist() == (quality == 1).tolist()
 
 
-def test_every_missing_mean_carries_a_bit():
+def test_every_missing_mean_has_a_bit():
     conditioned, shots = made(np.arange(12))
     conditioned["power"][:] = np.nan
     conditioned["quality"][:] = int(Quality.INPUT_MISSING)
-    found = clock_average(conditioned, seconds=600, shots=shots)
-    assert np.isnan(found["power"]).all()
-    assert (found["quality"] == int(Quality.INPUT_MISSING)).all()
+    result = clock_average(conditioned, seconds=600, shots=shots)
+    assert np.isnan(result["power"]).all()
+    assert (result["quality"] == int(Quality.INPUT_MISSING)).all()
 
 
-def test_a_profile_without_shots_counts_nothing():
+def test_a_profile_without_shots_has_no_weight():
     conditioned, shots = made([0, 1, 2])
     shots[1] = 0
-    found = clock_average(conditioned, seconds=300, shots=shots).compute()
+    result = clock_average(conditioned, seconds=300, shots=shots).compute()
     mean, variance, _ = by_hand(conditioned, shots, (0, 2))
-    np.testing.assert_allclose(found["power"][0], mean, rtol=1e-14)
-    np.testing.assert_allclose(found["variance"][0], variance, rtol=1e-14)
+    np.testing.assert_allclose(result["power"][0], mean, rtol=1e-14)
+    np.testing.assert_allclose(result["variance"][0], variance, rtol=1e-14)
 
 
 class TestIntervals:
-    def test_midnight_parts_days(self):
+    def test_days_end_at_midnight(self):
         conditioned, shots = made([-2, -1, 0, 1])
-        found = clock_average(conditioned, seconds=86400, shots=shots)
-        np.testing.assert_array_equal(found["profiles"], [2, 2])
+        result = clock_average(conditioned, seconds=86400, shots=shots)
+        np.testing.assert_array_equal(result["profiles"], [2, 2])
         minute = 60 * SECOND
         np.testing.assert_array_equal(
-            found["time_bnds"],
+            result["time_bnds"],
             [[MIDNIGHT - 2 * minute, MIDNIGHT], [MIDNIGHT, MIDNIGHT + 2 * minute]],
         )
-        np.testing.assert_array_equal(found["time"], [MIDNIGHT - minute, MIDNIGHT + minute])
+        np.testing.assert_array_equal(result["time"], [MIDNIGHT - minute, MIDNIGHT + minute])
 
     def test_a_profile_belongs_where_its_middle_lies(self):
-        # From 9:30 to 10:30, and from 9:30:01 on: the middle at 10:00 belongs to the later one.
+        # The middle at 10:00 exactly belongs to the later interval.
         for start, profiles in ((9.5, [1, 1]), (9.49, [2])):
             conditioned, shots = made([5.0, start])
-            found = clock_average(conditioned, seconds=600, shots=shots)
-            np.testing.assert_array_equal(found["profiles"], profiles)
+            result = clock_average(conditioned, seconds=600, shots=shots)
+            np.testing.assert_array_equal(result["profiles"], profiles)
 
-    def test_edges_stand_at_the_clock_not_at_the_first_profile(self):
+    def test_intervals_follow_the_clock_not_the_first_profile(self):
         conditioned, shots = made(np.arange(7, 37))
-        found = clock_average(conditioned, seconds=600, shots=shots)
-        np.testing.assert_array_equal(found["profiles"], [3, 10, 10, 7])
+        result = clock_average(conditioned, seconds=600, shots=shots)
+        np.testing.assert_array_equal(result["profiles"], [3, 10, 10, 7])
 
-    def test_gaps_leave_intervals_out(self):
+    def test_intervals_without_profiles_are_omitted(self):
         conditioned, shots = made([0, 1, 600, 601])
-        found = clock_average(conditioned, seconds=600, shots=shots)
-        np.testing.assert_array_equal(found["profiles"], [2, 2])
-        assert found["time"].to_index().is_monotonic_increasing
+        result = clock_average(conditioned, seconds=600, shots=shots)
+        np.testing.assert_array_equal(result["profiles"], [2, 2])
+        assert result["time"].to_index().is_monotonic_increasing
 
     def test_bounds_span_overlapping_profiles(self):
         conditioned, shots = made([0, 1, 2])
         conditioned["time_bnds"][0, 1] = MIDNIGHT + 300 * SECOND
-        found = clock_average(conditioned, seconds=3600, shots=shots)
-        np.testing.assert_array_equal(found["time_bnds"], [[MIDNIGHT, MIDNIGHT + 300 * SECOND]])
+        result = clock_average(conditioned, seconds=3600, shots=shots)
+        np.testing.assert_array_equal(result["time_bnds"], [[MIDNIGHT, MIDNIGHT + 300 * SECOND]])
 
     def test_times_before_1970_fall_into_the_right_interval(self):
         conditioned, shots = made([0, 1])
         moved = conditioned.assign_coords(
             time=conditioned["time"] - (MIDNIGHT - np.datetime64("1969-12-31T23:59", "ns")),
         )
-        found = clock_average(moved, seconds=600, shots=shots)
-        np.testing.assert_array_equal(found["profiles"], [1, 1])
+        result = clock_average(moved, seconds=600, shots=shots)
+        np.testing.assert_array_equal(result["profiles"], [1, 1])
 
     @pytest.mark.parametrize("seconds", [0, -600, 7000, 86401, 172800, np.nan])
-    def test_what_does_not_divide_a_day_is_refused(self, seconds):
+    def test_an_interval_that_does_not_divide_a_day_is_refused(self, seconds):
         conditioned, shots = made([0, 1])
-        with pytest.raises(RetrievalInputError, match="part of a day") as caught:
+        with pytest.raises(RetrievalInputError, match="divide a day") as caught:
             clock_average(conditioned, seconds=seconds, shots=shots)
         assert caught.value.field == "average"
 
@@ -186,31 +186,31 @@ WHOLE = clock_average(LONG, seconds=600, shots=LONG_SHOTS).compute()
     along_range=st.sampled_from([5, BINS]),
     scheduler=st.sampled_from(["synchronous", "threads"]),
 )
-def test_any_chunks_in_any_order_give_the_same_bits(along_time, along_range, scheduler):
+def test_chunks_and_schedulers_do_not_change_a_bit(along_time, along_range, scheduler):
     edges = [0, *sorted(along_time), 700]
     chunked = LONG.chunk({"time": tuple(np.diff(edges)), "range": along_range})
-    found = clock_average(chunked, seconds=600, shots=LONG_SHOTS)
-    assert all(isinstance(found[n].data, da.Array) for n in ("power", "variance", "quality"))
+    result = clock_average(chunked, seconds=600, shots=LONG_SHOTS)
+    assert all(isinstance(result[n].data, da.Array) for n in ("power", "variance", "quality"))
     with dask.config.set(scheduler=scheduler):
-        xr.testing.assert_identical(found.compute(), WHOLE)
+        xr.testing.assert_identical(result.compute(), WHOLE)
 
 
-def test_a_mean_of_more_profiles_than_a_task_takes_is_one_mean():
+def test_a_mean_may_hold_more_profiles_than_a_task():
     conditioned, shots = made(np.linspace(0, 500, 600))
-    found = clock_average(conditioned, seconds=86400, shots=shots).compute()
-    assert found.sizes["time"] == 1
+    result = clock_average(conditioned, seconds=86400, shots=shots).compute()
+    assert result.sizes["time"] == 1
     weight = (shots / shots.sum()).to_numpy()
     np.testing.assert_allclose(
-        found["power"][0], weight @ conditioned["power"].to_numpy(), rtol=1e-12
+        result["power"][0], weight @ conditioned["power"].to_numpy(), rtol=1e-12
     )
     variance = weight**2 @ conditioned["variance"].to_numpy()
-    np.testing.assert_allclose(found["variance"][0], variance, rtol=1e-12)
+    np.testing.assert_allclose(result["variance"][0], variance, rtol=1e-12)
 
 
 def test_the_means_of_an_interval_do_not_depend_on_other_intervals():
-    some = LONG.isel(time=slice(100, 420))
-    part = clock_average(some, seconds=600, shots=LONG_SHOTS[100:420]).compute()
-    inner = part.isel(time=slice(1, -1))
+    profiles = LONG.isel(time=slice(100, 420))
+    result = clock_average(profiles, seconds=600, shots=LONG_SHOTS[100:420]).compute()
+    inner = result.isel(time=slice(1, -1))
     xr.testing.assert_identical(inner, WHOLE.sel(time=inner["time"]))
 
 
@@ -222,69 +222,69 @@ class TestSharedVariance:
         def shared(times):
             return np.full((times.size, BINS), dark)
 
-        found = clock_average(conditioned, seconds=900, shots=shots, shared_variance=shared)
+        result = clock_average(conditioned, seconds=900, shots=shots, shared_variance=shared)
         own = conditioned.assign(variance=conditioned["variance"] - dark)
         without = clock_average(own, seconds=900, shots=shots)
-        np.testing.assert_allclose(found["variance"], without["variance"] + dark, rtol=1e-12)
-        np.testing.assert_array_equal(found["power"], without["power"])
+        np.testing.assert_allclose(result["variance"], without["variance"] + dark, rtol=1e-12)
+        np.testing.assert_array_equal(result["power"], without["power"])
 
     def test_it_is_that_of_the_middle_of_the_interval(self):
         conditioned, shots = made([0, 1, 2, 60, 61])
-        asked = []
+        times_of_call = []
 
         def shared(times):
-            asked.append(times)
+            times_of_call.append(times)
             return np.linspace(0.1, 0.2, times.size)[:, np.newaxis] * np.ones(BINS)
 
-        found = clock_average(conditioned, seconds=600, shots=shots, shared_variance=shared)
-        np.testing.assert_array_equal(asked[0], found["time"])
-        found = found.compute()
-        assert (found["variance"].to_numpy()[0] >= 0.1).all()
-        assert (found["variance"].to_numpy()[1] >= 0.2).all()
+        result = clock_average(conditioned, seconds=600, shots=shots, shared_variance=shared)
+        np.testing.assert_array_equal(times_of_call[0], result["time"])
+        result = result.compute()
+        assert (result["variance"].to_numpy()[0] >= 0.1).all()
+        assert (result["variance"].to_numpy()[1] >= 0.2).all()
 
     def test_a_share_larger_than_the_whole_leaves_the_share(self):
         conditioned, shots = made([0, 1])
-        found = clock_average(
+        result = clock_average(
             conditioned,
             seconds=600,
             shots=shots,
             shared_variance=lambda times: np.full((times.size, BINS), 9.0),
         )
-        np.testing.assert_allclose(found["variance"], 9.0)
+        np.testing.assert_allclose(result["variance"], 9.0)
 
     def test_means_with_a_dark_signal_scatter_as_stated(self):
-        """The error of a mean over many draws of noise and of dark files."""
+        """The variance of the means over many draws of noise and dark files is the stated one."""
         rng = np.random.default_rng(11)
         profiles, darks, sigma = 20, 3, 0.3
         minutes = np.arange(profiles)
         errors, stated = [], []
         for draw in range(100):
             files = sigma * rng.standard_normal((darks, BINS))
-            dark = Dark(files, MIDNIGHT - np.arange(1, darks + 1) * 60 * SECOND, "nearest")
+            dark = DarkSignals(files, MIDNIGHT - np.arange(1, darks + 1) * 60 * SECOND, "nearest")
             conditioned, shots = made(minutes, seed=draw)
             noise = sigma * rng.standard_normal((profiles, BINS))
             conditioned["power"][:] = noise - dark.at(conditioned["time"].to_numpy()).dark
             conditioned["variance"][:] = sigma**2 + sigma**2 / darks
-            found = clock_average(
+            result = clock_average(
                 conditioned,
                 seconds=3600,
                 shots=shots,
                 shared_variance=lambda times: np.full((times.size, BINS), sigma**2 / darks),
             )
-            errors.append(found["power"].to_numpy()[0])
-            stated.append(found["variance"].to_numpy()[0])
+            errors.append(result["power"].to_numpy()[0])
+            stated.append(result["variance"].to_numpy()[0])
         ratio = np.var(errors) / np.mean(stated)
         # 100 x 16 values: the ratio is known to sqrt(2 / 1600) = 3.5 %.
         assert abs(ratio - 1.0) < 0.12
 
 
-def test_the_variance_of_a_dark_signal_is_what_its_files_say():
+def test_the_variance_of_a_dark_signal_is_that_of_its_files():
     rng = np.random.default_rng(3)
     files = rng.standard_normal((6, 400))
     times = MIDNIGHT + np.arange(6) * 60 * SECOND
-    dark = Dark(files, times, "nearest")
-    asked = MIDNIGHT + np.array([0, 3600]) * SECOND
+    dark = DarkSignals(files, times, "nearest")
+    requested = MIDNIGHT + np.array([0, 3600]) * SECOND
     np.testing.assert_array_equal(
-        dark.variance(asked), dark_profile(files, times, asked, method="nearest").variance
+        dark.variance(requested), dark_profile(files, times, requested, method="nearest").variance
     )
-    assert abs(dark.variance(asked).mean() * 6 - 1.0) < 0.15
+    assert abs(dark.variance(requested).mean() * 6 - 1.0) < 0.15

@@ -1,4 +1,4 @@
-"""Gluing of labelled channels: a truth that both record is given back within its errors."""
+"""Gluing in xarray returns the truth that both channels record, within its errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DIMS = ("time", "range")
 BIN = 7.5
 distance = BIN * (np.arange(2000) + 0.5)
 RATIO = 20.0
-"""MHz a mV."""
+"""MHz per mV."""
 SHOTS = 600
 DEAD_TIME = 4e-3
 """Microseconds."""
@@ -38,13 +38,13 @@ def channel(power, variance, bits, unit, offset=0.0):
 
 
 def recorded(rate, *, profiles=6, lag=0.0, noise=0.02, dark=2.0, seed=0, common=False):
-    """Record a count rate with both recorders; `common`: of the same photoelectrons."""
+    """Return a count rate as both recorders see it; `common`: from the same photoelectrons."""
     rng = np.random.default_rng(seed)
     exposure = SHOTS * BIN / 150.0
     measured = rate / (1.0 + rate * DEAD_TIME)
     counts = rng.poisson(np.broadcast_to(measured * exposure, (profiles, distance.size)))
-    seen = np.minimum(counts / exposure, 0.9 / DEAD_TIME)
-    corrected = seen / (1.0 - seen * DEAD_TIME)
+    observed = np.minimum(counts / exposure, 0.9 / DEAD_TIME)
+    corrected = observed / (1.0 - observed * DEAD_TIME)
     light = corrected if common else np.broadcast_to(rate, corrected.shape)
     index = np.arange(distance.size)
     shifted = np.stack([np.interp(index - lag, index, row) for row in light])
@@ -67,11 +67,11 @@ def recorded(rate, *, profiles=6, lag=0.0, noise=0.02, dark=2.0, seed=0, common=
 
 
 @pytest.mark.parametrize("lag", [0.0, 7.0, -4.0, 3.4])
-def test_the_truth_comes_back_within_its_errors(lag):
+def test_the_truth_is_returned_within_its_errors(lag):
     rate = truth()
-    found = labeled_gluing.glue(*recorded(rate, profiles=60, lag=lag), lag=lag)
-    score = ((found["power"] - rate) / np.sqrt(found["variance"])).to_numpy()
-    bottom, top = (float(found[f"glue_{end}"].mean()) for end in ("bottom", "top"))
+    result = labeled_gluing.glue(*recorded(rate, profiles=60, lag=lag), lag=lag)
+    score = ((result["power"] - rate) / np.sqrt(result["variance"])).to_numpy()
+    bottom, top = (float(result[f"glue_{end}"].mean()) for end in ("bottom", "top"))
     near = (distance > 500.0) & (distance < bottom - 300.0)
     far = (distance > top + 300.0) & (distance < 0.9 * distance[-1])
     assert np.isfinite(score[:, near | far]).all()
@@ -79,10 +79,10 @@ def test_the_truth_comes_back_within_its_errors(lag):
     assert np.sqrt(np.mean(score[:, near] ** 2)) < 1.3
     assert abs(score[:, near].mean(axis=1).mean()) < 3.0 / np.sqrt(60.0) + 0.1
     assert 0.95 < np.sqrt(np.mean(score[:, far] ** 2)) < 1.05
-    assert not found["quality"].to_numpy()[:, near | far].any()
-    slope = (found["glue_slope"] - RATIO) / found["glue_slope_standard_error"]
+    assert not result["quality"].to_numpy()[:, near | far].any()
+    slope = (result["glue_slope"] - RATIO) / result["glue_slope_standard_error"]
     assert 0.7 < float(np.sqrt((slope**2).mean())) < 1.4
-    units = {name: found[name].attrs.get("units") for name in found if name != "quality"}
+    units = {name: result[name].attrs.get("units") for name in result if name != "quality"}
     assert units == {
         "power": "MHz",
         "variance": "MHz2",
@@ -93,28 +93,28 @@ def test_the_truth_comes_back_within_its_errors(lag):
     }
 
 
-def test_the_background_of_photon_counting_is_left():
+def test_the_background_of_photon_counting_remains():
     rate = truth(sky=3.0)
-    found = labeled_gluing.glue(*recorded(rate, profiles=30))
-    tail = found["power"].to_numpy()[:, -200:].mean()
+    result = labeled_gluing.glue(*recorded(rate, profiles=30))
+    tail = result["power"].to_numpy()[:, -200:].mean()
     assert tail == pytest.approx(rate[-200:].mean(), abs=0.01)
 
 
 def test_near_bins_are_analog_and_far_ones_photon_counting():
     analog, photon = recorded(truth())
-    found = labeled_gluing.glue(analog, photon)
-    far = distance > float(found["glue_top"].max())
+    result = labeled_gluing.glue(analog, photon)
+    far = distance > float(result["glue_top"].max())
     np.testing.assert_allclose(
-        found["power"].to_numpy()[:, far], photon["power"].to_numpy()[:, far], rtol=1e-12
+        result["power"].to_numpy()[:, far], photon["power"].to_numpy()[:, far], rtol=1e-12
     )
     spoiled = photon.copy(deep=True)
-    near = float(found["glue_bottom"].min())
-    # What photon counting says below the window plays no part.
+    near = float(result["glue_bottom"].min())
+    # Photon counting below the window is not used.
     spoiled["power"][:, distance < 0.5 * near] = 1e3
     again = labeled_gluing.glue(analog, spoiled)
     np.testing.assert_array_equal(
         again["power"].to_numpy()[:, distance < 0.4 * near],
-        found["power"].to_numpy()[:, distance < 0.4 * near],
+        result["power"].to_numpy()[:, distance < 0.4 * near],
     )
 
 
@@ -128,22 +128,22 @@ def test_near_bins_are_analog_and_far_ones_photon_counting():
     ],
 )
 def test_no_gluing_where_no_range_is_linear_in_both(make):
-    found = labeled_gluing.glue(*make())
-    quality = found["quality"].to_numpy()
+    result = labeled_gluing.glue(*make())
+    quality = result["quality"].to_numpy()
     assert (quality & int(Quality.NO_GLUING) != 0).all()
-    assert np.isnan(found["power"]).all()
+    assert np.isnan(result["power"]).all()
 
 
-def test_channels_that_see_different_light_are_not_joined():
+def test_channels_that_receive_different_light_are_not_glued():
     analog, photon = recorded(truth())
-    # A bend within the window, as by a dead time that is not undone.
+    # A curve within the window, as by an uncorrected dead time.
     photon["power"] = photon["power"] / (1.0 + 0.03 * photon["power"])
-    found = labeled_gluing.glue(analog, photon)
-    assert (found["quality"] & int(Quality.NO_GLUING) != 0).all()
-    assert np.isnan(found["power"]).all()
+    result = labeled_gluing.glue(analog, photon)
+    assert (result["quality"] & int(Quality.NO_GLUING) != 0).all()
+    assert np.isnan(result["power"]).all()
 
 
-def test_every_missing_value_carries_a_bit_of_the_part_it_is_made_of():
+def test_every_missing_value_has_a_bit_of_its_source_channel():
     analog, photon = recorded(truth(constant=2e9), profiles=4)
     analog["power"][0] = np.nan
     analog["quality"][0] = int(Quality.INPUT_MISSING)
@@ -154,15 +154,15 @@ def test_every_missing_value_carries_a_bit_of_the_part_it_is_made_of():
     analog["quality"][2, :30] |= int(Quality.INCOMPLETE_OVERLAP)
     analog["power"][3, 40] = np.nan
     analog["quality"][3, 40] = int(Quality.INPUT_MISSING)
-    found = labeled_gluing.glue(analog, photon)
-    power, quality = found["power"].to_numpy(), found["quality"].to_numpy()
+    result = labeled_gluing.glue(analog, photon)
+    power, quality = result["power"].to_numpy(), result["quality"].to_numpy()
     assert (quality[np.isnan(power)] != 0).all()
     assert (quality[:2] & int(Quality.NO_GLUING) != 0).all()
     assert np.isnan(power[:2]).all()
     assert (quality[2, -30:] == int(Quality.PILE_UP)).all()
     assert (quality[2, :30] & int(Quality.INCOMPLETE_OVERLAP) != 0).all()
     assert quality[3, 40] == int(Quality.INPUT_MISSING)
-    # Analog is saturated nearest to the lidar, photon counting farther on; there analog serves.
+    # Nearest to the lidar analog is saturated; photon counting is farther on, where analog is used.
     saturated = (quality[2] & int(Quality.SATURATED)) != 0
     counted_out = (photon["quality"].to_numpy()[2] & int(Quality.SATURATED)) != 0
     assert saturated.any()
@@ -176,8 +176,8 @@ def test_bits_move_with_the_lag_and_ends_without_source_are_missing():
     analog, photon = recorded(truth(), lag=5.0)
     analog["power"][:, 105] = np.nan
     analog["quality"][:, 105] = int(Quality.INPUT_MISSING)
-    found = labeled_gluing.glue(analog, photon, lag=5.0)
-    hit = (found["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
+    result = labeled_gluing.glue(analog, photon, lag=5.0)
+    hit = (result["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
     assert np.flatnonzero(hit).tolist() == [100]
     between = labeled_gluing.glue(analog, photon, lag=4.5)
     hit = (between["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
@@ -187,28 +187,32 @@ def test_bits_move_with_the_lag_and_ends_without_source_are_missing():
     assert np.flatnonzero(hit).tolist() == [0, 1, 2, 108]
 
 
-def test_bins_behind_the_lidar_are_missing():
+def test_bins_at_negative_ranges_are_missing():
     analog, photon = recorded(truth())
-    moved = [part.assign_coords(range=part["range"] - 45.0) for part in (analog, photon)]
-    found = labeled_gluing.glue(*moved)
+    moved = [
+        channel_.assign_coords(range=channel_["range"] - 45.0) for channel_ in (analog, photon)
+    ]
+    result = labeled_gluing.glue(*moved)
     behind = moved[1]["range"].to_numpy() <= 0
     assert behind.sum() == 6
-    assert np.isnan(found["power"].to_numpy()[:, behind]).all()
-    assert (found["quality"].to_numpy()[:, behind] & int(Quality.INPUT_MISSING) != 0).all()
-    seen = found["power"].to_numpy()[:, ~behind]
-    assert np.isfinite(seen[:, 60:]).all()
-    np.testing.assert_array_equal(np.isnan(seen), found["quality"].to_numpy()[:, ~behind] != 0)
+    assert np.isnan(result["power"].to_numpy()[:, behind]).all()
+    assert (result["quality"].to_numpy()[:, behind] & int(Quality.INPUT_MISSING) != 0).all()
+    power_ahead = result["power"].to_numpy()[:, ~behind]
+    assert np.isfinite(power_ahead[:, 60:]).all()
+    np.testing.assert_array_equal(
+        np.isnan(power_ahead), result["quality"].to_numpy()[:, ~behind] != 0
+    )
 
 
-def test_parts_of_unequal_length_are_joined_over_the_shorter():
+def test_channels_of_unequal_length_are_glued_over_the_shorter():
     analog, photon = recorded(truth())
-    found = labeled_gluing.glue(analog, photon.isel(range=slice(1500)))
-    assert found.sizes["range"] == 1500
-    np.testing.assert_array_equal(found["range"], distance[:1500])
+    result = labeled_gluing.glue(analog, photon.isel(range=slice(1500)))
+    assert result.sizes["range"] == 1500
+    np.testing.assert_array_equal(result["range"], distance[:1500])
 
 
 @pytest.mark.parametrize("chunks", [{"time": 1, "range": 300}, {"time": 4, "range": -1}])
-def test_any_chunks_give_the_same_bits(chunks):
+def test_chunks_do_not_change_a_bit(chunks):
     analog, photon = recorded(truth())
     whole = labeled_gluing.glue(analog, photon, lag=1.5)
     lazy = labeled_gluing.glue(analog.chunk(chunks), photon.chunk({"time": 3}), lag=1.5)
@@ -218,26 +222,26 @@ def test_any_chunks_give_the_same_bits(chunks):
 
 class TestLag:
     @pytest.mark.parametrize("lag", [0.0, 7.0, -4.0, 2.5])
-    def test_estimate_finds_it_in_noise_that_both_share(self, lag):
+    def test_estimate_is_the_lag_of_shared_noise(self, lag):
         rate = truth()
         analog, photon = recorded(rate, profiles=40, lag=lag, noise=1e-3, common=True)
         assert labeled_gluing.estimate_lag(analog, photon) == pytest.approx(lag, abs=0.15)
 
-    def test_estimate_falls_back_on_what_the_ranges_say(self):
+    def test_estimate_falls_back_on_the_ranges(self):
         analog, photon = recorded(truth(), lag=7.0)
         assert labeled_gluing.estimate_lag(analog, photon) == 0.0
         farther = analog.assign_coords(range=analog["range"] - 3 * BIN)
         assert labeled_gluing.estimate_lag(farther, photon) == pytest.approx(3.0)
 
-    def test_told_lag_is_the_difference_of_equal_ranges(self):
+    def test_range_lag_is_the_difference_of_the_ranges(self):
         analog, photon = recorded(truth())
         farther = analog.assign_coords(range=analog["range"] - 5.5 * BIN)
-        assert labeled_gluing.told_lag(farther, photon) == pytest.approx(5.5)
-        lag = labeled_gluing.told_lag(farther, photon)
+        assert labeled_gluing.range_lag(farther, photon) == pytest.approx(5.5)
+        lag = labeled_gluing.range_lag(farther, photon)
         # The analog bin that the lag leads to has the range of the photon counting one.
         index = 100 + lag
-        told = np.interp(index, np.arange(distance.size), farther["range"])
-        assert told == pytest.approx(distance[100])
+        range_at_lag = np.interp(index, np.arange(distance.size), farther["range"])
+        assert range_at_lag == pytest.approx(distance[100])
 
     def test_a_wrong_lag_of_a_falling_signal_shows(self):
         analog, photon = recorded(truth(), lag=7.0, profiles=20)
