@@ -1,8 +1,8 @@
 """Many raw files of one layout as one dask-backed Dataset.
 
-The data model is that of `lidarops.raw.model`. Headers are read once, when the archive is opened,
-and of files that the catalog knows to be alike one is;
-a task of the graph reads the bytes of one channel in the files of one chunk.
+The data model is that of `lidarops.raw.model`. Headers are read when the archive is opened; of
+files whose headers the catalog knows to be equal, one header is read. A task of the graph reads
+the bytes of one channel in the files of one chunk.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ _CHUNK_BYTES = 16_000_000
 
 
 @dataclass(slots=True)
-class Tally:
-    """Bytes of signals that were read."""
+class ByteCount:
+    """Number of signal bytes read."""
 
     bytes: int = 0
 
 
-_TALLY: ContextVar[Tally | None] = ContextVar("tally", default=None)
+_COUNT: ContextVar[ByteCount | None] = ContextVar("byte_count", default=None)
 
 
 @contextmanager
-def counting() -> Iterator[Tally]:
-    """Count the bytes of signals that are read in this thread; headers do not count."""
-    tally = Tally()
-    token = _TALLY.set(tally)
+def count_bytes_read() -> Iterator[ByteCount]:
+    """Count the signal bytes that this thread reads; headers do not count."""
+    count = ByteCount()
+    token = _COUNT.set(count)
     try:
-        yield tally
+        yield count
     finally:
-        _TALLY.reset(token)
+        _COUNT.reset(token)
 
 
 def open_archive(
@@ -70,54 +70,53 @@ def open_archive(
     Parameters
     ----------
     source : str, path, or iterable of paths or Granule
-        A folder (with its subfolders, hidden files left out), a file, a glob pattern, or files.
-        The order does not matter: profiles are sorted by start, then path. Of granules with a
-        `header_digest`, start, stop, altitude and pointing are taken instead of the header's
-        where `header_position` is "ignore".
+        A folder (with its subfolders, without hidden files), a file, a glob pattern, or files.
+        Profiles are sorted by start, then path. Where `header_position` is "ignore", granules
+        with a `header_digest` supply start, stop, altitude and pointing in place of the header.
     channels : iterable of str, optional
-        Channels to open, which all files must have alike; all signal channels, which must be
-        the same in all files, where not given.
+        Channels to open, with equal range grids in all files; by default all signal channels,
+        which must then be the same in all files.
     mask_and_scale : bool
-        Whether to give physical values (float32, mV or MHz) or raw counts (int32).
+        Whether to return physical values (float32, mV or MHz) or raw counts (int32).
     profiles_per_chunk : int, optional
-        About 16 MB a chunk where not given.
+        By default about 16 MB per chunk.
     header_position : {"longitude_first", "latitude_first", "ignore"}
         Which coordinate the instrument writes first.
     root : path or str, optional
-        Folder that relative paths start from; the working directory where not given.
+        Base folder of relative paths; by default the working directory.
     stretches : mapping of str to tuple of (int, int), optional
-        Of these channels only some bins, the others stay on disk: the first bin of each stretch
-        and the one past its last, ascending. ``{"photon_532o": ((0, 500),)}`` are the nearest 500.
+        By channel, the stretches of bins to read: first bin and the one past the last, ascending.
+        ``{"photon_532o": ((0, 500),)}`` reads the nearest 500 bins. Other channels are whole.
 
     Returns
     -------
     xarray.Dataset
         Channels are dask arrays (time, range), chunked along time. Computing one raises
-        `RawFormatError` where a file has changed since.
+        `RawFormatError` if a file has changed since.
 
     Raises
     ------
     RawFormatError
-        Naming the file where one cannot be read or is of another layout.
+        If a file cannot be read or is of another layout; the error names the file.
     """
     columns = Columns(channel_names(channels), header_position)
     stamps = _read_headers(columns, _files(source, root))
     columns.sort()
     columns.keep(stretches or {})
     chunks = _chunks(columns, profiles_per_chunk)
-    # dask itself would look at each number of a list.
+    # Hashing one text is faster than dask's walk over a list of numbers.
     token = tokenize(repr(stamps), columns.kept)
 
     def signal(channel: int, dataset: Dataset) -> da.Array:
-        offsets = columns.fact(channel, "offset").astype(np.int64)
-        scales = columns.fact(channel, "scale") if mask_and_scale else None
+        offsets = columns.channel_values(channel, "offset").astype(np.int64)
+        scales = columns.channel_values(channel, "scale") if mask_and_scale else None
         lengths = tuple(len(files.paths) for _, files in chunks)
         kept = columns.kept.get(dataset.name)
         name = f"licel-{dataset.name}-{tokenize(token, offsets, scales, lengths)}"
         graph = {}
-        for index, (part, files) in enumerate(chunks):
-            scale = None if scales is None else scales[part]
-            graph[name, index, 0] = (_Chunk(files, offsets[part], dataset.bins, kept, scale),)
+        for index, (rows, files) in enumerate(chunks):
+            scale = None if scales is None else scales[rows]
+            graph[name, index, 0] = (_Chunk(files, offsets[rows], dataset.bins, kept, scale),)
         shape = (lengths, (dataset.bins,))
         dtype = np.int32 if scales is None else np.float32
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
@@ -128,27 +127,27 @@ def open_archive(
 def _read_headers(
     columns: Columns, files: Mapping[str, Granule | None]
 ) -> list[tuple[str, int, int]]:
-    """Fill `columns`; return path, size and time of change of each file.
+    """Fill `columns`; return path, size and modification time of each file.
 
-    Of granules that say which headers are alike one is read, as far as the place that a header
-    tells is not asked for: the catalog may have another for it.
+    Of granules with equal header digests one header is read, unless the position of the header
+    is requested: the catalog may hold another position.
     """
     stamps = []
     variants: dict[tuple[str, int], int] = {}
     for path, granule in files.items():
-        alike = None
-        if granule is not None and granule.header_digest and columns.order == "ignore":
-            alike = granule.header_digest, granule.size
-            if alike in variants:
-                columns.append_alike(granule, path, variants[alike])
+        digest_and_size = None
+        if granule is not None and granule.header_digest and columns.position_order == "ignore":
+            digest_and_size = granule.header_digest, granule.size
+            if digest_and_size in variants:
+                columns.append_alike(granule, path, variants[digest_and_size])
                 stamps.append((path, granule.size, granule.mtime_ns))
                 continue
         with RawFile(path) as file:
             header = file.read_header()
             columns.append(header)
             stamps.append((path, file.size, file.mtime_ns))
-        if alike == (header_digest(header), header.size):
-            variants[alike] = columns.variant[-1]
+        if digest_and_size == (header_digest(header), header.size):
+            variants[digest_and_size] = columns.variant[-1]
     return stamps
 
 
@@ -162,13 +161,13 @@ class _Files:
 
 @dataclass(frozen=True, slots=True)
 class _Chunk:
-    """One task: reads one channel of the files of one chunk. Small, and can be pickled."""
+    """Task that reads one channel of the files of one chunk; small, and can be pickled."""
 
     files: _Files
     offsets: NDArray[np.int64]
     bins: int
     kept: Stretches | None
-    """Which bins of the channel these are; None for all."""
+    """Stretches of bins to read; None for all bins."""
     scales: NDArray[np.float64] | None
     """None for counts."""
 
@@ -189,20 +188,20 @@ class _Chunk:
                 values[index] = row
             else:
                 to_physical(row, self.scales[index], values[index])
-        tally = _TALLY.get()
-        if tally is not None:
-            tally.bytes += len(self.offsets) * self.bins * row.itemsize
+        count = _COUNT.get()
+        if count is not None:
+            count.bytes += len(self.offsets) * self.bins * row.itemsize
         return values
 
 
 def _read_stretches(
     file: RawFile, offset: int, stretches: Stretches, row: NDArray[np.int32]
 ) -> None:
-    place = 0
+    start = 0
     for first, past in stretches:
         bins = past - first
-        row[place : place + bins] = file.read_part(offset + row.itemsize * first, bins)
-        place += bins
+        row[start : start + bins] = file.read_part(offset + row.itemsize * first, bins)
+        start += bins
 
 
 def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]]:
@@ -211,13 +210,13 @@ def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]
         profiles = max(1, _CHUNK_BYTES // (4 * largest))
     if profiles < 1:
         raise RawFormatError(
-            f"{profiles} is not a number of profiles",
+            f"{profiles} is not a possible number of profiles",
             field="profiles_per_chunk",
             remedy="give at least 1",
         )
-    parts = [slice(i, i + profiles) for i in range(0, len(columns.paths), profiles)]
+    slices = [slice(i, i + profiles) for i in range(0, len(columns.paths), profiles)]
     return [
-        (part, _Files(tuple(columns.paths[part]), tuple(columns.sizes[part]))) for part in parts
+        (rows, _Files(tuple(columns.paths[rows]), tuple(columns.sizes[rows]))) for rows in slices
     ]
 
 
@@ -227,7 +226,7 @@ def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Gra
     if isinstance(source, str | os.PathLike):
         files = [(path, None) for path in _expand(base, Path(source))]
     else:
-        # What Path would make of it, at a tenth of the cost: a granule's path is in order.
+        # As Path would join them, at a tenth of the cost: the path of a granule is normalised.
         folder = "" if base == Path() else os.path.join(base, "")  # noqa: PTH118
         files = [
             (folder + item.path, item) if isinstance(item, Granule) else (str(base / item), None)
@@ -239,28 +238,28 @@ def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Gra
             file=base / source if isinstance(source, str | os.PathLike) else None,
             remedy="give a folder, a glob pattern or paths that exist",
         )
-    path, times = Counter(path for path, _ in files).most_common(1)[0]
-    if times > 1:
-        raise RawFormatError(f"is given {times} times", file=path)
-    # The first file, with which the layout of the others is compared, is always the same.
+    path, uses = Counter(path for path, _ in files).most_common(1)[0]
+    if uses > 1:
+        raise RawFormatError(f"is given {uses} times", file=path)
+    # Sorted, so the file that sets the expected layout does not depend on the order of input.
     return dict(sorted(files, key=itemgetter(0)))
 
 
 def _expand(base: Path, source: Path) -> list[str]:
-    place = base / source
-    if place.is_dir():
-        return list(_walk(place))
-    if place.exists():
-        return [str(place)]
-    # Unlike Path.glob this leaves hidden files out, such as those that are being written.
-    found = glob.glob(str(source), root_dir=base, recursive=True)  # noqa: PTH207
-    return [str(base / path) for path in found if (base / path).is_file()]
+    path = base / source
+    if path.is_dir():
+        return list(_walk(path))
+    if path.exists():
+        return [str(path)]
+    # Unlike Path.glob, this skips hidden files, such as files that are being written.
+    matches = glob.glob(str(source), root_dir=base, recursive=True)  # noqa: PTH207
+    return [str(base / match) for match in matches if (base / match).is_file()]
 
 
 def _walk(folder: Path) -> Iterator[str]:
     def fail(error: OSError) -> None:
         raise RawFormatError(f"cannot be listed: {error.strerror}", file=error.filename) from None
 
-    for place, folders, names in os.walk(folder, onerror=fail):
+    for parent, folders, names in os.walk(folder, onerror=fail):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        yield from (str(Path(place, name)) for name in names if not name.startswith("."))
+        yield from (str(Path(parent, name)) for name in names if not name.startswith("."))

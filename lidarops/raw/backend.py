@@ -1,7 +1,7 @@
 """The xarray engine ``licel``: ``xr.open_dataset(path, engine="licel")``.
 
-The Dataset (`lidarops.raw.model`) is lazy: indexing a channel reads the bytes of the bins that
-are asked for, and nothing else. It can be pickled: it holds the path, never an open file.
+The Dataset (`lidarops.raw.model`) is lazy: indexing a channel reads the bytes of the selected
+bins only. It can be pickled, because it holds the path and no open file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FIRST_LINES = re.compile(rb"[^\r\n]{1,1022}\r\n[^\r\n]{0,1022}\d/\d{4} +\d{1,2}
 
 
 class LicelBackendEntrypoint(BackendEntrypoint):
-    """Open one Licel raw file as an `xarray.Dataset` with time of length 1."""
+    """xarray engine that opens one Licel raw file as a Dataset with one time."""
 
     description: ClassVar[str] = "Open Licel raw lidar files"
 
@@ -44,13 +44,13 @@ class LicelBackendEntrypoint(BackendEntrypoint):
         Parameters
         ----------
         filename_or_obj : path or str
-            Of a local file.
+            A local file.
         drop_variables : str or iterable of str, optional
             Variables to leave out.
         channels : iterable of str, optional
-            Channels to open; all signal channels where not given.
+            Channels to open; by default all signal channels.
         mask_and_scale : bool
-            Whether to give physical values (float32, mV or MHz) or raw counts (int32).
+            Whether to return physical values (float32, mV or MHz) or raw counts (int32).
         header_position : {"longitude_first", "latitude_first", "ignore"}
             Which coordinate the instrument writes first.
 
@@ -61,6 +61,7 @@ class LicelBackendEntrypoint(BackendEntrypoint):
         Raises
         ------
         RawFormatError
+            If the file cannot be read, or an option does not fit it.
         """
         if not isinstance(filename_or_obj, str | os.PathLike):
             raise RawFormatError(
@@ -81,13 +82,13 @@ class LicelBackendEntrypoint(BackendEntrypoint):
             return indexing.LazilyIndexedArray(_LazyCounts(array))
 
         opened = build_raw_dataset(columns, signal, scaled=mask_and_scale)
-        unwanted = [drop_variables] if isinstance(drop_variables, str) else drop_variables or ()
-        opened = opened.drop_vars(list(unwanted), errors="ignore")
+        dropped = [drop_variables] if isinstance(drop_variables, str) else drop_variables or ()
+        opened = opened.drop_vars(list(dropped), errors="ignore")
         opened.encoding["engine"] = "licel"
         return opened
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Return whether the file starts as a Licel header does."""
+        """Return whether the file starts like a Licel header."""
         if not isinstance(filename_or_obj, str | os.PathLike):
             return False
         try:
@@ -99,7 +100,7 @@ class LicelBackendEntrypoint(BackendEntrypoint):
 
 @dataclass(frozen=True, slots=True)
 class _Counts:
-    """Where the counts of one dataset lie, and how to read a part of them."""
+    """Location of the counts of one dataset, and how to read some of them."""
 
     path: str
     size: int
@@ -111,12 +112,12 @@ class _Counts:
     def dtype(self) -> np.dtype[Any]:
         return np.dtype(np.int32 if self.scale is None else np.float32)
 
-    def read(self, wanted: range) -> NDArray[Any]:
-        """Return the values of these bins, reading from the lowest to the highest of them."""
-        out = np.empty(len(wanted), self.dtype)
-        if not wanted:
+    def read(self, selection: range) -> NDArray[Any]:
+        """Return the values of the selected bins; reads from the lowest to the highest."""
+        out = np.empty(len(selection), self.dtype)
+        if not selection:
             return out
-        low, high = min(wanted), max(wanted) + 1
+        low, high = min(selection), max(selection) + 1
         with RawFile(self.path) as file:
             file.expect(self.size)
             if high - low == self.bins:
@@ -124,11 +125,11 @@ class _Counts:
                 file.read_counts(self.offset, [counts])
             else:
                 counts = file.read_part(self.offset + 4 * low, high - low)
-        chosen = counts[:: abs(wanted.step)][:: int(np.sign(wanted.step))]
+        selected = counts[:: abs(selection.step)][:: int(np.sign(selection.step))]
         if self.scale is None:
-            out[...] = chosen
+            out[...] = selected
         else:
-            to_physical(chosen, self.scale, out)
+            to_physical(selected, self.scale, out)
         return out
 
 
@@ -150,5 +151,5 @@ class _LazyCounts(BackendArray):
         if isinstance(bins, slice):
             profile = self.counts.read(range(self.counts.bins)[bins])
             return profile[np.newaxis][time]
-        wanted = range(self.counts.bins)[bins]
-        return self.counts.read(range(wanted, wanted + 1))[time]
+        index = range(self.counts.bins)[bins]
+        return self.counts.read(range(index, index + 1))[time]

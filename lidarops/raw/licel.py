@@ -1,16 +1,16 @@
 """Licel raw files: bytes to header and arrays (numpy and the standard library only).
 
-After the header (`lidarops.raw.licel_header`) a file holds, per stored dataset, its bins as
+After the header (`lidarops.raw.licel_header`) a file holds, for each stored dataset, its bins as
 little-endian 32-bit counts followed by CRLF (`licel2023`). CRLF also occurs inside the data, so
-everything is found by offset; the CRLF behind a dataset is checked when the dataset is read.
+datasets are located by offset. The CRLF after a dataset is checked when the dataset is read.
 
 Reading
     `read_header` (header only), `parse_header` (the same from bytes), `read_counts` (one file),
     `read_physical` (many files of one layout, in mV and MHz).
 Writing
     `new_dataset` and `new_header` build a `Dataset` and a `Header` from numbers,
-    ``encode(header, counts)`` gives the bytes of a file, ``write(path, header, counts)`` writes
-    it (`lidarops.raw.licel_write`). A `Header` always says what its text says: it is built or
+    ``encode(header, counts)`` returns the bytes of a file, ``write(path, header, counts)`` writes
+    it (`lidarops.raw.licel_write`). A `Header` always agrees with its text: it is built or
     parsed, never edited.
 """
 
@@ -79,11 +79,11 @@ PathLike = str | os.PathLike[str]
 _PREFIX = 8 * 1024
 _HEADER_LIMIT = 512 * 1024
 _COUNTS = np.dtype("<i4")
-_MOST_ROWS = 256  # of one vectored read: systems admit 1024 buffers
+_MOST_ROWS = 256  # of one vectored read; systems allow 1024 buffers, two per row
 
 
 class RawFile:
-    """An open local raw file: the only place where raw files are opened.
+    """An open local raw file; all raw files are opened here.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class RawFile:
     Raises
     ------
     RawFormatError
-        Where the file cannot be opened, or is not a regular file.
+        If the file cannot be opened, or is not a regular file.
     """
 
     __slots__ = ("_descriptor", "mtime_ns", "path", "size")
@@ -100,7 +100,7 @@ class RawFile:
     def __init__(self, path: PathLike) -> None:
         self.path = os.fspath(path)
         try:
-            # Not to wait for a writer where the path is a pipe.
+            # Without O_NONBLOCK, opening a pipe would wait for a writer.
             self._descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
         except (OSError, ValueError) as error:
             raise RawFormatError(f"cannot be opened: {error}", file=self.path) from None
@@ -128,6 +128,7 @@ class RawFile:
         Raises
         ------
         RawFormatError
+            As `parse_header`.
         """
         prefix = self.read(0, _PREFIX)
         try:
@@ -145,40 +146,40 @@ class RawFile:
             raise self._unreadable(error) from None
 
     def read_counts(self, offset: int, rows: Sequence[Counts]) -> None:
-        """Fill `rows` with the counts of datasets that lie one behind another from `offset` on.
+        """Fill `rows` with the counts of consecutive datasets from byte `offset` on.
 
         Raises
         ------
         RawFormatError
-            Where the counts are not there, or CRLF does not follow each dataset.
+            If counts are missing, or a dataset is not followed by CRLF.
         """
         tails = [bytearray(2) for _ in rows]
         buffers: list[Any] = [buffer for pair in zip(rows, tails, strict=True) for buffer in pair]
         try:
-            got = os.preadv(self._descriptor, buffers, offset)
+            length = os.preadv(self._descriptor, buffers, offset)
         except OSError as error:
             raise self._unreadable(error) from None
         expected = sum([row.nbytes for row in rows]) + 2 * len(rows)
-        if got == self.size - offset and expected - 2 <= got < expected:
+        if length == self.size - offset and expected - 2 <= length < expected:
             # Only the last CRLF of the file is missing.
-            tails[-1][got - expected :] = b"\r\n"[got - expected :]
-            got = expected
-        if got != expected or b"".join(tails) != b"\r\n" * len(rows):
+            tails[-1][length - expected :] = b"\r\n"[length - expected :]
+            length = expected
+        if length != expected or b"".join(tails) != b"\r\n" * len(rows):
             raise RawFormatError(
-                f"no CRLF follows the counts behind byte {offset}: the data do not lie where"
-                " the header says",
+                f"no CRLF follows the counts from byte {offset}: the data are not where the"
+                " header says",
                 file=self.path,
                 field="data",
                 remedy="copy the file again from the instrument, or leave it out",
             )
 
     def read_part(self, offset: int, number: int) -> Counts:
-        """Return `number` counts from `offset` on.
+        """Return `number` counts from byte `offset` on.
 
         Raises
         ------
         RawFormatError
-            Where the file ends before.
+            If the file ends before.
         """
         content = self.read(offset, 4 * number)
         if len(content) < 4 * number:
@@ -188,13 +189,13 @@ class RawFile:
         return np.frombuffer(content, _COUNTS)
 
     def expect(self, size: int) -> None:
-        """Refuse a file that is no longer the one whose header was read."""
+        """Raise if the size of the file has changed since its header was read."""
         if self.size != size:
             raise RawFormatError(
                 f"had {size} bytes when its header was read, has {self.size} now",
                 file=self.path,
                 field="size",
-                remedy="open the archive again when nothing writes to it",
+                remedy="open the archive again when no process writes to it",
             )
 
     def _unreadable(self, error: OSError) -> RawFormatError:
@@ -207,7 +208,7 @@ def read_header(path: PathLike) -> Header:
     Raises
     ------
     RawFormatError
-        As `parse_header`, or where the file cannot be opened.
+        As `parse_header`, or if the file cannot be opened.
     """
     with RawFile(path) as file:
         return file.read_header()
@@ -235,21 +236,21 @@ def _layout(datasets: tuple[Dataset, ...]) -> tuple[ChannelLayout, ...]:
 
 
 def header_digest(header: Header) -> str:
-    """Return what is equal for two files of one size whose channels are read alike.
+    """Return a digest that is equal for headers with equal site and datasets.
 
     Returns
     -------
     str
-        16 hexadecimal digits of site, dataset lines and where the data start. Headers with equal
-        ones differ at most in file name, times, place, pointing, lasers and weather.
+        16 hexadecimal digits of site, dataset lines and start of the data. Headers with equal
+        digests differ at most in file name, times, position, pointing, lasers and weather.
     """
     datasets = header.source.split(b"\r\n", 3)[3]
-    about = f"{header.site}\n{header.data_start}\n".encode()
-    return hashlib.sha256(about + datasets).hexdigest()[:16]
+    prefix = f"{header.site}\n{header.data_start}\n".encode()
+    return hashlib.sha256(prefix + datasets).hexdigest()[:16]
 
 
 def channel_names(channels: Iterable[str] | None) -> tuple[str, ...] | None:
-    """Return channel names without repetitions; a single name stands for itself, None for all."""
+    """Return channel names without duplicates, also of a single name; None stands for all."""
     if channels is None:
         return None
     return tuple(dict.fromkeys([channels] if isinstance(channels, str) else channels))
@@ -262,13 +263,13 @@ def select(header: Header, channels: Iterable[str] | None = None) -> tuple[Datas
     ----------
     header : Header
     channels : str or iterable of str, optional
-        The signal channels in file order where not given. Datasets that are no signal can be
-        named.
+        By default the signal channels in file order. Datasets that are not signals can be named
+        too.
 
     Raises
     ------
     RawFormatError
-        Naming the choices, where a channel is not stored or no channel is left.
+        If a channel is not stored, or there is no channel; the error names the stored ones.
     """
     stored = {d.name: d for d in header.datasets if d.offset is not None}
     names = channel_names(channels)
@@ -291,13 +292,13 @@ def select_signals(header: Header, channels: Iterable[str] | None = None) -> tup
     Raises
     ------
     RawFormatError
-        As `select`, and where a dataset is no signal.
+        As `select`, and if a dataset is not a signal.
     """
     datasets = select(header, channels)
     for dataset in datasets:
         if dataset.mode is None:
             raise RawFormatError(
-                f"{dataset.name} is no signal: it has no physical values",
+                f"{dataset.name} is not a signal: it has no physical values",
                 file=header.path or header.name,
                 field="channels",
                 remedy="read it with licel.read_counts",
@@ -314,9 +315,9 @@ def read_counts(
     ----------
     path : path or str
     channels : iterable of str, optional
-        As for `select`.
+        As in `select`.
     bins : int, optional
-        Read only this many of the nearest bins; all where not given.
+        Return only this many of the nearest bins; by default all.
 
     Returns
     -------
@@ -326,6 +327,7 @@ def read_counts(
     Raises
     ------
     RawFormatError
+        If the file cannot be read, or has no such channel.
     """
     with RawFile(path) as file:
         header = file.read_header()
@@ -356,15 +358,15 @@ def read_physical(
     *,
     dtype: DTypeLike = np.float32,
 ) -> tuple[tuple[Header, ...], dict[str, NDArray[Any]]]:
-    """Read many files of one layout as physical values.
+    """Read many files of one layout, and return physical values.
 
     Parameters
     ----------
     paths : sequence of path or str
     channels : iterable of str, optional
-        As for `select`.
+        As in `select`.
     dtype : dtype
-        Of the values; the scaling itself runs in double precision.
+        Of the values; scaling is done in double precision.
 
     Returns
     -------
@@ -376,7 +378,7 @@ def read_physical(
     Raises
     ------
     RawFormatError
-        Naming the file where one cannot be read, or has another layout than the first.
+        If a file cannot be read, or has another layout than the first; the error names it.
     """
     names = channel_names(channels)
     headers: list[Header] = []
@@ -386,7 +388,7 @@ def read_physical(
     for index, path in enumerate(paths):
         with RawFile(path) as file:
             header = file.read_header()
-            # Files with the same dataset lines share the parsed ones: nothing to choose anew.
+            # Files with equal dataset lines share the parsed datasets, so the selection holds.
             if not headers or header.datasets is not headers[-1].datasets:
                 datasets = select_signals(header, names)
                 scales = [dataset.scale for dataset in datasets]
@@ -404,7 +406,7 @@ def read_physical(
 def _allocate(
     datasets: tuple[Dataset, ...], files: int, dtype: DTypeLike
 ) -> tuple[list[NDArray[Any]], list[Counts]]:
-    # One large block: the system maps it in huge pages, at a tenth of the cost of small ones.
+    # One large block: the system maps it in huge pages, at a tenth of the cost.
     total = np.empty(files * sum(dataset.bins for dataset in datasets), dtype)
     values, start = [], 0
     for dataset in datasets:
@@ -417,24 +419,24 @@ def _allocate(
 def check_layout(
     header: Header, datasets: tuple[Dataset, ...], expected: tuple[Dataset, ...]
 ) -> None:
-    """Refuse a file whose channels do not lie on the grid of the `expected` ones.
+    """Raise if channels differ from the `expected` ones in range grid or ADC bits.
 
     Raises
     ------
     RawFormatError
-        Naming the file and the channel.
+        Naming file and channels.
     """
     if datasets is expected:
         return
-    ours, theirs = _grid(datasets), _grid(expected)
-    if ours == theirs:
+    grid, expected_grid = _grid(datasets), _grid(expected)
+    if grid == expected_grid:
         return
-    odd = sorted({name for name, *_ in ours ^ theirs})
+    differing = sorted({name for name, *_ in grid ^ expected_grid})
     raise RawFormatError(
         "is of another layout (channels, bins, bin width or ADC bits) than the files before it",
         file=header.path,
-        field=", ".join(odd),
-        remedy="open files of one layout, or choose channels that all files have alike",
+        field=", ".join(differing),
+        remedy="open files of one layout, or choose channels that are equal in all files",
     )
 
 

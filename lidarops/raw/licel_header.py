@@ -1,13 +1,13 @@
-"""Header of a Licel raw file: bytes to dataclasses (standard library only).
+"""Header of a Licel raw file: bytes to records (standard library only).
 
 Line 1 holds the file name; line 2 site, start, stop, altitude, longitude, latitude and zenith
 angle, then azimuth and a quoted text (newer Licel) or a dummy, temperature and pressure
 (Raymetrics); line 3 the lasers and the number of datasets; then one line per dataset and an
 empty line (`licel2023`). Instruments deviate in widths, padding, decimals and site names, so
-line 2 is found by its dates, never by columns.
+line 2 is parsed relative to its dates, not by columns.
 
-There is no checksum: the one guard against a wrong header is that the offsets add up to the
-size of the file. A truncated file, or one with surplus bytes, is refused.
+There is no checksum. The only guard against a wrong header is that the offsets must add up to
+the size of the file: truncated files, and files with surplus bytes, are refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CONVENTION: Final = (
     "analog: mV = counts * input_range * 1000 / (shots * 2^adc_bits);"
     " photon counting: MHz = counts / shots * (150 m / bin_width)"
 )
-"""How counts become physical values. Licel's own later reader divides by 2^adc_bits - 1."""
+"""Conversion of counts to physical values. Later Licel readers divide by 2^adc_bits - 1."""
 
 HeaderOrder = Literal["longitude_first", "latitude_first"]
 
@@ -74,16 +74,16 @@ _PHOTON = frozenset({DatasetKind.PHOTON, DatasetKind.PHOTON_SQUARED})
 
 
 class Laser(NamedTuple):
-    """What line 3 of the header says of one laser."""
+    """One laser in line 3 of the header."""
 
     shots: int
     repetition_rate: float
-    """Hz; 0 in many files although the laser fires."""
+    """Hz; 0 in many files, although the laser fires."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """One dataset line of a header. Made by the parser or `licel_write.new_dataset`."""
+    """One dataset line of a header, from the parser or `licel_write.new_dataset`."""
 
     name: str
     """Unique in its header: ``analog_532o``, ``photon_355p``, ``analog_532o_2``."""
@@ -106,13 +106,13 @@ class Dataset:
     """0 for photon counting."""
     shots: int
     input_range: float | None
-    """V; None but for analog."""
+    """V; None unless analog."""
     discriminator: float | None
-    """V; None but for photon counting."""
+    """V; None unless photon counting."""
     device: str
     comment: str
     offset: int | None
-    """Byte at which the counts start; None where the file does not hold them."""
+    """Byte at which the counts start; None if the file does not store them."""
     line: bytes = field(compare=False, repr=False)
     """As written, with CRLF."""
 
@@ -121,12 +121,12 @@ class Dataset:
 
     @property
     def mode(self) -> DetectionMode | None:
-        """How the dataset detects light; None where it is not a signal."""
+        """Detection mode; None if the dataset is not a signal."""
         return _MODES.get(self.kind)
 
     @property
     def wavelength(self) -> float:
-        """m; NaN where the label is no wavelength that light detectors know (53200 nm)."""
+        """m; NaN if the label is outside of the optical range, such as 53200 nm."""
         wavelength = int(self.wavelength_label.partition(".")[0]) * 1e-9
         low, high = _WAVELENGTHS
         return wavelength if low < wavelength < high else math.nan
@@ -153,10 +153,10 @@ class Dataset:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Header of a Licel file. Made by the parser or `licel_write.new_header`."""
+    """Header of a Licel file, from the parser or `licel_write.new_header`."""
 
     name: str
-    """File name that the instrument wrote into line 1."""
+    """File name in line 1."""
     site: str
     start: datetime
     """UTC."""
@@ -181,17 +181,17 @@ class Header:
     lasers: tuple[Laser, ...]
     """Two or three."""
     timestamp: str | None
-    """Of the controller, as written."""
+    """Timestamp of the controller, as written."""
     datasets: tuple[Dataset, ...]
-    """In file order, inactive ones and those that are no signal included."""
+    """In file order, with inactive datasets and those that are not signals."""
     data_start: int
     """Byte after the empty line."""
     size: int
     """Bytes of the file."""
     notes: tuple[str, ...]
-    """What is odd, in words."""
+    """Oddities of the header, in words."""
     path: str = field(compare=False)
-    """Where the header was read; empty for bytes in memory."""
+    """File of the header; empty for bytes in memory."""
     source: bytes = field(compare=False, repr=False)
     """The header as written: `data_start` bytes."""
 
@@ -211,19 +211,19 @@ class Header:
         Parameters
         ----------
         order : {"longitude_first", "latitude_first"}
-            Which coordinate the instrument wrote first; Licel says the longitude.
+            Coordinate that the instrument wrote first; by the specification the longitude.
 
         Raises
         ------
         RawFormatError
-            Where the pair is impossible in this order.
+            If the pair is impossible in this order.
         """
         latitude, longitude = self.latitude, self.longitude
         if order == "latitude_first":
             latitude, longitude = longitude, latitude
         if abs(latitude) > 90 or abs(longitude) > 180:
             raise RawFormatError(
-                f"latitude {latitude:g}, longitude {longitude:g} is no place on Earth",
+                f"latitude {latitude:g}, longitude {longitude:g} is not a place on Earth",
                 file=self.path or self.name,
                 field="position",
                 remedy=f"header_position is {order}: choose the other order, or 'ignore',"
@@ -232,7 +232,7 @@ class Header:
         return latitude, longitude
 
 
-class _Site(NamedTuple):
+class _Place(NamedTuple):
     altitude: float
     longitude: float
     latitude: float
@@ -245,7 +245,7 @@ class _Site(NamedTuple):
 
 
 class IncompleteHeaderError(RawFormatError):
-    """The bytes end inside the header."""
+    """Bytes that end inside the header."""
 
 
 def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> Header:
@@ -258,7 +258,7 @@ def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> H
     file : str
         Name for messages.
     size : int, optional
-        Bytes of the whole file; the length of `buffer` where not given.
+        Bytes of the whole file; by default the length of `buffer`.
 
     Returns
     -------
@@ -267,8 +267,9 @@ def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> H
     Raises
     ------
     RawFormatError
-        Naming file, field and bytes, where the header is not one, is absurd, or promises
-        another size than the file has. Only a missing last CRLF is tolerated, with a note.
+        If the bytes are not a header, a value is impossible, or the header promises another
+        size than the file has; the error names file, field and bytes. Only a missing last CRLF
+        is accepted, with a note.
     """
     try:
         return _parse(buffer, file, len(buffer) if size is None else size)
@@ -291,7 +292,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
             "holds no start and stop date: this is not a Licel file", field="header line 2"
         )
     start, stop = _moments(dates)
-    place = _parse_site(second[dates.end() :].rstrip())
+    place = _parse_place(second[dates.end() :].rstrip())
     lasers, number, timestamp, notes = _parse_lasers(third)
     block_start = ends[2] + 2
     block_end = _line_ends(buffer, block_start, number)[-1] + 2
@@ -304,8 +305,8 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         )
     data_start = block_end + 2
     block = buffer[block_start:block_end]
-    fit = _fit if len(block) <= _CACHED_BLOCK else _fit.__wrapped__
-    datasets, about_datasets = fit(block, data_start, size)
+    parse = _parse_datasets if len(block) <= _CACHED_BLOCK else _parse_datasets.__wrapped__
+    datasets, dataset_notes = parse(block, data_start, size)
     return Header(
         name=first.strip(),
         site=second[: dates.start()].strip(),
@@ -324,7 +325,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         datasets=datasets,
         data_start=data_start,
         size=size,
-        notes=place.notes + notes + about_datasets,
+        notes=place.notes + notes + dataset_notes,
         path=file,
         source=buffer[:data_start],
     )
@@ -346,7 +347,7 @@ def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:
     return ends
 
 
-# The same few numbers stand in every header.
+# Headers of an archive repeat the same few numbers.
 @lru_cache(maxsize=1024)
 def _number(token: str, name: str) -> float:
     if _NUMBER.fullmatch(token) is None:
@@ -379,12 +380,12 @@ def _moment(text: str, name: str) -> datetime:
     try:
         return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError as error:
-        raise RawFormatError(f"is no date and time: {error}", field=name) from None
+        raise RawFormatError(f"is not a date and time: {error}", field=name) from None
 
 
-# Where a lidar stands and looks, and its lasers, are the same in many files.
+# Position, pointing and lasers are the same in many files.
 @lru_cache(maxsize=1024)
-def _parse_site(text: str) -> _Site:
+def _parse_place(text: str) -> _Place:
     tokens, custom = _split_custom(text)
     if len(tokens) < 4:
         raise RawFormatError(
@@ -401,11 +402,11 @@ def _parse_site(text: str) -> _Site:
         _bounded(azimuth, -360, 360, "azimuth")
         azimuth %= 360.0
     if len(tokens) == 7:
-        temperature, pressure, more = _parse_weather(*tokens[5:])
-        notes += more
+        temperature, pressure, weather_notes = _parse_weather(*tokens[5:])
+        notes += weather_notes
     elif len(tokens) not in {4, 5}:
         notes += (f"{len(tokens) - 4} values after the zenith angle are not interpreted",)
-    return _Site(
+    return _Place(
         altitude, longitude, latitude, zenith, azimuth, temperature, pressure, custom, notes
     )
 
@@ -440,7 +441,7 @@ def _parse_weather(
     pressure = _number(hectopascal, "pressure") * 1e2
     if 150 < temperature < 350 and 1e4 < pressure < 1.2e5:
         return temperature, pressure, ()
-    return None, None, (f"{celsius} degC, {hectopascal} hPa are not believed",)
+    return None, None, (f"{celsius} degC, {hectopascal} hPa are impossible and ignored",)
 
 
 @lru_cache(maxsize=1024)
@@ -456,17 +457,18 @@ def _parse_lasers(text: str) -> tuple[tuple[Laser, ...], int, str | None, tuple[
         for shots, rate in pairs
     )
     timestamp = tokens[9] if len(tokens) == 10 else None
-    odd = len(tokens) not in {5, 7, 9, 10}
-    notes = (f"{len(tokens)} values in line 3 are not all interpreted",) if odd else ()
+    unknown = len(tokens) not in {5, 7, 9, 10}
+    notes = (f"{len(tokens)} values in line 3 are not all interpreted",) if unknown else ()
     return lasers, number, timestamp, notes
 
 
-# The dataset lines of an archive repeat from file to file: parsing them once is what makes
-# a header scan fast.
+# Dataset lines repeat from file to file: parsing them once makes a header scan fast.
 @lru_cache(maxsize=128)
-def _fit(block: bytes, data_start: int, size: int) -> tuple[tuple[Dataset, ...], tuple[str, ...]]:
-    """Return the datasets of dataset lines, and notes on them."""
-    # By the specification inactive datasets are not stored; some software stores them.
+def _parse_datasets(
+    block: bytes, data_start: int, size: int
+) -> tuple[tuple[Dataset, ...], tuple[str, ...]]:
+    """Return the datasets that fit the size of the file, and notes on them."""
+    # By the specification, inactive datasets are not stored; some software stores them.
     expected = 0
     for stored, note in ((False, ()), (True, ("inactive datasets are stored",))):
         datasets = _parse_block(block, data_start, stored=stored)
@@ -498,13 +500,13 @@ def _parse_block(block: bytes, data_start: int, *, stored: bool) -> tuple[Datase
         try:
             dataset = _parse_line(block[start:end], offset, stored)
         except RawFormatError as error:
-            place = f"dataset {len(datasets) + 1}, {error.field}"
-            raise RawFormatError(error.problem, field=place) from None
+            field = f"dataset {len(datasets) + 1}, {error.field}"
+            raise RawFormatError(error.problem, field=field) from None
         datasets.append(dataset)
         offset += 0 if dataset.offset is None else 4 * dataset.bins + 2
         start = end
     uses: Counter[str] = Counter()
-    # An inactive dataset must not take the name of an active one.
+    # Active datasets get their names first: an inactive one must not take the plain name.
     for index in sorted(range(len(datasets)), key=lambda index: not datasets[index].active):
         name = datasets[index].name
         uses[name] += 1
@@ -514,11 +516,12 @@ def _parse_block(block: bytes, data_start: int, *, stored: bool) -> tuple[Datase
 
 
 def parse_dataset(line: bytes) -> Dataset:
-    """Parse one dataset line outside of a header: its offset is 0 and its name not yet unique.
+    """Parse one dataset line outside of a header; its offset is 0 and its name not yet unique.
 
     Raises
     ------
     RawFormatError
+        If a value is missing or impossible.
     """
     return _parse_line(line, 0, stored=True)
 
@@ -587,7 +590,7 @@ def _bin_shift(whole: str, decimals: str) -> float:
 
 def _dataset_notes(datasets: tuple[Dataset, ...]) -> tuple[str, ...]:
     return tuple(
-        f"{d.name} has no shots: its values are not known"
+        f"{d.name} has no shots: its values are undefined"
         for d in datasets
         if d.shots == 0 and d.active
     )

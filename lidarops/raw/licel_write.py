@@ -1,8 +1,8 @@
 """Write Licel raw files: numbers to header text, counts to bytes.
 
-Every header line is one blank and its values separated by single blanks, padded to 78
-characters, and CRLF, as Licel instruments write it. Headers are made by formatting and then
-parsing, so that a `Header` never differs from what a reader will find in the file.
+As from Licel instruments, every header line starts with a blank, has its values separated by
+single blanks, is padded to 78 characters and ends in CRLF. Headers are formatted and then parsed,
+so a `Header` always agrees with its text.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def new_dataset(
     kind : DatasetKind
         ``DatasetKind.ANALOG`` or ``DatasetKind.PHOTON`` for a signal channel.
     wavelength : float
-        m; written in whole nm (5.32e-5 gives the mis-typed ``53200.o``).
+        m; written in whole nm (5.32e-5 gives the mistyped ``53200.o`` of some files).
     bins : int
     bin_width : float
-        m; must be writable in four characters, such as 7.5 or 15.
+        m; must fit into four characters, such as 7.5 or 15.
     shots : int
     polarisation : str
         o, p, s, r or l.
@@ -77,7 +77,7 @@ def new_dataset(
     discriminator : float
         V, photon counting; written in mV with four decimals.
     device : str, optional
-        ``BT0`` or ``BC0`` where not given.
+        By default ``BT0`` (analog) or ``BC0`` (photon counting).
     active : bool
     bin_shift : float
         Bins; written with three decimals.
@@ -86,12 +86,12 @@ def new_dataset(
     Returns
     -------
     Dataset
-        With `offset` 0: its place and final name are known in a header only.
+        With `offset` 0; a header sets its offset and unique name.
 
     Raises
     ------
     RawFormatError
-        Where a number does not fit the format.
+        If a number does not fit the format.
     """
     analog = kind in {DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED}
     thousandths = round(bin_shift * 1000)
@@ -157,27 +157,27 @@ def new_header(
     lasers : sequence of Laser
         Two or three: shots and repetition rate in Hz.
     zenith_angle : float
-        degree; whole degrees but in the extended dialect. Raymetrics writes -90 for vertical.
+        degree; whole degrees except in the extended dialect. Raymetrics writes -90 for vertical.
     azimuth : float, optional
-        degree; makes the dialect extended, where it is needed.
+        degree; makes the dialect extended, which needs it.
     temperature, pressure : float, optional
-        K and Pa; make the dialect raymetrics, where both are needed.
+        K and Pa; make the dialect raymetrics, which needs both.
     custom : str, optional
         Quoted text; makes the dialect extended.
     timestamp : int, optional
-        Of the controller; needs three lasers.
+        Timestamp of the controller; needs three lasers.
     dialect : {"classic", "extended", "raymetrics"}, optional
-        Chosen by what is given where not given.
+        By default the one that the given values need.
 
     Returns
     -------
     Header
-        As a reader will see it: rounded as written, with offsets, names and promised size.
+        As parsed from its text: rounded as written, with offsets, names and promised size.
 
     Raises
     ------
     RawFormatError
-        Where a number does not fit the dialect.
+        If a number does not fit the dialect.
     """
     dialect = dialect or _dialect(azimuth, temperature, pressure, custom)
     place = [
@@ -211,12 +211,12 @@ def new_header(
 
 
 def format_header(header: Header) -> bytes:
-    """Return the header as bytes: as it was read, or as `new_header` made it.
+    """Return the header as bytes, as read or as built by `new_header`.
 
     Raises
     ------
     RawFormatError
-        Where a field was changed after the header was made, so that it contradicts the text.
+        If a field was changed after the header was made and contradicts the text.
     """
     if parse_header(header.source, file=header.path, size=header.size) != header:
         raise RawFormatError(
@@ -234,12 +234,12 @@ def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
     ----------
     header : Header
     counts : mapping of str to integer array (bins,)
-        By dataset name, for every dataset that `header` stores.
+        By name, for every stored dataset of `header`.
 
     Raises
     ------
     RawFormatError
-        Where counts are missing, surplus, of a wrong shape or type, or beyond 32 bits.
+        If counts are missing, surplus, of a wrong shape or type, or exceed 32 bits.
     """
     stored = [dataset for dataset in header.datasets if dataset.offset is not None]
     surplus = set(counts) - {dataset.name for dataset in stored}
@@ -248,12 +248,12 @@ def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
     parts = [format_header(header)]
     for dataset in stored:
         parts += [_counts(dataset, counts).tobytes(), b"\r\n"]
-    # A file that was read without its last CRLF is written without it.
+    # The size of a header read from a file without its last CRLF excludes the CRLF.
     return b"".join(parts)[: header.size]
 
 
 def write(path: str | os.PathLike[str], header: Header, counts: Mapping[str, NDArray[Any]]) -> None:
-    """Write a file: complete under its final name, or not at all.
+    """Write a file as a whole, or not at all.
 
     Raises
     ------
@@ -354,6 +354,8 @@ def _utc(moment: datetime, name: str) -> str:
     return f"{moment.astimezone(UTC):%d/%m/%Y %H:%M:%S}"
 
 
-def _compare(name: str, asked: object, written: object) -> None:
-    if asked != written:
-        raise RawFormatError(f"{asked!r} cannot be written: it reads as {written!r}", field=name)
+def _compare(name: str, requested: object, written: object) -> None:
+    if requested != written:
+        raise RawFormatError(
+            f"{requested!r} cannot be written: it reads as {written!r}", field=name
+        )

@@ -1,15 +1,15 @@
-"""The data model of raw files in xarray: the only module that names variables and attributes.
+"""Data model of raw files in xarray: names of variables, coordinates and attributes.
 
-For every channel ``<channel>(time, range)`` in mV (analog) or MHz (photon counting), or raw
-counts, with ``<channel>_shots(time)`` and, for analog channels, ``<channel>_input_range(time)``
-in V. ``time`` is the middle of the interval in ``time_bnds(time, nv)``; ``range`` is the centre of
-the bin. Channels on another range grid have their own dimension, ``range_2`` and so on.
-``zenith_angle(time)`` and, where known, ``azimuth(time)`` are coordinates, as are latitude,
-longitude and altitude. What is the same in all files is an attribute of the channel;
-what varies from file to file is a variable ``<channel>_<fact>(time)``.
+Every channel is a variable ``<channel>(time, range)`` in mV (analog) or MHz (photon counting), or
+in raw counts, with ``<channel>_shots(time)`` and, for analog channels,
+``<channel>_input_range(time)`` in V. ``time`` is the middle of the interval in
+``time_bnds(time, nv)``; ``range`` is the centre of the bin. Channels on another range grid have
+their own dimension, ``range_2`` and so on. ``zenith_angle(time)`` and, if known, ``azimuth(time)``
+are coordinates, as are latitude, longitude and altitude. A property that is the same in all files
+is an attribute of the channel; one that varies is a variable ``<channel>_<property>(time)``.
 
 Nothing is masked: a value at or above the attribute ``full_scale`` (in the units of the variable,
-present where it is the same in all files) is saturated or a glitch, and the processing flags it.
+present if it is the same in all files) is saturated or a glitch, and the processing flags it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lidarops.records import Granule
 Position = Literal["longitude_first", "latitude_first", "ignore"]
 
 Stretches = tuple[tuple[int, int], ...]
-"""Bins of a channel, ascending: the first of each stretch, and the one past its last."""
+"""Stretches of bins of a channel, ascending: first bin, and the one past the last."""
 
 POSITIONS: Final = ("longitude_first", "latitude_first", "ignore")
 
@@ -48,53 +48,53 @@ _POLARISATIONS = {
 }
 
 
-class _Fact(NamedTuple):
-    about: str
+class _Property(NamedTuple):
+    description: str
     units: str
-    """Empty for those of the channel."""
+    """Empty for the units of the channel."""
     dtype: type
     may_be_attribute: bool
-    """Whether an attribute says it where all files agree."""
+    """Whether it becomes an attribute if all files agree."""
 
 
-_FACTS: Mapping[str, _Fact] = {
-    "shots": _Fact("laser shots", "1", np.int32, may_be_attribute=False),
-    "input_range": _Fact("digitiser input range", "V", np.float64, may_be_attribute=False),
-    "scale": _Fact("value of one count", "", np.float64, may_be_attribute=False),
-    "laser": _Fact("laser", "1", np.int32, may_be_attribute=True),
-    "high_voltage": _Fact("detector voltage", "V", np.float64, may_be_attribute=True),
-    "discriminator": _Fact("discriminator level", "V", np.float64, may_be_attribute=True),
-    "bin_shift": _Fact("bin shift", "1", np.float64, may_be_attribute=True),
+_PROPERTIES: Mapping[str, _Property] = {
+    "shots": _Property("laser shots", "1", np.int32, may_be_attribute=False),
+    "input_range": _Property("digitiser input range", "V", np.float64, may_be_attribute=False),
+    "scale": _Property("value of one count", "", np.float64, may_be_attribute=False),
+    "laser": _Property("laser", "1", np.int32, may_be_attribute=True),
+    "high_voltage": _Property("detector voltage", "V", np.float64, may_be_attribute=True),
+    "discriminator": _Property("discriminator level", "V", np.float64, may_be_attribute=True),
+    "bin_shift": _Property("bin shift", "1", np.float64, may_be_attribute=True),
 }
 
 
 @dataclass(slots=True)
 class Columns:
-    """What many headers of one layout say, one column a fact. Grows by `append`."""
+    """Header values of many files of one layout, one column per property."""
 
     channels: tuple[str, ...] | None
     """Names to open; None for all."""
-    order: Position
+    position_order: Position
     paths: list[str] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     times: list[tuple[int, int]] = field(default_factory=list)
     """Start and stop in s since 1970."""
     places: list[tuple[float, float, float, float, float]] = field(default_factory=list)
-    """Latitude, longitude, altitude, zenith angle, azimuth; NaN where not known."""
+    """Latitude, longitude, altitude, zenith angle, azimuth; NaN if unknown."""
     sites: set[str] = field(default_factory=set)
     notes: set[str] = field(default_factory=set)
     variants: dict[tuple[Dataset, ...], tuple[int, tuple[Dataset, ...]]] = field(
         default_factory=dict
     )
-    """All datasets of a header -> number of the variant, chosen datasets."""
+    """All datasets of a header -> number of the variant, selected datasets."""
     variant: list[int] = field(default_factory=list)
     kept: dict[str, Stretches] = field(default_factory=dict)
-    """Of the channels of which not all bins are kept."""
+    """Stretches of the channels of which some bins are left out."""
 
     def __post_init__(self) -> None:
-        if self.order not in POSITIONS:
+        if self.position_order not in POSITIONS:
             raise RawFormatError(
-                f"{self.order!r} is not known",
+                f"{self.position_order!r} is unknown",
                 field="header_position",
                 remedy=f"choose one of {', '.join(POSITIONS)}",
             )
@@ -105,19 +105,23 @@ class Columns:
         Raises
         ------
         RawFormatError
-            Where the file lacks a channel, has it on another range grid than the first file, or
+            If the file lacks a channel, has it on another range grid than the first file, or has
             an impossible position.
         """
         if header.datasets not in self.variants:
-            chosen = select_signals(header, self.channels)
-            check_layout(header, chosen, self.datasets if self.variants else chosen)
-            ordered = sorted(chosen, key=lambda d: self._rank(d.name))
+            selected = select_signals(header, self.channels)
+            check_layout(header, selected, self.datasets if self.variants else selected)
+            ordered = sorted(selected, key=lambda d: self._rank(d.name))
             self.variants[header.datasets] = (len(self.variants), tuple(ordered))
-        position = (math.nan, math.nan) if self.order == "ignore" else header.position(self.order)
-        pointing = (header.zenith_angle, _known(header.azimuth))
+        position = (
+            (math.nan, math.nan)
+            if self.position_order == "ignore"
+            else header.position(self.position_order)
+        )
+        pointing = (header.zenith_angle, _nan_if_none(header.azimuth))
         self.sites.add(header.site)
         self.notes.update(header.notes)
-        self._enter(
+        self._add_row(
             header.path,
             header.size,
             (header.start, header.stop),
@@ -126,30 +130,30 @@ class Columns:
         )
 
     def append_alike(self, granule: Granule, path: str, variant: int) -> None:
-        """Add a file whose header says of site and datasets what another file's says.
+        """Add a file whose header has the site and datasets of another file.
 
         Parameters
         ----------
         granule : Granule
-            All that the header says besides; its position is not taken.
+            The other values of the header; its position is ignored.
         path : str
-            The file.
+            Path of the file.
         variant : int
-            Number of the other file's datasets.
+            Number of the variant of the other file.
         """
         if granule.start is None or granule.stop is None:
             raise RawFormatError("has no start or stop in the catalog", file=path, field="start")
-        pointing = (_known(granule.zenith_angle), _known(granule.azimuth))
+        pointing = (_nan_if_none(granule.zenith_angle), _nan_if_none(granule.azimuth))
         self.notes.update(granule.notes)
-        self._enter(
+        self._add_row(
             path,
             granule.size,
             (granule.start, granule.stop),
-            (math.nan, math.nan, _known(granule.altitude), *pointing),
+            (math.nan, math.nan, _nan_if_none(granule.altitude), *pointing),
             variant,
         )
 
-    def _enter(
+    def _add_row(
         self,
         path: str,
         size: int,
@@ -166,12 +170,12 @@ class Columns:
 
     @property
     def datasets(self) -> tuple[Dataset, ...]:
-        """The chosen datasets of the first file."""
+        """Selected datasets of the first file."""
         return next(iter(self.variants.values()))[1]
 
-    def fact(self, channel: int, name: str) -> NDArray[Any]:
-        """Return a property of dataset number `channel`, one value a file."""
-        by_variant = [getattr(chosen[channel], name) for _, chosen in self.variants.values()]
+    def channel_values(self, channel: int, name: str) -> NDArray[Any]:
+        """Return a property of dataset number `channel`, one value per file."""
+        by_variant = [getattr(selected[channel], name) for _, selected in self.variants.values()]
         return np.array(by_variant)[self.variant]
 
     def sort(self) -> None:
@@ -183,7 +187,7 @@ class Columns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the chosen datasets."""
+        """Names of the selected datasets."""
         return tuple(dataset.name for dataset in self.datasets)
 
     def keep(self, stretches: Mapping[str, Stretches]) -> None:
@@ -192,29 +196,32 @@ class Columns:
         Raises
         ------
         RawFormatError
-            Where a channel is not opened, or its stretches do not follow one another.
+            If a channel is not opened, or its stretches do not ascend.
         """
         stored = {dataset.name: dataset.bins for dataset in self.datasets}
-        for name, asked in stretches.items():
-            edges = [edge for stretch in asked for edge in stretch]
-            rising = all(low < high for low, high in pairwise(edges))
-            if not (rising and edges and 0 <= edges[0] < stored.get(name, 0)):
+        for name, requested in stretches.items():
+            edges = [edge for stretch in requested for edge in stretch]
+            ascending = all(low < high for low, high in pairwise(edges))
+            if not (ascending and edges and 0 <= edges[0] < stored.get(name, 0)):
                 raise RawFormatError(
-                    f"bins {list(asked)} of {name} cannot be kept",
+                    f"bins {list(requested)} of {name} cannot be kept",
                     field="stretches",
-                    remedy=f"give the first and the past bin of parts of {', '.join(stored)}",
+                    remedy=f"give ascending stretches of bins (first, past) of {', '.join(stored)}",
                 )
-            there = [(first, min(past, stored[name])) for first, past in asked]
-            self.kept[name] = tuple(stretch for stretch in there if stretch[0] < stretch[1])
+            clipped = [(first, min(past, stored[name])) for first, past in requested]
+            self.kept[name] = tuple(stretch for stretch in clipped if stretch[0] < stretch[1])
             if self.kept[name] == ((0, stored[name]),):
                 del self.kept[name]
         self.variants = {
-            datasets: (number, tuple(replace(d, bins=bins_of(self.stretches(d))) for d in chosen))
-            for datasets, (number, chosen) in self.variants.items()
+            datasets: (
+                number,
+                tuple(replace(d, bins=count_bins(self.stretches(d))) for d in selected),
+            )
+            for datasets, (number, selected) in self.variants.items()
         }
 
     def stretches(self, dataset: Dataset) -> Stretches:
-        """Return which bins of a chosen dataset are kept."""
+        """Return the kept stretches of bins of a selected dataset."""
         return self.kept.get(dataset.name, ((0, dataset.bins),))
 
     def _rank(self, name: str) -> int:
@@ -223,12 +230,12 @@ class Columns:
         return next(i for i, dataset in enumerate(self.datasets) if dataset.name == name)
 
 
-def _known(value: float | None) -> float:
+def _nan_if_none(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def bins_of(stretches: Stretches) -> int:
-    """Return how many bins stretches hold."""
+def count_bins(stretches: Stretches) -> int:
+    """Return the number of bins in stretches."""
     return sum(past - first for first, past in stretches)
 
 
@@ -243,17 +250,17 @@ def build_raw_dataset(columns: Columns, signal: Signal, *, scaled: bool) -> xr.D
     ----------
     columns : Columns
     signal : callable
-        Gives the array of a channel.
+        Returns the array of a channel.
     scaled : bool
-        Whether `signal` gives physical values or counts.
+        Whether `signal` returns physical values or counts.
     """
     grids = _grids(columns)
     variables: dict[str, xr.Variable] = {}
     for channel, dataset in enumerate(columns.datasets):
         dims = ("time", grids[columns.stretches(dataset), dataset.bin_width])
-        facts, attributes = _facts(columns, channel, scaled=scaled)
+        extra, attributes = _channel_properties(columns, channel, scaled=scaled)
         variables[dataset.name] = xr.Variable(dims, signal(channel, dataset), attributes)
-        variables.update(facts)
+        variables.update(extra)
     return xr.Dataset(
         variables,
         {**_time(columns), **_ranges(grids), **_place(columns)},
@@ -267,35 +274,35 @@ def build_raw_dataset(columns: Columns, signal: Signal, *, scaled: bool) -> xr.D
 
 def _grids(columns: Columns) -> dict[tuple[Stretches, float], str]:
     # The most common grid is "range"; the others follow in file order.
-    uses = Counter((columns.stretches(each), each.bin_width) for each in columns.datasets)
+    uses = Counter((columns.stretches(d), d.bin_width) for d in columns.datasets)
     ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
     return {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
 
 
-def _facts(
+def _channel_properties(
     columns: Columns, channel: int, *, scaled: bool
 ) -> tuple[dict[str, xr.Variable], dict[str, Any]]:
     dataset = columns.datasets[channel]
-    devices = sorted(set(columns.fact(channel, "device").tolist()))
+    devices = sorted(set(columns.channel_values(channel, "device").tolist()))
     attributes = {
         **_attributes(dataset, scaled=scaled),
         "device": ", ".join(devices),
         **_full_scale(columns, channel, scaled=scaled),
     }
     variables = {}
-    for name, fact in _FACTS.items():
-        values = columns.fact(channel, name)
+    for name, prop in _PROPERTIES.items():
+        values = columns.channel_values(channel, name)
         if values[0] is None or (name == "scale" and scaled):
             continue
-        if fact.may_be_attribute and _is_constant(values):
+        if prop.may_be_attribute and _is_constant(values):
             attributes[name] = values[0].item()
             continue
         variables[f"{dataset.name}_{name}"] = xr.Variable(
             ("time",),
-            values.astype(fact.dtype),
+            values.astype(prop.dtype),
             {
-                "units": fact.units or dataset.units,
-                "long_name": f"{fact.about} of {dataset.name}",
+                "units": prop.units or dataset.units,
+                "long_name": f"{prop.description} of {dataset.name}",
             },
         )
     return variables, attributes
@@ -306,11 +313,11 @@ def _full_scale(columns: Columns, channel: int, *, scaled: bool) -> dict[str, fl
     if dataset.input_range is None:
         return {}
     if scaled:
-        # In the precision of the signal, so that a saturated value compares equal.
-        nominal = columns.fact(channel, "input_range") * 1e3 * (1 - 0.5**dataset.adc_bits)
+        # In the precision of the signal, so saturated values compare equal.
+        nominal = columns.channel_values(channel, "input_range") * 1e3 * (1 - 0.5**dataset.adc_bits)
         values = nominal.astype(np.float32)
     else:
-        values = columns.fact(channel, "full_scale")
+        values = columns.channel_values(channel, "full_scale")
     return {"full_scale": values[0].item()} if _is_constant(values) else {}
 
 
@@ -322,13 +329,13 @@ def _attributes(dataset: Dataset, *, scaled: bool) -> dict[str, Any]:
     polarisation = _POLARISATIONS.get(dataset.polarisation, dataset.polarisation)
     kind = dataset.kind.name.lower().replace("_", " ")
     label = int(dataset.wavelength_label.partition(".")[0])
-    known = {} if math.isnan(dataset.wavelength) else {"wavelength": dataset.wavelength}
+    wavelength = {} if math.isnan(dataset.wavelength) else {"wavelength": dataset.wavelength}
     return {
         "units": dataset.units if scaled else "count",
         "long_name": f"{kind} signal at {label} nm, {polarisation} polarisation",
         "detection_mode": kind,
         "wavelength_label": dataset.wavelength_label,
-        **known,
+        **wavelength,
         "polarisation": polarisation,
         "bin_width": dataset.bin_width,
         "adc_bits": dataset.adc_bits,
@@ -383,7 +390,7 @@ def _place(columns: Columns) -> dict[str, xr.Variable]:
             azimuth,
             {"units": "degree", "long_name": "azimuth of the beam, clockwise from north"},
         )
-    if columns.order != "ignore":
+    if columns.position_order != "ignore":
         place["latitude"] = _constant(
             latitude, {"units": "degrees_north", "standard_name": "latitude"}
         )
@@ -394,7 +401,7 @@ def _place(columns: Columns) -> dict[str, xr.Variable]:
 
 
 def _constant(values: NDArray[np.float64], attributes: dict[str, str]) -> xr.Variable:
-    # A lidar on the move has a place at every time.
+    # A moving lidar has a position at every time.
     if _is_constant(values):
         return xr.Variable((), values[0], attributes)
     return xr.Variable(("time",), values, attributes)

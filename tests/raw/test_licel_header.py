@@ -65,7 +65,7 @@ def test_raymetrics_place():
 def test_weather_that_cannot_be_is_not_believed():
     header = place("0100 -060.0 -003.1 00 00 00.0 0000.0")
     assert (header.temperature, header.pressure) == (None, None)
-    assert "not believed" in header.notes[0]
+    assert "impossible" in header.notes[0]
 
 
 def test_newer_place():
