@@ -1,4 +1,4 @@
-"""Charts of benchmarks: marks on logarithmic axes, told apart in colour and in grey."""
+"""Charts of benchmarks: marks on logarithmic axes, distinguishable in colour and in grey."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HEIGHT: Final = 4.6
 _WIDTH: Final = 10.0
 _ROW: Final = 0.3
 _FEW_DECADES: Final = 2e3
-"""An axis of less than this ratio is labelled at 1, 2 and 5 of each decade."""
+"""Axes that span less than this ratio are labelled at 1, 2 and 5 of each decade."""
 _COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "d")
 _LINES: Final = ("-", "--", "-.", ":")
@@ -26,23 +26,23 @@ _LINES: Final = ("-", "--", "-.", ":")
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Points of one kind."""
+    """One series of points with its label and style."""
 
     label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
     low: tuple[float, ...] = ()
-    """Lower ends of vertical bars; none where empty."""
+    """Lower ends of vertical bars; empty without bars."""
     high: tuple[float, ...] = ()
     hollow: bool = False
     joined: bool = False
     band: bool = False
-    """`low` and `high` are the edges of an area, which need not hold the points."""
+    """Whether `low` and `high` are drawn as a filled area, which need not contain the points."""
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One pair of axes."""
+    """One panel of a chart."""
 
     title: str
     x_label: str
@@ -51,14 +51,14 @@ class Panel:
     x_log: bool = True
     y_log: bool = True
     level: float | None = None
-    """Where a thin horizontal line is drawn."""
+    """Height of a thin horizontal line."""
     front: tuple[tuple[float, float], ...] = ()
-    """Corners of the Pareto front from left to right; drawn as steps."""
+    """Corners of the Pareto front from left to right, drawn as steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """One figure: panels side by side, which share their vertical axis and the order of series."""
+    """A figure of panels side by side with a common vertical axis and order of series."""
 
     name: str
     """File name without suffix."""
@@ -69,7 +69,7 @@ class Chart:
 
 @dataclass(frozen=True, slots=True)
 class Ladder:
-    """One figure: names on the left, a mark for every series on a logarithmic axis."""
+    """A figure with a row per name and a mark per series on a logarithmic axis."""
 
     name: str
     title: str
@@ -77,11 +77,11 @@ class Ladder:
     x_label: str
     rows: tuple[str, ...]
     series: tuple[tuple[str, tuple[float | None, ...]], ...]
-    """Label and one value for each row."""
+    """Label, and one value per row."""
 
 
 def draw_chart(chart: Chart | Ladder) -> Figure:
-    """Return the figure of a chart; `lidarops.figures.product_figures.render` makes it a file."""
+    """Draw a chart; `lidarops.figures.product_figures.render` converts it to a file."""
     figure = _chart(chart) if isinstance(chart, Chart) else _ladder(chart)
     panels.title(figure, chart.title)
     figure.set_label(f"{chart.title}. {chart.caption}")
@@ -91,9 +91,9 @@ def draw_chart(chart: Chart | Ladder) -> Figure:
 def pareto(
     points: Sequence[tuple[float, float]], gain: float = 1.0
 ) -> tuple[tuple[float, float], ...]:
-    """Return the points that no other one beats in both coordinates, from left to right.
+    """Return the points with no other point below and to the left of them, from left to right.
 
-    Each has less than `gain` times the height of the one before.
+    Each point is lower than `gain` times the height of the previous point.
     """
     front: list[tuple[float, float]] = []
     for x, y in sorted(points):

@@ -1,4 +1,4 @@
-"""Products of networks as plain arrays: series by crossing beside the truth, and beams in space."""
+"""Network products as plain arrays: series at each crossing with the truth, and a map of beams."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.series_data import Section, SeriesEstimate, require
+from lidarops.figures.series_data import (
+    Section,
+    SeriesEstimate,
+    float_values,
+    join_estimates,
+    require,
+)
 from lidarops.figures.time_axis import Times
 from lidarops.flags import Quality
 from lidarops.records import SceneOutcome
@@ -19,7 +25,7 @@ from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_eart
 Floats = NDArray[np.float64]
 
 QUANTITIES: Final = ("extinction", "visibility")
-"""Of a series."""
+"""Quantities of a series."""
 
 _EXTINCTION: Final = (
     "extinction",
@@ -30,57 +36,58 @@ _VISIBILITY: Final = ("visibility_in_air", "visibility_in_air_lower", "visibilit
 _ANGLES: Final = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
 _SHARED: Final = ("time", "crossing_id", "beam_range", "quality_flag")
 CROSSING_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY, "time_bnds", "beam_zenith_angle")
-"""What `read_crossings` reads of a product."""
+"""Variables that `read_crossings` needs."""
 MAP_VARIABLES: Final = (
     *_SHARED,
     "visibility_in_air",
     *(f"beam_{name}" for name in _ANGLES),
     *_ANGLES[:3],
 )
-"""What `read_map` reads of a product."""
+"""Variables that `read_map` needs."""
 _PAIR: Final = ("time", "crossing")
 _SAME_BEAM: Final = 0.2
-"""degree, within which a file of the truth points as a beam does."""
+"""degree; files of the truth within this zenith angle of a beam belong to it."""
 _FLAT: Final = 0.2
-"""Of the larger extent: the least that an axis of a map spans to be drawn."""
+"""Smallest horizontal extent of a map that shows the ground, relative to the larger extent."""
 
 
 @dataclass(frozen=True, slots=True)
 class CrossingSeries(Section):
-    """What was retrieved where beams meet, over time; `near` and `far` are its nearest range."""
+    """Retrieved quantities at one crossing over time. `near` and `far` are its shortest range."""
 
     crossing: int
 
     @property
     def label(self) -> str:
-        """The crossing in words."""
+        """Name of the crossing in legends."""
         return f"crossing {self.crossing}"
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkMap:
-    """Beams and crossings on two axes."""
+    """Beams and crossings projected on two axes."""
 
     stations: Floats
     """(beam, 2) km."""
     ends: Floats
-    """(beam, 2) km, of the part of the beam that is used."""
+    """(beam, 2) km, far ends of the beams, just beyond the last crossing."""
     crossings: Floats
     """(crossing, 2) km."""
     numbers: tuple[int, ...]
     visibility: Floats
-    """(crossing,) km, median over time of what is to be used; NaN where there is none."""
+    """(crossing,) km, median over time of usable values; NaN without any."""
     used: NDArray[np.intp]
-    """(crossing,) Values that are to be used."""
+    """(crossing,) Number of usable values."""
     values: int
-    """Values of a crossing."""
+    """Number of values of a crossing."""
     axes: tuple[str, str]
+    """Labels of the two axes."""
     instruments: tuple[str, ...]
-    """Of each beam."""
+    """Instrument of each beam."""
 
 
 def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
-    """Return the instrument of each beam of a scene, as its plan says; none where it does not."""
+    """Return the instrument of each beam of a scene from its plan; empty if it lists none."""
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
         if step.name == "visibility" and "beams" in step.settings:
@@ -91,40 +98,43 @@ def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
 def read_crossings(
     product: xr.Dataset, truth: xr.Dataset | None = None, *, instruments: Sequence[str] = ()
 ) -> list[CrossingSeries]:
-    """Take the series of the crossings out of one product.
+    """Return the series at each crossing of a product.
 
     Parameters
     ----------
     product : Dataset
         Kind ``visibility``.
     truth : Dataset, optional
-        Of a simulated campaign.
+        Truth of a simulated campaign.
     instruments : sequence of str, optional
-        Of each beam, whose truth to take; none is taken where empty.
+        Instrument of each beam, to select its truth; empty for no truth.
 
     Returns
     -------
     list of CrossingSeries
-        Standard errors hold the systematic part. Truth is that of the beams, at the time.
+        Standard errors include the systematic error. The truth is the mean over the beams at the
+        crossing.
 
     Raises
     ------
     ProductError
-        Where a variable is missing, or does not have the dims of its kind.
+        If a variable is missing or has other dimensions.
     """
     require(
         product,
         {"time": ("time",), "crossing_id": ("crossing",), "beam_range": ("beam", "crossing")}
         | dict.fromkeys((*_EXTINCTION, *_VISIBILITY, "quality_flag"), _PAIR),
     )
-    value, random, systematic = (_floats(product, name) for name in _EXTINCTION)
-    seen, low, high = (_floats(product, name) for name in _VISIBILITY)
+    value, random, systematic = (float_values(product, name) for name in _EXTINCTION)
+    visibility, lower, upper = (float_values(product, name) for name in _VISIBILITY)
     flags = product["quality_flag"].values.astype(np.int64)
-    known = _truth(product, truth, instruments)
+    true_extinction = _truth(product, truth, instruments)
     time = product["time"].values.astype("datetime64[ns]")
-    nearest = np.nanmin(_floats(product, "beam_range"), axis=0)
+    nearest = np.nanmin(float_values(product, "beam_range"), axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        true_sight = np.where(known > 0, _constant(value, seen) / known, np.nan)
+        true_visibility = np.where(
+            true_extinction > 0, _contrast_constant(value, visibility) / true_extinction, np.nan
+        )
     return [
         CrossingSeries(
             near=float(nearest[v]),
@@ -133,12 +143,12 @@ def read_crossings(
             flag=flags[:, v],
             estimates={
                 "extinction": SeriesEstimate(
-                    value[:, v], np.hypot(random, systematic)[:, v], known[:, v], "m-1"
+                    value[:, v], np.hypot(random, systematic)[:, v], true_extinction[:, v], "m-1"
                 ),
                 "visibility": SeriesEstimate(
-                    seen[:, v] / 1e3,
-                    np.abs(high - low)[:, v] / 2e3,
-                    true_sight[:, v] / 1e3,
+                    visibility[:, v] / 1e3,
+                    np.abs(upper - lower)[:, v] / 2e3,
+                    true_visibility[:, v] / 1e3,
                     "km",
                 ),
             },
@@ -150,49 +160,37 @@ def read_crossings(
 
 def join_crossings(series: Sequence[CrossingSeries]) -> list[CrossingSeries]:
     """Join the series of several scenes by crossing, each over all times."""
-    found = []
-    for number in sorted({one.crossing for one in series}):
-        mine = [one for one in series if one.crossing == number]
-        order = np.argsort(np.concatenate([one.time for one in mine]), kind="stable")
-        found.append(
+    joined = []
+    for number in sorted({part.crossing for part in series}):
+        parts = [part for part in series if part.crossing == number]
+        order = np.argsort(np.concatenate([part.time for part in parts]), kind="stable")
+        joined.append(
             CrossingSeries(
-                near=mine[0].near,
-                far=mine[0].far,
-                time=np.concatenate([one.time for one in mine])[order],
-                flag=np.concatenate([one.flag for one in mine])[order],
-                estimates={name: _joined(mine, name, order) for name in QUANTITIES},
+                near=parts[0].near,
+                far=parts[0].far,
+                time=np.concatenate([part.time for part in parts])[order],
+                flag=np.concatenate([part.flag for part in parts])[order],
+                estimates=join_estimates(parts, order),
                 crossing=number,
             )
         )
-    return found
-
-
-def _joined(
-    series: Sequence[CrossingSeries], quantity: str, order: NDArray[np.intp]
-) -> SeriesEstimate:
-    parts = [one.estimates[quantity] for one in series]
-    return SeriesEstimate(
-        value=np.concatenate([part.value for part in parts])[order],
-        standard_error=np.concatenate([part.standard_error for part in parts])[order],
-        truth=np.concatenate([part.truth for part in parts])[order],
-        units=parts[0].units,
-    )
+    return joined
 
 
 def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap:
-    """Take beams and crossings out of one product.
+    """Return beams and crossings of a product, projected on two axes.
 
     Parameters
     ----------
     product : Dataset
         Kind ``visibility``.
     instruments : sequence of str, optional
-        Of each beam.
+        Instrument of each beam; beams are numbered without it.
 
     Raises
     ------
     ProductError
-        Where a variable is missing, or does not have the dims of its kind.
+        If a variable is missing or has other dimensions.
     """
     require(
         product,
@@ -200,29 +198,32 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
         | {"quality_flag": _PAIR, "crossing_id": ("crossing",)}
         | {f"beam_{name}": ("beam",) for name in _ANGLES},
     )
-    columns = [_floats(product, f"beam_{name}") for name in _ANGLES]
+    columns = [float_values(product, f"beam_{name}") for name in _ANGLES]
     beams = [
         Beam(lat, lon, alt, azimuth, 90.0 - zenith)
         for lat, lon, alt, zenith, azimuth in zip(*columns, strict=True)
     ]
     origin, direction = locate(beams)
-    reach = np.nanmax(_floats(product, "beam_range"), axis=1, initial=0.0)
-    place = [_floats(product, name) for name in _ANGLES[:3]]
+    reach = np.nanmax(float_values(product, "beam_range"), axis=1, initial=0.0)
+    position = [float_values(product, name) for name in _ANGLES[:3]]
     first = to_earth_centred(beams[0].latitude, beams[0].longitude, beams[0].altitude)
     turn = local_axes(beams[0].latitude, beams[0].longitude)
-    crossings = (to_earth_centred(*place) - first) @ turn.T
+    crossings = (to_earth_centred(*position) - first) @ turn.T
     ends = origin + 1.08 * reach[:, np.newaxis] * direction
     pair, names = _axes(np.concatenate([origin, crossings]))
     rejected = (product["quality_flag"].values.astype(np.int64) & int(Quality.rejecting())) != 0
-    seen = np.where(rejected, np.nan, _floats(product, "visibility_in_air")) / 1e3
-    used = np.isfinite(seen).sum(axis=0)
+    visibility = np.where(rejected, np.nan, float_values(product, "visibility_in_air")) / 1e3
+    used = np.isfinite(visibility).sum(axis=0)
     return NetworkMap(
         stations=origin[:, pair] / 1e3,
         ends=ends[:, pair] / 1e3,
         crossings=crossings[:, pair] / 1e3,
         numbers=tuple(int(number) for number in product["crossing_id"].values),
         visibility=np.array(
-            [np.nanmedian(column) if n else np.nan for column, n in zip(seen.T, used, strict=True)]
+            [
+                np.nanmedian(column) if count else np.nan
+                for column, count in zip(visibility.T, used, strict=True)
+            ]
         ),
         used=used,
         values=product.sizes["time"],
@@ -232,22 +233,22 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
 
 
 def _axes(points: Floats) -> tuple[list[int], tuple[str, str]]:
-    """Return the two axes that a network spans most of: of the ground where that is wide."""
+    """Return the two axes of a map and their labels: the ground, or a vertical plane if narrow."""
     east, north, up = np.ptp(points, axis=0)
-    called = ("east of the first lidar (km)", "north of the first lidar (km)")
+    labels = ("east of the first lidar (km)", "north of the first lidar (km)")
     level = 0 if east >= north else 1
     if up > 0 and min(east, north) < _FLAT * min(max(east, north), up):
-        return [level, 2], (called[level], "above the first lidar (km)")
-    return [0, 1], called
+        return [level, 2], (labels[level], "above the first lidar (km)")
+    return [0, 1], labels
 
 
-def _constant(extinction: Floats, visibility: Floats) -> float:
-    """Return the product of visibility and extinction, where both have one law."""
+def _contrast_constant(extinction: Floats, visibility: Floats) -> float:
+    """Return visibility times extinction, -ln(contrast); NaN if it is not constant."""
     known = np.isfinite(extinction) & np.isfinite(visibility)
     if not known.any():
         return float("nan")
     products = extinction[known] * visibility[known]
-    # Brought to another wavelength by a law that depends on visibility, it is no constant.
+    # It varies where the conversion to another wavelength depends on visibility.
     return float(np.median(products)) if np.ptp(products) < 0.01 * products.mean() else np.nan
 
 
@@ -256,16 +257,16 @@ def _truth(product: xr.Dataset, truth: xr.Dataset | None, instruments: Sequence[
     if truth is None or len(instruments) != product.sizes["beam"]:
         return np.full(shape, np.nan)
     bounds = product["time_bnds"].values.astype("datetime64[ns]")
-    zenith, ranges = _floats(product, "beam_zenith_angle"), _floats(product, "beam_range")
+    zenith, ranges = float_values(product, "beam_zenith_angle"), float_values(product, "beam_range")
     total, count = np.zeros(shape), np.zeros(shape)
     for beam, name in enumerate(instruments):
         for crossing in np.flatnonzero(np.isfinite(ranges[beam])):
-            when, known = _along(truth, name, zenith[beam], ranges[beam, crossing])
-            for n, (start, stop) in enumerate(bounds):
-                inside = known[(when >= start) & (when <= stop)]
+            times, true_values = _along(truth, name, zenith[beam], ranges[beam, crossing])
+            for row, (start, stop) in enumerate(bounds):
+                inside = true_values[(times >= start) & (times <= stop)]
                 if inside.size:
-                    total[n, crossing] += inside.mean()
-                    count[n, crossing] += 1
+                    total[row, crossing] += inside.mean()
+                    count[row, crossing] += 1
     with np.errstate(invalid="ignore"):
         return np.asarray(total / np.where(count > 0, count, np.nan))
 
@@ -273,24 +274,20 @@ def _truth(product: xr.Dataset, truth: xr.Dataset | None, instruments: Sequence[
 def _along(
     truth: xr.Dataset, instrument: str, zenith: float, distance: float
 ) -> tuple[Times, Floats]:
-    """Return times and true extinction at a distance on a beam."""
+    """Return times and true extinction at a distance along a beam."""
     suffix = instrument.replace("-", "_")
     names = np.asarray(truth["instrument"].values, dtype=np.str_)
     if f"profile_granule_{suffix}" not in truth:
-        mine = np.flatnonzero(names == instrument)
-        known = _floats(truth, "extinction")[mine]
+        rows = np.flatnonzero(names == instrument)
+        true_values = float_values(truth, "extinction")[rows]
     else:
-        mine = truth[f"profile_granule_{suffix}"].values.astype(np.intp)
-        middle = _floats(truth, f"range_{suffix}")
+        rows = truth[f"profile_granule_{suffix}"].values.astype(np.intp)
+        middle = float_values(truth, f"range_{suffix}")
         field = np.asarray(truth[f"profile_extinction_{suffix}"].values[:, 0], dtype=np.float64)
-        known = np.array([np.interp(distance, middle, row) for row in field])
-    when = truth["time"].values.astype("datetime64[ns]")[mine]
+        true_values = np.array([np.interp(distance, middle, row) for row in field])
+    times = truth["time"].values.astype("datetime64[ns]")[rows]
     if "zenith_angle" in truth:
-        here = np.abs(_floats(truth, "zenith_angle")[mine] - zenith) < _SAME_BEAM
-        when, known = when[here], known[here]
-    fine = np.isfinite(known)
-    return when[fine], known[fine]
-
-
-def _floats(product: xr.Dataset, name: str) -> Floats:
-    return np.asarray(product[name].values, dtype=np.float64)
+        same_beam = np.abs(float_values(truth, "zenith_angle")[rows] - zenith) < _SAME_BEAM
+        times, true_values = times[same_beam], true_values[same_beam]
+    finite = np.isfinite(true_values)
+    return times[finite], true_values[finite]

@@ -1,4 +1,4 @@
-"""Figures of networks: a map of beams and crossings, and the series of each crossing."""
+"""Figures of networks: a map of beams and crossings, and the series at each crossing."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from lidarops.figures.wording import counted, visible
 
 _DPI: Final = 150
 _COLORS: Final = "cividis"
-"""Perceptually uniform, and told apart by colour-blind readers and in grey."""
+"""Perceptually uniform; readable with colour vision deficiency and in grey."""
 _LINES: Final = ("-", "--", "-.", ":")
 CROSSINGS: Final = panels.SECTIONS
-"""Most crossings of one figure of series."""
+"""Most crossings in one figure of series."""
 
 
 def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
-    """Draw the beams of a network and the crossings in which they meet.
+    """Draw the beams of a network and their crossings.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
     Returns
     -------
     Figure
-        Crossings are coloured by the median of visibility over time, which stands beside each as
-        a number; a crossing without a value is hollow. Lines tell instruments apart.
+        The colour of a crossing is its median visibility over time, also written beside it. A
+        crossing without a value is hollow. Line styles distinguish instruments.
     """
     figure = Figure(figsize=(7.4, 6.2), dpi=_DPI, layout="constrained")
     panel = figure.subplots()
@@ -75,8 +75,8 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
             zorder=4,
         )
     panels.legend(panel, columns=2)
-    told = "; ".join(
-        f"crossing {number}: {value:.3g} km of {used} values"
+    medians = "; ".join(
+        f"crossing {number}: {value:.3g} km, {counted(used, 'value')}"
         for number, value, used in zip(
             network.numbers, network.visibility, network.used, strict=True
         )
@@ -85,7 +85,7 @@ def draw_map(network: NetworkMap, *, title: str = "") -> Figure:
         visible(
             f"{title}: map of {counted(len(network.ends), 'beam')} of"
             f" {counted(len(set(network.instruments)), 'instrument')}, with the median visibility"
-            f" where they meet. {told}."
+            f" at each crossing. {medians}."
         )
     )
     return figure
@@ -115,7 +115,7 @@ def _beams(panel: Axes, network: NetworkMap) -> None:
 
 
 def draw_series(series: Sequence[CrossingSeries], *, title: str = "") -> Figure:
-    """Draw extinction and visibility of crossings against time.
+    """Draw visibility and extinction at crossings against time.
 
     Parameters
     ----------
@@ -126,32 +126,31 @@ def draw_series(series: Sequence[CrossingSeries], *, title: str = "") -> Figure:
     Returns
     -------
     Figure
-        With errors of 1 sigma (random and systematic), flagged values marked, and the truth in
-        black dashes.
+        With 1-sigma errors (random and systematic), flagged values marked, and the truth as a
+        black dashed line.
     """
-    axis = time_axis(np.unique(np.concatenate([one.time for one in series])))
+    axis = time_axis(np.unique(np.concatenate([crossing.time for crossing in series])))
     figure = Figure(figsize=(10.0, 6.3), dpi=_DPI, layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     panels.title(figure, title)
     panels.estimates(upper, axis, series, "visibility")
     panels.estimates(lower, axis, series, "extinction")
     for panel in (upper, lower):
-        # Neither is ever negative, and its axis is not either.
+        # Neither quantity is ever negative.
         panel.set_ylim(bottom=max(0.0, panel.get_ylim()[0]))
     panels.time_ticks([upper, lower], axis)
     panels.legend(upper)
-    panels.legend(lower, besides=upper)
+    panels.legend(lower, other=upper)
     words = []
-    for one in series:
-        good = ~one.rejected
-        values = one.estimates["visibility"].value[good]
+    for crossing in series:
+        good = ~crossing.rejected
+        values = crossing.estimates["visibility"].value[good]
         values = values[np.isfinite(values)]
         span = f"{values.min():.3g} to {values.max():.3g} km" if values.size else "no value"
-        words.append(f"{one.label}: {span}, {int((~good).sum())} of {good.size} rejected")
+        words.append(f"{crossing.label}: {span}, {int((~good).sum())} of {good.size} rejected")
     figure.set_label(
         visible(
-            f"{title}: visibility and extinction where beams meet, against time."
-            f" {'; '.join(words)}."
+            f"{title}: visibility and extinction at the crossings against time. {'; '.join(words)}."
         )
     )
     return figure

@@ -1,7 +1,7 @@
-"""What figures are made of: axes, lines, marks and images drawn into one panel each.
+"""Elements of figures: axes, lines, marks and images, each drawn into one panel.
 
-Here and in `lidarops.figures.product_figures` is all that knows matplotlib. Colours are told apart by
-colour-blind readers (Okabe and Ito) and in grey, where marker and line differ too.
+Colours are distinguishable with colour vision deficiency (Okabe and Ito). Markers and line styles
+differ too, so that figures are readable in grey.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from lidarops.figures.raster import Raster, joined, share_with_care
+from lidarops.figures.raster import Raster, colour_limits, joined, share_with_care
 from lidarops.figures.series_data import Section, compare, normalised_error, thin
 from lidarops.figures.time_axis import TimeAxis, Times, segments
-from lidarops.figures.wording import bit_name, percent, visible
+from lidarops.figures.wording import bit_name, counted, percent, visible
 from lidarops.flags import Quality
 
 Floats = NDArray[np.float64]
@@ -35,15 +35,13 @@ INK: Final = "#222222"
 GREY: Final = "#767676"
 
 _POINTS: Final = 1500
-"""More profiles than these are drawn as block means."""
+"""More profiles than this are drawn as block means."""
 _MARKS: Final = 300
-"""At most so many flagged values are drawn."""
+"""Most flagged values that are drawn."""
 _BARS: Final = 150
-"""Up to so many points get error bars, more get a band."""
+"""Most points with error bars; more points get a band."""
 _FAR_OFF: Final = 10.0
-"""Normalised errors beyond this are drawn at it."""
-_DECADES: Final = 4.0
-"""Most decades of a colour scale."""
+"""Larger normalised errors are drawn at this value."""
 _REJECT_COLOR: Final = "#000000"
 _AXIS_UNITS: Final = {"extinction": ("km$^{-1}$", 1.0e3)}
 _IMAGE_UNITS: Final = {
@@ -67,17 +65,17 @@ _STYLES: Final = (
 )
 
 SECTIONS: Final = len(_STYLES)
-"""More sections than these cannot be told apart in one panel."""
+"""Most sections in one panel; more cannot be distinguished."""
 
 
 def title(figure: Figure, words: str) -> None:
-    """Write a title at the left. Names come from files: a dollar sign starts no formula."""
+    """Write a title at the left. Dollar signs do not start a formula: names come from files."""
     words = " ".join(visible(words).split())
     figure.suptitle(words, x=0.008, ha="left", fontsize=11.5, color=INK, parse_math=False)
 
 
 def nothing(panel: Axes, words: str) -> None:
-    """Say why a panel is empty."""
+    """Write into a panel why it is empty."""
     panel.text(0.5, 0.5, words, ha="center", va="center", transform=panel.transAxes, color=GREY)
 
 
@@ -86,21 +84,21 @@ def legend(
     handles: Sequence[Artist] = (),
     *,
     columns: int = 3,
-    besides: Axes | None = None,
+    other: Axes | None = None,
 ) -> None:
-    """Write the legend above a panel, where it hides nothing; not what is told `besides`."""
-    told = besides.get_legend_handles_labels()[1] if besides is not None else []
-    found = list(handles) or [
+    """Write the legend above a panel, without the labels of an `other` panel."""
+    labels = other.get_legend_handles_labels()[1] if other is not None else []
+    shown = list(handles) or [
         handle
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
-        if label not in told
+        if label not in labels
     ]
-    if found:
+    if shown:
         panel.legend(
-            handles=found,
+            handles=shown,
             loc="lower left",
             bbox_to_anchor=(0.0, 1.02),
-            ncols=min(columns, len(found)),
+            ncols=min(columns, len(shown)),
             fontsize=8.5,
             frameon=False,
             borderaxespad=0.2,
@@ -111,7 +109,7 @@ def legend(
 
 
 def time_ticks(panels: Sequence[Axes], axis: TimeAxis) -> None:
-    """Label the time axis of panels that share it, under the last of them."""
+    """Label the common time axis of panels, below the last panel."""
     ticks = axis.ticks()
     for panel in panels:
         panel.set_xlim(*axis.limits)
@@ -127,7 +125,7 @@ def time_ticks(panels: Sequence[Axes], axis: TimeAxis) -> None:
 
 
 def estimates(panel: Axes, axis: TimeAxis, sections: Sequence[Section], quantity: str) -> None:
-    """Draw one retrieved quantity of up to `SECTIONS` sections, its flags and its truth."""
+    """Draw a retrieved quantity of up to `SECTIONS` sections, with flags and truth."""
     _calm(panel)
     units, scale = _AXIS_UNITS.get(quantity, (sections[0].estimates[quantity].units, 1.0))
     panel.set_ylabel(f"{quantity} ({units})")
@@ -184,7 +182,7 @@ def _values(
 def _truth(
     panel: Axes, axis: TimeAxis, sections: Sequence[Section], quantity: str, scale: float
 ) -> None:
-    label = "truth of the simulation"
+    label = "simulated truth"
     for section in sections:
         truth = section.estimates[quantity].truth
         if np.isfinite(truth).any():
@@ -212,7 +210,7 @@ def _marks(
     *,
     care: bool,
 ) -> None:
-    """Mark the values that a quality bit rejects, or those that are to be used with care."""
+    """Mark the values that a quality bit rejects, or those to use with care."""
     chosen = [(s.flag != 0) & ~s.rejected if care else s.rejected for s in sections]
     times = np.concatenate([s.time[c] for s, c in zip(sections, chosen, strict=True)])
     values = scale * np.concatenate(
@@ -243,7 +241,7 @@ def _marks(
         label="\n".join([f"{what}: {counts}", *notes]),
         gid=f"{'care' if care else 'flagged'}-{quantity}",
     )
-    # Marks at the edge reach out of the panel; the layout must not make room for them.
+    # Marks at the edge extend beyond the panel; the layout must not make room for them.
     marks.set_in_layout(False)
 
 
@@ -252,7 +250,7 @@ def _subset(index: NDArray[np.intp], at_most: int) -> NDArray[np.intp]:
 
 
 def _limits(sections: Sequence[Section], quantity: str, scale: float) -> tuple[float, float]:
-    """Return limits that hold every value with its error bar that is not rejected."""
+    """Return limits that contain every usable value with its error bar."""
     edges: list[Floats] = []
     for section in sections:
         estimate = section.estimates[quantity]
@@ -274,7 +272,7 @@ def _finite(parts: Sequence[Floats]) -> Floats:
 
 
 def _with_gaps(time: Times, axis: TimeAxis, *values: Floats) -> tuple[Floats, ...]:
-    """Return positions and values with NaN between stretches, so that no line bridges a gap."""
+    """Return positions and values with NaN at gaps, so that no line crosses a gap."""
     cuts = [stretch.start for stretch in segments(time)][1:]
     x = axis.x(time)
     return np.insert(x, cuts, x[cuts]), *(np.insert(value, cuts, np.nan) for value in values)
@@ -294,7 +292,7 @@ def scores(panel: Axes, axis: TimeAxis, sections: Sequence[Section], quantity: s
         size = np.abs(score[known])
         largest = max(largest, min(_FAR_OFF, 1.1 * float(size.max(initial=0.0))))
         far = int((size > _FAR_OFF).sum())
-        # Those far off are drawn whatever is left out of the others.
+        # Values beyond 3 are always drawn, the others thinned.
         shown = np.union1d(_subset(known, 4 * _POINTS), known[size > 3.0])
         panel.plot(
             axis.x(section.time[shown]),
@@ -329,7 +327,7 @@ def image(
     rasters: Sequence[Raster],
     label: str = "range-corrected\nsignal",
 ) -> str:
-    """Draw rasters into a panel with a colour bar; return what is seen, in words."""
+    """Draw rasters into a panel with a colour bar; return a description in words."""
     full = max(float(raster.edges[-1]) for raster in rasters)
     reach = max(raster.reach for raster in rasters)
     far = min(full, 1.2 * reach) if reach > 0 else full
@@ -352,16 +350,14 @@ def image(
 
 
 def _signal(panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> list[QuadMesh]:
-    values = np.concatenate([raster.mean[~raster.flagged] for raster in rasters])
-    positive = values[np.isfinite(values) & (values > 0)]
-    if positive.size == 0:
+    limits = colour_limits(np.concatenate([raster.mean[~raster.flagged] for raster in rasters]))
+    if limits is None:
         return []
-    low, high = (float(level) for level in np.percentile(positive, [2.0, 99.8]))
-    low = max(low, high * 10.0**-_DECADES)
-    norm = LogNorm(low, max(high, 1.05 * low))
-    # The dark end of viridis is left out: rejected bins are black, in colour and in grey.
+    low, high = limits
+    norm = LogNorm(low, high)
+    # Without the dark end of viridis, because rejected bins are black.
     colors = ListedColormap(colormaps["viridis"](np.linspace(0.15, 1.0, 256)), name="signal")
-    # A logarithm has no place for a mean at or below zero: it takes the lowest colour.
+    # On the logarithmic scale, means at or below zero take the lowest colour.
     return [
         _blocks(panel, axis, raster, np.where(raster.mean <= 0, low, raster.mean), colors, norm)
         for raster in rasters
@@ -376,7 +372,7 @@ def _rejected(panel: Axes, axis: TimeAxis, raster: Raster) -> None:
 
 
 def _cloud_bases(panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> None:
-    known = [(r.start + (r.stop - r.start) / 2, r.clouds) for r in rasters]
+    known = [(raster.middle, raster.clouds) for raster in rasters]
     time = np.concatenate([middle[np.isfinite(base)] for middle, base in known])
     base = np.concatenate([base[np.isfinite(base)] for _, base in known])
     if base.size:
@@ -401,7 +397,7 @@ def _blocks(
     colors: Colormap,
     norm: LogNorm | None,
 ) -> QuadMesh:
-    """Draw one column after another, with empty ones where columns do not touch."""
+    """Draw the columns of a raster, with empty columns at gaps."""
     left, right = axis.x(raster.start), axis.x(raster.stop)
     apart = 1 + np.flatnonzero(left[1:] - right[:-1] > 1e-9)
     edges = np.append(np.insert(left, apart, right[apart - 1]), right[-1])
@@ -421,7 +417,7 @@ def _notes(panel: Axes, rasters: Sequence[Raster], far: float, full: float) -> s
         handles.append(Patch(color=_REJECT_COLOR, label=_wrapped(f"flagged: {', '.join(names)}")))
     clouds = sum(int(np.isfinite(raster.clouds).sum()) for raster in rasters)
     if clouds:
-        label = f"base of the lowest cloud or dense layer, in {clouds} columns"
+        label = f"base of the lowest cloud or dense layer, in {counted(clouds, 'column')}"
         notes.append(f"triangles: {label}")
         handles.append(
             Line2D(
@@ -435,17 +431,17 @@ def _notes(panel: Axes, rasters: Sequence[Raster], far: float, full: float) -> s
             )
         )
     if far < full:
-        notes.append(f"shown to {far / 1e3:.3g} of {full / 1e3:.3g} km: noise prevails beyond")
+        notes.append(f"shown to {far / 1e3:.3g} of {full / 1e3:.3g} km: noise dominates beyond")
     care = share_with_care(rasters)
     if care > 0:
         names = [bit_name(bit) for bit in bits & ~Quality.rejecting()]
-        notes.append(f"use {percent(care)} of bins with care ({', '.join(names)}), as measured")
+        notes.append(f"{percent(care)} of all bins: use with care ({', '.join(names)})")
     if notes[len(handles) :]:
         words = _wrapped("; ".join(notes[len(handles) :]))
         handles.append(Line2D([], [], linestyle="none", label=words))
     if handles:
         legend(panel, handles, columns=1)
-    return "; ".join(notes) or f"all of {full / 1e3:.3g} km"
+    return "; ".join(notes) or f"shown to its full range of {full / 1e3:.3g} km"
 
 
 def _wrapped(words: str) -> str:
@@ -455,7 +451,7 @@ def _wrapped(words: str) -> str:
 def _altitude_axis(panel: Axes, rasters: Sequence[Raster]) -> None:
     lines = {raster.altitude for raster in rasters}
     line = lines.pop() if len(lines) == 1 else None
-    # Along a nearly horizontal beam altitude is no scale for range.
+    # Along a nearly horizontal beam, altitude is not a useful axis.
     if line is None or abs(line[1]) < 0.05:
         return
     start, slope = line[0] / 1e3, line[1]
@@ -470,13 +466,11 @@ def _altitude_axis(panel: Axes, rasters: Sequence[Raster]) -> None:
 
 
 def background(panel: Axes, axis: TimeAxis, rasters: Sequence[Raster]) -> None:
-    """Draw the background of rasters against time, with its standard error."""
+    """Draw the background against time with its standard error."""
     _calm(panel)
     panel.set_ylabel(f"background\n({rasters[0].background_units})")
-    start = np.concatenate([raster.start for raster in rasters])
-    stop = np.concatenate([raster.stop for raster in rasters])
-    order = np.argsort(start, kind="stable")
-    middle = (start + (stop - start) / 2)[order]
+    order = np.argsort(np.concatenate([raster.start for raster in rasters]), kind="stable")
+    middle = np.concatenate([raster.middle for raster in rasters])[order]
     level = np.concatenate([raster.background for raster in rasters])[order]
     spread = np.concatenate([raster.background_error for raster in rasters])[order]
     x, value, error = _with_gaps(middle, axis, level, spread)

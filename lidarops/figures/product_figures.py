@@ -1,8 +1,7 @@
-"""Figures of products.
+"""Figures of products of all kinds, and their conversion to PNG files.
 
-They are built from `matplotlib.figure.Figure` directly, so that no global state of matplotlib
-is changed and any thread may draw. Times are UTC, and every figure says in words what it
-shows: `alt_text`.
+Figures are built from `matplotlib.figure.Figure` directly, without the global state of matplotlib,
+so that any thread may draw. Times are UTC. `alt_text` describes a figure in words.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from matplotlib.figure import Figure
 
 from lidarops.figures import panels, profile_panels, scan_panels
 from lidarops.figures.profile_data import Profile
-from lidarops.figures.raster import COLUMNS, Raster, read_raster
-from lidarops.figures.scan_data import ScanProfile, ScanResiduals, read_extinction
+from lidarops.figures.raster import Raster, read_raster
+from lidarops.figures.scan_data import ScanProfile, ScanResiduals
 from lidarops.figures.series_data import QUANTITIES, Section, compare, join, read_sections
 from lidarops.figures.time_axis import Times, time_axis
 from lidarops.figures.wording import bit_name, counted, percent, visible
@@ -30,53 +29,20 @@ from lidarops.flags import Quality, Severity
 DPI: Final = 150
 
 
-def retrieval(
-    products: Sequence[xr.Dataset],
-    truth: xr.Dataset | None = None,
-    *,
-    title: str = "",
-    instrument: str = "",
-    channel: str = "",
-) -> Figure:
-    """Draw extinction and background of homogeneous products against time.
-
-    Parameters
-    ----------
-    products : sequence of Dataset
-        Kind ``homogeneous``, of one instrument and channel, at least one profile in all.
-    truth : Dataset, optional
-        Of a simulated campaign.
-    title : str, optional
-    instrument, channel : str, optional
-        Whose truth to draw.
-
-    Returns
-    -------
-    Figure
-        Unflagged values with 1-sigma bars or band for every section, flagged ones as hollow
-        grey crosses, the truth in black. Extinction in km-1. `alt_text` describes it.
-
-    Raises
-    ------
-    ProductError
-        Where a product is not of this kind.
-    """
-    sections = [
-        section
-        for product in products
-        for section in read_sections(product, truth, instrument=instrument, channel=channel)
-    ]
-    return draw_retrieval(join(sections), title=title)
-
-
 def draw_retrieval(sections: Sequence[Section], *, title: str = "") -> Figure:
-    """Draw extinction and background of joined sections; see `retrieval`.
+    """Draw retrieved extinction and background of sections against time.
 
     Parameters
     ----------
     sections : sequence of Section
-        One to `panels.SECTIONS`, of one instrument and channel.
+        One to `panels.SECTIONS`, of one instrument and channel, joined in time.
     title : str, optional
+
+    Returns
+    -------
+    Figure
+        Unflagged values of each section with 1-sigma bars or a band, rejected values as hollow
+        grey crosses, the truth as a black dashed line. Extinction in km-1.
     """
     axis = time_axis(_times(sections))
     figure, (upper, lower) = _stack((3.0, 2.2), title)
@@ -84,60 +50,31 @@ def draw_retrieval(sections: Sequence[Section], *, title: str = "") -> Figure:
     panels.estimates(lower, axis, sections, "background")
     panels.time_ticks([upper, lower], axis)
     panels.legend(upper)
-    panels.legend(lower, besides=upper)
+    panels.legend(lower, other=upper)
     words = f"{title}: retrieved extinction and background against time."
     return _described(figure, f"{words} {_retrieved(sections)}.")
 
 
-def truth_comparison(
-    products: Sequence[xr.Dataset],
-    truth: xr.Dataset,
-    *,
-    title: str = "",
-    instrument: str = "",
-    channel: str = "",
-) -> Figure:
+def draw_comparison(sections: Sequence[Section], *, title: str = "") -> Figure:
     """Draw (retrieved - truth) / standard error of unflagged values against time.
 
     Parameters
     ----------
-    products, truth, title, instrument, channel
-        As in `retrieval`.
+    sections : sequence of Section
+        One to `panels.SECTIONS`, of one instrument and channel, joined in time.
+    title : str, optional
 
     Returns
     -------
     Figure
-        One panel for every quantity with a truth, with lines at +-3 and the share of values
-        within.
-
-    Raises
-    ------
-    ProductError
-        Where a product is not of this kind.
-    """
-    sections = [
-        section
-        for product in products
-        for section in read_sections(product, truth, instrument=instrument, channel=channel)
-    ]
-    return draw_comparison(join(sections), title=title)
-
-
-def draw_comparison(sections: Sequence[Section], *, title: str = "") -> Figure:
-    """Draw normalised errors of joined sections; see `truth_comparison`.
-
-    Parameters
-    ----------
-    sections : sequence of Section
-        One to `panels.SECTIONS`, of one instrument and channel.
-    title : str, optional
+        One panel per quantity with a truth, with lines at +-3 and the share of values within.
     """
     axis = time_axis(_times(sections))
-    found = {
+    comparisons = {
         name: [c for section in sections if (c := compare(section, name)) is not None]
         for name in QUANTITIES
     }
-    known = [name for name in QUANTITIES if found[name]] or ["extinction"]
+    known = [name for name in QUANTITIES if comparisons[name]] or ["extinction"]
     figure, stack = _stack((1.9,) * len(known), title)
     for panel, quantity in zip(stack, known, strict=True):
         panels.scores(panel, axis, sections, quantity)
@@ -145,7 +82,7 @@ def draw_comparison(sections: Sequence[Section], *, title: str = "") -> Figure:
     words = [
         f"{c.quantity} {c.section}: {percent(c.within_3)} of {c.count} within 3 standard errors"
         for name in known
-        for c in found[name]
+        for c in comparisons[name]
     ]
     text = "; ".join(words) or "no unflagged value has a truth"
     return _described(
@@ -153,32 +90,21 @@ def draw_comparison(sections: Sequence[Section], *, title: str = "") -> Figure:
     )
 
 
-def quicklook(products: Sequence[xr.Dataset], *, title: str = "") -> Figure:
-    """Draw the range-corrected signal against time and range, and the background beneath.
+def draw_quicklook(rasters: Sequence[Raster], *, title: str = "") -> Figure:
+    """Draw the range-corrected signal against time and range, and the background below.
 
     Parameters
     ----------
-    products : sequence of Dataset
-        Kind ``signal``, of one instrument and channel; may be lazy.
+    rasters : sequence of Raster
+        At least one, of one instrument and channel.
     title : str, optional
 
     Returns
     -------
     Figure
-        Block means on a logarithmic colour scale, to the range where the signal drowns in
-        noise; rejected bins black, gaps white.
-
-    Raises
-    ------
-    ProductError
-        Where a product is not of this kind.
+        Block means on a logarithmic colour scale, up to the range where noise dominates. Rejected
+        bins are black, gaps white.
     """
-    profiles = -(-sum(product.sizes.get("time", 0) for product in products) // COLUMNS)
-    return draw_quicklook([read_raster(p, profiles=profiles) for p in products], title=title)
-
-
-def draw_quicklook(rasters: Sequence[Raster], *, title: str = "") -> Figure:
-    """Draw rasters of one instrument and channel, at least one; see `quicklook`."""
     figure, (upper, lower) = _stack((3.9, 1.2), title)
     axis = time_axis(_middles(rasters))
     words = panels.image(figure, upper, axis, rasters)
@@ -189,31 +115,8 @@ def draw_quicklook(rasters: Sequence[Raster], *, title: str = "") -> Figure:
     )
 
 
-def backscatter_quicklook(products: Sequence[xr.Dataset], *, title: str = "") -> Figure:
-    """Draw attenuated backscatter against time and range, with clouds, and the background.
-
-    Parameters
-    ----------
-    products : sequence of Dataset
-        Kind ``elastic``, of one instrument and channel; may be lazy.
-    title : str, optional
-
-    Returns
-    -------
-    Figure
-        As `quicklook`, with a triangle at the base of the lowest cloud.
-
-    Raises
-    ------
-    ProductError
-        Where a product is not of this kind.
-    """
-    rasters = [read_raster(p, quantity="attenuated_backscatter") for p in products]
-    return draw_backscatter(rasters, title=title)
-
-
 def draw_backscatter(rasters: Sequence[Raster], *, title: str = "") -> Figure:
-    """Draw rasters of attenuated backscatter; see `backscatter_quicklook`."""
+    """Draw attenuated backscatter as `draw_quicklook`, with triangles at the lowest cloud bases."""
     figure, (upper, lower) = _stack((3.9, 1.2), title)
     axis = time_axis(_middles(rasters))
     words = panels.image(figure, upper, axis, rasters, "attenuated\nbackscatter")
@@ -225,7 +128,7 @@ def draw_backscatter(rasters: Sequence[Raster], *, title: str = "") -> Figure:
 
 
 def error_budget_figure(profile: Profile, *, title: str = "") -> Figure:
-    """Draw one mean profile of backscatter, and what its error is made of.
+    """Draw a mean backscatter profile and its error budget.
 
     Parameters
     ----------
@@ -249,7 +152,7 @@ def error_budget_figure(profile: Profile, *, title: str = "") -> Figure:
     return _described(
         figure,
         f"{title}: backscatter of particles against range at {moment} with its standard error,"
-        f" and the errors by noise, background, reference, lidar ratio and molecules. Reference"
+        f" and the errors from noise, background, reference, lidar ratio and molecules. Reference"
         f" window {bottom:.3g} to {top:.3g} km.",
     )
 
@@ -266,8 +169,9 @@ def scan_profile(profile: ScanProfile, *, title: str = "") -> Figure:
     Returns
     -------
     Figure
-        With 1-sigma bands, and lighter ones to which the largest error by a horizontal gradient
-        is added; flagged values marked, the reach as a line, the truth in black dashes.
+        With 1-sigma bands, lighter bands that include the largest error from a horizontal
+        gradient, marks at flagged values, a line at the reach, and the truth as a black dashed
+        line.
     """
     figure = Figure(figsize=(10.0, 5.8), dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -277,16 +181,16 @@ def scan_profile(profile: ScanProfile, *, title: str = "") -> Figure:
     scan_panels.against_altitude(right, profile, "extinction")
     left.set_ylabel("altitude (km)")
     panels.legend(left, columns=2)
-    panels.legend(right, columns=2, besides=left)
+    panels.legend(right, columns=2, other=left)
     return _described(
         figure,
         f"{title}: optical depth and extinction against altitude at {moment}, with standard"
-        f" errors and the largest errors by a horizontal gradient. {_scanned(profile)}.",
+        f" errors and the largest errors from a horizontal gradient. {_scanned(profile)}.",
     )
 
 
 def scan_residuals(residuals: ScanResiduals, *, title: str = "") -> Figure:
-    """Draw what the fit over angles leaves, against beam and altitude.
+    """Draw the residuals of the fit over zenith angles against beam and altitude.
 
     Parameters
     ----------
@@ -297,8 +201,9 @@ def scan_residuals(residuals: ScanResiduals, *, title: str = "") -> Figure:
     Returns
     -------
     Figure
-        Means over cycles on a diverging colour scale around 0, and beneath, the root mean
-        square by beam. Air in level layers leaves neither pattern nor sides that differ.
+        Means over cycles on a diverging colour scale around 0; below, the root mean square by
+        beam. For horizontally homogeneous air there is no pattern and no difference between the
+        sides.
     """
     figure, (upper, lower) = _stack((3.9, 1.5), title)
     limit = scan_panels.residual_map(figure, upper, residuals)
@@ -315,31 +220,8 @@ def scan_residuals(residuals: ScanResiduals, *, title: str = "") -> Figure:
     )
 
 
-def extinction_quicklook(products: Sequence[xr.Dataset], *, title: str = "") -> Figure:
-    """Draw the extinction of multi-angle products against time and altitude.
-
-    Parameters
-    ----------
-    products : sequence of Dataset
-        Kind ``multiangle``, of one instrument and channel; may be lazy.
-    title : str, optional
-
-    Returns
-    -------
-    Figure
-        As `quicklook`, without a background.
-
-    Raises
-    ------
-    ProductError
-        Where a product is not of this kind.
-    """
-    profiles = -(-sum(product.sizes.get("time", 0) for product in products) // COLUMNS)
-    return draw_extinction([read_extinction(p, profiles=profiles) for p in products], title=title)
-
-
 def draw_extinction(rasters: Sequence[Raster], *, title: str = "") -> Figure:
-    """Draw rasters of extinction, at least one; see `extinction_quicklook`."""
+    """Draw the extinction of scans against time and altitude as `draw_quicklook`."""
     figure, (panel,) = _stack((3.9,), title)
     axis = time_axis(_middles(rasters))
     words = panels.image(figure, panel, axis, rasters, "extinction")
@@ -361,7 +243,7 @@ def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str 
     Returns
     -------
     Figure
-        A table of percentages, shaded; only bits that occur.
+        A shaded table of percentages; only bits that occur.
     """
     bits = [bit for bit in Quality if any(share.get(bit, 0.0) > 0 for share in shares.values())]
     labels = [" ".join(visible(label).split()) for label in shares]
@@ -383,7 +265,7 @@ def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str 
     panel.set_yticks(range(len(labels)), labels, fontsize=9, parse_math=False)
     panel.tick_params(length=0)
     panel.spines[:].set_visible(False)
-    panel.set_xlabel("share of values; bits with * ask for care, the others reject")
+    panel.set_xlabel("share of values; bits with *: use with care, others: do not use")
     row, column = np.unravel_index(int(values.argmax()), values.shape)
     return _described(
         figure,
@@ -406,11 +288,11 @@ def overview(
     homogeneous : Dataset
         Product of kind ``homogeneous``; join the products of several scenes along time.
     truth : Dataset or None
-        Of a simulated campaign.
+        Truth of a simulated campaign.
     signal : Dataset or None
-        Product of kind ``signal`` of any instrument; the second panel is left out where None.
+        Product of kind ``signal`` of any instrument; without it, there is no second panel.
     instrument : str, optional
-        Whose truth to draw.
+        Instrument, to select its truth.
 
     Returns
     -------
@@ -420,11 +302,11 @@ def overview(
     Raises
     ------
     ProductError
-        Where a product is not of its kind.
+        If a product is not of its kind.
     """
     sections = join(read_sections(homogeneous, truth, instrument=instrument))[: panels.SECTIONS]
     rasters = [] if signal is None else [read_raster(signal)]
-    # 120 dots per inch suit the smaller text around a figure on a page.
+    # 120 dots per inch, because the figure is shown smaller than in a report.
     figure = Figure(figsize=(10.0, 5.0), dpi=120, layout="constrained")
     stack = list(figure.subplots(1 + len(rasters), 1, sharex=True, squeeze=False)[:, 0])
     axis = time_axis(np.union1d(_times(sections), _middles(rasters)))
@@ -432,33 +314,33 @@ def overview(
     panels.legend(stack[0], columns=4)
     words = f"Retrieved extinction against time. {_retrieved(sections)}."
     if rasters:
-        seen = panels.image(figure, stack[1], axis, rasters)
-        words = f"{words} Below, the range-corrected signal against time and range. {seen}."
+        description = panels.image(figure, stack[1], axis, rasters)
+        words = f"{words} Below, range-corrected signal against time and range. {description}."
     panels.time_ticks(stack, axis)
     return _described(figure, words)
 
 
 @dataclass(frozen=True, slots=True)
 class Sketch:
-    """A figure that is still to be drawn; goes to another process, so all of it can be pickled."""
+    """A figure to draw. Can be pickled, for another process."""
 
     draw: Callable[..., Figure]
-    """Called with what is to be seen, and the title."""
-    of: object
+    """Called with the content and the title."""
+    content: object
     title: str
 
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
-    """A figure as a file."""
+    """A figure as a PNG file with its description."""
 
     png: bytes
     alt: str
-    """What it shows, in words."""
+    """Description in words."""
 
 
 def render(figure: Figure) -> Rendered:
-    """Return a figure of this module as PNG with its words; equal figures give equal bytes."""
+    """Convert a figure to PNG with its description; equal figures give equal bytes."""
     buffer = io.BytesIO()
     alt = alt_text(figure)
     FigureCanvasAgg(figure)
@@ -466,19 +348,19 @@ def render(figure: Figure) -> Rendered:
         buffer,
         format="png",
         metadata={"Software": None, "Description": alt},
-        # To make the files smaller by another 4 % takes a twelfth of the time to draw them.
+        # Higher levels save at most 4 % of size and cost 8 % of the drawing time.
         pil_kwargs={"compress_level": 3},
     )
     return Rendered(buffer.getvalue(), alt)
 
 
 def draw_figure(_: object, sketch: Sketch) -> Rendered:
-    """Return what comes of a sketch, in whatever process."""
-    return render(sketch.draw(sketch.of, title=sketch.title))
+    """Draw and render a sketch; the first argument (data of the process) is not used."""
+    return render(sketch.draw(sketch.content, title=sketch.title))
 
 
 def alt_text(figure: Figure) -> str:
-    """Return what a figure of this module shows, in words."""
+    """Return the description of a figure in words."""
     return str(figure.get_label())
 
 
@@ -499,7 +381,7 @@ def _times(sections: Sequence[Section]) -> Times:
 
 
 def _middles(rasters: Sequence[Raster]) -> Times:
-    middles = [r.start + (r.stop - r.start) / 2 for r in rasters]
+    middles = [raster.middle for raster in rasters]
     return np.unique(np.concatenate([*middles, np.array([], dtype="datetime64[ns]")]))
 
 
@@ -517,12 +399,12 @@ def _retrieved(sections: Sequence[Section]) -> str:
 def _scanned(profile: ScanProfile) -> str:
     values = profile.estimates["extinction"].value
     known = 1e3 * values[np.isfinite(values)]
-    span = f"{known.min():.3g} to {known.max():.3g} per km" if known.size else "none to use"
+    span = f"{known.min():.3g} to {known.max():.3g} per km" if known.size else "no usable value"
     flagged, bits = int((profile.flag != 0).sum()), scan_panels.bits_in_words(profile)
     words = [f"extinction {span}", f"{flagged} of {profile.flag.size} altitudes flagged"]
     words[-1] += f" ({bits})" if bits else ""
     if np.isfinite(profile.reach):
         words.append(f"reach {profile.reach / 1e3:.3g} km")
     if profile.truth is not None:
-        words.append("with the truth of the simulation")
+        words.append("with the simulated truth")
     return "; ".join(words)

@@ -1,4 +1,4 @@
-"""Profiles of elastic products: what is drawn of one, and which one."""
+"""The backscatter profile of an elastic product that is drawn, with its error budget."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarops.flags import Quality, Severity
 Floats = NDArray[np.float64]
 
 CAUSES: Final = ("noise", "background", "reference", "lidar_ratio", "molecular")
-"""Of the errors of backscatter, as in the names of variables."""
+"""Causes of backscatter errors, as in the names of variables."""
 
 _ALONG_TIME: Final = ("time", "reference_bottom", "reference_top")
 _ALONG_BOTH: Final = (
@@ -31,16 +31,16 @@ PROFILE_VARIABLES: Final = (
     "lidar_ratio",
     *_ALONG_BOTH,
 )
-"""What `clearest_profile` reads of a product."""
+"""Variables that `clearest_profile` needs."""
 _REJECTED: Final = int(Quality.rejecting())
 _WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
 _BEYOND: Final = 1.15
-"""Times the top of the reference window, to which a profile is shown."""
+"""A profile is shown to this many times the top of its reference window."""
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One mean profile of backscatter, with its error budget, to just beyond the reference."""
+    """A mean backscatter profile with its error budget, to just beyond the reference."""
 
     time: np.datetime64
     """UTC."""
@@ -50,7 +50,7 @@ class Profile:
     """m-1 sr-1; NaN where rejected."""
     standard_error: Floats
     budget: dict[str, Floats]
-    """Absolute error by each of `CAUSES`, m-1 sr-1."""
+    """Absolute error from each of `CAUSES`, m-1 sr-1."""
     molecular: Floats
     """m-1 sr-1."""
     with_care: NDArray[np.bool_]
@@ -61,7 +61,7 @@ class Profile:
 
 
 def clearest_profile(product: xr.Dataset) -> Profile | None:
-    """Return the profile with most bins that no bit speaks against, up to its reference.
+    """Return the profile with the most unflagged bins below its reference.
 
     Parameters
     ----------
@@ -71,12 +71,12 @@ def clearest_profile(product: xr.Dataset) -> Profile | None:
     Returns
     -------
     Profile or None
-        The first of equals; None where no profile has a reference.
+        The first among equals; None if no profile has a reference and an unflagged bin.
 
     Raises
     ------
     ProductError
-        Where a variable is missing or has other dims.
+        If a variable is missing or has other dimensions.
     """
     require(
         product,
@@ -93,13 +93,12 @@ def clearest_profile(product: xr.Dataset) -> Profile | None:
         return None
     index = int(np.argmax(clear))
     shown = r <= _BEYOND * top[index]
-    chosen = product.isel(time=index, range=shown)
+    profile = product.isel(time=index, range=shown)
     bits = flag[index, shown]
     rejected = (bits & _REJECTED) != 0
 
     def values(name: str) -> Floats:
-        found = chosen[name].values.astype(np.float64)
-        return np.where(rejected, np.nan, found)
+        return np.where(rejected, np.nan, profile[name].values.astype(np.float64))
 
     return Profile(
         time=product["time"].values.astype("datetime64[ns]")[index],
@@ -107,8 +106,8 @@ def clearest_profile(product: xr.Dataset) -> Profile | None:
         backscatter=values("backscatter"),
         standard_error=values("backscatter_standard_error"),
         budget={cause: np.abs(values(f"backscatter_error_{cause}")) for cause in CAUSES},
-        molecular=chosen["molecular_backscatter"].values.astype(np.float64),
+        molecular=profile["molecular_backscatter"].values.astype(np.float64),
         with_care=(bits & _WITH_CARE) != 0,
-        reference=(float(chosen["reference_bottom"]), float(top[index])),
-        lidar_ratio=float(chosen["lidar_ratio"]),
+        reference=(float(profile["reference_bottom"]), float(top[index])),
+        lidar_ratio=float(profile["lidar_ratio"]),
     )

@@ -1,4 +1,4 @@
-"""Panels of one mean profile against range: backscatter, and what its error is made of."""
+"""Panels of a mean profile against range: backscatter and its error budget."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _UNITS: Final = "Mm$^{-1}$ sr$^{-1}$"
 
 
 def backscatter(panel: Axes, profile: Profile) -> None:
-    """Draw backscatter of particles with its standard error, and that of molecules."""
+    """Draw particle backscatter with its standard error, and molecular backscatter."""
     _against_range(panel, profile)
     r = profile.range / 1e3
     value, error = _MEGA * profile.backscatter, _MEGA * profile.standard_error
@@ -47,7 +47,7 @@ def backscatter(panel: Axes, profile: Profile) -> None:
     panel.axvline(0.0, color=INK, linewidth=0.8)
     inside = value[np.isfinite(value)]
     if inside.size:
-        # A few noisy bins must not shrink what is seen of the others.
+        # Percentiles, so that a few noisy bins do not set the axis.
         low, high = np.percentile(inside, [0.5, 99.5])
         margin = 0.15 * max(high - low, 0.1 * high)
         panel.set_xlim(low - margin, high + margin)
@@ -56,7 +56,7 @@ def backscatter(panel: Axes, profile: Profile) -> None:
 
 
 def error_budget_panels(panel: Axes, profile: Profile) -> None:
-    """Draw the error by each cause, and the standard error that they add up to."""
+    """Draw the error from each cause, and the total standard error."""
     _against_range(panel, profile)
     r = profile.range / 1e3
     for cause, values in profile.budget.items():

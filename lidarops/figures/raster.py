@@ -1,4 +1,7 @@
-"""Signals and backscatter as images small enough to draw, read in blocks of bounded memory."""
+"""Images of signals, backscatter and extinction: block means over time and range.
+
+Products are read in blocks of bounded memory.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +16,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
-from lidarops.figures.series_data import require
+from lidarops.figures.series_data import quality_bits, require
 from lidarops.figures.time_axis import Times, segments, usual_step
 from lidarops.flags import Quality, Severity
 
 Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
-"""Sums are taken in double precision and kept in single: an image needs no more."""
+"""Sums are computed in double and kept in single precision, enough for an image."""
 
 COLUMNS: Final = 1500
-"""Most columns of an image: about the pixels of a figure's width."""
+"""Most columns of an image: about the width of a figure in pixels."""
 ROWS: Final = 800
 """Most rows of an image."""
 _ALONG_TIME: Final = ("time", "background", "background_standard_error")
@@ -38,13 +41,15 @@ _COLUMNWISE: Final = (
     "background_error",
     "clouds",
 )
-"""What a raster has along its columns."""
+"""Fields of a raster along its columns."""
 _READ_ROWS: Final = 4096
-"""Most rows while reading: the part that is shown is known only afterwards."""
+"""Most rows while reading, because the range to show is known only afterwards."""
 _READ_BYTES: Final = 48_000_000
-"""Bound on what is held in memory of one variable."""
+"""Most bytes of one variable in memory."""
 _VISIBLE: Final = 1.0
-"""The signal reaches as far as its median exceeds this many standard errors."""
+"""The reach of a signal ends where its median falls below this many standard errors."""
+_DECADES: Final = 4.0
+"""Most decades of a colour scale."""
 
 _REJECTED: Final = int(Quality.rejecting() & ~Quality.INPUT_MISSING)
 _WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
@@ -54,67 +59,72 @@ _WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.C
 class Raster:
     """A quantity of a product reduced to block means over time and range.
 
-    Sums are kept, not means, so that rows can be merged further without loss.
+    It keeps sums instead of means, so that rows can be merged without loss.
     """
 
     start: Times
-    """(column,) Where each column starts, UTC."""
+    """(column,) Start of each column, UTC."""
     stop: Times
-    """(column,) Where each column ends."""
+    """(column,) End of each column."""
     edges: Floats
     """(row + 1,) Edges of the rows along range, m."""
     total: Sums
-    """(column, row) Sum of the quantity over bins that are not rejected."""
+    """(column, row) Sum of the quantity over usable bins."""
     variance: Sums
     """(column, row) Variance of that sum."""
     used: Sums
-    """(column, row) Number of those bins."""
+    """(column, row) Number of usable bins."""
     rejected: Sums
-    """(column, row) Number of bins that a quality bit rejects, missing data aside."""
+    """(column, row) Number of bins that a quality bit rejects, without missing data."""
     with_care: int
-    """Number of bins in all to use with care."""
+    """Total number of bins to use with care."""
     bins: Floats
     """(row,) Number of bins along range in a row."""
     profiles: NDArray[np.int64]
     """(column,) Number of profiles in a column."""
     background: Floats
-    """(column,) Mean."""
+    """(column,) Mean background."""
     background_error: Floats
     """(column,) Standard error of that mean."""
     clouds: Floats
-    """(column,) Range of the lowest cloud base, m; NaN where there is none."""
+    """(column,) Range of the lowest cloud base, m; NaN without a cloud."""
     units: str
     background_units: str
     bits: Quality
-    """Every bit that a bin carries."""
+    """All bits that any bin carries."""
     altitude: tuple[float, float] | None
-    """Altitude at range 0 in m and its change per m of range, where the product has it."""
+    """Altitude at range 0 in m, and its change per m of range; None if unknown."""
+
+    @property
+    def middle(self) -> Times:
+        """(column,) Middle of each column, UTC."""
+        return np.asarray(self.start + (self.stop - self.start) / 2)
 
     @property
     def mean(self) -> Floats:
-        """(column, row) Mean signal; NaN where no bin can be used."""
+        """(column, row) Mean over usable bins; NaN without any."""
         return np.where(self.used > 0, self.total / np.maximum(self.used, 1), np.nan)
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
-        """(column, row) Whether at least half of the bins of the block are rejected."""
+        """(column, row) Whether at least half of the bins of a block are rejected."""
         blocks = self.profiles[:, None] * self.bins[None, :]
         return np.asarray((self.rejected > 0) & (2 * self.rejected >= blocks))
 
     @property
     def reach(self) -> float:
-        """Range to which the signal stands out from its noise, m; 0 where it never does."""
+        """Range up to which the signal exceeds its noise, m; 0 if it never does."""
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.where(self.used > 0, self.total / np.sqrt(self.variance), 0.0)
         ratio = np.where(np.isfinite(ratio), ratio, 0.0)
         width = min(25, ratio.shape[1])
-        # The running mean along range keeps a single noisy row from being taken for signal.
+        # Smoothed along range, so that a single noisy row does not count as signal.
         smooth = np.convolve(np.median(ratio, axis=0), np.full(width, 1.0 / width), mode="same")
         rows = np.flatnonzero(smooth > _VISIBLE)
         return float(self.edges[rows[-1] + 1]) if rows.size else 0.0
 
     def shown_to(self, far: float) -> Raster:
-        """Return the rows up to `far` m, merged to at most `ROWS` of them."""
+        """Return the rows up to `far` (m), merged to at most `ROWS` rows."""
         rows = int(np.clip(np.searchsorted(self.edges, far), 1, self.edges.size - 1))
         starts = np.arange(0, rows, -(-rows // ROWS))
 
@@ -143,7 +153,7 @@ class Raster:
 
 
 def raster_variables(quantity: str = "signal") -> tuple[str, ...]:
-    """Return the variables that `read_raster` reads, those too that a product need not have."""
+    """Return the variables that `read_raster` reads, including optional ones."""
     return (*_ALONG_TIME, "range", *_along_both(quantity), "cloud_base_range", "altitude")
 
 
@@ -157,12 +167,12 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
     Parameters
     ----------
     product : Dataset
-        Dims (time, range); may be lazy: it is read block by block.
+        Dimensions (time, range); may be lazy, because it is read in blocks.
     quantity : str, optional
-        A variable of the product that has a standard error.
+        A variable of the product with a standard error.
     profiles : int, optional
-        Profiles to a column; as many as give `COLUMNS` columns where 0. Columns never reach
-        across a gap in time.
+        Profiles per column; 0 for about `COLUMNS` columns. Columns do not extend across gaps in
+        time.
 
     Returns
     -------
@@ -172,43 +182,43 @@ def read_raster(product: xr.Dataset, *, quantity: str = "signal", profiles: int 
     Raises
     ------
     ProductError
-        Where a variable is missing or has other dims, or nothing was measured.
+        If a variable is missing or has other dimensions, or the product is empty.
     """
     _check(product, quantity)
     time = product["time"].values.astype("datetime64[ns]")
     if np.any(time[1:] < time[:-1]):
         order = np.argsort(time, kind="stable")
         product, time = product.isel(time=order), time[order]
-    span = product["range"].values.astype(np.float64)
+    ranges = product["range"].values.astype(np.float64)
     size = profiles or -(-time.size // COLUMNS)
     columns = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(time)])
-    rows = np.arange(0, span.size, -(-span.size // _READ_ROWS))
-    parts = list(_reduced(product, quantity, columns, rows))
+    rows = np.arange(0, ranges.size, -(-ranges.size // _READ_ROWS))
+    blocks = list(_reduced(product, quantity, columns, rows))
     background, background_error = _background(product, columns)
     start, stop = _column_edges(time, columns)
     return Raster(
         start=start,
         stop=stop,
-        edges=_row_edges(span, rows),
-        total=np.concatenate([part.total for part in parts]),
-        variance=np.concatenate([part.variance for part in parts]),
-        used=np.concatenate([part.used for part in parts]),
-        rejected=np.concatenate([part.rejected for part in parts]),
-        with_care=sum(part.with_care for part in parts),
-        bins=np.diff([*rows, span.size]).astype(np.float64),
+        edges=bin_edges(ranges)[[*rows, ranges.size]],
+        total=np.concatenate([block.total for block in blocks]),
+        variance=np.concatenate([block.variance for block in blocks]),
+        used=np.concatenate([block.used for block in blocks]),
+        rejected=np.concatenate([block.rejected for block in blocks]),
+        with_care=sum(block.with_care for block in blocks),
+        bins=np.diff([*rows, ranges.size]).astype(np.float64),
         profiles=np.diff([*columns, time.size]),
         background=background,
         background_error=background_error,
         clouds=_clouds(product, columns),
         units=str(product[quantity].attrs.get("units", "")),
         background_units=str(product["background"].attrs.get("units", "")),
-        bits=Quality(int(np.bitwise_or.reduce([part.bits for part in parts]))),
-        altitude=_altitude(product, span),
+        bits=Quality(int(np.bitwise_or.reduce([block.bits for block in blocks]))),
+        altitude=_altitude(product, ranges),
     )
 
 
 def joined(rasters: Sequence[Raster]) -> list[Raster]:
-    """Join rasters that follow one another in time and have the same rows: one is drawn sooner.
+    """Join consecutive rasters with the same rows, because one raster is drawn faster.
 
     Parameters
     ----------
@@ -218,21 +228,20 @@ def joined(rasters: Sequence[Raster]) -> list[Raster]:
     Returns
     -------
     list of Raster
-        With the columns of all in their order. One that starts before another ends is not joined
-        to it.
+        All columns in their order. Rasters that overlap in time are not joined.
     """
-    found: list[list[Raster]] = []
+    groups: list[list[Raster]] = []
     for raster in rasters:
-        last = found[-1][-1] if found else None
+        last = groups[-1][-1] if groups else None
         if (
             last is not None
             and last.stop[-1] <= raster.start[0]
             and np.array_equal(last.edges, raster.edges)
         ):
-            found[-1].append(raster)
+            groups[-1].append(raster)
         else:
-            found.append([raster])
-    return [_joined(following) for following in found]
+            groups.append([raster])
+    return [_joined(group) for group in groups]
 
 
 def _joined(rasters: Sequence[Raster]) -> Raster:
@@ -250,7 +259,9 @@ def _joined(rasters: Sequence[Raster]) -> Raster:
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
+class _Block:
+    """Sums over a block of columns."""
+
     total: Sums
     variance: Sums
     used: Sums
@@ -261,7 +272,7 @@ class _Part:
 
 def _reduced(
     product: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
-) -> Iterator[_Part]:
+) -> Iterator[_Block]:
     bins = product.sizes["range"]
     edges = [*columns, product.sizes["time"]]
     first = 0
@@ -269,29 +280,29 @@ def _reduced(
         last = first + 1
         while last < columns.size and (edges[last + 1] - edges[first]) * bins * 8 <= _READ_BYTES:
             last += 1
-        part = product.isel(time=slice(int(edges[first]), int(edges[last])))
-        yield _sums(part, quantity, columns[first:last] - edges[first], rows)
+        block = product.isel(time=slice(int(edges[first]), int(edges[last])))
+        yield _sums(block, quantity, columns[first:last] - edges[first], rows)
         first = last
 
 
 def _sums(
-    part: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
-) -> _Part:
+    product: xr.Dataset, quantity: str, columns: NDArray[np.intp], rows: NDArray[np.intp]
+) -> _Block:
     def total(values: Floats | NDArray[np.bool_]) -> Sums:
         if values.dtype == np.bool_ and not values.any():
             return np.zeros((columns.size, rows.size), dtype=np.float32)
         by_row = values.astype(np.float64, copy=False)
-        # Up to as many bins as rows a row is a bin.
+        # With one bin per row there is nothing to add.
         if rows.size < values.shape[1]:
             by_row = np.add.reduceat(by_row, rows, axis=1)
         return np.asarray(np.add.reduceat(by_row, columns, axis=0), dtype=np.float32)
 
-    signal = part[quantity].values.astype(np.float64)
-    error = part[f"{quantity}_standard_error"].values.astype(np.float64)
-    flag = _flags(part)
+    signal = product[quantity].values.astype(np.float64)
+    error = product[f"{quantity}_standard_error"].values.astype(np.float64)
+    flag = quality_bits(product["quality_flag"])
     rejected = (flag & _REJECTED) != 0
     good = np.isfinite(signal) & ~rejected & ((flag & int(Quality.INPUT_MISSING)) == 0)
-    return _Part(
+    return _Block(
         total=total(np.where(good, signal, 0.0)),
         variance=total(np.where(good, error, 0.0) ** 2),
         used=total(good),
@@ -301,13 +312,6 @@ def _sums(
     )
 
 
-def _flags(part: xr.Dataset) -> NDArray[np.int64]:
-    values = part["quality_flag"].values
-    if values.dtype.kind == "f":
-        values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
-    return np.asarray(values, dtype=np.int64)
-
-
 def _background(product: xr.Dataset, columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
     value = product["background"].values.astype(np.float64)
     error = product["background_standard_error"].values.astype(np.float64)
@@ -315,9 +319,9 @@ def _background(product: xr.Dataset, columns: NDArray[np.intp]) -> tuple[Floats,
     count = np.add.reduceat(good.astype(np.float64), columns)
     total = np.add.reduceat(np.where(good, value, 0.0), columns)
     variance = np.add.reduceat(np.where(good, error, 0.0) ** 2, columns)
-    some = np.maximum(count, 1)
-    none = np.where(count > 0, 0.0, np.nan)
-    return total / some + none, np.sqrt(variance) / some + none
+    divisor = np.maximum(count, 1)
+    missing = np.where(count > 0, 0.0, np.nan)
+    return total / divisor + missing, np.sqrt(variance) / divisor + missing
 
 
 def _clouds(product: xr.Dataset, columns: NDArray[np.intp]) -> Floats:
@@ -329,7 +333,7 @@ def _clouds(product: xr.Dataset, columns: NDArray[np.intp]) -> Floats:
 
 
 def _column_edges(time: Times, columns: NDArray[np.intp]) -> tuple[Times, Times]:
-    """Let neighbouring columns touch, and give the last before a gap its usual width."""
+    """Return edges at which neighbouring columns touch; before a gap a column keeps its width."""
     half = usual_step(time) / 2
     last = np.append(columns[1:], time.size) - 1
     start, stop = time[columns] - half, time[last] + half
@@ -341,30 +345,40 @@ def _column_edges(time: Times, columns: NDArray[np.intp]) -> tuple[Times, Times]
     return start, stop
 
 
-def _row_edges(span: Floats, rows: NDArray[np.intp]) -> Floats:
-    middles = 0.5 * (span[1:] + span[:-1])
-    ends = [1.5 * span[0] - 0.5 * span[1], 1.5 * span[-1] - 0.5 * span[-2]]
-    bins = np.concatenate([ends[:1], middles, ends[1:]])
-    return np.asarray(bins[[*rows, span.size]])
+def bin_edges(middles: Floats) -> Floats:
+    """Return the edges of bins, half way between the given middles; at least two bins."""
+    between = 0.5 * (middles[1:] + middles[:-1])
+    ends = [1.5 * middles[0] - 0.5 * middles[1], 1.5 * middles[-1] - 0.5 * middles[-2]]
+    return np.concatenate([ends[:1], between, ends[1:]])
 
 
-def _altitude(product: xr.Dataset, span: Floats) -> tuple[float, float] | None:
+def _altitude(product: xr.Dataset, ranges: Floats) -> tuple[float, float] | None:
     if "altitude" not in product.variables or product["altitude"].dims != ("range",):
         return None
     values = product["altitude"].values.astype(np.float64)
-    slope = (values[-1] - values[0]) / (span[-1] - span[0])
-    return float(values[0] - slope * span[0]), float(slope)
+    slope = (values[-1] - values[0]) / (ranges[-1] - ranges[0])
+    return float(values[0] - slope * ranges[0]), float(slope)
 
 
 def _check(product: xr.Dataset, quantity: str) -> None:
-    wanted: dict[str, tuple[str, ...]] = dict.fromkeys(_ALONG_TIME, ("time",))
-    wanted |= {"range": ("range",)} | dict.fromkeys(_along_both(quantity), ("time", "range"))
-    require(product, wanted)
+    dims: dict[str, tuple[str, ...]] = dict.fromkeys(_ALONG_TIME, ("time",))
+    dims |= {"range": ("range",)} | dict.fromkeys(_along_both(quantity), ("time", "range"))
+    require(product, dims)
     if product.sizes["time"] < 1 or product.sizes["range"] < 2:
         raise ProductError("holds no profile of at least 2 bins", field=quantity)
 
 
 def share_with_care(rasters: Sequence[Raster]) -> float:
-    """Return the share of bins that are to be used with care."""
+    """Return the share of bins to use with care."""
     bins = sum(float((r.profiles[:, None] * r.bins).sum()) for r in rasters)
     return sum(raster.with_care for raster in rasters) / bins if bins else 0.0
+
+
+def colour_limits(values: Floats) -> tuple[float, float] | None:
+    """Return the ends of a logarithmic colour scale for `values`; None if none is positive."""
+    positive = values[np.isfinite(values) & (values > 0)]
+    if positive.size == 0:
+        return None
+    low, high = (float(level) for level in np.percentile(positive, [2.0, 99.8]))
+    low = max(low, high * 10.0**-_DECADES)
+    return low, max(high, 1.05 * low)

@@ -1,7 +1,7 @@
-"""Products read, and figures drawn, for a report: by one process, or several at the same time.
+"""Parallel reading of products and drawing of figures, in one process or several.
 
-What is read is the same, and in the same order, whoever reads it. A product that is missing or
-cannot be read stops nothing: the reason is handed over in place of what it holds.
+Results and their order do not depend on the number of processes. For a product that is missing or
+cannot be read, the result is a `ReadFailure` with the reason.
 """
 
 from __future__ import annotations
@@ -18,48 +18,48 @@ from lidarops.netcdf.read import open_product, profiles_in
 from lidarops.system.processes import Processes
 
 FEWEST: Final = 50
-"""Products that a process must have to read, to be worth its start."""
+"""Fewest products per process for which starting the process pays."""
 UNREADABLE: Final = (OSError, RuntimeError, ValueError, KeyError, IndexError, ProductError)
-"""What opening and reading a damaged or foreign file has been seen to raise."""
+"""Exceptions observed when damaged or foreign files are opened and read."""
 _AT_A_TIME: Final = 8
-"""Products handed to a process together, so that it waits less for the next."""
+"""Products sent to a process together, so that it waits less."""
 _LENGTHS_AT_A_TIME: Final = 32
 
 Item = TypeVar("Item")
-Found = TypeVar("Found")
-_Found_co = TypeVar("_Found_co", covariant=True)
+Content = TypeVar("Content")
+_Content_co = TypeVar("_Content_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
-class Reading(Generic[_Found_co]):
-    """What is to be read of one product; goes to another process, so all of it can be pickled."""
+class ReadTask(Generic[_Content_co]):
+    """A product to read, and how. Can be pickled, for another process."""
 
     path: Path
     names: tuple[str, ...]
-    """Of the variables that are read."""
-    read: Callable[..., _Found_co]
-    """Called with the product, and the truth of a simulation where it is asked for."""
+    """Names of the variables to read."""
+    read: Callable[..., _Content_co]
+    """Called with the product, and with the simulated truth if `with_truth`."""
     with_truth: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Unread:
-    """Why nothing was read of a product."""
+class ReadFailure:
+    """Why a product could not be read."""
 
     reason: str
 
 
 class Readers:
-    """Reads products, by several processes where there are enough products; to be used in a with.
+    """Reads products, in several processes if there are enough products. A context manager.
 
     Parameters
     ----------
     workers : int
-        Most processes; none is started for fewer than 2.
+        Most processes; with fewer than 2, no process is started.
     products : int
-        About how many there are to be read in all.
+        Approximate number of products to read in all.
     truth : xr.Dataset, optional
-        In memory, for the readings that ask for it.
+        In memory, for tasks `with_truth`.
     """
 
     def __init__(
@@ -75,46 +75,46 @@ class Readers:
     def __exit__(self, *error: object) -> None:
         self._processes.__exit__(*error)
 
-    def one(self, reading: Reading[Found]) -> Found | Unread:
+    def read(self, reading: ReadTask[Content]) -> Content | ReadFailure:
         """Read one product, in this process."""
         return _read(self._truth, reading)
 
-    def each(self, readings: Iterable[Reading[Found]]) -> Iterator[Found | Unread]:
-        """Read products; what is found of each, in their order."""
-        for _, found in self._processes.each(_read, readings, at_a_time=_AT_A_TIME):
-            yield found
+    def read_all(self, readings: Iterable[ReadTask[Content]]) -> Iterator[Content | ReadFailure]:
+        """Yield the content of each product, in their order."""
+        for _, content in self._processes.each(_read, readings, at_a_time=_AT_A_TIME):
+            yield content
 
-    def lengths(self, paths: Iterable[Path]) -> Iterator[int | Unread]:
-        """Count the profiles of products, in their order, without reading any."""
-        for _, found in self._processes.each(_length, paths, at_a_time=_LENGTHS_AT_A_TIME):
-            yield found
+    def lengths(self, paths: Iterable[Path]) -> Iterator[int | ReadFailure]:
+        """Yield the number of profiles of each product, in their order, without reading data."""
+        for _, length in self._processes.each(_length, paths, at_a_time=_LENGTHS_AT_A_TIME):
+            yield length
 
-    def later(self, task: Callable[[object, Item], Found], item: Item) -> Callable[[], Found]:
-        """Begin something else; see `lidarops.system.processes.Processes.later`."""
+    def later(self, task: Callable[[object, Item], Content], item: Item) -> Callable[[], Content]:
+        """Start any other task; see `lidarops.system.processes.Processes.later`."""
         return self._processes.later(task, item)
 
     @property
     def processes(self) -> int:
-        """How many processes there may be beside this one."""
+        """Most processes beside this one."""
         return self._processes.number
 
 
-def _read(truth: xr.Dataset | None, reading: Reading[Found]) -> Found | Unread:
+def _read(truth: xr.Dataset | None, reading: ReadTask[Content]) -> Content | ReadFailure:
     try:
         with open_product(reading.path, reading.names) as product:
             return reading.read(product, truth) if reading.with_truth else reading.read(product)
     except UNREADABLE as error:
-        return Unread(reason(reading.path, error))
+        return ReadFailure(reason(reading.path, error))
 
 
-def _length(_: object, path: Path) -> int | Unread:
+def _length(_: object, path: Path) -> int | ReadFailure:
     try:
         return profiles_in(path)
     except UNREADABLE as error:
-        return Unread(reason(path, error))
+        return ReadFailure(reason(path, error))
 
 
 def reason(path: Path, error: BaseException) -> str:
-    """Return the words of an error, without the path that stands beside them."""
+    """Return the message of an error without the path, which is shown beside it."""
     words = str(error).removeprefix(f"{path}: ").replace(str(path), path.name)
     return words or type(error).__name__

@@ -1,4 +1,4 @@
-"""Multi-angle products as plain arrays: what is drawn of one, and the truth beside it."""
+"""Multi-angle products as plain arrays: profiles, residuals and extinction, with the truth."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
-from lidarops.figures.raster import Raster, read_raster
-from lidarops.figures.series_data import require
+from lidarops.figures.raster import Raster, bin_edges, read_raster
+from lidarops.figures.series_data import quality_bits, require
 from lidarops.figures.time_axis import usual_step
 from lidarops.flags import Quality, Severity
 
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 QUANTITIES: Final = ("optical_depth", "extinction")
-"""Retrieved quantities of a profile, by the name of their variable."""
+"""Retrieved quantities of a profile, as the names of their variables."""
 
 _ERRORS: Final = ("", "_standard_error", "_gradient_error")
 _ALONG_BOTH: Final = (
@@ -29,9 +29,9 @@ _ALONG_BOTH: Final = (
 )
 _PROFILES: Final = ("time", "altitude", "reach", *_ALONG_BOTH)
 CYCLE_VARIABLES: Final = (*_PROFILES, "time_bnds", "station_altitude", "wavelength")
-"""What `clearest_cycle` reads of a product."""
+"""Variables that `clearest_cycle` needs."""
 EXTINCTION_VARIABLES: Final = _PROFILES
-"""What `read_extinction` reads of a product."""
+"""Variables that `read_extinction` needs."""
 RESIDUAL_VARIABLES: Final = (
     "time",
     "altitude",
@@ -40,24 +40,24 @@ RESIDUAL_VARIABLES: Final = (
     "quality_flag",
     "residual",
 )
-"""What `read_residuals` reads of a product."""
+"""Variables that `read_residuals` needs."""
 _REJECTED: Final = int(Quality.rejecting())
 _WITH_CARE: Final = int(sum(bit for bit in Quality if bit.severity is Severity.CARE))
 _UNITS: Final = {"optical_depth": "1", "extinction": "m-1"}
 _BEYOND: Final = 1.15
-"""Times the height of the reach above the lowest altitude, to which a profile is shown."""
+"""A profile is shown to this many times the height of its reach above the lowest altitude."""
 _LOWEST_BEAM: Final = 80.0
-"""degree from the zenith: a truth seen closer to the horizon is not taken for a profile."""
-_SAME_COLOUR: Final = 1e-9
-"""m, to which wavelengths of product and truth agree."""
+"""degree from the zenith; a truth along a lower beam is not used as a vertical profile."""
+_SAME_WAVELENGTH: Final = 1e-9
+"""m, largest difference between the wavelengths of product and truth."""
 _PLANE: Final = 5.0
-"""degree between azimuths of one plane."""
+"""degree, largest difference between azimuths of one plane."""
 _UPRIGHT: Final = 0.5
-"""degree from the zenith, below which an azimuth says nothing."""
+"""degree from the zenith, below which an azimuth is meaningless."""
 _MAP_ROWS: Final = 100
 """Most rows of a map of residuals."""
 _READ_BYTES: Final = 48_000_000
-"""Bound on what is held in memory of the residuals."""
+"""Most bytes of residuals in memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,56 +67,55 @@ class ProfileEstimate:
     value: Floats
     """NaN where rejected."""
     rejected: Floats
-    """Values that are not to be used; NaN elsewhere."""
+    """Rejected values; NaN elsewhere."""
     standard_error: Floats
     gradient_error: Floats
-    """Largest systematic error that a horizontal gradient makes."""
+    """Largest systematic error from a horizontal gradient."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrueProfile:
-    """The air on a simulated beam, over level layers."""
+    """True profile along a simulated beam, for level layers."""
 
     time: np.datetime64
     """UTC, of the raw file."""
     zenith_angle: float
-    """degree, of the beam that it was told along."""
+    """degree, of the beam that the truth is given along."""
     edges: Floats
     """(cell + 1,) m, altitude."""
     extinction: Floats
     """(cell,) m-1."""
     optical_depth: Floats
-    """(cell + 1,) From the lidar straight up to each edge."""
+    """(cell + 1,) Vertical optical depth from the lidar to each edge."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanProfile:
-    """The profile of one cycle of a scan, to just beyond its reach."""
+    """The profile of one scan cycle, to just beyond its reach."""
 
     time: np.datetime64
     """UTC."""
     altitude: Floats
     """(altitude,) m."""
     estimates: dict[str, ProfileEstimate]
-    """By each of `QUANTITIES`."""
+    """Estimate of each of `QUANTITIES`."""
     flag: NDArray[np.int64]
     """(altitude,) Bits of `Quality`."""
     reach: float
-    """m, highest altitude with an estimate; NaN where there is none."""
+    """m, highest altitude with an estimate; NaN without one."""
     truth: TrueProfile | None
 
     @property
     def with_care(self) -> Mask:
-        """(altitude,) Whether the value stands, but a bit asks for care."""
+        """(altitude,) Whether the value is usable, but only with care."""
         return np.asarray(((self.flag & _WITH_CARE) != 0) & ((self.flag & _REJECTED) == 0))
 
 
 @dataclass(frozen=True, slots=True)
 class ScanResiduals:
-    """What a fit over angles leaves of the signal, by beam.
+    """Residuals of the fit over zenith angles, by beam.
 
-    Beams stand in the order of the sky: plane by plane, and in a plane from one horizon over the
-    zenith to the other.
+    Beams are sorted by plane, and within a plane from one horizon over the zenith to the other.
     """
 
     zenith_angle: Floats
@@ -124,51 +123,51 @@ class ScanResiduals:
     plane: NDArray[np.intp]
     """(beam,) Index of its plane."""
     azimuths: tuple[float, ...]
-    """(plane,) degree, of the positive side; NaN for beams whose azimuth is not known."""
+    """(plane,) degree, of the positive side; NaN for beams of unknown azimuth."""
     edges: Floats
     """(row + 1,) m, altitude."""
     mean: Floats
-    """(row, beam) Mean residual over cycles and the altitudes of a row, per cent of the signal."""
+    """(row, beam) Mean residual over cycles and the altitudes of a row, percent of the signal."""
     count: Floats
-    """(row, beam) Number of residuals in that mean."""
+    """(row, beam) Number of residuals in the mean."""
     rms: Floats
-    """(beam,) Root mean square over cycles and altitudes, per cent."""
+    """(beam,) Root mean square over cycles and altitudes, percent."""
     rms_of_mean: Floats
-    """(beam,) The same of the means over cycles, weighted by their residuals: what does not average
-    out."""
+    """(beam,) Root mean square of the means over cycles, weighted by their number of residuals,
+    percent: the part that does not average out."""
     cycles: int
-    """Cycles with a residual."""
+    """Number of cycles with a residual."""
     altitudes: int
-    """In a row."""
+    """Number of altitudes in a row."""
 
 
 def clearest_cycle(
     product: xr.Dataset, truth: xr.Dataset | None = None, *, instrument: str = ""
 ) -> ScanProfile | None:
-    """Return the cycle with most optical depths that no bit speaks against.
+    """Return the cycle with the most unflagged optical depths.
 
     Parameters
     ----------
     product : Dataset
         Kind ``multiangle``.
     truth : Dataset, optional
-        Of a simulated campaign; its profiles are used, see `true_profile`.
+        Truth of a simulated campaign; its profiles are used, see `true_profile`.
     instrument : str, optional
-        Whose truth to take.
+        Instrument, to select its truth.
 
     Returns
     -------
     ScanProfile or None
-        Of equals the one with most that no bit rejects (a scan to one side has a bit at all
-        altitudes), then with most values, then the first. None where there is no value.
+        Among equals, the cycle with the most usable values (a one-sided scan is flagged at all
+        altitudes), then with the most values, then the first. None without any value.
 
     Raises
     ------
     ProductError
-        Where a variable is missing or has other dims or units.
+        If a variable is missing or has other dimensions or units.
     """
     _check_profiles(product)
-    flag = _bits(product)
+    flag = quality_bits(product["quality_flag"])
     known = np.isfinite(product["optical_depth"].values.astype(np.float64))
     clear = (known & (flag == 0)).sum(axis=1)
     usable = (known & ((flag & _REJECTED) == 0)).sum(axis=1)
@@ -197,12 +196,12 @@ def _shown(altitude: Floats, reach: float) -> Mask:
     return np.asarray(altitude <= altitude[0] + _BEYOND * max(reach - altitude[0], 0.0))
 
 
-def _estimate(chosen: xr.Dataset, name: str, bits: NDArray[np.int64]) -> ProfileEstimate:
-    value = chosen[name].values.astype(np.float64)
+def _estimate(cycle: xr.Dataset, name: str, bits: NDArray[np.int64]) -> ProfileEstimate:
+    value = cycle[name].values.astype(np.float64)
     rejected = (bits & _REJECTED) != 0
 
     def kept(suffix: str) -> Floats:
-        return np.where(rejected, np.nan, chosen[f"{name}_{suffix}"].values.astype(np.float64))
+        return np.where(rejected, np.nan, cycle[f"{name}_{suffix}"].values.astype(np.float64))
 
     return ProfileEstimate(
         value=np.where(rejected, np.nan, value),
@@ -218,18 +217,10 @@ def _check_profiles(product: xr.Dataset) -> None:
         {"time": ("time",), "altitude": ("altitude",), "reach": ("time",)}
         | dict.fromkeys(_ALONG_BOTH, ("time", "altitude")),
     )
-    for name, wanted in _UNITS.items():
+    for name, expected in _UNITS.items():
         units = product[name].attrs.get("units")
-        if units != wanted:
-            raise ProductError(f"has the units {units!r}, not {wanted!r}", field=name)
-
-
-def _bits(product: xr.Dataset) -> NDArray[np.int64]:
-    values = product["quality_flag"].values
-    if values.dtype.kind == "f":
-        # A fill value makes xarray turn integers into floats with NaN in its place.
-        values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
-    return np.asarray(values, dtype=np.int64)
+        if units != expected:
+            raise ProductError(f"has the units {units!r}, not {expected!r}", field=name)
 
 
 # The truth of a simulation -------------------------------------------------------------------
@@ -238,71 +229,73 @@ def _bits(product: xr.Dataset) -> NDArray[np.int64]:
 def true_profile(
     product: xr.Dataset, index: int, truth: xr.Dataset, *, instrument: str
 ) -> TrueProfile | None:
-    """Return what a perfect retrieval of one cycle would find.
+    """Return the true profile for one cycle.
 
-    Of the raw files within a cycle, or up to its length before or after it, whose air is told,
-    the one nearest to the zenith is taken, and of equals the nearest in time. Layers are level:
-    a cell at the range R lies R cos(zenith angle) above the station, and the optical depth
-    straight up is that along the beam times the cosine.
+    Of the raw files with a true profile, within a cycle or up to its length before or after it,
+    the one nearest to the zenith is used, and among equals the nearest in time. Layers are level:
+    a cell at the range R lies R cos(zenith angle) above the station, and the vertical optical
+    depth is the optical depth along the beam times cos(zenith angle).
 
     Parameters
     ----------
     product : Dataset
         Kind ``multiangle``.
     index : int
-        Of the cycle.
+        Index of the cycle.
     truth : Dataset
         See `lidarops.simulate.truth`.
     instrument : str
-        Whose truth to take.
+        Instrument, to select its truth.
 
     Returns
     -------
     TrueProfile or None
-        None where the truth tells no such profile within 80 degrees of the zenith, not at the
-        wavelength of the product, or the altitude of the station is not known.
+        None if the truth has no such profile within 80 degrees of the zenith at the wavelength of
+        the product, or the altitude of the station is unknown.
     """
     suffix = instrument.replace("-", "_")
-    of = {name: f"profile_{name}_{suffix}" for name in ("granule", *QUANTITIES)}
-    needed = [*of.values(), f"range_{suffix}", f"range_end_{suffix}", "zenith_angle", "time"]
-    colour = _colour(product, truth, suffix)
-    if "station_altitude" not in product.variables or colour is None:
+    variables = {name: f"profile_{name}_{suffix}" for name in ("granule", *QUANTITIES)}
+    needed = [*variables.values(), f"range_{suffix}", f"range_end_{suffix}", "zenith_angle", "time"]
+    column = _wavelength_index(product, truth, suffix)
+    if "station_altitude" not in product.variables or column is None:
         return None
     if not all(name in truth.variables for name in needed):
         return None
-    granule = truth[of["granule"]].values.astype(np.intp)
+    granule = truth[variables["granule"]].values.astype(np.intp)
     zenith = np.abs(truth["zenith_angle"].values.astype(np.float64)[granule])
     time = truth["time"].values.astype("datetime64[ns]")[granule]
     row = _nearest_upright(zenith, time, *_cycle(product, index))
     if row is None:
         return None
-    upright = float(np.cos(np.radians(zenith[row])))
+    cosine = float(np.cos(np.radians(zenith[row])))
     end = truth[f"range_end_{suffix}"].values.astype(np.float64)
     start = 2.0 * truth[f"range_{suffix}"].values.astype(np.float64)[:1] - end[:1]
-    told = {name: truth[of[name]].values[row, colour].astype(np.float64) for name in QUANTITIES}
+    true_values = {
+        name: truth[variables[name]].values[row, column].astype(np.float64) for name in QUANTITIES
+    }
     at_start = 0.0 if abs(float(start[0])) <= 1e-6 * float(end[0]) else np.nan
     return TrueProfile(
         time=time[row],
         zenith_angle=float(zenith[row]),
-        edges=float(product["station_altitude"]) + np.concatenate([start, end]) * upright,
-        extinction=told["extinction"],
-        optical_depth=np.append(at_start, told["optical_depth"]) * upright,
+        edges=float(product["station_altitude"]) + np.concatenate([start, end]) * cosine,
+        extinction=true_values["extinction"],
+        optical_depth=np.append(at_start, true_values["optical_depth"]) * cosine,
     )
 
 
-def _colour(product: xr.Dataset, truth: xr.Dataset, suffix: str) -> int | None:
+def _wavelength_index(product: xr.Dataset, truth: xr.Dataset, suffix: str) -> int | None:
     name = f"wavelength_{suffix}"
     if name not in truth.variables or "wavelength" not in product.variables:
         return None
-    told = product["wavelength"]
-    metres = float(told) * (1e-9 if told.attrs.get("units", "nm") == "nm" else 1.0)
-    apart = np.abs(truth[name].values.astype(np.float64) - metres)
-    nearest = int(np.argmin(apart))
-    return nearest if apart[nearest] <= _SAME_COLOUR else None
+    wavelength = product["wavelength"]
+    metres = float(wavelength) * (1e-9 if wavelength.attrs.get("units", "nm") == "nm" else 1.0)
+    difference = np.abs(truth[name].values.astype(np.float64) - metres)
+    nearest = int(np.argmin(difference))
+    return nearest if difference[nearest] <= _SAME_WAVELENGTH else None
 
 
 def _cycle(product: xr.Dataset, index: int) -> tuple[np.datetime64, np.timedelta64]:
-    """Return the middle of a cycle and its length."""
+    """Return middle and length of a cycle."""
     time = product["time"].values.astype("datetime64[ns]")
     if "time_bnds" in product.variables:
         start, stop = product["time_bnds"].values.astype("datetime64[ns]")[index]
@@ -313,11 +306,11 @@ def _cycle(product: xr.Dataset, index: int) -> tuple[np.datetime64, np.timedelta
 def _nearest_upright(
     zenith: Floats, time: NDArray[np.datetime64], middle: np.datetime64, length: np.timedelta64
 ) -> int | None:
-    apart = np.abs(time - middle)
-    found = np.flatnonzero((2 * apart <= 3 * length) & (zenith <= _LOWEST_BEAM))
-    if found.size == 0:
+    distance = np.abs(time - middle)
+    rows = np.flatnonzero((2 * distance <= 3 * length) & (zenith <= _LOWEST_BEAM))
+    if rows.size == 0:
         return None
-    return int(found[np.lexsort((apart[found], zenith[found]))[0]])
+    return int(rows[np.lexsort((distance[rows], zenith[rows]))[0]])
 
 
 # Residuals -----------------------------------------------------------------------------------
@@ -326,24 +319,24 @@ def _nearest_upright(
 def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
     """Average the residuals of a product over its cycles.
 
-    Residuals are differences of logarithms, 100 ln(signal / fit) in per cent. Those of values
-    that carry `Quality.NO_RESIDUAL` are left out: they are zero whatever the air is like. Flagged
-    values are kept, as what speaks against them shows here.
+    Residuals are 100 ln(signal / fit) in percent. Those with `Quality.NO_RESIDUAL` are left out,
+    because they are always zero. Other flagged values are kept, because residuals show the reason
+    of the flag.
 
     Parameters
     ----------
     product : Dataset
-        Kind ``multiangle``; may be lazy: it is read block by block.
+        Kind ``multiangle``; may be lazy, because it is read in blocks.
 
     Returns
     -------
     ScanResiduals or None
-        To the highest altitude with a residual; None where there is no residual.
+        Up to the highest altitude with a residual; None without any residual.
 
     Raises
     ------
     ProductError
-        Where a variable is missing or has other dims; but `beam_azimuth`, where it is not known.
+        If a variable is missing or has other dimensions; ``beam_azimuth`` may be missing.
     """
     known = {"beam_azimuth": ("beam",)} if "beam_azimuth" in product.variables else {}
     require(
@@ -370,7 +363,7 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
     in_row = np.add.reduceat(count, starts, axis=1)
     by_row = _ratio(np.add.reduceat(total, starts, axis=1), in_row)
     squares_of_means = (total**2 / np.maximum(count, 1.0)).sum(axis=1)
-    of_beam = count.sum(axis=1)
+    beam_count = count.sum(axis=1)
     return ScanResiduals(
         zenith_angle=zenith,
         plane=plane,
@@ -378,8 +371,8 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
         edges=_edges(product["altitude"].values.astype(np.float64))[[*starts, top]],
         mean=100.0 * by_row.T,
         count=in_row.T,
-        rms=100.0 * np.sqrt(_ratio(sums.squares[order].sum(axis=1), of_beam)),
-        rms_of_mean=100.0 * np.sqrt(_ratio(squares_of_means, of_beam)),
+        rms=100.0 * np.sqrt(_ratio(sums.squares[order].sum(axis=1), beam_count)),
+        rms_of_mean=100.0 * np.sqrt(_ratio(squares_of_means, beam_count)),
         cycles=sums.cycles,
         altitudes=size,
     )
@@ -387,7 +380,7 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
 
 @dataclass(slots=True)
 class _Sums:
-    """Of residuals over cycles, (beam, altitude)."""
+    """Sums of residuals over cycles, (beam, altitude)."""
 
     total: Floats
     squares: Floats
@@ -399,9 +392,9 @@ def _sums(product: xr.Dataset) -> _Sums:
     shape = product["residual"].shape[1:]
     sums = _Sums(np.zeros(shape), np.zeros(shape), np.zeros(shape))
     for part in _parts(product):
-        untold = (_bits(part) & int(Quality.NO_RESIDUAL)) != 0
+        no_residual = (quality_bits(part["quality_flag"]) & int(Quality.NO_RESIDUAL)) != 0
         residual = part["residual"].values.astype(np.float64)
-        known = np.isfinite(residual) & ~untold[:, np.newaxis, :]
+        known = np.isfinite(residual) & ~no_residual[:, np.newaxis, :]
         residual = np.where(known, residual, 0.0)
         sums.total += residual.sum(axis=0)
         sums.squares += (residual**2).sum(axis=0)
@@ -411,10 +404,10 @@ def _sums(product: xr.Dataset) -> _Sums:
 
 
 def _parts(product: xr.Dataset) -> Iterator[xr.Dataset]:
-    one = 8 * product.sizes["beam"] * product.sizes["altitude"]
-    few = max(1, _READ_BYTES // max(one, 1))
-    for first in range(0, product.sizes["time"], few):
-        yield product[["residual", "quality_flag"]].isel(time=slice(first, first + few))
+    cycle_bytes = 8 * product.sizes["beam"] * product.sizes["altitude"]
+    cycles = max(1, _READ_BYTES // max(cycle_bytes, 1))
+    for first in range(0, product.sizes["time"], cycles):
+        yield product[["residual", "quality_flag"]].isel(time=slice(first, first + cycles))
 
 
 def _ratio(total: Floats, count: Floats) -> Floats:
@@ -424,16 +417,14 @@ def _ratio(total: Floats, count: Floats) -> Floats:
 def _edges(middles: Floats) -> Floats:
     if middles.size == 1:
         return np.array([middles[0] - 0.5, middles[0] + 0.5])
-    between = 0.5 * (middles[1:] + middles[:-1])
-    ends = 1.5 * middles[[0, -1]] - 0.5 * middles[[1, -2]]
-    return np.concatenate([ends[:1], between, ends[1:]])
+    return bin_edges(middles)
 
 
 def _in_the_sky(
     zenith: Floats, azimuth: Floats
 ) -> tuple[Floats, NDArray[np.intp], tuple[float, ...], NDArray[np.intp]]:
     """Return signed zenith angles, planes and their azimuths, and the order of the beams."""
-    # A negative zenith angle leads opposite to the azimuth, also to one that is not known.
+    # A negative zenith angle points opposite to the azimuth, even if that is unknown.
     azimuth = np.where(zenith < 0, azimuth + 180.0, azimuth) % 360.0
     signed = np.where(np.isnan(azimuth), zenith, np.abs(zenith))
     plane = np.zeros(zenith.size, dtype=np.intp)
@@ -447,7 +438,7 @@ def _in_the_sky(
 
 
 def _side(azimuth: float, azimuths: list[float]) -> tuple[int, float]:
-    """Return the plane and the side of an azimuth, in a new plane where it lies in none."""
+    """Return plane and side of an azimuth; append a new plane if it lies in none."""
     for index, known in enumerate(azimuths):
         turn = abs((azimuth - known + 180.0) % 360.0 - 180.0)
         if turn <= _PLANE or (np.isnan(azimuth) and np.isnan(known)):
@@ -469,26 +460,26 @@ def read_extinction(product: xr.Dataset, *, profiles: int = 0) -> Raster:
     product : Dataset
         Kind ``multiangle``; may be lazy.
     profiles : int, optional
-        Cycles to a column; as many as fit an image where 0.
+        Cycles per column; 0 for about `lidarops.figures.raster.COLUMNS` columns.
 
     Returns
     -------
     Raster
-        In km-1, with edges in altitude instead of range and no background.
+        In km-1, with altitude instead of range and without background.
 
     Raises
     ------
     ProductError
-        Where a variable is missing or has other dims or units, or nothing was retrieved.
+        If a variable is missing or has other dimensions or units, or the product is empty.
     """
     _check_profiles(product)
-    nothing = ("time", np.full(product.sizes["time"], np.nan))
+    unknown = ("time", np.full(product.sizes["time"], np.nan))
     extinction = product[["extinction", "extinction_standard_error"]] * 1e3
     drawn = (
         extinction.assign(quality_flag=product["quality_flag"])
         .drop_vars([name for name in extinction.coords if name not in ("time", "altitude")])
         .rename(altitude="range")
-        .assign(background=nothing, background_standard_error=nothing)
+        .assign(background=unknown, background_standard_error=unknown)
     )
     drawn["extinction"].attrs["units"] = "km$^{-1}$"
     return read_raster(drawn, quantity="extinction", profiles=profiles)

@@ -1,4 +1,4 @@
-"""Panels of multi-angle products: a profile of one cycle, and what its fit leaves, by beam."""
+"""Panels of multi-angle products: the profile of a cycle, and residuals of the fit by beam."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ _SCALES: Final = {
     "extinction": (1.0e3, "extinction (km$^{-1}$)"),
 }
 _MARKS: Final = 30
-"""At most about so many marks of one kind in a panel."""
+"""Approximate most marks of one kind in a panel."""
 _COLORS: Final = "berlin"
-"""Diverging and perceptually uniform, told apart by colour-blind readers (Crameri)."""
+"""Diverging, perceptually uniform, readable with colour vision deficiency (Crameri)."""
 _HATCHED: Final = 0.25
-"""Share of the colour scale below zero, beyond which cells are hatched: in grey both ends of a
-diverging scale look alike."""
+"""Cells below this share of the negative colour scale are hatched, because both ends of a diverging
+scale look alike in grey."""
 _USUAL: Final = 0.97
-"""Share of the residuals whose cells lie inside the colour scale."""
+"""Share of the residuals inside the colour scale."""
 _LEAST: Final = 0.01
-"""Per cent, the least end of the colour scale."""
+"""Percent, smallest end of the colour scale."""
 _BEAM_TICKS: Final = 24
 
 
 def against_altitude(panel: Axes, profile: ScanProfile, quantity: str) -> None:
-    """Draw one quantity of a cycle with its errors, flags, reach and truth.
+    """Draw a quantity of one cycle with its errors, flags, reach and truth.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def against_altitude(panel: Axes, profile: ScanProfile, quantity: str) -> None:
         alpha=0.18,
         linewidth=0.8,
         linestyle=":",
-        label="plus largest gradient error",
+        label="plus largest error from a gradient",
         gid=f"gradient-{quantity}",
     )
     panel.fill_betweenx(
@@ -109,13 +109,13 @@ def _truth(panel: Axes, profile: ScanProfile, quantity: str, scale: float) -> No
         linewidth=1.1,
         linestyle=(0, (4, 2)),
         zorder=4,
-        label=f"truth {profile.truth.zenith_angle:.3g}° off zenith, {late:+.0f} min",
+        label=f"truth at zenith angle {profile.truth.zenith_angle:.3g}°, {late:+.0f} min",
         gid=f"truth-{quantity}",
     )
 
 
 def _true_line(profile: ScanProfile, quantity: str) -> tuple[Floats, Floats] | None:
-    """Return values and altitudes of the truth: means over cells as steps."""
+    """Return values and altitudes of the truth; means over cells as steps."""
     truth = profile.truth
     if truth is None:
         return None
@@ -129,7 +129,7 @@ def _limits(profile: ScanProfile, quantity: str, scale: float) -> tuple[float, f
     known = _true_line(profile, quantity)
     if known is not None:
         value, z = known
-        # A cloud that ends the reach must not shrink what lies below.
+        # Only up to the reach, so that a cloud above it does not set the axis.
         top = np.fmin(profile.reach, profile.altitude[-1])
         shown = value[np.isfinite(value) & (z <= top)]
         low, high = np.min([low, *shown]), np.max([high, *shown])
@@ -142,13 +142,13 @@ def _reached(estimate: ProfileEstimate) -> tuple[float, float]:
         return _span(estimate.rejected, 0.0 * estimate.rejected)
     low, high = _span(estimate.value, estimate.standard_error)
     systematic = np.nan_to_num(estimate.gradient_error)
-    # However large the systematic error, the profile takes a third of the panel.
+    # The systematic error widens the axis to three times the profile at most.
     outer = _span(estimate.value, estimate.standard_error + systematic)
     return max(outer[0], 2 * low - high), min(outer[1], 2 * high - low)
 
 
 def _span(value: Floats, error: Floats) -> tuple[float, float]:
-    """Return limits that hold the bars but for those of a few noisy altitudes."""
+    """Return limits that contain the error bars except those of a few noisy altitudes."""
     ends = np.concatenate([value - error, value + error, value])
     known = ends[np.isfinite(ends)]
     low, high = np.percentile(known, [0.5, 99.5]) if known.size else (0.0, 1.0)
@@ -184,21 +184,21 @@ def _flagged(panel: Axes, profile: ScanProfile, quantity: str, scale: float) -> 
             label=f"{words}: {counted(index.size, 'altitude')}",
             gid=f"{kind}-{quantity}",
         )
-        # Marks at the edge reach out of the panel; the layout must not make room for them.
+        # Marks at the edge extend beyond the panel; the layout must not make room for them.
         marks.set_in_layout(False)
 
 
 def bits_in_words(profile: ScanProfile) -> str:
-    """Return the names of all bits of a profile; empty where there is none."""
-    found = Quality(int(np.bitwise_or.reduce(profile.flag)))
-    return ", ".join(bit_name(bit) for bit in found)
+    """Return the names of all quality bits of a profile; empty without any."""
+    bits = Quality(int(np.bitwise_or.reduce(profile.flag)))
+    return ", ".join(bit_name(bit) for bit in bits)
 
 
 # Residuals -----------------------------------------------------------------------------------
 
 
 def residual_map(figure: Figure, panel: Axes, residuals: ScanResiduals) -> float:
-    """Draw mean residuals against beam and altitude; return the end of the colour scale, %."""
+    """Draw mean residuals against beam and altitude; return the end of the colour scale (%)."""
     panel.set_facecolor("#bbbbbb")
     limit = max(_usual(residuals), _LEAST)
     across = np.arange(residuals.zenith_angle.size + 1) - 0.5
@@ -241,9 +241,9 @@ def residual_map(figure: Figure, panel: Axes, residuals: ScanResiduals) -> float
 
 
 def _usual(residuals: ScanResiduals) -> float:
-    """Return the size that cells with `_USUAL` of all residuals do not exceed.
+    """Return the absolute mean residual below which `_USUAL` of all residuals lie.
 
-    Cells that few cycles reach count little: they are noise at the end of a beam.
+    Cells that few cycles reach count little, because they are mostly noise.
     """
     size, count = np.abs(residuals.mean).ravel(), residuals.count.ravel()
     order = np.argsort(np.where(count > 0, size, np.inf), kind="stable")
@@ -252,7 +252,7 @@ def _usual(residuals: ScanResiduals) -> float:
 
 
 def residual_rms(panel: Axes, residuals: ScanResiduals) -> None:
-    """Draw the root mean square residual of every beam, and what of it does not average out."""
+    """Draw the rms residual of every beam, and the part that does not average out."""
     panel.spines[["top", "right"]].set_visible(False)
     panel.grid(axis="y", color="#dddddd", linewidth=0.6)
     panel.set_axisbelow(True)
@@ -265,7 +265,7 @@ def residual_rms(panel: Axes, residuals: ScanResiduals) -> None:
         marker="o",
         markersize=5.0,
         color=_BLUE,
-        label="of single cycles" if many else "of the cycle",
+        label="single cycles" if many else "one cycle",
         gid="rms",
     )
     if many:
@@ -277,7 +277,7 @@ def residual_rms(panel: Axes, residuals: ScanResiduals) -> None:
             markersize=9.0,
             markeredgewidth=2.0,
             color=_VERMILION,
-            label=f"of the means of {residuals.cycles:,} cycles",
+            label=f"mean of {residuals.cycles:,} cycles",
             gid="rms-of-mean",
         )
     panel.set_ylim(bottom=0.0)

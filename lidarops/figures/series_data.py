@@ -1,4 +1,7 @@
-"""Homogeneous products as plain arrays by section, beside the truth of a simulation."""
+"""Homogeneous products as plain arrays by section, with the simulated truth.
+
+Also compares retrieved values with the truth, and checks and reads variables of any product.
+"""
 
 from __future__ import annotations
 
@@ -19,25 +22,25 @@ from lidarops.flags import Quality
 Floats = NDArray[np.float64]
 
 QUANTITIES: Final = ("extinction", "background", "amplitude")
-"""Retrieved quantities, by the name of their variable."""
+"""Retrieved quantities, as the names of their variables."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesEstimate:
-    """One retrieved quantity."""
+    """One retrieved quantity over time, with its standard error and truth."""
 
     value: Floats
     """(time,)"""
     standard_error: Floats
     """(time,)"""
     truth: Floats
-    """(time,) NaN where it is not known."""
+    """(time,) NaN where unknown."""
     units: str
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """What was retrieved from one range section, over time."""
+    """The quantities retrieved from one range section, over time."""
 
     near: float
     """m"""
@@ -52,12 +55,12 @@ class Section:
 
     @property
     def label(self) -> str:
-        """The section in words."""
+        """Range of the section in km, for legends."""
         return f"{self.near / 1e3:g}\N{EN DASH}{self.far / 1e3:g} km"
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
-        """(time,) Whether a bit says not to use the value."""
+        """(time,) Whether a quality bit rejects the value."""
         return np.asarray((self.flag & int(Quality.rejecting())) != 0)
 
 
@@ -67,33 +70,33 @@ _ALONG_BOTH: Final = (
     "quality_flag",
 )
 SECTION_VARIABLES: Final = ("time", *_ALONG_BOTH, "section_bounds")
-"""What `read_sections` reads of a product."""
+"""Variables that `read_sections` needs."""
 
 
 class Verdict(StrEnum):
-    """What a comparison with the truth says of the stated standard errors."""
+    """Verdict on the stated standard errors from a comparison with the truth."""
 
     AS_STATED = "as stated"
     BEYOND = "too many beyond 3"
     UNDERSTATED = "errors understated"
     OVERSTATED = "errors overstated"
-    SHARED = "profiles share an error"
-    NO_ERROR = "values without an error"
+    SHARED = "common error of all profiles"
+    NO_ERROR = "values without standard error"
 
     @property
     def unsafe(self) -> bool:
-        """Whether a user would trust the values more than they deserve."""
+        """Whether the stated errors are too small or missing."""
         return self in {Verdict.BEYOND, Verdict.UNDERSTATED, Verdict.NO_ERROR}
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """How unflagged values of one section compare with the truth."""
+    """Comparison of the unflagged values of one section with the truth."""
 
     quantity: str
     section: str
     count: int
-    """Unflagged values with a standard error and a truth."""
+    """Number of unflagged values with a standard error and a truth."""
     within_1: float
     """Share of them within 1 standard error of the truth; 0.683 for normal errors."""
     within_3: float
@@ -103,15 +106,15 @@ class Comparison:
     spread: float
     """Root mean square of (retrieved - truth) / standard error; 1 for normal errors."""
     without_error: int
-    """Values without a flag and with a truth, but not finite with a positive standard error."""
+    """Number of unflagged values with a truth that are not finite or lack a positive error."""
 
     @property
     def verdict(self) -> Verdict:
-        """What the comparison says of the stated standard errors.
+        """Verdict on the stated standard errors.
 
-        Chance allows the expected 0.27 percent beyond 3 and three times its Poisson spread, but
-        at least one value; 4 standard deviations of the spread of `count` normal errors,
-        1 / sqrt(2 count), around 1; and 5 of their mean, 1 / sqrt(count), around 0.
+        For `count` normal errors, chance allows: beyond 3 standard errors, the expected
+        0.27 percent plus three times its Poisson spread, but at least one value; a spread
+        within 4 / sqrt(2 count) of 1; a mean within 5 / sqrt(count) of 0.
         """
         if self.without_error > 0:
             return Verdict.NO_ERROR
@@ -136,61 +139,61 @@ def read_sections(
     paths: Sequence[str] = (),
     dark_subtracted: bool = True,
 ) -> list[Section]:
-    """Take the sections out of one homogeneous product.
+    """Return the sections of a homogeneous product.
 
     Parameters
     ----------
     product : Dataset
         Kind ``homogeneous``, dims (time, section).
     truth : Dataset, optional
-        Truth of a simulated campaign, dim granule.
+        Truth of a simulated campaign, dimension granule.
     instrument, channel : str, optional
-        Whose truth to take; of any instrument where empty.
+        Select the truth; empty for any instrument.
     paths : sequence of str, optional
-        Raw files behind the profiles, in their order: where there are as many as profiles the
-        truth is matched by path, else by time.
+        Raw files of the profiles, in their order. If there is one per profile, the truth is
+        matched by path, else by time.
     dark_subtracted : bool, optional
-        Whether the signal without any light was subtracted beforehand; where it was not, it is
-        part of the retrieved background, and so of its truth.
+        Whether the dark signal was subtracted. If not, it is part of the retrieved background
+        and of its truth.
 
     Returns
     -------
     list of Section
-        By near end, with truth NaN where there is none.
+        Sorted by near end; truth is NaN where unknown.
 
     Raises
     ------
     ProductError
-        Where a variable is missing, or does not have the dims and units of its kind.
+        If a variable is missing or has other dimensions or units.
     """
     _check(product)
     order = np.argsort(product["time"].values, kind="stable")
     time = product["time"].values.astype("datetime64[ns]")[order]
     ordered = [paths[i] for i in order] if len(paths) == time.size else []
-    true = {
+    true_values = {
         name: _truth(truth, time, instrument, ordered, variables)
         for name, variables in _true_variables(channel, dark_subtracted=dark_subtracted).items()
     }
-    flags = _integers(product["quality_flag"])[order]
+    flags = quality_bits(product["quality_flag"])[order]
     bounds = product["section_bounds"].values.astype(np.float64)
-    found = []
+    sections = []
     for k in np.argsort(bounds[:, 0], kind="stable"):
         estimates = {
             name: SeriesEstimate(
-                value=_floats(product, name)[order, k],
-                standard_error=_floats(product, f"{name}_standard_error")[order, k],
-                truth=true[name],
+                value=float_values(product, name)[order, k],
+                standard_error=float_values(product, f"{name}_standard_error")[order, k],
+                truth=true_values[name],
                 units=str(product[name].attrs.get("units", "")),
             )
             for name in QUANTITIES
         }
         near, far = float(bounds[k, 0]), float(bounds[k, 1])
-        found.append(Section(near, far, time, flags[:, k], estimates))
-    return found
+        sections.append(Section(near, far, time, flags[:, k], estimates))
+    return sections
 
 
 def join(sections: Iterable[Section]) -> list[Section]:
-    """Join the sections with the same bounds in time.
+    """Join sections with the same bounds in time.
 
     Parameters
     ----------
@@ -200,7 +203,7 @@ def join(sections: Iterable[Section]) -> list[Section]:
     Returns
     -------
     list of Section
-        One for every pair of bounds, by near end.
+        One per pair of bounds, sorted by near end.
     """
     groups: dict[tuple[float, float], list[Section]] = {}
     for section in sections:
@@ -214,7 +217,7 @@ def compare(section: Section, quantity: str) -> Comparison | None:
     Returns
     -------
     Comparison or None
-        None where no unflagged value has a truth.
+        None if no unflagged value has a truth.
     """
     estimate = section.estimates[quantity]
     known = (section.flag == 0) & np.isfinite(estimate.truth)
@@ -247,20 +250,20 @@ def normalised_error(section: Section, quantity: str) -> Floats:
 def thin(section: Section, points: int) -> Section:
     """Reduce the unflagged profiles of a section to about `points` block means for drawing.
 
-    A block holds the mean over its unflagged profiles, the standard error of that mean (noise
-    only, independent between profiles) and the mean truth of the same profiles. Blocks never
-    reach across a gap.
+    A block has the mean of its unflagged profiles, the standard error of that mean (as if errors
+    were independent between profiles) and the mean truth of these profiles. Blocks do not extend
+    across gaps.
 
     Parameters
     ----------
     section : Section
     points : int
-        Every gap may add one block to these.
+        Each gap may add one block.
 
     Returns
     -------
     Section
-        Of the unflagged profiles only; their means where they are more than `points`.
+        Unflagged profiles only; block means if there are more than `points`.
     """
     good = _where(section, section.flag == 0)
     if good.time.size <= points:
@@ -313,7 +316,7 @@ def _block_mean(values: Floats, starts: NDArray[np.intp]) -> Floats:
 
 
 def _block_error(errors: Floats, starts: NDArray[np.intp]) -> Floats:
-    # Of a mean of n independent values: the root mean square of their errors over root n.
+    # Error of a mean of n independent values: root mean square of their errors / sqrt(n).
     counts = np.add.reduceat(np.isfinite(errors).astype(np.int64), starts)
     return np.sqrt(_block_mean(errors**2, starts) / np.maximum(counts, 1))
 
@@ -328,62 +331,69 @@ def _joined(group: list[Section]) -> Section:
         far=group[0].far,
         time=time[order],
         flag=np.concatenate([section.flag for section in group])[order],
-        estimates={
-            name: SeriesEstimate(
-                value=_gathered([s.estimates[name].value for s in group], order),
-                standard_error=_gathered([s.estimates[name].standard_error for s in group], order),
-                truth=_gathered([s.estimates[name].truth for s in group], order),
-                units=group[0].estimates[name].units,
-            )
-            for name in QUANTITIES
-        },
+        estimates=join_estimates(group, order),
     )
 
 
-def _gathered(parts: list[Floats], order: NDArray[np.intp]) -> Floats:
-    return np.concatenate(parts)[order]
+def join_estimates(
+    sections: Sequence[Section], order: NDArray[np.intp]
+) -> dict[str, SeriesEstimate]:
+    """Concatenate the estimates of sections in time, then sort them by `order`."""
+    return {
+        name: SeriesEstimate(
+            value=np.concatenate([s.estimates[name].value for s in sections])[order],
+            standard_error=np.concatenate([s.estimates[name].standard_error for s in sections])[
+                order
+            ],
+            truth=np.concatenate([s.estimates[name].truth for s in sections])[order],
+            units=estimate.units,
+        )
+        for name, estimate in sections[0].estimates.items()
+    }
 
 
 def _check(product: xr.Dataset) -> None:
     require(product, {"time": ("time",)} | dict.fromkeys(_ALONG_BOTH, ("time", "section")))
     if "section_bounds" not in product or product["section_bounds"].shape[1:] != (2,):
-        raise ProductError("has no bounds of sections", field="section_bounds")
+        raise ProductError("has no section bounds", field="section_bounds")
     units = product["extinction"].attrs.get("units")
     if units != "m-1":
         raise ProductError(f"has the units {units!r}, not 'm-1'", field="extinction")
 
 
-def require(product: xr.Dataset, wanted: Mapping[str, tuple[str, ...]]) -> None:
-    """Refuse a product that lacks a variable, or has it with other dims than those wanted.
+def require(product: xr.Dataset, dims: Mapping[str, tuple[str, ...]]) -> None:
+    """Refuse a product that lacks a variable, or has it with other dimensions.
 
     Raises
     ------
     ProductError
-        Naming the variable and its dims.
+        Naming the variable and its dimensions.
     """
-    for name, dims in wanted.items():
+    for name, expected in dims.items():
         if name not in product.variables:
             raise ProductError("is missing from the product", field=name)
-        if product[name].dims != dims:
-            raise ProductError(f"has the dims {product[name].dims}, not {dims}", field=name)
+        if product[name].dims != expected:
+            raise ProductError(f"has the dims {product[name].dims}, not {expected}", field=name)
     if not np.issubdtype(product["time"].dtype, np.datetime64):
         raise ProductError("does not hold CF times", field="time")
 
 
-def _floats(product: xr.Dataset, name: str) -> Floats:
+def float_values(product: xr.Dataset, name: str) -> Floats:
+    """Return a variable in double precision."""
     return np.asarray(product[name].values, dtype=np.float64)
 
 
-def _integers(flags: xr.DataArray) -> NDArray[np.int64]:
+def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
+    """Return quality flags as integers; missing flags become `Quality.INPUT_MISSING`."""
     values = flags.values
     if values.dtype.kind == "f":
-        # A fill value makes xarray turn integers into floats with NaN in its place.
+        # Where there are fill values, xarray decodes integers as floats with NaN.
         values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
     return np.asarray(values, dtype=np.int64)
 
 
 def _true_variables(channel: str, *, dark_subtracted: bool) -> Mapping[str, Sequence[str]]:
-    """Return for every quantity the variables of the truth whose sum is its truth."""
+    """Return for each quantity the variables of the truth that add up to its true value."""
     offset = () if dark_subtracted else (f"dark_offset_{channel}",)
     return {
         "extinction": ("extinction",),
@@ -402,42 +412,44 @@ def _truth(
     if truth is None or variables[0] not in truth.variables or truth.sizes["granule"] == 0:
         return np.full(time.size, np.nan)
     # Photon counting has no dark offset.
-    known = [_floats(truth, name) for name in variables if name in truth.variables]
-    at = _match(time, truth, instrument, paths)
-    return np.where(at >= 0, np.sum(known, axis=0)[at], np.nan)
+    terms = [float_values(truth, name) for name in variables if name in truth.variables]
+    index = _match(time, truth, instrument, paths)
+    return np.where(index >= 0, np.sum(terms, axis=0)[index], np.nan)
 
 
 def _match(
     time: Times, truth: xr.Dataset, instrument: str, paths: Sequence[str]
 ) -> NDArray[np.intp]:
-    """Return the index of every profile's truth, -1 where there is none."""
-    mine = np.arange(truth.sizes["granule"])
+    """Return the index of the truth of every profile, -1 without one."""
+    granules = np.arange(truth.sizes["granule"])
     if instrument:
-        mine = mine[_texts(truth["instrument"]) == instrument]
+        granules = granules[_texts(truth["instrument"]) == instrument]
     if paths:
-        index = {path: int(i) for i, path in zip(mine, _texts(truth["path"])[mine], strict=True)}
-        found = np.array([index.get(path, -1) for path in paths], dtype=np.intp)
-        if (found >= 0).all():
-            return found
-    return _nearest(time, truth["time"].values.astype("datetime64[ns]")[mine], mine)
+        index = {
+            path: int(i) for i, path in zip(granules, _texts(truth["path"])[granules], strict=True)
+        }
+        matched = np.array([index.get(path, -1) for path in paths], dtype=np.intp)
+        if (matched >= 0).all():
+            return matched
+    return _nearest(time, truth["time"].values.astype("datetime64[ns]")[granules], granules)
 
 
-def _nearest(time: Times, known: Times, mine: NDArray[np.intp]) -> NDArray[np.intp]:
+def _nearest(time: Times, known: Times, granules: NDArray[np.intp]) -> NDArray[np.intp]:
     if known.size == 0:
         return np.full(time.size, -1, dtype=np.intp)
     order = np.argsort(known, kind="stable")
-    known, mine = known[order], mine[order]
+    known, granules = known[order], granules[order]
     after = np.clip(np.searchsorted(known, time), 1, max(known.size - 1, 1))
     after = np.minimum(after, known.size - 1)
     before = np.maximum(after - 1, 0)
     to_before, to_after = np.abs(time - known[before]), np.abs(time - known[after])
-    # Times of the truth may be starts of granules, those of profiles are middles: where
-    # neighbours are about equally near, the earlier one is meant.
+    # The truth may state starts of granules, but profiles have middles: of two about equally
+    # near neighbours, the earlier one is taken.
     step = np.median(np.diff(known)) if known.size > 1 else np.timedelta64(120, "s")
     earlier = to_before <= to_after + step * 0.1
     best = np.where(earlier, before, after)
     near = np.where(earlier, to_before, to_after) <= step * 0.6
-    return np.where(near, mine[best], -1)
+    return np.where(near, granules[best], -1)
 
 
 def _texts(strings: xr.DataArray) -> NDArray[np.str_]:

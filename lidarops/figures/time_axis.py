@@ -1,4 +1,4 @@
-"""The time axis of figures: UTC, gaps shown as gaps, long gaps cut out and marked."""
+"""Time axes of figures: UTC; gaps stay gaps, and are cut out and marked if they dominate."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Times = NDArray[np.datetime64]
 Floats = NDArray[np.float64]
 
 _GAP: Final = 2.5
-"""A distance of more than this many usual distances between profiles is a gap."""
+"""An interval between profiles of more than this many usual intervals is a gap."""
 _SPARSE: Final = 0.35
-"""Where less of the span than this was measured, the axis is broken at the gaps."""
+"""If measurements cover less than this share of the span, gaps are cut out of the axis."""
 _NARROWEST: Final = 1.0 / 250.0
-"""Least width of a stretch of measurement, as a share of all of them."""
+"""Smallest width of a stretch of measurements, as a share of all stretches."""
 _DAY: Final = np.timedelta64(1, "D")
 _MINUTES: Final = (1, 2, 5, 10, 15, 30, 60, 120, 180, 360, 720, 1440, 2880, 7200, 14400)
 _MONTHS: Final = (1, 2, 3, 6, 12, 24, 60, 120)
@@ -25,7 +25,7 @@ _MONTHS: Final = (1, 2, 3, 6, 12, 24, 60, 120)
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """One labelled position on the axis."""
+    """A labelled position on the axis."""
 
     x: float
     label: str
@@ -33,19 +33,19 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class TimeAxis:
-    """Where times lie along an axis, in units of days of measurement.
+    """Positions of times along an axis, in days of measurement.
 
-    An axis that is not broken has one stretch, from the first to the last profile.
+    An unbroken axis has one stretch, from the first to the last profile.
     """
 
     starts: Times
-    """(stretch,) Start of every stretch."""
+    """(stretch,) Start of each stretch."""
     stops: Times
-    """(stretch,) End of every stretch."""
+    """(stretch,) End of each stretch."""
     left: Floats
-    """(stretch,) Where the stretch starts along the axis."""
+    """(stretch,) Position where the stretch starts."""
     width: Floats
-    """(stretch,) How much of the axis it takes."""
+    """(stretch,) Length of the stretch along the axis."""
 
     @property
     def broken(self) -> bool:
@@ -59,11 +59,11 @@ class TimeAxis:
 
     @property
     def breaks(self) -> Floats:
-        """Positions in the middle of the gaps that are cut out."""
+        """Positions in the middle of the cut gaps."""
         return 0.5 * (self.left[1:] + (self.left + self.width)[:-1])
 
     def x(self, time: Times) -> Floats:
-        """Return positions of times; those inside a gap that is cut out lie at its start.
+        """Return positions of times; times inside a cut gap lie at its start.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class TimeAxis:
         return np.asarray(self.left[index] + np.clip(share, 0.0, 1.0) * self.width[index])
 
     def ticks(self, at_most: int = 8) -> list[Tick]:
-        """Return labelled positions at round UTC times; a day is named where it begins."""
+        """Return labelled positions at round UTC times; the date is shown once per day."""
         times = self._round_times(at_most)
         least = (self.limits[1] - self.limits[0]) / (at_most + 2)
         kept: list[np.datetime64] = []
@@ -92,15 +92,15 @@ class TimeAxis:
     def _round_times(self, at_most: int) -> Times:
         measured = float(((self.stops - self.starts) / np.timedelta64(1, "m")).sum())
         step = next((m for m in _MINUTES if measured / m <= at_most), None)
-        found: list[Times] = []
+        times: list[Times] = []
         for start, stop in zip(self.starts, self.stops, strict=True):
             inside = _multiples(start, stop, step, measured, at_most)
-            found.append(inside if inside.size else np.array([start]))
-        return np.concatenate(found)
+            times.append(inside if inside.size else np.array([start]))
+        return np.concatenate(times)
 
 
 def segments(time: Times) -> list[slice]:
-    """Cut sorted times where the distance between neighbours is a gap.
+    """Split sorted times at gaps.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def segments(time: Times) -> list[slice]:
     Returns
     -------
     list of slice
-        One for every stretch without a gap, in order; none for no times.
+        One per stretch without a gap, in order; empty for no times.
     """
     if time.size == 0:
         return []
@@ -120,14 +120,14 @@ def segments(time: Times) -> list[slice]:
 
 
 def usual_step(time: Times) -> np.timedelta64:
-    """Return the median distance of sorted times; one minute where it cannot be told."""
+    """Return the median interval of sorted times; one minute if there is none."""
     steps = np.diff(time.astype("datetime64[ns]").astype(np.int64))
     steps = steps[steps > 0]
     return np.timedelta64(int(np.median(steps)) if steps.size else 60_000_000_000, "ns")
 
 
 def time_axis(time: Times) -> TimeAxis:
-    """Lay out an axis for sorted times, broken at the gaps where they take most of the span.
+    """Lay out an axis for sorted times; gaps are cut out if they take most of the span.
 
     Parameters
     ----------
@@ -154,15 +154,15 @@ def _multiples(
     if step is not None:
         first = start.astype("datetime64[m]").astype(np.int64)
         last = stop.astype("datetime64[m]").astype(np.int64)
-        whole = np.arange(-(-first // step) * step, last + 1, step)
-        found = whole.astype("datetime64[m]").astype("datetime64[ns]")
+        units = np.arange(-(-first // step) * step, last + 1, step)
+        times = units.astype("datetime64[m]").astype("datetime64[ns]")
     else:
         months = next((m for m in _MONTHS if measured / (m * 43_830) <= at_most), _MONTHS[-1])
         first = start.astype("datetime64[M]").astype(np.int64)
         last = stop.astype("datetime64[M]").astype(np.int64)
-        whole = np.arange(-(-first // months) * months, last + 1, months)
-        found = whole.astype("datetime64[M]").astype("datetime64[ns]")
-    return np.asarray(found[(found >= start) & (found <= stop)])
+        units = np.arange(-(-first // months) * months, last + 1, months)
+        times = units.astype("datetime64[M]").astype("datetime64[ns]")
+    return np.asarray(times[(times >= start) & (times <= stop)])
 
 
 def _labels(times: Times) -> list[str]:

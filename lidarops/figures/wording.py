@@ -1,4 +1,4 @@
-"""Numbers and names as reports spell them."""
+"""Formats numbers, names and texts for reports."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _REORDERING: Final = frozenset(
 
 
 def bit_name(bit: Quality) -> str:
-    """Return the name of a single bit as CF flag meanings spell it."""
+    """Return the name of a single bit as in the CF ``flag_meanings``."""
     return (bit.name or "").lower()
 
 
 def percent(share: float) -> str:
-    """Return a share from 0 to 1 in percent, never rounded to 0 or 100 when it is neither."""
+    """Return a share (0 to 1) in percent; only exact 0 and 1 become 0 % and 100 %."""
     if math.isnan(share):
         return "no value"
     number = 100.0 * share
@@ -44,7 +44,7 @@ def size(count: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in the unit that suits it."""
+    """Return a duration in suitable units."""
     if seconds < 1.0:
         return f"{1e3 * seconds:.0f} ms"
     if seconds < 60.0:
@@ -55,26 +55,26 @@ def duration(seconds: float) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, which takes an s in the plural."""
+    """Return a number with its noun, in the plural with an s."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def lacking(unmet: Unmet) -> str:
-    """Return how many files lack what is asked for."""
+    """Return how many files lack a requested channel."""
     if unmet.nowhere:
         return "the only file" if unmet.of == 1 else f"all {unmet.of:,} files"
     return f"{unmet.files:,} of {unmet.of:,} files"
 
 
 def visible(text: str) -> str:
-    """Return text with control characters, and bytes that are no text, shown by their escapes."""
+    """Return text with control characters and invalid bytes shown as escapes."""
     if text.isprintable():
         return text
     return "".join(c if c in "\n\t" or not _is_control(c) else _escape(c) for c in text)
 
 
 def _is_control(character: str) -> bool:
-    # Cc: control. Cs: a byte of a file name that is not UTF-8. The others reorder text.
+    # Cc: control. Cs: bytes of file names that are not UTF-8. The others reorder text.
     return unicodedata.category(character) in {"Cc", "Cs"} or character in _REORDERING
 
 
@@ -83,5 +83,5 @@ def _escape(character: str) -> str:
 
 
 def decided_on(number: float | None) -> str:
-    """Return the number that a rule decided on; empty where there is none."""
+    """Return the number that a rule decided on; empty for None."""
     return "" if number is None else f"{number:.4g}"

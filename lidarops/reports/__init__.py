@@ -1,1 +1,1 @@
-"""Figures and pages about a run."""
+"""The HTML report of a run and of a benchmark, the run record, and `lidarops inspect`."""

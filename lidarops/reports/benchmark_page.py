@@ -1,4 +1,4 @@
-"""The report of a benchmark: one HTML page with tables and charts, without network or script."""
+"""The HTML report of a benchmark: one page with tables and charts, without network or scripts."""
 
 from __future__ import annotations
 
@@ -22,42 +22,42 @@ INDEX: Final = "index.html"
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One table, the same on the page and in a terminal."""
+    """A table, printed alike on the page and in a terminal."""
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    """One cell for each column; the first one names the row."""
+    """One cell per column; the first cell names the row."""
     note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One chapter of the page."""
+    """A chapter of the page."""
 
     title: str
     text: str
     charts: tuple[Chart | Ladder, ...] = ()
     tables: tuple[Table, ...] = ()
     details: tuple[Table, ...] = ()
-    """Tables that the page keeps folded and a terminal leaves out."""
+    """Tables that are folded on the page and left out in a terminal."""
 
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkReport:
-    """What a benchmark has to say."""
+    """The content of a benchmark's report."""
 
     title: str
     facts: tuple[tuple[str, str], ...]
-    """Where, when and with what it ran: term and value."""
+    """Terms and values: machine, time and versions."""
     parts: tuple[Part, ...]
     data: str = ""
-    """Name of the file beside the page that holds every figure; none where empty."""
+    """Name of the file beside the page with all numbers; empty without such a file."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChartFile:
-    """A chart as a file beside the page."""
+    """A chart as an image file beside the page."""
 
     file: str
     caption: str
@@ -69,9 +69,9 @@ def build_benchmark_page(report: BenchmarkReport, folder: Path) -> Path:
 
     Parameters
     ----------
-    report : Report
+    report : BenchmarkReport
     folder : Path
-        Made where missing.
+        Created if missing.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def build_benchmark_page(report: BenchmarkReport, folder: Path) -> Path:
     Raises
     ------
     CatalogError
-        Where the folder cannot be written.
+        If the folder cannot be written.
     """
     folder = Path(folder)
     try:
@@ -102,10 +102,10 @@ def build_benchmark_page(report: BenchmarkReport, folder: Path) -> Path:
 def _pictures(charts: Sequence[Chart | Ladder], folder: Path) -> list[ChartFile]:
     pictures = []
     for chart in charts:
-        drawn = product_figures.render(draw_chart(chart))
+        rendered = product_figures.render(draw_chart(chart))
         name = f"{chart.name}.png"
-        write_atomically(folder / name, drawn.png)
-        pictures.append(ChartFile(name, chart.caption, drawn.alt))
+        write_atomically(folder / name, rendered.png)
+        pictures.append(ChartFile(name, chart.caption, rendered.alt))
     return pictures
 
 

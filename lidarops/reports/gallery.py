@@ -1,6 +1,6 @@
-"""The figures of a run: products are read, drawn, and compared with the truth.
+"""The figures of a run's report: reads products, draws them, compares them with the truth.
 
-A product that is missing or cannot be read never stops a report: it is named as a problem.
+A missing or unreadable product does not stop the report; it is listed as a problem.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from lidarops.figures.network_data import (
 )
 from lidarops.figures.profile_data import PROFILE_VARIABLES, clearest_profile
 from lidarops.figures.raster import COLUMNS, Raster, raster_variables, read_raster
-from lidarops.figures.reading import UNREADABLE, Readers, Reading, Unread, reason
+from lidarops.figures.reading import UNREADABLE, Readers, ReadFailure, ReadTask, reason
 from lidarops.figures.scan_data import (
     CYCLE_VARIABLES,
     EXTINCTION_VARIABLES,
@@ -55,24 +55,24 @@ FIGURES: Final = 40
 _FLAG_ROWS: Final = 40
 _DARK_STEP: Final = "dark"
 """Name of the step of a plan that subtracts dark files."""
-_KINDS: Final = (
+_KIND_ORDER: Final = (
     ProductKind.HOMOGENEOUS,
     ProductKind.VISIBILITY,
     ProductKind.MULTIANGLE,
     ProductKind.ELASTIC,
     ProductKind.SIGNAL,
 )
-Found = TypeVar("Found")
+Content = TypeVar("Content")
 Drawing = Callable[[], product_figures.Rendered]
-"""Gives a figure when it is done."""
+"""Returns a figure once it is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure of the report."""
+    """A figure of the report."""
 
     file: str
-    """Name inside the report folder."""
+    """File name in the report folder."""
     instrument: str
     caption: str
     alt: str
@@ -80,7 +80,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A comparison with the truth, and whose it is."""
+    """A comparison with the truth, with its instrument and channel."""
 
     instrument: str
     channel: str
@@ -97,26 +97,26 @@ class Problem:
 
 @dataclass(slots=True)
 class Gallery:
-    """What was made of the products of a run."""
+    """Figures, comparisons and problems from the products of a run."""
 
     pictures: list[Figure] = field(default_factory=list)
     flags: Figure | None = None
     compared: list[Compared] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     undrawn: list[str] = field(default_factory=list)
-    """Labels of channels that the limit of figures left out."""
+    """Labels of channels that are not drawn because of the limit on figures."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Group:
-    """Every product of one kind, instrument and channel."""
+    """All products of one kind, instrument and channel."""
 
     kind: ProductKind
     instrument: str
     channel: str
     members: tuple[tuple[SceneOutcome, ProductRecord], ...]
     root: Path
-    """Folder that the paths of products start from."""
+    """Folder that product paths are relative to."""
 
     @property
     def label(self) -> str:
@@ -125,24 +125,24 @@ class _Group:
 
 @dataclass(frozen=True, slots=True)
 class _Sources:
-    """What figures are made from; products that cannot be read are noted in the gallery."""
+    """Reads products for figures; unreadable products are noted as problems of the gallery."""
 
     readers: Readers
     truth: xr.Dataset | None
     gallery: Gallery
 
-    def each(
+    def read_all(
         self,
         group: _Group,
         names: tuple[str, ...],
-        reads: Iterable[Callable[..., Found]],
+        reads: Iterable[Callable[..., Content]],
         *,
         with_truth: bool = False,
-    ) -> Iterator[Found]:
-        """Give what is read of each product of a group that can be read."""
+    ) -> Iterator[Content]:
+        """Yield the content of every readable product of a group."""
         paths = [product.path for _, product in group.members]
         readings = [
-            Reading(group.root / path, names, read, with_truth)
+            ReadTask(group.root / path, names, read, with_truth)
             for path, read in zip(paths, reads, strict=True)
         ]
         yield from self._read(paths, readings)
@@ -150,80 +150,80 @@ class _Sources:
     def rasters(
         self, group: _Group, names: tuple[str, ...], read: Callable[..., Raster]
     ) -> list[Raster]:
-        """Reduce all products of a group alike, as coarsely as their number asks for."""
+        """Reduce all products of a group to the same resolution, given by their total length."""
         sizes: dict[str, int] = {}
         paths = [product.path for _, product in group.members]
         lengths = self.readers.lengths([group.root / path for path in paths])
         for path, length in zip(paths, lengths, strict=True):
-            if isinstance(length, Unread):
+            if isinstance(length, ReadFailure):
                 self._note(path, length.reason)
             else:
                 sizes[path] = length
         profiles = -(-sum(sizes.values()) // COLUMNS)
         reduced = functools.partial(read, profiles=profiles)
-        readings = [Reading(group.root / path, names, reduced) for path in sizes]
+        readings = [ReadTask(group.root / path, names, reduced) for path in sizes]
         return list(self._read(list(sizes), readings))
 
-    def first(
+    def read_first(
         self,
         group: _Group,
         names: tuple[str, ...],
-        read: Callable[..., Found | None],
+        read: Callable[..., Content | None],
         *,
         with_truth: bool = False,
-    ) -> Found | None:
-        """Return what is read of the first product of a group that has it."""
-        told = {problem.path for problem in self.gallery.problems}
+    ) -> Content | None:
+        """Return the content of the first product of a group that has any, or None."""
+        noted = {problem.path for problem in self.gallery.problems}
         for _, product in group.members:
-            reading = Reading(group.root / product.path, names, read, with_truth)
-            found = self.readers.one(reading)
-            if isinstance(found, Unread):
-                if product.path not in told:
-                    self._note(product.path, found.reason)
-            elif found is not None:
-                return found
+            reading = ReadTask(group.root / product.path, names, read, with_truth)
+            content = self.readers.read(reading)
+            if isinstance(content, ReadFailure):
+                if product.path not in noted:
+                    self._note(product.path, content.reason)
+            elif content is not None:
+                return content
         return None
 
-    def draw(self, draw: Callable[..., Any], of: object, title: str) -> Drawing:
-        """Begin a figure, in another process where there is one."""
+    def draw(self, draw: Callable[..., Any], content: object, title: str) -> Drawing:
+        """Start drawing a figure, in another process if there is one."""
         return self.readers.later(
-            product_figures.draw_figure, product_figures.Sketch(draw, of, title)
+            product_figures.draw_figure, product_figures.Sketch(draw, content, title)
         )
 
-    def _read(self, paths: list[str], readings: list[Reading[Found]]) -> Iterator[Found]:
-        for path, found in zip(paths, self.readers.each(readings), strict=True):
-            if isinstance(found, Unread):
-                self._note(path, found.reason)
+    def _read(self, paths: list[str], readings: list[ReadTask[Content]]) -> Iterator[Content]:
+        for path, content in zip(paths, self.readers.read_all(readings), strict=True):
+            if isinstance(content, ReadFailure):
+                self._note(path, content.reason)
             else:
-                yield found
+                yield content
 
     def _note(self, path: str, words: str) -> None:
         self.gallery.problems.append(Problem(path, words))
 
 
 @dataclass(frozen=True, slots=True)
-class _Drawn:
+class _PendingFigure:
     name: str
     caption: str
-    figure: Drawing
+    draw: Drawing
 
 
 class _Album:
-    """Keeps figures as files in the order they come in, some of them while they are drawn."""
+    """Writes figures to files in their order; a bounded number is drawn at the same time."""
 
     def __init__(self, folder: Path, ahead: int) -> None:
         self.pictures: list[Figure] = []
         self._folder = folder
-        # What a figure is made from is held until it is done.
+        # Bounded, because the data of a figure stay in memory until it is drawn.
         self._ahead = ahead
-        self._waiting: deque[tuple[str, _Drawn]] = deque()
+        self._waiting: deque[tuple[str, _PendingFigure]] = deque()
         self._taken: Counter[str] = Counter()
 
     def __len__(self) -> int:
         return len(self.pictures) + len(self._waiting)
 
-    def add(self, instrument: str, drawn: _Drawn) -> None:
-        self._waiting.append((instrument, drawn))
+    def add(self, instrument: str, figure: _PendingFigure) -> None:
+        self._waiting.append((instrument, figure))
         self._keep(self._ahead)
 
     def finish(self) -> list[Figure]:
@@ -232,11 +232,11 @@ class _Album:
 
     def _keep(self, ahead: int) -> None:
         while len(self._waiting) > ahead:
-            instrument, drawn = self._waiting.popleft()
-            name = _unique(drawn.name, self._taken)
-            rendered = drawn.figure()
+            instrument, figure = self._waiting.popleft()
+            name = _unique(figure.name, self._taken)
+            rendered = figure.draw()
             write_atomically(self._folder / name, rendered.png)
-            self.pictures.append(Figure(name, instrument, drawn.caption, rendered.alt))
+            self.pictures.append(Figure(name, instrument, figure.caption, rendered.alt))
 
 
 def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
@@ -248,14 +248,14 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
     folder : Path
         Existing folder for the PNG files.
     limit : int, optional
-        Most figures of products; comparisons with the truth are made for all.
+        Most figures of products. Comparisons with the truth are made for all products.
     workers : int, optional
-        Most processes to read and draw with; changes no figure.
+        Most processes that read and draw. The figures do not depend on it.
 
     Returns
     -------
     Gallery
-        One or more figures for every instrument and channel over all scenes.
+        One or more figures per instrument and channel, over all scenes.
     """
     gallery = Gallery()
     with _sources(record, gallery, workers) as sources:
@@ -265,19 +265,19 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
             full = len(album) >= limit
             if full:
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
-            for drawn in _draw(group, sources, full=full):
-                album.add(group.instrument, drawn)
+            for figure in _draw(group, sources, full=full):
+                album.add(group.instrument, figure)
         gallery.pictures = album.finish()
         if flags is not None:
             name = f"{flags.name}.png"
-            rendered = flags.figure()
+            rendered = flags.draw()
             write_atomically(folder / name, rendered.png)
             gallery.flags = Figure(name, "", flags.caption, rendered.alt)
     return gallery
 
 
-def missing(record: RunRecord) -> frozenset[str]:
-    """Return the paths of the recorded products whose file is not there."""
+def missing_products(record: RunRecord) -> frozenset[str]:
+    """Return the paths of recorded products whose file is missing."""
     root = Path(record.products)
     return frozenset(
         product.path
@@ -288,7 +288,7 @@ def missing(record: RunRecord) -> frozenset[str]:
 
 
 def _groups(record: RunRecord) -> list[_Group]:
-    """Return the groups, homogeneous first, the channels of all instruments in turn."""
+    """Return the groups by kind; within a kind, the first channel of every instrument first."""
     members: dict[tuple[ProductKind, str, str], list[tuple[SceneOutcome, ProductRecord]]]
     members = defaultdict(list)
     for scene in record.scenes:
@@ -296,15 +296,15 @@ def _groups(record: RunRecord) -> list[_Group]:
             members[product.kind, scene.instrument, product.channel].append((scene, product))
     turns: Counter[tuple[ProductKind, str]] = Counter()
     ordered = []
-    for (kind, instrument, channel), found in sorted(members.items()):
+    for (kind, instrument, channel), products in sorted(members.items()):
         turn = turns[kind, instrument]
         turns[kind, instrument] += 1
-        group = _Group(kind, instrument, channel, tuple(found), Path(record.products))
-        ordered.append((_KINDS.index(kind), turn, instrument, channel, group))
+        group = _Group(kind, instrument, channel, tuple(products), Path(record.products))
+        ordered.append((_KIND_ORDER.index(kind), turn, instrument, channel, group))
     return [group for *_, group in sorted(ordered, key=lambda row: row[:4])]
 
 
-def _draw(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
+def _draw(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_PendingFigure]:
     if group.kind is ProductKind.HOMOGENEOUS:
         if not full or sources.truth is not None:
             yield from _homogeneous(group, sources, full=full)
@@ -320,7 +320,7 @@ def _draw(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
         yield from _signal(group, sources)
 
 
-def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
+def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_PendingFigure]:
     read = [
         functools.partial(
             read_sections,
@@ -331,10 +331,10 @@ def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_D
         )
         for scene, _ in group.members
     ]
-    by_scene = list(sources.each(group, SECTION_VARIABLES, read, with_truth=True))
+    by_scene = list(sources.read_all(group, SECTION_VARIABLES, read, with_truth=True))
     scenes = len(by_scene)
-    found = [section for sections in by_scene for section in sections]
-    sections = [section for section in join(found) if section.time.size > 0]
+    unjoined = [section for sections in by_scene for section in sections]
+    sections = [section for section in join(unjoined) if section.time.size > 0]
     compared = [
         Compared(group.instrument, group.channel, comparison)
         for section in sections
@@ -345,49 +345,49 @@ def _homogeneous(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_D
     for first in range(0, 0 if full else len(sections), panels.SECTIONS):
         few = sections[first : first + panels.SECTIONS]
         where = f"{group.label}, {', '.join(section.label for section in few)}"
-        yield _Drawn(
+        yield _PendingFigure(
             f"homogeneous_{group.instrument}_{group.channel}",
             f"Extinction and background with their standard errors: {where};"
             f" {counted(scenes, 'scene')}.",
             sources.draw(product_figures.draw_retrieval, few, group.label),
         )
         if compared:
-            yield _Drawn(
+            yield _PendingFigure(
                 f"truth_{group.instrument}_{group.channel}",
-                f"Unflagged values against the truth of the simulation: {where}.",
+                f"Unflagged values compared with the simulated truth: {where}.",
                 sources.draw(product_figures.draw_comparison, few, group.label),
             )
 
 
-def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_Drawn]:
+def _visibility(group: _Group, sources: _Sources, *, full: bool) -> Iterator[_PendingFigure]:
     read = [
         functools.partial(read_crossings, instruments=instruments_of(scene))
         for scene, _ in group.members
     ]
-    by_scene = list(sources.each(group, CROSSING_VARIABLES, read, with_truth=True))
-    series = join_crossings([one for crossings in by_scene for one in crossings])
+    by_scene = list(sources.read_all(group, CROSSING_VARIABLES, read, with_truth=True))
+    series = join_crossings([crossing for crossings in by_scene for crossing in crossings])
     sources.gallery.compared += [
         Compared(group.instrument, group.channel, comparison)
-        for one in series
-        if (comparison := compare(one, "extinction")) is not None
+        for crossing in series
+        if (comparison := compare(crossing, "extinction")) is not None
     ]
     if full or not series:
         return
     scene = group.members[0][0]
     read_network = functools.partial(read_map, instruments=instruments_of(scene))
-    network = sources.first(group, MAP_VARIABLES, read_network)
+    network = sources.read_first(group, MAP_VARIABLES, read_network)
     if network is not None:
-        yield _Drawn(
+        yield _PendingFigure(
             f"network_{group.instrument}_{group.channel}",
-            f"Beams, and visibility where they meet: {group.label}.",
+            f"Beams, crossings and median visibility at the crossings: {group.label}.",
             sources.draw(network_figures.draw_map, network, group.label),
         )
     for first in range(0, len(series), network_figures.CROSSINGS):
         few = series[first : first + network_figures.CROSSINGS]
-        yield _Drawn(
+        yield _PendingFigure(
             f"visibility_{group.instrument}_{group.channel}",
-            f"Visibility and extinction with their errors:"
-            f" {group.label}, {', '.join(one.label for one in few)}.",
+            f"Visibility and extinction at the crossings, with standard errors:"
+            f" {group.label}, {', '.join(crossing.label for crossing in few)}.",
             sources.draw(network_figures.draw_series, few, group.label),
         )
 
@@ -397,10 +397,10 @@ def _dark_subtracted(scene: SceneOutcome, channel: str) -> bool:
     return any(step.name == _DARK_STEP and step.channel == channel for step in steps)
 
 
-def _signal(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
+def _signal(group: _Group, sources: _Sources) -> Iterator[_PendingFigure]:
     rasters = sources.rasters(group, raster_variables(), read_raster)
     if rasters:
-        yield _Drawn(
+        yield _PendingFigure(
             f"signal_{group.instrument}_{group.channel}",
             f"Range-corrected signal and background: {group.label};"
             f" {counted(len(rasters), 'scene')}.",
@@ -408,60 +408,60 @@ def _signal(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
         )
 
 
-def _elastic(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
+def _elastic(group: _Group, sources: _Sources) -> Iterator[_PendingFigure]:
     quantity = "attenuated_backscatter"
     read = functools.partial(read_raster, quantity=quantity)
     rasters = sources.rasters(group, raster_variables(quantity), read)
     if rasters:
-        yield _Drawn(
+        yield _PendingFigure(
             f"elastic_{group.instrument}_{group.channel}",
             f"Attenuated backscatter, clouds and background: {group.label};"
             f" {counted(len(rasters), 'scene')}.",
             sources.draw(product_figures.draw_backscatter, rasters, group.label),
         )
-    profile = sources.first(group, PROFILE_VARIABLES, clearest_profile)
+    profile = sources.read_first(group, PROFILE_VARIABLES, clearest_profile)
     if profile is not None:
-        yield _Drawn(
+        yield _PendingFigure(
             f"profile_{group.instrument}_{group.channel}",
-            f"The profile of a scene with most unflagged bins, and its error budget:"
+            f"Profile with the most unflagged bins in a scene, and its error budget:"
             f" {group.label}.",
             sources.draw(product_figures.error_budget_figure, profile, group.label),
         )
 
 
-def _multiangle(group: _Group, sources: _Sources) -> Iterator[_Drawn]:
+def _multiangle(group: _Group, sources: _Sources) -> Iterator[_PendingFigure]:
     rasters = sources.rasters(group, EXTINCTION_VARIABLES, read_extinction)
     if rasters:
-        yield _Drawn(
+        yield _PendingFigure(
             f"multiangle_{group.instrument}_{group.channel}",
             f"Extinction over time and altitude: {group.label}; {counted(len(rasters), 'scene')}.",
             sources.draw(product_figures.draw_extinction, rasters, group.label),
         )
     clearest = functools.partial(clearest_cycle, instrument=group.instrument)
-    profile = sources.first(group, CYCLE_VARIABLES, clearest, with_truth=True)
+    profile = sources.read_first(group, CYCLE_VARIABLES, clearest, with_truth=True)
     if profile is not None:
-        yield _Drawn(
+        yield _PendingFigure(
             f"scan-profile_{group.instrument}_{group.channel}",
-            f"The cycle of a scene with most unflagged values: {group.label}.",
+            f"Scan cycle with the most unflagged values in a scene: {group.label}.",
             sources.draw(product_figures.scan_profile, profile, group.label),
         )
-    residuals = sources.first(group, RESIDUAL_VARIABLES, read_residuals)
+    residuals = sources.read_first(group, RESIDUAL_VARIABLES, read_residuals)
     if residuals is not None:
-        yield _Drawn(
+        yield _PendingFigure(
             f"scan-residuals_{group.instrument}_{group.channel}",
-            f"What the fit over angles leaves of the signal, mean of the cycles of a scene:"
+            f"Residuals of the fit over zenith angle, mean over the cycles of a scene:"
             f" {group.label}.",
             sources.draw(product_figures.scan_residuals, residuals, group.label),
         )
 
 
-def _flags(record: RunRecord, sources: _Sources) -> _Drawn | None:
+def _flags(record: RunRecord, sources: _Sources) -> _PendingFigure | None:
     shares = _shares(record)
     if not shares:
         return None
-    return _Drawn(
+    return _PendingFigure(
         "flags",
-        "Share of the values of every product that carry a quality bit, over all scenes.",
+        "Share of values with each quality bit, by channel and product kind, over all scenes.",
         sources.draw(product_figures.flags_overview, shares, "Flagged values"),
     )
 
@@ -518,15 +518,15 @@ def _unique(name: str, taken: Counter[str]) -> str:
 
 
 def comparisons_by_quantity(compared: Sequence[Compared]) -> Mapping[str, tuple[int, int, int]]:
-    """Return for every quantity how many values were compared, within 1 and 3 standard errors."""
+    """Return for each quantity the number of values compared, within 1 and within 3 errors."""
     totals: dict[str, tuple[int, int, int]] = {}
     for item in compared:
         c = item.comparison
         if c.count:
-            count, one, three = totals.get(c.quantity, (0, 0, 0))
+            count, within_1, within_3 = totals.get(c.quantity, (0, 0, 0))
             totals[c.quantity] = (
                 count + c.count,
-                one + round(c.within_1 * c.count),
-                three + round(c.within_3 * c.count),
+                within_1 + round(c.within_1 * c.count),
+                within_3 + round(c.within_3 * c.count),
             )
     return totals

@@ -1,4 +1,7 @@
-"""What a raw file or a product holds, as plain data and as tables for the terminal."""
+"""The content of a raw file or a product, as plain data and as tables for the terminal.
+
+This is what `lidarops inspect` shows.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,9 @@ from lidarops.netcdf.provenance import NETCDF_MAGIC, read_provenance
 from lidarops.raw import licel
 
 _LONG: Final = {"comment", "history", "references"}
-"""Attributes that no table has room for; JSON has them."""
+"""Attributes too long for a table; the JSON output has them."""
 _CHANNEL: Final = ("name", "wavelength", "bins", "bin_width", "shots", "adc_bits", "device")
-"""Facts about channels that the table shows; JSON has all."""
+"""Channel properties in the table; the JSON output has all."""
 _VERDICTS: Final = ("good", "use_with_care", "do_not_use")
 
 
@@ -37,7 +40,7 @@ def describe(file: Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        Plain JSON types. Key ``type`` is ``raw`` or ``netcdf``; what is not known is None.
+        Plain JSON types. Key ``type`` is ``raw`` or ``netcdf``; unknown values are None.
 
     Raises
     ------
@@ -56,26 +59,26 @@ def describe(file: Path) -> dict[str, Any]:
 
 def tables(file: Path) -> list[Table]:
     """Return the description of a file as tables; see `describe`."""
-    found = describe(file)
+    description = describe(file)
     about = _table(file.name, "field", "value")
-    for key, value in found.items():
+    for key, value in description.items():
         if isinstance(value, str | int | float) or value is None:
             _row(about, key.replace("_", " "), "not known" if value is None else value)
-    if found["type"] == "raw":
-        for note in found["notes"] or ["none"]:
+    if description["type"] == "raw":
+        for note in description["notes"] or ["none"]:
             _row(about, "notes", note)
-        return [about, _listed("Channels", found["channels"], _CHANNEL)]
-    for key, value in found["attributes"].items():
+        return [about, _listed("Channels", description["channels"], _CHANNEL)]
+    for key, value in description["attributes"].items():
         if key not in _LONG:
             _row(about, key, value)
-    held = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
-    shown = [about, _listed("Variables", found["variables"], held)]
+    columns = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
+    shown = [about, _listed("Variables", description["variables"], columns)]
     flags = ("name", "severity", "values", "share", "description")
-    return [*shown, _listed("Quality", found["quality"], flags)]
+    return [*shown, _listed("Quality", description["quality"], flags)]
 
 
 def provenance(file: Path) -> str:
-    """Return the PROV-JSON text of a product.
+    """Return the provenance of a product as PROV-JSON text.
 
     Raises
     ------
@@ -91,16 +94,16 @@ def _raw(file: Path) -> dict[str, Any]:
     except RawFormatError as error:
         error.remedy = error.remedy or "lidarops inspect reads Licel files and NetCDF products"
         raise
-    told: dict[str, Any] = _plain(header)
-    channels = told.pop("datasets")
-    for told_of, dataset in zip(channels, header.datasets, strict=True):
-        told_of |= {
+    description: dict[str, Any] = _plain(header)
+    channels = description.pop("datasets")
+    for channel, dataset in zip(channels, header.datasets, strict=True):
+        channel |= {
             "name": dataset.name,
             "bin_width": dataset.bin_width,
             "wavelength": _plain(dataset.wavelength),
         }
-    told |= {"zenith_angle": header.zenith_angle}
-    return {"type": "raw", "file": str(file), **told, "channels": channels}
+    description |= {"zenith_angle": header.zenith_angle}
+    return {"type": "raw", "file": str(file), **description, "channels": channels}
 
 
 def _product(file: Path) -> dict[str, Any]:
@@ -121,7 +124,7 @@ def _product(file: Path) -> dict[str, Any]:
 
 
 def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
-    told = {
+    properties = {
         "name": name,
         "dimensions": ", ".join(f"{dim} {size}" for dim, size in variable.sizes.items()),
         **{key: variable.attrs.get(key) for key in ("units", "standard_name", "long_name")},
@@ -129,24 +132,24 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
         **dict.fromkeys(("minimum", "maximum", "missing")),
     }
     if variable.dtype.kind not in "fiu" or variable.size == 0:
-        return told
+        return properties
     values = variable.to_numpy().astype(np.float64)
     finite = values[np.isfinite(values)]
-    told["missing"] = values.size - finite.size
+    properties["missing"] = values.size - finite.size
     if finite.size:
-        told |= {"minimum": float(finite.min()), "maximum": float(finite.max())}
-    return told
+        properties |= {"minimum": float(finite.min()), "maximum": float(finite.max())}
+    return properties
 
 
 def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
-    """Count values by verdict and by bit, where the file is a product of ours."""
+    """Count values by verdict and by quality bit; empty for files without quality flags."""
     if "quality_flag" not in dataset.variables:
         return []
     flags = dataset["quality_flag"].to_numpy().astype(np.int64)
-    found = []
+    rows = []
     if "usable" in dataset.variables:
         usable = dataset["usable"].to_numpy()
-        found = [
+        rows = [
             _counted(name, "verdict", int(np.count_nonzero(usable == value)), flags.size, "")
             for value, name in enumerate(_VERDICTS)
         ]
@@ -155,28 +158,28 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
         if count:
             severity = bit.severity.name.lower()
             name = str(bit.name).lower()
-            found.append(_counted(name, severity, count, flags.size, bit.description))
-    return found
+            rows.append(_counted(name, severity, count, flags.size, bit.description))
+    return rows
 
 
-def _counted(name: str, severity: str, count: int, size: int, about: str) -> dict[str, Any]:
+def _counted(name: str, severity: str, count: int, size: int, description: str) -> dict[str, Any]:
     return {
         "name": name,
         "severity": severity,
         "values": count,
         "share": round(count / size, 4) if size else None,
-        "description": about,
+        "description": description,
     }
 
 
 def _plain(value: Any) -> Any:
-    """Return plain JSON types; a number that is none becomes None."""
+    """Convert to plain JSON types; numbers that are not finite become None."""
     if is_dataclass(value):
-        return {each.name: _plain(getattr(value, each.name)) for each in fields(value)}
+        return {item.name: _plain(getattr(value, item.name)) for item in fields(value)}
     if isinstance(value, dict):
-        return {str(key): _plain(each) for key, each in value.items()}
+        return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(each) for each in value]
+        return [_plain(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
         return _plain(value.tolist())
     return _plain_scalar(value)
@@ -215,5 +218,5 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _row(table: Table, *cells: Any) -> None:
-    # Text, because a header may hold what rich would take for markup.
+    # As Text, because rich would interpret brackets in a header as markup.
     table.add_row(*(Text(str(cell)) for cell in cells))

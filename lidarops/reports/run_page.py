@@ -1,4 +1,4 @@
-"""The report of a run: one HTML page with its figures, readable from the file system."""
+"""The HTML report of a run: one page with its figures, readable without a web server."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from lidarops.reports.run_record import FILE_NAME, write_atomically
 INDEX: Final = "index.html"
 """Name of the page inside a run's report folder."""
 ROWS: Final = 2000
-"""Most rows of a table on the page; the run record beside it holds all."""
+"""Most rows of a table on the page. The run record beside it holds all rows."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProductLink:
-    """One product in the table of scenes."""
+    """A product in the table of scenes."""
 
     label: str
     href: str
@@ -42,7 +42,7 @@ class ProductLink:
 
 @dataclass(frozen=True, slots=True)
 class SceneRow:
-    """One scene in the table of scenes."""
+    """A row of the table of scenes."""
 
     scene: str
     station: str
@@ -52,7 +52,7 @@ class SceneRow:
     outcome: str
     products: tuple[ProductLink, ...]
     seconds: tuple[str, ...]
-    """By stage, in the order of the table's columns."""
+    """Time by stage, in the order of the table's columns."""
     plan_hash: str
 
 
@@ -62,7 +62,7 @@ class RunReport:
 
     page: Path
     quicklook: Path | None
-    """Its first figure of products; None where none can be drawn."""
+    """First figure of products; None if no figure could be drawn."""
 
 
 def build_report(
@@ -73,24 +73,24 @@ def build_report(
     Parameters
     ----------
     record : RunRecord
-        Any run, also one without scenes or with failures only.
+        Any run, also one without scenes or with failed scenes only.
     folder : Path
-        Report folder; made where missing. The figures stand beside the page, links are
-        relative, and the page needs neither network nor script.
+        Report folder; created if missing. Figures are files beside the page. Links are
+        relative, and the page needs neither network nor scripts.
     figures : int, optional
         Most figures of products.
     workers : int, optional
-        Most processes to read products and to draw with; changes nothing that is shown.
+        Most processes that read products and draw. The report does not depend on it.
 
     Returns
     -------
-    Report
-        Products that are missing or unreadable are named on the page.
+    RunReport
+        Missing and unreadable products are listed on the page.
 
     Raises
     ------
     CatalogError
-        Where the folder cannot be written.
+        If the folder cannot be written.
     """
     folder = Path(folder)
     try:
@@ -109,7 +109,7 @@ def build_report(
 
 
 def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:
-    """Return one row of plain values for every instrument, for a table outside the report."""
+    """Return one row of plain values per instrument, for tables outside the report."""
     return [
         {
             "station": row.station,
@@ -128,9 +128,9 @@ def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:
 
 
 def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
-    gone = gallery.missing(record)
+    missing = gallery.missing_products(record)
     problems = {problem.path: problem.reason for problem in filled.problems}
-    problems = dict.fromkeys(sorted(gone), "the file is missing") | problems
+    problems = dict.fromkeys(sorted(missing), "the file is missing") | problems
     stages = run_tables.stages(record)
     pictures = _by_instrument(filled.pictures)
     return _environment().get_template("run.html").render(
@@ -140,12 +140,12 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         instruments=run_tables.instruments(record),
         stages=stages,
         scenes=[
-            _scene_row(scene, record, folder, gone, [stage.stage for stage in stages])
+            _scene_row(scene, record, folder, missing, [stage.stage for stage in stages])
             for scene in record.scenes[:ROWS]
         ],
         left_out=run_tables.left_out(record),
-        barren=run_tables.barren(record),
-        steps=run_tables.done(record),
+        without_product=run_tables.scenes_without_product(record),
+        steps=run_tables.carried_out(record),
         flags=run_tables.flags(record),
         refused=run_tables.refused(record),
         failed=[scene for scene in record.scenes if scene.error],
@@ -181,7 +181,7 @@ def _scene_row(
     scene: SceneOutcome,
     record: RunRecord,
     folder: Path,
-    gone: frozenset[str],
+    missing: frozenset[str],
     stages: Sequence[str],
 ) -> SceneRow:
     flagged = run_tables.flagged_words(scene)
@@ -195,7 +195,7 @@ def _scene_row(
         products=tuple(
             ProductLink(
                 label=f"{product.kind} {product.channel}",
-                href="" if product.path in gone else _href(record, product.path, folder),
+                href="" if product.path in missing else _href(record, product.path, folder),
                 flagged=flagged[product.path],
                 size=size(product.size),
                 sha256=product.sha256,
@@ -214,7 +214,7 @@ def _href(record: RunRecord, product: str, folder: Path) -> str:
     path = (Path(record.products) / product).resolve()
     try:
         relative = os.path.relpath(path, folder.resolve())
-    except ValueError:  # on another drive, where no relative path leads
+    except ValueError:  # No relative path leads to another drive.
         return path.as_uri()
     return quote(os.fsencode(Path(relative).as_posix()))
 
@@ -222,19 +222,21 @@ def _href(record: RunRecord, product: str, folder: Path) -> str:
 def _by_instrument(pictures: Sequence[Figure]) -> list[tuple[str, list[Figure]]]:
     ordered = sorted(pictures, key=lambda picture: picture.instrument)
     return [
-        (name, list(found)) for name, found in groupby(ordered, lambda picture: picture.instrument)
+        (name, list(figures))
+        for name, figures in groupby(ordered, lambda picture: picture.instrument)
     ]
 
 
 def _compared_words(compared: Sequence[Compared]) -> Mapping[str, str]:
+    totals = gallery.comparisons_by_quantity(compared)
     return {
-        quantity: f"{percent(one / count)} within 1 and {percent(three / count)} within 3"
+        quantity: f"{percent(within_1 / count)} within 1 and {percent(within_3 / count)} within 3"
         f" standard errors of the truth, of {count:,} unflagged values"
-        for quantity, (count, one, three) in gallery.comparisons_by_quantity(compared).items()
+        for quantity, (count, within_1, within_3) in totals.items()
     }
 
 
 def _plan_hash(record: RunRecord) -> str:
-    """Return the sha256 over the hashes of all plans, sorted: equal plans, equal hash."""
+    """Return the sha256 over the sorted hashes of all plans."""
     hashes = sorted(scene.plan.hash for scene in record.scenes if scene.plan)
     return hashlib.sha256("\n".join(hashes).encode()).hexdigest() if hashes else ""

@@ -1,4 +1,4 @@
-"""Run records as JSON: what a run did, kept beside its report."""
+"""The run record as JSON (``run.json``): what a run did, stored beside its report."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _FORMAT: Final = "lidarops run record"
 _VERSION: Final = 1
 _T = TypeVar("_T")
 _REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"
-# JSON has no such numbers, and other readers than Python refuse Python's spelling of them.
+# JSON has no such numbers, and only Python reads Python's spelling of them.
 _NOT_FINITE: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
 class _MismatchError(Exception):
-    """A value that is not what its field says; carries the place and what was expected."""
+    """A value of the wrong type; carries its place and what was expected there."""
 
     def __init__(self, place: str, expected: str) -> None:
         self.place = place
@@ -40,24 +40,24 @@ class _MismatchError(Exception):
 
 
 def save_run_record(record: RunRecord, folder: Path) -> Path:
-    """Write a run record to ``run.json`` in `folder`, in one atomic step.
+    """Write a run record to ``run.json`` in `folder` atomically.
 
     Parameters
     ----------
     record : RunRecord
-        The run. Settings in it must be plain JSON types, as `lidarops.records` says.
+        Its settings must be plain JSON types, see `lidarops.records`.
     folder : Path
-        Report folder of the run; made where missing.
+        Report folder of the run; created if missing.
 
     Returns
     -------
     Path
-        The file. `load_run_record` gives back an equal record; tuples within settings become lists.
+        The file. `load_run_record` reads an equal record; tuples in settings become lists.
 
     Raises
     ------
     CatalogError
-        Where the folder cannot be written, or a setting is not a plain JSON type.
+        If the folder cannot be written, or a setting is not a plain JSON type.
     """
     target = Path(folder) / FILE_NAME
     document = {"format": _FORMAT, "version": _VERSION, "record": _plain(record)}
@@ -65,10 +65,10 @@ def save_run_record(record: RunRecord, folder: Path) -> Path:
         text = json.dumps(document, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise CatalogError(
-            f"the run record holds what JSON cannot: {error}",
+            f"the run record holds a value that JSON cannot hold: {error}",
             file=target,
             field="settings",
-            remedy="keep settings to text, finite numbers, booleans, lists and mappings",
+            remedy="use only text, finite numbers, booleans, lists and mappings in settings",
         ) from error
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -93,22 +93,22 @@ def load_run_record(path: str | Path) -> RunRecord:
     Returns
     -------
     RunRecord
-        Equal to the one that was saved.
+        Equal to the saved record.
 
     Raises
     ------
     CatalogError
-        With file, field and what was expected, where the file is missing, damaged or not
-        exactly a run record: a wrong type, an unknown or a missing field.
+        If the file is missing, damaged or not exactly a run record (a wrong type, an unknown
+        or a missing field). States the file, the field and what was expected.
     """
     path = Path(path)
     path = path / FILE_NAME if path.is_dir() else path
     try:
         document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
     except OSError as error:
-        missing = isinstance(error, NO_FILE)
+        is_missing = isinstance(error, NO_FILE)
         raise CatalogError(
-            f"cannot be read: {error}", file=path, remedy=_REMEDY, wrong_use=missing
+            f"cannot be read: {error}", file=path, remedy=_REMEDY, wrong_use=is_missing
         ) from error
     except (ValueError, RecursionError) as error:
         raise CatalogError(f"is not a JSON document: {error}", file=path, remedy=_REMEDY) from error
@@ -116,10 +116,10 @@ def load_run_record(path: str | Path) -> RunRecord:
         raise CatalogError("is not a lidarops run record", file=path, remedy=_REMEDY)
     if document.get("version") != _VERSION:
         raise CatalogError(
-            f"is version {document.get('version')!r}, and this lidarops reads {_VERSION}",
+            f"has version {document.get('version')!r}, but this lidarops reads {_VERSION}",
             file=path,
             field="version",
-            remedy="use the lidarops that wrote it, or run the campaign again",
+            remedy="use the lidarops version that wrote it, or run the campaign again",
         )
     try:
         record = _dataclass(RunRecord, document.get("record"), "record")
@@ -136,14 +136,14 @@ def write_atomically(target: Path, content: bytes) -> None:
     Parameters
     ----------
     target : Path
-        The file to make or replace; its folder exists.
+        File to create or replace; its folder must exist.
     content : bytes
-        All of it.
+        Whole content.
 
     Raises
     ------
     OSError
-        Where the file system refuses; `target` is then as before.
+        If the file system refuses; `target` is then unchanged.
     """
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
     temporary = Path(name)
@@ -152,7 +152,7 @@ def write_atomically(target: Path, content: bytes) -> None:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes files that only their owner may read, and reports are for others.
+        # mkstemp makes files that only their owner can read, but reports are shared.
         temporary.chmod(0o644)
         temporary.replace(target)
     finally:
@@ -168,8 +168,8 @@ def _plain(value: object) -> object:
         return [_plain(item) for item in value]
     if isinstance(value, datetime):
         return value.isoformat()
-    # Settings are plain already: a number that is not finite in them is refused by `save_run_record`,
-    # because text in its place could not be told from text when it is read.
+    # Settings are plain already. `save_run_record` refuses non-finite numbers in them: text in
+    # their place could not be distinguished from text when it is read.
     return dict(value) if isinstance(value, Mapping) else value
 
 
@@ -183,17 +183,17 @@ def _hints(kind: type) -> dict[str, object]:
 
 
 def _typed(expected: object, value: object, place: str) -> object:
-    """Return `value`, as JSON gave it, as the type `expected` of a field."""
-    origin, parts = typing.get_origin(expected), typing.get_args(expected)
+    """Return a JSON `value` as the type `expected` of a field."""
+    origin, arguments = typing.get_origin(expected), typing.get_args(expected)
     if origin is types.UnionType:
-        (kind,) = (part for part in parts if part is not type(None))
+        (kind,) = (argument for argument in arguments if argument is not type(None))
         return None if value is None else _typed(kind, value, place)
     if origin is tuple:
         items = _checked(value, list, "a list", place)
-        return tuple(_typed(parts[0], item, f"{place}[{i}]") for i, item in enumerate(items))
+        return tuple(_typed(arguments[0], item, f"{place}[{i}]") for i, item in enumerate(items))
     if origin is Mapping:
         pairs = _checked(value, dict, "a mapping", place)
-        return {key: _typed(parts[1], item, f"{place}.{key}") for key, item in pairs.items()}
+        return {key: _typed(arguments[1], item, f"{place}.{key}") for key, item in pairs.items()}
     if isinstance(expected, type) and is_dataclass(expected):
         return _dataclass(expected, value, place)
     if isinstance(expected, type) and issubclass(expected, StrEnum):
@@ -202,14 +202,14 @@ def _typed(expected: object, value: object, place: str) -> object:
 
 
 def _dataclass(kind: type[_T], value: object, place: str) -> _T:
-    given = _checked(value, dict, f"the fields of {kind.__name__}", place)
-    hints = _hints(kind)  # type: ignore[arg-type]  # mypy asks the instances' __hash__
-    for name in sorted(set(hints) ^ set(given)):
+    items = _checked(value, dict, f"the fields of {kind.__name__}", place)
+    hints = _hints(kind)  # type: ignore[arg-type]  # mypy checks the __hash__ of instances
+    for name in sorted(set(hints) ^ set(items)):
         missing = "this field, which is missing"
         raise _MismatchError(
             f"{place}.{name}", missing if name in hints else f"no such field of {kind.__name__}"
         )
-    return kind(**{name: _typed(hints[name], given[name], f"{place}.{name}") for name in hints})
+    return kind(**{name: _typed(hints[name], items[name], f"{place}.{name}") for name in hints})
 
 
 def _enum(kind: type[StrEnum], value: object, place: str) -> StrEnum:
@@ -221,7 +221,7 @@ def _enum(kind: type[StrEnum], value: object, place: str) -> StrEnum:
 
 
 def _checked(value: object, kind: type[_T], words: str, place: str) -> _T:
-    # JSON's true and false are whole numbers to Python.
+    # In Python, booleans are integers.
     if not isinstance(value, kind) or isinstance(value, bool):
         raise _MismatchError(place, f"{words}, not {value!r:.80}")
     return value
@@ -231,7 +231,7 @@ def _text(value: object, place: str) -> str:
     return _checked(value, str, "text", place)
 
 
-def _whole(value: object, place: str) -> int:
+def _integer(value: object, place: str) -> int:
     return _checked(value, int, "a whole number", place)
 
 
@@ -240,11 +240,11 @@ def _float(value: object, place: str) -> float:
         return _NOT_FINITE[value]
     if isinstance(value, float):
         return value
-    whole = _checked(value, int, "a number", place)
+    integer = _checked(value, int, "a number", place)
     try:
-        return float(whole)
+        return float(integer)
     except OverflowError as error:
-        raise _MismatchError(place, f"a number below 1e308, not {whole!r:.80}") from error
+        raise _MismatchError(place, f"a number below 1e308, not {integer!r:.80}") from error
 
 
 def _datetime(value: object, place: str) -> datetime:
@@ -261,7 +261,7 @@ def _anything(value: object, _: str) -> object:
 
 _SCALARS: Final[Mapping[object, Callable[[object, str], object]]] = {
     str: _text,
-    int: _whole,
+    int: _integer,
     float: _float,
     datetime: _datetime,
     Any: _anything,

@@ -1,4 +1,4 @@
-"""A run record as the tables of its report. No files are read here."""
+"""The tables of a run's report, made from the run record alone; no files are read."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from lidarops.flags import Quality, Severity
 from lidarops.plan.signal_rules import idle_window
 from lidarops.records import LeftOut, ProductKind, RunRecord, SceneOutcome, Step
 
-_NAMED: Final = 8
+_MOST_NAMES: Final = 8
 """Most names listed in one cell."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecisionRow:
-    """One thing that was done or not, over all scenes where that was so for this reason."""
+    """A step that was carried out or left out for one reason, over all scenes where it was."""
 
     step: str
     reason: str
     rule: str
     """Name of the rule that decided."""
     number: str
-    """That it decided on, over these scenes: one, or the least and the largest."""
+    """Number that the rule decided on: a value, or the range over these scenes."""
     channels: str
     instruments: str
     scenes: int
@@ -34,7 +34,7 @@ class DecisionRow:
 
 @dataclass(frozen=True, slots=True)
 class FlagRow:
-    """One quality bit over all products of a kind."""
+    """Counts of one quality bit over all products of a kind."""
 
     kind: str
     bit: str
@@ -50,13 +50,14 @@ class RefusedRow:
     """Files that were refused for the same reason."""
 
     reason: str
-    found: str
+    when: str
+    """``while cataloguing`` or ``while processing``."""
     files: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class BarrenRow:
-    """Scenes that can give no product for the same reason."""
+class NoProductRow:
+    """Scenes without product for the same reason."""
 
     reason: str
     scenes: tuple[str, ...]
@@ -64,7 +65,7 @@ class BarrenRow:
 
 @dataclass(frozen=True, slots=True)
 class StageRow:
-    """Time that a stage took over all scenes."""
+    """Time of one stage over all scenes."""
 
     stage: str
     total: str
@@ -75,7 +76,7 @@ class StageRow:
 
 @dataclass(frozen=True, slots=True)
 class InstrumentRow:
-    """What became of the scenes of one instrument."""
+    """Counts over the scenes of one instrument."""
 
     station: str
     instrument: str
@@ -90,7 +91,7 @@ class InstrumentRow:
 
     @property
     def flagged_share(self) -> str:
-        """Share of retrieved values that carry a bit."""
+        """Share of the retrieved values that carry a quality bit."""
         return percent(self.flagged / self.values) if self.values else "no value"
 
 
@@ -120,53 +121,56 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
-    """Return what scenes took and were to take, where that was measured.
+    """Return the measured and the estimated CPU time of scenes, if it was measured.
 
-    What a process loads with its first scenes is estimated once, while each worker pays it.
+    The estimate counts start-up (loading code with the first scenes) once, though every worker
+    pays it.
     """
-    # Of scenes that failed no time is known, and their estimates have nothing beside them.
+    # Failed scenes have no measured time, so their estimates are left out too.
     measured = [scene for scene in record.scenes if scene.cpu_seconds]
     if not measured:
         return []
     took = sum(scene.cpu_seconds for scene in measured)
     estimated = sum(scene.estimated_seconds for scene in measured)
-    told = (
-        f"; {duration(estimated)} were estimated ({record.costs}), with loading counted once,"
-        " which each worker pays"
+    estimate = (
+        f"; estimated: {duration(estimated)} ({record.costs}), with the start-up of one worker only"
     )
-    return [("CPU time of scenes", f"{duration(took)}{told if estimated else ''}")]
+    return [("CPU time of scenes", f"{duration(took)}{estimate if estimated else ''}")]
 
 
 def verdict(record: RunRecord) -> str:
-    """Return in one sentence whether all went well."""
+    """Return the outcome of the run in one sentence."""
     failed = sum(bool(scene.error) for scene in record.scenes)
     refused = len(record.refused) + sum(len(scene.refused) for scene in record.scenes)
     if not record.scenes:
         tail = f" {counted(refused, 'granule')} refused." if refused else ""
         return f"There was no scene to process.{tail}"
-    empty = [scene.scene for scene in record.scenes if scene.empty]
-    rest = sum(p.usable == 0 for scene in record.scenes if not scene.empty for p in scene.products)
-    tail = f" {counted(rest, 'product')} without a value to use." if rest else ""
+    empty = [scene.scene for scene in record.scenes if scene.unusable]
+    rest = sum(
+        p.usable == 0 for scene in record.scenes if not scene.unusable for p in scene.products
+    )
+    tail = f" {counted(rest, 'product')} without a usable value." if rest else ""
     parts = [f"{counted(failed, 'scene')} failed"] if failed else []
     parts += [f"{counted(refused, 'granule')} refused"] if refused else []
     if empty:
         number = counted(len(empty), "scene")
-        parts.append(f"the retrievals of {number} left nothing to use: {listed(empty)}")
-    barren = len(record.barren) + record.more_barren
-    parts += [f"{counted(barren, 'scene')} can give no product"] if barren else []
-    nowhere = {(each.instrument, each.channel) for each in record.unmet if each.nowhere}
+        parts.append(f"{number} without a usable value: {listed(empty)}")
+    no_product = len(record.empty_scenes) + record.more_empty_scenes
+    parts += [f"{counted(no_product, 'scene')} without product"] if no_product else []
+    nowhere = {(unmet.instrument, unmet.channel) for unmet in record.unmet if unmet.nowhere}
     if nowhere:
-        named = listed({channel for _, channel in nowhere})
-        parts.append(f"{counted(len(nowhere), 'channel')} named that no file holds: {named}")
+        channels = listed({channel for _, channel in nowhere})
+        number = counted(len(nowhere), "requested channel")
+        parts.append(f"{number} in no file: {channels}")
     if not parts:
         return f"Every scene was processed and no granule was refused.{tail}"
     *first, last = parts
-    told = f"{', '.join(first)} and {last}" if first else last
-    return f"{told[0].upper()}{told[1:]}.{tail}"
+    sentence = f"{', '.join(first)} and {last}" if first else last
+    return f"{sentence[0].upper()}{sentence[1:]}.{tail}"
 
 
 def instruments(record: RunRecord) -> list[InstrumentRow]:
-    """Return one row for every station and instrument with a scene or a refused granule."""
+    """Return one row per instrument with a scene or a refused granule."""
     stations: dict[str, str] = {}
     scenes: dict[str, list[SceneOutcome]] = defaultdict(list)
     for scene in record.scenes:
@@ -180,20 +184,20 @@ def instruments(record: RunRecord) -> list[InstrumentRow]:
 
 
 def left_out(record: RunRecord) -> list[DecisionRow]:
-    """Group what was not done by step and reason, the most frequent of a step first."""
+    """Group steps that were left out by step and reason, the most frequent of a step first."""
     return _decisions(record, _left_out)
 
 
-def done(record: RunRecord) -> list[DecisionRow]:
-    """Group what was done by step and reason, the most frequent of a step first."""
-    return _decisions(record, _done)
+def carried_out(record: RunRecord) -> list[DecisionRow]:
+    """Group steps that were carried out by step and reason, the most frequent of a step first."""
+    return _decisions(record, _carried_out)
 
 
-def _done(scene: SceneOutcome) -> Iterator[Step]:
+def _carried_out(scene: SceneOutcome) -> Iterator[Step]:
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
         idle = idle_window(step, steps)
-        yield replace(step, reason=f"{step.reason}; of no effect: {idle}") if idle else step
+        yield replace(step, reason=f"{step.reason}; no effect: {idle}") if idle else step
 
 
 def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:
@@ -202,14 +206,14 @@ def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:
 
 
 def _decisions(
-    record: RunRecord, of: Callable[[SceneOutcome], Iterable[Step | LeftOut]]
+    record: RunRecord, items_of: Callable[[SceneOutcome], Iterable[Step | LeftOut]]
 ) -> list[DecisionRow]:
     scenes: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     channels: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     names: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     numbers: dict[tuple[str, str, str], set[float]] = defaultdict(set)
     for scene in record.scenes:
-        for item in of(scene):
+        for item in items_of(scene):
             key = (item.name, item.reason, item.rule)
             scenes[key].add(scene.scene)
             channels[key].add(item.channel)
@@ -233,7 +237,7 @@ def _decisions(
 
 
 def flags(record: RunRecord) -> list[FlagRow]:
-    """Return one row for every quality bit that a kind of product carries."""
+    """Return one row per product kind and quality bit that its values carry."""
     values: Counter[ProductKind] = Counter()
     counts: dict[ProductKind, Counter[str]] = defaultdict(Counter)
     products: Counter[tuple[ProductKind, str]] = Counter()
@@ -272,31 +276,31 @@ def refused(record: RunRecord) -> list[RefusedRow]:
         for granule in scene.refused:
             files[granule.reason, "while processing"].append(granule.path)
     return [
-        RefusedRow(reason or "no reason was recorded", found, tuple(sorted(paths)))
-        for (reason, found), paths in sorted(
+        RefusedRow(reason or "no reason was recorded", when, tuple(sorted(paths)))
+        for (reason, when), paths in sorted(
             files.items(), key=lambda item: (-len(item[1]), item[0])
         )
     ]
 
 
-def barren(record: RunRecord) -> list[BarrenRow]:
-    """Group scenes that can give no product by reason, the most frequent first."""
+def scenes_without_product(record: RunRecord) -> list[NoProductRow]:
+    """Group scenes without product by reason, the most frequent first."""
     scenes: dict[str, list[str]] = defaultdict(list)
-    for scene, reason in record.barren.items():
+    for scene, reason in record.empty_scenes.items():
         scenes[reason].append(scene)
     return [
-        BarrenRow(reason, tuple(sorted(found)))
-        for reason, found in sorted(scenes.items(), key=lambda item: (-len(item[1]), item[0]))
+        NoProductRow(reason, tuple(sorted(names)))
+        for reason, names in sorted(scenes.items(), key=lambda item: (-len(item[1]), item[0]))
     ]
 
 
 def stages(record: RunRecord) -> list[StageRow]:
-    """Return the time that each stage took, in the order in which scenes name them."""
+    """Return the time of each stage, in the order in which scenes list them."""
     times: dict[str, list[tuple[float, str]]] = defaultdict(list)
     for scene in record.scenes:
         for stage, seconds in scene.seconds.items():
             times[stage].append((seconds, scene.scene))
-    whole = sum(seconds for rows in times.values() for seconds, _ in rows)
+    all_seconds = sum(seconds for rows in times.values() for seconds, _ in rows)
     rows = []
     for stage, spent in times.items():
         total = sum(seconds for seconds, _ in spent)
@@ -305,7 +309,7 @@ def stages(record: RunRecord) -> list[StageRow]:
             StageRow(
                 stage=stage,
                 total=duration(total),
-                share=percent(total / whole) if whole > 0 else "0 %",
+                share=percent(total / all_seconds) if all_seconds > 0 else "0 %",
                 longest=duration(longest),
                 longest_scene=scene_id,
             )
@@ -314,10 +318,10 @@ def stages(record: RunRecord) -> list[StageRow]:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return sorted names in a line, the first few of many."""
-    found = sorted(names)
-    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
-    return ", ".join(found[:_NAMED]) + more
+    """Return sorted names on one line, cut after the first few."""
+    ordered = sorted(names)
+    more = f" and {len(ordered) - _MOST_NAMES} more" if len(ordered) > _MOST_NAMES else ""
+    return ", ".join(ordered[:_MOST_NAMES]) + more
 
 
 def moment(time: datetime) -> str:
@@ -327,16 +331,16 @@ def moment(time: datetime) -> str:
 
 
 def outcome_word(scene: SceneOutcome) -> str:
-    """Return in a word what became of a scene."""
+    """Return the outcome of a scene in a word or two."""
     if scene.error:
         return "failed"
-    if scene.empty:
-        return "nothing to use"
+    if scene.unusable:
+        return "no usable value"
     return "done" if scene.products else "no product"
 
 
 def flagged_words(scene: SceneOutcome) -> Mapping[str, str]:
-    """Return for every product of a scene, by path, the share of its values with a bit."""
+    """Return the share of flagged values of each product of a scene, by path."""
     return {
         product.path: percent((product.values - product.unflagged) / product.values)
         if product.values
@@ -386,6 +390,6 @@ def _bit_order(name: str) -> tuple[int, str]:
 def _about(name: str) -> tuple[str, str]:
     known = Quality.__members__.get(name.upper())
     if known is None:
-        return "unknown", "this version of lidarops does not know the bit"
+        return "unknown", "bit unknown to this version of lidarops"
     word = "do not use" if known.severity is Severity.REJECT else "use with care"
     return word, known.description

@@ -1,1 +1,1 @@
-"""A static browser of the products of a campaign: pages that need no server and no network."""
+"""A static website of the products of a campaign. It needs neither server nor network."""

@@ -1,4 +1,7 @@
-"""Makes the site: pages of what changed, kept pages of what did not, and the calendar anew."""
+"""Builds the site: pages of new and changed products, and all calendar pages.
+
+Pages of unchanged products are kept.
+"""
 
 from __future__ import annotations
 
@@ -32,11 +35,11 @@ from lidarops.site.paths import (
 from lidarops.site.product_entry import Entry, Problem
 
 MANIFEST: Final = "manifest.json"
-"""What the site was made of; also what tells a site from any other folder."""
+"""File that lists the products of a site. It also identifies a folder as a site."""
 _FORMAT: Final = "lidarops site"
 _OURS: Final = ("product", "station")
-"""Folders of the site in which nothing else may lie."""
-# What opening and reading a damaged or foreign file has been seen to raise.
+"""Folders that only the site writes to."""
+# Exceptions observed when damaged or foreign files are opened and read.
 _UNREADABLE: Final = (
     OSError,
     RuntimeError,
@@ -51,15 +54,15 @@ _UNREADABLE: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What was made."""
+    """Result of building a site."""
 
     index: Path
     products: int
     """Products with a page."""
     made: int
-    """Pages of products that were made now; the others are unchanged."""
+    """Product pages that were made now; the others were kept."""
     problems: tuple[Problem, ...]
-    """Products without a page, or with less on it than there should be."""
+    """Products without a page, or with an incomplete page."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,7 @@ class _Task:
 
 
 _Outcome = tuple[Entry | Problem, bool]
-"""What became of a product, and whether its page was made now."""
+"""Entry or problem of a product, and whether its page was made now."""
 
 
 def build_site(
@@ -79,30 +82,30 @@ def build_site(
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.
 
-    Pages need neither server nor network nor script. The page of a product depends on the
-    product alone and is kept while the product's sha256, the page and lidarops are the same.
-    Equal archives give equal bytes, for any number of workers.
+    Pages need neither server, network nor scripts. The page of a product depends only on the
+    product. It is kept while the sha256 of the product, the page and lidarops do not change. Equal
+    archives give equal bytes, for any number of workers.
 
     Parameters
     ----------
     output : path or str
-        Output folder of a campaign, with its ``products``.
+        Output folder of a campaign, with its folder ``products``.
     workers : int, optional
-        Processes.
+        Number of processes.
     progress : callable, optional
-        Told how many products were done since it was last told.
+        Called with the number of products done since the last call.
 
     Returns
     -------
     Site
-        Products that cannot be read are named in it and on the first page.
+        Unreadable products are listed in it and on the first page.
 
     Raises
     ------
     ProductError
         If `output` holds no products.
     CatalogError
-        If the site cannot be written, or the folder ``site`` holds something else.
+        If the site cannot be written, or the folder ``site`` has other content.
     """
     output = Path(output).resolve()
     products, site = product_folder(output), output / SITE
@@ -133,7 +136,7 @@ def _collect(
 
 
 def _outcomes(tasks: Sequence[_Task], workers: int) -> Iterator[_Outcome]:
-    """Return what became of the products, in their order."""
+    """Yield the outcome of each product, in their order."""
     if workers == 1:
         yield from map(_page, tasks)
         return
@@ -160,49 +163,50 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _alone(task: _Task) -> _Outcome:
-    """Read in a process of its own what may have ended another one."""
+    """Make a page in a separate process, after the product may have crashed another."""
     with _pool(1) as pool:
         try:
             return pool.submit(_page, task).result()
         except BrokenExecutor:
-            return Problem(task.path, "reading it ended the process that read it"), True
+            return Problem(task.path, "reading it crashed the process"), True
 
 
 def _page(task: _Task) -> _Outcome:
-    """Make the page of one product, or keep it."""
+    """Make or keep the page of one product."""
     try:
         file = inside(task.products, task.path)
         with file.open("rb") as stream:
             sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
         if task.known is not None and _is_kept(task.known, sha256, task.site):
             return task.known, False
-        return _made(task, file, sha256), True
+        return _make(task, file, sha256), True
     except _UNREADABLE as error:
-        return Problem(task.path, _reason(file_of=task, error=error)), True
+        return Problem(task.path, _reason(task, error)), True
 
 
-def _reason(*, file_of: _Task, error: BaseException) -> str:
-    # The path stands beside the reason, and where the archive lies changes no page.
-    words = str(error).replace(str(file_of.products / file_of.path), file_of.path)
+def _reason(task: _Task, error: BaseException) -> str:
+    # With relative paths, because pages must not depend on the location of the archive.
+    words = str(error).replace(str(task.products / task.path), task.path)
     return words or type(error).__name__
 
 
 def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
     if known.sha256 != sha256:
         return False
-    found = (inside(site, name) for name in known.files)
+    files = (inside(site, name) for name in known.files)
     return all(
         file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() == digest
-        for file, digest in zip(found, known.digests, strict=True)
+        for file, digest in zip(files, known.digests, strict=True)
     )
 
 
-def _made(task: _Task, file: Path, sha256: str) -> Entry:
+def _make(task: _Task, file: Path, sha256: str) -> Entry:
     with xr.open_dataset(file, engine="netcdf4", decode_timedelta=False) as opened:
-        judged, origin = product_contents.judge(opened), product_contents.origin(opened)
+        quality = product_contents.count_quality(opened)
+        origin = product_contents.origin(opened)
         span = product_contents.span(opened)
         kind = product_contents.attribute(opened, "lidarops_kind")
-        gallery, problem = _drawn(opened, kind)
+        gallery, problem = _draw(opened, kind)
         page = product_page(task.path)
         station = product_contents.attribute(opened, "lidarops_station")
         entry = Entry(
@@ -220,14 +224,14 @@ def _made(task: _Task, file: Path, sha256: str) -> Entry:
             channel=product_contents.attribute(opened, "lidarops_channel"),
             start=span.start,
             stop=span.stop,
-            values=judged.values,
-            usable=judged.usable,
-            unflagged=judged.unflagged,
+            values=quality.values,
+            usable=quality.usable,
+            unflagged=quality.unflagged,
             alt=gallery.alt,
-            problem=_joined(problem, origin.problem, _unjudged(opened)),
+            problem=_joined(problem, origin.problem, _missing_flags(opened)),
         )
         contents = (
-            pages.product(entry, opened, judged, origin, gallery.figures),
+            pages.product(entry, opened, quality, origin, gallery.figures),
             gallery.thumbnail,
             origin.text.encode(),
         )
@@ -236,8 +240,8 @@ def _made(task: _Task, file: Path, sha256: str) -> Entry:
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
 
 
-def _drawn(opened: xr.Dataset, kind: str) -> tuple[product_gallery.Gallery, str]:
-    """Draw a product; where it is not what its kind says, as one of no known kind."""
+def _draw(opened: xr.Dataset, kind: str) -> tuple[product_gallery.Gallery, str]:
+    """Draw a product; if it does not fit its kind, as a product of unknown kind."""
     style = pages.style("thumb.css")
     try:
         return product_gallery.draw_gallery(opened, kind, style), ""
@@ -249,8 +253,8 @@ def _drawn(opened: xr.Dataset, kind: str) -> tuple[product_gallery.Gallery, str]
         return product_gallery.nothing("it cannot be drawn", style), problem
 
 
-def _unjudged(opened: xr.Dataset) -> str:
-    return "" if QUALITY_FLAG in opened else "the product holds no quality flags"
+def _missing_flags(opened: xr.Dataset) -> str:
+    return "" if QUALITY_FLAG in opened else "the product has no quality flags"
 
 
 def _joined(*problems: str) -> str:
@@ -258,7 +262,7 @@ def _joined(*problems: str) -> str:
 
 
 def _write(site: Path, name: str, content: bytes) -> None:
-    """Write one file of the site, in one step: the only place that does."""
+    """Write a file of the site atomically. All files are written here."""
     target = inside(site, name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -267,20 +271,20 @@ def _write(site: Path, name: str, content: bytes) -> None:
         raise CatalogError(
             f"cannot be written: {error}",
             file=target,
-            remedy="see that the folder can be written and the disk has space, then run again",
+            remedy="check that the folder can be written and the disk has space, then run again",
         ) from error
 
 
 def _write_calendar(site: Path, entries: Sequence[Entry], problems: Sequence[Problem]) -> set[str]:
-    """Write all pages that are of no single product; return every file of the site's folders."""
+    """Write all calendar pages; return the files that belong in the site's folders."""
     expected = {name for entry in entries for name in entry.files}
-    for station, of_station in pages.stations(entries).items():
-        known = pages.years(of_station)
-        for year, of_year in known.items():
+    for station, station_entries in pages.stations(entries).items():
+        by_year = pages.years(station_entries)
+        for year, year_entries in by_year.items():
             name = year_page(station, int(year))
             expected.add(name)
-            _write(site, name, pages.year(station, int(year), of_year, list(known)))
-        by_day = pages.days(of_station)
+            _write(site, name, pages.year(station, int(year), year_entries, list(by_year)))
+        by_day = pages.days(station_entries)
         around = [None, *by_day, None]
         for (before, _), (day, after) in zip(pairwise(around), pairwise(around[1:]), strict=False):
             if day is not None:
@@ -294,7 +298,7 @@ def _write_calendar(site: Path, entries: Sequence[Entry], problems: Sequence[Pro
 
 
 def _sweep(site: Path, expected: set[str]) -> None:
-    """Remove the pages of what is no longer there."""
+    """Remove pages of products that no longer exist."""
     for folder in _OURS:
         for file in sorted((site / folder).rglob("*"), reverse=True):
             if file.is_dir() and not file.is_symlink():
@@ -306,7 +310,7 @@ def _sweep(site: Path, expected: set[str]) -> None:
 
 @cache
 def _version() -> str:
-    """Return a digest of all that makes pages: with another one, none is kept."""
+    """Return a digest of the code that makes pages; if it changes, all pages are made again."""
     package = Path(__file__).resolve().parents[1]
     sources = [
         package / "flags.py",
@@ -335,16 +339,16 @@ def _write_manifest(site: Path, entries: Sequence[Entry], problems: Sequence[Pro
 
 
 def _manifest(site: Path) -> dict[str, Entry]:
-    """Read what the site was made of; nothing is kept where that cannot be told."""
+    """Return the entries of the existing site by path; empty if they are unknown or outdated."""
     file = site / MANIFEST
     if not file.is_file():
         if site.exists() and (not site.is_dir() or any(site.iterdir())):
             raise CatalogError(
-                "exists, and is no site of lidarops",
+                "exists, but is no site of lidarops",
                 file=site,
-                remedy="move it away, so that nothing in it is lost",
+                remedy="move it away, so that its content is not lost",
             )
-        # First of all, so that a site whose making was cut short is known as one.
+        # Written first, so that an interrupted build is recognised as a site.
         _write_manifest(site, [], [])
         return {}
     try:
@@ -359,7 +363,7 @@ def _manifest(site: Path) -> dict[str, Entry]:
 def _entry(item: dict[str, Any]) -> Entry:
     values = {field.name: item[field.name] for field in fields(Entry)}
     known = Entry(**(values | {"digests": tuple(item["digests"])}))
-    # A page is named by its product, not by a file that anyone may have edited.
+    # Page names follow from the product, not from a manifest that may have been edited.
     page = product_page(known.path)
     if (known.page, known.thumbnail) != (page, page.removesuffix(".html") + ".svg"):
         raise ValueError(known.path)

@@ -1,4 +1,4 @@
-"""Quantities against time and range, as images of block means."""
+"""Images of block means: quantities against time and range or altitude."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.figures.raster import Raster
+from lidarops.figures.raster import Raster, colour_limits
 from lidarops.figures.time_axis import TimeAxis, time_axis
 from lidarops.site import svg
 from lidarops.site.series_panels import Line, limits, time_scale, time_ticks, values
@@ -17,33 +17,32 @@ from lidarops.site.svg import BAR, BLANK, COLOURS, LEFT, REJECTED, WIDTH, Panel,
 Floats = NDArray[np.float64]
 
 COLUMNS: Final = 780
-"""Most columns of block means: what the eye tells apart across a figure."""
+"""Most columns of block means, about what the eye resolves across a figure."""
 ROWS: Final = 200
 _STRIPE: Final = 5
-"""Pixels of a stripe of rejection."""
-_DECADES: Final = 4.0
-"""Most decades of a colour scale."""
+"""Width of a stripe over rejected blocks, pixels."""
 _BEYOND: Final = 1.2
-"""Times the reach of the signal, to which it is shown."""
+"""A signal is shown to this many times its reach."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Block means with where they lie."""
+    """Block means with their position."""
 
     left: Floats
-    """(column,) Position along the axis of time."""
+    """(column,) Start along the time axis."""
     right: Floats
+    """(column,) End along the time axis."""
     edges: Floats
-    """(row + 1,) m."""
+    """(row + 1,) Range or altitude, m."""
     mean: Floats
-    """(column, row) NaN where nothing can be used."""
+    """(column, row) NaN without a usable value."""
     flagged: NDArray[np.bool_]
-    """(column, row) Whether at least half of a block is rejected."""
+    """(column, row) Whether at least half of the block is rejected."""
 
 
 def grid(raster: Raster, axis: TimeAxis) -> Grid:
-    """Cut a raster where its signal drowns, and merge its rows to what a page shows."""
+    """Cut a raster where noise dominates, and merge its rows to the resolution of a page."""
     full, reach = float(raster.edges[-1]), raster.reach
     cut = raster.shown_to(min(full, _BEYOND * reach) if reach > 0 else full)
     rows = cut.bins.size
@@ -63,47 +62,36 @@ def grid(raster: Raster, axis: TimeAxis) -> Grid:
     )
 
 
-def colour_range(found: Grid) -> tuple[float, float] | None:
-    """Return the ends of a logarithmic colour scale; None where no value is above zero."""
-    shown = found.mean[~found.flagged]
-    positive = shown[np.isfinite(shown) & (shown > 0)]
-    if positive.size == 0:
-        return None
-    low, high = (float(level) for level in np.percentile(positive, [2.0, 99.8]))
-    low = max(low, high * 10.0**-_DECADES)
-    return low, max(high, 1.05 * low)
-
-
-def pixels(found: Grid, axis: TimeAxis, width: int, height: int) -> NDArray[np.uint8]:
-    """Return the image of a grid, shape (height, width), top row farthest."""
+def pixels(blocks: Grid, axis: TimeAxis, width: int, height: int) -> NDArray[np.uint8]:
+    """Return the image of a grid, shape (height, width), farthest row on top."""
     first, last = axis.limits
     x = first + (np.arange(width) + 0.5) / width * (last - first)
-    column = np.clip(np.searchsorted(found.left, x, side="right") - 1, 0, found.left.size - 1)
-    within = (x >= found.left[column]) & (x <= found.right[column])
-    near, far = found.edges[0], found.edges[-1]
+    column = np.clip(np.searchsorted(blocks.left, x, side="right") - 1, 0, blocks.left.size - 1)
+    within = (x >= blocks.left[column]) & (x <= blocks.right[column])
+    near, far = blocks.edges[0], blocks.edges[-1]
     along = far - (np.arange(height) + 0.5) / height * (far - near)
-    row = np.clip(np.searchsorted(found.edges, along, side="right") - 1, 0, found.edges.size - 2)
+    row = np.clip(np.searchsorted(blocks.edges, along, side="right") - 1, 0, blocks.edges.size - 2)
     where = np.ix_(column, row)
-    image = np.where(found.flagged, REJECTED, _colours(found))[where].T
+    image = np.where(blocks.flagged, REJECTED, _colours(blocks))[where].T
     stripes = (np.arange(height)[:, None] + np.arange(width)[None, :]) // _STRIPE % 2
     image = np.where(image == REJECTED, REJECTED + stripes, image)
     return np.where(within[None, :], image, BLANK).astype(np.uint8)
 
 
-def _colours(found: Grid) -> NDArray[np.int64]:
-    ends = colour_range(found)
+def _colours(blocks: Grid) -> NDArray[np.int64]:
+    ends = colour_limits(blocks.mean[~blocks.flagged])
     if ends is None:
-        return np.full(found.mean.shape, BLANK)
+        return np.full(blocks.mean.shape, BLANK)
     low, high = ends
-    # A logarithm has no place for a mean at or below zero: it takes the lowest colour.
-    level = np.clip(np.nan_to_num(found.mean, nan=low), low, high)
+    # On the logarithmic scale, means at or below zero take the lowest colour.
+    level = np.clip(np.nan_to_num(blocks.mean, nan=low), low, high)
     share = np.log(level / low) / np.log(high / low)
     steps = 3 + np.rint(share * (COLOURS - 1)).astype(np.int64)
-    return np.where(np.isfinite(found.mean), steps, BLANK)
+    return np.where(np.isfinite(blocks.mean), steps, BLANK)
 
 
 def draw_image(raster: Raster, *, along: str, label: str, key: str) -> tuple[Sheet, str]:
-    """Draw a raster, with the background beneath where it has one.
+    """Draw a raster, with the background below it if known.
 
     Parameters
     ----------
@@ -111,7 +99,7 @@ def draw_image(raster: Raster, *, along: str, label: str, key: str) -> tuple[She
     along : str
         ``range`` or ``altitude``.
     label : str
-        Of the colour bar.
+        Label of the colour bar.
     key : str
         Unique on the page.
 
@@ -119,43 +107,41 @@ def draw_image(raster: Raster, *, along: str, label: str, key: str) -> tuple[She
     -------
     Sheet
     str
-        What is seen, in words.
+        Description in words.
     """
-    axis = time_axis(raster.start + (raster.stop - raster.start) / 2)
-    known = bool(np.isfinite(raster.background).any())
-    found = grid(raster, axis)
-    sheet = Sheet(height=520 if known else 390)
+    axis = time_axis(raster.middle)
+    has_background = bool(np.isfinite(raster.background).any())
+    blocks = grid(raster, axis)
+    sheet = Sheet(height=520 if has_background else 390)
     right = WIDTH - BAR
-    near, far = float(found.edges[0]) / 1e3, float(found.edges[-1]) / 1e3
+    near, far = float(blocks.edges[0]) / 1e3, float(blocks.edges[-1]) / 1e3
     upper = Panel(time_scale(axis, right), Scale(near, far, 330, 24))
     sheet.parts.append(f'<rect class="gap" x="{LEFT}" y="24" width="{right - LEFT}" height="306"/>')
-    lower = _background(raster, axis, right) if known else None
+    lower = _background(raster, axis, right) if has_background else None
     panels = [upper, lower[0]] if lower else [upper]
     time_ticks(sheet, axis, panels)
     sheet.frame(upper, f"{along} (km)")
-    sheet.image(upper, svg.png(pixels(found, axis, right - LEFT, 306)))
+    sheet.image(upper, svg.png(pixels(blocks, axis, right - LEFT, 306)))
     _clouds(sheet, upper, axis, raster)
     if lower:
         sheet.frame(lower[0], f"background ({svg.units(raster.background_units)})", at_most=4)
         values(sheet, lower[0], axis, [lower[1]], f"{key}-b")
-    ends = colour_range(found)
+    ends = colour_limits(blocks.mean[~blocks.flagged])
     if ends is None:
         sheet.text((LEFT + right) / 2, 180, "no usable value above zero", css="t m s")
     else:
         _bar(sheet, ends, label, right)
-    return sheet, _in_words(raster, found, ends, along)
+    return sheet, _in_words(raster, blocks, ends, along)
 
 
 def _background(raster: Raster, axis: TimeAxis, right: float) -> tuple[Panel, Line]:
-    middle = raster.start + (raster.stop - raster.start) / 2
-    none = np.array([])
-    line = Line("", middle, raster.background, raster.background_error, middle[:0], none)
+    middle, empty = raster.middle, np.array([])
+    line = Line("", middle, raster.background, raster.background_error, middle[:0], empty)
     return Panel(time_scale(axis, right), Scale(*limits([line]), 470, 356)), line
 
 
 def _clouds(sheet: Sheet, panel: Panel, axis: TimeAxis, raster: Raster) -> None:
-    middle = raster.start + (raster.stop - raster.start) / 2
-    x, y = panel.x(axis.x(middle)), panel.y(raster.clouds / 1e3)
+    x, y = panel.x(axis.x(raster.middle)), panel.y(raster.clouds / 1e3)
     low, high = panel.y.ends
     shown = (raster.clouds / 1e3 >= low) & (raster.clouds / 1e3 <= high)
     sheet.path(
@@ -175,23 +161,23 @@ def _bar(sheet: Sheet, ends: tuple[float, float], label: str, right: float) -> N
     sheet.text(WIDTH - 6, 177, label, css="t m s", turned=True)
 
 
-def _in_words(raster: Raster, found: Grid, ends: tuple[float, float] | None, along: str) -> str:
-    far = float(found.edges[-1]) / 1e3
-    words = [f"Shown to {far:.3g} km {along}"]
+def _in_words(raster: Raster, blocks: Grid, ends: tuple[float, float] | None, along: str) -> str:
+    far = float(blocks.edges[-1]) / 1e3
+    words = [f"Shown to {along} {far:.3g} km"]
     if raster.reach > 0:
-        words.append(f"it stands out from its noise up to {raster.reach / 1e3:.3g} km")
+        words.append(f"noise dominates beyond {raster.reach / 1e3:.3g} km")
     if ends:
-        words.append(f"colours from {svg.number(ends[0])} to {svg.number(ends[1])}")
-    words.append(f"{np.mean(found.flagged):.0%} of the image rejected by a quality bit (striped)")
+        words.append(f"colour scale from {svg.number(ends[0])} to {svg.number(ends[1])}")
+    words.append(f"{np.mean(blocks.flagged):.0%} of the image rejected by quality bits (striped)")
     cloudy = int(np.isfinite(raster.clouds).sum())
     if cloudy:
-        words.append(f"a cloud base in {cloudy} of {raster.clouds.size} columns (triangles)")
+        words.append(f"cloud base in {cloudy} of {raster.clouds.size} columns (triangles)")
     return "; ".join(words)
 
 
 def thumbnail(raster: Raster, width: float, height: float) -> Sheet:
-    """Return the image of a raster alone."""
-    axis = time_axis(raster.start + (raster.stop - raster.start) / 2)
+    """Return the image of a raster without axes."""
+    axis = time_axis(raster.middle)
     sheet = Sheet(height=height, width=width, stretched=True)
     panel = Panel(Scale(0, 1, 0, width), Scale(0, 1, height, 0))
     sheet.image(panel, svg.png(pixels(grid(raster, axis), axis, int(width), int(height))))

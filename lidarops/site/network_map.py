@@ -1,4 +1,4 @@
-"""A map of the beams of several lidars and of the points in which they meet."""
+"""A map of the beams of a network and their crossings."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Floats = NDArray[np.float64]
 _TOP: Final = 28
 _FOOT: Final = 492
 _ROOM: Final = 0.08
-"""Of the extent, on each side."""
+"""Margin on each side, relative to the extent."""
 _LEAST: Final = 0.05
-"""km that an axis spans at least."""
+"""km, smallest span of an axis."""
 _RING: Final = "M-5 0a5 5 0 1 0 10 0a5 5 0 1 0-10 0"
 _TRIANGLE: Final = "M-5 4h10l-5-9z"
 
 
 def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
-    """Draw beams and crossings to one scale, with the median visibility at each crossing.
+    """Draw beams and crossings to scale, with the median visibility at each crossing.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
     -------
     Sheet
     str
-        What it shows, in words.
+        Description in words.
     """
     sheet = Sheet(height=_FOOT + 50)
     panel = _panel(np.concatenate([network.stations, network.ends, network.crossings]))
@@ -48,10 +48,14 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
     for station in _placed(panel, network.stations):
         _mark(sheet, station, _TRIANGLE, "mark c1")
     crossings = _placed(panel, network.crossings)
-    for place, number, seen in zip(crossings, network.numbers, network.visibility, strict=True):
-        known = bool(np.isfinite(seen))
+    for place, number, visibility in zip(
+        crossings, network.numbers, network.visibility, strict=True
+    ):
+        known = bool(np.isfinite(visibility))
         _mark(sheet, place, _RING, "mark c0" if known else "off")
-        sheet.text(place[0] + 9, place[1] - 7, f"{number}: {_km(seen)}" if known else f"{number}")
+        sheet.text(
+            place[0] + 9, place[1] - 7, f"{number}: {_km(visibility)}" if known else f"{number}"
+        )
     svg.legend(
         sheet,
         LEFT + 14,
@@ -59,15 +63,15 @@ def draw_network_map(network: NetworkMap) -> tuple[Sheet, str]:
         [
             (_TRIANGLE, "mark c1", "lidar"),
             ("M-9 0H9", "line d2 c1", "beam"),
-            (_RING, "mark c0", "crossing, with its median visibility"),
-            (_RING, "off", "crossing without a value to use"),
+            (_RING, "mark c0", "crossing, with median visibility"),
+            (_RING, "off", "crossing without a usable value"),
         ],
     )
     return sheet, _words(network)
 
 
 def _panel(points: Floats) -> Panel:
-    """Return a panel of equal scales on both axes, with all points in it."""
+    """Return a panel with equal scales on both axes that contains all points."""
     across, up = WIDTH - RIGHT - LEFT, _FOOT - _TOP
     low, high = points.min(axis=0), points.max(axis=0)
     span = np.maximum(high - low, _LEAST) * (1.0 + 2.0 * _ROOM)
@@ -96,11 +100,11 @@ def _km(visibility: float) -> str:
 
 
 def _words(network: NetworkMap) -> str:
-    seen = zip(network.numbers, network.visibility, network.used, strict=True)
+    medians = zip(network.numbers, network.visibility, network.used, strict=True)
     known = [
         f"{_km(visibility)} at crossing {number} ({used} of {counted(network.values, 'value')})"
-        for number, visibility, used in seen
+        for number, visibility, used in medians
         if np.isfinite(visibility)
     ]
     beams = counted(len(network.stations), "beam")
-    return f"{beams}; median visibility {', '.join(known) or 'nowhere, as no value can be used'}"
+    return f"{beams}; median visibility: {', '.join(known) or 'no usable value'}"

@@ -1,4 +1,4 @@
-"""The pages of the site as text."""
+"""The pages of the site as HTML."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from lidarops import __version__
 from lidarops.figures.wording import counted, percent, size, visible
 from lidarops.site.paths import day_page, href, slug, year_page
-from lidarops.site.product_contents import Judged, Origin, variables
+from lidarops.site.product_contents import Origin, QualityCounts, variables
 from lidarops.site.product_entry import SIGNAL, UNKNOWN, Entry, Grade, Problem, mean_share
 from lidarops.site.product_gallery import Drawn
 
@@ -25,7 +25,7 @@ INDEX: Final = "index.html"
 ROWS: Final = 2000
 """Most rows of a table on a page."""
 _YEARS: Final = 48
-"""Most years on the first page whose months are shown; with more, stations link to years."""
+"""Most years on the first page with a table of months; beyond, stations link to years."""
 _PROBLEMS: Final = 200
 _LATEST: Final = 6
 _KIND_ORDER: Final = ("visibility", "homogeneous", "multiangle", "elastic", "signal")
@@ -35,7 +35,7 @@ _ABOUT: Final = {
     "multiangle": "Optical depth and extinction of scans",
     "elastic": "Backscatter of elastic profiles",
     "signal": "Range-corrected signals",
-    UNKNOWN: "Products of a kind that is not stated",
+    UNKNOWN: "Products of unknown kind",
 }
 
 ByDay = Mapping[str, Sequence[Entry]]
@@ -70,11 +70,11 @@ def _render(template: str, page: str, **context: Any) -> bytes:
 def product(
     entry: Entry,
     opened: xr.Dataset,
-    judged: Judged,
+    quality: QualityCounts,
     origin: Origin,
     figures: Sequence[Drawn],
 ) -> bytes:
-    """Return the page of a product; it depends on the product and its path alone."""
+    """Return the page of a product; it depends only on the product and its path."""
     page = entry.page
     file = entry.path.rsplit("/", 1)[-1]
     about = _ABOUT.get(entry.kind, f"Product of kind {entry.kind}")
@@ -101,9 +101,9 @@ def product(
         problem=entry.problem,
         summary=summary,
         figures=figures,
-        judged=judged,
+        quality=quality,
         grade=entry.grade,
-        quality=_quality(entry),
+        quality_text=_quality(entry),
         origin=origin,
         prov=href(entry.files[2], page),
         variables=variables(opened),
@@ -132,7 +132,7 @@ def _quality(entry: Entry) -> str:
     if entry.share is None:
         return "no quality flags"
     flagged = percent((entry.values - entry.unflagged) / entry.values)
-    return f"{percent(entry.share)} of {entry.values:,} values usable, {flagged} carry a bit"
+    return f"{percent(entry.share)} of {entry.values:,} values usable, {flagged} flagged"
 
 
 def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def _order(entry: Entry) -> tuple[Any, ...]:
 
 
 def _short(share: float | None) -> str:
-    """Return a share in whole percent, never rounded to 0 or 100 when it is neither."""
+    """Return a share in whole percent; only exact 0 and 1 become 0 % and 100 %."""
     if share is None:
         return ""
     whole = round(100 * share)
@@ -168,14 +168,10 @@ def _short(share: float | None) -> str:
 
 
 def _by(entries: Iterable[Entry], key: Callable[[Entry], str]) -> dict[str, list[Entry]]:
-    found: dict[str, list[Entry]] = defaultdict(list)
+    groups: dict[str, list[Entry]] = defaultdict(list)
     for entry in entries:
-        found[key(entry)].append(entry)
-    return dict(sorted(found.items()))
-
-
-def _days(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
-    return _by(entries, lambda entry: entry.day)
+        groups[key(entry)].append(entry)
+    return dict(sorted(groups.items()))
 
 
 def stations(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
@@ -190,13 +186,13 @@ def years(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
 
 def days(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
     """Return the entries by day."""
-    return _days(entries)
+    return _by(entries, lambda entry: entry.day)
 
 
 def index(entries: Sequence[Entry], problems: Sequence[Problem], campaigns: Sequence[str]) -> bytes:
     """Return the first page."""
     by_station = stations(entries)
-    rows = sum(len(years(found)) for found in by_station.values())
+    rows = sum(len(years(group)) for group in by_station.values())
     title = f"Lidar archive: {', '.join(campaigns[:3])}" if campaigns else "Lidar archive"
     newest = sorted(entries, key=lambda entry: (entry.start, entry.path), reverse=True)
     retrieved = [entry for entry in newest if entry.kind != SIGNAL] or newest
@@ -208,7 +204,7 @@ def index(entries: Sequence[Entry], problems: Sequence[Problem], campaigns: Sequ
         trail=[],
         grades=list(Grade),
         months=calendar.month_name[1:],
-        stations=[_station(key, found, matrix=rows <= _YEARS) for key, found in by_station.items()],
+        stations=[_station(key, group, matrix=rows <= _YEARS) for key, group in by_station.items()],
         latest=[_card(entry, INDEX, place=True) for entry in retrieved[:_LATEST]],
         problems=problems,
         files=len({*(entry.path for entry in entries), *(item.path for item in problems)}),
@@ -236,8 +232,8 @@ def _station(key: str, entries: Sequence[Entry], *, matrix: bool) -> dict[str, A
         "about": f"{counted(len(entries), 'product')}, {', '.join(instruments[:6])}",
         "links": links,
         "years": [
-            link | {"cells": _months(found)}
-            for link, found in zip(links, by_year.values(), strict=True)
+            link | {"cells": _months(group)}
+            for link, group in zip(links, by_year.values(), strict=True)
         ]
         if matrix
         else [],
@@ -246,23 +242,23 @@ def _station(key: str, entries: Sequence[Entry], *, matrix: bool) -> dict[str, A
 
 def _months(entries: Sequence[Entry]) -> list[dict[str, Any] | None]:
     cells: list[dict[str, Any] | None] = [None] * 12
-    for month, found in _by(entries, lambda entry: entry.day[5:7]).items():
-        share = mean_share(found)
+    for month, group in _by(entries, lambda entry: entry.day[5:7]).items():
+        share = mean_share(group)
         number = int(month)
         cells[number - 1] = {
             "number": number,
-            "label": f"{calendar.month_name[number]} {found[0].day[:4]}",
-            "days": len({entry.day for entry in found}),
+            "label": f"{calendar.month_name[number]} {group[0].day[:4]}",
+            "days": len({entry.day for entry in group}),
             "share": _short(share),
             "grade": Grade.of(share),
         }
     return cells
 
 
-def year(key: str, number: int, entries: Sequence[Entry], known: Sequence[str]) -> bytes:
-    """Return the page of a station's year; `known` are all its years."""
+def year(key: str, number: int, entries: Sequence[Entry], all_years: Sequence[str]) -> bytes:
+    """Return the page of a year of a station; `all_years` are those with data."""
     page = year_page(key, number)
-    by_day = _days(entries)
+    by_day = days(entries)
     months = sorted({int(day[5:7]) for day in by_day})
     weeks = calendar.Calendar()
     return _render(
@@ -274,9 +270,9 @@ def year(key: str, number: int, entries: Sequence[Entry], known: Sequence[str]) 
         trail=[("Archive", href(INDEX, page))],
         others=[
             (other, "" if int(other) == number else href(year_page(key, int(other)), page))
-            for other in known
+            for other in all_years
         ]
-        if len(known) > 1
+        if len(all_years) > 1
         else [],
         grades=list(Grade),
         weekdays=calendar.day_name[:],
@@ -285,7 +281,7 @@ def year(key: str, number: int, entries: Sequence[Entry], known: Sequence[str]) 
                 "number": month,
                 "name": calendar.month_name[month],
                 "weeks": [
-                    [_day(key, found, month, by_day, page) for found in week]
+                    [_day(key, date_, month, by_day, page) for date_ in week]
                     for week in weeks.monthdatescalendar(number, month)
                 ],
             }
@@ -294,16 +290,16 @@ def year(key: str, number: int, entries: Sequence[Entry], known: Sequence[str]) 
     )
 
 
-def _day(key: str, found: date, month: int, by_day: ByDay, page: str) -> dict[str, Any]:
-    if found.month != month:
+def _day(key: str, date_: date, month: int, by_day: ByDay, page: str) -> dict[str, Any]:
+    if date_.month != month:
         return {"href": "", "number": 0}
-    entries = by_day.get(found.isoformat(), ())
+    entries = by_day.get(date_.isoformat(), ())
     if not entries:
-        return {"href": "", "number": found.day}
+        return {"href": "", "number": date_.day}
     share = mean_share(entries)
     return {
-        "href": href(day_page(key, found.isoformat()), page),
-        "number": found.day,
+        "href": href(day_page(key, date_.isoformat()), page),
+        "number": date_.day,
         "share": _short(share),
         "grade": Grade.of(share),
         "words": f" usable, {counted(len(entries), 'product')}",
@@ -311,13 +307,13 @@ def _day(key: str, found: date, month: int, by_day: ByDay, page: str) -> dict[st
 
 
 def day(
-    key: str, found: str, entries: Sequence[Entry], before: str | None, after: str | None
+    key: str, day_: str, entries: Sequence[Entry], before: str | None, after: str | None
 ) -> bytes:
-    """Return the page of a station's day, with links to the days of data around it."""
-    page = day_page(key, found)
+    """Return the page of a day of a station, with links to the previous and next day with data."""
+    page = day_page(key, day_)
     ordered = sorted(entries, key=_order)
     share = mean_share(entries)
-    mean = "" if share is None else f", {percent(share)} usable in the mean"
+    mean = "" if share is None else f", on average {percent(share)} of values usable"
 
     def beside(other: str | None) -> tuple[str, str] | None:
         return None if other is None else (other, href(day_page(key, other), page))
@@ -326,7 +322,7 @@ def day(
         "day.html",
         page,
         place=entries[0].place,
-        day=found,
+        day=day_,
         lead=f"{counted(len(entries), 'product')}{mean}",
         trail=_trail(entries[0], page),
         before=beside(before),

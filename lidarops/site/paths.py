@@ -1,4 +1,4 @@
-"""Where products lie and where their pages go: no path leads out of its folder."""
+"""Paths of products, pages and links. No path leads out of its folder."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ def product_folder(output: Path) -> Path:
 
 
 def product_paths(folder: Path) -> list[str]:
-    """List the products below a folder, sorted; hidden files are not looked at.
+    """List the products below a folder, sorted, without hidden files.
 
-    Links to folders are not followed, so that the walk ends and stays inside.
+    Links to folders are not followed, so that the search ends and stays inside.
     """
-    found = []
-    for here, folders, files in os.walk(folder):
+    paths = []
+    for parent, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        found += [
-            (Path(here) / name).relative_to(folder).as_posix()
+        paths += [
+            (Path(parent) / name).relative_to(folder).as_posix()
             for name in files
             if name.endswith(".nc") and not name.startswith(".")
         ]
-    return sorted(found)
+    return sorted(paths)
 
 
 def inside(folder: Path, path: str) -> Path:
@@ -67,16 +67,16 @@ def inside(folder: Path, path: str) -> Path:
     pure = PurePosixPath(path)
     if pure.is_absolute() or ".." in pure.parts or not pure.parts:
         raise ProductError("is no path inside its folder", file=path)
-    found = folder / pure
-    if not found.resolve().is_relative_to(folder.resolve()):
+    file = folder / pure
+    if not file.resolve().is_relative_to(folder.resolve()):
         raise ProductError(
             "is a link that leads out of its folder", file=path, remedy="put the file in its place"
         )
-    return found
+    return file
 
 
 def slug(name: str) -> str:
-    """Return a name as part of a path: itself where it is plain, else a digest of it."""
+    """Return a name as a part of a path: the name itself if it is plain, else a digest."""
     if _SAFE.fullmatch(name) and not name.endswith("."):
         return name
     return f"x-{hashlib.sha256(name.encode('utf-8', 'surrogateescape')).hexdigest()[:16]}"
@@ -104,7 +104,7 @@ def href(target: str, page: str) -> str:
     Parameters
     ----------
     target : str
-        May begin with ``../`` to reach what lies beside the site.
+        May begin with ``../`` for files beside the site.
     page : str
     """
     relative = os.path.relpath(target, os.path.dirname(page) or ".")  # noqa: PTH120

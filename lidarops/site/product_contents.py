@@ -1,4 +1,4 @@
-"""What a product holds, as plain text and numbers for its page."""
+"""The content of a product for its page: quality counts, provenance, variables, times."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from lidarops.figures.series_data import quality_bits
 from lidarops.figures.wording import bit_name, percent
 from lidarops.flags import Quality, Severity
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -18,13 +19,13 @@ from lidarops.site.product_entry import UNKNOWN
 
 PROVENANCE: Final = "provenance"
 _READ_BYTES: Final = 16_000_000
-"""Bound on what is held in memory of the flags."""
+"""Most bytes of flags in memory."""
 _BITS: Final = 31
 
 
 @dataclass(frozen=True, slots=True)
 class FlagRow:
-    """One quality bit that values carry."""
+    """Count of one quality bit."""
 
     bit: str
     severity: str
@@ -37,8 +38,8 @@ class FlagRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """What the quality bits say of the values of a product."""
+class QualityCounts:
+    """Counts of the values of a product by quality."""
 
     values: int
     usable: int
@@ -48,18 +49,18 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """A step that ran, or one that was left out."""
+    """A step that was carried out or left out."""
 
     name: str
-    of: str
-    """Channel, and instrument in a network."""
+    channel: str
+    """Channel; in a network with its instrument."""
     settings: str
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class InputRow:
-    """A file that a product was made from."""
+    """An input file of a product."""
 
     path: str
     role: str
@@ -68,10 +69,10 @@ class InputRow:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a product came from, read of its PROV-JSON; empty where it has none."""
+    """Provenance of a product from its PROV-JSON; empty without it."""
 
     text: str = ""
-    """The document itself."""
+    """PROV-JSON document."""
     id: str = ""
     plan_hash: str = ""
     code_version: str = ""
@@ -81,12 +82,12 @@ class Origin:
     left_out: tuple[StepRow, ...] = ()
     inputs: tuple[InputRow, ...] = ()
     problem: str = ""
-    """Why there is none, or less than there should be."""
+    """Why the provenance is missing or incomplete."""
 
 
 @dataclass(frozen=True, slots=True)
 class VariableRow:
-    """One variable of a product."""
+    """A variable of a product."""
 
     name: str
     dims: str
@@ -96,22 +97,22 @@ class VariableRow:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """When the data of a product begin and end, UTC, ISO 8601 to the second."""
+    """Start and end of the data of a product, UTC, ISO 8601 to the second."""
 
     start: str
     stop: str
 
 
-def judge(product: xr.Dataset) -> Judged:
+def count_quality(product: xr.Dataset) -> QualityCounts:
     """Count the values of a product by quality bit.
 
     Parameters
     ----------
     product : Dataset
-        May be lazy: flags are read in blocks of bounded memory.
+        May be lazy; flags are read in blocks of bounded memory.
     """
     if QUALITY_FLAG not in product:
-        return Judged(0, 0, 0, ())
+        return QualityCounts(0, 0, 0, ())
     counts = np.zeros(_BITS, dtype=np.int64)
     values = usable = unflagged = 0
     rejecting = np.int64(Quality.rejecting())
@@ -123,25 +124,18 @@ def judge(product: xr.Dataset) -> Judged:
         for bit in range(_BITS):
             counts[bit] += np.count_nonzero(raised & np.int64(1 << bit))
     rows = [_flag_row(1 << bit, int(counts[bit]), values) for bit in range(_BITS) if counts[bit]]
-    return Judged(values, usable, unflagged, tuple(rows))
+    return QualityCounts(values, usable, unflagged, tuple(rows))
 
 
 def _blocks(flags: xr.DataArray) -> Iterator[NDArray[np.int64]]:
     first = flags.dims[0] if flags.dims else None
     if first is None or flags.size == 0:
-        yield _integers(flags)
+        yield np.atleast_1d(quality_bits(flags))
         return
     length = flags.sizes[first]
     step = max(1, _READ_BYTES * length // (8 * flags.size))
     for start in range(0, length, step):
-        yield _integers(flags.isel({first: slice(start, start + step)}))
-
-
-def _integers(flags: xr.DataArray) -> NDArray[np.int64]:
-    values = np.atleast_1d(flags.values)
-    if values.dtype.kind == "f":
-        values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
-    return np.asarray(values, dtype=np.int64)
+        yield quality_bits(flags.isel({first: slice(start, start + step)}))
 
 
 def _flag_row(bit: int, count: int, values: int) -> FlagRow:
@@ -152,9 +146,7 @@ def _flag_row(bit: int, count: int, values: int) -> FlagRow:
         bit=bit_name(Quality(bit)) if known else f"bit {bit.bit_length() - 1}",
         severity=severity if known else "unknown",
         css="bad" if rejects or not known else "care",
-        meaning=Quality(bit).description
-        if known
-        else "this version of lidarops does not know the bit",
+        meaning=Quality(bit).description if known else "bit unknown to this version of lidarops",
         count=count,
         share=percent(count / values),
         width=max(1, round(100 * count / values)),
@@ -162,21 +154,21 @@ def _flag_row(bit: int, count: int, values: int) -> FlagRow:
 
 
 def span(product: xr.Dataset) -> Span:
-    """Return when the data begin and end, from the attributes or else the times themselves.
+    """Return start and end of the data from the attributes, else from the times.
 
     Raises
     ------
     ValueError
-        If the product says neither.
+        If the product has neither.
     """
     names = ("time_coverage_start", "time_coverage_end")
-    told = [str(product.attrs.get(name, "")) for name in names]
-    if not all(told):
+    ends = [str(product.attrs.get(name, "")) for name in names]
+    if not all(ends):
         time = product["time"].values if "time" in product.variables else np.array([])
         if time.size == 0 or time.dtype.kind != "M":
-            raise ValueError("says neither in its attributes nor by a time when it was measured")
-        told = [str(time.min()), str(time.max())]
-    return Span(*(_second(text) for text in told))
+            raise ValueError("has no time of measurement, neither as attributes nor as a variable")
+        ends = [str(time.min()), str(time.max())]
+    return Span(*(_second(text) for text in ends))
 
 
 def _second(text: str) -> str:
@@ -188,7 +180,7 @@ def _second(text: str) -> str:
 
 
 def variables(product: xr.Dataset) -> list[VariableRow]:
-    """Return one row for every variable but the provenance, coordinates first."""
+    """Return one row per variable except the provenance, coordinates first."""
     names = [*product.coords, *product.data_vars]
     return [
         VariableRow(
@@ -208,9 +200,9 @@ def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
 
 
 def origin(product: xr.Dataset) -> Origin:
-    """Read the provenance of a product; what it lacks is named, not raised."""
+    """Read the provenance of a product; problems are stated in the result, not raised."""
     if PROVENANCE not in product:
-        return Origin(problem="the product holds no provenance")
+        return Origin(problem="the product has no provenance")
     try:
         text = str(product[PROVENANCE].item())
         document = json.loads(text)
@@ -243,7 +235,7 @@ def _step(item: Mapping[str, Any]) -> StepRow:
     settings = item.get("settings", {})
     return StepRow(
         name=str(item["name"]),
-        of=" ".join(str(item[key]) for key in ("instrument", "channel") if item.get(key)),
+        channel=" ".join(str(item[key]) for key in ("instrument", "channel") if item.get(key)),
         settings="\n".join(f"{key}: {_plain(settings[key])}" for key in sorted(settings)),
         reason=str(item["reason"]),
     )

@@ -1,4 +1,4 @@
-"""What the site remembers of a product, and how good its values are, in words."""
+"""The entry of a product in the calendar, and grades for the share of usable values."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ UNKNOWN: Final = "unknown"
 
 
 class Grade(StrEnum):
-    """How many of the values can be used, in a word."""
+    """Grade of a share of usable values."""
 
     MOST = "most"
     SOME = "some"
     FEW = "few"
     NONE = "none"
-    UNJUDGED = "not judged"
+    UNKNOWN = "unknown"
 
     @property
     def css(self) -> str:
-        """Name of its style."""
+        """CSS class."""
         return f"g-{self.name.lower()}"
 
     @property
     def meaning(self) -> str:
-        """Which shares of usable values it stands for."""
+        """Range of shares in words."""
         return _MEANING[self]
 
     @classmethod
     def of(cls, share: float | None) -> Grade:
-        """Return the grade of a share of usable values, 0 to 1; None where nothing judges."""
+        """Return the grade of a share of usable values (0 to 1; None without quality flags)."""
         if share is None:
-            return cls.UNJUDGED
+            return cls.UNKNOWN
         if share <= 0.0:
             return cls.NONE
         if share < _SOME:
@@ -50,13 +50,13 @@ _MEANING: Final = {
     Grade.SOME: "25 to 75 % usable",
     Grade.FEW: "less than 25 % usable",
     Grade.NONE: "no value usable",
-    Grade.UNJUDGED: "without quality flags",
+    Grade.UNKNOWN: "no quality flags",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One product as the calendar knows it."""
+    """A product in the calendar."""
 
     path: str
     """Relative to the folder of the products."""
@@ -67,7 +67,7 @@ class Entry:
     thumbnail: str
     """Relative to the site."""
     digests: tuple[str, ...]
-    """sha256 of the files of the product's page, in the order of `files`."""
+    """sha256 of the files of the page, in the order of `files`."""
     campaign: str
     station: str
     place: str
@@ -79,39 +79,39 @@ class Entry:
     """UTC, ISO 8601 to the second."""
     stop: str
     values: int
-    """Number of values that quality bits judge."""
+    """Number of values with quality flags."""
     usable: int
-    """Number of those that no bit rejects."""
+    """Number of values that no bit rejects."""
     unflagged: int
     alt: str
-    """What the thumbnail shows."""
+    """Description of the thumbnail."""
     problem: str
-    """What is wrong with the product although it has a page; empty where nothing is."""
+    """What is wrong with the product; empty if nothing."""
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Files of its page, relative to the site."""
+        """Files of the page, relative to the site."""
         return self.page, self.thumbnail, f"{self.page.removesuffix('.html')}.prov.json"
 
     @property
     def day(self) -> str:
-        """UTC day on which its data begin."""
+        """UTC day on which the data begin."""
         return self.start[:10]
 
     @property
     def share(self) -> float | None:
-        """Share of usable values; None where nothing judges them."""
+        """Share of usable values; None without quality flags."""
         return self.usable / self.values if self.values else None
 
     @property
     def grade(self) -> Grade:
-        """How good its values are."""
+        """Grade of the share of usable values."""
         return Grade.of(self.share)
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A product that has no page, or a page with less than it should have."""
+    """A product without a page, or with an incomplete page."""
 
     path: str
     reason: str
@@ -120,11 +120,11 @@ class Problem:
 def mean_share(entries: Iterable[Entry]) -> float | None:
     """Return the mean over products of the share of usable values.
 
-    Retrievals count where there are any: the far range of a signal is flagged by nature. The
-    mean is over products and not over values, so that a product of many bins does not hide one
-    of few sections. None where nothing is judged.
+    Only retrievals count if there are any, because signals are always flagged at far range. The
+    mean is over products, not values, so that a product of many bins does not dominate one of few
+    sections. None without quality flags.
     """
-    judged = [(entry.kind == SIGNAL, entry.share) for entry in entries if entry.share is not None]
-    retrieved = [share for is_signal, share in judged if not is_signal]
-    shares = retrieved or [share for _, share in judged]
+    known = [(entry.kind == SIGNAL, entry.share) for entry in entries if entry.share is not None]
+    retrieved = [share for is_signal, share in known if not is_signal]
+    shares = retrieved or [share for _, share in known]
     return fmean(shares) if shares else None

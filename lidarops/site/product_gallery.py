@@ -1,4 +1,4 @@
-"""The figures of a product, by its kind; a kind that is not known is drawn by its dimensions."""
+"""The figures of a product page, by kind; unknown kinds are drawn by their dimensions."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from lidarops.figures.raster import Raster, read_raster
 from lidarops.figures.scan_data import clearest_cycle, read_extinction
 from lidarops.figures.series_data import Section, join, read_sections
 from lidarops.figures.time_axis import time_axis
+from lidarops.figures.wording import counted
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.records import ProductKind
@@ -36,12 +37,12 @@ _PREFERRED: Final = (
     "signal",
 )
 _BULK: Final = 64_000_000
-"""Bytes of a variable of an unknown kind, above which only some of its profiles are read."""
+"""Bytes of a variable of an unknown kind above which only some profiles are read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """One figure of a page."""
+    """A figure of a page."""
 
     caption: str
     figure: Markup
@@ -55,7 +56,7 @@ class Gallery:
     thumbnail: bytes
     """SVG file."""
     alt: str
-    """What the thumbnail shows."""
+    """Description of the thumbnail."""
 
 
 _Parts = tuple[list[Drawn], Sheet, str]
@@ -69,7 +70,7 @@ def draw_gallery(product: xr.Dataset, kind: str, style: str) -> Gallery:
     product : Dataset
         Open; may be lazy.
     kind : str
-        A kind of product, or any other word.
+        Kind of the product, which may be unknown.
     style : str
         Style sheet of the thumbnail.
 
@@ -80,7 +81,7 @@ def draw_gallery(product: xr.Dataset, kind: str, style: str) -> Gallery:
     Raises
     ------
     ProductError
-        Where a product is not what its kind says.
+        If the product does not fit its kind.
     """
     drawn, thumbnail, alt = _DRAWERS.get(kind, _any)(product)
     return Gallery(tuple(drawn), thumbnail.file(style), alt)
@@ -102,8 +103,8 @@ def _signal(product: xr.Dataset) -> _Parts:
 
 def _image(raster: Raster, what: str, label: str, along: str) -> _Parts:
     sheet, words = image_panels.draw_image(raster, along=along, label=label, key="f1")
-    sky = ", and the background below" if np.isfinite(raster.background).any() else ""
-    caption = f"{what} against time and {along}{sky}"
+    below = ", with the background below" if np.isfinite(raster.background).any() else ""
+    caption = f"{what} against time and {along}{below}"
     return [_finish(sheet, caption, words, "f1")], image_panels.thumbnail(raster, *THUMB), caption
 
 
@@ -115,7 +116,7 @@ def _elastic(product: xr.Dataset) -> _Parts:
     if profile is not None:
         sheet, words = profile_panels.error_budget_panels(profile, "f2")
         moment = _moment(profile.time)
-        caption = f"Profile of {moment}, the one with most unflagged bins, and its error budget"
+        caption = f"Profile at {moment} (most unflagged bins) and its error budget"
         drawn.append(_finish(sheet, caption, words, "f2"))
     return drawn, thumbnail, alt
 
@@ -126,7 +127,7 @@ def _multiangle(product: xr.Dataset) -> _Parts:
     profile = clearest_cycle(product)
     if profile is not None:
         sheet, words = profile_panels.scan_panels(profile, "f2")
-        caption = f"Cycle of {_moment(profile.time)}, the one with most unflagged values"
+        caption = f"Scan cycle at {_moment(profile.time)} (most unflagged values)"
         drawn.append(_finish(sheet, caption, words, "f2"))
     return drawn, thumbnail, alt
 
@@ -137,17 +138,17 @@ def _moment(time: np.datetime64) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """What one panel of a stack shows of a section."""
+    """A quantity in one panel of a stack."""
 
     name: str
     factor: float
-    """From the unit of the section to the one shown."""
-    called: str
+    """From the unit of the section to the displayed unit."""
+    title: str
     units: str
 
     @property
     def label(self) -> str:
-        return f"{self.called} ({self.units})"
+        return f"{self.title} ({self.units})"
 
 
 def _homogeneous(product: xr.Dataset) -> _Parts:
@@ -167,17 +168,17 @@ def _visibility(product: xr.Dataset) -> _Parts:
         _Quantity("visibility", 1.0, "visibility", "km"),
         _Quantity("extinction", 1e3, "extinction", "km⁻¹"),
     )
-    called = "Visibility and extinction where beams meet"
-    drawn, thumbnail, alt = _stacks(read_crossings(product), quantities, called)
+    title = "Visibility and extinction at the crossings"
+    drawn, thumbnail, alt = _stacks(read_crossings(product), quantities, title)
     sheet, words = network_map.draw_network_map(read_map(product))
-    plan = _finish(sheet, "Beams and the crossings in which they meet", words, "map")
+    plan = _finish(sheet, "Map of beams and crossings", words, "map")
     return [*drawn, plan], thumbnail, alt
 
 
 def _stacks(
-    sections: Sequence[Section], quantities: tuple[_Quantity, _Quantity], called: str
+    sections: Sequence[Section], quantities: tuple[_Quantity, _Quantity], title: str
 ) -> _Parts:
-    """Draw two quantities of series against time, a figure for every few of them."""
+    """Draw two quantities of series against time, a few series per figure."""
     drawn = []
     for first in range(0, len(sections), series_panels.SERIES):
         few, key = (
@@ -185,13 +186,13 @@ def _stacks(
             f"f{first // series_panels.SERIES + 1}",
         )
         sheet, words = _stack(few, quantities, key)
-        drawn.append(_finish(sheet, f"{called} against time", words, key))
+        drawn.append(_finish(sheet, f"{title} against time", words, key))
     main = quantities[0]
     lines = [
         series_panels.line_of(s, main.name, main.factor) for s in sections[: series_panels.SERIES]
     ]
     reach = series_panels.in_words(lines, main.units)
-    alt = f"{main.called.capitalize()} against time. {reach}"
+    alt = f"{main.title.capitalize()} against time. {reach}"
     return drawn, series_panels.sparkline(lines, *THUMB), alt
 
 
@@ -216,13 +217,13 @@ def _stack(
     for name, panel, lines in drawn:
         beyond = series_panels.values(sheet, panel, axis, lines, f"{key}-{name}")
         if beyond:
-            words.append(f"{beyond} values of {name} lie beyond the axis")
+            words.append(f"{counted(beyond, 'value')} of {name} beyond the axis")
     series_panels.series_legend(sheet, 14, drawn[0][2])
     return sheet, "; ".join(words)
 
 
 def nothing(words: str, style: str) -> Gallery:
-    """Return a gallery without figures that says why."""
+    """Return a gallery without figures, with the reason as thumbnail."""
     _, thumbnail, alt = _nothing(words)
     return Gallery((), thumbnail.file(style), alt)
 
@@ -230,7 +231,7 @@ def nothing(words: str, style: str) -> Gallery:
 def _nothing(words: str) -> _Parts:
     sheet = Sheet(height=THUMB[1], width=THUMB[0])
     sheet.text(THUMB[0] / 2, THUMB[1] / 2 + 5, words, css="t m")
-    return [], sheet, f"Nothing is drawn: {words}"
+    return [], sheet, f"No figure: {words}"
 
 
 def _any(product: xr.Dataset) -> _Parts:
@@ -265,7 +266,7 @@ def _any(product: xr.Dataset) -> _Parts:
 
 
 def _main_variable(product: xr.Dataset) -> str | None:
-    """Return the first variable over time that a reader would look for."""
+    """Return the most interesting variable over time, or None."""
     if "time" not in product.variables or product["time"].dtype.kind != "M":
         return None
     over_time = [
@@ -273,9 +274,9 @@ def _main_variable(product: xr.Dataset) -> str | None:
         for name, variable in product.data_vars.items()
         if variable.dims[:1] == ("time",) and variable.dtype.kind == "f" and variable.size
     ]
-    known = [name for name in _PREFERRED if name in over_time]
-    judged = [name for name in over_time if f"{name}_standard_error" in product]
-    return next(iter([*known, *judged, *over_time]), None)
+    preferred = [name for name in _PREFERRED if name in over_time]
+    uncertain = [name for name in over_time if f"{name}_standard_error" in product]
+    return next(iter([*preferred, *uncertain, *over_time]), None)
 
 
 def _lines(product: xr.Dataset, variable: xr.DataArray, table: Floats) -> list[Line]:
@@ -285,8 +286,8 @@ def _lines(product: xr.Dataset, variable: xr.DataArray, table: Floats) -> list[L
     flag = np.zeros(table.shape, dtype=np.int64)
     if QUALITY_FLAG in product and product[QUALITY_FLAG].dims == variable.dims:
         flag = product[QUALITY_FLAG].values.reshape(table.shape).astype(np.int64)[order]
-    found = np.isfinite(table).sum(axis=0)
-    columns = np.sort(np.argsort(-found, kind="stable")[: series_panels.SERIES])
+    counts = np.isfinite(table).sum(axis=0)
+    columns = np.sort(np.argsort(-counts, kind="stable")[: series_panels.SERIES])
     name = str(variable.dims[1]) if variable.ndim > 1 else ""
     rejected = (flag & int(Quality.rejecting())) != 0
     return [

@@ -1,4 +1,4 @@
-"""Values of one profile against range or altitude, two panels side by side."""
+"""Profiles against range or altitude, in two panels side by side."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _decades(values: Sequence[Floats]) -> tuple[float, float]:
 
 
 def error_budget_panels(profile: Profile, key: str) -> tuple[Sheet, str]:
-    """Draw backscatter of one profile with its standard error, and what the error is made of."""
+    """Draw a backscatter profile with its standard error, and its error budget."""
     sheet = Sheet(height=_HEIGHT)
     y = profile.range / 1e3
     value, error, molecular = (
@@ -98,12 +98,12 @@ def error_budget_panels(profile: Profile, key: str) -> tuple[Sheet, str]:
     named = [("M-9 0H9", "line c0", "particles"), ("M-9 0H9", "line d2 c1", "molecules")]
     svg.legend(sheet, LEFT + 14, 20, named)
     rows = [("M-9 0H9", f"line d{n} c{n}", _CAUSES[name]) for n, name in enumerate(causes)]
-    svg.legend(sheet, LEFT + 330, 20, [*rows, ("M-9 0H9", "line ink", "all")])
+    svg.legend(sheet, LEFT + 330, 20, [*rows, ("M-9 0H9", "line ink", "total")])
     bottom, top = (f"{edge / 1e3:.3g}" for edge in profile.reference)
     good = value[np.isfinite(value)]
     reach = f"{svg.number(float(good.min()))} to {svg.number(float(good.max()))} {unit}"
     return sheet, (
-        f"Backscatter of particles {reach}, lidar ratio {profile.lidar_ratio:g} sr, reference"
+        f"Particle backscatter {reach}, lidar ratio {profile.lidar_ratio:g} sr, reference"
         f" window {bottom} to {top} km; the band is the standard error"
     )
 
@@ -113,7 +113,7 @@ def _positive(values: Floats) -> Floats:
 
 
 def scan_panels(profile: ScanProfile, key: str) -> tuple[Sheet, str]:
-    """Draw optical depth and extinction of one cycle of a scan against altitude."""
+    """Draw optical depth and extinction of one scan cycle against altitude."""
     sheet = Sheet(height=_HEIGHT)
     y = profile.altitude / 1e3
     factors = {"optical_depth": 1.0, "extinction": 1e3}
@@ -137,15 +137,15 @@ def scan_panels(profile: ScanProfile, key: str) -> tuple[Sheet, str]:
     ):
         sheet.frame(panel, "" if number else "altitude (km)", below=label)
         _estimate(sheet, panel, panel.y(y), parts, f"{key}-s{number}")
-    named = [("M-9 0H9", "line c0", "retrieved, with its standard error")]
-    wide = ("M-9-4H9V4H-9z", "band wide c0", "with the error by a horizontal gradient")
+    named = [("M-9 0H9", "line c0", "retrieved, with standard error")]
+    wide = ("M-9-4H9V4H-9z", "band wide c0", "plus largest error from a horizontal gradient")
     svg.legend(sheet, LEFT + 14, 20, [*named, wide, (svg.cross(0, 0), "off", "rejected")])
     value = shown["extinction"][0]
     good = value[np.isfinite(value)]
     reach = (
         f"{svg.number(float(good.min()))} to {svg.number(float(good.max()))} km⁻¹"
         if good.size
-        else "no value to use"
+        else "no usable value"
     )
     flagged = int((profile.flag != 0).sum())
     return sheet, f"Extinction {reach}; {flagged} of {profile.flag.size} altitudes flagged"

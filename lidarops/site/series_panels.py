@@ -1,4 +1,4 @@
-"""Values against time: one panel a quantity, one mark and line a series."""
+"""Values against time, with one panel per quantity and one mark and line per series."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 POINTS: Final = 600
-"""More values than these are drawn as block means."""
+"""More values than this are drawn as block means."""
 _BARS: Final = 160
-"""Up to so many values get an error bar, more get a band."""
+"""Most values with error bars; more values get a band."""
 _CROSSES: Final = 300
 SERIES: Final = 4
-"""Most series that marks tell apart."""
+"""Most series in a panel, one per mark."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One series to draw."""
+    """A series to draw."""
 
     label: str
     time: Times
     value: Floats
-    """Values that no bit speaks against."""
+    """Unflagged values."""
     error: Floats
     """Their standard errors; NaN where unknown."""
     off_time: Times
     off_value: Floats
-    """Values that a quality bit speaks against; NaN where there is no value."""
+    """Flagged values; NaN without a value."""
 
 
 def line_of(section: Section, quantity: str, factor: float) -> Line:
-    """Return a quantity of a section of a homogeneous product, in units times `factor`."""
+    """Return a quantity of a section, multiplied by `factor`."""
     few = thin(section, POINTS)
     estimate = few.estimates[quantity]
     off = section.flag != 0
@@ -58,7 +58,7 @@ def line_of(section: Section, quantity: str, factor: float) -> Line:
 
 
 def limits(lines: Sequence[Line]) -> tuple[float, float]:
-    """Return where a panel begins and ends: all but the outermost hundredths, with room."""
+    """Return the limits of a panel: the 1st and 99th percentile with a margin."""
     good = _finite([line.value for line in lines])
     values = good if good.size else _finite([line.off_value for line in lines])
     if values.size == 0:
@@ -82,7 +82,7 @@ def time_scale(axis: TimeAxis, right: float = WIDTH - RIGHT) -> Scale:
 
 
 def time_ticks(sheet: Sheet, axis: TimeAxis, panels: Sequence[Panel]) -> None:
-    """Draw ticks of UTC through panels, labels below the last, and marks where time is cut."""
+    """Draw UTC ticks through panels, labels below the last panel, and marks at cut gaps."""
     scale = panels[-1].x
     _, top, _, height = panels[-1].box
     for tick in axis.ticks(8):
@@ -99,11 +99,11 @@ def time_ticks(sheet: Sheet, axis: TimeAxis, panels: Sequence[Panel]) -> None:
 
 
 def values(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line], key: str) -> int:
-    """Draw series into a panel; return how many values lie beyond its ends."""
+    """Draw series into a panel; return the number of values beyond its limits."""
     sheet.clipped(panel, lambda: _draw(sheet, panel, axis, lines), key)
     low, high = panel.y.ends
-    found = _finite([line.value for line in lines])
-    return int(np.count_nonzero((found < low) | (found > high)))
+    finite = _finite([line.value for line in lines])
+    return int(np.count_nonzero((finite < low) | (finite > high)))
 
 
 def _draw(sheet: Sheet, panel: Panel, axis: TimeAxis, lines: Sequence[Line]) -> None:
@@ -132,14 +132,14 @@ def _rejected(sheet: Sheet, panel: Panel, axis: TimeAxis, line: Line) -> None:
     some = slice(None, None, max(1, -(-line.off_time.size // _CROSSES)))
     x, y = panel.x(axis.x(line.off_time[some])), panel.y(line.off_value[some])
     sheet.path(svg.marks(x, y, svg.cross), "off")
-    # What has no value at all still happened: a short line at the foot of the panel.
+    # Times without a value are marked by a short line at the bottom of the panel.
     foot = panel.box[1] + panel.box[3]
     lost = x[~np.isfinite(y)]
     sheet.path("".join(f"M{a:.1f} {foot:.1f}v-8" for a in lost.tolist()), "off")
 
 
 def series_legend(sheet: Sheet, y: float, lines: Sequence[Line], x: float = LEFT + 110) -> None:
-    """Name the series, and how flagged values are drawn."""
+    """Draw the legend of series and flagged values."""
     rows = [
         (f"M-9 0H9{svg.MARKS[index](0.0, 0.0)}", f"mark line c{index}", line.label)
         for index, line in enumerate(lines)
@@ -150,7 +150,7 @@ def series_legend(sheet: Sheet, y: float, lines: Sequence[Line], x: float = LEFT
 
 
 def in_words(lines: Sequence[Line], units: str) -> str:
-    """Return the reach of every series in words."""
+    """Return the range of values and the number of flagged values of each series in words."""
     words = []
     for line in lines:
         good = _finite([line.value])

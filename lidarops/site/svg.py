@@ -1,9 +1,8 @@
 """Drawing primitives: panels, axes, lines, marks and images as SVG text.
 
-A page of the site holds its figures as SVG, because a browser draws text and lines sharper than
-any image, in its own colours for light and dark, and because a figure then costs milliseconds.
-Colours are classes of the style sheet; marks and dashes differ too, so that colour is never
-alone.
+Pages contain figures as SVG: text and lines are sharp, colours adapt to light and dark mode, and
+drawing takes milliseconds. Colours are classes of the style sheet. Marks and dashes differ too, so
+that figures do not depend on colour alone.
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ from lidarops.figures.wording import visible
 Floats = NDArray[np.float64]
 
 WIDTH: Final = 960
-"""Units of length across a figure."""
+"""Width of a figure in its own units."""
 LEFT: Final = 74
 RIGHT: Final = 18
 BAR: Final = 122
-"""Space at the right for a colour bar."""
+"""Space on the right for a colour bar."""
 COLOURS: Final = 253
 """Steps of the colour scale of images."""
 BLANK: Final = 0
-"""Index of what was not measured: transparent."""
+"""Palette index of blocks without data (transparent)."""
 REJECTED: Final = 1
-"""Index of the dark stripes of what a quality bit rejects; the light ones follow."""
+"""Palette index of the dark stripes of rejected blocks; the light stripes have the next index."""
 
 # viridis without its dark end, as in the figures of a run's report.
 _VIRIDIS: Final = (
@@ -45,17 +44,18 @@ _VIRIDIS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Maps values to a length along an axis."""
+    """Maps values to positions along an axis."""
 
     low: float
     high: float
     start: float
-    """Where `low` lies, in units of the figure."""
+    """Position of `low`, in units of the figure."""
     stop: float
+    """Position of `high`."""
     log: bool = False
 
     def __call__(self, values: Floats | float) -> Floats:
-        """Return positions, kept within a figure's reach where values lie far outside."""
+        """Return positions, clipped at one axis length outside the ends."""
         low, high = (np.log(self.low), np.log(self.high)) if self.log else (self.low, self.high)
         with np.errstate(invalid="ignore", divide="ignore"):
             along = np.log(np.asarray(values)) if self.log else np.asarray(values, dtype=np.float64)
@@ -84,15 +84,15 @@ def round_steps(low: float, high: float, at_most: int) -> list[float]:
 def _decades(low: float, high: float) -> list[float]:
     first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
     for steps in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)):
-        found = [s * 10.0**p for p in range(first, last + 1) for s in steps]
-        found = [value for value in found if low * (1 - 1e-9) <= value <= high * (1 + 1e-9)]
-        if len(found) >= 3:
-            return found
+        ticks = [s * 10.0**p for p in range(first, last + 1) for s in steps]
+        ticks = [value for value in ticks if low * (1 - 1e-9) <= value <= high * (1 + 1e-9)]
+        if len(ticks) >= 3:
+            return ticks
     return [low, high]
 
 
 def _labelled(scale: Scale, at_most: int) -> list[tuple[float, str]]:
-    """Return ticks with their labels, which have equal decimals on an even scale."""
+    """Return ticks with labels, with equal decimals on a linear scale."""
     ticks = scale.ticks(at_most)
     words = [number(tick) for tick in ticks]
     if not scale.log and not any("\N{MULTIPLICATION SIGN}" in text for text in words):
@@ -102,7 +102,7 @@ def _labelled(scale: Scale, at_most: int) -> list[tuple[float, str]]:
 
 
 def number(value: float) -> str:
-    """Return a number as axes spell it: a true minus, powers of ten where it is long."""
+    """Return a number for axes: with a minus sign, and powers of ten if it is long."""
     if value == 0.0:
         return "0"
     text = f"{value:.4g}"
@@ -121,7 +121,7 @@ def _raised(power: int) -> str:
 
 
 def units(text: str) -> str:
-    """Return CF units with raised exponents: ``m-1 sr-1`` becomes m⁻¹ sr⁻¹."""
+    """Return CF units with superscript exponents: ``m-1 sr-1`` becomes m⁻¹ sr⁻¹."""
     plain = text.replace("$^{-1}$", "-1")
     words = []
     for word in plain.split():
@@ -147,17 +147,17 @@ class Panel:
 
 @dataclass(slots=True)
 class Sheet:
-    """A figure as it is drawn."""
+    """A figure that is being drawn."""
 
     height: float
     width: float = WIDTH
     stretched: bool = False
-    """Whether the file may be drawn wider or higher than it is: images only."""
+    """Whether the aspect ratio of the file may change; for images only."""
     parts: list[str] = field(default_factory=list)
     _clips: int = 0
 
     def text(self, x: float, y: float, words: str, *, css: str = "t", turned: bool = False) -> None:
-        """Write words; `css` names style and anchor."""
+        """Write text; `css` names style and anchor."""
         turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
         plain = escape(visible(words))
         self.parts.append(f'<text class="{css}" x="{x:.1f}" y="{y:.1f}"{turn}>{plain}</text>')
@@ -168,7 +168,7 @@ class Sheet:
             self.parts.append(f'<path class="{css}" d="{data}"/>')
 
     def clipped(self, panel: Panel, draw: Callable[[], None], key: str) -> None:
-        """Draw what is cut off at the edges of a panel; `key` is unique on a page."""
+        """Draw with clipping at the edges of a panel; `key` must be unique on a page."""
         self._clips += 1
         name = f"{key}-{self._clips}"
         left, top, width, height = panel.box
@@ -180,7 +180,7 @@ class Sheet:
         self.parts.append("</g>")
 
     def frame(self, panel: Panel, label: str, *, below: str = "", at_most: int = 5) -> None:
-        """Draw the axes of a panel; those below only where they have a label."""
+        """Draw the axes of a panel; the horizontal axis only if `below` labels it."""
         left, top, width, height = panel.box
         bottom = top + height
         grid, edge = "", f"M{left:.1f} {top:.1f}V{bottom:.1f}h{width:.1f}"
@@ -201,7 +201,7 @@ class Sheet:
         self.text(left - 56, top + height / 2, label, css="t m s", turned=True)
 
     def image(self, panel: Panel, png: bytes) -> None:
-        """Lay an image over a panel."""
+        """Fill a panel with an image."""
         left, top, width, height = panel.box
         data = base64.b64encode(png).decode("ascii")
         self.parts.append(
@@ -211,7 +211,7 @@ class Sheet:
         )
 
     def svg(self, key: str, alt: str) -> Markup:
-        """Return the figure for a page; `alt` says what it shows."""
+        """Return the figure as markup for a page; `alt` describes it."""
         return Markup(  # noqa: S704 - every text in `parts` was escaped by `text`
             f'<svg class="fig" viewBox="0 0 {self.width:g} {self.height:g}" role="img"'
             f' aria-labelledby="{key}-t"><title id="{key}-t">{escape(visible(alt))}</title>'
@@ -219,7 +219,7 @@ class Sheet:
         )
 
     def file(self, style: str) -> bytes:
-        """Return the figure as a file of its own, with its style in it."""
+        """Return the figure as an SVG file that includes its style."""
         aspect = ' preserveAspectRatio="none"' if self.stretched else ""
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g}'
@@ -229,24 +229,24 @@ class Sheet:
 
 
 def line(x: Floats, y: Floats) -> str:
-    """Return a path through points, broken where one is not finite."""
+    """Return a path through points, interrupted at points that are not finite."""
     parts, pen = [], "M"
-    for here, there in zip(x.tolist(), y.tolist(), strict=True):
-        if not (np.isfinite(here) and np.isfinite(there)):
+    for px, py in zip(x.tolist(), y.tolist(), strict=True):
+        if not (np.isfinite(px) and np.isfinite(py)):
             pen = "M"
             continue
-        parts.append(f"{pen}{here:.1f} {there:.1f}")
+        parts.append(f"{pen}{px:.1f} {py:.1f}")
         pen = "L"
     return "".join(parts)
 
 
 def band(along: Floats, low: Floats, high: Floats, *, upright: bool = False) -> str:
-    """Return closed paths between two curves, one for every stretch without a gap.
+    """Return closed paths between two curves, one per stretch without a gap.
 
     Parameters
     ----------
     along, low, high : ndarray, shape (n,)
-        Positions; curves run along y where `upright`.
+        Positions; `along` is vertical if `upright`.
     """
     good = np.isfinite(along) & np.isfinite(low) & np.isfinite(high)
     cuts = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
@@ -273,15 +273,13 @@ def cross(x: float, y: float) -> str:
 
 
 def marks(x: Floats, y: Floats, mark: Callable[[float, float], str]) -> str:
-    """Return one mark at every point that is finite."""
+    """Return a mark at every finite point."""
     good = np.isfinite(x) & np.isfinite(y)
-    return "".join(
-        mark(here, there) for here, there in zip(x[good].tolist(), y[good].tolist(), strict=True)
-    )
+    return "".join(mark(px, py) for px, py in zip(x[good].tolist(), y[good].tolist(), strict=True))
 
 
 def legend(sheet: Sheet, x: float, y: float, entries: Iterable[tuple[str, str, str]]) -> None:
-    """Draw a legend in a line: path data around the origin, its style, and words."""
+    """Draw a legend in one line; entries are path data around the origin, style and text."""
     for data, css, words in entries:
         sheet.parts.append(
             f'<path class="{css}" transform="translate({x:.1f} {y - 4:.1f})" d="{data}"/>'
@@ -291,7 +289,7 @@ def legend(sheet: Sheet, x: float, y: float, entries: Iterable[tuple[str, str, s
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
-    """Return an indexed image as PNG: blank, two stripes of rejection, and the colour scale.
+    """Return an indexed image as PNG: blank, two kinds of stripes, and the colour scale.
 
     Parameters
     ----------

@@ -37,13 +37,18 @@ def stored(path: Path, data: xr.Dataset) -> xr.Dataset:
 
 @pytest.fixture
 def made() -> xr.Dataset:
-    """Eight profiles of 300 m; the first has a cloud at 40 m, the last no reference."""
+    """Return eight profiles to 300 m; the first has a cloud at 40 m, the last no reference."""
     return elastic(profiles=8)
 
 
 @pytest.fixture
 def product(made: xr.Dataset, tmp_path: Path) -> xr.Dataset:
     return stored(tmp_path / "elastic.nc", made)
+
+
+def backscatter_quicklook(product, *, title=""):
+    raster = read_raster(product, quantity=QUANTITY)
+    return product_figures.draw_backscatter([raster], title=title)
 
 
 def lines(panel, label):
@@ -55,7 +60,7 @@ def legend_texts(panel):
 
 
 class TestRaster:
-    def test_means_are_those_of_what_is_not_rejected(self, product):
+    def test_means_are_over_usable_bins(self, product):
         raster = read_raster(product, quantity=QUANTITY, profiles=4)
         rejected = (product["quality_flag"] & int(Quality.rejecting())) != 0
         values = product[QUANTITY].where(~rejected).to_numpy()
@@ -83,7 +88,7 @@ class TestRaster:
 
 class TestQuicklook:
     def test_the_image_holds_the_backscatter(self, product):
-        figure = product_figures.backscatter_quicklook([product], title="lidar")
+        figure = backscatter_quicklook(product, title="lidar")
         upper, lower, *_ = figure.axes
         meshes = [item for item in upper.collections if isinstance(item, QuadMesh)]
         drawn = np.concatenate([np.ma.filled(m.get_array(), np.nan).ravel() for m in meshes[:1]])
@@ -97,39 +102,39 @@ class TestQuicklook:
         assert "attenuated\nbackscatter (m$^{-1}$ sr$^{-1}$)" in labels
         assert "background" in lower.get_ylabel()
 
-    def test_triangles_stand_at_cloud_bases(self, product):
-        figure = product_figures.backscatter_quicklook([product])
+    def test_triangles_mark_cloud_bases(self, product):
+        figure = backscatter_quicklook(product)
         (triangles,) = [line for line in figure.axes[0].get_lines() if line.get_marker() == "v"]
         np.testing.assert_allclose(triangles.get_ydata(), [0.04])
         assert triangles.get_gid() == "cloud-base"
         assert len(triangles.get_xdata()) == 1
         words = product_figures.alt_text(figure)
-        assert "base of the lowest cloud or dense layer, in 1 columns" in words
+        assert "base of the lowest cloud or dense layer, in 1 column" in words
         assert "attenuated backscatter" in words
 
     def test_without_clouds_there_are_no_triangles(self, made, tmp_path):
         made["cloud_base_range"][:] = np.nan
-        figure = product_figures.backscatter_quicklook([stored(tmp_path / "clear.nc", made)])
+        figure = backscatter_quicklook(stored(tmp_path / "clear.nc", made))
         assert not [line for line in figure.axes[0].get_lines() if line.get_marker() == "v"]
         assert "triangles" not in product_figures.alt_text(figure)
 
     def test_rejected_bins_are_black(self, product):
-        figure = product_figures.backscatter_quicklook([product])
+        figure = backscatter_quicklook(product)
         assert "flagged" in product_figures.alt_text(figure)
         assert "no reference" in product_figures.alt_text(figure).replace("_", " ")
         assert [c for c in figure.axes[0].collections if c.get_gid() == "flagged-signal"]
 
-    def test_nothing_at_all_is_said(self, made, tmp_path):
+    def test_an_empty_panel_has_a_note(self, made, tmp_path):
         made["quality_flag"][:] |= np.int32(Quality.NO_REFERENCE)
         empty = stored(tmp_path / "empty.nc", made)
-        figure = product_figures.backscatter_quicklook([empty])
+        figure = backscatter_quicklook(empty)
         product_figures.render(figure)
         texts = [text.get_text() for text in figure.axes[0].texts]
         assert any("no usable signal" in text for text in texts)
 
 
 class TestClearestProfile:
-    def test_it_is_the_one_with_most_unflagged_bins_below_its_reference(self, made, tmp_path):
+    def test_has_the_most_unflagged_bins_below_its_reference(self, made, tmp_path):
         made["quality_flag"][1:4, 10:20] |= np.int32(Quality.PILE_UP)
         made["quality_flag"][5:7, 10:12] |= np.int32(Quality.PILE_UP)
         product = stored(tmp_path / "flags.nc", made)
@@ -195,7 +200,7 @@ class TestErrorBudget:
             assert "reference window" in legend_texts(panel)
             assert "sr$^{-1}$" in panel.get_xlabel()
 
-    def test_words_say_what_is_seen(self, product):
+    def test_the_description_names_quantity_and_reference(self, product):
         figure = product_figures.error_budget_figure(clearest_profile(product), title="lidar")
         words = product_figures.alt_text(figure)
         assert words.startswith("lidar: backscatter of particles")
@@ -244,7 +249,7 @@ class TestGallery:
             assert picture.alt
         assert found.flags is not None
 
-    def test_a_damaged_product_is_named_and_the_others_are_drawn(self, archive, made, tmp_path):
+    def test_a_damaged_product_is_listed_and_the_others_are_drawn(self, archive, made, tmp_path):
         record = _run(archive, ("e/bad.nc", made), ("e/good.nc", made.isel(time=slice(0, 6))))
         bad = archive.root / "e/bad.nc"
         bad.write_bytes(bad.read_bytes()[:2000])

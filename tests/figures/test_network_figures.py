@@ -1,4 +1,4 @@
-"""Figures of networks: what they show is what the product says."""
+"""Figures of networks show the values of the product."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def made() -> xr.Dataset:
 
 
 def truth(made: xr.Dataset, extinction: float = EXTINCTION) -> xr.Dataset:
-    """Of homogeneous air, a file a minute from each lidar."""
+    """Return the truth of homogeneous air, with one file per minute and lidar."""
     start = made["time_bnds"].values[0, 0]
     times = start + np.arange(60) * np.timedelta64(60, "s")
     return xr.Dataset(
@@ -45,7 +45,7 @@ def truth(made: xr.Dataset, extinction: float = EXTINCTION) -> xr.Dataset:
 
 def test_series_hold_values_errors_and_truth(made):
     series = read_crossings(made, truth(made), instruments=NAMES)
-    assert [one.label for one in series] == ["crossing 0", "crossing 1", "crossing 2"]
+    assert [crossing.label for crossing in series] == ["crossing 0", "crossing 1", "crossing 2"]
     for v, one in enumerate(series):
         np.testing.assert_array_equal(
             one.estimates["extinction"].value, made["extinction"].values[:, v]
@@ -65,14 +65,14 @@ def test_series_hold_values_errors_and_truth(made):
         assert found.count == 12
 
 
-def test_a_wrong_truth_is_seen(made):
+def test_a_wrong_truth_gives_a_bias(made):
     (one, *_) = read_crossings(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
     found = compare(one, "extinction")
     assert found is not None
     assert found.bias < -3.0
 
 
-def test_truth_is_that_of_the_beams_where_they_meet(made):
+def test_truth_is_the_mean_over_the_beams_at_the_crossing(made):
     known = truth(made).drop_vars("extinction")
     known["extinction"] = ("granule", np.full(180, np.nan))
     middle = np.arange(50.0, 5000.0, 100.0)
@@ -99,7 +99,7 @@ def test_scenes_are_joined_in_time(made):
         )
 
 
-def test_the_map_tells_each_crossing_in_words_and_colour(made):
+def test_the_map_shows_each_crossing_in_words_and_colour(made):
     network = read_map(made, NAMES)
     figure = network_figures.draw_map(network, title="valley")
     (panel, *_) = figure.axes
@@ -111,15 +111,15 @@ def test_the_map_tells_each_crossing_in_words_and_colour(made):
     assert sum(line.get_gid() == "beam" for line in panel.lines) == 3
     alt = product_figures.alt_text(figure)
     assert "3 beams of 3 instruments" in alt
-    assert f"crossing 0: {medians[0]:.3g} km of 12 values" in alt
-    # Where it lies: the first beam leads north-east of its lidar.
+    assert f"crossing 0: {medians[0]:.3g} km, 12 values" in alt
+    # The first beam points to the north-east of its lidar.
     assert network.axes[0].startswith("east")
     np.testing.assert_allclose(
         np.hypot(*(network.crossings[2] - network.stations[0])), 1.588, atol=0.01
     )
 
 
-def test_a_crossing_without_a_value_says_so(made):
+def test_a_crossing_without_a_value_is_labelled(made):
     lost = made.copy(deep=True)
     lost["quality_flag"][:, 1] = int(Quality.LOW_SIGNAL)
     figure = network_figures.draw_map(read_map(lost))

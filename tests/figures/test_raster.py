@@ -1,4 +1,4 @@
-"""Products as images: block means, flags, edges and reach."""
+"""Rasters of products: block means, flags, edges and reach."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CARE = [bit for bit in Quality if bit not in Quality.rejecting()]
 
 
 def oracle(product, columns, rows):
-    """Mean of the bins that no bit rejects, by plain loops."""
+    """Return the mean over usable bins, by plain loops."""
     flag, value = product["quality_flag"].values, product["signal"].values.astype(float)
     good = ((flag & BAD) == 0) & np.isfinite(value)
     out = np.full((len(columns), len(rows)), np.nan)
@@ -57,7 +57,7 @@ def test_blocks_are_means_of_usable_bins(count, bins, profiles, seed):
 @given(bins=st.integers(2, 3000), share=st.floats(0.01, 1.0))
 @settings(max_examples=20, deadline=None)
 def test_rows_merge_without_loss(bins, share):
-    product = signal(times(START, 3, 60.0), bins=bins, bin=5.0)
+    product = signal(times(START, 3, 60.0), bins=bins, bin_width=5.0)
     found = read_raster(product)
     cut = found.shown_to(share * bins * 5.0)
     assert cut.edges.size - 1 <= raster.ROWS
@@ -69,7 +69,7 @@ def test_rows_merge_without_loss(bins, share):
 
 
 def test_many_bins_are_read_in_blocks(monkeypatch):
-    product = signal(times(START, 30, 60.0), bins=9000, bin=3.0)
+    product = signal(times(START, 30, 60.0), bins=9000, bin_width=3.0)
     whole = read_raster(product, profiles=4)
     assert whole.mean.shape == (8, 3000)
     monkeypatch.setattr(raster, "_READ_BYTES", 1)
@@ -81,7 +81,7 @@ def test_many_bins_are_read_in_blocks(monkeypatch):
     np.testing.assert_allclose(whole.mean, oracle(product, columns, rows), rtol=1e-4, atol=0.1)
 
 
-def test_columns_touch_and_leave_gaps_open():
+def test_columns_touch_except_at_gaps():
     time = np.concatenate([times(START, 10, 60.0), times(START + timedelta(hours=2), 4, 60.0)])
     found = read_raster(signal(time), profiles=3)
     gaps = (found.start[1:] - found.stop[:-1]) / np.timedelta64(1, "m")
@@ -101,8 +101,8 @@ def test_background_is_the_mean_with_its_error():
     assert np.isnan(found.background[2])
 
 
-def test_reach_is_where_the_signal_drowns():
-    product = signal(times(START, 60, 60.0), bins=2000, bin=15.0)
+def test_reach_ends_where_noise_dominates():
+    product = signal(times(START, 60, 60.0), bins=2000, bin_width=15.0)
     product["signal"].values[:, 400:] = (
         product["signal_standard_error"].values[:, 400:]
         * np.random.default_rng(0).standard_normal((60, 1600))
@@ -145,14 +145,14 @@ def test_empty_product_is_refused():
 
 
 def rasters_of(*starts: float, bins: int = 30) -> list[raster.Raster]:
-    """Rasters of an hour each, from so many hours after the start."""
+    """Return rasters of one hour each, at the given hours after the start."""
     return [
         read_raster(signal(times(START + timedelta(hours=hours), 60, 60.0), bins=bins, seed=seed))
         for seed, hours in enumerate(starts)
     ]
 
 
-def test_joined_are_those_that_follow_one_another_with_the_same_rows():
+def test_consecutive_rasters_with_the_same_rows_are_joined():
     following = rasters_of(0, 1, 5)
     (whole,) = joined(following)
     assert whole.start.size == 180
@@ -164,7 +164,7 @@ def test_joined_are_those_that_follow_one_another_with_the_same_rows():
     assert whole.bits == following[0].bits | following[1].bits | following[2].bits
 
 
-def test_joined_are_no_others():
+def test_other_rasters_are_not_joined():
     overlapping, backwards = rasters_of(0, 0.5), rasters_of(1, 0)
     other_rows = [*rasters_of(0), *rasters_of(1, bins=31)]
     for apart in (overlapping, backwards, other_rows):
@@ -172,7 +172,7 @@ def test_joined_are_no_others():
     assert joined([]) == []
 
 
-def test_the_picture_of_joined_rasters_is_that_of_each(monkeypatch):
+def test_joining_does_not_change_the_figure(monkeypatch):
     parts = rasters_of(0, 1, 2, 6, 6.5)
     one = product_figures.render(product_figures.draw_quicklook(parts, title="joined"))
     monkeypatch.setattr(panels, "joined", list)

@@ -1,4 +1,4 @@
-"""Figures do not depend on who reads the products and draws, nor on whether he lives on."""
+"""Figures do not depend on the number of processes, nor on the loss of one."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from support.fabricated import (
 from lidarops.errors import ProductError
 from lidarops.figures import product_figures, reading
 from lidarops.figures.raster import raster_variables, read_raster
-from lidarops.figures.reading import Readers, Reading, Unread
+from lidarops.figures.reading import Readers, ReadFailure, ReadTask
 from lidarops.records import InputRecord, ProductKind, Role, RunRecord
 from lidarops.reports import gallery, run_page
 
@@ -38,7 +38,7 @@ SCENES = 6
 
 @pytest.fixture
 def many(archive: Archive, tmp_path: Path) -> RunRecord:
-    """A simulated run of several scenes, with products of two kinds that cannot be read."""
+    """Return a simulated run of several scenes with unreadable products of two kinds."""
     scenes, all_times = [], []
     for number in range(SCENES):
         time = times(START + timedelta(hours=3 * number), 12, 900.0)
@@ -66,7 +66,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 class TestFigures:
-    def test_are_the_same_whoever_reads(self, many, tmp_path, monkeypatch):
+    def test_do_not_depend_on_the_number_of_processes(self, many, tmp_path, monkeypatch):
         run_page.build_report(many, tmp_path / "one")
         alone = gallery.fill(many, tmp_path / "one")
         monkeypatch.setattr(reading, "FEWEST", 1)
@@ -122,7 +122,7 @@ def process(product: xr.Dataset) -> int:
 
 
 def deadly(product: xr.Dataset) -> int:
-    """Take down any process but the first."""
+    """End any process but the main one."""
     if multiprocessing.parent_process() is not None and product.sizes["time"] == 5:
         os._exit(9)
     return product.sizes["time"]
@@ -135,8 +135,8 @@ def paths(archive: Archive) -> list[Path]:
     return [archive.root / f"{count}.nc" for count in range(2, 10)]
 
 
-def readings(paths: list[Path], read, **options) -> list[Reading]:
-    return [Reading(path, raster_variables(), read, **options) for path in paths]
+def readings(paths: list[Path], read, **options) -> list[ReadTask]:
+    return [ReadTask(path, raster_variables(), read, **options) for path in paths]
 
 
 class TestReaders:
@@ -145,46 +145,46 @@ class TestReaders:
         monkeypatch.setattr(reading, "_AT_A_TIME", 1)
         truth = xr.Dataset({"level": 100.0})
         with Readers(workers, 1000, truth) as readers:
-            shapes = list(readers.each(readings(paths, shape)))
-            known = list(readers.each(readings(paths, of_truth, with_truth=True)))
-            refused = list(readers.each(readings([*paths, Path("no.nc")], refusing)))
+            shapes = list(readers.read_all(readings(paths, shape)))
+            known = list(readers.read_all(readings(paths, of_truth, with_truth=True)))
+            refused = list(readers.read_all(readings([*paths, Path("no.nc")], refusing)))
         assert shapes == [(count, 4) for count in range(2, 10)]
         assert known == [100.0 + count for count in range(2, 10)]
-        told = [Unread("signal: is of no use")] * len(paths)
-        assert refused == [*told, Unread("the file is missing")]
+        told = [ReadFailure("signal: is of no use")] * len(paths)
+        assert refused == [*told, ReadFailure("the file is missing")]
 
     def test_processes_are_started_where_they_are_worth_it(self, paths):
         for workers, products, others in ((2, 99, False), (1, 1000, False), (2, 100, True)):
             with Readers(workers, products) as readers:
-                found = set(readers.each(readings(paths, process)))
+                found = set(readers.read_all(readings(paths, process)))
             assert (os.getpid() not in found) == others
 
     def test_death_of_a_process_stops_nothing(self, paths, monkeypatch, caplog):
         monkeypatch.setattr(reading, "_AT_A_TIME", 1)
         with caplog.at_level(logging.WARNING), Readers(2, 1000) as readers:
-            assert list(readers.each(readings(paths, deadly))) == list(range(2, 10))
-            assert list(readers.each(readings(paths, shape)))[-1] == (9, 4)
-            assert set(readers.each(readings(paths, process))) == {os.getpid()}
+            assert list(readers.read_all(readings(paths, deadly))) == list(range(2, 10))
+            assert list(readers.read_all(readings(paths, shape)))[-1] == (9, 4)
+            assert set(readers.read_all(readings(paths, process))) == {os.getpid()}
         assert caplog.text.count("a process was lost") == 1
 
-    def test_a_daemon_that_may_start_no_process_reads_itself(self, paths, monkeypatch):
+    def test_a_daemon_process_reads_by_itself(self, paths, monkeypatch):
         monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
         with Readers(2, 1000) as readers:
-            assert set(readers.each(readings(paths, process))) == {os.getpid()}
+            assert set(readers.read_all(readings(paths, process))) == {os.getpid()}
 
     def test_nothing_to_read(self):
         with Readers(2, 1000) as readers:
-            assert list(readers.each([])) == []
+            assert list(readers.read_all([])) == []
 
-    def test_errors_of_this_program_are_not_taken_for_those_of_a_file(self, paths):
+    def test_errors_of_the_program_are_not_hidden_as_file_errors(self, paths):
         with Readers() as readers, pytest.raises(TypeError):
-            list(readers.each(readings(paths, len, with_truth=True)))
+            list(readers.read_all(readings(paths, len, with_truth=True)))
 
     def test_reduce_to_the_same_rasters(self, paths):
         with Readers(2, 1000) as readers:
-            there = list(readers.each(readings(paths, read_raster)))
+            there = list(readers.read_all(readings(paths, read_raster)))
         with Readers() as readers:
-            here = list(readers.each(readings(paths, read_raster)))
+            here = list(readers.read_all(readings(paths, read_raster)))
         for one, other in zip(here, there, strict=True):
             np.testing.assert_array_equal(one.total, other.total)
             assert replace(one, bits=other.bits).bits == one.bits
@@ -200,18 +200,18 @@ import os, sys, time
 from pathlib import Path
 from lidarops.figures import reading
 
-def told(product):
+def wait(product):
     Path(sys.argv[1], str(os.getpid())).touch()
     time.sleep(600)
 
 if __name__ == "__main__":
     path = Path(sys.argv[2])
     with reading.Readers(2, 1000) as readers:
-        list(readers.each([reading.Reading(path, (), told)] * 2))
+        list(readers.read_all([reading.ReadTask(path, (), wait)] * 2))
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="looks for processes as POSIX has them")
+@pytest.mark.skipif(sys.platform == "win32", reason="uses POSIX processes")
 def test_processes_do_not_outlive_the_one_that_started_them(paths, tmp_path):
     script, seen = tmp_path / "reader.py", tmp_path / "seen"
     script.write_text(_READER)
@@ -232,5 +232,5 @@ def alive(number: int) -> bool:
         state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
     except FileNotFoundError:
         return False
-    # Nobody may be there to ask how it ended.
+    # A zombie has ended, but has no parent that asks for its exit status.
     return state != "Z"

@@ -1,4 +1,4 @@
-"""Figures of multi-angle products hold the values, mark the flagged ones and show the truth."""
+"""Figures of multi-angle products show values, flags, residuals and truth."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ BOTH = ("time", "altitude")
 
 
 def true_extinction(altitude):
-    """Extinction in m-1 of a boundary layer under cleaner air."""
+    """Return the extinction in m-1 of a boundary layer below cleaner air."""
     return 2e-5 + 1.3e-4 / (1.0 + np.exp((altitude - 1500.0) / 80.0))
 
 
 def true_depth(altitude):
-    """Optical depth from the station, by the closed integral of `true_extinction`."""
+    """Return the optical depth from the station, the exact integral of `true_extinction`."""
 
     def below(z):
         return 2e-5 * z - 1.3e-4 * 80.0 * np.log1p(np.exp(-(z - 1500.0) / 80.0))
@@ -41,7 +41,7 @@ def true_depth(altitude):
 
 
 def multiangle(cycles=12, *, seed=0, tilt=0.02):
-    """A product of kind ``multiangle`` whose residuals grow with the sine of the zenith angle."""
+    """Return a multi-angle product whose residuals grow with the sine of the zenith angle."""
     random = np.random.default_rng(seed)
     time = times(START, cycles, 1020.0)
     shape = (cycles, ALTITUDE.size)
@@ -87,14 +87,14 @@ def multiangle(cycles=12, *, seed=0, tilt=0.02):
 
 
 def truth_of(product, *, instrument="plain-scanner", zenith=(60.0, 30.0, 45.0)):
-    """Truth of a campaign: in each cycle one file at every zenith angle, told along its beam."""
+    """Return a truth with one file per cycle and zenith angle, given along its beam."""
     middles = np.repeat(product["time"].values, len(zenith))
     time = middles + np.tile(np.arange(len(zenith)) * 60, product.sizes["time"]).astype(
         "timedelta64[s]"
     )
     angle = np.tile(zenith, product.sizes["time"])
     end = 100.0 * np.arange(1, 81)
-    # Files of another instrument come first, so that rows of profiles are not those of files.
+    # Files of another instrument come first, so that rows of profiles differ from rows of files.
     other = 4
     upright = np.cos(np.radians(angle))[:, None]
     depth = true_depth(STATION + end * upright) / upright
@@ -124,10 +124,14 @@ def truth_of(product, *, instrument="plain-scanner", zenith=(60.0, 30.0, 45.0)):
     )
 
 
+def extinction_quicklook(product, *, title=""):
+    return product_figures.draw_extinction([scan_data.read_extinction(product)], title=title)
+
+
 def artist(panel, gid):
-    found = [each for each in panel.get_children() if each.get_gid() == gid]
-    assert len(found) <= 1
-    return found[0] if found else None
+    artists = [child for child in panel.get_children() if child.get_gid() == gid]
+    assert len(artists) <= 1
+    return artists[0] if artists else None
 
 
 def picture(figure):
@@ -140,9 +144,9 @@ def drawn(product, truth=None):
 
 
 def half_width(band, z):
-    """Half the width of a band between x at the altitude z (km)."""
-    crossings = band.get_paths()[0].vertices
-    x = crossings[np.isclose(crossings[:, 1], z), 0]
+    """Return half the width of a band at the altitude z (km)."""
+    vertices = band.get_paths()[0].vertices
+    x = vertices[np.isclose(vertices[:, 1], z), 0]
     return np.ptp(x) / 2
 
 
@@ -216,16 +220,20 @@ class TestTruth:
         assert profile.truth.time == profile.time + np.timedelta64(60, "s")
 
     @pytest.mark.parametrize("zenith", [0.0, 30.0, -60.0, 75.0])
-    def test_layers_are_level_so_that_any_beam_tells_the_vertical_profile(self, zenith):
+    def test_in_level_layers_any_beam_gives_the_vertical_profile(self, zenith):
         product = multiangle(cycles=3)
         truth = truth_of(product, zenith=(zenith,))
-        told = scan_data.true_profile(product, 1, truth, instrument="plain-scanner")
-        assert told.edges[0] == STATION
-        np.testing.assert_allclose(told.optical_depth, true_depth(told.edges), rtol=1e-9, atol=1e-9)
+        profile = scan_data.true_profile(product, 1, truth, instrument="plain-scanner")
+        assert profile.edges[0] == STATION
         np.testing.assert_allclose(
-            told.extinction, np.diff(true_depth(told.edges)) / np.diff(told.edges), rtol=1e-6
+            profile.optical_depth, true_depth(profile.edges), rtol=1e-9, atol=1e-9
         )
-        assert told.time == product["time"].values[1]
+        np.testing.assert_allclose(
+            profile.extinction,
+            np.diff(true_depth(profile.edges)) / np.diff(profile.edges),
+            rtol=1e-6,
+        )
+        assert profile.time == product["time"].values[1]
 
     def test_no_truth_near_the_horizon_far_off_in_time_or_of_another_kind(self):
         product = multiangle(cycles=3)
@@ -244,7 +252,7 @@ class TestTruth:
         ):
             assert scan_data.true_profile(other, 1, truth, instrument="plain-scanner") is None
 
-    def test_bounds_of_the_cycle_say_how_far_off_a_file_may_be(self):
+    def test_bounds_of_the_cycle_limit_the_time_of_the_truth(self):
         product = multiangle(cycles=1)
         truth = truth_of(product, zenith=(30.0,))
         truth["time"] = truth["time"] + np.timedelta64(10, "m")
@@ -326,7 +334,7 @@ class TestProfileFigure:
         )
         assert artist(drawn(product)[0], "truth-optical_depth") is None
 
-    def test_a_cloud_above_the_reach_does_not_shrink_what_lies_below(self):
+    def test_a_cloud_above_the_reach_does_not_set_the_axis(self):
         product = multiangle()
         truth = truth_of(product)
         height = truth["range_plain_scanner"].values * np.cos(np.radians(30.0))
@@ -355,10 +363,10 @@ class TestProfileFigure:
         product = multiangle()
         product["extinction"][:] = np.nan
         figure = product_figures.scan_profile(scan_data.clearest_cycle(product), title="scanner")
-        assert "extinction none to use" in product_figures.alt_text(figure)
+        assert "extinction no usable value" in product_figures.alt_text(figure)
         assert np.isfinite(figure.axes[1].get_xlim()).all()
 
-    def test_words_say_what_is_seen(self):
+    def test_the_description_lists_reach_truth_and_flags(self):
         product = multiangle()
         profile = scan_data.clearest_cycle(product, truth_of(product), instrument="plain-scanner")
         words = product_figures.alt_text(product_figures.scan_profile(profile, title="scanner"))
@@ -371,7 +379,7 @@ class TestProfileFigure:
 
 
 class TestResiduals:
-    def test_means_and_rms_are_those_of_the_product_in_per_cent(self):
+    def test_means_and_rms_are_those_of_the_product_in_percent(self):
         product = multiangle()
         read = scan_data.read_residuals(product)
         residual = 100 * product["residual"].values[..., ALTITUDE <= REACH]
@@ -442,9 +450,9 @@ class TestResiduals:
     @pytest.mark.parametrize(
         ("zenith", "azimuth", "signed", "planes", "azimuths"),
         [
-            # A negative angle leads opposite to its azimuth.
+            # A negative angle points opposite to its azimuth.
             ([-60, 0, 60], [90, 90, 90], [-60, 0, 60], [0, 0, 0], (90.0,)),
-            # Around north azimuths jump, the plane does not.
+            # Azimuths jump at north, planes do not.
             ([30, 40, 50], [359.8, 0.1, 180.0], [-50, 30, 40], [0, 0, 0], (0.1,)),
             ([30, 30, 30, 30], [0, 90, 180, 270], [-30, 30, -30, 30], [0, 0, 1, 1], (0.0, 90.0)),
             ([60, 0, -30], [np.nan] * 3, [-30, 0, 60], [0, 0, 0], (np.nan,)),
@@ -452,7 +460,9 @@ class TestResiduals:
             ([0, 0], [0, 90], [0, 0], [0, 0], ()),
         ],
     )
-    def test_beams_stand_in_the_order_of_the_sky(self, zenith, azimuth, signed, planes, azimuths):
+    def test_beams_are_sorted_by_plane_and_signed_zenith_angle(
+        self, zenith, azimuth, signed, planes, azimuths
+    ):
         beams = len(zenith)
         product = multiangle().isel(beam=slice(beams))
         product = product.assign_coords(
@@ -468,7 +478,7 @@ class TestResiduals:
         assert len(borders) == max(planes)
         assert ("not known" in lower.get_xlabel()) == bool(np.isnan(azimuths).any())
 
-    def test_azimuths_may_be_left_out_where_nobody_knows_them(self):
+    def test_azimuths_may_be_missing(self):
         read = scan_data.read_residuals(multiangle().drop_vars("beam_azimuth"))
         np.testing.assert_array_equal(read.zenith_angle, np.sort(ZENITH))
         assert np.isnan(read.azimuths).all()
@@ -484,7 +494,7 @@ class TestResiduals:
         np.testing.assert_allclose(artist(below, "rms-of-mean").get_ydata(), read.rms_of_mean)
         assert below.get_xticklabels()[0].get_text() == "\u221260"
 
-    def test_negative_residuals_are_told_from_positive_ones_in_grey(self):
+    def test_negative_residuals_differ_from_positive_ones_in_grey(self):
         read = scan_data.read_residuals(multiangle())
         hatched = artist(product_figures.scan_residuals(read).axes[0], "negative").get_array()
         shown = ~np.ma.getmaskarray(hatched)
@@ -505,7 +515,7 @@ class TestResiduals:
         assert artist(figure.axes[0], "negative") is None
         assert picture(figure).std() > 0
 
-    def test_words_name_the_worst_beam(self):
+    def test_the_description_names_the_beam_with_the_largest_residuals(self):
         product = multiangle()
         product["residual"][:, 1] += 0.2
         words = product_figures.alt_text(
@@ -518,9 +528,9 @@ class TestResiduals:
 class TestQuicklook:
     def test_extinction_in_km_with_rejected_bins_black(self):
         product = multiangle()
-        figure = product_figures.extinction_quicklook([product], title="scanner")
+        figure = extinction_quicklook(product, title="scanner")
         panel = figure.axes[0]
-        mesh, black = (each for each in panel.collections if isinstance(each, QuadMesh))
+        mesh, black = (item for item in panel.collections if isinstance(item, QuadMesh))
         assert black.get_gid() == "flagged-signal"
         use = (product["quality_flag"].values & int(Quality.rejecting())) == 0
         rows = mesh.get_array().shape[0]
@@ -547,13 +557,13 @@ class TestQuicklook:
         assert raster.units == "km$^{-1}$"
 
     def test_one_cycle_is_enough(self):
-        assert picture(product_figures.extinction_quicklook([multiangle(cycles=1)])).std() > 0
+        assert picture(extinction_quicklook(multiangle(cycles=1))).std() > 0
 
 
 READERS = {
     "profile": scan_data.clearest_cycle,
     "residuals": scan_data.read_residuals,
-    "quicklook": lambda product: product_figures.extinction_quicklook([product]),
+    "quicklook": extinction_quicklook,
 }
 NEEDED = {
     "profile": (
@@ -607,7 +617,7 @@ class TestRendering:
             yield product_figures.render(
                 product_figures.scan_residuals(scan_data.read_residuals(product))
             ).png
-            yield product_figures.render(product_figures.extinction_quicklook([product])).png
+            yield product_figures.render(extinction_quicklook(product)).png
 
         assert list(files()) == list(files())
 
@@ -617,7 +627,7 @@ class TestRendering:
         for figure in (
             product_figures.scan_profile(scan_data.clearest_cycle(product), title=title),
             product_figures.scan_residuals(scan_data.read_residuals(product), title=title),
-            product_figures.extinction_quicklook([product], title=title),
+            extinction_quicklook(product, title=title),
         ):
             assert picture(figure).std() > 0
             assert "\x1b" not in product_figures.alt_text(figure)
@@ -642,31 +652,33 @@ class TestGallery:
         product = multiangle()
         made, folder = self.run(tmp_path, {"a.nc": product}, truth_of(product))
         assert not made.problems
-        assert [each.file for each in made.pictures] == [
+        assert [picture.file for picture in made.pictures] == [
             f"{kind}_plain-scanner_{CHANNEL}.png"
             for kind in ("multiangle", "scan-profile", "scan-residuals")
         ]
-        for each in made.pictures:
-            assert Image.open(folder / each.file).size[0] == 1500
-        assert "truth of the simulation" in made.pictures[1].alt
+        for figure in made.pictures:
+            assert Image.open(folder / figure.file).size[0] == 1500
+        assert "simulated truth" in made.pictures[1].alt
         assert made.flags is not None
 
-    def test_a_product_that_cannot_be_read_is_named_once_and_the_next_is_drawn(self, tmp_path):
+    def test_an_unreadable_product_is_listed_once_and_the_next_is_drawn(self, tmp_path):
         broken = multiangle().drop_vars(["optical_depth", "residual"])
         made, _ = self.run(tmp_path, {"a.nc": broken, "b.nc": multiangle()})
         assert [problem.path for problem in made.problems] == ["a.nc"]
         assert "optical_depth" in made.problems[0].reason
         assert len(made.pictures) == 3
 
-    def test_what_cannot_be_told_is_left_out(self, tmp_path):
+    def test_figures_without_values_are_left_out(self, tmp_path):
         product = multiangle()
         product["quality_flag"][:] = int(Quality.NO_LEVERAGE | Quality.NO_RESIDUAL)
         product["optical_depth"][:] = np.nan
         made, _ = self.run(tmp_path, {"a.nc": product})
         assert not made.problems
-        assert [each.file.partition("_")[0] for each in made.pictures] == ["multiangle"]
+        assert [figure.file.partition("_")[0] for figure in made.pictures] == ["multiangle"]
 
     def test_multiangle_comes_after_homogeneous_and_before_the_others(self):
-        ranks = [gallery._KINDS.index(kind) for kind in ("homogeneous", "multiangle", "elastic")]
+        ranks = [
+            gallery._KIND_ORDER.index(kind) for kind in ("homogeneous", "multiangle", "elastic")
+        ]
         assert ranks == sorted(ranks)
-        assert set(gallery._KINDS) == set(ProductKind)
+        assert set(gallery._KIND_ORDER) == set(ProductKind)

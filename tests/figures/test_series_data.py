@@ -1,4 +1,4 @@
-"""Sections of homogeneous products: what is read, matched with the truth, thinned, counted."""
+"""Sections of homogeneous products: reading, matching with the truth, thinning, comparison."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def sections_of(product, truth=None, **options):
     return read_sections(product, truth, **options)
 
 
-def test_values_come_out_as_they_stand():
+def test_values_are_those_of_the_product():
     product = homogeneous(times(START, 40, 60.0))
     near, far = sections_of(product)
     assert (near.near, near.far, near.label) == (2500.0, 5000.0, "2.5\N{EN DASH}5 km")
@@ -117,7 +117,7 @@ class TestTruth:
         truth = truth_of(time, other=30)
         (section, _) = sections_of(homogeneous(time), truth, instrument="vertical")
         assert np.isnan(section.estimates["extinction"].truth).all()
-        # Its background at the first profile is told as 9 MHz; the others have none.
+        # Its background is 9 MHz at the first profile and unknown at the others.
         background = section.estimates["background"].truth
         assert background[0] == 9.0
         assert np.isnan(background[1:]).all()
@@ -132,7 +132,7 @@ class TestTruth:
         difference = with_dark.estimates["background"].truth - without.estimates["background"].truth
         np.testing.assert_allclose(difference, 2.5)
 
-    def test_survives_the_way_through_a_file(self, tmp_path):
+    def test_is_the_same_when_read_from_a_file(self, tmp_path):
         time = times(START, 30, 60.0)
         truth_of(time).to_netcdf(tmp_path / "truth.nc")
         with xr.open_dataset(tmp_path / "truth.nc") as opened:
@@ -157,18 +157,18 @@ class TestCompare:
     def test_counts_unflagged_values_only(self):
         time = times(START, 2000, 30.0)
         for section in sections_of(homogeneous(time, flagged=0.2), truth_of(time)):
-            found = compare(section, "extinction")
-            assert found.count == int((section.flag == 0).sum())
+            comparison = compare(section, "extinction")
+            assert comparison.count == int((section.flag == 0).sum())
             estimate = section.estimates["extinction"]
             score = (estimate.value - estimate.truth) / estimate.standard_error
             score = score[section.flag == 0]
-            assert found.within_1 == np.mean(np.abs(score) <= 1)
-            assert found.within_3 == np.mean(np.abs(score) <= 3)
+            assert comparison.within_1 == np.mean(np.abs(score) <= 1)
+            assert comparison.within_3 == np.mean(np.abs(score) <= 3)
             # Normal errors: 0.6827 +- 4 binomial standard deviations.
-            assert abs(found.within_1 - 0.6827) < 4 * np.sqrt(0.2166 / found.count)
-            assert found.bias == pytest.approx(score.mean())
-            assert found.spread == pytest.approx(1.0, abs=4 / np.sqrt(2 * found.count))
-            assert found.verdict is Verdict.AS_STATED
+            assert abs(comparison.within_1 - 0.6827) < 4 * np.sqrt(0.2166 / comparison.count)
+            assert comparison.bias == pytest.approx(score.mean())
+            assert comparison.spread == pytest.approx(1.0, abs=4 / np.sqrt(2 * comparison.count))
+            assert comparison.verdict is Verdict.AS_STATED
 
     @pytest.mark.parametrize(
         ("scale", "shift", "verdict"),
@@ -187,35 +187,35 @@ class TestCompare:
             product["extinction"] + shift * product["extinction_standard_error"]
         ).assign_attrs(units="m-1")
         (section, _) = sections_of(product, truth_of(time))
-        found = compare(section, "extinction")
-        assert found.verdict is verdict
+        comparison = compare(section, "extinction")
+        assert comparison.verdict is verdict
         assert verdict.unsafe == (verdict in (Verdict.BEYOND, Verdict.UNDERSTATED))
 
     @pytest.mark.parametrize("error", [0.0, -1.0, np.nan, np.inf])
-    def test_values_without_a_standard_error_are_told(self, error):
+    def test_values_without_a_standard_error_are_counted(self, error):
         time = times(START, 10, 30.0)
         product = homogeneous(time, flagged=0.0)
         product["extinction_standard_error"][4, :] = error
         (section, _) = sections_of(product, truth_of(time))
-        found = compare(section, "extinction")
-        assert (found.count, found.without_error) == (9, 1)
-        assert found.verdict is Verdict.NO_ERROR
-        assert found.verdict.unsafe
+        comparison = compare(section, "extinction")
+        assert (comparison.count, comparison.without_error) == (9, 1)
+        assert comparison.verdict is Verdict.NO_ERROR
+        assert comparison.verdict.unsafe
         assert np.isnan(normalised_error(section, "extinction")[4])
 
-    def test_nothing_but_values_without_error(self):
+    def test_only_values_without_standard_error(self):
         time = times(START, 10, 30.0)
         product = homogeneous(time, flagged=0.0)
         product["extinction_standard_error"][:] = np.nan
         (section, _) = sections_of(product, truth_of(time))
-        found = compare(section, "extinction")
-        assert (found.count, found.without_error) == (0, 10)
-        assert found.verdict is Verdict.NO_ERROR
-        assert found.verdict.unsafe
-        assert np.isnan(found.within_3)
+        comparison = compare(section, "extinction")
+        assert (comparison.count, comparison.without_error) == (0, 10)
+        assert comparison.verdict is Verdict.NO_ERROR
+        assert comparison.verdict.unsafe
+        assert np.isnan(comparison.within_3)
 
 
-def test_join_sorts_in_time_and_keeps_other_bounds_apart():
+def test_join_sorts_in_time_and_separates_other_bounds():
     late = homogeneous(times(START + timedelta(days=1), 10, 60.0), seed=1)
     early = homogeneous(times(START, 10, 60.0), seed=2, sections=((2500.0, 5000.0), (1.0, 2.0)))
     joined = join([*sections_of(late), *sections_of(early)])
@@ -240,7 +240,7 @@ def test_thin_is_the_block_mean_of_unflagged_values(count, points, seed):
         np.testing.assert_array_equal(thinned.time, section.time[good])
         return
     size = -(-int(good.sum()) // points)
-    # The oracle: blocks of `size` profiles, those without an unflagged one left out.
+    # Oracle: blocks of `size` profiles, without those that have no unflagged profile.
     blocks = [np.arange(i, min(i + size, count)) for i in range(0, count, size)]
     blocks = [block[good[block]] for block in blocks if good[block].any()]
     assert thinned.time.size == len(blocks)
@@ -252,7 +252,7 @@ def test_thin_is_the_block_mean_of_unflagged_values(count, points, seed):
         np.testing.assert_allclose(found.truth, [estimate.truth[b].mean() for b in blocks])
 
 
-def test_thin_never_reaches_across_a_gap():
+def test_thin_does_not_average_across_a_gap():
     time = np.concatenate([times(START, 7, 60.0), times(START + timedelta(hours=9), 7, 60.0)])
     (section, _) = sections_of(homogeneous(time, flagged=0.0))
     thinned = thin(section, 3)

@@ -19,24 +19,24 @@ from lidarops.reports.inspection import describe, tables
 
 
 @pytest.mark.parametrize("kind", list(MAKERS))
-def test_products_tell_verdicts_bits_and_extremes(kind: ProductKind, tmp_path: Path):
+def test_products_show_verdicts_bits_and_extremes(kind: ProductKind, tmp_path: Path):
     data = MAKERS[kind]()
     path = tmp_path / "product.nc"
     write_product(build_product(data, context(kind)), path)
     shown = CliRunner().invoke(app, ["inspect", str(path), "--json"])
     assert shown.exit_code == 0
-    told = json.loads(shown.output)
-    assert told == describe(path)
-    assert told["attributes"]["lidarops_kind"] == kind
-    held = {each["name"]: each for each in told["variables"]}
+    description = json.loads(shown.output)
+    assert description == describe(path)
+    assert description["attributes"]["lidarops_kind"] == kind
+    variables = {row["name"]: row for row in description["variables"]}
     with xr.open_dataset(path) as opened:
-        assert set(held) == set(opened.variables)
+        assert set(variables) == set(opened.variables)
         for name in opened.data_vars:
             if opened[name].dtype.kind == "f" and opened[name].size and name in data:
-                assert held[name]["missing"] == int(opened[name].isnull().sum())
+                assert variables[name]["missing"] == int(opened[name].isnull().sum())
                 largest = None if opened[name].isnull().all() else float(opened[name].max())
-                assert held[name]["maximum"] == pytest.approx(largest)
-    counts = {each["name"]: each for each in told["quality"]}
+                assert variables[name]["maximum"] == pytest.approx(largest)
+    counts = {row["name"]: row for row in description["quality"]}
     size = data["quality_flag"].size
     assert sum(counts[name]["values"] for name in ("good", "use_with_care", "do_not_use")) == size
     good = int((data["quality_flag"] == 0).sum())
@@ -45,16 +45,16 @@ def test_products_tell_verdicts_bits_and_extremes(kind: ProductKind, tmp_path: P
     assert all(word in table.output for word in ("Variables", "Quality", "do_not_use", "units"))
 
 
-def test_raw_files_tell_all_their_channels(demo_archive: Path):
+def test_raw_files_show_all_their_channels(demo_archive: Path):
     path = sorted((demo_archive / "hill").glob("v*"))[0]
     shown = CliRunner().invoke(app, ["inspect", str(path), "--json"])
-    told = json.loads(shown.output)
-    assert told["type"] == "raw"
-    assert told["start"].startswith("2024-09-2")
-    assert {"analog_532o", "photon_532o"} <= {each["name"] for each in told["channels"]}
-    widths = {each["name"]: (each["bins"], each["bin_width"]) for each in told["channels"]}
+    description = json.loads(shown.output)
+    assert description["type"] == "raw"
+    assert description["start"].startswith("2024-09-2")
+    assert {"analog_532o", "photon_532o"} <= {row["name"] for row in description["channels"]}
+    widths = {row["name"]: (row["bins"], row["bin_width"]) for row in description["channels"]}
     assert set(widths.values()) == {(4000, 7.5)}, widths
-    green = {each["wavelength"] for each in told["channels"] if "532" in each["name"]}
+    green = {row["wavelength"] for row in description["channels"] if "532" in row["name"]}
     assert list(green) == [pytest.approx(532e-9)]
     _, channels = tables(path)
     for column in channels.columns:
@@ -66,13 +66,13 @@ def test_raw_files_tell_all_their_channels(demo_archive: Path):
 def test_foreign_netcdf_is_shown_too(tmp_path: Path):
     path = tmp_path / "other.nc"
     xr.Dataset({"x": ("n", [1.0, float("nan")])}).to_netcdf(path)
-    told = describe(path)
-    assert told["quality"] == []
-    assert told["variables"][0]["missing"] == 1
+    description = describe(path)
+    assert description["quality"] == []
+    assert description["variables"][0]["missing"] == 1
     assert CliRunner().invoke(app, ["inspect", str(path)]).exit_code == 0
 
 
-def test_what_is_neither_is_refused(tmp_path: Path):
+def test_other_files_are_refused(tmp_path: Path):
     path = tmp_path / "text.txt"
     path.write_text("nothing")
     with pytest.raises(LidarOpsError, match=r"text\.txt"):

@@ -1,4 +1,4 @@
-"""Run records as JSON: exact there and back, and nothing else is taken for one."""
+"""Run records as JSON: exact round trip; anything else is refused."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from lidarops.records import (
 )
 from lidarops.reports.run_record import FILE_NAME, load_run_record, save_run_record
 
-# Names of files are bytes on disk: those that are not UTF-8 come as lone surrogates.
+# File names are bytes; those that are not UTF-8 are read as unpaired surrogates.
 text = st.text(st.characters(codec=None), max_size=6)
 number = st.floats(allow_nan=False)
 whole = st.integers(-(2**63), 2**63)
@@ -125,8 +125,8 @@ records = st.builds(
     refused=some(granules),
     truth=text,
     unmet=some(st.builds(Unmet, text, text, text, text, whole, whole, whole)),
-    barren=st.dictionaries(text, text, max_size=2),
-    more_barren=whole,
+    empty_scenes=st.dictionaries(text, text, max_size=2),
+    more_empty_scenes=whole,
 )
 
 
@@ -136,7 +136,7 @@ records = st.builds(
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
-def test_record_comes_back_equal(record, tmp_path_factory):
+def test_a_loaded_record_equals_the_saved_one(record, tmp_path_factory):
     folder = tmp_path_factory.getbasetemp() / "there-and-back"
     path = save_run_record(record, folder)
     back = load_run_record(path)
@@ -179,7 +179,7 @@ def test_tuples_within_settings_keep_the_hash(tmp_path):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, {1, 2}, object(), b"x"])
-def test_settings_that_are_no_json_are_refused(tmp_path, value):
+def test_settings_outside_json_are_refused(tmp_path, value):
     plan = Plan("s", (Step("a", "c", {"x": [value]}, "why"),), ())
     record = fab.run_record(tmp_path, [fab.outcome("s", plan=plan)])
     with pytest.raises(CatalogError, match="settings"):
@@ -187,7 +187,7 @@ def test_settings_that_are_no_json_are_refused(tmp_path, value):
     assert not (tmp_path / "run").exists()
 
 
-def test_save_replaces_whole_and_leaves_nothing_else(tmp_path):
+def test_saving_replaces_the_file_and_leaves_no_other(tmp_path):
     save_run_record(fab.run_record(tmp_path, [fab.outcome("s" * 5000)]), tmp_path)
     small = fab.run_record(tmp_path)
     save_run_record(small, tmp_path)
@@ -264,7 +264,7 @@ def test_missing_field_is_named(tmp_path, name):
         b"[" * 100_000, b"1" * 10_000,
     ],
 )  # fmt: skip
-def test_what_is_no_run_record_is_refused(tmp_path, content):
+def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / FILE_NAME
     path.write_bytes(content)
     with pytest.raises(LidarOpsError, match=FILE_NAME):

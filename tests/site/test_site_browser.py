@@ -1,4 +1,4 @@
-"""The site in a real browser: by mouse, by keyboard, without a network, and by its rules."""
+"""The site in a real browser: mouse, keyboard, no network, accessibility."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium here"
 
 @dataclass
 class Watched:
-    """A page whose requests and complaints are kept."""
+    """A page with its requests and error messages."""
 
     page: Any
     requests: list[str] = field(default_factory=list)
     complaints: list[str] = field(default_factory=list)
 
     def failed(self, request: Any) -> None:
-        # A link that becomes a download ends its request as a page.
+        # A download aborts the request for a page.
         if request.failure != "net::ERR_ABORTED" or not request.url.endswith(".nc"):
             self.complaints.append(request.url)
 
@@ -105,13 +105,13 @@ def test_calendar_to_download_by_mouse(site: Path, watched: Watched) -> None:
     _quiet(watched)
 
 
-def _until(page: Any, told: str) -> None:
-    """Wait for a condition: Playwright's own way evaluates text, which the pages forbid."""
+def _until(page: Any, condition: str) -> None:
+    """Wait for a condition; the pages forbid Playwright's own way, which evaluates text."""
     for _ in range(200):
-        if page.evaluate(told):
+        if page.evaluate(condition):
             return
         page.wait_for_timeout(50)
-    raise AssertionError(f"it never comes true that {told}")
+    raise AssertionError(f"never true: {condition}")
 
 
 def _tab_to(page: Any, words: str) -> None:
@@ -169,7 +169,7 @@ def test_images_are_drawn_and_thumbnails_load(site: Path, watched: Watched) -> N
     _quiet(watched)
 
 
-def test_policy_stops_what_is_not_of_the_site(site: Path, watched: Watched) -> None:
+def test_policy_blocks_other_sources(site: Path, watched: Watched) -> None:
     watched.open(site / "index.html")
     loaded = watched.page.evaluate(
         """() => new Promise(done => {
@@ -186,7 +186,7 @@ def test_policy_stops_what_is_not_of_the_site(site: Path, watched: Watched) -> N
 @pytest.mark.skipif(not AXE.exists(), reason="axe-core is not installed: npm ci in tests/site")
 @pytest.mark.slow
 def test_axe_finds_nothing_serious(site: Path, chromium: Any, scheme: str) -> None:
-    # The rules of the pages would keep axe out as any other script.
+    # The policy of the pages would block axe, as any script.
     context = chromium.new_context(color_scheme=scheme, bypass_csp=True)
     page = context.new_page()
     found = []

@@ -1,4 +1,4 @@
-"""The site as files: what is made, kept, refused, and that its bytes are those of the archive."""
+"""The site as files: which pages are made, kept or refused; equal archives give equal sites."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CatalogError, ProductError
+from lidarops.flags import Quality
 from lidarops.records import ProductKind
 from lidarops.site import paths
 from lidarops.site.build import build_site
 from lidarops.site.product_entry import Grade
 
 FIRST_PAGE = 300_000
-"""Bytes that the first page may load."""
+"""Most bytes that the first page may load."""
 
 
 class _Page(HTMLParser):
@@ -125,12 +126,12 @@ def test_pages_have_what_a_screen_reader_needs(site: Path, pattern: str) -> None
         assert all(attrs.get("scope") for attrs in page.all("th"))
 
 
-def test_product_page_tells_flags_provenance_and_download(archive: Path, site: Path) -> None:
+def test_product_page_has_flags_provenance_and_download(archive: Path, site: Path) -> None:
     page = next(site.glob("product/odesa/lidar-1/elastic/2026/*20260301T000000.html"))
     text = page.read_text(encoding="utf-8")
     for words in (
         "incomplete_overlap",
-        "nearer than the range of full overlap",
+        Quality.INCOMPLETE_OVERLAP.description,
         "do not use",
         "use with care",
         "2026/03/a00.dat",
@@ -167,15 +168,15 @@ def test_counts_of_quality_are_those_of_the_file(archive: Path, site: Path) -> N
             assert row["usable"] == int((usable < 2).sum())
 
 
-def test_unknown_kind_gets_a_figure_and_is_named_for_what_it_lacks(site: Path) -> None:
+def test_a_product_of_unknown_kind_gets_a_figure_and_a_problem(site: Path) -> None:
     text = (site / "product/odesa/wind.html").read_text(encoding="utf-8")
     assert "Product of kind wind" in text
-    assert "the product holds no provenance" in text
+    assert "the product has no provenance" in text
     assert text.count('<svg class="fig"') == 1
     assert "4 of 6 series" in text
 
 
-def test_first_page_is_small_with_all_it_loads(site: Path) -> None:
+def test_first_page_and_its_files_are_small(site: Path) -> None:
     index = site / "index.html"
     page = _page(index)
     loaded = [attrs["src"] for attrs in page.all("img")] + [page.all("link")[0]["href"]]
@@ -187,12 +188,12 @@ def test_equal_archives_give_equal_bytes_for_any_number_of_workers(
     archive: Path, site: Path, tmp_path: Path
 ) -> None:
     other = _copy(archive, tmp_path / "elsewhere")
-    # In another order of making, too.
+    # Workers also finish in another order.
     build_site(other, workers=2)
     assert contents(other / "site") == contents(site)
 
 
-def test_what_is_unchanged_is_kept_and_what_vanished_is_removed(
+def test_unchanged_pages_are_kept_and_pages_of_removed_products_deleted(
     archive: Path, tmp_path: Path
 ) -> None:
     output = _copy(archive, tmp_path / "out")
@@ -222,7 +223,7 @@ def test_what_is_unchanged_is_kept_and_what_vanished_is_removed(
     assert contents(fresh / "site") == contents(output / "site")
 
 
-def test_damaged_products_are_named_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_damaged_products_are_listed_and_the_others_shown(tmp_path: Path) -> None:
     output = tmp_path / "out"
     whole = add(output, ProductKind.SIGNAL)
     cut = add(output, ProductKind.ELASTIC)
@@ -247,7 +248,7 @@ def test_damaged_products_are_named_and_the_rest_goes_on(tmp_path: Path) -> None
     assert "it cannot be drawn as multiangle" in damaged
 
 
-def test_damaged_provenance_is_named(tmp_path: Path) -> None:
+def test_damaged_provenance_is_a_problem(tmp_path: Path) -> None:
     output = tmp_path / "out"
     path = add(output, ProductKind.HOMOGENEOUS)
     with netCDF4.Dataset(path, "a") as file:
@@ -259,7 +260,7 @@ def test_damaged_provenance_is_named(tmp_path: Path) -> None:
     assert "provenance" in made.problems[0].reason
 
 
-def test_text_of_files_is_text_on_pages(tmp_path: Path) -> None:
+def test_text_from_files_is_escaped(tmp_path: Path) -> None:
     output = tmp_path / "out"
     evil = '<script>alert(1)</script>"><img src=x onerror=alert(2)>\u202e'
     add_unknown(
@@ -290,7 +291,7 @@ def test_links_out_of_the_products_are_not_followed(tmp_path: Path) -> None:
     assert "leads out" in made.problems[0].reason
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
     output = tmp_path / "out"
     add(output, ProductKind.SIGNAL)
     (output / "site").mkdir()
@@ -302,7 +303,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
         build_site(tmp_path / "nothing")
 
 
-def test_pages_do_not_leave_the_site_through_a_link(tmp_path: Path) -> None:
+def test_pages_are_not_written_through_a_link(tmp_path: Path) -> None:
     output = tmp_path / "out"
     add(output, ProductKind.SIGNAL)
     build_site(output)
@@ -315,7 +316,7 @@ def test_pages_do_not_leave_the_site_through_a_link(tmp_path: Path) -> None:
     assert not list(elsewhere.iterdir())
 
 
-def test_manifest_that_was_edited_only_costs_time(tmp_path: Path) -> None:
+def test_an_edited_manifest_only_costs_time(tmp_path: Path) -> None:
     output = tmp_path / "out"
     add(output, ProductKind.SIGNAL)
     build_site(output)
@@ -360,7 +361,7 @@ def test_paths_that_lead_out_are_refused(tmp_path: Path, path: str) -> None:
 @pytest.mark.parametrize(
     ("share", "grade"),
     [
-        (None, Grade.UNJUDGED),
+        (None, Grade.UNKNOWN),
         (0.0, Grade.NONE),
         (1e-9, Grade.FEW),
         (0.25, Grade.SOME),

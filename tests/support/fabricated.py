@@ -1,4 +1,4 @@
-"""Fabricated products, truth and run records: what the rest of the package would write."""
+"""Synthetic products, truth and run records, as the package would write them."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ START = datetime(2024, 3, 1, tzinfo=UTC)
 
 
 def times(start: datetime, count: int, seconds: float) -> np.ndarray:
-    """Middles of `count` profiles every so many seconds."""
+    """Return the middle times of `count` profiles at an interval of `seconds`."""
     first = np.datetime64(start.replace(tzinfo=None), "ns")
     return first + ((np.arange(count) + 0.5) * seconds * 1e9).astype("timedelta64[ns]")
 
 
 def true_extinction(time: np.ndarray) -> np.ndarray:
-    """Extinction in m-1 that follows the hour of the day."""
+    """Return an extinction in m-1 that varies with the hour of the day."""
     hour = (time - time.astype("datetime64[D]")) / np.timedelta64(1, "h")
     return 1.0e-4 + 6.0e-5 * np.cos(2 * np.pi * (hour - 5) / 24)
 
 
 def true_background(time: np.ndarray) -> np.ndarray:
-    """Background in MHz that follows the sun."""
+    """Return a background in MHz that varies with the sun."""
     hour = (time - time.astype("datetime64[D]")) / np.timedelta64(1, "h")
     return 0.02 + 1.5 * np.clip(np.cos(2 * np.pi * (hour - 12) / 24), 0, None)
 
@@ -49,7 +49,7 @@ def true_background(time: np.ndarray) -> np.ndarray:
 def homogeneous(
     time: np.ndarray, *, seed: int = 0, sections=SECTIONS, flagged: float = 0.1, scale: float = 1.0
 ) -> xr.Dataset:
-    """A product of kind ``homogeneous`` whose errors are `scale` times what it states."""
+    """Return a product of kind ``homogeneous`` with errors `scale` times the stated ones."""
     random = np.random.default_rng(seed)
     shape = (time.size, len(sections))
     truth = {
@@ -92,11 +92,16 @@ def homogeneous(
 
 
 def signal(
-    time: np.ndarray, *, bins: int = 600, bin: float = 15.0, seed: int = 0, layer: float = 3000.0
+    time: np.ndarray,
+    *,
+    bins: int = 600,
+    bin_width: float = 15.0,
+    seed: int = 0,
+    layer: float = 3000.0,
 ) -> xr.Dataset:
-    """A product of kind ``signal`` with a boundary layer, a cloud layer and saturated bins."""
+    """Return a product of kind ``signal``: boundary layer, cloud layer, saturated bins."""
     random = np.random.default_rng(seed)
-    span = (np.arange(bins) + 0.5) * bin
+    span = (np.arange(bins) + 0.5) * bin_width
     hour = (time - time.astype("datetime64[D]")) / np.timedelta64(1, "h")
     top = 1000.0 + 500.0 * np.sin(2 * np.pi * (hour - 8) / 24)
     beta = 0.15 * np.exp(-span / 8000.0)[None, :]
@@ -143,7 +148,7 @@ def signal(
 
 
 def truth_of(time: np.ndarray, *, instrument: str = "horizontal", other: int = 3) -> xr.Dataset:
-    """Truth of a campaign with one instrument of interest and `other` granules of another."""
+    """Return the truth of one instrument, with `other` granules of a second instrument."""
     count = time.size + other
     all_times = np.concatenate([time, np.repeat(time[:1], other)])
     extinction = np.concatenate([true_extinction(time), np.full(other, np.nan)])
@@ -170,12 +175,12 @@ def truth_of(time: np.ndarray, *, instrument: str = "horizontal", other: int = 3
 
 @dataclass
 class Archive:
-    """Where products of a fabricated run are written."""
+    """The product folder of a synthetic run."""
 
     root: Path
 
     def write(self, name: str, data: xr.Dataset, kind: ProductKind) -> ProductRecord:
-        """Write a product and record it as the engine would."""
+        """Write a product and return its record, as the engine would."""
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         data.to_netcdf(path)
@@ -198,19 +203,19 @@ class Archive:
 
 
 def granule(path: str, reason: str = "", *, instrument: str = "horizontal") -> Granule:
-    """A granule, refused where a reason is given."""
+    """Return a granule, refused if a reason is given."""
     status = Status.REFUSED if reason else Status.GOOD
     return Granule(path, 1234, 1, instrument, Role.SIGNAL, status, reason)
 
 
 def plan(scene: str, *left_out: LeftOut) -> Plan:
-    """A small plan."""
-    step = Step("homogeneous", CHANNEL, {"method": "auto", "sections": [[2500, 5000]]}, "asked for")
+    """Return a plan of one step."""
+    step = Step("homogeneous", CHANNEL, {"method": "auto", "sections": [[2500, 5000]]}, "requested")
     return Plan(scene, (step,), left_out)
 
 
 def outcome(scene: str, start: datetime = START, **changes) -> SceneOutcome:
-    """What became of a scene of 20 granules."""
+    """Return the outcome of a scene of 20 granules."""
     fields = {
         "station": "kyiv",
         "instrument": "horizontal",
@@ -222,7 +227,7 @@ def outcome(scene: str, start: datetime = START, **changes) -> SceneOutcome:
 
 
 def run_record(root: Path, scenes=(), **changes) -> RunRecord:
-    """A run over `scenes`."""
+    """Return the record of a run over `scenes`."""
     fields = {
         "id": "20240302T000000-1a2b",
         "campaign": "demo",

@@ -1,4 +1,4 @@
-"""Fixtures of the reports' tests."""
+"""Fixtures for tests of reports and figures."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from support.fabricated import (
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Archive:
-    """An empty product root."""
+    """Return an empty product folder."""
     return Archive(tmp_path / "products")
 
 
 @pytest.fixture
 def simulated(archive: Archive, tmp_path: Path) -> RunRecord:
-    """A simulated run over one day, with truth."""
+    """Return the record of a simulated run over one day, with truth."""
     time = times(START, 96, 900.0)
     truth = tmp_path / "truth.nc"
     truth_of(time).to_netcdf(truth)

@@ -1,4 +1,4 @@
-"""A small archive of real products of every kind, and the browser that looks at its site."""
+"""A small archive of products of every kind, and a browser for its site."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _ARGUMENTS = [
 
 
 def add(output: Path, kind: ProductKind, days: int = 0, **changes: Any) -> Path:
-    """Write one product of a day into an archive."""
+    """Write the product of a day into an archive."""
     start = START + timedelta(days=days)
     scene = f"lidar-1_{start:%Y%m%dT%H%M%S}"
-    told = provenance(kind, scene=scene)
+    record = provenance(kind, scene=scene)
     about = {"scene": scene, "start": start, "stop": start + timedelta(days=1)}
-    whole = context(kind, **(about | {"provenance": told} | changes))
+    whole = context(kind, **(about | {"provenance": record} | changes))
     data = MAKERS[kind]()
     shift = np.timedelta64(days, "D")
     data = data.assign_coords(time=data["time"] + shift)
@@ -47,7 +47,7 @@ def add(output: Path, kind: ProductKind, days: int = 0, **changes: Any) -> Path:
 
 
 def add_unknown(output: Path, name: str = "wind", **attributes: str) -> Path:
-    """Write a file of a kind that this version does not know: discrete crossings over time."""
+    """Write a product of an unknown kind: several series over time."""
     rng = np.random.default_rng(5)
     time = np.datetime64("2026-03-02T06:00", "ns") + np.arange(8) * np.timedelta64(10, "m")
     attrs = {
@@ -92,7 +92,7 @@ def contents(site: Path) -> dict[str, bytes]:
 
 @contextmanager
 def browser() -> Iterator[Any]:
-    """Give a headless Chromium."""
+    """Yield a headless Chromium."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
