@@ -1,1 +1,1 @@
-"""Optical depths of single heights joined into one profile of smooth extinction."""
+"""Optical depths of single altitudes combined into one profile with smooth extinction."""

@@ -1,7 +1,7 @@
 """Compiled solution of pentadiagonal systems: one sweep, with variances, 16 at a time.
 
 A system is the precision of the estimates of one profile plus a multiple of the penalty. The
-arithmetic of one lane does not depend on what the others hold.
+result of one lane does not depend on the data in the others.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 LANES: Final = 16
+"""Systems solved at a time, one in each lane of the vector registers."""
 PAD: Final = 2
-"""Rows of zeros at either end, which stand for what lies outside the bands."""
+"""Rows of zeros at either end, in place of values outside the grid."""
 _LOGARITHM_EVERY: Final = 4
-"""Pivots multiplied before a logarithm is taken; four of any admitted size do not overflow."""
+"""Pivots multiplied before a logarithm is taken; four of any allowed size do not overflow."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -33,14 +34,14 @@ def penalty(altitude: Array, station_altitude: float) -> Array:
 
     Parameters
     ----------
-    altitude : (height,) float
+    altitude : (altitude,) float
         m, ascending.
     station_altitude : float
         m, below all of them.
 
     Returns
     -------
-    (3, height) float64
+    (3, altitude) float64
         m-3: diagonal, first and second off-diagonal.
     """
     return _penalty(np.diff(altitude, prepend=station_altitude))
@@ -48,10 +49,10 @@ def penalty(altitude: Array, station_altitude: float) -> Array:
 
 @_compiled
 def _penalty(step: Array) -> Array:
-    heights = step.size
-    bands = np.zeros((3, heights))
+    altitudes = step.size
+    bands = np.zeros((3, altitudes))
     row = np.empty(3)
-    for k in range(heights - 1):
+    for k in range(altitudes - 1):
         root = math.sqrt(2.0 / (step[k] + step[k + 1]))
         row[0] = root / step[k]
         row[1] = -root * (1.0 / step[k] + 1.0 / step[k + 1])
@@ -66,21 +67,21 @@ def _penalty(step: Array) -> Array:
 
 @_compiled
 def multiply_banded(bands: Array, vector: Array, out: Array) -> None:
-    """Multiply a vector by one symmetric pentadiagonal matrix of (3, height) bands."""
-    heights = vector.size
-    for k in range(heights):
+    """Multiply a vector by one symmetric pentadiagonal matrix of (3, altitude) bands."""
+    altitudes = vector.size
+    for k in range(altitudes):
         out[k] = bands[0, k] * vector[k]
-    for k in range(heights - 1):
+    for k in range(altitudes - 1):
         out[k] += bands[1, k] * vector[k + 1]
         out[k + 1] += bands[1, k] * vector[k]
-    for k in range(heights - 2):
+    for k in range(altitudes - 2):
         out[k] += bands[2, k] * vector[k + 2]
         out[k + 2] += bands[2, k] * vector[k]
 
 
 @_compiled
 def multiply_rows(bands: Array, vectors: Array) -> Array:
-    """Multiply (profile, height) rows, each by its own matrix of (3, profile, height) bands."""
+    """Multiply (profile, altitude) rows, each by its own matrix of (3, profile, altitude) bands."""
     out = np.empty_like(vectors)
     for t in range(vectors.shape[0]):
         multiply_banded(bands[:, t], vectors[t], out[t])
@@ -89,7 +90,7 @@ def multiply_rows(bands: Array, vectors: Array) -> Array:
 
 @_compiled
 def add_rows(values: Array, profile: Integers, share: Array, out: Array) -> None:
-    """Add (system, height) rows to those of their profiles, each with its share."""
+    """Add (system, altitude) rows to those of their profiles, each with its share."""
     for i in range(profile.size):
         row = out[profile[i]]
         for k in range(row.size):
@@ -98,7 +99,7 @@ def add_rows(values: Array, profile: Integers, share: Array, out: Array) -> None
 
 @_compiled
 def _load(rows: Array, profile: Integers, first: int, work: Array) -> None:
-    """Transpose the rows of 16 systems into lanes; the last one fills lanes left over."""
+    """Transpose the rows of 16 systems into lanes; the last system fills unused lanes."""
     chosen = np.empty(LANES, dtype=np.int64)
     for j in range(LANES):
         chosen[j] = profile[min(first + j, profile.size - 1)]
@@ -127,12 +128,13 @@ def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
     o : (3, row, lane) float64
         Bands of the precision.
     b : (row, lane) float64
-        Right sides.
-    k : (3, height) float64
+        Right-hand sides.
+    k : (3, altitude) float64
         Bands of the penalty.
     lam : (lane,) float64
+        Weights of the penalty.
     f : (4, row, lane) float64
-        Gets the reciprocal pivots, the two off-diagonals of L, and the solution so far.
+        Output: the reciprocal pivots, the two off-diagonals of L, and the forward solution.
     """
     edge, far, farther = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
     for i in range(PAD, b.shape[0] - PAD):
@@ -157,14 +159,14 @@ def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
 
 @_compiled
 def _sweep_up(f: Array, c: Array) -> None:
-    """Substitute back, and invert within the bands (Takahashi's recursion).
+    """Substitute back, and invert within the bands (Takahashi's recursion, `takahashi1973`).
 
     Parameters
     ----------
     f : (4, row, lane) float64
-        From `_sweep_down`; the last gets the solutions.
+        From `_sweep_down`; the last row becomes the solution.
     c : (3, row, lane) float64
-        Gets the diagonal and the off-diagonals of the inverse.
+        Output: the diagonal and the off-diagonals of the inverse.
     """
     for i in range(f.shape[1] - PAD - 1, PAD - 1, -1):
         d, l1, l2, x = f[0, i], f[1, i], f[2, i], f[3, i]
@@ -182,8 +184,8 @@ def _sweep_up(f: Array, c: Array) -> None:
 
 
 @_compiled
-def _work(heights: int) -> tuple[Array, Array, Array, Array]:
-    rows = heights + 2 * PAD
+def _work(altitudes: int) -> tuple[Array, Array, Array, Array]:
+    rows = altitudes + 2 * PAD
     return (
         np.zeros((3, rows, LANES)),
         np.zeros((rows, LANES)),
@@ -200,16 +202,17 @@ def solve_banded(
 
     Parameters
     ----------
-    bands : (3, profile, height) float64
+    bands : (3, profile, altitude) float64
         Precision of each profile.
-    right : (profile, height) float64
-    stiffness : (3, height) float64
+    right : (profile, altitude) float64
+    stiffness : (3, altitude) float64
         Bands of the penalty.
     profile : (system,) int64
-        Which profile each system is of.
+        Profile of each system.
     lam : (system,) float64
-    out : (4, system, height) float64
-        Gets the solution, the diagonal and the two off-diagonals of the inverse.
+        Weight of the penalty.
+    out : (4, system, altitude) float64
+        Output: the solution, the diagonal and the two off-diagonals of the inverse.
     """
     o, b, f, c = _work(right.shape[1])
     lams = np.ones(LANES)
@@ -236,7 +239,7 @@ def _load_system(
 
 @_compiled
 def _misfits(o: Array, b: Array, t: Array, f: Array, c: Array, total: Array) -> None:
-    """Sum over heights what `banded_scores` gives, 16 systems at a time, into (4, lane) totals."""
+    """Fill the (4, lane) sums over altitudes of `banded_scores`, 16 systems at a time."""
     total[:] = 0.0
     product = np.ones(LANES)
     likely, rss, free = total[0], total[1], total[2]
@@ -267,13 +270,13 @@ def banded_scores(
     profile: Integers,
     lam: Array,
 ) -> Array:
-    r"""Return what the choice of :math:`\lambda` needs to know of each solution.
+    r"""Return the quantities of each solution from which :math:`\lambda` is chosen.
 
     Parameters
     ----------
     bands, right, stiffness, profile, lam
-        As for `solve_banded`, with right sides :math:`\Omega t`.
-    estimates : (profile, height) float64
+        As for `solve_banded`, with right-hand sides :math:`\Omega t`.
+    estimates : (profile, altitude) float64
         :math:`t`, 0 where there is none.
 
     Returns

@@ -1,4 +1,4 @@
-"""The vertical solution, block by block: nothing of one block depends on another."""
+"""The vertical solution, block by block; blocks are independent of each other."""
 
 from __future__ import annotations
 
@@ -26,27 +26,34 @@ Booleans = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
 WINDOW: Final = 15
-"""Heights over which the variance of the inhomogeneity is pooled."""
+"""Altitudes over which the variance of the inhomogeneity is pooled."""
 _LARGEST_INFORMATION: Final = 1e6
+"""Limit of information, in medians of the block."""
 _USUAL_INFORMATION: Final = 100.0
+"""Limit of the mean information, in medians of the block."""
 _NEGLIGIBLE: Final = 1e-4
-_LEAST_FREEDOM_TO_DOUBT: Final = 2.0
-"""Of 4 beams: from fewer, an estimate that is off cannot be told."""
+"""Information of a profile, in medians of the block, below which it is treated as empty."""
+_LEAST_FREEDOM_TO_REJECT: Final = 2.0
+"""Degrees of freedom of 4 beams: with fewer, an outlying estimate cannot be identified."""
 _FEWEST_FREEDOM: Final = 4.1
-_DOUBTED_BELOW: Final = 0.5
-"""Share of its weight below which an estimate is reported as weighted down."""
+"""Degrees of freedom below which Student's variance would diverge."""
+_DOWNWEIGHTED_BELOW: Final = 0.5
+"""Share of its weight below which an estimate is reported as an outlier."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Systems to solve: a profile with a weight of smoothness, and what its answer counts."""
+    """Systems to solve: profiles with weights of smoothness, and their shares in the average."""
 
     profile: Integers
+    """(pair,): row of the profile."""
     smoothing: Array
+    """(pair,): weight of smoothness."""
     share: Array
+    """(pair,): share in the average, 1 in total for each profile."""
 
     def total(self, values: Array, profiles: int) -> Array:
-        """Sum (pair, height) rows into (profile, height), each with its share."""
+        """Sum (pair, altitude) rows into (profile, altitude), each with its share."""
         out = np.zeros((profiles, values.shape[1]))
         _banded.add_rows(values, self.profile, self.share, out)
         return out
@@ -54,19 +61,19 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class BlockNoise:
-    """How the standard errors of one block are corrected."""
+    """Correction of the standard errors of one block."""
 
     profile: Integers
     """(member,): its profiles that have data."""
     calibration: _calibration.Calibration | None
-    """None in a block too small to be calibrated."""
+    """None if the block is too small to be calibrated."""
     inflation: Array
-    """(height,): factor on the variance for a noise that is known from few residuals."""
+    """(altitude,): factor on the variance because the noise is estimated from few residuals."""
 
     def ratio(self, upper: Integers, lower: Integers) -> Array:
         """Return the factor on the posterior variance of differences of optical depths.
 
-        (member, difference), or (difference,) where it is that of all members.
+        The shape is (member, difference), or (difference,) if common to all members.
         """
         below = np.where(lower >= 0, self.inflation[np.maximum(lower, 0)], 1.0)
         few: Array = np.maximum(self.inflation[upper], below)
@@ -80,42 +87,43 @@ class BlockNoise:
 
 @dataclass(frozen=True, slots=True)
 class VerticalSystem:
-    """The systems that were solved, to be applied to other right sides.
+    """The systems that were solved, to be applied to other right-hand sides.
 
-    `lidarops.retrieve.multiangle.vertical.smooth_profile` has the functions that use it.
+    See `respond` and `layer_optical_depth` in
+    `lidarops.retrieve.multiangle.vertical.smooth_profile`.
     """
 
     altitude: Array
-    """(height,) m."""
+    """(altitude,) m."""
     station_altitude: float
     """m."""
     estimates: Array
-    """(profile, height): optical depths of single heights, 0 where there is none."""
+    """(profile, altitude): optical depths of single altitudes, 0 where there is none."""
     information: Array
-    """(profile, height): weights of the estimates, 0 where there is none."""
+    """(profile, altitude): weights of the estimates, 0 where there is none."""
     within_reach: Booleans
-    """(profile, height)."""
+    """(profile, altitude)."""
     bands: Array
-    """(3, profile, height): precision of the estimates."""
+    """(3, profile, altitude): precision of the estimates."""
     stiffness: Array
-    """(3, height): bands of the smoothness."""
+    """(3, altitude): bands of the penalty on roughness."""
     pairs: Pairs
     blocks: tuple[BlockNoise, ...]
 
     def respond(self, rows: Array) -> Array:
         """Apply the smoother of each profile to its row; NaN beyond the reach."""
         used = self.information > 0.0
-        broken = np.any(used & ~np.isfinite(rows), axis=1)
-        clean = np.where(used & ~broken[:, np.newaxis], rows, 0.0)
+        invalid = np.any(used & ~np.isfinite(rows), axis=1)
+        clean = np.where(used & ~invalid[:, np.newaxis], rows, 0.0)
         right = _banded.multiply_rows(self.bands, clean)
         solved = _solve_pairs(right, self.bands, self.stiffness, self.pairs)
         smooth = self.pairs.total(solved[0], rows.shape[0])
-        return np.where(self.within_reach & ~broken[:, np.newaxis], smooth, np.nan)
+        return np.where(self.within_reach & ~invalid[:, np.newaxis], smooth, np.nan)
 
     def layer_variance(self, lower: int, upper: int) -> Array:
-        """Return the calibrated variance of the optical depth between two heights, (profile,)."""
-        profiles, heights = self.information.shape
-        right = np.zeros((profiles, heights))
+        """Return the calibrated variance of the optical depth between two altitudes, (profile,)."""
+        profiles, altitudes = self.information.shape
+        right = np.zeros((profiles, altitudes))
         right[:, upper] = 1.0
         if lower >= 0:
             right[:, lower] = -1.0
@@ -133,14 +141,14 @@ class VerticalSystem:
 
 @dataclass(frozen=True, slots=True)
 class VerticalSolution:
-    """Everything that the blocks gave, as `lidarops.retrieve.multiangle.vertical.smooth_profile.VerticalResult` has it."""
+    """The solution of all blocks; fields are as in `smooth_profile.VerticalResult`."""
 
     optical_depth: Array
     optical_depth_variance: Array
     extinction: Array
     extinction_variance: Array
     weight_in_own: Array
-    """(profile, height): diagonal of the smoother."""
+    """(profile, altitude): diagonal of the smoother."""
     downweighted: Booleans
     effective_degrees_of_freedom: Array
     correlation: Array
@@ -152,7 +160,7 @@ class VerticalSolution:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Members of a block that have data, and what is common to them."""
+    """Profiles of a block that have data, with the properties common to them."""
 
     estimates: Array
     information: Array
@@ -162,12 +170,12 @@ class _Block:
     extent: float
     """m, from the lidar to the highest estimate."""
     gaps: Integers
-    """Rows of which neighbouring heights come from other beams."""
+    """Rows where neighbouring altitudes come from different beams."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Solution of one block, by the rows of its members."""
+    """Solution of one block; rows are its members."""
 
     information: Array
     bands: Array
@@ -176,9 +184,10 @@ class _Fit:
     depth: Array
     variance: Array
     extinction: Array
-    """Optical depth gained since the height below."""
+    """Optical depth of the layer from the altitude below."""
     extinction_variance: Array
     own: Array
+    """Weight of each estimate in its own optical depth."""
 
 
 def _solve_pairs(right: Array, bands: Array, stiffness: Array, pairs: Pairs) -> Array:
@@ -205,23 +214,23 @@ def _own_weights(bands: Array, inverse: Array) -> Array:
 
 
 def _usual_information(information: Array) -> float:
-    """Return the mean of what is there, or a multiple of the median where few have almost all."""
-    there = information[information > 0.0]
-    return float(min(there.mean(), _USUAL_INFORMATION * np.median(there)))
+    """Return the mean information, limited to a multiple of the median."""
+    known = information[information > 0.0]
+    return float(min(known.mean(), _USUAL_INFORMATION * np.median(known)))
 
 
-def _telling(problem: _inputs.VerticalProblem, member: Integers) -> Integers:
-    """Return the members that are not negligible beside the others of their block."""
+def _informative(problem: _inputs.VerticalProblem, member: Integers) -> Integers:
+    """Return the members whose information is not negligible in their block."""
     height = problem.altitude - problem.station_altitude
     total = (problem.information[member] * height**2).sum(axis=1)
-    telling: Integers = member[total >= _NEGLIGIBLE * np.median(total)]
-    return telling
+    informative: Integers = member[total >= _NEGLIGIBLE * np.median(total)]
+    return informative
 
 
 def _fit(block: _Block, information: Array) -> _Fit:
     """Choose the smoothness of a block and solve."""
     profiles = information.shape[0]
-    # What is believed less has more noise of its own, not more of what it shares.
+    # An estimate with less weight has more noise of its own, not more of the correlated noise.
     share = block.share * _ratio(information, block.information)
     bands = _precision(block, information, share)
     unit = _usual_information(information) * block.extent**3
@@ -264,9 +273,9 @@ def _precision(block: _Block, information: Array, share: Array) -> Array:
 
 
 def _ratio(reduced: Array, whole: Array) -> Array:
-    """Return reduced over whole information, 1 where there is none."""
-    # The bisquare gives undoubted estimates a little more than their whole information; a noise
-    # that is shared by more than all of itself would have a negative variance.
+    """Return reduced over whole information, at most 1; 1 where there is none."""
+    # The bisquare raises the information of good estimates slightly above the whole; a correlated
+    # share above 1 would leave a negative variance.
     return np.minimum(np.where(whole > 0.0, reduced / np.where(whole > 0.0, whole, 1.0), 1.0), 1.0)
 
 
@@ -294,21 +303,21 @@ def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calib
     )
 
 
-def _inflation(freedom: Array | None, correlation: float, heights: int) -> Array:
-    """Return the factor on variances for a noise known from a window of residuals."""
+def _inflation(freedom: Array | None, correlation: float, altitudes: int) -> Array:
+    """Return the factor on variances because noise is estimated from a window of residuals."""
     if freedom is None:
-        return np.ones(heights)
+        return np.ones(altitudes)
     total = np.convolve(freedom.sum(axis=0), np.ones(WINDOW), mode="full")
     start = WINDOW // 2
     square = correlation * correlation
-    known = total[start : start + heights] * (1.0 - square) / (1.0 + square)
+    known = total[start : start + altitudes] * (1.0 - square) / (1.0 + square)
     known = np.maximum(known, _FEWEST_FREEDOM)
     factor: Array = known / (known - 2.0)
     return factor
 
 
 def _within_reach(information: Array) -> Booleans:
-    """Return which heights are not above the highest estimate of their profile."""
+    """Return which altitudes are not above the highest estimate of their profile."""
     used = information > 0.0
     reached: Booleans = np.cumsum(used[:, ::-1], axis=1)[:, ::-1] > 0
     return reached
@@ -343,28 +352,28 @@ def _block(
     )
 
 
-def _members(labels: npt.NDArray[np.int64], there: Booleans) -> list[Integers]:
+def _members(labels: npt.NDArray[np.int64], has_data: Booleans) -> list[Integers]:
     """Return, for each block, its profiles that have data, in ascending order."""
     order = np.argsort(labels, kind="stable")
     bounds = np.flatnonzero(np.diff(labels[order])) + 1
-    members = [group[there[group]] for group in np.split(order, bounds)]
+    members = [group[has_data[group]] for group in np.split(order, bounds)]
     return [member for member in members if member.size]
 
 
-def _solve_block(block: _Block, *, bin_pass: bool) -> _Fit:
-    if not bin_pass:
+def _solve_block(block: _Block, *, robust: bool) -> _Fit:
+    if not robust:
         return _fit(block, block.information)
     screened = _outliers.screen_outliers(block.estimates, block.information)
     fit = _fit(block, _outliers.reduce_information(block.information, screened))
-    doubted = _outliers.downweight_outliers(
+    reduced = _outliers.downweight_outliers(
         block.estimates, block.information, block.share, fit.depth, fit.variance
     )
-    return fit if doubted is None else _fit(block, doubted)
+    return fit if reduced is None else _fit(block, reduced)
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
-    """What one block adds to the solution."""
+class _SolvedBlock:
+    """One block with its solution."""
 
     member: Integers
     block: _Block
@@ -373,15 +382,15 @@ class _Part:
     no_residual: bool
 
     def rows(self, step: Array) -> dict[str, Array]:
-        """Return the (member, height) arrays of the solution, with their errors calibrated."""
-        every = np.arange(step.size)
+        """Return the (member, altitude) arrays of the solution, with their errors calibrated."""
+        rows = np.arange(step.size)
         fit, from_station = self.fit, np.full(step.size, -1)
         return {
             "optical_depth": fit.depth,
-            "optical_depth_variance": fit.variance * self.noise.ratio(every, from_station),
+            "optical_depth_variance": fit.variance * self.noise.ratio(rows, from_station),
             "extinction": fit.extinction / step,
             "extinction_variance": fit.extinction_variance
-            * self.noise.ratio(every, every - 1)
+            * self.noise.ratio(rows, rows - 1)
             / step**2,
             "weight_in_own": fit.own,
         }
@@ -395,26 +404,26 @@ class _Part:
         }
 
 
-def _part(
+def _solve_and_calibrate(
     problem: _inputs.VerticalProblem,
     member: Integers,
     moments: ResidualMoments | None,
     within: Booleans,
     *,
-    bin_pass: bool,
-) -> _Part:
+    robust: bool,
+) -> _SolvedBlock:
     stiffness = _banded.penalty(problem.altitude, problem.station_altitude)
     block = _block(problem, member, moments, stiffness)
     freedom = None if moments is None else moments.degrees_of_freedom[member]
     most = np.inf if freedom is None else float(freedom.max())
-    fit = _solve_block(block, bin_pass=bin_pass and most >= _LEAST_FREEDOM_TO_DOUBT)
+    fit = _solve_block(block, robust=robust and most >= _LEAST_FREEDOM_TO_REJECT)
     calibrated = member.size >= _smoothing_choice.FEWEST_TO_CHOOSE
     noise = BlockNoise(
         member,
         _calibrate(block, fit, within) if calibrated else None,
         _inflation(freedom, block.correlation, problem.altitude.size),
     )
-    return _Part(member, block, fit, noise, most <= 0.0)
+    return _SolvedBlock(member, block, fit, noise, most <= 0.0)
 
 
 def solve_vertical_blocks(
@@ -422,9 +431,9 @@ def solve_vertical_blocks(
     labels: npt.NDArray[np.int64],
     moments: ResidualMoments | None,
     *,
-    bin_pass: bool,
+    robust: bool,
 ) -> VerticalSolution:
-    """Solve all blocks, see `lidarops.retrieve.multiangle.vertical.smooth_profile.smooth_optical_depth`."""
+    """Solve all blocks (see `smooth_profile.smooth_optical_depth`)."""
     shape = problem.optical_depth.shape
     step = np.diff(problem.altitude, prepend=problem.station_altitude)
     within = _within_reach(problem.information)
@@ -435,18 +444,19 @@ def solve_vertical_blocks(
     saturated, no_residual = np.zeros((2, shape[0]), dtype=np.bool_)
     pairs, blocks = [_NO_PAIRS], []
     for candidates in _members(labels, within[:, 0]):
-        member = _telling(problem, candidates)
+        member = _informative(problem, candidates)
         within[np.setdiff1d(candidates, member)] = False
-        part = _part(problem, member, moments, within[member], bin_pass=bin_pass)
-        for name, values in part.rows(step).items():
+        solved = _solve_and_calibrate(problem, member, moments, within[member], robust=robust)
+        fit = solved.fit
+        for name, values in solved.rows(step).items():
             rows[name][member] = np.where(within[member], values, np.nan)
-        for name, value in part.scalars().items():
+        for name, value in solved.scalars().items():
             scalars[name][member] = value
-        information[member], bands[:, member] = part.fit.information, part.fit.bands
-        downweighted[member] = part.fit.information < part.block.information * _DOUBTED_BELOW
-        saturated[member], no_residual[member] = part.fit.choice.saturated, part.no_residual
-        pairs.append(replace(part.fit.pairs, profile=member[part.fit.pairs.profile]))
-        blocks.append(part.noise)
+        information[member], bands[:, member] = fit.information, fit.bands
+        downweighted[member] = fit.information < solved.block.information * _DOWNWEIGHTED_BELOW
+        saturated[member], no_residual[member] = fit.choice.saturated, solved.no_residual
+        pairs.append(replace(fit.pairs, profile=member[fit.pairs.profile]))
+        blocks.append(solved.noise)
     system = VerticalSystem(
         problem.altitude,
         problem.station_altitude,

@@ -1,4 +1,4 @@
-"""Standard errors of a block calibrated height by height, by the spread of a rougher solution."""
+"""Calibration of the standard errors of a block, by the spread of a rougher solution."""
 
 from __future__ import annotations
 
@@ -18,45 +18,49 @@ Integers = npt.NDArray[np.int64]
 PILOT: Final = 0.01
 """Weight of smoothness of the pilot solution over that of the solution."""
 _MOST_ROWS: Final = 256
+"""Differences that are calibrated one by one; others are interpolated between them."""
 _LARGEST_DEVIATION: Final = 3.0
+"""Standard deviations to which the smoothing errors of the pilot solution are clipped."""
 _LEAST_SCALE: Final = 0.7
-"""A thin haze may have a sharp layer all the same. With 1, errors would be too large where profiles
-differ by noise alone, and those of thin hazes more than those of thick ones."""
+"""Least scale of a profile, because a thin haze may still have a sharp layer. With 1, errors would
+be too large where profiles differ by noise alone, more so for thin hazes than for thick ones."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What the calibration of one block rests on.
+    """Inputs of the calibration of one block.
 
-    The typical profile stands for all of the block in what depends on weights only.
+    The typical profile represents all profiles of the block in quantities that depend on weights
+    only.
     """
 
     bands: Array
-    """(3, height): precision of the typical profile."""
+    """(3, altitude): precision of the typical profile."""
     information: Array
-    """(height,): of the typical profile, 0 where there is no estimate."""
+    """(altitude,): of the typical profile, 0 where there is no estimate."""
     share: Array
-    """(height,): correlated share of its variance."""
+    """(altitude,): correlated share of its variance."""
     correlation: float
+    """Of the correlated noise at neighbouring altitudes."""
     stiffness: Array
-    """(3, height)."""
+    """(3, altitude): bands of the penalty on roughness."""
     smoothing: float
-    """In the unit of the system."""
+    """Weight of the penalty, in the unit of the system."""
     bias: Array
-    """(profile, height): pilot solution less its smoothed self; NaN beyond the reach."""
+    """(profile, altitude): pilot solution minus its smoothed form; NaN beyond the reach."""
     scale: Array
     """(profile,): from `relative_squares`."""
 
 
 @_compiled
 def _factor(bands: Array, stiffness: Array, lam: float) -> Array:
-    """Return reciprocal pivots and off-diagonals of L, (3, height)."""
-    heights = bands.shape[1]
-    f = np.zeros((3, heights))
+    """Return reciprocal pivots and off-diagonals of L, (3, altitude)."""
+    altitudes = bands.shape[1]
+    f = np.zeros((3, altitudes))
     edge = far = farther = 0.0
-    for k in range(heights):
+    for k in range(altitudes):
         near_l = f[1, k - 1] if k > 0 else 0.0
         far_l = f[2, k - 2] if k > 1 else 0.0
         pivot = bands[0, k] + lam * stiffness[0, k] - near_l * edge - far_l * farther
@@ -69,24 +73,24 @@ def _factor(bands: Array, stiffness: Array, lam: float) -> Array:
 
 @_compiled
 def _substitute(f: Array, x: Array) -> None:
-    """Solve in place with what `_factor` gave."""
-    heights = x.size
-    for k in range(heights):
+    """Solve in place with the factors of `_factor`."""
+    altitudes = x.size
+    for k in range(altitudes):
         if k > 0:
             x[k] -= f[1, k - 1] * x[k - 1]
         if k > 1:
             x[k] -= f[2, k - 2] * x[k - 2]
-    for k in range(heights - 1, -1, -1):
+    for k in range(altitudes - 1, -1, -1):
         x[k] *= f[0, k]
-        if k < heights - 1:
+        if k < altitudes - 1:
             x[k] -= f[1, k] * x[k + 1]
-        if k < heights - 2:
+        if k < altitudes - 2:
             x[k] -= f[2, k] * x[k + 2]
 
 
 @_compiled
 def _noise(y: Array, information: Array, share: Array, correlation: float) -> float:
-    r"""Return y'Vy for noise of which a share decays as the correlation to the distance."""
+    r"""Return y'Vy for noise of which a share is correlated, decaying with the distance."""
     total = tail = 0.0
     for k in range(y.size):
         tail *= correlation
@@ -109,14 +113,14 @@ def sandwich(
     upper: Integers,
     lower: Integers,
 ) -> Array:
-    r"""Return what the system says of differences of optical depths, and what the noise does.
+    r"""Return posterior variances of differences of optical depths, and their components.
 
     With :math:`a` the difference, :math:`C` the inverse of the system, :math:`C_q` that of the
-    pilot and :math:`V` the covariance of the noise (which :math:`\Omega^{-1}` is only at low
-    frequencies): the posterior variance :math:`c = a'Ca`, the variance from noise
+    pilot and :math:`V` the covariance of the noise (equal to :math:`\Omega^{-1}` only at low
+    frequencies), these are: the posterior variance :math:`c = a'Ca`, the variance from noise
     :math:`v = x'Vx, x = \Omega C a`, the expected square of the smoothing error
     :math:`c - a'C \Omega C a`, and the variance :math:`n = y'Vy, y = \Omega C_q (a - x)` of the
-    smoothing error as the pilot shows it.
+    smoothing error estimated from the pilot.
 
     Parameters
     ----------
@@ -161,9 +165,10 @@ def sandwich(
 
 
 def typical_profile(information: Array, share: Array) -> tuple[Array, Array]:
-    """Return mean information and share of the profiles of a block.
+    """Return mean information and correlated share of the profiles of a block.
 
-    Heights that few profiles have (less than half of the most) count as missing.
+    Altitudes with estimates of few profiles (less than half of the largest number) count as
+    missing.
     """
     used = information > 0.0
     count = used.sum(axis=0)
@@ -174,66 +179,66 @@ def typical_profile(information: Array, share: Array) -> tuple[Array, Array]:
 
 
 def _common(count: Integers) -> Booleans:
-    """Return the heights that at least half as many profiles have as any height."""
+    """Return the altitudes with at least half of the largest number of profiles."""
     common: Booleans = count >= max(0.5 * count.max(), 1.0)
     return common
 
 
 def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
-    r"""Return the square of each profile's optical depth over the usual one of its block.
+    r"""Return the squared optical depth of each profile over the usual one of its block.
 
-    What smoothing takes from a profile is in proportion to its extinction: of a haze that is
-    three times as thick, three times as much. At the highest altitude within the reach of a
-    profile that half of the block reach too, with the variance V of its optical depth and the
-    weighted mean R of the squares of all that reach it,
+    The smoothing error of a profile is proportional to its extinction. At the highest altitude
+    within the reach of a profile that half of the block also reaches, with the variance V of its
+    optical depth and the weighted mean R of the squares of all profiles that reach it,
 
     .. math:: \max\left(0.7, \frac{\tau^2 + V}{R + V}\right),
 
-    which is 1 where noise hides the optical depth.
+    which is 1 where noise exceeds the optical depth by far.
 
     Parameters
     ----------
-    depth, variance : (profile, height) float64
-    within : (profile, height) bool
-        The reach; of every profile at least one height.
+    depth, variance : (profile, altitude) float64
+    within : (profile, altitude) bool
+        Altitudes within the reach, at least one of every profile.
 
     Returns
     -------
     (profile,) float64
     """
-    # Beyond that, a profile would be compared with few others, or with itself.
+    # Above it, a profile would be compared with few others, or only with itself.
     shared = int(np.flatnonzero(_common(within.sum(axis=0)))[-1])
     tops, own = np.unique(np.minimum(within.sum(axis=1) - 1, shared), return_inverse=True)
     reached = within[:, tops]
     square = np.where(reached, depth[:, tops] ** 2, np.nan)
     noise = np.where(reached, variance[:, tops], np.nan)
-    # The median, as one profile of much noise may have the largest square of all.
+    # The median, because the square of a single noisy profile may exceed all others.
     usual = np.maximum(np.nanmedian(square, axis=0), np.finfo(np.float64).tiny)
     weight = (usual / (usual + noise)) ** 2
-    told = np.nansum(weight, axis=0)
-    # Nothing where no profile is known, or most have no optical depth at all.
-    mean = np.nansum(weight * square, axis=0) / np.where(told > 0.0, told, 1.0)
-    each = np.arange(len(own)), own
-    over, of = (square + noise)[each], (np.where(told > 0.0, mean, square) + noise)[each]
-    known = np.isfinite(over) & np.isfinite(of) & (of > 0.0)
-    relative = np.where(known, over, 1.0) / np.where(known, of, 1.0)
+    total = np.nansum(weight, axis=0)
+    # Zero if no profile is known, or most have no optical depth at all.
+    mean = np.nansum(weight * square, axis=0) / np.where(total > 0.0, total, 1.0)
+    at_top = np.arange(len(own)), own
+    own_square = (square + noise)[at_top]
+    usual_square = (np.where(total > 0.0, mean, square) + noise)[at_top]
+    known = np.isfinite(own_square) & np.isfinite(usual_square) & (usual_square > 0.0)
+    relative = np.where(known, own_square, 1.0) / np.where(known, usual_square, 1.0)
     scale: Array = np.maximum(relative, _LEAST_SCALE)
     return scale
 
 
-def _observed(bias: Array, known: Array) -> Array:
-    r"""Return the square of the smoothing error, from what the model and the pilot say of it.
+def _smoothing_square(bias: Array, known: Array) -> Array:
+    r"""Return the square of the smoothing error, estimated from the model and the pilot.
 
-    What the profiles share shows in the mean of the pilot's smoothing error, with little noise;
-    what they do not share, in its spread. Each is taken as far as its noise allows, the rest
-    from the model, and what is seen for certain is never averaged away:
+    The smoothing error common to the profiles appears in the mean of that of the pilot, with
+    little noise; the rest appears in its spread. Each estimate is weighted by its certainty and
+    complemented by the model. A significant mean error is never averaged away:
 
     .. math::
         B = \bar b^2 - n / T, \quad \beta = \max(0, B, u B + (1 - u) m), \quad
         b^2 = \beta + \max(0, (1 - w) (m - \beta)^+ + w [\overline{b^2} - \bar b^2 - n (1 - 1/T)])
 
-    with the model's square :math:`m`, the noise :math:`n` of the pilot's, and the weights
-    :math:`u, w` of a signal of that square among the noise of the two estimates.
+    with the square :math:`m` of the model, the noise :math:`n` of the pilot, and the weights
+    :math:`u, w` of the two estimates, from that square and their noise.
 
     Parameters
     ----------
@@ -247,10 +252,10 @@ def _observed(bias: Array, known: Array) -> Array:
     (difference,) float64
     """
     _, _, model, noise = known
-    there = np.isfinite(bias)
-    count = np.maximum(there.sum(axis=0), 1)
+    present = np.isfinite(bias)
+    count = np.maximum(present.sum(axis=0), 1)
     limit = _LARGEST_DEVIATION * np.sqrt(noise + model)
-    clipped = np.clip(np.where(there, bias, 0.0), -limit, limit)
+    clipped = np.clip(np.where(present, bias, 0.0), -limit, limit)
     mean = clipped.sum(axis=0) / count
     square = (clipped**2).sum(axis=0) / count
     of_mean = noise / count
@@ -278,17 +283,17 @@ def variance_ratio(
     ----------
     calibration : Calibration
     upper, lower : (difference,) int64
-        Heights in ascending order; -1 for the lidar.
+        Altitudes in ascending order; -1 for the lidar.
     bias : (profile, difference) float64
-        The differences of `Calibration.bias`.
+        Differences of `Calibration.bias`.
 
     Returns
     -------
     (profile, difference) float64
-        Of many differences some are calculated and the rest interpolated between them.
+        Of more than 256 differences, some are calculated and the others interpolated.
     """
-    every = -(-upper.size // _MOST_ROWS)
-    chosen = np.unique(np.append(np.arange(0, upper.size, every), upper.size - 1))
+    stride = -(-upper.size // _MOST_ROWS)
+    chosen = np.unique(np.append(np.arange(0, upper.size, stride), upper.size - 1))
     known = sandwich(
         calibration.bands,
         calibration.information,
@@ -299,10 +304,10 @@ def variance_ratio(
         upper[chosen],
         lower[chosen],
     )
-    if every > 1:
+    if stride > 1:
         known = _interpolated(known, chosen, upper.size)
-    taken = calibration.scale[:, np.newaxis] * _observed(bias, known)
-    factor: Array = (known[1] + taken) / known[0]
+    smoothing_error = calibration.scale[:, np.newaxis] * _smoothing_square(bias, known)
+    factor: Array = (known[1] + smoothing_error) / known[0]
     return factor
 
 

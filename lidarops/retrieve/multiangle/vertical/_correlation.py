@@ -1,4 +1,4 @@
-"""Noise along height: its correlation from residuals, and the precision that follows."""
+"""Correlation of noise along altitude, estimated from residuals, and the resulting precision."""
 
 from __future__ import annotations
 
@@ -13,66 +13,73 @@ Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 
 LAGS: Final = 3
+"""Largest distance of residuals that are multiplied, in altitudes."""
 LARGEST: Final = 0.97
+"""Limit of the correlation."""
 _NONE_BELOW: Final = 0.05
+"""Ratio at the first lag below which the correlation is taken as zero."""
 _SIMPLE_BELOW: Final = 0.1
+"""Ratio at the first lag below which the decay cannot be estimated."""
 _AMPLITUDES: Final = (0.5, 1.05)
+"""Limits of the amplitude of the correlation."""
 _LINKED: Final = 0.5
+"""Correlated share, over the largest of the neighbours, from which on an altitude is linked."""
 _CANDIDATES: Final = np.arange(99) / 100.0
+"""Correlations to choose from."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
 class ResidualMoments:
-    """What the residuals of the beams tell about the noise of the optical depths.
+    """Sums over the residuals of beams, from which the noise of optical depths is estimated.
 
-    Made by `lidarops.retrieve.multiangle.vertical.smooth_profile.residual_moments`. The correlation along height and the
-    standard errors need it.
+    Returned by `smooth_profile.residual_moments`. The correlation along altitude and the standard
+    errors depend on them.
     """
 
     lag_products: Array
-    """(profile, 3): sums over beams and heights of products of weighted residuals 1, 2 and 3
-    heights apart, weighted by the share of the inhomogeneity in them."""
+    """(profile, 3): sums over beams and altitudes of products of weighted residuals 1, 2 and 3
+    altitudes apart, weighted by the share of the inhomogeneity in them."""
     lag_norms: Array
-    """(profile, 3): the same sums, where the inhomogeneity is wholly correlated."""
+    """(profile, 3): expectation of these sums if the inhomogeneity is fully correlated."""
     inhomogeneity_share: Array
-    """(profile, height): share of the inhomogeneity in the variance of the optical depth, 0..1."""
+    """(profile, altitude): share of the inhomogeneity in the variance of optical depth, 0..1."""
     degrees_of_freedom: Array
-    """(profile, height): beams used less 2, at least 0."""
+    """(profile, altitude): number of beams used minus 2, at least 0."""
     gaps: Booleans
-    """(profile,): whether samples are missing between others, so that neighbouring heights come
-    from other beams."""
+    """(profile,): whether samples are missing between others, so that neighbouring altitudes come
+    from different beams."""
 
 
 @_compiled
 def lag_sums(
     residual: Array, weight: Array, leverage: Array, variance: Array
 ) -> tuple[Array, Array, Array]:
-    """Sum products of weighted residuals along height, and what they are for full correlation.
+    """Return sums of products of residuals along altitude, and their values at full correlation.
 
-    Each product counts by the share of the inhomogeneity in it: where noise dominates, it tells
-    of errors that beams have in common with themselves, as of a background, not of the air.
+    Each product is weighted by the share of the inhomogeneity in it: where noise dominates, the
+    products show errors along a beam, such as those of the background, not the air.
 
     Parameters
     ----------
-    residual, weight, leverage : (profile, beam, height) float64
-    variance : (profile, height) float64
+    residual, weight, leverage : (profile, beam, altitude) float64
+    variance : (profile, altitude) float64
         Of the inhomogeneity.
 
     Returns
     -------
     products, norms : (profile, 3) float64
-    freedom : (profile, height) float64
-        Beams used less 2, at least 0.
+    freedom : (profile, altitude) float64
+        Number of beams used minus 2, at least 0.
     """
-    profiles, beams, heights = residual.shape
+    profiles, beams, altitudes = residual.shape
     products, norms = np.zeros((profiles, LAGS)), np.zeros((profiles, LAGS))
-    freedom = np.zeros((profiles, heights))
-    weighted, spread = np.zeros(heights), np.zeros(heights)
+    freedom = np.zeros((profiles, altitudes))
+    weighted, spread = np.zeros(altitudes), np.zeros(altitudes)
     for t in range(profiles):
         for beam in range(beams):
-            for k in range(heights):
+            for k in range(altitudes):
                 w = weight[t, beam, k]
                 share = w * variance[t, k] * (1.0 - leverage[t, beam, k])
                 u = residual[t, beam, k] * np.sqrt(w)
@@ -82,14 +89,14 @@ def lag_sums(
                 spread[k] = np.sqrt(share) if used else 0.0
             for lag in range(1, LAGS + 1):
                 product = norm = 0.0
-                for k in range(heights - lag):
+                for k in range(altitudes - lag):
                     joint = spread[k] * spread[k + lag]
                     if joint > 0.0:
                         product += joint * weighted[k] * weighted[k + lag]
                         norm += joint * joint
                 products[t, lag - 1] += product
                 norms[t, lag - 1] += norm
-        for k in range(heights):
+        for k in range(altitudes):
             freedom[t, k] = max(freedom[t, k] - 2.0, 0.0)
     return products, norms, freedom
 
@@ -97,8 +104,8 @@ def lag_sums(
 def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
     r"""Fit :math:`\phi \rho^h` to the pooled lag ratios of a block.
 
-    Detector noise is not correlated along height, so :math:`\phi` may be less than 1. Below a
-    ratio of 0.1 at the first lag the decay cannot be told, and :math:`\phi` is 1.
+    Detector noise is not correlated along altitude, so :math:`\phi` may be less than 1. With a
+    ratio below 0.1 at the first lag, the decay cannot be estimated, and :math:`\phi` is 1.
 
     Parameters
     ----------
@@ -126,35 +133,35 @@ def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
 
 @_compiled
 def correlated_precision(information: Array, share: Array, correlation: float) -> Array:
-    r"""Return the precision of the estimates as an autoregressive process along height.
+    r"""Return the precision of the estimates as an autoregressive process along altitude.
 
-    Noise of which only a share is correlated is no such process. The one here has its variance
-    and its power at low frequencies, which is where the smooth profile lies:
-    :math:`q = 1 + 2 f \rho / (1 - \rho)`, :math:`r = (q - 1) / (q + 1)`. A height that
-    shares less than half as much as one of the two on either side is no link of the chain: its
-    noise is its own, and would tell wrongly of that of its neighbours. It is bridged, as a single
-    missing height is; a longer hole breaks the chain.
+    Noise of which only a share f is correlated is not such a process. The one used here has the
+    same variance and the same power at low frequencies, which contain the smooth profile:
+    :math:`q = 1 + 2 f \rho / (1 - \rho)`, :math:`r = (q - 1) / (q + 1)`. An altitude whose
+    correlated share is less than half of that of one of the two on either side is not linked: most
+    of its noise is its own and does not predict that of its neighbours. It is bridged like a single
+    missing altitude; a longer gap breaks the chain.
 
     Parameters
     ----------
-    information : (profile, height) float64
+    information : (profile, altitude) float64
         0 where there is no estimate.
-    share : (profile, height) float64
+    share : (profile, altitude) float64
         Correlated share of the variance.
     correlation : float
-        At neighbouring heights.
+        Correlation of that noise at neighbouring altitudes.
 
     Returns
     -------
-    (3, profile, height) float64
-        Diagonal, and the first and second off-diagonals (of a height with those above it).
+    (3, profile, altitude) float64
+        Diagonal, and the first and second off-diagonals (of an altitude with those above it).
     """
-    profiles, heights = information.shape
-    bands = np.zeros((3, profiles, heights))
+    profiles, altitudes = information.shape
+    bands = np.zeros((3, profiles, altitudes))
     decay = 2.0 * correlation / (1.0 - correlation)
     for t in range(profiles):
         last, joint = -1, 0.0
-        for k in range(heights):
+        for k in range(altitudes):
             q = share[t, k] * decay
             joint *= q / (q + 2.0)
             if not information[t, k] > 0.0:

@@ -1,4 +1,4 @@
-"""What the vertical solution accepts, and the one shape in which its kernels get it."""
+"""Validation of the inputs of the vertical solution, and their form for the kernels."""
 
 from __future__ import annotations
 
@@ -16,32 +16,34 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 LARGEST_DEPTH: Final = 1e6
+"""Optical depth beyond which an estimate counts as missing."""
 _INFORMATION: Final = (1e-16, 1e16)
+"""Information below which an estimate counts as missing, and its upper limit."""
 _UNIFORM: Final = 1e-3
-"""Largest deviation of a step from the mean step, as a share: what rounded altitudes need."""
+"""Largest relative deviation of a step from the mean step; allows for rounded altitudes."""
 
 
 @dataclass(frozen=True, slots=True)
 class VerticalProblem:
-    """Estimates of single heights, cleaned."""
+    """Valid estimates of single altitudes."""
 
     optical_depth: Array
-    """(profile, height), 0 where there is no estimate."""
+    """(profile, altitude), 0 where there is no estimate."""
     information: Array
-    """(profile, height), 0 where there is no estimate."""
+    """(profile, altitude), 0 where there is no estimate."""
     altitude: Array
-    """(height,) m."""
+    """(altitude,) m."""
     station_altitude: float
     """m."""
 
 
 def matrix(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
-    """Return contiguous float64 of `shape`, broadcast along profiles.
+    """Return a contiguous float64 array of `shape`, broadcast along profiles.
 
     Raises
     ------
     RetrievalInputError
-        Where it does not fit.
+        For a shape that does not broadcast to it.
     """
     array = real_array(values, name).astype(np.float64, copy=False)
     try:
@@ -50,17 +52,17 @@ def matrix(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
         raise RetrievalInputError(
             f"has the shape {array.shape}, not {shape}",
             field=name,
-            remedy="give (profile, height), as the optical depth has",
+            remedy="give (profile, altitude), as for the optical depth",
         ) from None
 
 
 def beams(*arrays: npt.ArrayLike) -> tuple[Array, Array, Array]:
-    """Return residual, weight and leverage as contiguous (profile, beam, height) float64.
+    """Return residual, weight and leverage as contiguous (profile, beam, altitude) float64.
 
     Raises
     ------
     RetrievalInputError
-        Where they are not of one shape with three axes.
+        For arrays that do not have three axes and the same shape.
     """
     first, second, third = (
         np.ascontiguousarray(real_array(values, name), dtype=np.float64)
@@ -71,7 +73,7 @@ def beams(*arrays: npt.ArrayLike) -> tuple[Array, Array, Array]:
             raise RetrievalInputError(
                 f"has the shape {array.shape}",
                 field=name,
-                remedy="give (profile, beam, height), the same for residual, weight and leverage",
+                remedy="give (profile, beam, altitude), the same for residual, weight and leverage",
             )
     return first, second, third
 
@@ -82,24 +84,24 @@ def vertical_problem(
     altitude: npt.ArrayLike,
     station_altitude: float,
 ) -> VerticalProblem:
-    """Check and clean the input of `lidarops.retrieve.multiangle.vertical.smooth_profile.smooth_optical_depth`.
+    """Validate the input of `smooth_profile.smooth_optical_depth` and drop invalid estimates.
 
     Raises
     ------
     RetrievalInputError
-        For shapes that do not fit, and for an altitude that is not one.
+        For inconsistent shapes, negative information or an invalid altitude axis.
     """
     depth = np.array(real_array(optical_depth, "optical_depth"), dtype=np.float64)
     if depth.ndim != 2:
         raise RetrievalInputError(
             f"has the shape {depth.shape}",
             field="optical_depth",
-            remedy="give (profile, height)",
+            remedy="give (profile, altitude)",
         )
     grid, station = _grid(altitude, station_altitude)
     if depth.shape[1] != grid.size:
         raise RetrievalInputError(
-            f"has {depth.shape[1]} heights, but altitude has {grid.size}",
+            f"has {depth.shape[1]} altitudes, but altitude has {grid.size}",
             field="optical_depth",
             remedy="the last axis of optical_depth is altitude",
         )
@@ -118,14 +120,14 @@ def _grid(altitude: npt.ArrayLike, station_altitude: float) -> tuple[Array, floa
     grid = np.ascontiguousarray(real_array(altitude, "altitude"), dtype=np.float64)
     if grid.ndim != 1 or grid.size == 0 or not np.all(np.isfinite(grid)):
         raise RetrievalInputError(
-            "is not a finite axis", field="altitude", remedy="give one value in m per height"
+            "is not a finite axis", field="altitude", remedy="give a list of values in m"
         )
     station = finite(station_altitude, "station_altitude")
     if not grid[0] > station:
         raise RetrievalInputError(
             f"starts at {grid[0]:g} m, not above the lidar at {station:g} m",
             field="altitude",
-            remedy="cut the heights at and below the lidar",
+            remedy="remove the altitudes at and below the lidar",
         )
     steps = np.diff(grid)
     mean = (grid[-1] - grid[0]) / max(steps.size, 1)
@@ -139,12 +141,12 @@ def _grid(altitude: npt.ArrayLike, station_altitude: float) -> tuple[Array, floa
 
 
 def finite(value: float, name: str, *, least: float = -np.inf) -> float:
-    """Return a finite number that is not below `least`.
+    """Return a finite number of at least `least`.
 
     Raises
     ------
     RetrievalInputError
-        For any other.
+        For any other value.
     """
     number = real_array(value, name).astype(np.float64)
     if number.ndim != 0 or not np.isfinite(number) or number < least:
@@ -160,7 +162,7 @@ def labels(block: npt.ArrayLike | None, profiles: int) -> npt.NDArray[Any]:
     Raises
     ------
     RetrievalInputError
-        Where they are not one whole number for each profile.
+        For labels that are not one whole number per profile.
     """
     array = np.zeros(profiles, dtype=np.int64) if block is None else np.asarray(block)
     if array.shape != (profiles,) or (array.dtype.kind not in "iu" and array.size):
@@ -172,30 +174,30 @@ def labels(block: npt.ArrayLike | None, profiles: int) -> npt.NDArray[Any]:
     return array
 
 
-def moments(given: ResidualMoments, problem_: VerticalProblem) -> ResidualMoments:
-    """Return residual moments with their shapes checked.
+def validated_moments(moments: ResidualMoments, problem: VerticalProblem) -> ResidualMoments:
+    """Return residual moments after validation of their shapes.
 
     Raises
     ------
     RetrievalInputError
-        Where they are of other profiles or heights.
+        For moments of other profiles or altitudes.
     """
-    profiles = problem_.optical_depth.shape[0]
+    profiles = problem.optical_depth.shape[0]
     shapes: dict[str, tuple[int, ...]] = {
         "lag_products": (profiles, LAGS),
         "lag_norms": (profiles, LAGS),
-        "inhomogeneity_share": problem_.optical_depth.shape,
-        "degrees_of_freedom": problem_.optical_depth.shape,
+        "inhomogeneity_share": problem.optical_depth.shape,
+        "degrees_of_freedom": problem.optical_depth.shape,
         "gaps": (profiles,),
     }
     for name, shape in shapes.items():
-        if getattr(given, name).shape != shape:
+        if getattr(moments, name).shape != shape:
             raise RetrievalInputError(
-                f"has the shape {getattr(given, name).shape}, not {shape}",
+                f"has the shape {getattr(moments, name).shape}, not {shape}",
                 field=f"residuals.{name}",
-                remedy="make it by residual_moments from the same profiles",
+                remedy="call residual_moments with the same profiles",
             )
-    return given
+    return moments
 
 
 def layer(altitude: Array, station_altitude: float, bottom: float, top: float) -> tuple[int, int]:
@@ -204,11 +206,11 @@ def layer(altitude: Array, station_altitude: float, bottom: float, top: float) -
     Raises
     ------
     RetrievalInputError
-        Where a bound is outside the grid, or they are not in order.
+        For a bound outside the grid, or bounds not in order.
     """
     levels = np.concatenate([[station_altitude], altitude])
     half = 0.5 * (altitude[1] - altitude[0] if altitude.size > 1 else 0.0)
-    found = []
+    indices = []
     for value, name in ((bottom, "bottom"), (top, "top")):
         level = finite(value, name)
         nearest = int(np.argmin(np.abs(levels - level)))
@@ -218,11 +220,11 @@ def layer(altitude: Array, station_altitude: float, bottom: float, top: float) -
                 field=name,
                 remedy=f"give the station or {altitude[0]:g} to {altitude[-1]:g} m",
             )
-        found.append(nearest - 1)
-    if found[0] >= found[1]:
+        indices.append(nearest - 1)
+    if indices[0] >= indices[1]:
         raise RetrievalInputError(
-            f"the layer from {bottom:g} to {top:g} m holds no height",
+            f"the layer from {bottom:g} to {top:g} m contains no altitude",
             field="top",
             remedy="give a top at least one spacing above the bottom",
         )
-    return found[0], found[1]
+    return indices[0], indices[1]

@@ -1,4 +1,4 @@
-"""How smooth a block of profiles is: restricted likelihood and Mallows' Cp over a fixed grid."""
+"""Choice of the smoothness of a block: restricted likelihood and Mallows' Cp on a fixed grid."""
 
 from __future__ import annotations
 
@@ -17,14 +17,18 @@ PER_DECADE: Final = 6
 GRID: Final = 10.0 ** (np.arange(11 * PER_DECADE + 1) / PER_DECADE - 10.0)
 """Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
 LEAST_FREEDOM: Final = 2.0
+"""Degrees of freedom below which a weight is not allowed."""
 FEWEST_TO_CHOOSE: Final = 8
-"""Profiles of a block from which one weight is chosen; below, solutions are averaged."""
+"""Profiles in a block from which on one weight is chosen; with fewer, solutions are averaged."""
 _SCORED_PROFILES: Final = 64
-_SCORED_HEIGHTS: Final = 25_600
-"""What a block is scored on at most: as many profiles, or heights of all of them together."""
+_SCORED_VALUES: Final = 25_600
+"""A block is scored on at most so many profiles, or profiles with so many values together."""
 _SWITCH: Final = 1.2
+"""Ratio of degrees of freedom from which on Cp is preferred to the likelihood."""
 _STRANGE: Final = 3.0
+"""Cp of a profile, in medians, beyond which it is left out of the sum."""
 _NEGLIGIBLE: Final = 1e-6
+"""Relative likelihood below which a weight is left out of the average."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +36,13 @@ class SmoothingChoice:
     """Weights of smoothness of one block."""
 
     smoothing: Array
-    """(candidate,): dimensionless; one of them, or several to be averaged over."""
+    """(candidate,): dimensionless; one weight, or several to be averaged over."""
     share: Array
-    """(candidate,): what each counts, 1 together."""
+    """(candidate,): share of each in the average, 1 in total."""
     effective_degrees_of_freedom: float
     """Mean over the scored profiles and the candidates."""
     saturated: bool
-    """Whether the best is the smoothest that is admitted."""
+    """Whether the best weight is the largest that is allowed."""
 
     @property
     def mean_smoothing(self) -> float:
@@ -51,9 +55,9 @@ class Scores:
     """The criteria on the grid, summed over the scored profiles of a block."""
 
     likelihood: Array
-    """(smoothing,): minus twice the restricted log-likelihood, but for a constant."""
+    """(smoothing,): minus twice the restricted log-likelihood, up to a constant."""
     risk: Array
-    """(smoothing,): Mallows' Cp, but for a constant."""
+    """(smoothing,): Mallows' Cp, up to a constant."""
     freedom: Array
     """(smoothing,): mean effective degrees of freedom of a profile."""
     profiles: int
@@ -69,46 +73,46 @@ def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: floa
         J = \sum [t'\Omega(t - x) + \ln|\Omega + \lambda K|] - r \ln\lambda, \quad
         C_p = \sum [(t - x)'\Omega(t - x) + 2 tr C\Omega],
 
-    where profiles unlike the others are left out of Cp: those with 3 times the median where the
-    median is least. A long block is scored on every n-th profile.
+    where profiles unlike the others are left out of Cp: those with more than 3 times the median at
+    the weight with the least median. A long block is scored on every n-th profile.
 
     Parameters
     ----------
-    bands : (3, profile, height) float64
-    estimates : (profile, height) float64
+    bands : (3, profile, altitude) float64
+    estimates : (profile, altitude) float64
         0 where there is none.
-    stiffness : (3, height) float64
+    stiffness : (3, altitude) float64
     unit : float
-        What the dimensionless weights are multiplied by.
+        Factor of the dimensionless weights.
 
     Returns
     -------
     Scores
     """
-    profiles, heights = estimates.shape
-    most = max(_SCORED_PROFILES, _SCORED_HEIGHTS // heights)
+    profiles, altitudes = estimates.shape
+    most = max(_SCORED_PROFILES, _SCORED_VALUES // altitudes)
     scored = np.arange(0, profiles, -(-profiles // most))
     right = _banded.multiply_rows(bands, estimates)
     profile = np.repeat(scored, GRID.size)
     lam = np.tile(GRID * unit, scored.size)
     raw = _banded.banded_scores(bands, right, estimates, stiffness, profile, lam)
     fit, misfit, freedom, logarithm = raw.reshape(4, scored.size, GRID.size)
-    likelihood = (fit + logarithm - (heights - 1) * np.log(GRID * unit)).sum(axis=0)
-    # Where a pivot lost all its digits, the weight is too large to be thought of.
+    likelihood = (fit + logarithm - (altitudes - 1) * np.log(GRID * unit)).sum(axis=0)
+    # Where a pivot lost all its digits, the weight is too large.
     likelihood = np.where(np.isfinite(likelihood), likelihood, np.inf)
     risk = misfit + 2.0 * freedom
     typical = np.median(risk, axis=0)
     best = int(np.argmin(typical))
-    sane = risk[:, best] <= _STRANGE * typical[best]
-    return Scores(likelihood, risk[sane].sum(axis=0), freedom.mean(axis=0), profiles)
+    typical_profiles = risk[:, best] <= _STRANGE * typical[best]
+    return Scores(likelihood, risk[typical_profiles].sum(axis=0), freedom.mean(axis=0), profiles)
 
 
 def choose_smoothing(scores: Scores) -> SmoothingChoice:
     """Choose the weight of a block, or the weights to average over.
 
-    Profiles of a block share their shape, which the likelihood takes for independent draws: in
-    clouds it then smooths too much. Cp knows the noise, but is erratic; it is followed only
-    where it asks for 1.2 times the degrees of freedom, and at most by a factor of 10.
+    Profiles of a block have similar shapes, but the likelihood treats them as independent; in
+    clouds it then smooths too much. Cp uses the known noise, but is erratic. It is used only if it
+    gives 1.2 times the degrees of freedom, and lowers the weight by at most a factor of 10.
     """
     admitted = np.flatnonzero((scores.freedom >= LEAST_FREEDOM) & np.isfinite(scores.likelihood))
     last = int(admitted[-1]) if admitted.size else 0

@@ -1,4 +1,4 @@
-"""The precision of optical depths along height where samples are missing here and there."""
+"""Precision of optical depths along altitude where samples are missing between others."""
 
 from __future__ import annotations
 
@@ -12,45 +12,48 @@ Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 
 _HALF_WINDOW: Final = 7
+"""Altitudes to either side over which the noise of single altitudes is averaged."""
 _LINKED: Final = 0.5
+"""Correlated share, over the largest of the neighbours, from which on an altitude is linked."""
 _FARTHEST: Final = 2
+"""Largest distance of linked altitudes."""
 _LEAST_SHARE: Final = 1e-6
-"""Below which no noise is shared, and its ratio to that of a height's own means nothing."""
+"""Correlated share up to which noise counts as uncorrelated."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 def profiles_with_gaps(
-    there: Booleans, signal: npt.NDArray[np.floating], variance: Array
+    used: Booleans, signal: npt.NDArray[np.floating], variance: Array
 ) -> Booleans:
-    """Tell which profiles miss samples between others of the same beam.
+    """Return which profiles miss samples between others of the same beam.
 
-    Of weak light, a sample that noise made negative is not missing, though it is not used.
+    A weak signal that noise made negative is not used, but does not count as missing.
 
     Parameters
     ----------
-    there : (profile, beam, height) bool
+    used : (profile, beam, altitude) bool
         Samples that are used.
-    signal, variance : (profile, beam, height) float
+    signal, variance : (profile, beam, altitude) float
         NaN where missing.
 
     Returns
     -------
     (profile,) bool
     """
-    found: Booleans = np.any(there[..., 1:] & ~there[..., :-1], axis=(1, 2))
-    rows = np.flatnonzero(found)
+    gaps: Booleans = np.any(used[..., 1:] & ~used[..., :-1], axis=(1, 2))
+    rows = np.flatnonzero(gaps)
     if rows.size:
-        below = np.logical_or.accumulate(there[rows], axis=-1)
-        above = np.logical_or.accumulate(there[rows, :, ::-1], axis=-1)[..., ::-1]
-        given = np.isfinite(signal[rows]) & np.isfinite(variance[rows])
-        found[rows] = np.any(below & above & ~given, axis=(1, 2))
-    return found
+        below = np.logical_or.accumulate(used[rows], axis=-1)
+        above = np.logical_or.accumulate(used[rows, :, ::-1], axis=-1)[..., ::-1]
+        measured = np.isfinite(signal[rows]) & np.isfinite(variance[rows])
+        gaps[rows] = np.any(below & above & ~measured, axis=(1, 2))
+    return gaps
 
 
 @_compiled
 def _link(information: Array, share: Array, linked: Booleans) -> None:
-    """Fill which heights share at least half as much noise as the two on either side."""
+    """Fill which altitudes have at least half of the correlated share of those on either side."""
     for k in range(share.size):
         most = np.max(share[max(k - 2, 0) : k + 3])
         enough = share[k] > _LEAST_SHARE and share[k] >= _LINKED * most
@@ -59,7 +62,7 @@ def _link(information: Array, share: Array, linked: Booleans) -> None:
 
 @_compiled
 def _own_noise(share: Array, linked: Booleans, k: int) -> float:
-    """Return the mean over links around a height of their own noise over what they share."""
+    """Return the mean over links around an altitude of own over correlated noise."""
     total = count = 0.0
     for j in range(max(k - _HALF_WINDOW, 0), min(k + _HALF_WINDOW + 1, share.size)):
         if linked[j]:
@@ -70,49 +73,50 @@ def _own_noise(share: Array, linked: Booleans, k: int) -> float:
 
 @_compiled
 def gap_precision(information: Array, share: Array, correlation: float) -> Array:
-    r"""Return the precision of estimates of which neighbours come from other beams.
+    r"""Return the precision of estimates whose neighbours come from different beams.
 
-    The noise is :math:`n_k = c_k + e_k`: the first is shared, of variance :math:`f / I` and
-    correlated by :math:`\rho^d`, the second of a height alone. The variance of
-    c hardly changes with the beams that are missing, that of e does from height to height. In
-    a chain of the standard errors of single heights, :math:`z_k - r z_{k-1}` over
-    :math:`\sqrt{1 - r^2}` would take a smooth profile for one that jumps with these,
-    and the data for far more certain than they are; so links have the mean
+    The noise is :math:`n_k = c_k + e_k`: c is common to altitudes, with the variance
+    :math:`f / I` and the correlation :math:`\rho^d`; e is that of a single altitude. The variance
+    of c hardly depends on the missing beams, while that of e changes from altitude to altitude. In
+    a chain scaled with the standard errors of single altitudes, :math:`z_k - r z_{k-1}` over
+    :math:`\sqrt{1 - r^2}` would turn a smooth profile into one that jumps with these errors, and
+    the data would appear far more certain than they are. Links therefore have the mean
     :math:`m = \overline{(1 - f) / f}` of their neighbourhood,
 
     .. math:: f' = \frac{1}{1 + m_k}, \quad I' = \frac{f' I}{f}, \quad
               m_k = m + (1 - r)^2 \left(\frac{1 - f}{f} - m\right), \quad r = \frac{q - 1}{q + 1},
 
-    which leaves a chain of little correlation the weights of its heights.
+    so that a chain with little correlation keeps the weights of its altitudes.
 
-    At low frequencies, a height of a chain tells :math:`I / q` of a smooth profile, and two links
-    that bridge a third :math:`(1 - r^2) / (1 + r^2)`, nearly twice :math:`(1 - r) / (1 + r)`. The
-    height that is bridged adds what is missing, :math:`(1 - r)^2 / (1 + r^2) \cdot I / q`, not
-    I. Behind a hole of more than one height no link is possible: a chain that starts anew there
-    tells :math:`(1 - r^d) / (1 + r^d)` of what the first of all tells.
+    At low frequencies, an altitude of a chain has the information :math:`I / q` on a smooth
+    profile, and two links that bridge a third :math:`(1 - r^2) / (1 + r^2)`, nearly twice
+    :math:`(1 - r) / (1 + r)`. The bridged altitude adds the missing information,
+    :math:`(1 - r)^2 / (1 + r^2) \cdot I / q`, not I. Behind a gap of more than one altitude no
+    link is possible: the chain that starts there has :math:`(1 - r^d) / (1 + r^d)` of the
+    information of a first altitude.
 
     Parameters
     ----------
-    information : (profile, height) float64
+    information : (profile, altitude) float64
         0 where there is no estimate.
-    share : (profile, height) float64
+    share : (profile, altitude) float64
         f, correlated share of the variance.
     correlation : float
-        :math:`\rho`, of the shared noise at neighbouring heights.
+        :math:`\rho`, of the correlated noise at neighbouring altitudes.
 
     Returns
     -------
-    (3, profile, height) float64
-        Diagonal, and the first and second off-diagonals (of a height with those above it).
+    (3, profile, altitude) float64
+        Diagonal, and the first and second off-diagonals (of an altitude with those above it).
     """
-    profiles, heights = information.shape
-    bands = np.zeros((3, profiles, heights))
+    profiles, altitudes = information.shape
+    bands = np.zeros((3, profiles, altitudes))
     decay = 2.0 * correlation / (1.0 - correlation)
-    linked = np.zeros(heights, np.bool_)
+    linked = np.zeros(altitudes, np.bool_)
     for t in range(profiles):
         _link(information[t], share[t], linked)
         last, known = -1, 0.0
-        for k in range(heights):
+        for k in range(altitudes):
             own = information[t, k]
             if not (own > 0.0 and share[t, k] > _LEAST_SHARE):
                 bands[0, t, k] = own

@@ -15,35 +15,37 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 def project(profiles: Array) -> Array:
     """Return the nearest profiles that start at 0 or above and never decrease.
 
-    Neighbours out of order are pooled to their mean until none is (Ayer et al. 1955); negative
-    means then become 0, which is the projection under both conditions.
+    Neighbours out of order are pooled to their mean until none is left (pool adjacent violators,
+    `ayer1955`). Negative means then become 0, which is the least-squares projection under both
+    conditions. The result has no negative extinction, but means over many profiles are biased high
+    where the signal is weak; those of the profiles themselves are not.
 
     Parameters
     ----------
-    profiles : (profile, height) float64
-        NaN is passed over and stays.
+    profiles : (profile, altitude) float64
+        NaN is skipped and stays.
 
     Returns
     -------
-    (profile, height) float64
+    (profile, altitude) float64
     """
     out = np.full(profiles.shape, np.nan)
-    heights = profiles.shape[1]
-    mean, count = np.empty(heights), np.empty(heights, dtype=np.int64)
+    altitudes = profiles.shape[1]
+    mean, count = np.empty(altitudes), np.empty(altitudes, dtype=np.int64)
     for t in range(profiles.shape[0]):
         pools = 0
-        for k in range(heights):
+        for k in range(altitudes):
             if np.isnan(profiles[t, k]):
                 continue
             mean[pools], count[pools] = profiles[t, k], 1
             while pools > 0 and mean[pools - 1] >= mean[pools]:
-                both = count[pools - 1] + count[pools]
-                mean[pools - 1] += (mean[pools] - mean[pools - 1]) * count[pools] / both
-                count[pools - 1] = both
+                merged = count[pools - 1] + count[pools]
+                mean[pools - 1] += (mean[pools] - mean[pools - 1]) * count[pools] / merged
+                count[pools - 1] = merged
                 pools -= 1
             pools += 1
         pool, left = -1, 0
-        for k in range(heights):
+        for k in range(altitudes):
             if np.isnan(profiles[t, k]):
                 continue
             if left == 0:
