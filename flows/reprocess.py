@@ -47,10 +47,10 @@ from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneErro
 from lidarops.records import ProductKind, RunRecord, SceneOutcome
 from lidarops.reports import run_page
 from lidarops.run import clusters
-from lidarops.run import selection as asked
 from lidarops.run.archive import Options, Result, Selection, bring_up_to_date, report_run
-from lidarops.run.options import unreported
+from lidarops.run.options import missing_report
 from lidarops.run.publication import publish_products
+from lidarops.run.selection import check_archive_and_catalog, check_selection, selects_no_scene
 
 _T = TypeVar("_T")
 
@@ -244,10 +244,10 @@ def reprocess(
         publish_task(_opaque(settings), publish)
     built = None
     if result.record is None:
-        none = asked.none(settings, selection)
+        none = selects_no_scene(settings, selection)
         what = "no scene of the archive is asked for" if none else "nothing to do"
         get_run_logger().info("campaign %s: %s", settings.name, what)
-        if said := unreported(settings):
+        if said := missing_report(settings):
             get_run_logger().warning("campaign %s: %s", settings.name, said)
     else:
         local = chosen.workers if isinstance(chosen, clusters.Local) else 1
@@ -284,14 +284,14 @@ def _tell_troubles(campaign: Campaign, result: Result) -> str:
     named = {
         "scenes failed": failed,
         "scenes left nothing to use": dict.fromkeys(
-            (*result.empty, *(each.scene for each in scenes if each.empty)),
+            (*result.unusable, *(each.scene for each in scenes if each.unusable)),
             "its retrievals left nothing to use",
         ),
         "files refused": _refused(campaign, result),
-        "scenes can give no product": result.barren,
+        "scenes can give no product": result.empty_scenes,
         "good files stand in no scene": result.set_aside,
         "channels named and in no file": {
-            f"{each.channel} of {each.instrument}, for {each.asked}": each.reason
+            f"{each.channel} of {each.instrument}, for {each.requested_by}": each.reason
             for each in result.unmet
             if each.nowhere
         },
@@ -304,7 +304,7 @@ def _tell_troubles(campaign: Campaign, result: Result) -> str:
         if len(troubles) > _NAMED:
             logger.warning("... and %d more %s", len(troubles) - _NAMED, what)
     numbers = {what: len(each) for what, each in named.items()}
-    numbers["more on days in which nothing changed"] = result.untold
+    numbers["more on days in which nothing changed"] = result.more_unused
     told = ", ".join(f"{number} {what}" for what, number in numbers.items() if number)
     logger.warning("campaign %s: %s", campaign.name, told)
     return told
@@ -373,11 +373,11 @@ def main(
         valid = reprocess.validate_parameters(given)
         settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
         of_selection = ("instruments", "stations", "products", "since", "until")
-        asked.refuse_unknown(settings, _selection(*(valid[name] for name in of_selection)))
+        check_selection(settings, _selection(*(valid[name] for name in of_selection)))
         clusters.choose_cluster(
             workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
         )
-        asked.refuse_nowhere(settings, archive=archive)
+        check_archive_and_catalog(settings, archive=archive)
     with usage.told():
         result, built = reprocess(**given)
     if result.record is None:

@@ -1,8 +1,8 @@
-"""Frozen records that cross module borders: the vocabulary of lidarops, no logic.
+"""Frozen records that all packages share: the vocabulary of lidarops, without logic.
 
-The words mean the same everywhere: a *granule* is one raw file as catalogued, a *scene*
-the granules that are processed together, a *plan* what runs for one scene and what is
-left out and why, a *product* one NetCDF file, a *run* one execution over many scenes.
+A *granule* is one raw file as catalogued. A *scene* is the granules that are processed together.
+A *plan* lists the steps that run for one scene, and those that are left out, with the reasons. A
+*product* is one NetCDF file. A *run* is one execution over many scenes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class DetectionMode(StrEnum):
 
 
 class Role(StrEnum):
-    """What a file is for."""
+    """Purpose of a file."""
 
     SIGNAL = "signal"
     DARK = "dark"
@@ -40,7 +40,7 @@ class Status(StrEnum):
 
 
 class ProductKind(StrEnum):
-    """Kinds of product."""
+    """Kind of product."""
 
     SIGNAL = "signal"
     HOMOGENEOUS = "homogeneous"
@@ -51,13 +51,13 @@ class ProductKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ChannelLayout:
-    """What a channel looks like in every file of a layout: its place on the range grid."""
+    """One channel of raw files: its detection mode, wavelength and range grid."""
 
     name: str
-    """Identifier such as ``photon_532o``: mode, wavelength label, polarisation."""
+    """Identifier such as ``photon_532o``: mode, wavelength in nm, polarisation."""
     mode: DetectionMode
     wavelength: float
-    """m; NaN where the header holds no wavelength that light detectors know."""
+    """m; NaN where the header gives no plausible wavelength."""
     bins: int
     bin_width: float
     """m."""
@@ -79,7 +79,7 @@ class Granule:
     reason: str = ""
     """Why the granule is refused; empty when good."""
     notes: tuple[str, ...] = ()
-    """What is odd about a good granule, in words."""
+    """Peculiarities of a good granule, in words."""
     start: datetime | None = None
     stop: datetime | None = None
     zenith_angle: float | None = None
@@ -92,19 +92,19 @@ class Granule:
     """m above the geoid."""
     layout: tuple[ChannelLayout, ...] = ()
     sha256: str | None = None
-    """Of the whole file; None until the file has been read whole."""
+    """Digest of the file; None until the whole file has been read."""
     header_digest: str | None = None
-    """Equal in files whose headers differ in what stands above alone, and in the lasers; None
-    where that is not known, or the file may have changed."""
+    """Equal for files whose headers differ only in the fields above and in the lasers; None where
+    unknown, or where the file may have changed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """Good signal files of one instrument with the same channels, of a stretch of time."""
+    """Number of good signal files of one instrument with the same channels, in one period."""
 
     instrument: str
     since: datetime
-    """Where the stretch begins, not its first file."""
+    """Start of the period, not of its first file."""
     layout: tuple[ChannelLayout, ...]
     files: int
 
@@ -123,10 +123,10 @@ class Scene:
     granules: tuple[Granule, ...]
     """Good signal granules, by start time then path."""
     dark: tuple[Granule, ...] = ()
-    """Good dark granules that serve this scene, by start time then path."""
+    """Good dark granules for this scene, by start time then path."""
     members: tuple[Scene, ...] = ()
-    """Of a network: the part of each instrument, whose granules are together those of the scene;
-    `station` and `instrument` are the network's key. Empty for a single instrument."""
+    """Scenes of the instruments of a network, which together hold the granules of this scene;
+    `station` and `instrument` are the key of the network. Empty for a single instrument."""
 
     @property
     def layout(self) -> tuple[ChannelLayout, ...]:
@@ -136,18 +136,18 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One thing that the plan does, with the settings it does it with."""
+    """One step of a plan, with its settings and the reason why it runs."""
 
     name: str
     channel: str
     settings: Mapping[str, Any]
     reason: str
     instrument: str = ""
-    """Member of a network that the step is for; empty where the scene has no members."""
+    """Member of a network to which the step applies; empty where the scene has no members."""
     rule: str = ""
     """Name of the rule that decided, in `lidarops.plan.rule_table`."""
     number: float | None = None
-    """That the rule decided on, where there is one."""
+    """Number on which the rule decided, where there is one."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step as plain JSON types."""
@@ -156,14 +156,14 @@ class Step:
             "channel": self.channel,
             "settings": dict(self.settings),
             "reason": self.reason,
-            **_of_member(self.instrument),
-            **_decided(self.rule, self.number),
+            **_member_field(self.instrument),
+            **_rule_fields(self.rule, self.number),
         }
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """One thing that the plan does not do, and why."""
+    """One step that a plan leaves out, and the reason."""
 
     name: str
     channel: str
@@ -173,25 +173,25 @@ class LeftOut:
     rule: str = ""
     """Name of the rule that decided, in `lidarops.plan.rule_table`."""
     number: float | None = None
-    """That the rule decided on, where there is one."""
+    """Number on which the rule decided, where there is one."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain JSON types."""
+        """Return the omission as plain JSON types."""
         return {
             "name": self.name,
             "channel": self.channel,
             "reason": self.reason,
-            **_of_member(self.instrument),
-            **_decided(self.rule, self.number),
+            **_member_field(self.instrument),
+            **_rule_fields(self.rule, self.number),
         }
 
 
-def _of_member(instrument: str) -> dict[str, Any]:
-    """Return what only plans of networks hold, so that other plans keep their hash."""
+def _member_field(instrument: str) -> dict[str, Any]:
+    """Return the instrument in plans of networks; plans of single instruments lack the key."""
     return {"instrument": instrument} if instrument else {}
 
 
-def _decided(rule: str, number: float | None) -> dict[str, Any]:
+def _rule_fields(rule: str, number: float | None) -> dict[str, Any]:
     return {
         **({"rule": rule} if rule else {}),
         **({"number": number} if number is not None else {}),
@@ -200,7 +200,7 @@ def _decided(rule: str, number: float | None) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What runs for one scene, and what is left out and why. Pure data."""
+    """The steps that run for one scene, and those that are left out, with the reasons."""
 
     scene: str
     steps: tuple[Step, ...]
@@ -223,7 +223,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class InputRecord:
-    """One file that a product was made from."""
+    """One input file of a product."""
 
     path: str
     role: Role
@@ -232,7 +232,7 @@ class InputRecord:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where a product came from: everything that its content depends on."""
+    """Origin of a product: everything on which its content depends."""
 
     campaign: str
     scene: str
@@ -241,7 +241,7 @@ class Provenance:
     inputs: tuple[InputRecord, ...]
     plan: Plan
     settings: Mapping[str, Any]
-    """The part of the campaign that the product depends on, as plain JSON types."""
+    """The part of the campaign on which the product depends, as plain JSON types."""
     versions: Mapping[str, str]
     """Package name -> version."""
     code_version: str
@@ -249,7 +249,7 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class ProductRecord:
-    """One product that was written."""
+    """One written product."""
 
     path: str
     """Relative to the product root, with forward slashes."""
@@ -264,19 +264,19 @@ class ProductRecord:
     unflagged: int
     """Number of values that carry no bit."""
     usable: int | None = None
-    """Number of values that no bit rejects; None where it was not counted."""
+    """Number of values without a rejecting bit; None where they were not counted."""
 
 
-JUDGE_THEMSELVES: Final = (ProductKind.ELASTIC, ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
-"""Products of which a scene is a trouble where all values are rejected.
+EXPECTED_USABLE: Final = (ProductKind.ELASTIC, ProductKind.MULTIANGLE, ProductKind.VISIBILITY)
+"""Kinds of product of which a scene should have usable values.
 
-Not homogeneous ones: sections are tried in any air, and fog or the dark leaves none of them.
+Not ``homogeneous``: its sections are retrieved in any air, and fog or darkness rejects all values.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class SceneOutcome:
-    """What became of one scene."""
+    """Result of processing one scene."""
 
     scene: str
     station: str
@@ -286,49 +286,47 @@ class SceneOutcome:
     plan: Plan | None
     products: tuple[ProductRecord, ...] = ()
     refused: tuple[Granule, ...] = ()
-    """Granules that turned out unreadable while processing."""
+    """Granules that could not be read during processing."""
     inputs: tuple[InputRecord, ...] = ()
     error: str = ""
-    """Why the scene gave no product; empty when it did."""
+    """Why the scene gave no product; empty where it gave one."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time by stage."""
     bytes_read: int = 0
-    """Of raw files, headers apart."""
+    """Bytes of raw files, without headers."""
     cpu_seconds: float = 0.0
-    """CPU time of the thread that processed it; 0 where it was not measured."""
+    """CPU time of the thread that processed the scene; 0 where not measured."""
     estimated_seconds: float = 0.0
-    """CPU time that was reckoned with before; 0 where nothing was."""
+    """CPU time estimated before the run; 0 where not estimated."""
     left_out: tuple[LeftOut, ...] = ()
-    """What else was left out of what the scene was asked for: of products that it does not give at
-    all, and of channels that it does not read, while `plan` tells of those that were made."""
+    """Requested steps that are not in `plan`, because their product or channel was not made."""
 
     @property
-    def empty(self) -> bool:
-        """Whether every value of the retrievals that judge themselves is rejected."""
-        retrieved = [product for product in self.products if product.kind in JUDGE_THEMSELVES]
+    def unusable(self) -> bool:
+        """Whether all values of the products in `EXPECTED_USABLE` are rejected."""
+        retrieved = [product for product in self.products if product.kind in EXPECTED_USABLE]
         return bool(retrieved) and all(product.usable == 0 for product in retrieved)
 
 
 @dataclass(frozen=True, slots=True)
 class Unmet:
-    """What a campaign asks for, or tells facts of, and files of an instrument do not hold."""
+    """A channel that a campaign requests or gives facts of, and files of an instrument lack."""
 
     instrument: str
     channel: str
-    asked: str
-    """Kind of the product that asks for the channel, or the facts that name it, with their
-    period."""
+    requested_by: str
+    """Kind of the product that needs the channel, or the facts that name it, with their period."""
     reason: str
     files: int
-    """Number of files that lack it."""
+    """Number of files that lack the channel."""
     of: int
-    """Number of files that were to hold it: all of the instrument, or of the period of facts."""
+    """Number of files that should hold it: all of the instrument, or of the period of the facts."""
     held: int
-    """Number of files of the instrument, of whatever period, that hold it."""
+    """Number of files of the instrument, of any period, that hold it."""
 
     @property
     def nowhere(self) -> bool:
-        """Whether no file holds it, as after a slip of the pen."""
+        """Whether no file holds the channel, as after a typing error."""
         return self.held == 0
 
 
@@ -351,19 +349,20 @@ class RunRecord:
     truth: str = ""
     """Path of the truth file of a simulated campaign, empty for real data."""
     costs: str = ""
-    """Whence the costs were that times were estimated with; empty where nothing was estimated."""
+    """Source of the costs behind the estimated times; empty where nothing was estimated."""
     unmet: tuple[Unmet, ...] = ()
-    """What is asked for, or told facts of, and not in the files; what no file holds first."""
-    barren: Mapping[str, str] = field(default_factory=dict)
-    """Scene -> why it can give no product, of the first of those that the run looked at."""
-    more_barren: int = 0
-    """How many more there were."""
+    """Channels that are requested or have facts, but are missing in files; those that no file
+    holds come first."""
+    empty_scenes: Mapping[str, str] = field(default_factory=dict)
+    """Scene -> why it can give no product; the first of those that the run examined."""
+    more_empty_scenes: int = 0
+    """Number of further scenes without product."""
 
     @property
     def failed(self) -> bool:
-        """Whether anything was refused or failed, was asked for in vain, or left nothing to use."""
+        """Whether a file was refused, a scene failed or is unusable, or a channel is in no file."""
         return (
-            bool(self.refused or self.barren)
-            or any(each.nowhere for each in self.unmet)
-            or any(scene.error or scene.refused or scene.empty for scene in self.scenes)
+            bool(self.refused or self.empty_scenes)
+            or any(request.nowhere for request in self.unmet)
+            or any(scene.error or scene.refused or scene.unusable for scene in self.scenes)
         )

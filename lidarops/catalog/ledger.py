@@ -31,7 +31,7 @@ from lidarops.catalog.schema import (
 )
 from lidarops.errors import CatalogError
 from lidarops.records import (
-    JUDGE_THEMSELVES,
+    EXPECTED_USABLE,
     Granule,
     InputRecord,
     ProductRecord,
@@ -486,8 +486,8 @@ class Ledger(Granules):
         with self.transaction() as connection:
             return {row.scene: row.error for row in connection.execute(query)}
 
-    def empty(self, *, without: Collection[str] = ()) -> list[str]:
-        """Return the scenes whose retrievals left nothing to use, as `SceneOutcome.empty`.
+    def unusable_scenes(self, *, without: Collection[str] = ()) -> list[str]:
+        """Return the scenes whose retrievals left nothing to use, as `SceneOutcome.unusable`.
 
         Parameters
         ----------
@@ -497,7 +497,7 @@ class Ledger(Granules):
         # Not counted by day: a run over a part of a scene leaves its other products as they are.
         judged = (
             _P.campaign == self.campaign,
-            _P.kind.in_([kind.value for kind in JUDGE_THEMSELVES]),
+            _P.kind.in_([kind.value for kind in EXPECTED_USABLE]),
         )
         # Few, so that the paths can be compared here: a statement takes only so many of them.
         suspects = sa.select(_P.scene).where(*judged, _P.usable == 0)

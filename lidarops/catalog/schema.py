@@ -173,7 +173,7 @@ VERDICT = sa.Table(
     sa.Column("signature", _DIGEST, nullable=False),
     # Scenes of the day that can give no product.
     sa.Column("barren", sa.Integer, nullable=False),
-    # Granules of the day that stand in no scene.
+    # Good granules of the day that belong to no scene.
     sa.Column("set_aside", sa.Integer, nullable=False),
     sqlite_with_rowid=False,
 )

@@ -144,8 +144,8 @@ def show_plan(
     Example: lidarops plan catalogs/demo.yaml
     """
     from lidarops.plan import cost_estimate
-    from lidarops.run import selection as asked
     from lidarops.run.archive import assess
+    from lidarops.run.selection import selects_no_scene
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
     wanted = _selection(instrument, station, product, since, until)
@@ -159,7 +159,7 @@ def show_plan(
         scene, whole = each.scene, settings.all_steps
         times = {
             "to_be_made": making.add(scene, each.needed(), whole=whole),
-            "everything": everything.add(scene, each.asked, whole=whole),
+            "everything": everything.add(scene, each.requested, whole=whole),
         }
         if as_json:
             scenes.append({**_plain(each), "estimated_cpu_seconds": times})
@@ -167,9 +167,9 @@ def show_plan(
         title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
         if not stale:
             took = f"about {times['everything']:.2g} s of CPU time"
-            show(_plan_table(f"{title}, {took}", each.asked))
+            show(_plan_table(f"{title}, {took}", each.requested))
         show(_stale_table(f"{title}, about {times['to_be_made']:.2g} s of CPU time", each))
-    none = none and asked.none(settings, wanted)
+    none = none and selects_no_scene(settings, wanted)
     # What is fresh too was not looked at.
     told = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
     if as_json:
@@ -243,8 +243,8 @@ def reprocess(
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
     from lidarops.run import archive as pipeline
-    from lidarops.run import options as runs
-    from lidarops.run import selection as asked
+    from lidarops.run.options import missing_report
+    from lidarops.run.selection import selects_no_scene
 
     set_up(log_level, as_json=log_json, file=log_file)
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
@@ -262,12 +262,12 @@ def reprocess(
             expect=bar.grow,
         )
         result = pipeline.bring_up_to_date(settings, selection=wanted, options=options)
-    none = result.record is None and asked.none(settings, wanted)
+    none = result.record is None and selects_no_scene(settings, wanted)
     if none and not as_json:
         _tell_none(settings, result, removing=remove_orphans)
     elif not as_json:
         _tell(settings, result, removing=remove_orphans)
-    unreported = runs.unreported(settings) if result.record is None else ""
+    unreported = missing_report(settings) if result.record is None else ""
     if unreported and not as_json:
         typer.echo(unreported)
     page, removed = None, None
@@ -312,10 +312,10 @@ def _loaded(
     all_steps: bool = False,
 ) -> Campaign:
     from lidarops.campaign.model import load_campaign
-    from lidarops.run.selection import refuse_nowhere
+    from lidarops.run.selection import check_archive_and_catalog
 
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
-    refuse_nowhere(settings, archive=archive)
+    check_archive_and_catalog(settings, archive=archive)
     return settings.model_copy(update={"all_steps": all_steps or settings.all_steps})
 
 
@@ -414,7 +414,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
         {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
         for each in judged.stale
     ]
-    plan = judged.asked
+    plan = judged.requested
     idle = [idle_window(step, plan.steps) for step in plan.steps]
     steps = [
         {**step.as_dict(), **({"no_effect": why} if why else {})}
@@ -438,15 +438,15 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             **result.failures,
             **{scene.scene: scene.error for scene in scenes if scene.error},
         },
-        "empty_scenes": list(result.left_nothing),
+        "unusable_scenes": list(result.unusable_scenes),
         "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
         "products": [product.path for scene in scenes for product in scene.products],
         "files_set_aside": dict(result.set_aside),
-        "barren_scenes": dict(result.barren),
-        "more_of_both": result.untold,
+        "empty_scenes": dict(result.empty_scenes),
+        "more_of_both": result.more_unused,
         "not_in_files": [{**asdict(each), "nowhere": each.nowhere} for each in result.unmet],
-        "orphans": {each.path: each.reason for each in result.orphans if not each.asked},
-        "kept_products": {each.path: each.reason for each in result.orphans if each.asked},
+        "orphans": {each.path: each.reason for each in result.orphans if not each.requested},
+        "kept_products": {each.path: each.reason for each in result.orphans if each.requested},
     }
 
 
@@ -488,12 +488,14 @@ def _tell(campaign: Campaign, result: Result, *, removing: bool) -> None:
 
 
 def _unused_table(result: Result, told: Collection[str]) -> Table:
-    title = "Not used" + (f" ({result.untold} more on other days)" if result.untold else "")
+    title = "Not used" + (
+        f" ({result.more_unused} more on other days)" if result.more_unused else ""
+    )
     table = make_table(title, "file or scene", "because")
     for path, reason in result.set_aside.items():
         if path not in told:
             add_row(table, path, reason)
-    for scene, reason in result.barren.items():
+    for scene, reason in result.empty_scenes.items():
         add_row(table, scene, reason)
     return table
 
@@ -504,7 +506,7 @@ def _unmet_table(result: Result) -> Table:
     title = "Asked for, and not in the files"
     table = make_table(title, "instrument", "channel", "asked for by", "because", "missing in")
     for each in result.unmet:
-        told = (each.instrument, each.channel, each.asked, each.reason)
+        told = (each.instrument, each.channel, each.requested_by, each.reason)
         add_row(table, *told, lacking(each))
     return table
 
@@ -525,7 +527,7 @@ def _orphans_table(result: Result, removed: int | None) -> Table:
     fate = "kept; --remove-orphans removes them" if removed is None else f"{removed} removed"
     table = make_table(f"Products that nothing asks for ({fate})", "file", "because")
     for orphan in result.orphans:
-        if not orphan.asked:
+        if not orphan.requested:
             add_row(table, orphan.path, orphan.reason)
     return table
 
@@ -534,7 +536,7 @@ def _kept_table(result: Result) -> Table:
     title = "Products that are asked for, and could not be made again (kept)"
     table = make_table(title, "file", "because")
     for orphan in result.orphans:
-        if orphan.asked:
+        if orphan.requested:
             add_row(table, orphan.path, orphan.reason)
     return table
 
@@ -542,7 +544,7 @@ def _kept_table(result: Result) -> Table:
 def _empty_table(result: Result) -> Table:
     table = make_table("Without a value to use", "scene", "problem")
     told = _of_this_run(result)
-    for scene in result.left_nothing:
+    for scene in result.unusable_scenes:
         if scene in told:
             add_row(table, scene, _EMPTY)
     return table
@@ -558,7 +560,7 @@ def _failures_table(result: Result) -> Table:
     for scene, error in result.failures.items():
         if scene not in told:
             add_row(table, scene, error)
-    for scene in result.empty:
+    for scene in result.unusable:
         if scene not in told:
             add_row(table, scene, _EMPTY)
     return table

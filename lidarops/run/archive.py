@@ -1,6 +1,6 @@
-"""The way of the data for whoever runs it: catalog -> scenes -> run -> report.
+"""Bring an archive up to date: catalog, plan, process, report.
 
-The command line and the Prefect flows call these; neither holds logic of its own.
+The command line and the Prefect flows call these functions and add no logic of their own.
 """
 
 from __future__ import annotations
@@ -20,13 +20,20 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.process.scene import Job, failed
+from lidarops.process.scene import Job, failed_outcome
 from lidarops.records import Granule, RunRecord, Unmet
 from lidarops.reports import run_page, run_record
-from lidarops.run import selection as asked
-from lidarops.run.executor import Ended, Stop, alone, local_client, process_jobs, read_bytes
+from lidarops.run.executor import (
+    EndedScene,
+    Stop,
+    local_client,
+    process_jobs,
+    process_one_by_one,
+    read_bytes,
+)
 from lidarops.run.leftovers import Orphan
 from lidarops.run.options import Options, Result
+from lidarops.run.selection import check_selection, unmet_requests
 from lidarops.run.session import Session
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, Selection, Signature
 from lidarops.system.processes import load_ahead, one_ahead, unswept
@@ -46,14 +53,15 @@ __all__ = [
     "update_catalog",
 ]
 
-GIVE_UP = 5
-"""Scenes in a row that fail for the sake of a disk, after which the others are not tried."""
+MOST_FAILURES_IN_A_ROW = 5
+"""The run stops after this many scenes in a row failed for a cause that may pass (a full disk)."""
 
-AGAIN: Final = 30
-"""Days in which nothing changed that are looked at again, to tell what is wrong with them."""
+MOST_DAYS_JUDGED_AGAIN: Final = 30
+"""Unchanged days that are judged again to name their unused files and scenes; the unused ones of
+other days are only counted."""
 
-_OF_WORKERS: Final = ("distributed.nanny", "lidarops.run.executor", "lidarops.reports.gallery")
-"""Modules that a worker needs, for scenes and then for the report."""
+_WORKER_MODULES: Final = ("distributed.nanny", "lidarops.run.executor", "lidarops.reports.gallery")
+"""Modules that workers need, for scenes and then for the report."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -69,13 +77,13 @@ def reprocess(
     options: Options | None = None,
     client: Client | None = None,
 ) -> RunRecord | None:
-    """Bring catalog and products up to date: what is stale is made, nothing else.
+    """Bring catalog and products up to date: make all stale products, and nothing else.
 
     Parameters
     ----------
     campaign : Campaign
     selection : Selection, optional
-        What is asked for; everything where not given.
+        What to process; default everything.
     options : Options, optional
     client : distributed.Client, optional
         A cluster to run on.
@@ -83,19 +91,18 @@ def reprocess(
     Returns
     -------
     RunRecord or None
-        None where there was nothing to do; nothing was written then.
+        None if there was nothing to do; then nothing was written.
 
     Raises
     ------
     CampaignError
-        If what is asked for is unknown.
+        If the selection names something unknown.
     CatalogError
         If archive or catalog cannot be used, or another run holds the catalog.
     SceneError
         If the cluster is lost.
     """
-    found = bring_up_to_date(campaign, selection=selection, options=options, client=client)
-    return found.record
+    return bring_up_to_date(campaign, selection=selection, options=options, client=client).record
 
 
 def bring_up_to_date(
@@ -105,10 +112,10 @@ def bring_up_to_date(
     options: Options | None = None,
     client: Client | None = None,
 ) -> Result:
-    """Do what `reprocess` does, and tell all that is known at the end."""
+    """Do what `reprocess` does, and return the state of the archive after the run."""
     selection = selection or Selection()
     options = options or Options()
-    asked.refuse_unknown(campaign, selection)
+    check_selection(campaign, selection)
     with (
         Store(campaign.catalog_url, campaign.name) as store,
         Lock(store, wait=options.wait) as lock,
@@ -116,9 +123,9 @@ def bring_up_to_date(
     ):
         while True:
             try:
-                return _Work(campaign, store, lock, selection, options).carry_out(client)
+                return _Pass(campaign, store, lock, selection, options).carry_out(client)
             except _OvertakenError:
-                _LOG.info("another run has ended: looking again")
+                _LOG.info("another run has ended: judging again")
 
 
 def assess(
@@ -129,19 +136,19 @@ def assess(
     everything: bool = False,
     wait: float = 0.0,
 ) -> Iterator[Judgement]:
-    """Tell for every scene that may have something to be done what that is, and why.
+    """Judge what every scene needs, and why.
 
-    Brings the catalog up to date, and processes nothing.
+    Updates the catalog, and processes nothing.
 
     Parameters
     ----------
     campaign : Campaign
     selection : Selection, optional
-        What is asked for; everything where not given.
+        What to process; default everything.
     force : bool
-        Whether all of it counts as stale.
+        Whether every selected product counts as stale.
     everything : bool
-        Whether to tell of scenes too for which nothing is to be done.
+        Whether to yield also scenes that need nothing.
     wait : float
         s to wait for another run on the same catalog.
 
@@ -150,15 +157,15 @@ def assess(
     Judgement
     """
     selection = selection or Selection()
-    asked.refuse_unknown(campaign, selection)
+    check_selection(campaign, selection)
     update_catalog(campaign, wait=wait)
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection, force=force)
-        days = _dirty(judge, store, selection, force=force or everything)
+        days = _days_to_judge(judge, store, selection, force=force or everything)
         for batch in judge.batches(days):
-            for each in judge.days(batch).judgements:
-                if everything or each.stale or each.held:
-                    yield each
+            for judged in judge.days(batch).judgements:
+                if everything or judged.stale or judged.held:
+                    yield judged
 
 
 def update_catalog(
@@ -168,7 +175,7 @@ def update_catalog(
     wait: float = 0.0,
     workers: int = 1,
 ) -> ScanSummary:
-    """Bring the catalog up to date with the archive; see `lidarops.catalog.scan.scan_archive`."""
+    """Update the catalog from the archive; see `lidarops.catalog.scan.scan_archive`."""
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         return _scan(campaign, store, lock, progress, workers)
 
@@ -201,7 +208,7 @@ class _Writer:
             raise _OvertakenError
 
 
-def _dirty(judge: Judge, store: Store, selection: Selection, *, force: bool) -> list[int]:
+def _days_to_judge(judge: Judge, store: Store, selection: Selection, *, force: bool) -> list[int]:
     verdicts = store.verdicts()
     signatures = judge.signatures()
     days = selection.days(sorted(signatures))
@@ -215,22 +222,23 @@ def _dirty(judge: Judge, store: Store, selection: Selection, *, force: bool) -> 
 
 
 @dataclass(slots=True)
-class _Found:
-    """What is gathered on the way."""
+class _Gathered:
+    """What a pass over the archive collects."""
 
     fresh: int = 0
     orphans: list[Orphan] = field(default_factory=list)
     set_aside: list[Granule] = field(default_factory=list)
     held: list[Judgement] = field(default_factory=list)
-    barren: list[Judgement] = field(default_factory=list)
-    told: dict[int, tuple[int, int]] = field(default_factory=dict)
-    """Days that are settled, or will be where they are in `open` and all goes well."""
+    empty_scenes: list[Judgement] = field(default_factory=list)
+    unused: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """Days -> numbers of empty scenes and of granules set aside. These days are settled; those in
+    `open` only once all their scenes succeed."""
     open: dict[int, set[str]] = field(default_factory=lambda: defaultdict(set))
-    """Days on which something is stale -> scenes."""
+    """Days with stale products -> scenes."""
 
 
-class _Work:
-    """One pass: catalog, judge, process what is stale, enter it."""
+class _Pass:
+    """One pass: update the catalog, judge, process what is stale, enter it in the ledger."""
 
     def __init__(
         self,
@@ -246,7 +254,7 @@ class _Work:
         self._selection = selection
         self._options = options
         self._write = _Writer(lock)
-        self._found = _Found()
+        self._gathered = _Gathered()
         self._judgements: dict[str, Judgement] = {}
         self._suspects: list[Job] = []
         self._session: Session | None = None
@@ -259,7 +267,7 @@ class _Work:
         self._judge = self._new_judge()
         signatures = self._judge.signatures()
         verdicts = self._store.verdicts()
-        days = _dirty(self._judge, self._store, self._selection, force=self._options.force)
+        days = _days_to_judge(self._judge, self._store, self._selection, force=self._options.force)
         clean = [
             day
             for day in sorted(signatures.keys() - set(days))
@@ -269,41 +277,43 @@ class _Work:
         status, caught = RunStatus.FINISHED, 0
         if days:
             if self._options.workers > 1 and not self._options.cluster and client is None:
-                # Meanwhile it is judged what they are to do.
-                load_ahead(_OF_WORKERS)
+                # The modules load while this process judges the scenes.
+                load_ahead(_WORKER_MODULES)
             with Stop() as stop:
                 self._process(days, client, stop)
                 caught = stop.signal
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
             self._settle(signatures)
-        unmet = asked.unmet_requests(self._campaign, self._store, self._selection)
-        run = self._conclude(status, unmet)
-        found = self._found
-        self._look_again(clean[:AGAIN])
+        unmet = unmet_requests(self._campaign, self._store, self._selection)
+        record = self._conclude(status, unmet)
+        gathered = self._gathered
+        self._collect_unused(clean[:MOST_DAYS_JUDGED_AGAIN])
         return Result(
-            record=run,
+            record=record,
             status=status,
             summary=self._summary,
-            fresh=found.fresh,
-            orphans=tuple(found.orphans),
+            fresh=gathered.fresh,
+            orphans=tuple(gathered.orphans),
             failures=self._store.failures(),
-            # Nothing would ever make these again, so that they would be told for ever.
-            empty=tuple(self._store.empty(without={each.path for each in found.orphans})),
-            barren={each.scene.id: each.barren for each in found.barren},
-            set_aside={each.path: each.reason for each in found.set_aside},
-            untold=sum(sum(verdicts[day][1:]) for day in clean[AGAIN:]),
+            # Orphans are never made again, so they would be reported for ever.
+            unusable=tuple(
+                self._store.unusable_scenes(without={orphan.path for orphan in gathered.orphans})
+            ),
+            empty_scenes={judged.scene.id: judged.empty_reason for judged in gathered.empty_scenes},
+            set_aside={granule.path: granule.reason for granule in gathered.set_aside},
+            more_unused=sum(sum(verdicts[day][1:]) for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
             unmet=unmet,
             signal=caught,
         )
 
-    def _look_again(self, days: Sequence[int]) -> None:
-        """Find out what it was that days were settled with."""
+    def _collect_unused(self, days: Sequence[int]) -> None:
+        """Collect the unused scenes and files of settled days."""
         judge = Judge(self._campaign, self._store)
         for batch in judge.batches(days):
             judged = judge.days(batch)
-            self._found.set_aside += judged.set_aside
-            self._found.barren += [each for each in judged.judgements if each.barren]
+            self._gathered.set_aside += judged.set_aside
+            self._gathered.empty_scenes += _empty_scenes(judged)
 
     def _new_judge(self, *, again: bool = False) -> Judge:
         force = self._options.force and not again
@@ -318,26 +328,26 @@ class _Work:
             return
         options = self._options
         with ExitStack() as stack:
-            used = client
+            used_client = client
             if client is None and (options.cluster or options.workers > 1):
-                # First, as a run that this one has to wait for may leave nothing to do.
+                # Take the lock first: another run may leave nothing to do.
                 self._write()
-                used = self._reached(self._started, stack, stop)
-            taken = partial(self._take, note=used is None)
+                used_client = self._reached(self._started, stack, stop)
+            taken = partial(self._take, note=used_client is None)
             if first is not None:
                 others = chain([first], jobs)
-                self._enter(process_jobs(others, client=used, stop=stop, taken=taken), stop)
+                self._enter(process_jobs(others, client=used_client, stop=stop, taken=taken), stop)
             if self._suspects and not stop:
-                if used is None:
+                if used_client is None:
                     own = partial(local_client, 1, memory=options.memory)
-                    used = self._reached(own, stack, stop)
-                if used is not None:
-                    self._enter_suspects(used, stop)
+                    used_client = self._reached(own, stack, stop)
+                if used_client is not None:
+                    self._enter_suspects(used_client, stop)
 
     def _enter_suspects(self, client: Client, stop: Stop) -> None:
         for job in self._suspects:
             self._take(job)
-        self._enter(alone(self._suspects, client=client, stop=stop), stop)
+        self._enter(process_one_by_one(self._suspects, client=client, stop=stop), stop)
 
     def _reached(
         self,
@@ -345,8 +355,8 @@ class _Work:
         stack: ExitStack,
         stop: Stop,
     ) -> Client | None:
-        """Start a cluster; None where a signal came first, which the run is then entered with."""
-        # A queue may take an hour, in which a signal would wait for no scene at all.
+        """Start or reach a cluster; None if a signal came first, which then ends the run."""
+        # A queue may take an hour; a signal must not wait for it.
         if not stop:
             with stop.idle():
                 client = stack.enter_context(start())
@@ -361,52 +371,54 @@ class _Work:
             return options.cluster()
         return local_client(options.workers, memory=options.memory)
 
-    def _enter(self, ended: Iterator[Ended], stop: Stop) -> None:
+    def _enter(self, ended: Iterator[EndedScene], stop: Stop) -> None:
         session = self._running()
-        for each in ended:
-            judged = self._judgements.pop(each.job.scene.id)
-            outcome = session.end(judged, each.outcome, final=each.final)
-            self._failing = self._failing + 1 if outcome.error and not each.final else 0
-            if self._failing >= GIVE_UP:
-                stop.now(f"the last {GIVE_UP} scenes failed alike: {outcome.error}")
+        for scene in ended:
+            judged = self._judgements.pop(scene.job.scene.id)
+            outcome = session.end(judged, scene.outcome, final=scene.final)
+            self._failing = self._failing + 1 if outcome.error and not scene.final else 0
+            if self._failing >= MOST_FAILURES_IN_A_ROW:
+                stop.now(
+                    f"{MOST_FAILURES_IN_A_ROW} scenes in a row failed, the last one: {outcome.error}"
+                )
             if self._options.progress:
                 self._options.progress(outcome)
 
     def _judged(self, days: Sequence[int], client: Client | None) -> Iterator[DaysJudged]:
         judged = map(self._judge.days, self._judge.batches(days))
-        apart = client is not None or self._options.cluster or self._options.workers > 1
-        # Workers would wait while this process looks at what they are to do next.
-        return one_ahead(judged) if apart else judged
+        on_workers = client is not None or self._options.cluster or self._options.workers > 1
+        # Judge ahead, so that workers do not wait.
+        return one_ahead(judged) if on_workers else judged
 
     def _jobs(self, days: Sequence[int], client: Client | None) -> Iterator[Job]:
-        """Give what is stale, the largest scenes of some days first."""
+        """Yield the jobs of stale scenes, the largest of each group of days first."""
         for judged in self._judged(days, client):
             self._note(judged)
-            stale = [each for each in judged.judgements if each.stale]
+            stale_scenes = [scene for scene in judged.judgements if scene.stale]
             jobs = [
-                Job(self._campaign, each.scene, each.needed(), self._options.profiles_per_chunk)
-                for each in stale
+                Job(self._campaign, stale.scene, stale.needed(), self._options.profiles_per_chunk)
+                for stale in stale_scenes
             ]
-            self._judgements.update((each.scene.id, each) for each in stale)
-            for each in stale:
-                self._found.open[each.day].add(each.scene.id)
+            self._judgements.update((stale.scene.id, stale) for stale in stale_scenes)
+            for stale in stale_scenes:
+                self._gathered.open[stale.day].add(stale.scene.id)
             if self._options.expect:
-                self._options.expect(sum(len(each.scene.granules) for each in stale))
-            suspect = {each.scene.id for each in stale if each.suspect}
-            self._suspects += [job for job in jobs if job.scene.id in suspect]
-            # The largest scene last would keep one worker busy while the others idle.
+                self._options.expect(sum(len(stale.scene.granules) for stale in stale_scenes))
+            suspects = {stale.scene.id for stale in stale_scenes if stale.suspect}
+            self._suspects += [job for job in jobs if job.scene.id in suspects]
+            # A large scene at the end would keep one worker busy while the others idle.
             for job in sorted(jobs, key=read_bytes, reverse=True):
-                if job.scene.id not in suspect:
+                if job.scene.id not in suspects:
                     yield job
 
     def _note(self, judged: DaysJudged) -> None:
-        found = self._found
-        found.fresh += sum(each.fresh for each in judged.judgements)
-        found.orphans += judged.orphans
-        found.set_aside += judged.set_aside
-        found.told.update(judged.told)
-        found.barren += [each for each in judged.judgements if each.barren]
-        found.held += [each for each in judged.judgements if each.held]
+        gathered = self._gathered
+        gathered.fresh += sum(scene.fresh for scene in judged.judgements)
+        gathered.orphans += judged.orphans
+        gathered.set_aside += judged.set_aside
+        gathered.unused.update(judged.unused)
+        gathered.empty_scenes += _empty_scenes(judged)
+        gathered.held += [scene for scene in judged.judgements if scene.held]
         if judged.digests or judged.touched or judged.gone:
             self._write()
             self._store.store_digests(judged.digests)
@@ -431,115 +443,133 @@ class _Work:
     # The end
 
     def _settle(self, signatures: Mapping[int, Signature]) -> None:
-        """Note the days on which everything is fresh, so that they need no second look."""
-        found = self._found
-        settled = _verdicts(signatures, found.told, found.told.keys() - found.open.keys())
-        if found.open and self._selection.everything:
+        """Record the days on which everything is fresh; they are not judged again until changed."""
+        gathered = self._gathered
+        settled = _verdicts(
+            signatures, gathered.unused, gathered.unused.keys() - gathered.open.keys()
+        )
+        if gathered.open and self._selection.everything:
             judge = self._new_judge(again=True)
-            again = judge.signatures(found.open)
-            clear = {
+            signatures_after = judge.signatures(gathered.open)
+            fresh_days = {
                 day
-                for day, now in again.items()
-                # Files may have joined or left it, or a profile changed, after its scenes ended.
+                for day, now in signatures_after.items()
+                # Files may have come or gone, or a profile changed, after its scenes ended.
                 if now.sources == signatures[day].sources and self._went_as_planned(day)
             }
-            settled |= _verdicts(again, found.told, clear & found.told.keys())
-            # A day with scenes that were not tried stays open, whatever became of the others.
-            waiting = {each.day for each in self._judgements.values()}
-            for batch in judge.batches(again.keys() - clear - waiting):
+            settled |= _verdicts(
+                signatures_after, gathered.unused, fresh_days & gathered.unused.keys()
+            )
+            # A day with scenes that were not tried stays open.
+            waiting = {judged.day for judged in self._judgements.values()}
+            for batch in judge.batches(signatures_after.keys() - fresh_days - waiting):
                 judged = judge.days(batch)
-                settled |= _verdicts(again, judged.told, judged.told.keys() - judged.open)
+                settled |= _verdicts(
+                    signatures_after, judged.unused, judged.unused.keys() - judged.open
+                )
         known = self._store.verdicts()
-        new = {day: told for day, told in settled.items() if told[0] and known.get(day) != told}
+        new = {
+            day: verdict
+            for day, verdict in settled.items()
+            if verdict[0] and known.get(day) != verdict
+        }
         if new:
             self._write()
             self._store.store_verdicts(new)
 
     def _went_as_planned(self, day: int) -> bool:
-        """Return whether another look would find all that was stale on a day to be fresh."""
+        """Return whether every product that was stale on a day is now fresh."""
         done = self._session.settled if self._session else set()
-        return self._found.open[day] <= done
+        return self._gathered.open[day] <= done
 
     def _conclude(self, status: RunStatus, unmet: tuple[Unmet, ...]) -> RunRecord | None:
         if self._session is None:
             return None
-        for each in self._found.held:
-            job = Job(self._campaign, each.scene, each.plan)
-            self._session.add(failed(job, f"{each.held} (not tried again: nothing has changed)"))
-        barren = {each.scene.id: each.barren for each in self._found.barren}
-        return self._session.finish(status, self._found.set_aside, barren=barren, unmet=unmet)
+        for judged in self._gathered.held:
+            job = Job(self._campaign, judged.scene, judged.plan)
+            self._session.add(
+                failed_outcome(job, f"{judged.held} (not tried again, because nothing has changed)")
+            )
+        empty_scenes = {
+            judged.scene.id: judged.empty_reason for judged in self._gathered.empty_scenes
+        }
+        return self._session.finish(
+            status, self._gathered.set_aside, empty_scenes=empty_scenes, unmet=unmet
+        )
+
+
+def _empty_scenes(judged: DaysJudged) -> list[Judgement]:
+    return [scene for scene in judged.judgements if scene.empty_reason]
 
 
 def _verdicts(
-    signatures: Mapping[int, Signature], told: Mapping[int, tuple[int, int]], days: Iterable[int]
+    signatures: Mapping[int, Signature], unused: Mapping[int, tuple[int, int]], days: Iterable[int]
 ) -> dict[int, tuple[str, int, int]]:
-    return {day: (signatures[day].whole, *told[day]) for day in days}
+    return {day: (signatures[day].whole, *unused[day]) for day in days}
 
 
-def remove_orphans(campaign: Campaign, found: Result, *, wait: float = 0.0) -> int:
-    """Remove products that nothing asks for any more, files and ledger rows.
+def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> int:
+    """Remove products that the campaign no longer requests: files and ledger rows.
 
-    Products that another run has made again since are left, and those that the campaign still asks
-    for where other files of their scene no longer allow them.
+    Products stay if another run has made them again since, or if the campaign still requests them
+    although the present files of their scene do not allow them.
 
     Parameters
     ----------
     campaign : Campaign
-    found : Result
-        Of the run that found them.
+    result : Result
+        Of the run that listed them.
     wait : float
         s to wait for another run on the same catalog.
 
     Returns
     -------
     int
-        How many files were removed.
+        Number of files removed.
 
     Raises
     ------
     CatalogError
-        If the archive holds no file at all, as where it is not mounted, or another run holds the
-        catalog.
+        If the archive holds no file at all (is it mounted?), or another run holds the catalog.
     """
-    # A file that was removed by hand leaves nothing to keep.
-    unasked = [
-        each
-        for each in found.orphans
-        if not (each.asked and (campaign.products_root / each.path).exists())
+    # A requested product is kept, unless its file was removed by hand.
+    removable = [
+        orphan
+        for orphan in result.orphans
+        if not (orphan.requested and (campaign.products_root / orphan.path).exists())
     ]
-    if not unasked:
+    if not removable:
         return 0
-    if not found.summary.files:
+    if not result.summary.files:
         raise CatalogError(
-            f"holds no raw file, so that {len(unasked)} products would be removed",
+            f"holds no raw file, so that {len(removable)} products would be removed",
             file=campaign.archive,
             field="archive",
-            remedy="see that it is mounted; where it is to be empty, remove the products by hand",
+            remedy="check that it is mounted; if it is to be empty, remove the products by hand",
         )
     removed = 0
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         lock.acquire()
         with store.all_made() as made:
-            runs = {each.path: each.run for each in made}
-        still = [each.path for each in unasked if runs.get(each.path) == each.run]
-        for name in still:
+            runs = {product.path: product.run for product in made}
+        paths = [orphan.path for orphan in removable if runs.get(orphan.path) == orphan.run]
+        for name in paths:
             path = campaign.products_root / name
             removed += path.exists()
             path.unlink(missing_ok=True)
-        store.forget_products(still, lock.token)
+        store.forget_products(paths, lock.token)
     return removed
 
 
 def report_run(campaign: Campaign, run: RunRecord, *, workers: int = 1) -> run_page.RunReport:
-    """Keep the record of a run and build its page.
+    """Save the record of a run and build its report page.
 
     Parameters
     ----------
     campaign : Campaign
     run : RunRecord
     workers : int, optional
-        Most processes of this machine to read products and to draw with; changes nothing that
-        is shown.
+        Largest number of local processes that read products and draw; does not affect the page.
 
     Returns
     -------

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from lidarops.campaign.yaml_errors import duplicate_keys
 from lidarops.errors import LidarOpsError
 from lidarops.run import kubernetes
-from lidarops.run.executor import TRIMMING, local_client
+from lidarops.run.executor import MALLOC_TRIM_VARIABLE, local_client
 
 if TYPE_CHECKING:
     from distributed import Client, Security
@@ -31,7 +31,9 @@ Memory = Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$", description="
 Name = Annotated[str, Field(pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$", max_length=63)]
 Workers = Annotated[int, Field(ge=1, le=10_000)]
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
-_ENVIRONMENT = f"""export DASK_DISTRIBUTED__NANNY__PRE_SPAWN_ENVIRON="{{'{TRIMMING}': None}}\""""
+_ENVIRONMENT = (
+    f"""export DASK_DISTRIBUTED__NANNY__PRE_SPAWN_ENVIRON="{{'{MALLOC_TRIM_VARIABLE}': None}}\""""
+)
 
 
 class ClusterError(LidarOpsError):

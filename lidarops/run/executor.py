@@ -1,6 +1,6 @@
-"""Run many scenes, serially or on a dask cluster.
+"""Process jobs, in this process or on a dask cluster.
 
-Nothing that happens to one scene stops the others: not an error, not the death of its worker.
+No scene stops the others, neither by an error nor by the death of its worker.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
 from lidarops.netcdf.provenance import code_version
-from lidarops.process.scene import Job, attempt, failed
+from lidarops.process.scene import Job, attempt, failed_outcome
 from lidarops.records import SceneOutcome
 from lidarops.run import worker
 from lidarops.system.processes import keep_memory, start_method
@@ -31,54 +31,54 @@ if TYPE_CHECKING:
 
     Future = AnyFuture[Any]
 
-AHEAD: Final = 2
-"""Scenes a worker thread has at hand, the one that it works on included."""
-LEAST_AHEAD: Final = 4
-RECOUNT: Final = 5.0
-"""s after which the threads of a cluster, which may grow and shrink, are counted anew."""
-PATIENCE: Final = 120.0
-"""s without any worker after which one is missed: on this machine, where none will come, for good.
-"""
-FIRM: Final = 1.0
-"""s that a new worker is left without a scene that may take it down: dask starts no other for one
-that dies before its nanny, which looks every few hundredths of a second, has seen that it runs."""
-GRACE: Final = 20.0
-"""s that scenes in hand get to end, on a cluster that is asked to stop."""
-TRIES: Final = 3
-"""Times that a scene may take its worker down before it is refused."""
-TRIMMING: Final = "MALLOC_TRIM_THRESHOLD_"
-"""Variable by which dask has the C library give back small pieces of memory at once."""
+SCENES_PER_THREAD: Final = 2
+"""Scenes submitted per worker thread, including the one in work."""
+LEAST_SCENES_AHEAD: Final = 4
+"""Least number of scenes submitted to a cluster."""
+RECOUNT_INTERVAL: Final = 5.0
+"""s between counts of the threads of a cluster, which may grow and shrink."""
+WORKER_TIMEOUT: Final = 120.0
+"""s without any worker after which a warning is logged; local workers are then considered lost."""
+START_DELAY: Final = 1.0
+"""s before a new worker gets a scene that may kill it: dask replaces no worker that dies before its
+nanny, which polls every few hundredths of a second, has seen it running."""
+GRACE_PERIOD: Final = 20.0
+"""s that running scenes get to end on a cluster after a request to stop."""
+MOST_TRIES: Final = 3
+"""A scene that kills its worker this often is refused."""
+MALLOC_TRIM_VARIABLE: Final = "MALLOC_TRIM_THRESHOLD_"
+"""Environment variable by which dask makes the C library return small pieces of memory at once."""
 _DASK: Final = {
-    # Every death of a worker is to be seen here, where it is counted for its scene alone.
+    # This module counts the deaths of workers, per scene.
     "distributed.scheduler.allowed-failures": 0,
-    # Every process would wake a hundred times a second to sample stacks, for a page that is not
-    # served, and fifty times to look how late it is.
+    # Profiling would wake every process 100 times a second, and the tick 50 times, for a dashboard
+    # that is not served.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
-    # Each process would read a dozen files of the system twice a second, for the same page.
+    # For the same dashboard, each process would read a dozen system files twice a second.
     "distributed.admin.system-monitor.interval": "10s",
-    # With it every array is mapped and given back for itself: a sixth of the time of small scenes.
-    f"distributed.nanny.pre-spawn-environ.{TRIMMING}": None,
+    # With it, mapping and returning every array takes a sixth of the time of small scenes.
+    f"distributed.nanny.pre-spawn-environ.{MALLOC_TRIM_VARIABLE}": None,
 }
 
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
-    """A scene that ended."""
+class EndedScene:
+    """A scene that has ended."""
 
     job: Job
     outcome: SceneOutcome
     final: bool
-    """Whether another try on the same inputs cannot but end like this."""
+    """Whether another try on the same inputs would end the same way."""
 
 
 class Stop:
-    """A wish to stop: by signal, or by whoever calls `now`.
+    """A request to stop, by a signal or by a call of `now`.
 
-    The first SIGINT or SIGTERM lets scenes in hand end; the second abandons them. Where none is in
-    hand, as told by `idle`, the first one breaks off at once.
+    After the first SIGINT or SIGTERM running scenes may end; the second abandons them. Within
+    `idle` no scene is running, and the first signal interrupts at once.
     """
 
     def __init__(self) -> None:
@@ -91,20 +91,20 @@ class Stop:
         return bool(self.reason)
 
     def now(self, reason: str) -> None:
-        """Ask to stop."""
+        """Request to stop."""
         self.reason = self.reason or reason
 
     @contextmanager
     def idle(self) -> Iterator[None]:
-        """Let a signal break off what is done within: no scene is in hand that is to end first.
+        """Let a signal interrupt the body, while no scene is running.
 
-        Whoever calls looks afterwards whether it came to that.
+        The caller checks afterwards whether a stop was requested.
         """
         self._idle = True
         try:
             yield
         except KeyboardInterrupt:
-            # Raised on, it would end the process as Ctrl-C does, whatever the signal was.
+            # Re-raised, it would end the process like Ctrl-C, whatever the signal was.
             if not self.signal:
                 raise
         finally:
@@ -126,9 +126,9 @@ class Stop:
         self.signal = number
         self.now(f"stopped by {signal.Signals(number).name}")
         if self._idle:
-            _LOG.warning("%s: no scene is in hand", self.reason)
+            _LOG.warning("%s: no scene is running", self.reason)
             raise KeyboardInterrupt
-        _LOG.warning("%s: scenes in hand are ended; once more to abandon them", self.reason)
+        _LOG.warning("%s: running scenes may end; signal again to abandon them", self.reason)
 
 
 def read_bytes(job: Job) -> int:
@@ -140,14 +140,14 @@ def read_bytes(job: Job) -> int:
 def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]:
     """Start a dask cluster of single-threaded processes on this machine.
 
-    netCDF4 writes from one thread of a process only, and BLAS and numba gain nothing from more.
+    netCDF4 writes from only one thread of a process, and BLAS and numba gain nothing from more.
 
     Parameters
     ----------
     workers : int
     memory : str, optional
-        Most memory of a worker, such as ``2GiB``; an equal share of the machine's where not
-        given. A worker that needs more is restarted, and its scene tried again.
+        Memory limit of a worker, such as ``2GiB``; default an equal share of the machine's memory.
+        A worker that exceeds it is restarted, and its scene is tried again.
     """
     import dask  # noqa: PLC0415 - takes a second to import
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
@@ -157,13 +157,13 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
         worker.quiet(),
         dask.config.set({**_DASK, **started}),
         LocalCluster(
-            # A signal while they start would leave a cluster that nobody can close.
+            # Workers start below: a signal during the start here would leave an unclosed cluster.
             n_workers=0,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
             dashboard_address=None,
-            # Without a dashboard dask still answers by HTTP, on a port of all interfaces.
+            # Without a dashboard dask still serves HTTP, by default on all interfaces.
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
             memory_limit=memory or "auto",
             preload=worker.__name__,
@@ -176,17 +176,17 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
 
 
 def _await_workers(client: Client, workers: int) -> None:
-    """Wait for workers that are starting; fewer are better than none."""
+    """Wait for starting workers; go on with fewer if some do not start."""
     try:
-        client.wait_for_workers(workers, timeout=PATIENCE)
+        client.wait_for_workers(workers, timeout=WORKER_TIMEOUT)
     except TimeoutError as error:
-        there = len(client.nthreads())
-        if not there:
+        started = len(client.nthreads())
+        if not started:
             raise SceneError(
-                f"no worker has started within {PATIENCE:.0f} s",
-                remedy="give more memory to each, or ask for fewer",
+                f"no worker started within {WORKER_TIMEOUT:.0f} s",
+                remedy="give each worker more memory, or start fewer",
             ) from error
-        _LOG.warning("%d of %d workers have started within %.0f s", there, workers, PATIENCE)
+        _LOG.warning("%d of %d workers started within %.0f s", started, workers, WORKER_TIMEOUT)
 
 
 def process_jobs(
@@ -195,17 +195,17 @@ def process_jobs(
     client: Client | None = None,
     stop: Stop | None = None,
     taken: Callable[[Job], None] | None = None,
-) -> Iterator[Ended]:
-    """Process scenes as they come, in the order in which they end.
+) -> Iterator[EndedScene]:
+    """Process jobs and yield the scenes in the order in which they end.
 
     Parameters
     ----------
     jobs : iterable of Job
-        Taken one by one, never many more than there are workers.
+        Consumed one by one, only a few more than there are workers.
     client : distributed.Client, optional
-        A cluster; in this process where None.
+        Cluster to run on; None processes in this process.
     stop : Stop, optional
-        Asked before every scene.
+        Checked before every scene.
     taken : callable, optional
         Called with a job before it starts.
 
@@ -213,28 +213,27 @@ def process_jobs(
     ------
     Ended
     """
-    # A wish that nobody has had yet is false.
     stop = Stop() if stop is None else stop
     if client is None:
-        yield from _serial(jobs, stop, taken)
+        yield from _process_here(jobs, stop, taken)
     else:
-        yield from _Window(client, stop, taken).run(jobs)
+        yield from _ClusterQueue(client, stop, taken).run(jobs)
 
 
-def _serial(
+def _process_here(
     jobs: Iterable[Job], stop: Stop, taken: Callable[[Job], None] | None
-) -> Iterator[Ended]:
+) -> Iterator[EndedScene]:
     keep_memory()
     for job in jobs:
         if stop:
             return
         if taken:
             taken(job)
-        yield Ended(job, *attempt(job))
+        yield EndedScene(job, *attempt(job))
 
 
-def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]:
-    """Process scenes that may take their worker down: one at a time, so that it is known which.
+def process_one_by_one(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[EndedScene]:
+    """Process scenes that may kill their worker, one at a time, to know which one does.
 
     Parameters
     ----------
@@ -245,149 +244,149 @@ def alone(jobs: Sequence[Job], *, client: Client, stop: Stop) -> Iterator[Ended]
     Yields
     ------
     Ended
-        A scene that takes its worker down every time ends as failed, by name.
+        A scene that kills its worker every time ends as failed.
     """
-    staff = _Staff(client)
+    workers = _Workers(client)
     for job in jobs:
-        for _ in range(TRIES):
-            staff.ready(stop)
+        for _ in range(MOST_TRIES):
+            workers.ready(stop)
             if stop:
                 return
-            future = _submitted(client, job)
-            _wait(future, staff)
-            ended = _ended(future, job)
+            future = _submit(client, job)
+            _wait(future, workers)
+            ended = _outcome_of(future, job)
             future.release()
             if ended is not None:
                 yield ended
                 break
         else:
-            reason = f"its worker died {TRIES} times: too little memory, or a damaged file"
-            yield Ended(job, failed(job, reason), final=True)
+            reason = f"its worker died {MOST_TRIES} times: too little memory, or a damaged file"
+            yield EndedScene(job, failed_outcome(job, reason), final=True)
 
 
-def _submitted(client: Client, job: Job) -> Future:
-    # As bytes, which the scheduler hands on: a job it would unpickle and pickle again.
+def _submit(client: Client, job: Job) -> Future:
+    # As bytes: the scheduler would unpickle and pickle a job.
     return client.submit(_on_worker, pickle.dumps(job), code_version(), pure=False)
 
 
 def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool] | str:
-    """Process a scene; return its outcome and whether it is final, or why it cannot be tried."""
-    # First, as other code may know other jobs.
+    """Process a scene; return its outcome and whether it is final, or why it was not tried."""
+    # First, because other code may not be able to unpickle the job.
     if code_version() != code:
         return f"the worker has other code of lidarops: {code_version()}, not {code}"
     job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
     return attempt(job)
 
 
-def _wait(future: Future, staff: _Staff) -> None:
-    """Wait for a scene to end, while there is somebody who may end it."""
+def _wait(future: Future, workers: _Workers) -> None:
+    """Wait for a scene to end; raise SceneError if the workers are lost."""
     done: queue.SimpleQueue[Future] = queue.SimpleQueue()
     future.add_done_callback(done.put)
     while True:
-        staff.count()
+        workers.count()
         try:
-            done.get(timeout=RECOUNT)
+            done.get(timeout=RECOUNT_INTERVAL)
         except queue.Empty:
             continue
         return
 
 
-class _Staff:
-    """The threads of a cluster, which may grow in number, shrink, or be gone for good."""
+class _Workers:
+    """Counts the threads of a cluster, which may grow, shrink or be lost."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
         self._threads = 0
         self._recount = -math.inf
-        self._missed_since: float | None = None
+        self._missing_since: float | None = None
 
     def count(self) -> int:
-        """Return their number, counted anew where that was not done just now."""
+        """Return the number of threads, counted at most every `RECOUNT_INTERVAL`."""
         now = time.monotonic()
         if now >= self._recount:
             try:
                 self._threads = sum(self._client.nthreads().values())
             except OSError as gone:
-                raise _lost() from gone
-            self._recount = now + RECOUNT
-            self._miss(now)
+                raise _scheduler_lost() from gone
+            self._recount = now + RECOUNT_INTERVAL
+            self._check_missing(now)
         return self._threads
 
     def ready(self, stop: Stop) -> None:
-        """Wait for a worker, and until another one would take its place."""
+        """Wait for a worker that dask would replace if it died."""
         while not stop:
             self._recount = -math.inf
             if self.count():
                 break
             time.sleep(0.1)
-        time.sleep(FIRM)
+        time.sleep(START_DELAY)
 
-    def _miss(self, now: float) -> None:
+    def _check_missing(self, now: float) -> None:
         if self._threads:
-            self._missed_since = None
-        # From the first count on, as the last one may lie far back.
-        elif self._missed_since is None:
-            self._missed_since = now
-        elif now - self._missed_since > PATIENCE:
-            self._missed_since = now
+            self._missing_since = None
+        # Time counts from this first miss: the last count may be long ago.
+        elif self._missing_since is None:
+            self._missing_since = now
+        elif now - self._missing_since > WORKER_TIMEOUT:
+            self._missing_since = now
             if _is_local(self._client):
                 raise SceneError(
-                    "the workers on this machine are gone, and none takes their place",
-                    remedy="see what ended them, and run again: what is done stays done",
+                    "the workers on this machine are gone, and none replaces them",
+                    remedy="find out what ended them, and run again: finished scenes are kept",
                 )
-            _LOG.warning("no worker is there: scenes wait for one")
+            _LOG.warning("there is no worker: scenes wait for one")
 
 
-class _Window:
-    """Keeps a cluster busy with a few scenes a worker, whatever the number of scenes."""
+class _ClusterQueue:
+    """Keeps a cluster busy with a few scenes per worker, whatever the number of scenes."""
 
     def __init__(self, client: Client, stop: Stop, taken: Callable[[Job], None] | None) -> None:
         self._client = client
         self._stop = stop
         self._taken = taken
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._at_work: dict[Future, Job] = {}
+        self._running: dict[Future, Job] = {}
         self._suspects: list[Job] = []
-        self._staff = _Staff(client)
+        self._workers = _Workers(client)
 
-    def run(self, jobs: Iterable[Job]) -> Iterator[Ended]:
+    def run(self, jobs: Iterable[Job]) -> Iterator[EndedScene]:
         source = iter(jobs)
         self._fill(source)
-        asked = None
-        while self._at_work:
+        stop_requested = None
+        while self._running:
             if self._stop:
-                asked = asked or time.monotonic()
-                if time.monotonic() - asked > GRACE:
-                    self._client.cancel(list(self._at_work), force=True)
+                stop_requested = stop_requested or time.monotonic()
+                if time.monotonic() - stop_requested > GRACE_PERIOD:
+                    self._client.cancel(list(self._running), force=True)
                     return
             try:
                 future = self._done.get(timeout=0.2)
             except queue.Empty:
-                # There may be more workers by now.
+                # More workers may have joined.
                 self._fill(source)
                 continue
-            job = self._at_work.pop(future)
-            # First, so that no worker waits while the outcome is entered.
+            job = self._running.pop(future)
+            # First, so that no worker waits while the outcome is entered in the ledger.
             self._fill(source)
-            ended = _ended(future, job)
+            ended = _outcome_of(future, job)
             future.release()
             if ended is None:
                 _LOG.warning("scene %s: its worker died", job.scene.id)
                 self._suspects.append(job)
             else:
                 yield ended
-        yield from alone(self._suspects, client=self._client, stop=self._stop)
+        yield from process_one_by_one(self._suspects, client=self._client, stop=self._stop)
 
     def _fill(self, source: Iterator[Job]) -> None:
-        room = max(LEAST_AHEAD, AHEAD * self._staff.count())
-        while len(self._at_work) < room and not self._stop:
+        room = max(LEAST_SCENES_AHEAD, SCENES_PER_THREAD * self._workers.count())
+        while len(self._running) < room and not self._stop:
             job = next(source, None)
             if job is None:
                 return
             if self._taken:
                 self._taken(job)
-            future = _submitted(self._client, job)
-            self._at_work[future] = job
+            future = _submit(self._client, job)
+            self._running[future] = job
             future.add_done_callback(self._done.put)
 
 
@@ -397,19 +396,19 @@ def _is_local(client: Client) -> bool:
     return isinstance(client.cluster, LocalCluster)
 
 
-def _ended(future: Future, job: Job) -> Ended | None:
-    """Return how a scene ended, or None where its worker died."""
+def _outcome_of(future: Future, job: Job) -> EndedScene | None:
+    """Return how a scene ended, or None if its worker died."""
     from distributed import KilledWorker  # noqa: PLC0415 - takes a second to import
 
     error = None if future.status == "finished" else _error_of(future)
     if error is None:
-        found = future.result()
-        if isinstance(found, str):
-            return Ended(job, failed(job, found), final=False)
-        return Ended(job, *found)
+        result = future.result()
+        if isinstance(result, str):
+            return EndedScene(job, failed_outcome(job, result), final=False)
+        return EndedScene(job, *result)
     if isinstance(error, KilledWorker):
         return None
-    return Ended(job, failed(job, f"the worker failed: {error!r}"), final=False)
+    return EndedScene(job, failed_outcome(job, f"the worker failed: {error!r}"), final=False)
 
 
 def _error_of(future: Future) -> BaseException | None:
@@ -418,14 +417,14 @@ def _error_of(future: Future) -> BaseException | None:
     try:
         error: BaseException | None = future.exception()
     except CancelledError as gone:
-        raise _lost() from gone
+        raise _scheduler_lost() from gone
     if isinstance(error, CancelledError):
-        raise _lost() from error
+        raise _scheduler_lost() from error
     return error
 
 
-def _lost() -> SceneError:
+def _scheduler_lost() -> SceneError:
     return SceneError(
-        "the dask scheduler is gone, and with it the scenes in hand",
-        remedy="run again: what is done stays done",
+        "the dask scheduler is gone, and with it the running scenes",
+        remedy="run again: finished scenes are kept",
     )

@@ -1,4 +1,4 @@
-"""What is left over: scenes that can give no product, and products that would not be made again."""
+"""Find what is left over: scenes without product, and products that would not be made again."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from lidarops.campaign.model import Campaign
 from lidarops.campaign.product_settings import Products
 from lidarops.catalog.ledger import Made
 from lidarops.plan import product_dependence
-from lidarops.plan.scenes import Cut, instrument_and_start
+from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.plan.signal_rules import GLUED, StepName
 from lidarops.process.scene import nothing_to_do
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Scene
 
 Planned = tuple[Scene, Plan]
-"""A scene, and all that the campaign asks for of it."""
+"""A scene, and the plan of all its requested products."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,47 +28,46 @@ class Orphan:
     path: str
     reason: str
     run: str
-    """The one that made it."""
-    asked: bool = False
-    """Whether the campaign still asks for it, and its files, or others of its scene, no longer
-    allow it."""
+    """Id of the run that made it."""
+    requested: bool = False
+    """Whether the campaign still requests it but the present files do not allow it."""
     lost: bool = False
-    """Whether the campaign still asks for it, and no raw file of its scene is left."""
+    """Whether the campaign still requests it, but no raw file of its scene is left."""
 
 
 class Fate(StrEnum):
-    """What became of the signal files that a product was made from, whose scene is gone."""
+    """What happened to the signal files of a product whose scene no longer exists."""
 
-    CUT_ANEW = "its files are cut into other scenes now"
-    UNUSED = "its raw files are refused, or stand in no scene"
+    CUT_ANEW = "its files belong to other scenes now"
+    UNUSED = "its raw files are refused, or belong to no scene"
     GONE = "no raw file of its scene is left"
 
 
 class Fates:
-    """Tells what became of the signal files of products.
+    """Finds what happened to the signal files of products.
 
     Parameters
     ----------
-    found : Cut
-        The scenes of some days, and the good granules that stand in none.
+    cut : Cut
+        The scenes of some days, and the good granules that belong to none.
     refused : callable
-        Gives the granules that the catalog refuses; asked once, and only where it matters.
+        Returns the granules that the catalog refuses; called at most once.
     signals : callable
-        Of a product, the signal files that it was made from.
+        Returns the signal files that a product was made from.
     """
 
     def __init__(
         self,
-        found: Cut,
+        cut: Cut,
         refused: Callable[[], Iterable[Granule]],
         signals: Callable[[Made], Iterable[InputRecord]],
     ) -> None:
-        self._found = found
+        self._cut = cut
         self._refused = refused
         self._signals = signals
 
     def of(self, made: Made) -> Fate:
-        """Return what became of the files of a product, of those that are left where some are."""
+        """Return the fate of the files of a product; if some are left, the fate of these."""
         signals = list(self._signals(made))
         if any(used.path in self._in_scenes or used.sha256 in self._in_scenes for used in signals):
             return Fate.CUT_ANEW
@@ -76,46 +75,52 @@ class Fates:
 
     @cached_property
     def _in_scenes(self) -> set[str | None]:
-        granules = (granule for scene in self._found.scenes for granule in scene.granules)
+        granules = (granule for scene in self._cut.scenes for granule in scene.granules)
         return {name for granule in granules for name in (granule.path, granule.sha256)}
 
     @cached_property
     def _idle(self) -> set[str]:
-        return {granule.path for granule in (*self._refused(), *self._found.set_aside)}
+        return {granule.path for granule in (*self._refused(), *self._cut.set_aside)}
 
 
 def scenes_without_product(planned: Iterable[Planned], campaign: Campaign) -> dict[str, str]:
-    """Return the scenes that can give no product and serve none of a network, and why.
+    """Return the scenes that give no product and are used by no network, and why.
 
     Parameters
     ----------
     planned : iterable of (Scene, Plan)
-        All of some days.
+        All scenes of some days.
     campaign : Campaign
     """
-    everything = list(planned)
-    idle = [(scene, told) for scene, told in everything if not product_dependence.wanted(told)]
-    serving = {each.path for scene, _ in everything if scene.members for each in scene.granules}
-    found = {}
-    for scene, told in idle:
+    scenes = list(planned)
+    without = [
+        (scene, plan) for scene, plan in scenes if not product_dependence.planned_products(plan)
+    ]
+    in_networks = {
+        granule.path for scene, _ in scenes if scene.members for granule in scene.granules
+    }
+    reasons = {}
+    for scene, plan in without:
         networks = _of_networks_alone(scene, campaign)
         if not networks:
-            found[scene.id] = nothing_to_do(told)
-        elif not any(granule.path in serving for granule in scene.granules):
-            found[scene.id] = (
-                f"nothing to do: used by network {' and '.join(networks)} alone, of which no other"
-                " instrument has files then"
+            reasons[scene.id] = nothing_to_do(plan)
+        elif not any(granule.path in in_networks for granule in scene.granules):
+            reasons[scene.id] = (
+                f"nothing to do: used by network {' and '.join(networks)} only, of which no other"
+                " instrument has files at that time"
             )
-    return found
+    return reasons
 
 
 def _of_networks_alone(scene: Scene, campaign: Campaign) -> list[str]:
-    """Return the networks of an instrument that is asked for nothing itself."""
+    """Return the networks of an instrument that has no requested product of its own."""
     owner = campaign.instruments.get(scene.instrument)
     if owner is None or owner.products != Products():
         return []
     return [
-        name for name, each in campaign.networks.items() if scene.instrument in each.instruments
+        name
+        for name, network in campaign.networks.items()
+        if scene.instrument in network.instruments
     ]
 
 
@@ -131,48 +136,48 @@ def orphaned_products(
     Parameters
     ----------
     planned : sequence of (Scene, Plan)
-        All of some days.
+        All scenes of some days.
     made : iterable of Made
         The products of those days.
     campaign : Campaign
     other_files : callable
         Whether a product was made from other signal files than its scene has now.
     fate : callable
-        What became of the signal files of a product whose scene is gone; `Fates.of`.
+        Returns what happened to the signal files of a product whose scene is gone; `Fates.of`.
 
     Returns
     -------
     list of (Made, Orphan)
     """
-    scenes = {scene.id: (scene, told) for scene, told in planned}
-    asked = {
+    scenes = {scene.id: (scene, plan) for scene, plan in planned}
+    requested = {
         (scene.id, kind.value, channel)
-        for scene, told in planned
-        for kind, channel in product_dependence.wanted(told)
+        for scene, plan in planned
+        for kind, channel in product_dependence.planned_products(plan)
     }
-    found = []
-    for each in made:
-        if each.key in asked:
+    orphans = []
+    for product in made:
+        if product.key in requested:
             continue
-        reason, kept, lost = "the campaign does not ask for it any more", False, False
-        if _asks(campaign, each):
-            if each.scene in scenes:
-                scene, told = scenes[each.scene]
-                reason, kept = _why(told, each), other_files(each, scene)
+        reason, kept, lost = "the campaign no longer requests it", False, False
+        if _requests(campaign, product):
+            if product.scene in scenes:
+                scene, plan = scenes[product.scene]
+                reason, kept = _why_left_out(plan, product), other_files(product, scene)
             else:
-                absent = _absent(each, planned, campaign)
-                became = fate(each)
-                # What cannot be read now may have been the only good bytes.
-                kept = bool(absent) or became is Fate.UNUSED
-                lost = not absent and became is Fate.GONE
-                reason = absent or became.value
-        found.append((each, Orphan(each.path, reason, each.run, kept, lost)))
-    return found
+                missing = _missing_members(product, planned, campaign)
+                file_fate = fate(product)
+                # Unreadable files may be the only copies; keep the product.
+                kept = bool(missing) or file_fate is Fate.UNUSED
+                lost = not missing and file_fate is Fate.GONE
+                reason = missing or file_fate.value
+        orphans.append((product, Orphan(product.path, reason, product.run, kept, lost)))
+    return orphans
 
 
-def _asks(campaign: Campaign, product: Made) -> bool:
-    """Return whether the campaign asks its instrument or network for a product."""
-    name, _ = instrument_and_start(product.scene)
+def _requests(campaign: Campaign, product: Made) -> bool:
+    """Return whether the campaign requests a product of its instrument or network."""
+    name, _ = parse_scene_id(product.scene)
     if name in campaign.networks:
         channel = campaign.networks[name].visibility.channel
         return (product.kind, product.channel) == (ProductKind.VISIBILITY.value, channel)
@@ -185,27 +190,28 @@ def _asks(campaign: Campaign, product: Made) -> bool:
     return product.channel in settings.channels
 
 
-def _why(told: Plan, product: Made) -> str:
-    """Return why a plan leaves out a product that is asked for."""
+def _why_left_out(plan: Plan, product: Made) -> str:
+    """Return why a plan leaves out a requested product."""
     reasons = dict.fromkeys(
         left.reason
-        for left in told.left_out
+        for left in plan.left_out
         if left.channel == product.channel and left.name in (product.kind, StepName.READ)
     )
     return "; ".join(reasons) or "its plan leaves it out"
 
 
-def _absent(product: Made, planned: Sequence[Planned], campaign: Campaign) -> str:
-    """Return which instruments of a network lack files, so that too few are left; else nothing."""
-    name, start = instrument_and_start(product.scene)
+def _missing_members(product: Made, planned: Sequence[Planned], campaign: Campaign) -> str:
+    """Return which instruments of a network have no files left; empty if this is not the cause."""
+    name, start = parse_scene_id(product.scene)
     if name not in campaign.networks:
         return ""
-    there = {scene.instrument for scene, _ in planned if _holds(scene, start)}
-    lost = [each for each in campaign.networks[name].instruments if each not in there]
-    # Where the network has a scene then, that one replaces the one that is gone.
-    if name in there or len(lost) in {0, len(campaign.networks[name].instruments)}:
+    members = campaign.networks[name].instruments
+    present = {scene.instrument for scene, _ in planned if _holds(scene, start)}
+    missing = [member for member in members if member not in present]
+    # If the network has a scene at that time, it replaces the one that is gone.
+    if name in present or len(missing) in {0, len(members)}:
         return ""
-    return f"no raw file of {' and '.join(lost)} is left"
+    return f"no raw file of {' and '.join(missing)} is left"
 
 
 def _holds(scene: Scene, moment: datetime) -> bool:

@@ -1,4 +1,4 @@
-"""How a run is asked for, and what it came to."""
+"""Options of a run, and its result."""
 
 from __future__ import annotations
 
@@ -23,91 +23,93 @@ Progress = Callable[[SceneOutcome], None]
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to run; changes no result."""
+    """How to run; affects no product."""
 
     force: bool = False
-    """Process what is asked for though it is fresh."""
+    """Process everything selected, also what is fresh."""
     workers: int = 1
-    """Processes of this machine, also where a cluster does the rest."""
+    """Local processes; they scan and report also if a cluster processes the scenes."""
     memory: str | None = None
-    """Most memory of a worker that is started here, such as ``2GiB``."""
+    """Memory limit of a local worker, such as ``2GiB``."""
     cluster: Callable[[], AbstractContextManager[Client]] | None = None
-    """Starts or reaches a cluster to run on instead; called only where something is stale."""
+    """Starts or reaches a cluster to run on instead; called only if something is stale."""
     wait: float = 0.0
     """s to wait for another run on the same catalog."""
     profiles_per_chunk: int | None = None
     progress: Progress | None = None
     """Called with the outcome of each scene as it ends."""
     expect: Callable[[int], None] | None = None
-    """Called with numbers of granules that are found to be processed."""
+    """Called with the number of granules of each group of stale scenes before processing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What a run did, and how the archive stands after it."""
+    """What a run did, and the state of the archive after it."""
 
     record: RunRecord | None
-    """None where there was nothing to do."""
+    """None if there was nothing to do."""
     status: RunStatus
     summary: ScanSummary
     fresh: int
-    """Products that were looked at and found fresh; those of days in which nothing at all changed
-    are not counted."""
+    """Number of products that were judged fresh, without those of unchanged days."""
     orphans: tuple[Orphan, ...]
     failures: Mapping[str, str]
     """Scene -> error, of every scene whose last try failed."""
-    empty: tuple[str, ...]
-    """Scenes whose retrievals left nothing to use; what is found orphaned does not count."""
-    barren: Mapping[str, str]
+    unusable: tuple[str, ...]
+    """Scenes whose retrievals gave no usable value; orphaned products do not count."""
+    empty_scenes: Mapping[str, str]
     """Scene -> why it can give no product."""
     set_aside: Mapping[str, str]
-    """Path of a good granule that stands in no scene -> why."""
-    untold: int = 0
-    """More of both, on days in which nothing changed."""
+    """Path of a good granule that belongs to no scene -> why."""
+    more_unused: int = 0
+    """Number of further empty scenes and granules set aside, on unchanged days."""
     unmet: tuple[Unmet, ...] = ()
-    """What is asked for, or told facts of, and not in the files; what no file holds first."""
+    """What products or facts of the campaign name and the files do not hold; what no file holds
+    comes first."""
     signal: int = 0
     """The signal that stopped the run."""
 
     @property
-    def left_nothing(self) -> tuple[str, ...]:
-        """Scenes whose retrievals left nothing to use: of the archive, and of this run's part."""
+    def unusable_scenes(self) -> tuple[str, ...]:
+        """Scenes whose retrievals gave no usable value: of the archive, and of this run."""
         scenes = () if self.record is None else self.record.scenes
-        return tuple(dict.fromkeys((*self.empty, *(each.scene for each in scenes if each.empty))))
+        return tuple(
+            dict.fromkeys((*self.unusable, *(scene.scene for scene in scenes if scene.unusable)))
+        )
 
     @property
     def lost(self) -> Mapping[str, str]:
-        """Products that are asked for, and of whose scene no raw file is left -> why."""
-        return {each.path: each.reason for each in self.orphans if each.lost}
+        """Requested products of whose scene no raw file is left -> why."""
+        return {orphan.path: orphan.reason for orphan in self.orphans if orphan.lost}
 
     @property
     def troubled(self) -> bool:
-        """Whether anything was refused, failed or lost, in this run or before and still so."""
+        """Whether anything is refused, failed, empty or lost, now or since an earlier run."""
         return bool(
             self.summary.refused
             or self.failures
-            or self.empty
-            or self.barren
+            or self.unusable
+            or self.empty_scenes
             or self.set_aside
-            or self.untold
-            or any(each.nowhere for each in self.unmet)
+            or self.more_unused
+            or any(request.nowhere for request in self.unmet)
             or self.lost
             or self.status is not RunStatus.FINISHED
             or (self.record is not None and self.record.failed)
         )
 
 
-def unreported(campaign: Campaign) -> str:
-    """Say how to get the page of the last run, where its report was begun and is not there.
+def missing_report(campaign: Campaign) -> str:
+    """Return how to get the missing report page of the last run; empty if it is not missing.
 
-    So it is where the disk was full, or where the run was stopped while it drew.
+    The page is missing if the disk was full or the run was stopped while it drew.
     """
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
         for last in store.runs(limit=1):
             folder = campaign.report_root / last.id
             if folder.is_dir() and not (folder / run_page.INDEX).exists():
-                told = "the page of the last run is missing"
+                problem = "the report page of the last run is missing"
                 if (folder / run_record.FILE_NAME).exists():
-                    return f"{told}: lidarops report {folder}"
-                return f"{told}, and its record: lidarops reprocess --force makes others"
+                    return f"{problem}; make it with: lidarops report {folder}"
+                return f"{problem}, and so is its record; lidarops reprocess --force makes new ones"
     return ""

@@ -1,4 +1,4 @@
-"""What is asked for: whether there is such a thing at all."""
+"""Check a selection against the campaign: unknown names, no scene, channels that no file holds."""
 
 from __future__ import annotations
 
@@ -13,63 +13,63 @@ from lidarops.records import ProductKind, Unmet
 from lidarops.run.staleness import Selection
 
 
-def refuse_unknown(campaign: Campaign, selection: Selection) -> None:
-    """Refuse a selection that cannot be meant.
+def check_selection(campaign: Campaign, selection: Selection) -> None:
+    """Refuse a selection that names what the campaign does not have.
 
     Raises
     ------
     CampaignError
-        If the campaign knows no such station or instrument, or the interval is empty, or nothing
-        of it is asked for such a kind of product.
+        If the campaign has no such station or instrument or requests no such kind of product, or if
+        the interval of time is empty.
     """
     known = {
         "instrument": (selection.instruments, (*campaign.instruments, *campaign.networks)),
         "station": (selection.stations, (*campaign.stations, *campaign.networks)),
     }
-    for word, (asked, there) in known.items():
-        for name in asked:
-            if name not in there:
+    for word, (selected, names) in known.items():
+        for name in selected:
+            if name not in names:
                 raise CampaignError(
                     f"the campaign has no {word} {name!r}",
-                    remedy=f"known: {', '.join(sorted(set(there)))}",
+                    remedy=f"known: {', '.join(sorted(set(names)))}",
                 )
     kinds = _kinds(campaign)
     for kind in selection.kinds:
         if kind not in kinds:
             raise CampaignError(
-                f"no instrument or network of the campaign is asked for product {kind.value!r}",
-                remedy=f"asked for: {', '.join(kinds) or 'none'}",
+                f"no instrument or network of the campaign requests product {kind.value!r}",
+                remedy=f"requested: {', '.join(kinds) or 'none'}",
             )
     since, until = selection.since, selection.until
     if since is not None and until is not None and since >= until:
         raise CampaignError(
-            f"no time lies from {since.isoformat()} to {until.isoformat()}",
+            f"the interval from {since.isoformat()} to {until.isoformat()} is empty",
             field="since, until",
             remedy="since must be earlier than until",
         )
 
 
 def _kinds(campaign: Campaign) -> list[ProductKind]:
-    """Return the kinds of product that a campaign asks for."""
-    wanted = [each.products for each in campaign.instruments.values()]
+    """Return the kinds of product that a campaign requests."""
+    requests = [instrument.products for instrument in campaign.instruments.values()]
     return [
         kind
         for kind in ProductKind
-        if any(getattr(each, kind.value, None) is not None for each in wanted)
+        if any(getattr(products, kind.value, None) is not None for products in requests)
         or (kind is ProductKind.VISIBILITY and campaign.networks)
     ]
 
 
-def refuse_nowhere(campaign: Campaign, *, archive: str | None) -> None:
-    """Refuse an archive that is not there and a catalog that has no URL of a database.
+def check_archive_and_catalog(campaign: Campaign, *, archive: str | None) -> None:
+    """Refuse an archive that does not exist and a catalog whose URL names no database.
 
     Parameters
     ----------
     campaign : Campaign
         As loaded.
     archive : str, optional
-        What was given beside the campaign file: it is wrong use where that is not there, while
-        the archive of a file may be away for a while.
+        Archive that overrides the campaign file. It is wrong use if this one does not exist; the
+        archive of a campaign file may be temporarily unavailable.
 
     Raises
     ------
@@ -83,20 +83,20 @@ def refuse_nowhere(campaign: Campaign, *, archive: str | None) -> None:
         raise
 
 
-def none(campaign: Campaign, selection: Selection) -> bool:
-    """Return whether something is asked for in which no scene of the catalog lies.
+def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:
+    """Return whether a selection is limited and contains no scene of the catalog.
 
     Parameters
     ----------
     campaign : Campaign
-        With a catalog.
+        A catalog must exist.
     selection : Selection
     """
     if selection.everything:
         return False
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
-        days = selection.days(sorted({each.day for each in store.day_sums()}))
-        # No scene is longer than a day, and the first one that is asked for answers.
+        days = selection.days(sorted({day_sum.day for day_sum in store.day_sums()}))
+        # No scene is longer than a day; the first selected scene decides.
         return not any(
             selection.scenes(cut_scenes(campaign, store.granules_of(day, day, dark_days=0)).scenes)
             for day in days
@@ -104,7 +104,7 @@ def none(campaign: Campaign, selection: Selection) -> bool:
 
 
 def unmet_requests(campaign: Campaign, store: Store, selection: Selection) -> tuple[Unmet, ...]:
-    """Return what is asked for, or told facts of, and not in the files.
+    """Return what products or facts of the campaign name and the files do not hold.
 
     Parameters
     ----------
@@ -112,24 +112,27 @@ def unmet_requests(campaign: Campaign, store: Store, selection: Selection) -> tu
     store : Store
         Its catalog.
     selection : Selection
-        Only of instruments, and of members of networks, that are asked for.
+        Limits the result to these instruments and members of these networks.
     """
-    # To count files takes longer than to find that none lacks anything, as is usual.
-    if not (availability.names_any(campaign) and availability.lacks_any(campaign, store.layouts())):
+    # Usually no file lacks anything, which is faster to find out than to count files.
+    if not (
+        availability.names_channels(campaign)
+        and availability.lacks_channels(campaign, store.layouts())
+    ):
         return ()
     owners: dict[str, tuple[str, ...]] = {name: (name,) for name in campaign.instruments}
-    owners |= {name: tuple(each.instruments) for name, each in campaign.networks.items()}
-    chosen = {
+    owners |= {name: tuple(network.instruments) for name, network in campaign.networks.items()}
+    selected = {
         member
         for name, members in owners.items()
         for member in members
         if (not selection.instruments or name in selection.instruments)
         and (not selection.stations or _station(campaign, name) in selection.stations)
     }
-    return availability.unavailable(
+    return availability.unavailable_channels(
         campaign,
-        store.holdings(availability.edges(campaign)),
-        instruments=chosen,
+        store.holdings(availability.validity_edges(campaign)),
+        instruments=selected,
         kinds=selection.kinds,
         since=selection.since,
         until=selection.until,

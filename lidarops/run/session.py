@@ -1,4 +1,4 @@
-"""One run in the ledger: every scene is entered as it ends."""
+"""Enter one run in the ledger, every scene as it ends."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.netcdf.provenance import code_version
 from lidarops.plan import cost_estimate
-from lidarops.plan.product_dependence import Wanted
+from lidarops.plan.product_dependence import ProductKey
 from lidarops.records import Granule, LeftOut, ProductRecord, RunRecord, Scene, SceneOutcome, Unmet
 from lidarops.run.staleness import Judge, Judgement
 
 MOST_INPUTS: Final = 100_000
-"""Granules whose names the record of a run keeps; the ledger keeps all."""
-MOST_BARREN: Final = 1000
-"""Scenes without any product that the record of a run names; it counts the others."""
+"""Granules that the record of a run names; the ledger names all."""
+MOST_EMPTY_SCENES: Final = 1000
+"""Scenes without product that the record of a run names; it counts the others."""
 
 _LOG = logging.getLogger(__name__)
 
 
 class Session:
-    """A run that is entered in the ledger as it goes.
+    """A run that enters each scene in the ledger as it ends.
 
     Parameters
     ----------
     campaign : Campaign
     store : Store
     lock : Lock
-        Held by whoever begins the session.
+        Must be held when the session begins.
     judge : Judge
     """
 
@@ -60,15 +60,15 @@ class Session:
         self._left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
         self._named = 0
         self.settled: set[str] = set()
-        """Scenes of which another look would find every product fresh."""
+        """Scenes whose products are all fresh now."""
         self._tally = cost_estimate.Tally(cost_estimate.load_calibration())
         self.started = datetime.now(UTC)
         self.id = f"{self.started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
 
     def begin(self) -> None:
-        """Enter the run, and clear away what a killed one left."""
+        """Enter the run in the ledger, and remove temporary files of killed runs."""
         for path in versions.sweep(self._output):
-            _LOG.warning("removed %s, which a killed run left", path)
+            _LOG.warning("removed %s, left by a killed run", path)
         run = Run(
             id=self.id,
             started=self.started,
@@ -81,13 +81,14 @@ class Session:
         self._store.begin_run(run, self._lock.token)
 
     def take(self, judged: Judgement, *, note: bool) -> None:
-        """Prepare for a scene that is about to start.
+        """Prepare for a scene that is about to start: keep replaced versions.
 
         Parameters
         ----------
         judged : Judgement
         note : bool
-            Whether the scene may take this very process down, which the ledger then remembers.
+            Whether to note the start in the ledger, because the scene runs in this process: if the
+            process dies, the next run knows the suspect.
         """
         for stale in judged.stale:
             reason = stale.reason
@@ -99,12 +100,12 @@ class Session:
             self._store.begin_scene(judged.scene.id, judged.day, self.id, self._lock.token)
 
     def end(self, judged: Judgement, outcome: SceneOutcome, *, final: bool) -> SceneOutcome:
-        """Enter what became of a scene.
+        """Enter the outcome of a scene.
 
         Returns
         -------
         SceneOutcome
-            As it was entered: failed where its files are not there any more.
+            As entered; failed if its product files are missing or changed.
         """
         new, outcome = self._new_products(judged, outcome)
         entry = Entry(
@@ -117,31 +118,33 @@ class Session:
         )
         self._store.record(entry, self.id, self._lock.token)
         self._settle(judged, outcome, new)
-        # Once it is entered, as an estimate is no reason to lose a scene.
+        # After the entry, so that a failing estimate loses no scene.
         outcome = replace(
             outcome,
             estimated_seconds=self._estimated(judged),
             left_out=self._beyond(judged, outcome),
         )
         self._settle_versions(judged, outcome)
-        self._tell(outcome)
+        self._log(outcome)
         self._named += outcome.granules
-        # The page shows a few scenes; the names of a million files would only fill memory.
+        # A million file names would fill memory, and the page shows few.
         self._outcomes.append(
             outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
         )
         return outcome
 
     def _settle(self, judged: Judgement, outcome: SceneOutcome, new: Sequence[NewProduct]) -> None:
-        # What was refused is no part of the scene any more.
+        # A refused file no longer belongs to the scene.
         if outcome.error or outcome.refused:
             return
-        made = {(each.record.kind, each.record.channel): each.depends_on for each in new}
+        made = {
+            (product.record.kind, product.record.channel): product.depends_on for product in new
+        }
         if self._judge.settles(judged, outcome.inputs, made):
             self.settled.add(judged.scene.id)
 
     def add(self, outcome: SceneOutcome) -> None:
-        """Add to the record of the run what was not tried."""
+        """Add a scene that was not tried to the record of the run."""
         self._outcomes.append(outcome)
 
     def finish(
@@ -149,7 +152,7 @@ class Session:
         status: RunStatus,
         set_aside: Sequence[Granule],
         *,
-        barren: Mapping[str, str] | None = None,
+        empty_scenes: Mapping[str, str] | None = None,
         unmet: tuple[Unmet, ...] = (),
     ) -> RunRecord:
         """Close the run in the ledger and return its record.
@@ -158,8 +161,8 @@ class Session:
         ----------
         status : RunStatus
         set_aside : sequence of Granule
-            Good ones that stand in no scene.
-        barren : mapping of str to str, optional
+            Good granules that belong to no scene.
+        empty_scenes : mapping of str to str, optional
             Scene -> why it can give no product.
         unmet : tuple of Unmet
         """
@@ -180,23 +183,23 @@ class Session:
             truth=_truth(self._campaign),
             costs=self._tally.costs.words,
             unmet=unmet,
-            barren=dict(islice((barren or {}).items(), MOST_BARREN)),
-            more_barren=max(len(barren or {}) - MOST_BARREN, 0),
+            empty_scenes=dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES)),
+            more_empty_scenes=max(len(empty_scenes or {}) - MOST_EMPTY_SCENES, 0),
         )
 
     def _estimated(self, judged: Judgement) -> float:
-        """Return the CPU time that a scene was to take, s, with what it is the first to load."""
+        """Return the estimated CPU time of a scene (s), with the code that it loads first."""
         before = self._tally.loading
         whole = self._campaign.all_steps
         own = self._tally.add(judged.scene, judged.needed(), whole=whole)
         return own + self._tally.loading - before
 
     def _beyond(self, judged: Judgement, outcome: SceneOutcome) -> tuple[LeftOut, ...]:
-        """Return what was left out of what is asked for, and is in no plan of a product."""
-        told = set(() if outcome.plan is None else outcome.plan.left_out)
-        found = tuple(left for left in judged.asked.left_out if left not in told)
-        # Equal in nearly all scenes of an instrument, of which a run may have 100,000.
-        return self._left_out.setdefault(found, found)
+        """Return the left-out steps of the request that are in no plan of a product."""
+        planned = set(() if outcome.plan is None else outcome.plan.left_out)
+        others = tuple(left for left in judged.requested.left_out if left not in planned)
+        # Share equal tuples: nearly all scenes of an instrument have the same.
+        return self._left_out.setdefault(others, others)
 
     def _new_products(
         self, judged: Judgement, outcome: SceneOutcome
@@ -207,7 +210,7 @@ class Session:
             if mtime_ns is None:
                 error = f"{record.path}: vanished or changed after it was written"
                 return [], replace(outcome, products=(), error=error)
-            product: Wanted = (record.kind, record.channel)
+            product: ProductKey = (record.kind, record.channel)
             depends_on, used = self._judge.depends_on(
                 judged.scene, judged.plan, product, outcome.inputs
             )
@@ -218,13 +221,13 @@ class Session:
 
     def _written(self, record: ProductRecord) -> int | None:
         try:
-            about = (self._campaign.products_root / record.path).stat()
+            status = (self._campaign.products_root / record.path).stat()
         except OSError:
             return None
-        return about.st_mtime_ns if about.st_size == record.size else None
+        return status.st_mtime_ns if status.st_size == record.size else None
 
     def _settle_versions(self, judged: Judgement, outcome: SceneOutcome) -> None:
-        """Drop the kept versions that nothing has replaced."""
+        """Drop kept versions that were not replaced."""
         now = {record.path: record.sha256 for record in outcome.products}
         for stale in judged.stale:
             if stale.before is not None:
@@ -233,22 +236,22 @@ class Session:
                 if now.get(path, stale.before.sha256) == stale.before.sha256:
                     versions.drop(self._output, kept)
 
-    def _tell(self, outcome: SceneOutcome) -> None:
-        about = {
+    def _log(self, outcome: SceneOutcome) -> None:
+        fields = {
             "scene": outcome.scene,
             "granules": outcome.granules,
             "products": [record.path for record in outcome.products],
             "seconds": dict(outcome.seconds),
         }
         if outcome.error:
-            _LOG.error("scene %s failed: %s", outcome.scene, outcome.error, extra=about)
+            _LOG.error("scene %s failed: %s", outcome.scene, outcome.error, extra=fields)
         else:
             _LOG.info(
                 "scene %s: %d granules, %d products",
                 outcome.scene,
                 outcome.granules,
                 len(outcome.products),
-                extra=about,
+                extra=fields,
             )
         for granule in outcome.refused:
             facts = {"scene": outcome.scene, "granule": granule.path}
@@ -256,7 +259,7 @@ class Session:
 
 
 def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:
-    """Return the digests of the files of a scene that the catalog holds otherwise, or not."""
+    """Return path -> SHA-256 of the files of a scene whose digest differs from the catalog's."""
     known = {granule.path: granule.sha256 for granule in (*scene.granules, *scene.dark)}
     return {
         used.path: used.sha256

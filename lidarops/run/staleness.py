@@ -1,8 +1,8 @@
-"""Which products are stale, and why.
+"""Decide which products are stale, and why.
 
-A product is fresh when its part of the plan, the settings and the code that it depends on, and
-the contents of all its inputs are those that the ledger recorded, and its file is there with the
-recorded content. Anything else is stale, for a reason that can be said.
+A product is fresh if four things equal what the ledger recorded: its part of the plan, the settings
+and the code that it depends on, the contents of all its inputs, and the content of its file. Every
+other product is stale, and the reason is stated.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.netcdf.provenance import code_version
 from lidarops.plan import product_dependence
-from lidarops.plan.product_dependence import Wanted
+from lidarops.plan.product_dependence import ProductKey
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import (
     DARK_REACH,
     Cut,
     cut_scenes,
-    instrument_and_start,
+    parse_scene_id,
+    scene_stop,
     select_scenes,
-    stop_of,
 )
 from lidarops.records import Granule, InputRecord, Plan, ProductKind, Role, Scene
 from lidarops.run import leftovers
@@ -40,19 +40,19 @@ from lidarops.run.leftovers import Orphan
 
 DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 MOST_GRANULES: Final = 50_000
-"""Granules that are judged at a time, unless one day has more; held in memory are those at work
-and, where workers process them, those that come next."""
+"""Granules that are judged at a time, unless one day has more. Memory holds the current group and,
+if workers process the scenes, the next group."""
 CRASHES: Final = 3
-"""Tries in which a scene may take its process down before it is refused."""
+"""A scene that kills its process this often is refused."""
 
 _PROFILE_ROLES: Final = {"molecular_profile": Role.MOLECULAR, "overlap_profile": Role.OVERLAP}
-# What may change without a scene being cut or a product being made in another way.
+# Settings that change neither the scenes nor the content of a product.
 _OPERATION: Final = frozenset({"archive", "output", "catalog", "superseded", "simulation"})
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What is asked for; everything where empty."""
+    """Stations, instruments, kinds of product and times to process; empty fields select all."""
 
     stations: tuple[str, ...] = ()
     instruments: tuple[str, ...] = ()
@@ -62,11 +62,11 @@ class Selection:
 
     @property
     def everything(self) -> bool:
-        """Whether nothing is left out."""
+        """Whether the selection contains everything."""
         return self == Selection()
 
     def days(self, days: Iterable[int]) -> list[int]:
-        """Return those of the days on which there may be something that is asked for."""
+        """Return the days that may hold selected scenes."""
         first = None if self.since is None else day_of(self.since)
         last = None if self.until is None else day_of(self.until)
         return [
@@ -74,19 +74,19 @@ class Selection:
         ]
 
     def product(self, made: Made, campaign: Campaign) -> bool:
-        """Return whether a product, whose scene may be gone, is one of what is asked for."""
-        instrument, start = instrument_and_start(made.scene)
+        """Return whether a product is selected; its scene may no longer exist."""
+        instrument, start = parse_scene_id(made.scene)
         owner = campaign.instruments.get(instrument)
         return (
             (not self.kinds or made.kind in self.kinds)
             and (not self.instruments or instrument in self.instruments)
             and (not self.stations or (owner.station if owner else instrument) in self.stations)
-            and (self.since is None or stop_of(made.scene, campaign) > self.since)
+            and (self.since is None or scene_stop(made.scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
 
     def scenes(self, scenes: Sequence[Scene]) -> tuple[Scene, ...]:
-        """Return those of the scenes that are asked for."""
+        """Return the selected scenes."""
         return tuple(
             scene
             for scene in select_scenes(scenes, since=self.since, until=self.until)
@@ -97,73 +97,73 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Stale:
-    """A product that has to be made, and why."""
+    """A product to be made, and the reason."""
 
     kind: ProductKind
     channel: str
     reason: str
     before: Made | None = None
-    """What the ledger holds of it, where it was made before."""
+    """Its ledger entry, if it was made before."""
 
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What is to be done for one scene."""
+    """The work that one scene needs."""
 
     scene: Scene
     plan: Plan
-    """All that the campaign asks for."""
-    asked: Plan
-    """What of it the selection asks for."""
+    """Plan of all products that the campaign requests."""
+    requested: Plan
+    """Part of the plan that the selection requests."""
     day: int
     key: str
-    """Changes with anything that may change the outcome."""
+    """Digest of everything that may change the outcome."""
     stale: tuple[Stale, ...]
     fresh: int
     held: str = ""
-    """Why the scene is not tried again, though products of it are missing."""
+    """Why the scene is not tried again although products are missing."""
     suspect: bool = False
-    """Whether an earlier try took its process down."""
-    barren: str = ""
-    """Why the scene can give no product, and serves none of a network; empty where it does."""
+    """Whether an earlier try killed its process."""
+    empty_reason: str = ""
+    """Why the scene gives no product of its own and is used by no network; else empty."""
 
     def needed(self) -> Plan:
         """Return the part of the plan that the stale products need."""
         return product_dependence.plan_closure(
-            self.plan, [(each.kind, each.channel) for each in self.stale]
+            self.plan, [(product.kind, product.channel) for product in self.stale]
         )
 
 
 class Signature(NamedTuple):
-    """What a day looks like: equal where nothing can have become stale."""
+    """State of one day: if it is unchanged, no product of the day can have become stale."""
 
     sources: str
-    """What its products are made from."""
+    """Digest of what its products are made from."""
     whole: str
-    """That, and its products; empty where the file of one is not as recorded."""
+    """Digest of the sources and the products; empty if a product file is not as recorded."""
 
 
 @dataclass(frozen=True, slots=True)
 class DaysJudged:
-    """What was found for some days."""
+    """Judgements of the scenes of some days."""
 
     judgements: tuple[Judgement, ...]
     orphans: tuple[Orphan, ...]
     set_aside: tuple[Granule, ...]
-    told: Mapping[int, tuple[int, int]]
-    """Days that may be settled -> barren scenes, granules set aside."""
+    unused: Mapping[int, tuple[int, int]]
+    """Days that may be settled -> numbers of empty scenes and of granules set aside."""
     open: frozenset[int]
-    """Days with something to do, after which they may be."""
+    """Days with stale products; they may be settled after processing."""
     gone: frozenset[str]
-    """Scenes of which the ledger notes a failure, and that are no more or all fresh."""
+    """Scenes with a recorded failure that no longer exist or are all fresh."""
     touched: Mapping[str, int]
-    """Products with a new modification time, but the recorded content."""
+    """Products with the recorded content but a new modification time (ns), by path."""
     digests: Mapping[str, str]
-    """Contents of files that had to be read whole, by path; for the catalog."""
+    """SHA-256 of files that had to be read in full, by path; for the catalog."""
 
 
 class Judge:
-    """Judges the products of a campaign against its ledger.
+    """Compares the products of a campaign with its ledger.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ class Judge:
     store : Store
     selection : Selection
     force : bool
-        Whether everything that is asked for counts as stale.
+        Whether every selected product counts as stale.
     """
 
     def __init__(
@@ -194,31 +194,31 @@ class Judge:
     # Days
 
     def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
-        """Return what every day looks like.
+        """Return the state of every day.
 
         Parameters
         ----------
         days : collection of int, optional
-            Only of these; all with granules or products where not given.
+            Days to return; default all days with granules or products.
         """
         sums: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
-        for each in self._store.day_sums():
-            told = (each.role.value, each.good, each.low, each.high)
-            sums[each.day].append(told)
-            if each.role is Role.DARK:
+        for day_sum in self._store.day_sums():
+            fingerprint = (day_sum.role.value, day_sum.good, day_sum.low, day_sum.high)
+            sums[day_sum.day].append(fingerprint)
+            if day_sum.role is Role.DARK:
                 for near in range(1, DARK_DAYS + 1):
-                    sums[each.day - near].append((near, *told))
-                    sums[each.day + near].append((-near, *told))
+                    sums[day_sum.day - near].append((near, *fingerprint))
+                    sums[day_sum.day + near].append((-near, *fingerprint))
         products, broken = self._product_days()
         base = self._base()
-        found = {}
+        signatures = {}
         for day in sums.keys() | products.keys():
             if days is None or day in days:
                 digest = hashlib.sha256(f"{base}{day}{sorted(sums[day], key=repr)}".encode())
                 sources = digest.hexdigest()
                 digest.update(products[day].digest() if day in products else b"")
-                found[day] = Signature(sources, "" if day in broken else digest.hexdigest())
-        return found
+                signatures[day] = Signature(sources, "" if day in broken else digest.hexdigest())
+        return signatures
 
     def _product_days(self) -> tuple[dict[int, Any], set[int]]:
         root = str(self._campaign.products_root)
@@ -232,7 +232,7 @@ class Judge:
         return products, broken
 
     def _base(self) -> str:
-        told = as_settings(self._campaign)
+        settings = as_settings(self._campaign)
         names = sorted(
             {
                 name
@@ -244,7 +244,7 @@ class Judge:
         )
         return product_dependence.digest(
             [
-                {key: value for key, value in told.items() if key not in _OPERATION},
+                {key: value for key, value in settings.items() if key not in _OPERATION},
                 code_version(),
                 [[name, self._profile(name)] for name in names],
             ]
@@ -253,8 +253,8 @@ class Judge:
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
         """Group days so that the granules of a group fit in memory."""
         counts: dict[int, int] = defaultdict(int)
-        for each in self._store.day_sums():
-            counts[each.day] += each.good
+        for day_sum in self._store.day_sums():
+            counts[day_sum.day] += day_sum.good
         group: list[int] = []
         held = 0
         for day in sorted(days):
@@ -272,48 +272,55 @@ class Judge:
         Parameters
         ----------
         days : sequence of int
-            Rising; from `batches`.
+            Ascending; from `batches`.
         """
-        first, last, wanted = days[0], days[-1], set(days)
-        found = self._cut(first, last, wanted)
+        first, last, judged_days = days[0], days[-1], set(days)
+        cut = self._cut(first, last, judged_days)
         tried = self._store.tried(first, last)
-        made = {each.key: each for each in self._store.made(first, last) if each.day in wanted}
+        products = self._store.made(first, last)
+        made = {product.key: product for product in products if product.day in judged_days}
         touched: dict[str, int] = {}
-        everything = [self._scene(scene, made, tried, touched) for scene in found.scenes]
-        planned = [(each.scene, each.plan) for each in everything]
-        barren = leftovers.scenes_without_product(planned, self._campaign)
-        everything = [
-            replace(each, barren=barren[each.scene.id]) if each.scene.id in barren else each
-            for each in everything
+        judgements = [self._scene(scene, made, tried, touched) for scene in cut.scenes]
+        planned = [(judged.scene, judged.plan) for judged in judgements]
+        empty_reasons = leftovers.scenes_without_product(planned, self._campaign)
+        judgements = [
+            replace(judged, empty_reason=empty_reasons.get(judged.scene.id, ""))
+            for judged in judgements
         ]
-        chosen = {scene.id for scene in self._selection.scenes(found.scenes)}
-        fates = leftovers.Fates(found, self._store.refused, self._signals)
+        selected = {scene.id for scene in self._selection.scenes(cut.scenes)}
+        fates = leftovers.Fates(cut, self._store.refused, self._signals)
         orphans = leftovers.orphaned_products(
             planned, made.values(), self._campaign, self._other_files, fates.of
         )
-        orphaned = {known.day for known, _ in orphans}
+        orphaned = {product.day for product, _ in orphans}
         digests, self._digests = self._digests, {}
-        counts = _counts(everything, found.set_aside)
-        gone = {each.scene.id for each in everything if self._healed(each, tried)}
-        there = {scene.id for scene in found.scenes}
-        gone |= {name for name, each in tried.items() if each.day in wanted and name not in there}
+        counts = _counts(judgements, cut.set_aside)
+        gone = {judged.scene.id for judged in judgements if self._healed(judged, tried)}
+        present = {scene.id for scene in cut.scenes}
+        gone |= {
+            scene
+            for scene, last_try in tried.items()
+            if last_try.day in judged_days and scene not in present
+        }
         return DaysJudged(
-            judgements=tuple(each for each in everything if each.scene.id in chosen),
+            judgements=tuple(judged for judged in judgements if judged.scene.id in selected),
             orphans=tuple(
-                each for known, each in orphans if self._selection.product(known, self._campaign)
+                orphan
+                for product, orphan in orphans
+                if self._selection.product(product, self._campaign)
             ),
-            set_aside=found.set_aside,
-            told={day: counts[day] for day in days if day not in orphaned}
+            set_aside=cut.set_aside,
+            unused={day: counts[day] for day in days if day not in orphaned}
             if self._selection.everything
             else {},
-            open=frozenset(each.day for each in everything if each.stale),
+            open=frozenset(judged.day for judged in judgements if judged.stale),
             gone=frozenset(gone),
             touched=touched,
             digests=digests,
         )
 
     def _healed(self, judged: Judgement, tried: Mapping[str, Tried]) -> bool:
-        """Return whether a scene that failed needs no try any more, as when a file came back."""
+        """Return whether a failed scene is complete again, e.g. because a file came back."""
         last = tried.get(judged.scene.id)
         complete = not (judged.stale or judged.held or self._selection.kinds)
         return last is not None and bool(last.error) and complete
@@ -342,18 +349,18 @@ class Judge:
         judged = self.judgement(scene, whole)
         last = tried.get(scene.id)
         stale = []
-        asked = product_dependence.of_kinds(whole, self._selection.kinds)
-        for kind, channel in product_dependence.wanted(asked):
+        requested = product_dependence.plan_of_kinds(whole, self._selection.kinds)
+        for kind, channel in product_dependence.planned_products(requested):
             known = made.get((scene.id, kind.value, channel))
             reason = self._reason(scene, whole, (kind, channel), known, touched)
             if reason:
                 stale.append(Stale(kind, channel, reason, known))
         judged = replace(
             judged,
-            asked=asked,
+            requested=requested,
             key=self.key(judged),
             stale=tuple(stale),
-            fresh=len(product_dependence.wanted(asked)) - len(stale),
+            fresh=len(product_dependence.planned_products(requested)) - len(stale),
             suspect=last is not None and last.crashes > 0,
         )
         if last is None or self._force or not stale:
@@ -363,15 +370,16 @@ class Judge:
         return judged
 
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
-        """Return a judgement that asks for every product of a scene."""
-        stale = tuple(Stale(*each, "asked for") for each in product_dependence.wanted(whole))
+        """Return a judgement by which every product of a scene is stale."""
+        products = product_dependence.planned_products(whole)
+        stale = tuple(Stale(kind, channel, "requested") for kind, channel in products)
         return Judgement(scene, whole, whole, day_of(scene.start), "", stale, 0)
 
     def key(self, judged: Judgement) -> str:
-        """Return what changes with anything that may change the outcome of a scene.
+        """Return the digest of everything that may change the outcome of a scene.
 
-        Raw files are told by size and time: contents become known at different moments, and
-        what this costs is one try more of a scene whose files were touched.
+        Raw files enter by size and modification time, because their contents become known at
+        different moments. A scene whose files were touched is therefore tried once more.
         """
         scene, whole = judged.scene, judged.plan
         return product_dependence.digest(
@@ -388,37 +396,37 @@ class Judge:
         )
 
     def depends_on(
-        self, scene: Scene, whole: Plan, product: Wanted, files: Sequence[InputRecord]
+        self, scene: Scene, whole: Plan, product: ProductKey, files: Sequence[InputRecord]
     ) -> tuple[Dependence, tuple[InputRecord, ...]]:
-        """Return what a product depends on, and those of the files that it was made from."""
-        mine = product_dependence.plan_closure(whole, [product])
-        used = product_dependence.inputs(mine, files)
-        settings = self._settings.of(scene, mine, product[1])
-        found = Dependence(
-            plan_hash=mine.hash,
+        """Return what a product depends on, and the files that it was made from."""
+        closure = product_dependence.plan_closure(whole, [product])
+        used = product_dependence.product_inputs(closure, files)
+        settings = self._settings.of(scene, closure, product[1])
+        dependence = Dependence(
+            plan_hash=closure.hash,
             settings_hash=product_dependence.digest(settings),
-            inputs_hash=product_dependence.digest_of_inputs(used),
+            inputs_hash=product_dependence.inputs_digest(used),
             code_version=code_version(),
         )
-        return found, used
+        return dependence, used
 
     def settles(
-        self, judged: Judgement, files: Sequence[InputRecord], made: Mapping[Wanted, Dependence]
+        self, judged: Judgement, files: Sequence[InputRecord], made: Mapping[ProductKey, Dependence]
     ) -> bool:
-        """Return whether another look at a scene would find all that was stale to be fresh.
+        """Return whether every product that was stale is now fresh.
 
         Parameters
         ----------
         judged : Judgement
         files : sequence of InputRecord
-            What its products were made from.
+            Files that its products were made from.
         made : mapping of (ProductKind, str) to Dependence
-            What each depends on, by kind and channel.
+            Dependences of each product, by kind and channel.
         """
         contents = {used.path: used.sha256 for used in files}
         scene, whole = judged.scene, judged.plan
         for granule in (*scene.granules, *scene.dark):
-            # Other products may have been found fresh by what is no longer there.
+            # Other products may have been judged fresh by a digest that is no longer valid.
             if granule.sha256 and contents.get(granule.path, granule.sha256) != granule.sha256:
                 return False
         now = self._files(
@@ -426,10 +434,12 @@ class Judge:
         )
         for stale in judged.stale:
             product = (stale.kind, stale.channel)
-            used = product_dependence.inputs(product_dependence.plan_closure(whole, [product]), now)
+            used = product_dependence.product_inputs(
+                product_dependence.plan_closure(whole, [product]), now
+            )
             if product not in made:
                 return False
-            if made[product].inputs_hash != product_dependence.digest_of_inputs(used):
+            if made[product].inputs_hash != product_dependence.inputs_digest(used):
                 return False
         return True
 
@@ -437,49 +447,49 @@ class Judge:
         self,
         scene: Scene,
         whole: Plan,
-        product: Wanted,
+        product: ProductKey,
         known: Made | None,
         touched: dict[str, int],
     ) -> str:
-        """Return why a product is stale; empty where it is fresh."""
+        """Return why a product is stale; empty if it is fresh."""
         if self._force or known is None:
             return "forced" if self._force else "not made yet"
-        was = known.depends_on
-        mine = product_dependence.plan_closure(whole, [product])
-        settings = product_dependence.digest(self._settings.of(scene, mine, product[1]))
-        if (was.code_version, was.plan_hash, was.settings_hash) != (
+        recorded = known.depends_on
+        closure = product_dependence.plan_closure(whole, [product])
+        settings = product_dependence.digest(self._settings.of(scene, closure, product[1]))
+        if (recorded.code_version, recorded.plan_hash, recorded.settings_hash) != (
             code_version(),
-            mine.hash,
+            closure.hash,
             settings,
         ):
-            return _changed(was, mine.hash)
-        # Only now, as files may have to be read for it.
-        used = product_dependence.inputs(mine, self._files(scene, whole, self._content))
-        if was.inputs_hash != product_dependence.digest_of_inputs(used):
+            return _changed(recorded, closure.hash)
+        # Last, because files may have to be read for it.
+        used = product_dependence.product_inputs(closure, self._files(scene, whole, self._content))
+        if recorded.inputs_hash != product_dependence.inputs_digest(used):
             return _difference(self._store.inputs_of(known.path), used)
         return self._file_reason(known, touched)
 
     def _file_reason(self, made: Made, touched: dict[str, int]) -> str:
         path = self._campaign.products_root / made.path
         try:
-            about = path.stat()
-            if (about.st_size, about.st_mtime_ns) == (made.size, made.mtime_ns):
+            status = path.stat()
+            if (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns):
                 return ""
-            if about.st_size == made.size:
+            if status.st_size == made.size:
                 with path.open("rb") as stream:
                     if hashlib.file_digest(stream, "sha256").hexdigest() == made.sha256:
-                        touched[made.path] = about.st_mtime_ns
+                        touched[made.path] = status.st_mtime_ns
                         return ""
         except FileNotFoundError:
             return "its file is missing"
         except OSError as error:
             return f"its file cannot be read: {error.strerror or error}"
-        return "its file is not the one that was recorded"
+        return "its file differs from the recorded one"
 
     def _files(
         self, scene: Scene, whole: Plan, content: Callable[[Granule], str]
     ) -> tuple[InputRecord, ...]:
-        """Return the inputs of a scene as they are now."""
+        """Return the present inputs of a scene."""
         raw = [
             InputRecord(granule.path, granule.role, content(granule))
             for granule in (*scene.granules, *scene.dark)
@@ -490,14 +500,14 @@ class Judge:
         )
 
     def _content(self, granule: Granule) -> str:
-        """Return the sha256 of a granule, or what no sha256 is where it cannot be read."""
-        known = granule.sha256 or self._digests.get(granule.path)
-        if known is None:
+        """Return the SHA-256 of a granule; if it cannot be read, a text that equals no SHA-256."""
+        digest = granule.sha256 or self._digests.get(granule.path)
+        if digest is None:
             try:
-                known = self._digests[granule.path] = self._source.digest(granule.path)
+                digest = self._digests[granule.path] = self._source.digest(granule.path)
             except OSError:
-                known = None
-        return known or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
+                digest = None
+        return digest or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
 
     def _other_files(self, made: Made, scene: Scene) -> bool:
         return {used.sha256 for used in self._signals(made)} != {
@@ -514,77 +524,77 @@ class Judge:
                 with (Path(self._campaign.folder) / name).open("rb") as stream:
                     self._profiles[name] = hashlib.file_digest(stream, "sha256").hexdigest()
             except (OSError, ValueError):
-                # The processing of the scene will say what is wrong with it.
+                # The processing of the scene reports the problem.
                 self._profiles[name] = "unreadable"
         return self._profiles[name]
 
 
 def _looks_right(root: str, made: Made) -> bool:
     try:
-        about = os.stat(f"{root}/{made.path}")  # noqa: PTH116 - a Path takes five times as long
+        status = os.stat(f"{root}/{made.path}")  # noqa: PTH116 - a Path takes five times as long
     except OSError:
         return False
-    return (about.st_size, about.st_mtime_ns) == (made.size, made.mtime_ns)
+    return (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns)
 
 
 def _profiles(whole: Plan) -> tuple[tuple[str, Role], ...]:
-    found = {
+    profiles = {
         (step.settings[key], role)
         for step in whole.steps
         for key, role in _PROFILE_ROLES.items()
         if step.settings.get(key)
     }
-    return tuple(sorted(found))
+    return tuple(sorted(profiles))
 
 
 def _channels(whole: Plan) -> list[str]:
-    return sorted({channel for _, channel in product_dependence.wanted(whole)})
+    return sorted({channel for _, channel in product_dependence.planned_products(whole)})
 
 
 def _counts(
     judgements: Sequence[Judgement], set_aside: Sequence[Granule]
 ) -> dict[int, tuple[int, int]]:
-    barren: dict[int, int] = defaultdict(int)
+    empty: dict[int, int] = defaultdict(int)
     aside: dict[int, int] = defaultdict(int)
-    for each in judgements:
-        barren[each.day] += bool(each.barren)
+    for judged in judgements:
+        empty[judged.day] += bool(judged.empty_reason)
     for granule in set_aside:
         aside[day_of(_moment(granule))] += 1
     return defaultdict(
         lambda: (0, 0),
-        {day: (barren[day], aside[day]) for day in barren.keys() | aside.keys()},
+        {day: (empty[day], aside[day]) for day in empty.keys() | aside.keys()},
     )
 
 
-def _changed(was: Dependence, plan_hash: str) -> str:
-    if was.code_version != code_version():
-        return f"the code changed, from {was.code_version} to {code_version()}"
-    if was.plan_hash != plan_hash:
+def _changed(recorded: Dependence, plan_hash: str) -> str:
+    if recorded.code_version != code_version():
+        return f"the code changed, from {recorded.code_version} to {code_version()}"
+    if recorded.plan_hash != plan_hash:
         return "its plan changed"
-    return "the campaign changed in what it tells of it"
+    return "its settings in the campaign changed"
 
 
 def _difference(before: Sequence[InputRecord], now: Sequence[InputRecord]) -> str:
-    """Say how the inputs of a product changed, by name where they are few."""
-    old = {used.sha256: used for used in before}
-    new = {used.sha256: used for used in now}
-    lost = [old[sha256] for sha256 in old.keys() - new.keys()]
-    fresh = [new[sha256] for sha256 in new.keys() - old.keys()]
+    """Describe how the inputs of a product changed; name the first file of each change."""
+    files_before = {used.sha256: used for used in before}
+    files_now = {used.sha256: used for used in now}
+    lost = [files_before[sha256] for sha256 in files_before.keys() - files_now.keys()]
+    fresh = [files_now[sha256] for sha256 in files_now.keys() - files_before.keys()]
     changed = {used.path for used in lost} & {used.path for used in fresh}
-    parts = [
+    changes = [
         _named("changed", [used for used in fresh if used.path in changed]),
         _named("new", [used for used in fresh if used.path not in changed]),
         _named("gone", [used for used in lost if used.path not in changed]),
     ]
-    return "; ".join(part for part in parts if part) or "its inputs changed"
+    return "; ".join(change for change in changes if change) or "its inputs changed"
 
 
 def _named(word: str, files: Sequence[InputRecord]) -> str:
     if not files:
         return ""
     first = min(files, key=lambda used: used.path)
-    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return f"{word}: {first.role.value} {first.path}{more}"
+    others = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return f"{word}: {first.role.value} {first.path}{others}"
 
 
 def _moment(granule: Granule) -> datetime:

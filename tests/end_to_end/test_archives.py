@@ -187,7 +187,7 @@ def test_the_command_line_reprocesses_and_tells(
         (
             ["reprocess", "CAMPAIGN", "--archive", "/", "--product", "multiangle"],
             2,
-            "asked for: signal",
+            "requested: signal",
         ),
         (["inspect", "/nowhere"], 2, "/nowhere"),
         (["inspect", "/"], 2, "directory"),
@@ -327,7 +327,7 @@ def test_the_campaign_knows_the_pointing_better_than_the_header(tmp_path: Path) 
         if not level:
             result = bring_up_to_date(campaign)
             assert result.record is None
-            (reason,) = result.barren.values()
+            (reason,) = result.empty_scenes.values()
             assert reason.startswith("nothing to do: homogeneous of photon_532o: section")
         campaign = campaign.model_copy(update={"all_steps": True})
         record = reprocess(campaign)

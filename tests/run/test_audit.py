@@ -74,7 +74,7 @@ def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> 
     assert nothing.exit_code == 1
     told = json.loads(nothing.stdout)
     assert told["run"] is None
-    assert told["empty_scenes"] == ["rich_20260301T000000", "rich_20260302T000000"]
+    assert told["unusable_scenes"] == ["rich_20260301T000000", "rich_20260302T000000"]
     assert not (archive.folder / "out/report").exists()
     archive.flip("raw/poor/h10")
     planned = runner.invoke(app, ["plan", file, "--stale", "--json"])

@@ -21,10 +21,16 @@ from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
-from lidarops.process.scene import Job, failed
+from lidarops.process.scene import Job, failed_outcome
 from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
-from lidarops.run.executor import Ended, Stop, alone, local_client, process_jobs
+from lidarops.run.executor import (
+    EndedScene,
+    Stop,
+    process_one_by_one,
+    local_client,
+    process_jobs,
+)
 from lidarops.run.session import Session
 from lidarops.run.staleness import Judge
 
@@ -147,8 +153,8 @@ def test_scenes_are_taken_one_by_one_and_never_many_ahead(
             taken += 1
             yield job
 
-    monkeypatch.setattr(executor, "attempt", lambda job: (failed(job, "no"), True))
-    ended: list[Ended] = []
+    monkeypatch.setattr(executor, "attempt", lambda job: (failed_outcome(job, "no"), True))
+    ended: list[EndedScene] = []
     for each in process_jobs(counted()):
         ended.append(each)
         assert taken == len(ended)
@@ -170,7 +176,7 @@ def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
         at_hand -= 1
         done += 1
     assert done == len(jobs)
-    assert most <= executor.LEAST_AHEAD + 1
+    assert most <= executor.LEAST_SCENES_AHEAD + 1
 
 
 def test_workers_that_are_gone_for_good_are_not_waited_for(
@@ -180,13 +186,13 @@ def test_workers_that_are_gone_for_good_are_not_waited_for(
     jobs = scene_jobs(campaign)
     with local_client(1) as client:
         # Not before, as the first worker may well take longer to start.
-        monkeypatch.setattr(executor, "PATIENCE", 1.0)
-        monkeypatch.setattr(executor, "RECOUNT", 0.5)
+        monkeypatch.setattr(executor, "WORKER_TIMEOUT", 1.0)
+        monkeypatch.setattr(executor, "RECOUNT_INTERVAL", 0.5)
         client.retire_workers()
         with pytest.raises(SceneError, match="workers on this machine are gone"):
             list(process_jobs(jobs, client=client))
         with pytest.raises(SceneError, match="workers on this machine are gone"):
-            list(alone(jobs, client=client, stop=Stop()))
+            list(process_one_by_one(jobs, client=client, stop=Stop()))
 
 
 class Growing:
@@ -225,10 +231,10 @@ class Begun:
 def test_workers_that_come_later_get_scenes_before_one_has_ended(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(executor, "RECOUNT", 0.0)
-    monkeypatch.setattr(executor, "_submitted", Begun)
+    monkeypatch.setattr(executor, "RECOUNT_INTERVAL", 0.0)
+    monkeypatch.setattr(executor, "_submit", Begun)
     monkeypatch.setattr(
-        executor, "_ended", lambda _, job: Ended(job, failed(job, "no"), final=True)
+        executor, "_outcome_of", lambda _, job: EndedScene(job, failed_outcome(job, "no"), final=True)
     )
     jobs = scene_jobs(archive.write()) * 4
     assert len(list(process_jobs(jobs, client=Growing()))) == len(jobs)
@@ -281,6 +287,6 @@ def test_a_scene_that_may_kill_waits_for_a_worker_that_is_there(
             return next(counted)
 
     monkeypatch.setattr(executor.time, "sleep", waited.append)
-    executor._Staff(Cluster()).ready(Stop())
+    executor._Workers(Cluster()).ready(Stop())
     assert not list(counted)
-    assert waited[-1] == executor.FIRM
+    assert waited[-1] == executor.START_DELAY

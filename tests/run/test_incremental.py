@@ -69,35 +69,35 @@ def test_a_run_with_nothing_to_do_writes_nothing(archive: Archive) -> None:
 
 
 def _dead_time(archive: Archive) -> None:
-    archive.told["instruments"]["rich"]["facts"][1]["channels"]["photon_532o"]["dead_time"] = 5e-9
+    archive.settings["instruments"]["rich"]["facts"][1]["channels"]["photon_532o"]["dead_time"] = 5e-9
 
 
 def _lidar_ratio(archive: Archive) -> None:
-    archive.told["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+    archive.settings["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
 
 
 def _sections(archive: Archive) -> None:
-    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 825]]
+    archive.settings["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 825]]
 
 
 def _closed_period(archive: Archive) -> None:
     """A calibration that is valid from the last day on."""
-    facts = archive.told["instruments"]["rich"]["facts"]
+    facts = archive.settings["instruments"]["rich"]["facts"]
     facts[1]["valid_to"] = "2026-03-04T00:00:00Z"
     facts.append({**facts[1], "valid_from": "2026-03-04T00:00:00Z", "azimuth": 12.0})
     del facts[2]["valid_to"]
 
 
 def _new_overlap(archive: Archive) -> None:
-    archive.told["instruments"]["rich"]["facts"][0]["full_overlap_range"] = 500.0
+    archive.settings["instruments"]["rich"]["facts"][0]["full_overlap_range"] = 500.0
 
 
 def _title(archive: Archive) -> None:
-    archive.told["title"] = "Another title"
+    archive.settings["title"] = "Another title"
 
 
 def _name(archive: Archive) -> None:
-    archive.told["instruments"]["poor"]["name"] = "Poor lidar"
+    archive.settings["instruments"]["poor"]["name"] = "Poor lidar"
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_what_is_made_bit_by_bit_is_what_is_made_at_once(archive: Archive, tmp_p
         change(archive)
         reprocess(archive.write())
     other = Archive(tmp_path / "other")
-    other.told = archive.told
+    other.settings = archive.settings
     reprocess(other.write())
     assert archive.contents("out/products") == other.contents("out/products")
 
@@ -274,7 +274,7 @@ def test_a_kind_that_nothing_is_asked_for_is_wrong_use(archive: Archive) -> None
     for command in ("plan", "reprocess"):
         refused = CliRunner().invoke(app, [command, str(archive.file), "--product", "visibility"])
         assert refused.exit_code == 2
-        assert "asked for: signal, homogeneous, elastic" in refused.stderr
+        assert "requested: signal, homogeneous, elastic" in refused.stderr
 
 
 def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(
@@ -331,7 +331,7 @@ def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
     with Store(campaign.catalog_url, campaign.name) as store:
         rows = {row["path"]: row for row in store.products()}
         assert {path: row["usable"] for path, row in rows.items()} == usable
-        assert store.empty() == [scene.scene for scene in record.scenes if scene.empty]
+        assert store.unusable_scenes() == [scene.scene for scene in record.scenes if scene.unusable]
     poorest = next(path for path, row in rows.items() if row["kind"] == "elastic")
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
         connection.execute("update product set usable = 0 where kind = 'elastic'")
@@ -339,7 +339,7 @@ def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
     scenes = {row["scene"] for path, row in rows.items() if row["kind"] == "elastic"}
     again = bring_up_to_date(campaign)
     assert again.record is None
-    assert set(again.empty) == scenes - {rows[poorest]["scene"]}
+    assert set(again.unusable) == scenes - {rows[poorest]["scene"]}
     assert again.troubled
 
 
@@ -363,19 +363,19 @@ def test_the_run_in_which_a_scene_comes_to_nothing_says_so(
     assert shown.stdout.count("left nothing to use") == 1
     assert "earlier runs" not in shown.stdout
     told = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
-    assert told["empty_scenes"] == ["rich_20260301T000000"]
+    assert told["unusable_scenes"] == ["rich_20260301T000000"]
 
 
 def test_products_that_nothing_asks_for_are_not_told_as_empty(archive: Archive) -> None:
     archive.write()
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
         connection.execute("update product set usable = 0 where kind = 'elastic'")
-    assert bring_up_to_date(archive.write()).empty
-    del archive.told["instruments"]["rich"]["products"]["elastic"]
+    assert bring_up_to_date(archive.write()).unusable
+    del archive.settings["instruments"]["rich"]["products"]["elastic"]
     for _ in range(2):
         result = bring_up_to_date(archive.write())
         assert result.orphans
-        assert not result.empty
+        assert not result.unusable
         assert not result.troubled
 
 
@@ -449,7 +449,7 @@ def test_a_scene_that_cannot_but_fail_is_not_tried_until_something_changes(
 
 
 def test_replaced_versions_are_kept_where_the_campaign_says_so(archive: Archive) -> None:
-    archive.told["superseded"] = "keep"
+    archive.settings["superseded"] = "keep"
     assert reprocess(archive.write()) is None
     before = archive.contents("out/products")
     _lidar_ratio(archive)
@@ -481,9 +481,9 @@ def _judged_anew(archive: Archive) -> dict[int, tuple[str, int, int]]:
         signatures = judge.signatures()
         found = [judge.days(batch) for batch in judge.batches(signatures)]
     return {
-        day: (signatures[day].whole, *told)
+        day: (signatures[day].whole, *unused)
         for each in found
-        for day, told in each.told.items()
+        for day, unused in each.unused.items()
         if day not in each.open
     }
 
@@ -518,7 +518,7 @@ def _vanished(archive: Archive) -> None:
 
 
 def _nothing_asked(archive: Archive) -> None:
-    archive.told["instruments"]["poor"]["products"] = {}
+    archive.settings["instruments"]["poor"]["products"] = {}
     _title(archive)
 
 

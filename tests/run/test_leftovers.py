@@ -19,7 +19,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.plan.product_dependence import plan_closure, wanted
+from lidarops.plan.product_dependence import plan_closure, planned_products
 from lidarops.records import ProductKind
 from lidarops.reports import gallery, run_record
 from lidarops.run import archive as pipeline
@@ -46,7 +46,7 @@ def _told(archive: Archive) -> dict[str, object]:
     """What the command tells programs; one that exits with 1 gives a reason."""
     result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])
     told = json.loads(result.stdout)
-    reasons = ("failed_scenes", "empty_scenes", "refused_files", "files_set_aside", "barren_scenes")
+    reasons = ("failed_scenes", "unusable_scenes", "refused_files", "files_set_aside", "empty_scenes")
     nowhere = any(each["nowhere"] for each in told["not_in_files"])
     assert result.exit_code == int(nowhere or any(told[name] for name in reasons))
     return dict(told)
@@ -65,26 +65,26 @@ def test_a_file_that_is_used_in_no_scene_is_named_by_every_run(archive: Archive)
 
 
 def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -> None:
-    archive.told["instruments"]["poor"]["products"] = {
+    archive.settings["instruments"]["poor"]["products"] = {
         "homogeneous": {"channels": ["photon_355o"], "sections": [[750, 840]]}
     }
     archive.write()
     for _ in range(2):
-        told = _told(archive)["barren_scenes"]
+        told = _told(archive)["empty_scenes"]
         assert len(told) == 4
         assert all("photon_355o" in why for why in told.values())
 
 
 def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None:
     """Of a kind that gives nothing no product can tell, and the plans of the others do not."""
-    archive.told["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 1500]]
-    archive.told["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+    archive.settings["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 1500]]
+    archive.settings["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
     record = reprocess(archive.write())
     assert record is not None
     assert {scene.instrument for scene in record.scenes} == {"rich"}
     for scene in record.scenes:
         assert scene.plan is not None
-        assert scene.plan.hash == plan_closure(scene.plan, wanted(scene.plan)).hash
+        assert scene.plan.hash == plan_closure(scene.plan, planned_products(scene.plan)).hash
         told = [left.reason for left in scene.left_out if left.rule == "section_level"]
         assert len(told) == 1
         assert "climbs by 750 m" in told[0]
@@ -100,28 +100,28 @@ def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None
 def test_a_report_names_scenes_that_can_give_nothing(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "MOST_BARREN", 3)
-    archive.told["instruments"]["poor"]["products"] = {
+    monkeypatch.setattr(session, "MOST_EMPTY_SCENES", 3)
+    archive.settings["instruments"]["poor"]["products"] = {
         "homogeneous": {"channels": ["photon_532o"], "sections": [[50_000, 60_000]]}
     }
     record = reprocess(archive.write(), options=Options(force=True))
     assert record is not None
-    assert list(record.barren) == [f"poor_2026030{day}T000000" for day in (1, 2, 3)]
-    assert record.more_barren == 1
+    assert list(record.empty_scenes) == [f"poor_2026030{day}T000000" for day in (1, 2, 3)]
+    assert record.more_empty_scenes == 1
     assert record.failed
     page = report_run(archive.write(), record).page.read_text()
     assert "section 50000-60000 m does not lie inside the bins" in page
     assert "poor_20260303T000000" in page
-    assert "1 more can give none" in page
+    assert "1 more without product" in page
     assert "4 scenes can give no product" in page
 
 
 def _misspelt_product(archive: Archive) -> None:
-    archive.told["instruments"]["rich"]["products"]["homogeneous"]["channels"].append("photon_999o")
+    archive.settings["instruments"]["rich"]["products"]["homogeneous"]["channels"].append("photon_999o")
 
 
 def _misspelt_facts(archive: Archive) -> None:
-    facts = archive.told["instruments"]["rich"]["facts"][1]
+    facts = archive.settings["instruments"]["rich"]["facts"][1]
     facts["channels"] = {"photon_533o": facts["channels"]["photon_532o"]}
 
 
@@ -142,10 +142,10 @@ def test_a_channel_that_no_file_holds_is_named_by_every_run(
     assert found.record.failed
     page = report_run(archive.write(), found.record).page.read_text()
     assert page.count(channel) >= 2
-    assert "Asked for, and not in the files" in page
+    assert "Requested, but not in the files" in page
     for _ in range(2):
         (told,) = _told(archive)["not_in_files"]
-        assert (told["channel"], told["asked"], told["nowhere"]) == (channel, asked, True)
+        assert (told["channel"], told["requested_by"], told["nowhere"]) == (channel, asked, True)
     shown = CliRunner().invoke(app, ["reprocess", str(archive.file)], env={"COLUMNS": "200"})
     assert channel in shown.stdout
     assert shown.exit_code == 1
@@ -159,11 +159,11 @@ def test_a_channel_that_no_file_holds_is_named_by_every_run(
 def test_a_channel_that_came_with_a_new_laser_is_told_and_no_trouble(archive: Archive) -> None:
     for path in (archive.folder / "raw/rich").glob("h3*"):
         path.write_bytes(path.read_bytes().replace(b"00532.o", b"00533.o"))
-    archive.told["instruments"]["rich"]["facts"][1]["channels"]["photon_533o"] = {"dead_time": 3e-9}
+    archive.settings["instruments"]["rich"]["facts"][1]["channels"]["photon_533o"] = {"dead_time": 3e-9}
     archive.write()
     told = _told(archive)
     assert any("photon_533o" in path for path in told["products"])
-    files = {(each["channel"], each["asked"][:5]): each for each in told["not_in_files"]}
+    files = {(each["channel"], each["requested_by"][:5]): each for each in told["not_in_files"]}
     assert files["photon_533o", "facts"]["files"] == 3
     assert files["photon_533o", "facts"]["of"] == 6
     assert files["photon_532o", "homog"]["files"] == 3
@@ -178,9 +178,9 @@ def test_of_very_many_days_some_are_told_and_the_rest_counted(
         archive.raw(f"poor/h-twin{day}", day * DAY + 600, seed=1)
     campaign = archive.write()
     assert len(bring_up_to_date(campaign).set_aside) == 4
-    monkeypatch.setattr(pipeline, "AGAIN", 3)
+    monkeypatch.setattr(pipeline, "MOST_DAYS_JUDGED_AGAIN", 3)
     again = bring_up_to_date(campaign)
-    assert (len(again.set_aside), again.untold, again.troubled) == (3, 1, True)
+    assert (len(again.set_aside), again.more_unused, again.troubled) == (3, 1, True)
 
 
 # Forgotten -----------------------------------------------------------------------------------
@@ -214,7 +214,7 @@ def test_failures_are_forgotten_on_days_with_others_between(archive: Archive) ->
 
 
 def test_failures_are_forgotten_with_the_last_trace_of_their_day(archive: Archive) -> None:
-    archive.told["instruments"]["rich"]["dark_files"] = "none/d*"
+    archive.settings["instruments"]["rich"]["dark_files"] = "none/d*"
     reprocess(archive.write())
     _fail(archive, "%_20260304T%", unmade=True)
     assert len(bring_up_to_date(archive.write()).failures) == 2
@@ -253,7 +253,7 @@ def test_what_is_not_asked_for_is_not_orphaned(archive: Archive) -> None:
 
 def _leave_over(archive: Archive) -> None:
     """Leave products over, of scenes that are there and of those that are gone."""
-    del archive.told["instruments"]["rich"]["products"]["homogeneous"]
+    del archive.settings["instruments"]["rich"]["products"]["homogeneous"]
     _without(archive, "poor")
 
 
@@ -360,8 +360,8 @@ def test_products_whose_files_cannot_be_used_any_more_are_kept(archive: Archive,
             path.symlink_to("nowhere")
     for _ in range(2):
         found = bring_up_to_date(campaign)
-        (orphan,) = {(each.reason, each.asked, each.lost) for each in found.orphans}
-        assert orphan == ("its raw files are refused, or stand in no scene", True, False)
+        (orphan,) = {(each.reason, each.requested, each.lost) for each in found.orphans}
+        assert orphan == ("its raw files are refused, or belong to no scene", True, False)
         assert len(found.orphans) == 2
         assert found.troubled
         assert not found.lost
@@ -373,9 +373,9 @@ def test_products_whose_files_cannot_be_used_any_more_are_kept(archive: Archive,
 def test_products_of_scenes_that_are_cut_in_another_way_are_not_told_as_lost(
     archive: Archive,
 ) -> None:
-    archive.told["scenes"] = {"window": "6h"}
+    archive.settings["scenes"] = {"window": "6h"}
     found = bring_up_to_date(archive.write())
-    assert {each.reason for each in found.orphans} == {"its files are cut into other scenes now"}
+    assert {each.reason for each in found.orphans} == {"its files belong to other scenes now"}
     assert len(found.orphans) == 24
     assert not found.troubled
 

@@ -20,7 +20,7 @@ PLACES = {
     "east": (47.25, 11.353, 310.0),
     "north": (47.2811, 11.3265, 190.0),
 }
-GONE = "the campaign does not ask for it any more"
+GONE = "the campaign no longer requests it"
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -58,7 +58,7 @@ class Net:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.file = folder / "net.yaml"
-        self.told = _tree()
+        self.settings = _tree()
         for seed, name in enumerate(PLACES):
             self.raw(f"{name}/h0", seed)
 
@@ -68,7 +68,7 @@ class Net:
         )
 
     def write(self) -> Campaign:
-        self.file.write_text(yaml.safe_dump(self.told))
+        self.file.write_text(yaml.safe_dump(self.settings))
         return load_campaign(self.file)
 
     def lose(self, *stations: str) -> None:
@@ -103,16 +103,16 @@ def test_lidars_that_serve_a_network_alone_are_no_trouble(net: Net) -> None:
     for made in (1, 0):
         result = bring_up_to_date(net.write())
         assert (result.record is not None) == bool(made)
-        assert not result.barren
+        assert not result.empty_scenes
         assert not result.troubled
     code, told = net.command()
-    assert (code, told["barren_scenes"]) == (0, {})
+    assert (code, told["empty_scenes"]) == (0, {})
     shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"]).stdout
     assert "used by network valley" in shown
 
 
 def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
-    net.told["instruments"]["west-lidar"]["products"] = {"signal": {}}
+    net.settings["instruments"]["west-lidar"]["products"] = {"signal": {}}
     net.write()
     for kind, some in (("visibility", True), ("signal", False)):
         line = ["plan", str(net.file), "--json", "--product", kind, "--instrument", "valley"]
@@ -124,25 +124,25 @@ def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
 
 def test_a_lidar_without_its_network_is_told(net: Net) -> None:
     net.lose("east", "north")
-    barren = bring_up_to_date(net.write()).barren
-    assert list(barren) == ["west-lidar_20260301T000000"]
-    assert "no other instrument has files" in barren["west-lidar_20260301T000000"]
+    empty_scenes = bring_up_to_date(net.write()).empty_scenes
+    assert list(empty_scenes) == ["west-lidar_20260301T000000"]
+    assert "no other instrument has files" in empty_scenes["west-lidar_20260301T000000"]
 
 
 def test_a_network_that_can_give_nothing_is_told_once(net: Net) -> None:
     net.lose("east")
-    assert list(bring_up_to_date(net.write()).barren) == ["valley_20260301T000000"]
+    assert list(bring_up_to_date(net.write()).empty_scenes) == ["valley_20260301T000000"]
 
 
 @pytest.mark.parametrize("why", ["asked", "alone"])
 def test_a_lidar_that_can_give_nothing_is_told_beside_a_network(net: Net, why: str) -> None:
-    lidar = net.told["instruments"]["west-lidar"]
+    lidar = net.settings["instruments"]["west-lidar"]
     if why == "asked":
         lidar["products"] = {"signal": {"channels": ["photon_355o"]}}
     else:
-        net.told["instruments"]["other"] = {**lidar, "files": "other/h*"}
+        net.settings["instruments"]["other"] = {**lidar, "files": "other/h*"}
         net.raw("other/h0", 9)
-    (name,) = bring_up_to_date(net.write()).barren
+    (name,) = bring_up_to_date(net.write()).empty_scenes
     assert name == ("west-lidar" if why == "asked" else "other") + "_20260301T000000"
 
 
@@ -171,8 +171,8 @@ def test_a_product_whose_network_lost_members_is_kept(net: Net, lost: list[str],
 
 
 def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:
-    net.told["instruments"]["other"] = {
-        **net.told["instruments"]["west-lidar"], "files": "other/h*", "products": {"signal": {}},
+    net.settings["instruments"]["other"] = {
+        **net.settings["instruments"]["west-lidar"], "files": "other/h*", "products": {"signal": {}},
     }  # fmt: skip
     net.raw("other/h0", 9)
     assert reprocess(net.write())
@@ -184,15 +184,15 @@ def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:
 
 
 def _no_longer_meeting(net: Net) -> None:
-    net.told["networks"]["valley"]["visibility"]["smallest_angle"] = 85
+    net.settings["networks"]["valley"]["visibility"]["smallest_angle"] = 85
 
 
 def _another_channel(net: Net) -> None:
-    net.told["networks"]["valley"]["visibility"]["channel"] = "analog_532o"
+    net.settings["networks"]["valley"]["visibility"]["channel"] = "analog_532o"
 
 
 def _no_network(net: Net) -> None:
-    del net.told["networks"]
+    del net.settings["networks"]
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ class Archive:
     def __init__(self, folder: Path, *, days: int = 4) -> None:
         self.folder = folder
         self.file = folder / "campaign.yaml"
-        self.told = tree()
+        self.settings = tree()
         if self.file.exists():
             # A copy of one that was made before.
             return
@@ -85,7 +85,7 @@ class Archive:
 
     def write(self) -> Campaign:
         """Write the campaign file and load it."""
-        self.file.write_text(yaml.safe_dump(self.told))
+        self.file.write_text(yaml.safe_dump(self.settings))
         return load_campaign(self.file)
 
     def flip(self, name: str, place: int = -40) -> None:
