@@ -1,1 +1,18 @@
-"""Extinction and visibility where the beams of several lidars meet."""
+"""Extinction and visibility where the beams of several lidars cross.
+
+The order of the retrieval, and the modules that do it:
+
+1. `geometry`: stations and pointings give beams, and the crossings where beams meet.
+2. `_beam_signals`: the signals are validated; noise is estimated where no variance is given
+   (`noise`), and the median signals of blocks of profiles are taken.
+3. `_fit_layout`, `_condensed_signals`: outlying bins are bridged (`noise`). Each beam is condensed
+   to its signal at the crossings and the integrals between them, with their covariance.
+4. `_empirical_prior`: each block chooses the prior of ln extinction over the crossings.
+5. `_joint_solution`: all beams of a profile are solved together for all crossings.
+6. `_block_errors`, `_curvature_errors`: the block adds errors that one profile cannot see.
+7. `extinction_field`: `retrieve_network` runs these steps and flags the values.
+
+`cycles` and `_closed_forms` hold the closed forms of a single cycle of beams, and the slope and
+Klett methods for single beams. `labeled` runs the retrieval on xarray data and adds the errors
+that all bins of a beam share.
+"""

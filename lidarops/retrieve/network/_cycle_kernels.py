@@ -1,4 +1,4 @@
-"""Compiled closed form of a cycle of beams: its start crossing, variance and sensitivities.
+"""Compiled closed form of a cycle of beams: start crossing, variance and sensitivities.
 
 Row j of a cycle joins the crossings j and j + 1 by one beam, and the last row returns to the
 first crossing: near_j s_j - far_j s_(j+1) = integral_j, where s is the reciprocal of extinction.
@@ -19,7 +19,7 @@ Codes = npt.NDArray[np.uint8]
 
 NO_POLE: Final = 0
 POLE: Final = 1
-"""The multipliers make the determinant vanish or change its sign: no value."""
+"""The multipliers make the determinant zero or change its sign: no value."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -28,9 +28,9 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 def _prefix(
     starts: Array, ends: Array, integrals: Array, multiplier: float, unbiased: bool, work: Array
 ) -> tuple[float, float, bool]:
-    """Fill `work` with the terms of a cycle; return its solution, determinant and pole.
+    """Fill `work` with the terms of a cycle; return solution, determinant and whether at a pole.
 
-    Columns of work: the term mu_j Q_(j-1) c_j of the numerator, and the share of Q_j in the
+    Columns of work: the term mu_j Q_(j-1) c_j of the numerator, and the term of Q_j in the
     determinant.
     """
     k = starts.size
@@ -43,13 +43,13 @@ def _prefix(
         work[j, 0] = term
         numerator += term
         product *= ends[j] * inverse
-        share = 0.0
+        determinant_term = 0.0
         if j == k - 1:
-            share = mu * product
+            determinant_term = mu * product
         elif unbiased:
-            share = mu * (1.0 - multiplier) * product
-        work[j, 1] = share
-        determinant -= share
+            determinant_term = mu * (1.0 - multiplier) * product
+        work[j, 1] = determinant_term
+        determinant -= determinant_term
         if j < k - 1:
             mu *= multiplier
     return numerator / determinant, determinant, multiplier < 1.0 and mu * product >= 1.0
@@ -86,16 +86,16 @@ def solve_with_variance(
     Parameters
     ----------
     starts, ends, integrals : (cycle, row) float64
-        Signal at the first and the second crossing of each row, and twice the exponent times the
-        integral between them, counted negative where the row runs towards its lidar.
+        Signal at the first and the second crossing of each row, and 2 m times the integral
+        between them, negative where the row leads towards its lidar.
     variances : (cycle or 1, row, 3) float64
         Relative variances of the three.
     multipliers : (cycle or 1,) float64
-        0 to 1; row j is multiplied by its power j - 1. 1 is the exact solution.
+        0 to 1; row j is multiplied by the power j - 1. 1 gives the exact solution.
     unbiased : bool
-        Whether what the multipliers leave over is put to the start crossing.
+        Whether the terms that the multipliers neglect are assigned to the start crossing.
     solution, variance : (cycle,) float64
-        Get s_1 in the unit of integrals / starts, NaN at a pole, and its variance.
+        Out: s_1 in the unit of integrals / starts, and its variance; NaN at a pole.
     poles : (cycle,) uint8
     """
     k = starts.shape[1]
@@ -136,7 +136,7 @@ def solve_with_sensitivities(
     sensitivities: Array,
     poles: Codes,
 ) -> None:
-    """Solve as `solve_with_variance`; return determinants and (cycle, row, 3) sensitivities."""
+    """Solve as `solve_with_variance`; fill determinants and (cycle, row, 3) sensitivities."""
     work = np.empty((starts.shape[1], 2))
     for n in range(starts.shape[0]):
         value, determinant, pole = _prefix(
@@ -155,7 +155,7 @@ def solve_with_sensitivities(
 def substitute_cycle(
     starts: Array, ends: Array, integrals: Array, first: Array, solutions: Array
 ) -> None:
-    """Fill (cycle, row) solutions at all crossings from that at the first, backwards."""
+    """Fill (cycle, row) solutions at all crossings from the first one, backwards."""
     k = starts.shape[1]
     for n in range(starts.shape[0]):
         solutions[n, 0] = first[n]
@@ -189,7 +189,7 @@ def determinant_variance(
     covariances: Array,
     out: Array,
 ) -> None:
-    """Fill (cycle,) variances of the determinants; arguments as above."""
+    """Fill (cycle,) variances of the determinants. Arguments are those of `solve_with_variance`."""
     k = starts.shape[1]
     work, nothing = np.empty((k, 2)), np.zeros(k)
     for n in range(starts.shape[0]):

@@ -1,11 +1,11 @@
-"""Compiled solution of networks of beams: all crossings of a profile at once.
+"""Compiled joint solution of a network: all crossings of a profile together.
 
 Along a beam, a_p / extinction_p + 2 m (integral from the first crossing to p) is a constant. The
-network chooses one constant per beam so that the beams agree in the crossings that they share. The
-equations are taken in logarithms, where the noise of the values is additive: written as rows that
-are linear in 1 / extinction, the noise multiplies the unknowns, and long chains of rows are biased
-by it. Each pass linearises the constants, weighs with the full covariance of a beam, eliminates
-its constant and solves for the crossings by Cholesky's method.
+solution chooses one constant per beam so that beams agree at the crossings that they share. The
+equations are logarithmic, because noise of the values is then additive. In rows that are linear
+in 1 / extinction, noise multiplies the unknowns and biases long chains of rows. Each pass
+linearises the constants, weights with the full covariance of a beam, eliminates its constant and
+solves for the crossings by Cholesky factorisation.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -26,38 +26,42 @@ SOLVED: Final = 0
 UNDETERMINED: Final = 1
 """No crossings, or a singular system."""
 UNSETTLED: Final = 2
-"""The last pass still moved the solution."""
+"""The solution did not converge."""
 
 LIKELIHOOD: Final = 4
 COLUMNS: Final = 5
-"""Of a summary: chi-square and degrees of freedom of the beams alone, and of beams and prior; -2 ln
-of the marginal likelihood, but a constant."""
+"""Columns of a summary: chi-square and degrees of freedom of the beams alone, then of beams and
+prior; -2 ln of the marginal likelihood, without a constant."""
 
 LONGEST_STEP: Final = 1.5
-_THINNEST: Final = 1e-3
-"""Optical depth of the thinnest beam that a start is made from."""
-_SETTLED: Final = 1e-3
+"""Largest step of the logarithm of a constant in one pass."""
+_THINNEST_BEAM: Final = 1e-3
+"""Smallest optical depth of a beam for the start constants."""
+_CONVERGED_STEP: Final = 1e-3
+"""Largest change of a logarithm in the last pass of a converged solution."""
 _TINIEST_PIVOT: Final = 1e-13
-_NEARLY_NONE: Final = 1e-2
-DOUBT: Final = 2.0
-"""Times the standard deviation of the prior, by which a field may deviate, for what is stated."""
+"""Smallest pivot of a regular matrix, relative to its diagonal."""
+_WEAK_PRECISION: Final = 1e-2
+"""Precision of ln extinction in place of a prior: a standard deviation of 10."""
+PRIOR_DOUBT: Final = 2.0
+"""Factor of the prior's standard deviation that the stated error allows a field to deviate by."""
 _LARGEST_VARIANCE: Final = 4.0
-"""Of ln extinction; beyond, it is not determined."""
+"""Variance of ln extinction beyond which it is not determined."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled
 def factorise(matrix: Array, size: int) -> bool:
-    """Overwrite the lower triangle by Cholesky's factor; False where it is singular."""
+    """Overwrite the lower triangle by its Cholesky factor; return False if it is singular."""
     for i in range(size):
-        whole = matrix[i, i]
+        diagonal = matrix[i, i]
         for j in range(i + 1):
             total = matrix[i, j]
             for k in range(j):
                 total -= matrix[i, k] * matrix[j, k]
             if i == j:
-                if not total > _TINIEST_PIVOT * whole:
+                if not total > _TINIEST_PIVOT * diagonal:
                     return False
                 matrix[i, i] = math.sqrt(total)
             else:
@@ -67,7 +71,7 @@ def factorise(matrix: Array, size: int) -> bool:
 
 @_compiled
 def substitute_factorised(factor: Array, size: int, side: Array) -> None:
-    """Overwrite a right side by the solution of the factorised system."""
+    """Overwrite the right side by the solution of the factorised system."""
     for i in range(size):
         total = side[i]
         for k in range(i):
@@ -82,10 +86,10 @@ def substitute_factorised(factor: Array, size: int, side: Array) -> None:
 
 @_compiled
 def _row_covariance(packed: Array, quantities: int, count: int, weights: Array, out: Array) -> None:
-    """Fill the covariance of u_c - ln w_c, of which w_c holds all integrals beyond c.
+    """Fill the covariance of u_c - ln w_c, where w_c contains all integrals beyond c.
 
-    With d_cs = -1 / w_c for the integrals s >= c, it is U + d V' + V d' + d W d', summed over the
-    integrals from the far end, so that each entry costs one addition.
+    With d_cs = -1 / w_c for the integrals s >= c, it is U + d V' + V d' + d W d', summed over
+    the integrals.
     """
     first = (quantities + 1) // 2
     for i in range(count):
@@ -94,15 +98,15 @@ def _row_covariance(packed: Array, quantities: int, count: int, weights: Array, 
             for s in range(j, count - 1):
                 cross += packed[i * quantities + first + s]
             out[i, j] = packed[i * quantities + j] - cross / weights[j]
-    # The other half of the transformation, of rows.
+    # Second half of the transformation: the rows.
     for i in range(count):
         for j in range(i + 1):
-            other = 0.0
+            row_term = 0.0
             for s in range(i, count - 1):
-                other += packed[(first + s) * quantities + j]
+                row_term += packed[(first + s) * quantities + j]
                 for t in range(j, count - 1):
-                    other -= packed[(first + s) * quantities + first + t] / weights[j]
-            out[i, j] -= other / weights[i]
+                    row_term -= packed[(first + s) * quantities + first + t] / weights[j]
+            out[i, j] -= row_term / weights[i]
     for i in range(count):
         for j in range(i + 1, count):
             out[i, j] = out[j, i]
@@ -110,7 +114,7 @@ def _row_covariance(packed: Array, quantities: int, count: int, weights: Array, 
 
 @_compiled
 def _invert(matrix: Array, size: int, inverse: Array) -> float:
-    """Fill the inverse of a covariance, overwriting it; return its log determinant or NaN."""
+    """Fill the inverse of a covariance, which is overwritten; return ln determinant or NaN."""
     if not factorise(matrix, size):
         return math.nan
     logarithm = 0.0
@@ -124,7 +128,7 @@ def _invert(matrix: Array, size: int, inverse: Array) -> float:
 
 
 @_compiled
-def _beam(
+def _linearise_beam(
     values: Array,
     integrals: Array,
     packed: Array,
@@ -136,16 +140,16 @@ def _beam(
 ) -> tuple[float, float]:
     """Linearise a beam; return the information on its constant, and the log determinant.
 
-    Columns: y = u - ln w, the derivative j of ln w by the constant, and P j.
+    Columns filled: y = u - ln w, the derivative j of ln w by the constant, and P j.
     """
     covariance, inverse, weights = work
-    beyond, last = 0.0, math.exp(constant)
+    remaining, end_value = 0.0, math.exp(constant)
     for c in range(count - 1, -1, -1):
         if c < count - 1:
-            beyond += integrals[c]
-        weights[c] = last + beyond
+            remaining += integrals[c]
+        weights[c] = end_value + remaining
         columns[c, 0] = values[c] - math.log(weights[c])
-        columns[c, 1] = last / weights[c]
+        columns[c, 1] = end_value / weights[c]
     _row_covariance(packed, quantities, count, weights, covariance)
     logarithm = _invert(covariance, count, inverse)
     information = 0.0
@@ -159,13 +163,14 @@ def _beam(
 
 
 @_compiled
-def _start(
+def _homogeneous_constant(
     integrals: Array, exponent: float, count: int, extinction: float, length: float
 ) -> float:
+    """Return the constant of a beam in homogeneous air."""
     total = 0.0
     for c in range(count - 1):
         total += integrals[c]
-    depth = max(2.0 * exponent * extinction * length, _THINNEST)
+    depth = max(2.0 * exponent * extinction * length, _THINNEST_BEAM)
     return math.log(total / math.expm1(depth))
 
 
@@ -179,41 +184,42 @@ def start_constants(
     first_passage: Indices,
     constants: Array,
 ) -> None:
-    """Fill (profile, beam) constants as if the air were homogeneous.
+    """Fill (profile, beam) constants of homogeneous air.
 
     Parameters
     ----------
     integrals, usable, slopes
-        As `lidarops.retrieve.network._condensed_signals.condense` gives them.
+        From `lidarops.retrieve.network._condensed_signals.condense`.
     lengths : (passage,) float64
-        m, from a passage to the next on its beam.
+        m, from a passage to the next one on its beam.
     exponent : (beam,) float64
     first_passage : (beam + 1,) intp
     constants : (profile, beam) float64
         Logarithms of the signal at the last passage over extinction there.
     """
     for n in range(integrals.shape[0]):
-        top = bottom = 0.0
+        weighted_sum = weight_sum = 0.0
         for c in range(lengths.size):
             if slopes[n, c, 1] > 0.0:
-                top += slopes[n, c, 0] / slopes[n, c, 1]
-                bottom += 1.0 / slopes[n, c, 1]
-        extinction = top / bottom if bottom > 0.0 else 0.0
+                weighted_sum += slopes[n, c, 0] / slopes[n, c, 1]
+                weight_sum += 1.0 / slopes[n, c, 1]
+        extinction = weighted_sum / weight_sum if weight_sum > 0.0 else 0.0
         for beam in range(exponent.size):
             first, last = first_passage[beam], first_passage[beam + 1]
-            count = _count(usable[n], first, last)
+            count = _count_usable(usable[n], first, last)
             length = 0.0
             for c in range(first, first + count - 1):
                 length += lengths[c]
             constants[n, beam] = 0.0
             if count >= 2:
-                constants[n, beam] = _start(
+                constants[n, beam] = _homogeneous_constant(
                     integrals[n, first:last], exponent[beam], count, extinction, length
                 )
 
 
 @_compiled
-def _count(usable: Codes, first: int, last: int) -> int:
+def _count_usable(usable: Codes, first: int, last: int) -> int:
+    """Return the number of usable passages before the first one that is not."""
     count = 0
     for c in range(first, last):
         if usable[c] == 0:
@@ -223,7 +229,7 @@ def _count(usable: Codes, first: int, last: int) -> int:
 
 
 @_compiled
-def _enter(
+def _add_beam(
     columns: Array,
     inverse: Array,
     information: float,
@@ -231,7 +237,7 @@ def _enter(
     matrix: Array,
     side: Array,
 ) -> float:
-    """Add a beam, its constant eliminated, to the normal equations; return y' M y."""
+    """Add a beam without its constant to the normal equations; return y' M y."""
     count, square = crossing.size, 0.0
     for i in range(count):
         for k in range(count):
@@ -243,16 +249,18 @@ def _enter(
 
 
 @_compiled
-def add_prior(matrix: Array, side: Array, level: float, precision: Array, flat: bool) -> None:
+def add_prior(
+    matrix: Array, side: Array, level: float, precision: Array, without_prior: bool
+) -> None:
     """Add the prior to the normal equations.
 
-    In place of none, a tenfold of e about the level of the profile is put, so that what is
-    undetermined does not keep the rest from being solved.
+    Without a prior, a standard deviation of 10 about the level of the profile takes its place, so
+    that undetermined crossings do not make the system singular.
     """
     for v in range(side.size):
-        if flat:
-            matrix[v, v] += _NEARLY_NONE
-            side[v] += _NEARLY_NONE * level
+        if without_prior:
+            matrix[v, v] += _WEAK_PRECISION
+            side[v] += _WEAK_PRECISION * level
             continue
         for w in range(side.size):
             matrix[v, w] += precision[v, w]
@@ -260,6 +268,7 @@ def add_prior(matrix: Array, side: Array, level: float, precision: Array, flat: 
 
 @_compiled
 def invert_system(factor: Array, size: int, out: Array) -> None:
+    """Fill the inverse of a factorised system."""
     for v in range(size):
         for i in range(size):
             out[v, i] = 0.0
@@ -268,18 +277,18 @@ def invert_system(factor: Array, size: int, out: Array) -> None:
 
 
 @_compiled
-def add_observations(usable: Codes, first_passage: Indices, counts: Indices) -> None:
-    """Fill the passages of each beam; 0 where there is one only."""
+def count_passages(usable: Codes, first_passage: Indices, counts: Indices) -> None:
+    """Fill the number of usable passages of each beam; 0 where there is only one."""
     for beam in range(counts.size):
-        count = _count(usable, first_passage[beam], first_passage[beam + 1])
+        count = _count_usable(usable, first_passage[beam], first_passage[beam + 1])
         counts[beam] = count if count >= 2 else 0
 
 
 @_compiled
-def _tally(
+def _count_observations(
     first_passage: Indices, crossing: Indices, counts: Indices, seen: Codes
 ) -> tuple[int, int, int]:
-    """Fill the crossings seen; return beams, passages, crossings."""
+    """Fill which crossings are seen; return the numbers of beams, passages and crossings."""
     used = observations = crossings = 0
     for v in range(seen.size):
         seen[v] = 0
@@ -304,9 +313,9 @@ def assemble(
     matrix: Array,
     side: Array,
 ) -> tuple[float, float, float]:
-    """Fill the normal equations of all beams; return square, log determinants and mean level.
+    """Fill the normal equations of all beams; return y' M y, log determinants and mean level.
 
-    A beam of singular covariance is left out: its count gets zero.
+    A beam with a singular covariance is left out: its count becomes 0.
     """
     values, integrals, covariance = data
     first_passage, offset, crossing = geometry
@@ -323,7 +332,7 @@ def assemble(
         first = first_passage[beam]
         last = first + counts[beam]
         quantities = 2 * (first_passage[beam + 1] - first) - 1
-        information[beam], logarithm = _beam(
+        information[beam], logarithm = _linearise_beam(
             values[first:last], integrals[first:last],
             covariance[offset[beam] : offset[beam + 1]], quantities, counts[beam],
             constants[beam], (scratch, inverses[beam], weights), columns[beam],
@@ -333,7 +342,7 @@ def assemble(
         if not (math.isfinite(logarithm) and 0.0 < information[beam] < math.inf):
             counts[beam] = 0
             continue
-        square += _enter(
+        square += _add_beam(
             columns[beam], inverses[beam], information[beam], crossing[first:last], matrix, side
         )
         logarithms += logarithm + math.log(information[beam])
@@ -344,7 +353,7 @@ def assemble(
 
 
 @_compiled
-def _move(
+def _move_constants(
     geometry: tuple[Indices, Indices, Indices],
     counts: Indices,
     columns: Array,
@@ -352,7 +361,7 @@ def _move(
     solution: Array,
     constants: Array,
 ) -> float:
-    """Move the constants of the beams; return by how much the farthest logarithm follows."""
+    """Update the constants of the beams; return the largest change of a logarithm."""
     first_passage, _, crossing = geometry
     moved = 0.0
     for beam in range(counts.size):
@@ -360,8 +369,8 @@ def _move(
             continue
         step = 0.0
         for c in range(counts[beam]):
-            gap = columns[beam, c, 0] - solution[crossing[first_passage[beam] + c]]
-            step += columns[beam, c, 2] * gap
+            residual = columns[beam, c, 0] - solution[crossing[first_passage[beam] + c]]
+            step += columns[beam, c, 2] * residual
         step = min(max(step / information[beam], -LONGEST_STEP), LONGEST_STEP)
         constants[beam] += step
         moved = max(moved, abs(step) * columns[beam, 0, 1])
@@ -370,12 +379,13 @@ def _move(
 
 @_compiled
 def workspace(first_passage: Indices, beams: int) -> tuple[Array, Array, Array, Array, Array]:
-    most = 1
+    """Return scratch, inverse covariances, weights, columns and information of the beams."""
+    most_passages = 1
     for beam in range(beams):
-        most = max(most, first_passage[beam + 1] - first_passage[beam])
+        most_passages = max(most_passages, first_passage[beam + 1] - first_passage[beam])
     return (
-        np.empty((most, most)), np.empty((beams, most, most)), np.empty(most),
-        np.empty((beams, most, 3)), np.empty(beams),
+        np.empty((most_passages, most_passages)), np.empty((beams, most_passages, most_passages)),
+        np.empty(most_passages), np.empty((beams, most_passages, 3)), np.empty(beams),
     )  # fmt: skip
 
 
@@ -387,15 +397,15 @@ def solve_joint(
     covariance: Array,
     geometry: tuple[Indices, Indices, Indices],
     precision: Array,
-    doubts: Array,
+    excluded_fields: Array,
     norm: float,
-    flat: bool,
+    without_prior: bool,
     passes: int,
     constants: Array,
     logarithms: Array,
     variances: Array,
-    believed: Array,
-    missed: Array,
+    prior_true_variance: Array,
+    excluded_variance: Array,
     summary: Array,
     status: Codes,
     left_out: Codes,
@@ -405,28 +415,28 @@ def solve_joint(
     Parameters
     ----------
     values, integrals, usable, covariance
-        As `lidarops.retrieve.network._condensed_signals.condense` gives them.
+        From `lidarops.retrieve.network._condensed_signals.condense`.
     geometry : (beam + 1,), (beam + 1,) and (passage,) intp
-        Where passages and where covariances of a beam start; the crossing of each passage.
+        First passage and start of the covariance of each beam; crossing of each passage.
     precision : (crossing, crossing) float64
-        Prior precision of ln extinction, which leaves a common level free.
-    doubts : (field, crossing) float64
-        Fields of ln extinction that the prior rules out, each of the size that it may have.
+        Prior precision of ln extinction, with a free common level.
+    excluded_fields : (field, crossing) float64
+        Fields of ln extinction that the prior excludes, each with its possible size.
     norm : float
-        -ln of its determinant.
-    flat : bool
-        Whether to leave the prior out.
+        -ln of the determinant of the precision.
+    without_prior : bool
     passes : int
+        Number of linearisations.
     constants : (profile, beam) float64
-        In: where to start; out: where the passes ended.
-    logarithms, variances, believed, missed : (profile, crossing) float64
-        Get ln(extinction / m-1), its variance where fields deviate by more than the prior has it
-        (`DOUBT`), and where they do not, and what `doubts` add to it; NaN where undetermined, or
-        unseen.
+        In: start values. Out: values after the last pass.
+    logarithms, variances, prior_true_variance, excluded_variance : (profile, crossing) float64
+        Out: ln(extinction / m-1), its variance for a field that deviates by `PRIOR_DOUBT` times
+        the prior, its variance if the prior is true, and the variance that `excluded_fields` add.
+        NaN where undetermined or unseen.
     summary : (profile, COLUMNS) float64
     status : (profile,) uint8
     left_out : (profile, beam) uint8
-        Gets 1 where two passages or more of a beam are usable, and their covariance is singular
+        Out: 1 where two or more passages of a beam are usable, but their covariance is singular
         or not finite.
     """
     beams, crossings = constants.shape[1], logarithms.shape[1]
@@ -439,9 +449,9 @@ def solve_joint(
     )
     counts, seen = np.zeros(beams, dtype=np.intp), np.zeros(crossings, dtype=np.uint8)
     for n in range(values.shape[0]):
-        add_observations(usable[n], geometry[0], counts)
-        used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
-        fine, moved, square, determinants = used > 0, math.inf, 0.0, 0.0
+        count_passages(usable[n], geometry[0], counts)
+        used, observations, count = _count_observations(geometry[0], geometry[2], counts, seen)
+        determined, largest_step, square, determinants = used > 0, math.inf, 0.0, 0.0
         data = (values[n], integrals[n], covariance[n])
         for _ in range(passes):
             square, determinants, level = assemble(
@@ -451,38 +461,52 @@ def solve_joint(
                 target[v] = side[v]
                 for w in range(crossings):
                     inverse[v, w] = matrix[v, w]
-            add_prior(matrix, side, level, precision, flat)
-            used, observations, count = _tally(geometry[0], geometry[2], counts, seen)
-            fine = used > 0 and math.isfinite(square + determinants)
-            fine = fine and factorise(matrix, crossings)
-            if not fine:
+            add_prior(matrix, side, level, precision, without_prior)
+            used, observations, count = _count_observations(geometry[0], geometry[2], counts, seen)
+            determined = used > 0 and math.isfinite(square + determinants)
+            determined = determined and factorise(matrix, crossings)
+            if not determined:
                 break
             substitute_factorised(matrix, crossings, side)
-            moved = _move(geometry, counts, work[3], work[4], side, constants[n])
+            largest_step = _move_constants(geometry, counts, work[3], work[4], side, constants[n])
         for beam in range(beams):
             first = geometry[0][beam]
-            usual = _count(usable[n], first, geometry[0][beam + 1])
-            left_out[n, beam] = counts[beam] == 0 and usual >= 2
+            usable_count = _count_usable(usable[n], first, geometry[0][beam + 1])
+            left_out[n, beam] = counts[beam] == 0 and usable_count >= 2
         for v in range(crossings):
-            determinants += 2.0 * math.log(matrix[v, v]) if fine else math.nan
-        free = (observations - used - count, observations - used - (count if flat else 1))
-        rough = _square_at(inverse, target, side, square) if flat and fine else math.nan
-        summary[n, 0] = _least_square(inverse, target, seen, square, fine)
-        summary[n, 2] = summary[n, 0] if flat or not fine else square - _dot(side, target)
-        if flat and fine and math.isnan(summary[n, 0]):
-            # Beams that leave some crossings open, or whose constants have run away, may disagree.
-            summary[n, 2], free = rough, (free[0], observations - used - 1)
-        summary[n, 1], summary[n, 3] = free
+            determinants += 2.0 * math.log(matrix[v, v]) if determined else math.nan
+        freedom = (
+            observations - used - count,
+            observations - used - (count if without_prior else 1),
+        )
+        chi_square_here = (
+            _chi_square_at(inverse, target, side, square)
+            if without_prior and determined
+            else math.nan
+        )
+        summary[n, 0] = _least_chi_square(inverse, target, seen, square, determined)
+        summary[n, 2] = (
+            summary[n, 0] if without_prior or not determined else square - _dot(side, target)
+        )
+        if without_prior and determined and math.isnan(summary[n, 0]):
+            # Beams may disagree even if crossings stay undetermined or constants diverged.
+            summary[n, 2], freedom = chi_square_here, (freedom[0], observations - used - 1)
+        summary[n, 1], summary[n, 3] = freedom
         summary[n, 4] = summary[n, 2] + determinants + norm
-        status[n] = UNDETERMINED if not fine else (SOLVED if moved < _SETTLED else UNSETTLED)
-        _hand_over(
-            matrix, side, precision, doubts, seen, fine, (inverse, target), logarithms[n],
-            variances[n], believed[n], missed[n],
+        status[n] = (
+            UNDETERMINED
+            if not determined
+            else (SOLVED if largest_step < _CONVERGED_STEP else UNSETTLED)
+        )
+        _store_solution(
+            matrix, side, precision, excluded_fields, seen, determined, (inverse, target),
+            logarithms[n], variances[n], prior_true_variance[n], excluded_variance[n],
         )  # fmt: skip
 
 
 @_compiled
 def _dot(left: Array, right: Array) -> float:
+    """Return the scalar product, summed in order."""
     total = 0.0
     for v in range(left.size):
         total += left[v] * right[v]
@@ -490,23 +514,25 @@ def _dot(left: Array, right: Array) -> float:
 
 
 @_compiled
-def _square_at(matrix: Array, side: Array, solution: Array, square: float) -> float:
-    """Return chi-square of the beams alone at a solution, which need not be their least."""
+def _chi_square_at(matrix: Array, side: Array, solution: Array, square: float) -> float:
+    """Return chi-square of the beams alone at a solution that need not be its minimum."""
     total = square
     for v in range(side.size):
-        here = 0.0
+        product = 0.0
         for w in range(side.size):
-            here += matrix[v, w] * solution[w]
-        total += solution[v] * (here - 2.0 * side[v])
+            product += matrix[v, w] * solution[w]
+        total += solution[v] * (product - 2.0 * side[v])
     return total
 
 
 @_compiled
-def _least_square(matrix: Array, side: Array, seen: Codes, square: float, fine: bool) -> float:
-    """Return chi-square of the beams alone, at the constants that the prior has led to."""
+def _least_chi_square(
+    matrix: Array, side: Array, seen: Codes, square: float, determined: bool
+) -> float:
+    """Return the smallest chi-square of the beams alone, at the constants found with the prior."""
     for v in range(side.size):
         matrix[v, v] += 1.0 - seen[v]
-    if not (fine and factorise(matrix, side.size)):
+    if not (determined and factorise(matrix, side.size)):
         return math.nan
     best = side.copy()
     substitute_factorised(matrix, side.size, best)
@@ -514,42 +540,42 @@ def _least_square(matrix: Array, side: Array, seen: Codes, square: float, fine: 
 
 
 @_compiled
-def _hand_over(
+def _store_solution(
     factor: Array,
     solution: Array,
     precision: Array,
-    doubts: Array,
+    excluded_fields: Array,
     seen: Codes,
-    fine: bool,
+    determined: bool,
     work: tuple[Array, Array],
     logarithms: Array,
     variances: Array,
-    believed: Array,
-    missed: Array,
+    prior_true_variance: Array,
+    excluded_variance: Array,
 ) -> None:
     """Fill the solution and its variances where crossings are seen, NaN elsewhere.
 
-    The inverse C of all information is the covariance of a field of which the prior P is true;
-    C + (d^2 - 1) C P C that of one which deviates by d times as much. A field f that the prior
-    rules out moves the solution by C P f.
+    The inverse C of all information is the covariance if the prior P is true, and
+    C + (d^2 - 1) C P C if the field deviates d times as much. A field f that the prior excludes
+    shifts the solution by C P f.
     """
-    inverse, pull = work
-    if fine:
+    inverse, gain = work
+    if determined:
         invert_system(factor, solution.size, inverse)
     for v in range(solution.size):
-        good = fine and seen[v] == 1 and inverse[v, v] < _LARGEST_VARIANCE
-        logarithms[v] = solution[v] if good else math.nan
-        variances[v], believed[v], missed[v] = math.nan, math.nan, math.nan
-        if good:
-            believed[v] = inverse[v, v]
-            told = 0.0
+        valid = determined and seen[v] == 1 and inverse[v, v] < _LARGEST_VARIANCE
+        logarithms[v] = solution[v] if valid else math.nan
+        variances[v], prior_true_variance[v], excluded_variance[v] = math.nan, math.nan, math.nan
+        if valid:
+            prior_true_variance[v] = inverse[v, v]
+            prior_share = 0.0
             for i in range(solution.size):
-                pull[i] = 0.0
+                gain[i] = 0.0
                 for k in range(solution.size):
-                    pull[i] += precision[i, k] * inverse[k, v]
-                told += inverse[v, i] * pull[i]
-            missed[v] = 0.0
-            for field in range(doubts.shape[0]):
-                reach = _dot(doubts[field], pull)
-                missed[v] += reach * reach
-            variances[v] = inverse[v, v] + (DOUBT * DOUBT - 1.0) * max(told, 0.0)
+                    gain[i] += precision[i, k] * inverse[k, v]
+                prior_share += inverse[v, i] * gain[i]
+            excluded_variance[v] = 0.0
+            for field in range(excluded_fields.shape[0]):
+                shift = _dot(excluded_fields[field], gain)
+                excluded_variance[v] += shift * shift
+            variances[v] = inverse[v, v] + (PRIOR_DOUBT * PRIOR_DOUBT - 1.0) * max(prior_share, 0.0)

@@ -1,4 +1,4 @@
-"""Cycles of beams in closed form: exact, or with a multiplier that trades noise for bias."""
+"""Closed forms for cycles of beams: exact, or with a multiplier that trades noise for bias."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Booleans = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleResult:
-    """Solutions of cycles, with the leading axes of the rows."""
+    """Solutions of cycles. Leading axes are those of the rows."""
 
     value: Array
     """(...) reciprocal extinction at the start crossing, in the unit of integral / signal."""
     variance: Array
-    """(...) of it; NaN where no variances are given."""
+    """(...) variance of `value`; NaN where no variances are given."""
     sensitivities: Array
-    """(..., row, 3) derivatives of it by the logarithms of start, end and integral."""
+    """(..., row, 3) derivatives of `value` by the logarithms of start, end and integral."""
     attenuation: Array
-    """(...) product of the ratios end / start around the cycle; 1 is singular."""
+    """(...) product of the ratios end / start around the cycle; singular at 1."""
     ill_conditioned: Booleans
     far_start: Booleans
     not_positive: Booleans
@@ -61,18 +61,18 @@ def solve_cycle(
 
     .. math:: S_1 = \frac{\sum_j \mu_j Q_{j-1} c_j}{1 - \mu_k Q_k}
 
-    is exact for a multiplier of 1. Below, what is neglected makes S too small by
-    `systematic_error`; the unbiased estimate puts it to S_1, so that nothing is neglected in
-    homogeneous air: the determinant is :math:`1 - \mu_k Q_k - \sum (\mu_j - \mu_{j+1}) Q_j`.
+    is exact for a multiplier of 1. For smaller multipliers, neglected terms make S too small by
+    `systematic_error`. The unbiased estimate assigns them to S_1, so that nothing is neglected
+    in homogeneous air: the determinant is :math:`1 - \mu_k Q_k - \sum (\mu_j - \mu_{j+1}) Q_j`.
 
     Parameters
     ----------
     start, end : (..., row) float
         Signals (power R^2 / overlap)^m at the first and at the second crossing of each row.
     integral : (..., row) float
-        2 m times the integral between them, m; negative where the row runs towards its lidar.
+        m, 2 m times the integral between them; negative where the row leads towards its lidar.
     relative_variance : (..., row, 3) float, optional
-        Of start, end and integral, independent.
+        Relative variances of start, end and integral, which are independent.
     multiplier : (...) float
         0 to 1.
     unbiased : bool
@@ -80,27 +80,27 @@ def solve_cycle(
     Returns
     -------
     CycleResult
-        No value where the multiplier is below 1 and :math:`\mu_k Q_k \ge 1`: beyond the pole.
+        No value beyond the pole: where the multiplier is below 1 and :math:`\mu_k Q_k \ge 1`.
 
     Raises
     ------
     RetrievalInputError
-        For shapes that do not fit, and multipliers out of 0-1.
+        For shapes that do not match, and multipliers outside 0 to 1.
 
     References
     ----------
     drabenko2021 (with corrected signs), yegorov2008.
     """
-    shape, (a, n, b) = _rows(start, end, integral)
-    count, k = a.shape
-    chosen = _multipliers(multiplier, shape[:-1])
+    shape, (starts, ends, integrals) = _rows(start, end, integral)
+    count, k = starts.shape
+    multipliers = _multipliers(multiplier, shape[:-1])
     value, determinant, gradient = np.empty(count), np.empty(count), np.empty((count, k, 3))
     codes = np.empty(count, dtype=np.uint8)
     _cycle_kernels.solve_with_sensitivities(
-        a, n, b, chosen, unbiased, value, determinant, gradient, codes
+        starts, ends, integrals, multipliers, unbiased, value, determinant, gradient, codes
     )
     with np.errstate(all="ignore"):
-        attenuation = np.asarray(np.cumprod(n / a, axis=1)[:, -1], dtype=np.float64)
+        attenuation = np.asarray(np.cumprod(ends / starts, axis=1)[:, -1], dtype=np.float64)
         variances = _relative_variances(relative_variance, shape)
         variance = np.cumsum((gradient**2 * variances).reshape(count, -1), axis=1)[:, -1]
         spread = np.cumsum(variances[:, :, 0] + variances[:, :, 1], axis=1)[:, -1]
@@ -109,11 +109,11 @@ def solve_cycle(
             weak = ~(attenuation > 0) | (attenuation == 1.0)
         flags = (
             weak,
-            b[:, 0] < 0,
+            integrals[:, 0] < 0,
             ~(value > 0),
             ~np.isfinite(value),
             variance > value**2,
-            ~((a > 0) & (n > 0) & np.isfinite(a) & np.isfinite(n)).all(axis=1),
+            ~((starts > 0) & (ends > 0) & np.isfinite(starts) & np.isfinite(ends)).all(axis=1),
             codes == _cycle_kernels.POLE,
         )
     return CycleResult(
@@ -134,46 +134,48 @@ def values_and_variances(
     multiplier: npt.ArrayLike = 1.0,
     unbiased: bool = False,
 ) -> tuple[Array, Array]:
-    """Return (...) values and variances of `solve_cycle` alone, at the speed of memory.
+    """Return (...) values and variances of `solve_cycle`, without sensitivities and flags.
 
     Parameters
     ----------
     start, end, integral : (..., row) float
     relative_variance : (..., row, 3) float
-        One for all cycles, (row, 3), is the fastest.
+        One array (row, 3) for all cycles is the fastest.
     multiplier : (...) float
     unbiased : bool
     """
-    shape, (a, n, b) = _rows(start, end, integral)
+    shape, (starts, ends, integrals) = _rows(start, end, integral)
     variances = _relative_variances(relative_variance, shape)
-    value, variance = np.empty(len(a)), np.empty(len(a))
-    codes = np.empty(len(a), dtype=np.uint8)
-    chosen = _multipliers(multiplier, shape[:-1])
-    _cycle_kernels.solve_with_variance(a, n, b, variances, chosen, unbiased, value, variance, codes)
+    value, variance = np.empty(len(starts)), np.empty(len(starts))
+    codes = np.empty(len(starts), dtype=np.uint8)
+    multipliers = _multipliers(multiplier, shape[:-1])
+    _cycle_kernels.solve_with_variance(
+        starts, ends, integrals, variances, multipliers, unbiased, value, variance, codes
+    )
     return value.reshape(shape[:-1]), variance.reshape(shape[:-1])
 
 
 def substitute_back(
     start: npt.ArrayLike, end: npt.ArrayLike, integral: npt.ArrayLike, first: npt.ArrayLike
 ) -> Array:
-    """Return (..., row) reciprocal extinction at all crossings from that at the first.
+    """Return (..., row) reciprocal extinction at all crossings from the first one.
 
-    From crossing to crossing backwards, the noise of rows that run towards their lidar is amplified;
-    `solve_cycle` with the rows turned to start elsewhere tells by how much.
+    The substitution goes backwards from crossing to crossing. It amplifies the noise of rows that
+    lead towards their lidar; `solve_cycle` with rotated rows gives the variance elsewhere.
 
     Parameters
     ----------
     start, end, integral : (..., row) float
-        As for `solve_cycle`.
+        As in `solve_cycle`.
     first : (...) float
-        Its value.
+        Reciprocal extinction at the first crossing.
     """
-    shape, (a, n, b) = _rows(start, end, integral)
+    shape, (starts, ends, integrals) = _rows(start, end, integral)
     value = inputs.real_array(first, "first").astype(np.float64)
     if value.shape != shape[:-1]:
         raise RetrievalInputError(f"has the shape {value.shape}, not {shape[:-1]}", field="first")
-    out = np.empty_like(a)
-    _cycle_kernels.substitute_cycle(a, n, b, value.reshape(-1), out)
+    out = np.empty_like(starts)
+    _cycle_kernels.substitute_cycle(starts, ends, integrals, value.reshape(-1), out)
     return out.reshape(shape)
 
 
@@ -184,12 +186,12 @@ def systematic_error(optical_depth: npt.ArrayLike, multiplier: npt.ArrayLike) ->
         \frac{S_1 - \tilde S_1}{S_1} = \frac{\sum_{j<k} (\mu_j - \mu_{j+1})
         e^{-2 \sum_{l \le j} s_l m_l \tau_l}}{1 - \mu_k e^{-2 \sum_l s_l m_l \tau_l}}
 
-    It holds in any field: extinction at the crossings cancels. NaN beyond the pole.
+    It holds in any field, because extinction at the crossings cancels. NaN beyond the pole.
 
     Parameters
     ----------
     optical_depth : (..., row) float
-        Exponent m times optical depth of each row, negative where it runs towards its lidar.
+        Exponent m times optical depth of each row, negative where it leads towards its lidar.
     multiplier : (...) float
         0 to 1.
 
@@ -212,14 +214,16 @@ def systematic_error(optical_depth: npt.ArrayLike, multiplier: npt.ArrayLike) ->
 def _rows(
     start: npt.ArrayLike, end: npt.ArrayLike, integral: npt.ArrayLike
 ) -> tuple[tuple[int, ...], list[Array]]:
-    """Return the common shape of the rows, and each as contiguous (cycle, row)."""
+    """Return the common shape of the rows, and contiguous (cycle, row) arrays."""
     arrays = [
         inputs.real_array(v, n).astype(np.float64, copy=False)
         for v, n in ((start, "start"), (end, "end"), (integral, "integral"))
     ]
     shape = _common_shape(arrays, "start, end and integral")
     if not shape or shape[-1] < 2:
-        raise RetrievalInputError(f"has the shape {shape}", field="start", remedy="give rows last")
+        raise RetrievalInputError(
+            f"has the shape {shape}", field="start", remedy="give 2 or more rows on the last axis"
+        )
     count = int(np.prod(shape[:-1], dtype=np.int64))
     return shape, [
         np.ascontiguousarray(np.broadcast_to(v, shape).reshape(count, shape[-1])) for v in arrays

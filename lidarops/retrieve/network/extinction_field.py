@@ -1,30 +1,30 @@
-"""Extinction and visibility from several lidars that look into the same air.
+"""Extinction and visibility from the signals of several lidars whose beams cross.
 
 Where two beams cross, both lidars see the same extinction, whatever their constants and the
-lidar ratio are. Along a beam, a = (P R^2 / overlap)^m is proportional to extinction times
-exp(-2 m optical depth), if backscatter goes as extinction^(1/m) there; so that between a near
-crossing n and a far one v
+lidar ratio. Along a beam, a = (P R^2 / overlap)^m is proportional to extinction times
+exp(-2 m optical depth), if backscatter ~ extinction^(1/m) there. Between a near crossing n and a
+far one v therefore
 
     a_n / extinction_n - a_v / extinction_v = 2 m (integral of a from n to v).
 
-Nothing in it needs calibration: a lidar's constant multiplies the whole row. The overlap does
-not cancel: an error of 1, 3 and 10 percent at the first crossing changes extinction there by 5, 14
+No calibration is needed: the constant of a lidar multiplies the whole row. The overlap does not
+cancel: an error of 1, 3 and 10 percent at the first crossing changes extinction there by 5, 14
 and 34 percent.
 
-A gradient over the whole network looks like attenuation where air is thin or noise is high, and
-no test tells it there: what the prior allows, and what the rest of the block tells of it
-(`lidarops.retrieve.network._block_errors`), is then most of the standard error. In 800 random networks
-0.01(1) percent of the values without a flag are off by more than 4 standard errors, 0.005(3) in
-plumes that drift within a block (`lidarops bench stability`). What is left stands in single
-crossings in dense plumes. More profiles in a block and more beams tell more.
+In thin air or high noise, a gradient over the whole network looks like attenuation, and no test
+can separate them. The standard error is then mostly what the prior allows and what the rest of
+the block shows (`lidarops.retrieve.network._block_errors`). In 800 random networks, 0.01(1)
+percent of the unflagged values differed from the truth by more than 4 standard errors, and
+0.005(3) percent in plumes that drift within a block (`lidarops bench stability`). The remaining
+ones are single crossings in dense plumes. More profiles per block and more beams reduce them.
 
-A layer so thin that signals bend within the bins of a fit puts an error into the values there, of
-which the block tells too (`lidarops.retrieve.network._curvature_errors`).
+In a layer so thin that the signal is curved within the bins of a fit, the fitted values are
+biased. The block shows this error too (`lidarops.retrieve.network._curvature_errors`).
 
-Scale heights are 300 m and more there. In steeper fields the far crossings may fade, and leave
-fewer equations than unknowns: errors are then stated with a prior that holds ln extinction over
-the crossings to 0.6, and values are flagged where the beams exclude the usual one. A field that is
-steeper still, of which so few beams tell nothing, is missed.
+Scale heights in these networks are 300 m or more. In steeper fields the signals at far crossings
+may be too weak, which leaves fewer equations than unknowns. Errors are then stated with a prior
+of 0.6 for ln extinction over the crossings, and values are flagged where the beams contradict
+the usual prior. A still steeper field goes undetected where so few beams cannot show it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ import numpy.typing as npt
 from scipy import special
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.air import visibility as sight
+from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.network import (
     _beam_signals,
@@ -48,48 +48,50 @@ from lidarops.retrieve.network import (
     _empirical_prior,
     _joint_solution,
 )
-from lidarops.retrieve.network import geometry as beams_geometry
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
-from lidarops.retrieve.network.geometry import Cycle, Network
+from lidarops.retrieve.network.geometry import Cycle, Network, build_cycle
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 Booleans = npt.NDArray[np.bool_]
 
 DEFAULT_BINS: Final = 7
+"""Bins of the fit that gives the signal at a crossing."""
 DEFAULT_UNBIASED_MULTIPLIER: Final = 0.25
-"""Of the unbiased estimate: its noise is nearly least there, in fields of any kind."""
+"""Of the unbiased estimate. Its noise is close to the minimum there, in all kinds of fields."""
 _LEAST_PROBABILITY: Final = 1e-4
+"""Of a chi-square; below, a fit is flagged as poor."""
 
 
 class NetworkMethod(StrEnum):
-    """How extinction is found. All but the network see one cycle, or one beam."""
+    """How extinction is retrieved. All methods but the network use one cycle or one beam."""
 
     NETWORK = "network"
-    """All beams and crossings at once, weighted by their full covariance."""
+    """All beams and crossings together, weighted by their full covariance."""
     CYCLE = "cycle"
     """The exact closed form of a cycle."""
     MULTIPLIER = "multiplier"
     """The closed form with a multiplier below 1: less noise, a known systematic error."""
     UNBIASED = "unbiased"
-    """The same, with what is neglected put to the start crossing: no error in homogeneous air."""
+    """The same, with the neglected terms assigned to the start crossing: no systematic error in
+    homogeneous air."""
     SLOPE = "slope"
-    """Each beam for itself, as if homogeneous from crossing to crossing."""
+    """Each beam alone, taken as homogeneous from crossing to crossing."""
     KLETT = "klett"
-    """Each beam for itself, from the slope at the far end of a segment."""
+    """Each beam alone, from the slope at the far end of a segment."""
 
 
 _HOMOGENEOUS: Final = frozenset(
     {NetworkMethod.MULTIPLIER, NetworkMethod.UNBIASED, NetworkMethod.SLOPE, NetworkMethod.KLETT}
 )
-
+"""Methods that assume homogeneous air."""
 
 _HARMLESS: Final = frozenset({"weak_signal", "bridged"})
-"""Flags that do not speak against a value."""
+"""Flags that do not reject a value."""
 
 
 class FieldPrior(StrEnum):
-    """What a network is told about the field beforehand."""
+    """Prior knowledge of the field that the network method uses."""
 
     BLOCK = "block"
     """The mean field of the block of profiles, and how much profiles deviate from it."""
@@ -98,14 +100,14 @@ class FieldPrior(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossingFlags:
-    """What is wrong with a value: (..., crossing) booleans each."""
+    """Reasons to doubt a value: one (..., crossing) array of booleans each."""
 
     ill_conditioned: Booleans
-    """Attenuation around the cycle, what takes its place, or the value itself is less than 3
-    standard errors: of the profile, or typically of its block. Or the beams are too few to tell
-    the field, and tell that it is not as the prior has it."""
+    """The attenuation around the cycle (or its substitute) or the value itself is less than 3
+    standard errors, in the profile or typically in its block. Or the beams are too few to
+    determine the field, and contradict the prior."""
     far_start: Booleans
-    """The start of the cycle is the far crossing of its beam."""
+    """The cycle starts at the far crossing of its first beam."""
     not_positive: Booleans
     """The solution is negative."""
     not_finite: Booleans
@@ -113,32 +115,33 @@ class CrossingFlags:
     uncertain: Booleans
     """The standard error exceeds the value."""
     signal_not_positive: Booleans
-    """A beam of the crossing has a bin before it that is zero or negative."""
+    """A beam of the crossing has a bin before the crossing that is zero or negative."""
     signal_missing: Booleans
-    """A beam of the crossing has a bin before it of which power or variance is not finite."""
+    """A beam of the crossing has a bin before it with a power or variance that is not finite."""
     weak_signal: Booleans
-    """A beam of the crossing is too noisy there, or of a variance that cannot be (zero), and was left
-    out; the others stand."""
+    """A beam of the crossing is too noisy there, or its variance is invalid (zero), so it was left
+    out. The value from the other beams is valid."""
     bridged: Booleans
-    """A beam of the crossing has bins that lie far off their neighbours: these took the place of
-    single ones. Several together, which may be air, were left as they are, and what they and the
-    bins between two edges change is part of the standard error. The value stands."""
+    """A beam of the crossing has outlying bins. Single ones were interpolated from their
+    neighbours. Several adjacent ones, which may be air, were left in place; the change that
+    they and the bins between two edges make is part of the standard error. The value is
+    valid."""
     outlying: Booleans
-    """A beam of the crossing has so many such bins before it that it was left out."""
+    """A beam of the crossing has so many outlying bins before it that it was left out."""
     pole: Booleans
-    """The multiplier makes the determinant vanish or turn its sign: no value."""
+    """The multiplier makes the determinant zero or changes its sign: no value."""
     unsettled: Booleans
-    """The last pass of the network still moved the solution."""
+    """The network solution did not converge."""
     poor_fit: Booleans
-    """The beams disagree by more than their noise allows."""
+    """The beams disagree by more than their noise."""
     not_homogeneous: Booleans
-    """The method takes the air for homogeneous, and the beams say that it is not."""
+    """The method assumes homogeneous air, and the beams show that it is not."""
     not_measured: Booleans
-    """Fewer than two beams have full overlap and range there."""
+    """Fewer than two beams have full overlap and a signal there."""
 
     @property
     def flagged(self) -> Booleans:
-        """Union of all but `weak_signal` and `bridged`, which do a value that is left no harm."""
+        """Union of all flags except `weak_signal` and `bridged`, which leave a value valid."""
         union = np.zeros_like(self.far_start)
         for field in fields(self):
             if field.name not in _HARMLESS:
@@ -148,61 +151,32 @@ class CrossingFlags:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MultiPositionResult:
-    """Extinction at the crossings of a network, with the leading axes of the power."""
+    """Extinction at the crossings of a network. Leading axes are those of the power."""
 
     extinction: Array
-    """(..., crossing) m-1; NaN at crossings that are near ones on no beam, and where there is none."""
+    """(..., crossing) m-1; NaN without a value, and at crossings that are far on all beams."""
     extinction_standard_error: Array
-    """m-1, by noise, by what a line through a few bins has wrong where the signal bends, and by
-    what a field may deviate from the prior: twice the prior's standard deviation is counted, eight
-    times as much where beams are too few to test the prior, and a bend over the network where the
-    mean of the block's beams allows it.
-    Of a block in thin air, no less than is typical of it, and what noise moves all by."""
-    visibility: sight.VisibilityResult
+    """m-1. From noise, from the error of a straight-line fit where the signal is curved, and from
+    deviations of the field from the prior: twice the prior's standard deviation is assumed, eight
+    times where the beams are too few to test the prior, and a curvature of the field over the
+    network where the mean of the block's beams allows it. In thin air it is at least the typical
+    error of the block, and includes the bias that noise gives all its profiles."""
+    visibility: air_visibility.VisibilityResult
     """(..., crossing) m, at the wavelength of the lidars."""
     flags: CrossingFlags
     near_crossing: Booleans
     """(crossing,) True where extinction is reported."""
     reduced_chi_square: Array
-    """(...) of the beams of the network, free of the prior; NaN for other methods, and where
-    nothing is left over."""
+    """(...) of the beams alone, without the prior; NaN for other methods, and without degrees of
+    freedom."""
     degrees_of_freedom: Array
     """(...)."""
     prior_deviation: Array
-    """(...) of ln extinction about the mean field; inf without prior, NaN without network."""
+    """(...) standard deviation of ln extinction about the mean field; inf without prior, NaN for
+    other methods."""
     multiplier: Array
     """(...) of the cycle; NaN for other methods."""
     method: NetworkMethod
-
-
-def average_signals(
-    power: npt.ArrayLike, groups: npt.ArrayLike, *, variance: npt.ArrayLike | None = None
-) -> tuple[Array, Array | None]:
-    """Average the signals of groups of profiles, as should be done before they are solved.
-
-    A lidar's energy changes from profile to profile: a beam with a gap would put a step into the
-    mean, and is left out of it, as is one with a bin of unknown variance. Where no profile of a
-    group has a bin, the mean has none.
-
-    Parameters
-    ----------
-    power : (profile, beam, range) float
-    groups : (profile,) int or str
-        Labels; groups come in their sorted order.
-    variance : (profile, beam, range) float, optional
-
-    Returns
-    -------
-    power : (group, beam, range) float64
-    variance : (group, beam, range) float64, or None where none is given
-        Of the mean.
-
-    Raises
-    ------
-    RetrievalInputError
-        For shapes that do not fit.
-    """
-    return _beam_signals.average_blocks(power, groups, variance)
 
 
 def retrieve_network(
@@ -221,48 +195,47 @@ def retrieve_network(
     start: int | None = None,
     multiplier: float | None = None,
     bins: int = DEFAULT_BINS,
-    contrast: float = sight.MOR_CONTRAST,
+    contrast: float = air_visibility.MOR_CONTRAST,
 ) -> MultiPositionResult:
-    """Find extinction and visibility where the beams of several lidars meet.
+    """Retrieve extinction and visibility where the beams of several lidars cross.
 
-    Average signals before (`average_signals`), not results afterwards: noise makes these biased.
+    Average signals before the retrieval, not results afterwards: noise biases single results.
 
     Parameters
     ----------
     power : (..., beam, range) float
-        Any unit, free of background. Each lidar has its own constant, which may change from
-        profile to profile.
+        Background-subtracted, in any unit. Each lidar has its own constant, which may change
+        from profile to profile.
     range : (range,) or (beam, range) float
         m.
     network : Network
-        Of `lidarops.retrieve.network.geometry`, with as many beams.
+        From `lidarops.retrieve.network.geometry`, with the same beams as `power`.
     method : {"network", "cycle", "multiplier", "unbiased", "slope", "klett"}
     variance : (..., beam, range) float, optional
         Noise variance in the square of the power's unit, broadcast against `power`; bins are
-        independent. Where not given, second differences along range tell it, block by block, and
-        sums of bins that these are correlated, where there are profiles enough.
+        independent. By default it is estimated block by block from second differences along
+        range. With enough profiles, the variance of sums of bins shows correlated noise.
     overlap : (beam, range) or (range,) float, optional
-        Overlap function, by which power is divided; bins below 0.5 are not used.
+        Overlap function; power is divided by it. Bins with an overlap below 0.5 are not used.
     full_overlap_range : float or (beam,) float, optional
-        m; nearer bins are not used. One of the two is required.
+        m; nearer bins are not used. Either this or `overlap` is required.
     exponent : float or (beam,) float
         m of backscatter ~ extinction^(1/m) along a beam.
     blocks : (...) int or str, optional
-        Labels of the profiles that are pooled, for the mean field and the multiplier; one block
-        where not given. A block's results depend on its own profiles only. Where many of them are
-        far noisier than many others, it is parted into the quiet and the noisy ones.
+        Labels of the profiles that share a mean field and a multiplier; by default, all. Results
+        of a block depend on its own profiles only. A block in which many profiles are far noisier
+        than many others is split into the quiet and the noisy ones.
     prior : {"block", "none"}
-        For the network. "none" solves each profile for itself; crossings that are not
-        determined are NaN.
+        For the network. "none" solves each profile alone; undetermined crossings are NaN.
     cycle : Cycle, optional
-        For "cycle", "multiplier" and "unbiased"; that of `geometry.cycle` where not given.
+        For "cycle", "multiplier" and "unbiased"; by default from `geometry.build_cycle`.
     start : int, optional
-        Crossing of the cycle to solve for alone, with the cycle turned to it; all near crossings
-        in turn where not given.
+        The only crossing to solve for: the cycle is rotated to start there. By default, all near
+        crossings in turn.
     multiplier : float, optional
-        For "multiplier" (the best of each block where not given) and "unbiased" (0.25).
+        For "multiplier" (default: the best one of each block) and "unbiased" (default: 0.25).
     bins : int
-        Of the fit that gives the signal at a crossing.
+        Number of bins of the fit that gives the signal at a crossing.
     contrast : float
         Threshold of visibility.
 
@@ -273,16 +246,16 @@ def retrieve_network(
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right.
+        For invalid arguments.
 
     References
     ----------
     drabenko2021, yegorov2008.
     """
-    chosen = inputs.choice(method, NetworkMethod, "method")
-    told = inputs.choice(prior, FieldPrior, "prior")
-    _check_settings(chosen, multiplier, cycle, start)
-    sight.koschmieder_constant(contrast)
+    network_method = inputs.choice(method, NetworkMethod, "method")
+    field_prior = inputs.choice(prior, FieldPrior, "prior")
+    _check_settings(network_method, multiplier, cycle, start)
+    air_visibility.koschmieder_constant(contrast)
     if network.crossings == 0:
         raise RetrievalInputError(
             "has no crossings: its beams do not meet",
@@ -293,22 +266,22 @@ def retrieve_network(
         power, range, network, variance=variance, overlap=overlap,
         full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, bins=bins,
     )  # fmt: skip
-    if chosen is NetworkMethod.NETWORK:
-        estimate, fit = _solve_network(beams, network.crossing, told)
+    if network_method is NetworkMethod.NETWORK:
+        estimate, prior_fit = _solve_network(beams, network.crossing, field_prior)
     else:
         walk = None
-        if chosen not in {NetworkMethod.SLOPE, NetworkMethod.KLETT}:
-            walk = cycle if cycle is not None else beams_geometry.build_cycle(network, start=start)
-        estimate, fit = _solve_closed(beams, chosen, walk, multiplier, start), None
-    return _judged(beams, estimate, fit, chosen, contrast)
+        if network_method not in {NetworkMethod.SLOPE, NetworkMethod.KLETT}:
+            walk = cycle if cycle is not None else build_cycle(network, start=start)
+        estimate, prior_fit = _solve_closed(beams, network_method, walk, multiplier, start), None
+    return _flag_result(beams, estimate, prior_fit, network_method, contrast)
 
 
 def _solve_network(
     beams: _beam_signals.BeamSignals, position: Array, prior: FieldPrior
 ) -> tuple[_closed_forms.CrossingEstimate, _empirical_prior.PriorSolution]:
     layout = beams.layout
-    numbers = np.cumsum(layout.measured) - 1
-    crossing = numbers[layout.passages.crossing].astype(np.intp)
+    measured_index = np.cumsum(layout.measured) - 1
+    crossing = measured_index[layout.passages.crossing].astype(np.intp)
     position = position[layout.measured]
     if prior is FieldPrior.NONE or crossing.size == 0:
         fit = _empirical_prior.solve_without_prior(
@@ -320,50 +293,56 @@ def _solve_network(
         )
     shape = (beams.block.size, layout.crossings)
     extinction, variance = np.full(shape, np.nan), np.full(shape, np.nan)
-    believed = np.full(shape, np.nan)
+    prior_true_variance = np.full(shape, np.nan)
     with np.errstate(over="ignore", under="ignore"):
         extinction[:, layout.measured] = np.exp(fit.logarithm)
         variance[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.variance
-        believed[:, layout.measured] = np.exp(2.0 * fit.logarithm) * fit.believed
+        prior_true_variance[:, layout.measured] = (
+            np.exp(2.0 * fit.logarithm) * fit.prior_true_variance
+        )
     if prior is FieldPrior.BLOCK:
-        seen = beams.data.usable == 1
-        variance = _block_errors.at_least_typical(extinction, variance, beams.block, seen)
+        usable = beams.data.usable == 1
+        variance = _block_errors.at_least_typical(extinction, variance, beams.block, usable)
     with np.errstate(over="ignore", under="ignore"):
-        bent = _by_bends(beams, fit, crossing, position)
-        variance[:, layout.measured] += extinction[:, layout.measured] ** 2 * bent
-    none = np.zeros(shape, dtype=np.bool_)
-    # Doubt in the prior, which is stated, is no noise that makes a value lie anywhere.
-    shaky = _closed_forms.shaky(extinction, believed, beams.block) | fit.doubtful[:, np.newaxis]
+        curvature = _curvature_variance(beams, fit, crossing, position)
+        variance[:, layout.measured] += extinction[:, layout.measured] ** 2 * curvature
+    no_flag = np.zeros(shape, dtype=np.bool_)
+    # The stated doubt in the prior is no noise that makes values unreliable.
+    poorly_determined = (
+        _closed_forms.poorly_determined(extinction, prior_true_variance, beams.block)
+        | fit.prior_contradicted[:, np.newaxis]
+    )
     estimate = _closed_forms.CrossingEstimate(
-        extinction, variance, shaky, none, np.zeros(shape[1], dtype=np.bool_),
+        extinction, variance, poorly_determined, no_flag, np.zeros(shape[1], dtype=np.bool_),
         np.full(shape[0], np.nan),
     )  # fmt: skip
     return estimate, fit
 
 
-def _by_bends(
+def _curvature_variance(
     beams: _beam_signals.BeamSignals,
     fit: _empirical_prior.PriorSolution,
     crossing: Indices,
     position: Array,
 ) -> Array:
-    """Return (profile, crossing) variances of ln extinction by what bends of signals put into values.
+    """Return (profile, crossing) variances of ln extinction from curved signals.
 
-    What the profiles of a block share tells the bends; see `lidarops.retrieve.network._curvature_errors`.
+    The block shows the curvature; see `lidarops.retrieve.network._curvature_errors`.
     """
-    out = np.zeros_like(fit.logarithm)
+    variance = np.zeros_like(fit.logarithm)
     geometry = (beams.layout.first_passage, beams.layout.offset, crossing)
-    for b in np.unique(beams.block):
-        mine = np.flatnonzero(beams.block == b)
-        precision, flat = _empirical_prior.prior_of(position, fit, mine[0])
-        data, moved = beams.data.take(mine), np.zeros((mine.size, position.shape[0], 4))
+    for number in np.unique(beams.block):
+        profiles = np.flatnonzero(beams.block == number)
+        precision, without_prior = _empirical_prior.prior_of(position, fit, profiles[0])
+        data, shifts = beams.data.take(profiles), np.zeros((profiles.size, position.shape[0], 4))
         _curvature_errors.carry_errors(
-            data.log_value, data.integral, data.usable, data.covariance, geometry, precision, flat,
-            fit.logarithm[mine], _curvature_errors.usual(data.departure, data.usable), data.departure,
-            moved,
+            data.log_value, data.integral, data.usable, data.covariance, geometry, precision,
+            without_prior, fit.logarithm[profiles],
+            _curvature_errors.block_medians(data.curvature_error, data.usable),
+            data.curvature_error, shifts,
         )  # fmt: skip
-        out[mine] = _curvature_errors.variance(moved)
-    return out
+        variance[profiles] = _curvature_errors.curvature_variance(shifts)
+    return variance
 
 
 def _solve_closed(
@@ -374,12 +353,12 @@ def _solve_closed(
     start: int | None,
 ) -> _closed_forms.CrossingEstimate:
     if cycle is None:
-        return _closed_forms.by_single_beams(beams, far_end=method is NetworkMethod.KLETT)
+        return _closed_forms.solve_single_beams(beams, far_end=method is NetworkMethod.KLETT)
     if method is NetworkMethod.CYCLE:
         multiplier = 1.0
     elif method is NetworkMethod.UNBIASED and multiplier is None:
         multiplier = DEFAULT_UNBIASED_MULTIPLIER
-    return _closed_forms.by_cycle(
+    return _closed_forms.solve_cycle_crossings(
         beams,
         cycle,
         multiplier,
@@ -388,49 +367,49 @@ def _solve_closed(
     )
 
 
-def _judged(
+def _flag_result(
     beams: _beam_signals.BeamSignals,
     estimate: _closed_forms.CrossingEstimate,
     fit: _empirical_prior.PriorSolution | None,
     method: NetworkMethod,
     contrast: float,
 ) -> MultiPositionResult:
-    """Report extinction at near crossings, and flag it."""
+    """Return extinction at the near crossings, with flags."""
     shape = estimate.extinction.shape
     near = beams.layout.near_crossing | estimate.far_start
     with np.errstate(invalid="ignore"):
         finite = np.isfinite(estimate.variance)
-        finite &= np.abs(estimate.extinction) < sight.LARGEST_EXTINCTION
+        finite &= np.abs(estimate.extinction) < air_visibility.LARGEST_EXTINCTION
         positive = finite & (estimate.extinction > 0)
         uncertain = estimate.variance > estimate.extinction**2
     extinction = np.where(positive & near, estimate.extinction, np.nan)
     error = np.sqrt(np.where(positive & near, estimate.variance, np.nan))
-    none = np.zeros(shape[0], dtype=np.bool_)
+    no_flag = np.zeros(shape[0], dtype=np.bool_)
     chi_square, freedom = np.full(shape[0], np.nan), np.full(shape[0], np.nan)
-    deviation, unsettled, poor = np.full(shape[0], np.nan), none, none
-    weak = beams.weak
+    deviation, not_converged, poor = np.full(shape[0], np.nan), no_flag, no_flag
+    too_weak = beams.weak
     if fit is not None:
         freedom, deviation = fit.degrees_of_freedom, fit.deviation
         with np.errstate(invalid="ignore", divide="ignore"):
             chi_square = np.where(freedom > 0, fit.chi_square / freedom, np.nan)
         poor = _improbable(fit.chi_square, freedom)
         poor |= _improbable(fit.prior_chi_square, fit.prior_degrees_of_freedom)
-        unsettled = fit.status == _joint_solution.UNSETTLED
+        not_converged = fit.status == _joint_solution.UNSETTLED
         dropped = fit.left_out[:, beams.layout.passages.beam] == 1
-        weak = weak | (dropped & (beams.data.usable == 1))
+        too_weak = too_weak | (dropped & (beams.data.usable == 1))
     flags = CrossingFlags(
         ill_conditioned=estimate.weak_attenuation & finite,
         far_start=np.broadcast_to(estimate.far_start, shape),
         not_positive=finite & ~positive,
         not_finite=~finite,
         uncertain=uncertain,
-        signal_not_positive=_lost(beams, NOT_POSITIVE),
-        signal_missing=_lost(beams, MISSING),
-        weak_signal=_by_crossing(beams, weak),
+        signal_not_positive=_lost_signal(beams, NOT_POSITIVE),
+        signal_missing=_lost_signal(beams, MISSING),
+        weak_signal=_by_crossing(beams, too_weak),
         bridged=_by_crossing(beams, beams.data.bridged[:, beams.layout.passages.beam] == 1),
-        outlying=_lost(beams, OUTLYING),
+        outlying=_lost_signal(beams, OUTLYING),
         pole=estimate.pole,
-        unsettled=np.broadcast_to(unsettled[:, np.newaxis], shape),
+        unsettled=np.broadcast_to(not_converged[:, np.newaxis], shape),
         poor_fit=np.broadcast_to(poor[..., np.newaxis], shape),
         not_homogeneous=(
             _closed_forms.inhomogeneous(beams, estimate)
@@ -450,29 +429,30 @@ def _judged(
     errors = error.reshape(*leading, shape[1])
     return MultiPositionResult(
         values, errors,
-        sight.visibility_from_extinction(values, errors, contrast=contrast),
+        air_visibility.visibility_from_extinction(values, errors, contrast=contrast),
         shaped, near, chi_square.reshape(leading), freedom.reshape(leading),
         deviation.reshape(leading), estimate.multiplier.reshape(leading), method,
     )  # fmt: skip
 
 
 def _improbable(chi_square: Array, freedom: Array) -> Booleans:
-    """Return where chance gives so large a chi-square once in ten thousand, or less."""
+    """Return where a chi-square this large has a probability below `_LEAST_PROBABILITY`."""
     known = np.isfinite(chi_square) & (freedom > 0)
-    chance = special.gammaincc(
+    probability = special.gammaincc(
         np.where(known, freedom, 1.0) / 2.0, np.where(known, np.maximum(chi_square, 0.0), 0.0) / 2.0
     )
-    return np.asarray(known & (chance < _LEAST_PROBABILITY))
+    return np.asarray(known & (probability < _LEAST_PROBABILITY))
 
 
-def _lost(beams: _beam_signals.BeamSignals, reason: int) -> Booleans:
-    """Return where a beam of a crossing has lost it for a reason."""
+def _lost_signal(beams: _beam_signals.BeamSignals, reason: int) -> Booleans:
+    """Return where a beam of a crossing lost its signal for the given reason."""
     status = beams.data.status[:, beams.layout.passages.beam]
-    beyond = (beams.data.usable == 0) & ~beams.weak
-    return _by_crossing(beams, (status == reason) & beyond)
+    lost = (beams.data.usable == 0) & ~beams.weak
+    return _by_crossing(beams, (status == reason) & lost)
 
 
 def _by_crossing(beams: _beam_signals.BeamSignals, passages: Booleans) -> Booleans:
+    """Return (profile, crossing) whether any passage of the crossing is True."""
     out = np.zeros((passages.shape[0], beams.layout.crossings), dtype=np.bool_)
     for c, crossing in enumerate(beams.layout.passages.crossing):
         out[:, crossing] |= passages[:, c]
@@ -502,5 +482,5 @@ def _check_settings(
         raise RetrievalInputError(
             f"is {start}, but the cycle starts at {int(cycle.crossing[0])}",
             field="start",
-            remedy="give it to geometry.cycle",
+            remedy="give it to geometry.build_cycle",
         )

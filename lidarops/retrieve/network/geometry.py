@@ -1,7 +1,8 @@
-"""Where the beams of several lidars meet: stations and pointings in, crossings out.
+"""Geometry of a network: crossings of the beams from the stations and pointings of the lidars.
 
-Beams are straight: refraction bends a beam by less than 1 m in 10 km of horizontal air. Heights
-are above the ellipsoid; a common error of all heights (the geoid) shifts everything alike.
+Beams are straight lines: refraction bends a beam by less than 1 m in 10 km of horizontal air.
+Heights are above the ellipsoid. A height error common to all stations (the geoid) shifts all
+crossings alike.
 """
 
 from __future__ import annotations
@@ -27,19 +28,20 @@ SEMI_MAJOR_AXIS: Final = 6_378_137.0
 FLATTENING: Final = 1.0 / 298.257223563
 """1, WGS84 (`wgs84`)."""
 _ECCENTRICITY_SQUARED: Final = FLATTENING * (2.0 - FLATTENING)
-_GEODETIC_PASSES: Final = 6
-"""Of Bowring's iteration, which is exact to rounding after 3 below 100 km."""
+_BOWRING_PASSES: Final = 6
+"""Passes of Bowring's iteration. Below 100 km, 3 passes are exact to rounding."""
 
 DEFAULT_TOLERANCE: Final = 15.0
 """m, two bins of 7.5 m."""
 SMALLEST_CROSSING_ANGLE: Final = 2.0
-"""degree. Below, a pointing error of 0.1 degree moves the passage by 5 percent of its range."""
+"""degree. At smaller angles, a pointing error of 0.1 degree moves the crossing by more than 5
+percent of its range."""
 MOST_BEAMS: Final = 512
 
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """One direction of one lidar."""
+    """One line of sight of one lidar."""
 
     latitude: float
     """degree, WGS84."""
@@ -55,12 +57,12 @@ class Beam:
 
 @dataclass(frozen=True, slots=True)
 class Passages:
-    """On which beams crossings lie: one entry for each beam and crossing, ordered along the beams."""
+    """Passages of beams through crossings: one entry per beam and crossing, beam by beam."""
 
     beam: Indices
     crossing: Indices
     range: Array
-    """m, from the lidar to the foot of the crossing on the beam."""
+    """m, from the lidar to the point of the beam next to the crossing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,15 +76,15 @@ class Network:
     crossing: Array
     """(crossing, 3) positions, m, ordered by their nearest range."""
     miss_distance: Array
-    """(crossing,) m, the largest distance of the crossing from a beam of its own."""
+    """(crossing,) m, largest distance of the crossing from a beam that passes through it."""
     crossing_angle: Array
-    """(crossing,) degree, the largest angle between beams that meet there, folded to 0-90."""
+    """(crossing,) degree, largest angle between beams that meet there, reduced to 0-90."""
     passages: Passages
     near_crossing: Booleans
-    """(crossing,) True where a beam goes on from the crossing to a further one: there, attenuation
-    beyond the crossing tells its extinction. Elsewhere, noise is amplified along the beam."""
+    """(crossing,) True where a beam continues from the crossing to a farther one: attenuation
+    behind the crossing then determines its extinction. Elsewhere, noise is amplified."""
     geodetic: Array | None = field(default=None)
-    """(crossing, 3) latitude and longitude in degree, altitude in m, where stations have them."""
+    """(crossing, 3) latitude and longitude in degree, altitude in m; None for a local frame."""
 
     @property
     def beams(self) -> int:
@@ -96,29 +98,29 @@ class Network:
 
     def on_beam(self, beam: int) -> tuple[Indices, Array]:
         """Return the crossings on a beam and their ranges, the nearest first."""
-        mine = self.passages.beam == beam
-        return self.passages.crossing[mine], self.passages.range[mine]
+        on_this_beam = self.passages.beam == beam
+        return self.passages.crossing[on_this_beam], self.passages.range[on_this_beam]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cycle:
-    """A closed walk over beams: row j leads along beam j from crossing j to crossing j + 1."""
+    """A closed path over beams: row j follows beam j from crossing j to crossing j + 1."""
 
     beam: Indices
     crossing: Indices
     start_range: Array
-    """(row,) m, of the crossing at which the row starts, on its beam."""
+    """(row,) m, range on the beam of the crossing where the row starts."""
     end_range: Array
-    """(row,) m, of the crossing at which it ends."""
+    """(row,) m, range on the beam of the crossing where the row ends."""
 
     @property
     def sign(self) -> Array:
-        """(row,) +1 where the row leads away from its lidar, -1 where towards it."""
+        """(row,) +1 where the row leads away from its lidar, -1 where it leads towards it."""
         return np.where(self.end_range > self.start_range, 1.0, -1.0)
 
     @property
     def far_start(self) -> bool:
-        """Whether the first crossing is the far one on the first beam."""
+        """Whether the first crossing is the far one of the two on the first beam."""
         return bool(self.sign[0] < 0)
 
 
@@ -128,7 +130,7 @@ class Cycle:
 def to_earth_centred(
     latitude: npt.ArrayLike, longitude: npt.ArrayLike, altitude: npt.ArrayLike
 ) -> Array:
-    """Return (..., 3) earth-centred, earth-fixed coordinates in m of WGS84 positions.
+    """Return (..., 3) earth-centred, earth-fixed coordinates (m) of WGS84 positions.
 
     Parameters
     ----------
@@ -167,20 +169,20 @@ def to_geodetic(position: npt.ArrayLike) -> Array:
     second = _ECCENTRICITY_SQUARED / axis_ratio**2
     reduced = np.arctan2(z, across * axis_ratio)
     phi = reduced
-    for _ in range(_GEODETIC_PASSES):
+    for _ in range(_BOWRING_PASSES):
         phi = np.arctan2(
             z + second * SEMI_MAJOR_AXIS * axis_ratio * np.sin(reduced) ** 3,
             across - _ECCENTRICITY_SQUARED * SEMI_MAJOR_AXIS * np.cos(reduced) ** 3,
         )
         reduced = np.arctan2(axis_ratio * np.sin(phi), np.cos(phi))
     normal = SEMI_MAJOR_AXIS / np.sqrt(1.0 - _ECCENTRICITY_SQUARED * np.sin(phi) ** 2)
-    # Stable at every latitude, which across / cos(phi) is not.
+    # Stable at every latitude, unlike across / cos(phi).
     altitude = across * np.cos(phi) + z * np.sin(phi) - SEMI_MAJOR_AXIS**2 / normal
     return np.stack([np.degrees(phi), np.degrees(np.arctan2(y, x)), altitude], axis=-1)
 
 
 def local_axes(latitude: npt.ArrayLike, longitude: npt.ArrayLike) -> Array:
-    """Return (..., 3, 3): the unit vectors east, north and up in earth-centred coordinates."""
+    """Return (..., 3, 3) unit vectors east, north and up in earth-centred coordinates."""
     phi, lam = np.broadcast_arrays(np.radians(latitude), np.radians(longitude))
     zero = np.zeros(phi.shape)
     east = np.stack([-np.sin(lam), np.cos(lam), zero], axis=-1)
@@ -190,10 +192,10 @@ def local_axes(latitude: npt.ArrayLike, longitude: npt.ArrayLike) -> Array:
 
 
 def locate(beams: Sequence[Beam]) -> tuple[Array, Array]:
-    """Return (beam, 3) positions in m and unit directions in the frame of the first station.
+    """Return (beam, 3) positions (m) and unit directions in the frame of the first station.
 
-    Each direction is turned from the horizon of its own station to that of the first: over
-    10 km they differ by 0.09 degree, which is 16 m.
+    Each direction is rotated from the horizon of its own station to that of the first one. Over
+    10 km these differ by 0.09 degree, or 16 m.
 
     Parameters
     ----------
@@ -205,16 +207,18 @@ def locate(beams: Sequence[Beam]) -> tuple[Array, Array]:
         East, north, up.
     """
     values = inputs.real_array(
-        [(r.latitude, r.longitude, r.altitude, r.azimuth, r.elevation) for r in beams], "beams"
+        [(b.latitude, b.longitude, b.altitude, b.azimuth, b.elevation) for b in beams], "beams"
     ).astype(np.float64)
     _check_beams(values)
     latitude, longitude, altitude, azimuth, elevation = values.T
     centred = to_earth_centred(latitude, longitude, altitude)
     axes = local_axes(latitude, longitude)
     azimuth, elevation = np.radians(azimuth), np.radians(elevation)
-    level = np.cos(elevation)
-    own = np.stack([level * np.sin(azimuth), level * np.cos(azimuth), np.sin(elevation)], axis=-1)
-    direction = np.einsum("rij,ri->rj", axes, own)
+    horizontal = np.cos(elevation)
+    station_direction = np.stack(
+        [horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), np.sin(elevation)], axis=-1
+    )
+    direction = np.einsum("rij,ri->rj", axes, station_direction)
     return (centred - centred[0]) @ axes[0].T, direction @ axes[0].T
 
 
@@ -229,28 +233,28 @@ def build_network(
     farthest: float | Sequence[float] = np.inf,
     smallest_angle: float = SMALLEST_CROSSING_ANGLE,
 ) -> Network:
-    """Find the crossings in which the beams of stations meet. Cached by its arguments.
+    """Find the crossings where beams of stations meet. Results are cached by the arguments.
 
     Parameters
     ----------
     beams : sequence of Beam
     tolerance : float
-        m; beams that pass each other within it meet. Passages of several beams within it are
-        one crossing. No crossing is nearer to a lidar than it.
+        m; beams meet where they pass each other within this distance. Passages of several beams
+        within it form one crossing. No crossing is nearer to a lidar than this.
     nearest, farthest : float or one per beam
-        m, ranges between which a beam is used: full overlap, and the reach of its signal.
+        m, limits of the usable ranges of a beam: full overlap, and the end of its signal.
     smallest_angle : float
-        degree; beams that are more parallel do not meet.
+        degree; beams at smaller angles do not meet.
 
     Returns
     -------
     Network
-        In the frame of the first beam's station.
+        In the local frame of the first beam's station.
 
     Raises
     ------
     RetrievalInputError
-        For positions or pointings out of bounds, and settings that cannot be right.
+        For positions or pointings out of bounds, and invalid settings.
     """
     return _network_of_beams(
         tuple(beams),
@@ -270,12 +274,12 @@ def network_of_lines(
     farthest: float | Sequence[float] = np.inf,
     smallest_angle: float = SMALLEST_CROSSING_ANGLE,
 ) -> Network:
-    """Find the crossings of beams that are given in a local frame; else as `build_network`.
+    """Find the crossings of beams given in a local frame; otherwise as `build_network`.
 
     Parameters
     ----------
     origin, direction : (beam, 3) float
-        m, and vectors of any length.
+        Positions in m, and vectors of any length.
     """
     start = np.array(origin, dtype=np.float64)
     along = np.array(direction, dtype=np.float64)
@@ -292,7 +296,7 @@ def network_of_lines(
         _per_beam(nearest, len(start), "nearest"),
         _per_beam(farthest, len(start), "farthest"),
     )
-    return _meet(start, along / length, tolerance, limits, smallest_angle)
+    return _find_crossings(start, along / length, tolerance, limits, smallest_angle)
 
 
 @lru_cache(maxsize=64)
@@ -306,19 +310,19 @@ def _network_of_beams(
     if not beams:
         raise RetrievalInputError("are none", field="beams")
     origin, direction = locate(beams)
-    met = _meet(origin, direction, tolerance, (nearest, farthest), smallest_angle)
+    network = _find_crossings(origin, direction, tolerance, (nearest, farthest), smallest_angle)
     axes = local_axes(beams[0].latitude, beams[0].longitude)
     first = to_earth_centred(beams[0].latitude, beams[0].longitude, beams[0].altitude)
-    geodetic = to_geodetic(first + met.crossing @ axes)
-    return _frozen(
+    geodetic = to_geodetic(first + network.crossing @ axes)
+    return _freeze(
         Network(
-            met.origin, met.direction, met.crossing, met.miss_distance, met.crossing_angle,
-            met.passages, met.near_crossing, geodetic,
+            network.origin, network.direction, network.crossing, network.miss_distance,
+            network.crossing_angle, network.passages, network.near_crossing, geodetic,
         )
     )  # fmt: skip
 
 
-def _meet(
+def _find_crossings(
     origin: Array,
     direction: Array,
     tolerance: float,
@@ -333,18 +337,18 @@ def _meet(
         raise RetrievalInputError(
             f"are {len(origin)}, more than {MOST_BEAMS}", field="beams", remedy="split the network"
         )
-    groups = _merged(origin, direction, tolerance, limits, smallest_angle)
+    groups = _beam_groups(origin, direction, tolerance, limits, smallest_angle)
     points = [_closest_point(origin, direction, group) for group in groups]
     crossing = np.array(points).reshape(-1, 3)
     ranges = [
-        [float(direction[r] @ (point - origin[r])) for r in group]
+        [float(direction[b] @ (point - origin[b])) for b in group]
         for group, point in zip(groups, points, strict=True)
     ]
-    order = sorted(range(len(groups)), key=lambda v: (min(ranges[v]), groups[v]))
+    order = sorted(range(len(groups)), key=lambda c: (min(ranges[c]), groups[c]))
     entries = sorted(
         (beam, along, number)
-        for number, v in enumerate(order)
-        for beam, along in zip(groups[v], ranges[v], strict=True)
+        for number, c in enumerate(order)
+        for beam, along in zip(groups[c], ranges[c], strict=True)
     )
     passages = Passages(
         np.array([e[0] for e in entries], dtype=np.intp),
@@ -354,84 +358,84 @@ def _meet(
     near = np.zeros(len(groups), dtype=np.bool_)
     goes_on = passages.beam[:-1] == passages.beam[1:]
     near[passages.crossing[:-1][goes_on]] = True
-    return _frozen(
+    return _freeze(
         Network(
             origin,
             direction,
             crossing[order],
-            np.array([_miss(origin, direction, groups[v], points[v]) for v in order]),
-            np.array([_widest_angle(direction, groups[v]) for v in order]),
+            np.array([_miss_distance(origin, direction, groups[c], points[c]) for c in order]),
+            np.array([_widest_angle(direction, groups[c]) for c in order]),
             passages,
             near,
         )
     )
 
 
-def _merged(
+def _beam_groups(
     origin: Array,
     direction: Array,
     tolerance: float,
     limits: tuple[tuple[float, ...], tuple[float, ...]],
     smallest_angle: float,
 ) -> list[tuple[int, ...]]:
-    """Return the beams of every crossing: pairs that meet, joined where more meet in one place."""
+    """Return the beams of each crossing: meeting pairs, merged where several meet at one place."""
     groups: list[tuple[int, ...]] = []
-    for _, i, j in sorted(_pairs(origin, direction, tolerance, limits, smallest_angle)):
+    for _, i, j in sorted(_meeting_pairs(origin, direction, tolerance, limits, smallest_angle)):
         point = _closest_point(origin, direction, (i, j))
-        for number, group in enumerate(groups):
-            joined = tuple(sorted({*group, i, j}))
+        for index, group in enumerate(groups):
+            merged = tuple(sorted({*group, i, j}))
             centre = _closest_point(origin, direction, group)
             if np.linalg.norm(centre - point) > 2.0 * tolerance:
                 continue
-            common = _closest_point(origin, direction, joined)
-            if _miss(origin, direction, joined, common) <= tolerance:
-                groups[number] = joined
+            merged_centre = _closest_point(origin, direction, merged)
+            if _miss_distance(origin, direction, merged, merged_centre) <= tolerance:
+                groups[index] = merged
                 break
         else:
             groups.append((i, j))
     return groups
 
 
-def _pairs(
+def _meeting_pairs(
     origin: Array,
     direction: Array,
     tolerance: float,
     limits: tuple[tuple[float, ...], tuple[float, ...]],
     smallest_angle: float,
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs of beams that meet, with the nearer of their ranges."""
-    least = np.maximum(limits[0], tolerance)
-    most = np.asarray(limits[1])
-    found = []
+    """Return (nearer of both ranges, beam, beam) of each pair of beams that meet."""
+    nearest = np.maximum(limits[0], tolerance)
+    farthest = np.asarray(limits[1])
+    pairs = []
     for i, j in itertools.combinations(range(len(origin)), 2):
         cosine = float(direction[i] @ direction[j])
         sine_squared = float(np.sum(np.cross(direction[i], direction[j]) ** 2))
         if sine_squared < np.sin(np.radians(smallest_angle)) ** 2:
             continue
-        apart = origin[j] - origin[i]
-        on_i, on_j = float(direction[i] @ apart), float(direction[j] @ apart)
-        first = (on_i - cosine * on_j) / sine_squared
-        second = (cosine * on_i - on_j) / sine_squared
-        miss = apart + second * direction[j] - first * direction[i]
-        inside = least[i] < first <= most[i] and least[j] < second <= most[j]
+        baseline = origin[j] - origin[i]
+        on_i, on_j = float(direction[i] @ baseline), float(direction[j] @ baseline)
+        range_i = (on_i - cosine * on_j) / sine_squared
+        range_j = (cosine * on_i - on_j) / sine_squared
+        miss = baseline + range_j * direction[j] - range_i * direction[i]
+        inside = nearest[i] < range_i <= farthest[i] and nearest[j] < range_j <= farthest[j]
         if inside and float(miss @ miss) <= tolerance**2:
-            found.append((min(first, second), i, j))
-    return found
+            pairs.append((min(range_i, range_j), i, j))
+    return pairs
 
 
 def _closest_point(origin: Array, direction: Array, beams: tuple[int, ...]) -> Array:
-    """Return the point of the least sum of squared distances from beams."""
+    """Return the point with the least sum of squared distances from beams."""
     matrix, side = np.zeros((3, 3)), np.zeros(3)
-    for r in beams:
-        across = np.eye(3) - np.outer(direction[r], direction[r])
-        matrix += across
-        # From the first of the beams, so that digits are not lost far from the frame's origin.
-        side += across @ (origin[r] - origin[beams[0]])
+    for b in beams:
+        projection = np.eye(3) - np.outer(direction[b], direction[b])
+        matrix += projection
+        # Relative to the first beam, to keep digits far from the origin of the frame.
+        side += projection @ (origin[b] - origin[beams[0]])
     return np.asarray(np.linalg.solve(matrix, side) + origin[beams[0]])
 
 
-def _miss(origin: Array, direction: Array, beams: tuple[int, ...], point: Array) -> float:
-    return max(float(np.linalg.norm(np.cross(direction[r], point - origin[r]))) for r in beams)
+def _miss_distance(origin: Array, direction: Array, beams: tuple[int, ...], point: Array) -> float:
+    return max(float(np.linalg.norm(np.cross(direction[b], point - origin[b]))) for b in beams)
 
 
 def _widest_angle(direction: Array, beams: tuple[int, ...]) -> float:
@@ -454,20 +458,21 @@ def _widest_angle(direction: Array, beams: tuple[int, ...]) -> float:
 def build_cycle(
     net: Network, beams: Sequence[int] | None = None, *, start: int | None = None
 ) -> Cycle:
-    """Order beams that meet pairwise into a cycle, walked in the direction of attenuation.
+    """Return the cycle of beams that meet pairwise, followed in the direction of attenuation.
 
-    The walk leads away from the lidars over a larger distance than towards them, so that the
-    determinant of a homogeneous field is between 0 and 1. It starts where both beams of a crossing
-    lead away from their lidars, where there is such a crossing: from a far start, every
-    multiplier but 1 gives nonsense.
+    The cycle leads away from the lidars over a larger distance than towards them, so that the
+    determinant of a homogeneous field is between 0 and 1. It starts at a crossing where both
+    beams lead away from their lidars, if there is one: from a far start, every multiplier
+    except 1 gives a useless estimate.
 
     Parameters
     ----------
     net : Network
     beams : sequence of int, optional
-        Beams in their order around the cycle; those of the network where it is one cycle.
+        Beams in their order around the cycle. By default, all beams of a network that is a
+        single cycle.
     start : int, optional
-        The crossing to solve for, in place of the one that suits best.
+        The crossing to solve for. By default, the most suitable one.
 
     Returns
     -------
@@ -476,9 +481,9 @@ def build_cycle(
     Raises
     ------
     RetrievalInputError
-        Where the beams form no cycle, or the start is not on it.
+        If the beams form no cycle, or the start is not on it.
     """
-    order = _single_cycle(net) if beams is None else [int(r) for r in beams]
+    order = _single_cycle(net) if beams is None else [int(b) for b in beams]
     if len(order) < 3 or len(set(order)) != len(order) or not set(order) <= set(range(net.beams)):
         raise RetrievalInputError(
             f"are {order}", field="beams", remedy="give at least 3 different beams of the network"
@@ -488,11 +493,12 @@ def build_cycle(
     if len(set(shared)) != k:
         raise RetrievalInputError(f"{order} meet in one place", field="beams")
     lengths = [
-        _range(net, order[j], shared[(j + 1) % k]) - _range(net, order[j], shared[j])
+        _range_on_beam(net, order[j], shared[(j + 1) % k])
+        - _range_on_beam(net, order[j], shared[j])
         for j in range(k)
     ]
     if sum(lengths) < 0:
-        # Backwards, row j runs along the same beam from its last crossing to its first.
+        # Backwards, row j follows the same beam from its last crossing to its first.
         order, shared = order[::-1], [shared[(j + 1) % k] for j in range(k)][::-1]
         lengths = [-length for length in lengths[::-1]]
     first = _start_row(lengths, shared, start)
@@ -500,8 +506,8 @@ def build_cycle(
     return Cycle(
         np.array(order, dtype=np.intp),
         np.array(shared, dtype=np.intp),
-        np.array([_range(net, order[j], shared[j]) for j in range(k)]),
-        np.array([_range(net, order[j], shared[(j + 1) % k]) for j in range(k)]),
+        np.array([_range_on_beam(net, order[j], shared[j]) for j in range(k)]),
+        np.array([_range_on_beam(net, order[j], shared[(j + 1) % k]) for j in range(k)]),
     )
 
 
@@ -517,26 +523,26 @@ def _start_row(lengths: list[float], shared: list[int], start: int | None) -> in
 
 
 def _single_cycle(net: Network) -> list[int]:
-    counts = np.bincount(net.passages.beam, minlength=net.beams)
-    pairs = np.bincount(net.passages.crossing, minlength=net.crossings)
-    if net.beams < 3 or np.any(counts != 2) or np.any(pairs != 2):
+    crossings_on_beam = np.bincount(net.passages.beam, minlength=net.beams)
+    beams_at_crossing = np.bincount(net.passages.crossing, minlength=net.crossings)
+    if net.beams < 3 or np.any(crossings_on_beam != 2) or np.any(beams_at_crossing != 2):
         raise RetrievalInputError(
             "are not one cycle, with two crossings on every beam and two beams at every crossing",
             field="beams",
-            remedy="name the beams of a cycle in their order, or use the method 'network'",
+            remedy="give the beams of a cycle in their order, or use the method 'network'",
         )
     order, crossing = [0], int(net.on_beam(0)[0][0])
     while True:
-        here = net.passages.beam[net.passages.crossing == crossing]
-        beam = int(here[here != order[-1]][0])
+        meeting_beams = net.passages.beam[net.passages.crossing == crossing]
+        beam = int(meeting_beams[meeting_beams != order[-1]][0])
         if beam == order[0]:
             break
         order.append(beam)
-        crossings = net.on_beam(beam)[0]
-        crossing = int(crossings[crossings != crossing][0])
+        ends = net.on_beam(beam)[0]
+        crossing = int(ends[ends != crossing][0])
     if len(order) != net.beams:
         raise RetrievalInputError(
-            "form several cycles", field="beams", remedy="name the beams of one of them"
+            "form several cycles", field="beams", remedy="give the beams of one of them"
         )
     return order
 
@@ -548,7 +554,7 @@ def _shared_crossing(net: Network, first: int, second: int) -> int:
     return int(shared[0])
 
 
-def _range(net: Network, beam: int, crossing: int) -> float:
+def _range_on_beam(net: Network, beam: int, crossing: int) -> float:
     crossings, ranges = net.on_beam(beam)
     return float(ranges[crossings == crossing][0])
 
@@ -565,10 +571,10 @@ def _check_beams(values: Array) -> None:
         "elevation": (-90.0, 90.0),
     }
     for (name, (low, high)), column in zip(bounds.items(), values.T, strict=True):
-        wrong = ~((column >= low) & (column <= high))
-        if wrong.any():
+        outside = ~((column >= low) & (column <= high))
+        if outside.any():
             raise RetrievalInputError(
-                f"of beam {int(np.argmax(wrong))} is {column[wrong][0]}",
+                f"of beam {int(np.argmax(outside))} is {column[outside][0]}",
                 field=name,
                 remedy=f"give a value from {low:g} to {high:g}",
             )
@@ -587,11 +593,11 @@ def _per_beam(value: float | Sequence[float], beams: int, name: str) -> tuple[fl
     return tuple(float(v) for v in np.broadcast_to(values, (beams,)))
 
 
-def _frozen(net: Network) -> Network:
-    shared = net.passages
+def _freeze(net: Network) -> Network:
+    passages = net.passages
     for array in (
         net.origin, net.direction, net.crossing, net.miss_distance, net.crossing_angle,
-        net.near_crossing, net.geodetic, shared.beam, shared.crossing, shared.range,
+        net.near_crossing, net.geodetic, passages.beam, passages.crossing, passages.range,
     ):  # fmt: skip
         if array is not None:
             array.setflags(write=False)

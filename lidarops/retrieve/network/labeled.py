@@ -1,4 +1,4 @@
-"""Networks of lidars over xarray: averaged signals of beams in, the ``visibility`` product out."""
+"""Networks of lidars on xarray data: from averaged signals of beams to the visibility product."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 Integers = npt.NDArray[np.int64]
 
-_WITHHELD: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING
-"""Bits of a bin that is not used. Those before full overlap are not asked for."""
-_CARE: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
-"""Bits of bins that a result keeps to which they add."""
+_UNUSABLE: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING
+"""Bits of a bin that is not used. Bins before full overlap are excluded by range."""
+_WARNINGS: Final = Quality.PILE_UP | Quality.BACKGROUND_UNCERTAIN
+"""Bits of bins that are passed on to the values they contribute to."""
 _QUALITY_OF_FLAG: Final = {
     "ill_conditioned": Quality.POORLY_DETERMINED,
     "far_start": Quality.EXTRAPOLATED,
@@ -43,20 +43,20 @@ _QUALITY_OF_FLAG: Final = {
     "not_homogeneous": Quality.NOT_HOMOGENEOUS,
     "not_measured": Quality.INPUT_MISSING,
 }
-"""Of `CrossingFlags`; `not_finite` is told where nothing else rejects the value."""
+"""Quality bits of `CrossingFlags`. `not_finite` is used where no other flag rejects the value."""
 BEFORE_TAIL: Final = (0.6, 0.7)
-"""Of the start of the tail: where the signal is taken that may be left in the tail."""
-_SEEN: Final = 3.0
-"""Standard errors by which bins before the tail are then brighter than it."""
-_PROBE: Final = 1e-2
-"""Relative change of signals, by which sensitivities are found."""
-BEYOND: Final = 200
-"""Bins kept beyond the farthest crossing of a beam: more than twice the widest window of a bin."""
-_MOST_APART: Final = 16
-"""Beams whose errors are looked at one by one; of more, those of an instrument together."""
-_SHARE_OF_ERROR: Final = 0.5
-"""Of the standard error: the most that signal left in the background may move an extinction
-without a flag."""
+"""Window, as fractions of the start of the tail, where the signal before the tail is measured."""
+_DETECTED_SIGMAS: Final = 3.0
+"""Standard errors by which a signal before the tail is detected."""
+_RELATIVE_CHANGE: Final = 1e-2
+"""Relative change of signals for sensitivities."""
+BINS_BEYOND: Final = 200
+"""Bins kept beyond the farthest crossing of a beam: over twice the widest window of a bin."""
+_MOST_SEPARATE_BEAMS: Final = 16
+"""Largest number of beams whose errors are computed one by one. With more, beams of one instrument
+are changed together."""
+_UNFLAGGED_SHARE: Final = 0.5
+"""Largest shift of extinction by signal in the background without a flag, in standard errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,16 +67,16 @@ class BeamAverages:
     """``power``, ``variance`` and ``quality`` over (time, range), ``shots`` and ``time_bnds``, in
     memory; from `lidarops.retrieve.signal.labeled_averaging.clock_average`."""
     interval: Integers
-    """(time,) number of the interval of the clock of each average."""
+    """(time,) number of the clock interval of each average."""
     instrument: str
     station: tuple[float, float, float]
     """Latitude and longitude (degree), altitude (m)."""
     background_range: tuple[float, float]
-    """m: the tail, whose mean is the background."""
+    """m, start and end of the tail, whose mean is the background."""
     nearest: float
     """m, range of full overlap."""
     overlap: Array | None
-    """(range,) overlap function, where it is known."""
+    """(range,) overlap function, if known."""
     exponent: float
     """m of backscatter ~ extinction^(1/m)."""
     zenith_angle: float
@@ -87,36 +87,36 @@ class BeamAverages:
 
 @dataclass(frozen=True, slots=True)
 class NetworkSettings:
-    """How a network is solved, and what its systematic errors are made of."""
+    """Settings of the retrieval, and relative errors for its systematic errors."""
 
     block_intervals: int
-    """Intervals of the clock that share a mean field."""
+    """Number of clock intervals that share a mean field."""
     visibility: Definition
     method: str = "network"
     prior: str = "block"
     exponent_relative_error: float = 0.1
-    """Of m."""
+    """Relative error of the exponent m."""
     lidar_ratio_relative_error: float = 0.02
-    """Of a crossing against the others: of the constant between backscatter^m and extinction."""
+    """Of one crossing against the others: of the constant between backscatter^m and extinction."""
     overlap_relative_error: float = 0.003
-    """At the nearest point of a beam that is used; falls to 0 at the farthest."""
+    """At the nearest used range of a beam; falls linearly to 0 at the farthest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Signals:
-    """The signals of all beams on common intervals."""
+    """Signals of all beams on common intervals."""
 
     power: Array
-    """(interval, beam, bin), free of background; NaN where missing."""
+    """(interval, beam, bin) background-subtracted; NaN where missing."""
     variance: Array
     range: Array
     """(beam, bin) m; NaN beyond the bins of a beam."""
     background_error: Array
-    """(interval, beam)."""
-    left: Array
-    """(interval, beam): the most signal that may have been subtracted with the background."""
-    care: Flags
-    """(interval, beam) bits of the bins between the crossings of the beam."""
+    """(interval, beam) standard error of the background."""
+    tail_signal: Array
+    """(interval, beam) largest signal that may have been subtracted with the background."""
+    warnings: Flags
+    """(interval, beam) warning bits of the bins between the crossings of the beam."""
     overlap: Array
     """(beam, bin)."""
 
@@ -126,148 +126,154 @@ def retrieve_network(
 ) -> xr.Dataset:
     """Retrieve extinction and visibility where the beams of several lidars meet.
 
-    Signals are averages; the background is subtracted and the network solved
-    (`lidarops.retrieve.network.extinction_field`). Errors that all bins of a beam share (that of the
-    background, of the overlap, of the signal left in the tail, of the exponent) are found by
-    solving again with the signals changed by them.
+    The background is subtracted from the averaged signals, and the network is solved
+    (`lidarops.retrieve.network.extinction_field`). Errors that all bins of a beam share (from
+    background, overlap, signal in the tail, exponent) come from solving again with signals
+    changed by them.
 
     Parameters
     ----------
-    beams : sequence of BeamSignals
+    beams : sequence of BeamAverages
     network : Network
-        With as many beams.
-    settings : Settings
+        With the same beams.
+    settings : NetworkSettings
 
     Returns
     -------
     xr.Dataset
-        In memory: the variables of the ``visibility`` product, of the near crossings. Where a
-        value is NaN, a bit of ``quality_flag`` says why.
+        In memory: the variables of the ``visibility`` product at the near crossings. Where a
+        value is NaN, a bit of ``quality_flag`` gives the reason.
 
     Raises
     ------
     RetrievalInputError
-        Where arguments cannot be right.
+        If arguments are invalid.
     """
     if len(beams) != network.beams:
         raise RetrievalInputError(f"are {len(beams)} for {network.beams} beams", field="beams")
     intervals = np.unique(np.concatenate([beam.interval for beam in beams]))
-    signals = _gathered(beams, intervals, network)
+    signals = _gather_signals(beams, intervals, network)
     solver = _Solver(beams, network, settings, signals, intervals)
-    found = solver.solve(signals.power)
-    errors = _Errors.of(solver, found, settings)
+    result = solver.solve(signals.power)
+    errors = _Errors.of(solver, result, settings)
     near = np.flatnonzero(network.near_crossing)
-    extinction = found.extinction[:, near]
+    extinction = result.extinction[:, near]
     random, systematic = errors.random[:, near], errors.systematic[:, near]
-    pair = ("time", "crossing")
-    seen = labeled.visibility_of_extinction(
-        xr.DataArray(extinction, dims=pair),
-        xr.DataArray(random, dims=pair),
-        xr.DataArray(systematic, dims=pair),
+    dimensions = ("time", "crossing")
+    visibility = labeled.visibility_of_extinction(
+        xr.DataArray(extinction, dims=dimensions),
+        xr.DataArray(random, dims=dimensions),
+        xr.DataArray(systematic, dims=dimensions),
         settings.visibility,
     )
-    flags = _judged(found, errors, signals, network)[:, near]
+    flags = _quality_flags(result, errors, signals, network)[:, near]
     return xr.Dataset(
         {
-            **seen.data_vars,
-            "extinction": (pair, extinction),
-            "extinction_standard_error": (pair, random),
-            "extinction_systematic_error": (pair, systematic),
-            "condition": (pair, errors.condition[:, near]),
-            "quality_flag": (pair, flags),
-            "optical_depth": ("time", _depth(extinction, network)),
-            "reduced_chi2": ("time", found.reduced_chi_square),
+            **visibility.data_vars,
+            "extinction": (dimensions, extinction),
+            "extinction_standard_error": (dimensions, random),
+            "extinction_systematic_error": (dimensions, systematic),
+            "condition": (dimensions, errors.condition[:, near]),
+            "quality_flag": (dimensions, flags),
+            "optical_depth": ("time", _optical_depth(extinction, network)),
+            "reduced_chi2": ("time", result.reduced_chi_square),
             "degrees_of_freedom": (
                 "time",
-                np.where(found.degrees_of_freedom >= 0, found.degrees_of_freedom, np.nan),
+                np.where(result.degrees_of_freedom >= 0, result.degrees_of_freedom, np.nan),
             ),
             "prior_deviation": (
                 "time",
-                np.where(np.isfinite(found.prior_deviation), found.prior_deviation, np.nan),
+                np.where(np.isfinite(result.prior_deviation), result.prior_deviation, np.nan),
             ),
             "shots": ("time", _shots(beams, intervals)),
             "beam_range": (("beam", "crossing"), _distances(network)[:, near]),
         },
-        coords=_places(beams, intervals, network, near),
-        attrs={"steps": _told(beams, network, found, settings)},
+        coords=_coordinates(beams, intervals, network, near),
+        attrs={"steps": _describe_steps(beams, network, result, settings)},
     )
 
 
-def _gathered(beams: Sequence[BeamAverages], intervals: Integers, network: Network) -> _Signals:
+def _gather_signals(
+    beams: Sequence[BeamAverages], intervals: Integers, network: Network
+) -> _Signals:
     bins = max(beam.averages.sizes["range"] for beam in beams)
     shape = (intervals.size, len(beams), bins)
     power, variance = np.full(shape, np.nan), np.full(shape, np.nan)
     grid, overlap = np.full(shape[1:], np.nan), np.ones(shape[1:])
-    error, left = np.full(shape[:2], np.nan), np.zeros(shape[:2])
-    care = np.zeros(shape[:2], dtype=np.int32)
+    error, tail_signal = np.full(shape[:2], np.nan), np.zeros(shape[:2])
+    warnings = np.zeros(shape[:2], dtype=np.int32)
     for index, beam in enumerate(beams):
         rows = np.searchsorted(intervals, beam.interval)
         data, distance = beam.averages, beam.averages["range"].to_numpy().astype(np.float64)
-        bits = data["quality"].to_numpy()
-        values = np.where((bits & int(_WITHHELD)) != 0, np.nan, data["power"].to_numpy())
+        quality = data["quality"].to_numpy()
+        values = np.where((quality & int(_UNUSABLE)) != 0, np.nan, data["power"].to_numpy())
         noise = data["variance"].to_numpy()
         start, stop = beam.background_range
         tail = (distance >= start) & (distance <= stop)
-        sky = _background.tail_mean(
+        background = _background.tail_mean(
             values[:, tail], distance[tail], start=start, variance=noise[:, tail]
         )
-        mine = slice(distance.size)
-        power[rows, index, mine] = values - sky.background[:, np.newaxis]
-        variance[rows, index, mine] = noise
-        grid[index, mine] = distance
+        beam_bins = slice(distance.size)
+        power[rows, index, beam_bins] = values - background.background[:, np.newaxis]
+        variance[rows, index, beam_bins] = noise
+        grid[index, beam_bins] = distance
         if beam.overlap is not None:
-            # Before the first range that is told, no bin is used.
-            overlap[index, mine] = np.nan_to_num(beam.overlap)
-        error[rows, index] = sky.background_standard_error
-        left[rows, index] = _left_in_tail(power[rows, index, mine], noise, distance, tail)
+            # Bins nearer than the first known overlap are not used anyway.
+            overlap[index, beam_bins] = np.nan_to_num(beam.overlap)
+        error[rows, index] = background.background_standard_error
+        tail_signal[rows, index] = _signal_in_tail(
+            power[rows, index, beam_bins], noise, distance, tail
+        )
         ranges = network.on_beam(index)[1]
         used = (distance >= ranges[0]) & (distance <= ranges[-1])
-        care[rows, index] = np.bitwise_or.reduce(bits[:, used] & np.int32(_CARE), axis=1)
-    # The solver looks at no farther bins, and is asked many times.
-    near = slice(_bins_used(grid, network))
+        warnings[rows, index] = np.bitwise_or.reduce(quality[:, used] & np.int32(_WARNINGS), axis=1)
+    # Farther bins do not matter, and the network is solved many times.
+    used_bins = slice(_bins_used(grid, network))
     return _Signals(
-        np.ascontiguousarray(power[..., near]),
-        np.ascontiguousarray(variance[..., near]),
-        grid[:, near],
+        np.ascontiguousarray(power[..., used_bins]),
+        np.ascontiguousarray(variance[..., used_bins]),
+        grid[:, used_bins],
         error,
-        left,
-        care,
-        overlap[:, near],
+        tail_signal,
+        warnings,
+        overlap[:, used_bins],
     )
 
 
 def _bins_used(grid: Array, network: Network) -> int:
-    """Return how many of the bins of the beams reach beyond their farthest crossings."""
+    """Return the number of bins up to the farthest crossing of any beam, and a margin."""
     reached = [int(np.sum(row <= network.on_beam(index)[1][-1])) for index, row in enumerate(grid)]
-    return max(reached) + BEYOND
+    return max(reached) + BINS_BEYOND
 
 
-def _left_in_tail(net: Array, noise: Array, distance: Array, tail: npt.NDArray[np.bool_]) -> Array:
-    """Return the most signal that the tail may hold, 0 where none is seen before it.
+def _signal_in_tail(
+    signal: Array, noise: Array, distance: Array, tail: npt.NDArray[np.bool_]
+) -> Array:
+    """Return (interval,) the largest signal that the tail may contain; 0 if none is detected.
 
-    Before the tail the signal is S - L, with L what of it was in the tail and was subtracted; S
-    falls with the square of range at least.
+    The signal before the tail is S - L, where L is the signal in the tail that was subtracted.
+    S decreases at least with the square of range.
     """
-    start = distance[tail][0] if tail.any() else 0.0
-    low, high = (share * start for share in BEFORE_TAIL)
-    before = (distance >= low) & (distance < high)
-    if not before.any():
-        return np.zeros(len(net))
-    fall = np.mean(distance[tail] ** -2.0) / np.mean(distance[before] ** -2.0)
-    known = np.isfinite(net) & np.isfinite(noise)
-    spread, number = np.where(known, noise, 0.0), known.astype(np.int64)
-    mean = np.where(known, net, 0.0)[:, before].sum(axis=1)
+    tail_start = distance[tail][0] if tail.any() else 0.0
+    low, high = (share * tail_start for share in BEFORE_TAIL)
+    before_tail = (distance >= low) & (distance < high)
+    if not before_tail.any():
+        return np.zeros(len(signal))
+    tail_ratio = np.mean(distance[tail] ** -2.0) / np.mean(distance[before_tail] ** -2.0)
+    known = np.isfinite(signal) & np.isfinite(noise)
+    known_noise, counted = np.where(known, noise, 0.0), known.astype(np.int64)
+    mean = np.where(known, signal, 0.0)[:, before_tail].sum(axis=1)
     variance = sum(
-        spread[:, part].sum(axis=1) / np.maximum(number[:, part].sum(axis=1), 1) ** 2
-        for part in (before, tail)
+        known_noise[:, window].sum(axis=1) / np.maximum(counted[:, window].sum(axis=1), 1) ** 2
+        for window in (before_tail, tail)
     )
-    mean = mean / np.maximum(number[:, before].sum(axis=1), 1)
-    seen = mean > _SEEN * np.sqrt(variance)
-    return np.asarray(np.where(seen, mean * fall / (1.0 - fall), 0.0))
+    mean = mean / np.maximum(counted[:, before_tail].sum(axis=1), 1)
+    detected = mean > _DETECTED_SIGMAS * np.sqrt(variance)
+    return np.asarray(np.where(detected, mean * tail_ratio / (1.0 - tail_ratio), 0.0))
 
 
 class _Solver:
-    """Solves the network for signals that are changed a little."""
+    """Solves the network repeatedly for slightly changed signals."""
 
     def __init__(
         self,
@@ -281,13 +287,13 @@ class _Solver:
         self.exponent = np.array([beam.exponent for beam in beams])
         names = [beam.instrument for beam in beams]
         together = list(dict.fromkeys(names))
-        self.groups = (
+        self.beam_groups = (
             [[index] for index in range(len(beams))]
-            if len(beams) <= _MOST_APART
+            if len(beams) <= _MOST_SEPARATE_BEAMS
             else [[r for r, name in enumerate(names) if name == one] for one in together]
         )
-        """Beams whose errors are looked at together."""
-        self._told: dict[str, Any] = {
+        """Beams that are changed together."""
+        self._arguments: dict[str, Any] = {
             "method": settings.method,
             "prior": settings.prior,
             "variance": signals.variance,
@@ -297,44 +303,46 @@ class _Solver:
         }
 
     def solve(self, power: Array, exponent: Array | None = None) -> MultiPositionResult:
-        """Solve for signals, and exponents where these are not the told ones."""
+        """Solve for signals, optionally with other exponents."""
         return extinction_field.retrieve_network(
             power,
             self.signals.range,
             self.network,
             exponent=self.exponent if exponent is None else exponent,
-            **self._told,
+            **self._arguments,
         )
 
-    def slopes(self) -> Array:
-        """Return (beam, bin) what falls from 1 at the nearest crossing of a beam to 0 at its last."""
-        out = np.zeros(self.signals.range.shape)
+    def near_end_weights(self) -> Array:
+        """Return (beam, bin) weights from 1 at the nearest crossing of a beam to 0 at its last."""
+        weights = np.zeros(self.signals.range.shape)
         for index in range(self.network.beams):
             ranges = self.network.on_beam(index)[1]
-            out[index] = np.interp(self.signals.range[index], [ranges[0], ranges[-1]], [1.0, 0.0])
-        return out
+            weights[index] = np.interp(
+                self.signals.range[index], [ranges[0], ranges[-1]], [1.0, 0.0]
+            )
+        return weights
 
-    def hats(self) -> Iterator[Array]:
-        """Yield, for each crossing, (beam, bin) what falls from 1 there to 0 at its neighbours."""
+    def crossing_weights(self) -> Iterator[Array]:
+        """Yield, for each crossing, (beam, bin) weights: 1 there, 0 at its neighbours."""
         for crossing in range(self.network.crossings):
-            out = np.zeros(self.signals.range.shape)
+            weights = np.zeros(self.signals.range.shape)
             for index in range(self.network.beams):
                 numbers, ranges = self.network.on_beam(index)
                 if crossing in numbers:
                     peak = (numbers == crossing).astype(np.float64)
-                    out[index] = np.interp(self.signals.range[index], ranges, peak)
-            yield out
+                    weights[index] = np.interp(self.signals.range[index], ranges, peak)
+            yield weights
 
-    def changes(self, found: MultiPositionResult, change: Array) -> Iterator[Array]:
-        """Yield, for each group of beams, by how much extinction moves with the signals."""
-        for group in self.groups:
+    def extinction_changes(self, result: MultiPositionResult, change: Array) -> Iterator[Array]:
+        """Yield, for each group of beams, the change of extinction with the signals."""
+        for group in self.beam_groups:
             if not change[:, group].any():
-                # The same signals give the same values.
-                yield found.extinction - found.extinction
+                # Unchanged signals give unchanged values.
+                yield result.extinction - result.extinction
                 continue
             power = self.signals.power.copy()
             power[:, group] += change[:, group]
-            yield self.solve(power).extinction - found.extinction
+            yield self.solve(power).extinction - result.extinction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -343,78 +351,95 @@ class _Errors:
 
     random: Array
     systematic: Array
-    left: Array
-    """What of the systematic error is by signal left in the background."""
+    tail_signal: Array
+    """Part of the systematic error from signal in the background."""
     condition: Array
-    """Relative change of extinction over that of the signals at the near ends of beams."""
+    """Relative change of extinction over relative change of signals at the near ends of beams."""
 
     @staticmethod
-    def of(solver: _Solver, found: MultiPositionResult, settings: NetworkSettings) -> _Errors:
+    def of(solver: _Solver, result: MultiPositionResult, settings: NetworkSettings) -> _Errors:
         signals = solver.signals
-        sky = np.nan_to_num(signals.background_error)[..., np.newaxis]
-        random = _rooted(
+        background_error = np.nan_to_num(signals.background_error)[..., np.newaxis]
+        random = _root_sum_square(
             [
-                found.extinction_standard_error,
-                *solver.changes(found, np.broadcast_to(sky, signals.power.shape)),
+                result.extinction_standard_error,
+                *solver.extinction_changes(
+                    result, np.broadcast_to(background_error, signals.power.shape)
+                ),
             ]
         )
-        probed = _rooted(list(solver.changes(found, _PROBE * signals.power * solver.slopes())))
+        overlap_change = _root_sum_square(
+            list(
+                solver.extinction_changes(
+                    result, _RELATIVE_CHANGE * signals.power * solver.near_end_weights()
+                )
+            )
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
-            condition = probed / _PROBE / found.extinction
-        remains = np.broadcast_to(signals.left[..., np.newaxis], signals.power.shape)
-        left = _rooted(list(solver.changes(found, remains)))
-        told = solver.exponent * (1.0 + settings.exponent_relative_error)
-        bent = solver.solve(signals.power, np.minimum(told, 10.0)).extinction - found.extinction
-        mixed = _mixed(solver, found, settings.lidar_ratio_relative_error)
-        parts = [bent, mixed, left, condition * found.extinction * settings.overlap_relative_error]
-        return _Errors(random, _rooted(parts), left, condition)
+            condition = overlap_change / _RELATIVE_CHANGE / result.extinction
+        tail = np.broadcast_to(signals.tail_signal[..., np.newaxis], signals.power.shape)
+        tail_signal = _root_sum_square(list(solver.extinction_changes(result, tail)))
+        exponent = solver.exponent * (1.0 + settings.exponent_relative_error)
+        by_exponent = (
+            solver.solve(signals.power, np.minimum(exponent, 10.0)).extinction - result.extinction
+        )
+        by_lidar_ratio = _lidar_ratio_error(solver, result, settings.lidar_ratio_relative_error)
+        contributions = [
+            by_exponent,
+            by_lidar_ratio,
+            tail_signal,
+            condition * result.extinction * settings.overlap_relative_error,
+        ]
+        return _Errors(random, _root_sum_square(contributions), tail_signal, condition)
 
 
-def _mixed(solver: _Solver, found: MultiPositionResult, relative_error: float) -> Array:
-    """Return what lidar ratios that differ from crossing to crossing do, m-1."""
-    total = np.zeros(found.extinction.shape)
+def _lidar_ratio_error(
+    solver: _Solver, result: MultiPositionResult, relative_error: float
+) -> Array:
+    """Return the error from lidar ratios that differ between crossings, m-1."""
+    square_sum = np.zeros(result.extinction.shape)
     if relative_error > 0.0:
-        for hat in solver.hats():
-            power = solver.signals.power * (1.0 + _PROBE * hat)
-            total += (solver.solve(power).extinction - found.extinction) ** 2
-    return np.asarray(np.sqrt(total) * relative_error / _PROBE)
+        for weights in solver.crossing_weights():
+            power = solver.signals.power * (1.0 + _RELATIVE_CHANGE * weights)
+            square_sum += (solver.solve(power).extinction - result.extinction) ** 2
+    return np.asarray(np.sqrt(square_sum) * relative_error / _RELATIVE_CHANGE)
 
 
-def _rooted(parts: Sequence[Array]) -> Array:
-    """Return the root of the sum of squares; a part that has no value makes the whole missing."""
-    total = np.zeros(parts[0].shape)
-    for part in parts:
-        total += part**2
+def _root_sum_square(contributions: Sequence[Array]) -> Array:
+    """Return the root of the sum of squares; NaN where any contribution is NaN."""
+    total = np.zeros(contributions[0].shape)
+    for contribution in contributions:
+        total += contribution**2
     return np.sqrt(total)
 
 
-def _judged(
-    found: MultiPositionResult, errors: _Errors, signals: _Signals, network: Network
+def _quality_flags(
+    result: MultiPositionResult, errors: _Errors, signals: _Signals, network: Network
 ) -> Flags:
-    """Return what speaks against each value, and a reason for each that is missing."""
-    bits = np.zeros(found.extinction.shape, dtype=np.int32)
+    """Return the quality bits of each value, with a reason for each missing one."""
+    bits = np.zeros(result.extinction.shape, dtype=np.int32)
     for name, bit in _QUALITY_OF_FLAG.items():
-        bits |= np.where(getattr(found.flags, name), np.int32(bit), np.int32(0))
+        bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
     for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
-        bits[:, crossing] |= signals.care[:, index]
+        bits[:, crossing] |= signals.warnings[:, index]
     with np.errstate(invalid="ignore"):
-        moved = errors.left > _SHARE_OF_ERROR * errors.random
-        loose = ~(np.hypot(errors.random, errors.systematic) < found.extinction)
-    bits |= np.where(moved, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
+        background_doubt = errors.tail_signal > _UNFLAGGED_SHARE * errors.random
+        uncertain = ~(np.hypot(errors.random, errors.systematic) < result.extinction)
+    bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(
-        loose & np.isfinite(found.extinction), np.int32(Quality.POORLY_DETERMINED), np.int32(0)
+        uncertain & np.isfinite(result.extinction), np.int32(Quality.POORLY_DETERMINED), np.int32(0)
     )
     with np.errstate(invalid="ignore"):
-        bits[found.degrees_of_freedom < 0] |= np.int32(Quality.PRIOR_DOMINATED)
-    lost = ~np.isfinite(found.extinction) & ((bits & np.int32(Quality.rejecting())) == 0)
-    why = np.where(
-        found.flags.weak_signal, np.int32(Quality.LOW_SIGNAL), np.int32(Quality.NO_REAL_SOLUTION)
+        bits[result.degrees_of_freedom < 0] |= np.int32(Quality.PRIOR_DOMINATED)
+    unexplained = ~np.isfinite(result.extinction) & ((bits & np.int32(Quality.rejecting())) == 0)
+    reason = np.where(
+        result.flags.weak_signal, np.int32(Quality.LOW_SIGNAL), np.int32(Quality.NO_REAL_SOLUTION)
     )
-    return bits | np.where(lost, why, np.int32(0))
+    return bits | np.where(unexplained, reason, np.int32(0))
 
 
-def _depth(extinction: Array, network: Network) -> Array:
-    """Return the optical depth of the longest stretch between crossings of a beam."""
+def _optical_depth(extinction: Array, network: Network) -> Array:
+    """Return the optical depth between the outermost crossings of the longest beam."""
     spans = [ranges[-1] - ranges[0] for _, ranges in map(network.on_beam, range(network.beams))]
     known = np.isfinite(extinction)
     with np.errstate(invalid="ignore"):
@@ -423,20 +448,21 @@ def _depth(extinction: Array, network: Network) -> Array:
 
 
 def _distances(network: Network) -> Array:
-    """Return (beam, crossing) ranges, NaN where a crossing does not lie on a beam."""
-    out = np.full((network.beams, network.crossings), np.nan)
-    out[network.passages.beam, network.passages.crossing] = network.passages.range
-    return out
+    """Return (beam, crossing) ranges; NaN where a beam does not pass through a crossing."""
+    ranges = np.full((network.beams, network.crossings), np.nan)
+    ranges[network.passages.beam, network.passages.crossing] = network.passages.range
+    return ranges
 
 
 def _shots(beams: Sequence[BeamAverages], intervals: Integers) -> npt.NDArray[np.int32]:
+    """Return (interval,) laser shots of all beams."""
     total = np.zeros(intervals.size, dtype=np.int64)
     for beam in beams:
         total[np.searchsorted(intervals, beam.interval)] += beam.averages["shots"].to_numpy()
     return np.minimum(total, np.iinfo(np.int32).max).astype(np.int32)
 
 
-def _places(
+def _coordinates(
     beams: Sequence[BeamAverages],
     intervals: Integers,
     network: Network,
@@ -444,10 +470,10 @@ def _places(
 ) -> dict[str, Any]:
     if network.geodetic is None:
         raise RetrievalInputError(
-            "has no positions", field="network", remedy="make it by geometry.network"
+            "has no positions", field="network", remedy="build it with geometry.build_network"
         )
-    never = np.iinfo(np.int64)
-    start, stop = np.full(intervals.size, never.max), np.full(intervals.size, never.min)
+    limits = np.iinfo(np.int64)
+    start, stop = np.full(intervals.size, limits.max), np.full(intervals.size, limits.min)
     for beam in beams:
         rows = np.searchsorted(intervals, beam.interval)
         bounds = beam.averages["time_bnds"].to_numpy().astype("datetime64[ns]").astype(np.int64)
@@ -471,19 +497,19 @@ def _places(
     }
 
 
-def _told(
+def _describe_steps(
     beams: Sequence[BeamAverages],
     network: Network,
-    found: MultiPositionResult,
+    result: MultiPositionResult,
     settings: NetworkSettings,
 ) -> str:
-    """Return in words which beam is whose, where it meets others, and what visibility is."""
-    texts = [f"method {found.method.value}", settings.visibility.words]
+    """Return a description of the beams, their crossings and the definition of visibility."""
+    texts = [f"method {result.method.value}", settings.visibility.words]
     for index, beam in enumerate(beams):
         numbers, ranges = network.on_beam(index)
-        met = ", ".join(f"{v} at {r:.0f} m" for v, r in zip(numbers, ranges, strict=True))
+        crossings = ", ".join(f"{v} at {r:.0f} m" for v, r in zip(numbers, ranges, strict=True))
         texts.append(
             f"beam {index}: {beam.instrument}, zenith angle {beam.zenith_angle:g}, azimuth"
-            f" {beam.azimuth:g} degree, with the crossings {met}"
+            f" {beam.azimuth:g} degree, with the crossings {crossings}"
         )
     return "; ".join(texts)

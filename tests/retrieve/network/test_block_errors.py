@@ -21,7 +21,7 @@ def places(crossings, axes=3, seed=1):
 @pytest.mark.parametrize("axes", [2, 3])
 def test_bends_are_what_no_level_and_no_gradient_describes(axes):
     position = places(14, axes)
-    fields = _block_errors.bends(position)
+    fields = _block_errors.bent_fields(position)
     plain = np.column_stack([np.ones(14), position])
     np.testing.assert_allclose(fields @ plain, 0.0, atol=1e-9)
     assert np.sum(fields**2) / 14 == pytest.approx(_block_errors.BEND**2)
@@ -35,14 +35,14 @@ def test_bends_are_what_no_level_and_no_gradient_describes(axes):
 def test_bends_are_alike_in_all_directions_and_sizes_of_a_network():
     position = places(14)
     turn, _ = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))
-    one = _block_errors.bends(position)
-    other = _block_errors.bends(3.0 * position @ turn.T + [500.0, -70.0, 9.0])
+    one = _block_errors.bent_fields(position)
+    other = _block_errors.bent_fields(3.0 * position @ turn.T + [500.0, -70.0, 9.0])
     np.testing.assert_allclose(other.T @ other, one.T @ one, atol=1e-12)
 
 
 @pytest.mark.parametrize("crossings", [0, 1, 2, 3])
 def test_few_crossings_in_a_plane_have_no_bends(crossings):
-    assert _block_errors.bends(places(crossings, 2)).size == 0
+    assert _block_errors.bent_fields(places(crossings, 2)).size == 0
 
 
 # Errors ---------------------------------------------------------------------------------------
@@ -52,14 +52,16 @@ def test_what_noise_moves_all_profiles_by_is_told_where_it_matters():
     logarithm = np.full((40, 3), -7.0) + np.random.default_rng(3).normal(0.0, 1e-3, (40, 3))
     variance = np.full((40, 3), 0.2**2)
     logarithm[::2, 1] = np.nan
-    found = _block_errors.of_noise(logarithm, variance, np.array([-7.09, -7.5, np.nan]))
+    found = _block_errors.noise_bias_variance(logarithm, variance, np.array([-7.09, -7.5, np.nan]))
     np.testing.assert_allclose(found, [0.0, 0.25, 0.0], rtol=0.01)
 
 
 def test_fields_move_profiles_by_no_more_than_the_mean_leaves_open():
-    missed = np.array([[0.01, 0.01, 0.01, np.nan], [0.5, 0.5, 0.5, 0.5]])
+    excluded_variance = np.array([[0.01, 0.01, 0.01, np.nan], [0.5, 0.5, 0.5, 0.5]])
     told, free = np.full(4, -7.0), np.array([-7.0, -7.2, np.nan, -7.0])
-    found = _block_errors.of_field(missed, told, free, np.array([0.1, 0.1, np.nan, 0.1]))
+    found = _block_errors.excluded_field_variance(
+        excluded_variance, told, free, np.array([0.1, 0.1, np.nan, 0.1])
+    )
     np.testing.assert_allclose(found, [[0.01, 0.01, 0.01, np.nan], [0.1, 0.14, 0.5, 0.1]])
 
 
@@ -109,7 +111,7 @@ def test_a_profile_is_compared_with_those_that_see_what_it_sees():
 )
 def test_networks_that_once_stated_too_little_state_their_errors(cluster, failure, before):
     """Of the random networks of the benchmark, in which nearly all false values stood."""
-    judged = next(j for j, _ in draws.judge_networks(cluster, 50) if j.failure.name == failure)
+    judged = next(j for j, _ in draws.score_networks(cluster, 50) if j.failure.name == failure)
     kept = np.isfinite(judged.error) & (judged.bits == 0)
     false = kept & (np.abs(judged.error) > 4.0 * judged.random)
     assert false.sum() <= 0.01 * before
@@ -122,15 +124,15 @@ def test_errors_are_told_without_touching_a_value_or_a_clear_case(monkeypatch):
     def both():
         found = [
             j
-            for j, _ in draws.judge_networks(0, 50)
+            for j, _ in draws.score_networks(0, 50)
             if j.failure.name in {"none, plume", "outliers"}
         ]
         return [np.concatenate([np.ravel(getattr(j, n)) for j in found]) for n in NAMES]
 
     NAMES = ("error", "random")
     error, stated = both()
-    monkeypatch.setattr(_block_errors, "of_noise", lambda *_: 0.0)
-    monkeypatch.setattr(_block_errors, "of_field", lambda *_: 0.0)
+    monkeypatch.setattr(_block_errors, "noise_bias_variance", lambda *_: 0.0)
+    monkeypatch.setattr(_block_errors, "excluded_field_variance", lambda *_: 0.0)
     monkeypatch.setattr(_block_errors, "at_least_typical", lambda _, variance, *__: variance)
     plain_error, plain = both()
     np.testing.assert_array_equal(error, plain_error)
@@ -147,10 +149,10 @@ def test_a_profile_that_is_far_off_moves_no_other(off):
     variance = np.full((50, 1), 0.02**2)
     logarithm[7] += off
     variance[7] *= 1e6
-    assert _block_errors.of_noise(logarithm, variance, np.array([-7.0]))[0] == 0.0
+    assert _block_errors.noise_bias_variance(logarithm, variance, np.array([-7.0]))[0] == 0.0
     # Where many are off to one side, by little, all are told so.
     logarithm[:20] += 0.1
-    told = _block_errors.of_noise(logarithm, variance, np.array([-7.0]))[0]
+    told = _block_errors.noise_bias_variance(logarithm, variance, np.array([-7.0]))[0]
     assert 0.02**2 < told < 0.06**2
 
 

@@ -22,6 +22,7 @@ from lidarops.retrieve.network import (
     _condensed_signals,
     _curvature_errors,
     _empirical_prior,
+    _fit_layout,
     extinction_field,
 )
 
@@ -64,8 +65,8 @@ def off(net, found, field):
 def test_a_departure_is_what_a_line_has_more_than_the_truth(bins):
     net = triangle()
     r = np.tile(grid(net, 3.0), (net.beams, 1)) + np.array([[0.0], [0.7], [1.9]])
-    layout = _condensed_signals.lay_out(net, r, None, np.full(3, 100.0), bins)
-    shares = _curvature_errors.weights(layout)
+    layout = _fit_layout.lay_out_fits(net, r, None, np.full(3, 100.0), bins)
+    shares = _curvature_errors.curvature_weights(layout)
     rng = np.random.default_rng(4)
     for c, (beam, where) in enumerate(
         zip(layout.passages.beam, layout.passages.range, strict=True)
@@ -83,17 +84,19 @@ def test_the_noise_of_a_departure_is_what_is_stated():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 3000, additive=0.0)
-    layout = _condensed_signals.lay_out(net, np.tile(r, (6, 1)), None, np.full(6, 100.0), 7)
+    layout = _fit_layout.lay_out_fits(net, np.tile(r, (6, 1)), None, np.full(6, 100.0), 7)
     data = _condensed_signals.condense(
         power, variance[np.newaxis], np.zeros(3000, dtype=np.intp), np.ones(6), layout,
         relative=False, screened=False,
     )  # fmt: skip
-    told = np.median(data.departure[..., 1], axis=0)
-    np.testing.assert_allclose(np.var(data.departure[..., 0], axis=0), told, rtol=0.12)
+    told = np.median(data.curvature_error[..., 1], axis=0)
+    np.testing.assert_allclose(np.var(data.curvature_error[..., 0], axis=0), told, rtol=0.12)
     for number in (3000, 9):
         usual = np.stack(
             [
-                _curvature_errors.usual(data.departure[n : n + number], data.usable[n : n + number])
+                _curvature_errors.block_medians(
+                    data.curvature_error[n : n + number], data.usable[n : n + number]
+                )
                 for n in range(0, 3000 // number * number, number)
             ]
         )
@@ -111,7 +114,7 @@ def test_the_noise_of_a_departure_is_what_is_stated():
 def test_a_solution_tells_the_prior_that_it_was_found_with(deviation, strength):
     net = three_by_two()
     shape = (1, net.crossings)
-    layout = _condensed_signals.lay_out(
+    layout = _fit_layout.lay_out_fits(
         net, np.tile(grid(net), (net.beams, 1)), None, np.full(net.beams, 100), 7
     )
     power = signals(net, grid(net), gradient)[np.newaxis]
@@ -129,7 +132,7 @@ def test_a_solution_tells_the_prior_that_it_was_found_with(deviation, strength):
         assert not precision.any()
     else:
         expected = _empirical_prior._free_level(
-            _empirical_prior._gradient(net.crossing), deviation, strength
+            _empirical_prior._gradient_covariance(net.crossing), deviation, strength
         )[0]
         np.testing.assert_allclose(precision, expected, rtol=1e-12, atol=1e-12)
 
@@ -142,7 +145,7 @@ def test_errors_of_values_move_solutions_as_if_these_were_solved_anew(build, dev
     # Without noise: what it leaves in a beam, weights that follow the constant change.
     power = signals(net, r, gradient)[np.newaxis]
     variance = (0.01 * power[0]) ** 2
-    layout = _condensed_signals.lay_out(
+    layout = _fit_layout.lay_out_fits(
         net, np.tile(r, (net.beams, 1)), None, np.full(net.beams, 100), 7
     )
     data = _condensed_signals.condense(
@@ -245,9 +248,13 @@ def test_noise_is_not_counted_as_a_bend_and_bends_are(profiles):
     moved[..., 2] = np.sqrt(noise) * rng.standard_normal(moved.shape[:-1])
     quiet = moved.copy()
     moved[:, 1:] += [1.0, 0.0, 1.0, 0.0]
-    found = np.stack([_curvature_errors.variance(moved[:, k]) for k in range(2000)], axis=1)
+    found = np.stack(
+        [_curvature_errors.curvature_variance(moved[:, k]) for k in range(2000)], axis=1
+    )
     np.testing.assert_allclose(np.mean(found[:, 1:]), 1.0, rtol=0.05)
-    found = np.stack([_curvature_errors.variance(quiet[:, k]) for k in range(2000)], axis=1)
+    found = np.stack(
+        [_curvature_errors.curvature_variance(quiet[:, k]) for k in range(2000)], axis=1
+    )
     assert np.all(np.mean(found, axis=(0, 1)) < (0.15 if profiles < 3 else 0.02) * noise)
 
 
@@ -257,10 +264,12 @@ def test_a_loud_profile_neither_hides_what_others_show_nor_passes_for_it():
     loud = moved.copy()
     loud[1, 0] = [0.0, 0.0, 3.0, 100.0]
     np.testing.assert_allclose(
-        _curvature_errors.variance(loud)[2:], _curvature_errors.variance(moved)[2:], 0.1
+        _curvature_errors.curvature_variance(loud)[2:],
+        _curvature_errors.curvature_variance(moved)[2:],
+        0.1,
     )
     loud[:, 0, 2] = [0.0, 100.0] + 18 * [0.0]
-    assert not np.any(_curvature_errors.variance(loud)[2:])
+    assert not np.any(_curvature_errors.curvature_variance(loud)[2:])
 
 
 @pytest.mark.parametrize("field", [gradient, plume])
@@ -277,7 +286,9 @@ def test_where_signals_are_smooth_errors_stay_as_they_are(field, relative, profi
         ]
 
     value, stated = both()
-    monkeypatch.setattr(_curvature_errors, "variance", lambda moved: np.zeros(moved.shape[:-1]))
+    monkeypatch.setattr(
+        _curvature_errors, "curvature_variance", lambda moved: np.zeros(moved.shape[:-1])
+    )
     plain_value, plain = both()
     np.testing.assert_array_equal(value, plain_value)
     ratio = (stated / plain)[np.isfinite(plain)]
@@ -300,7 +311,7 @@ def test_blocks_state_the_same_alone_and_beside_others():
 
 def test_random_networks_state_what_thin_layers_do():
     name = "layer of a few bins"
-    found = [j for c in range(24) for j, _ in draws.judge_networks(c, 10) if j.failure.name == name]
+    found = [j for c in range(24) for j, _ in draws.score_networks(c, 10) if j.failure.name == name]
     assert 6 < len(found) <= 12
     kept = [np.isfinite(j.error) & (j.bits == 0) for j in found]
     errors = np.concatenate(

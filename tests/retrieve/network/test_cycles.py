@@ -221,7 +221,7 @@ def total_error(multiplier, data):
 @pytest.mark.parametrize("angle", [55.0, 60.0, 70.0])
 def test_closed_multiplier_is_within_1_percent_of_the_best(relative, angle):
     data = paper_rows(angle, relative=relative)
-    closed = _multiplier.optimal(*data, np.array([False]))[0]
+    closed = _multiplier.optimal_multiplier(*data, np.array([False]))[0]
     grid = min(total_error(x, data) for x in np.linspace(0.0, 1.0, 2001))
     assert total_error(closed, data) <= 1.01 * grid
     assert 0.5 < closed < 1.0
@@ -229,9 +229,9 @@ def test_closed_multiplier_is_within_1_percent_of_the_best(relative, angle):
 
 def test_grid_takes_over_where_noise_is_loud():
     data = paper_rows(relative=0.2)
-    chosen = _multiplier.optimal(*data, np.array([True]))[0]
+    chosen = _multiplier.optimal_multiplier(*data, np.array([True]))[0]
     grid = min(total_error(x, data) for x in np.linspace(0.0, 1.0, 2001))
-    assert chosen in _multiplier.GRID
+    assert chosen in _multiplier.MULTIPLIER_GRID
     assert total_error(chosen, data) <= 1.02 * grid
 
 

@@ -344,36 +344,6 @@ def test_average_signals_before_not_solutions_afterwards():
     assert root_mean_square(means - 1) > 2 * error
 
 
-def test_averages_leave_out_beams_with_gaps():
-    rng = np.random.default_rng(1)
-    power = rng.uniform(1.0, 2.0, (5, 2, 8))
-    power[1, 0, 3] = np.nan
-    power[:, 1, 6:] = np.nan
-    labels = ["b", "a", "a", "b", "a"]
-    mean, variance = extinction_field.average_signals(power, labels, variance=np.full((2, 8), 0.3))
-    assert mean.shape == (2, 2, 8)
-    np.testing.assert_allclose(mean[0, 0], power[[2, 4], 0].mean(axis=0), rtol=1e-14)
-    np.testing.assert_allclose(mean[0, 1, :6], power[[1, 2, 4], 1, :6].mean(axis=0), rtol=1e-14)
-    assert np.isnan(mean[:, 1, 6:]).all()
-    np.testing.assert_allclose(variance[:, 0, 0], [0.15, 0.15], rtol=1e-14)
-    assert extinction_field.average_signals(power, labels)[1] is None
-    # A bin of unknown variance is a gap: one profile must not take it from the mean of all.
-    noise = np.full(power.shape, 0.3)
-    noise[[2, 0], [0, 1], [5, 2]] = np.nan, np.inf
-    noise[:, 1, 5] = np.nan
-    mean, variance = extinction_field.average_signals(power, labels, variance=noise)
-    np.testing.assert_allclose(mean[0, 0], power[4, 0], rtol=1e-14)
-    np.testing.assert_allclose(variance[0, 0], 0.3, rtol=1e-14)
-    np.testing.assert_allclose(mean[1, 1, :6], power[3, 1, :6], rtol=1e-14)
-    np.testing.assert_allclose(variance[:, 1, :5], [[0.1] * 5, [0.3] * 5], rtol=1e-14)
-    assert np.isnan(variance[:, 1, 5]).all()
-    with pytest.raises(RetrievalInputError, match="power"):
-        extinction_field.average_signals(power[0], labels)
-    with pytest.raises(RetrievalInputError, match="groups") as raised:
-        extinction_field.average_signals(power, labels[:2])
-    assert raised.value.field == "groups"
-
-
 def test_unknown_noise_is_told_by_the_signal():
     net = triangle()
     r = grid(net)

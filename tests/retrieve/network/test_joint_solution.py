@@ -21,7 +21,12 @@ from support.oracle_network import (
     triangle,
 )
 
-from lidarops.retrieve.network import _condensed_signals, _empirical_prior, _joint_solution
+from lidarops.retrieve.network import (
+    _condensed_signals,
+    _empirical_prior,
+    _fit_layout,
+    _joint_solution,
+)
 
 # Linear algebra -----------------------------------------------------------------------------
 
@@ -50,7 +55,7 @@ def test_singular_matrix_is_told():
 
 def condensed(net, power, variance, exponent=1.0, bins=7, step=5.0):
     r = grid(net, step)
-    layout = _condensed_signals.lay_out(
+    layout = _fit_layout.lay_out_fits(
         net, np.tile(r, (net.beams, 1)), None, np.full(net.beams, 100.0), bins
     )
     data = _condensed_signals.condense(
@@ -215,7 +220,7 @@ def test_solution_is_the_least_squares_one(deviation):
         bound = 1e-6 if np.isfinite(deviation) else 2e-3
         np.testing.assert_allclose(best.x[net.beams :], result.logarithm[n], atol=bound)
         covariance = np.linalg.inv(best.jac.T @ best.jac)[net.beams :, net.beams :]
-        np.testing.assert_allclose(np.diag(covariance), result.believed[n], rtol=0.02)
+        np.testing.assert_allclose(np.diag(covariance), result.prior_true_variance[n], rtol=0.02)
         if np.isfinite(deviation):
             # A field that deviates by twice the prior's standard deviation.
             doubt = covariance @ precision @ covariance
@@ -223,11 +228,13 @@ def test_solution_is_the_least_squares_one(deviation):
             np.testing.assert_allclose(stated, result.variance[n], rtol=0.02)
             # What fields move the solution by that the prior rules out.
             moved = problem.bends @ precision @ covariance
-            np.testing.assert_allclose(np.sum(moved**2, axis=0), result.missed[n], rtol=0.02)
+            np.testing.assert_allclose(
+                np.sum(moved**2, axis=0), result.excluded_variance[n], rtol=0.02
+            )
             assert 2 * best.cost == pytest.approx(result.prior_chi_square[n], rel=1e-5)
         else:
-            np.testing.assert_array_equal(result.variance[n], result.believed[n])
-            np.testing.assert_array_equal(result.missed[n], 0.0)
+            np.testing.assert_array_equal(result.variance[n], result.prior_true_variance[n])
+            np.testing.assert_array_equal(result.excluded_variance[n], 0.0)
             assert 2 * best.cost == pytest.approx(result.chi_square[n], rel=0.02)
     assert result.degrees_of_freedom[0] == layout.passages.beam.size - net.beams - net.crossings
 
@@ -363,7 +370,7 @@ def test_a_profile_of_singular_covariances_is_not_determined():
 
 def test_prior_with_an_only_crossing_is_finite():
     precision, norm = _empirical_prior._free_level(
-        _empirical_prior._gradient(np.zeros((1, 3))), 0.1
+        _empirical_prior._gradient_covariance(np.zeros((1, 3))), 0.1
     )
     assert np.isfinite(precision).all()
     assert np.isfinite(norm)
@@ -388,7 +395,7 @@ def test_the_mean_of_profiles_tells_a_field_that_the_prior_excludes(field, told)
     sharp = problem.afresh(_empirical_prior.DEVIATIONS[0])
     # Profiles fit by themselves, the steep ones hardly worse.
     assert np.median(sharp.prior_chi_square / sharp.prior_degrees_of_freedom) < 2.0
-    assert _empirical_prior._unlikely(_empirical_prior._told(mean, sharp, 1.0)) == told
+    assert _empirical_prior._mean_improbable(_empirical_prior._solve_mean(mean, sharp, 1.0)) == told
 
 
 def uneven(net):
@@ -415,10 +422,10 @@ def fifty(field, relative, lost=0.0):
 
 def test_a_field_that_the_mean_tells_to_vary_is_not_told_to_be_even():
     data, where = fifty(uneven, 0.05)
-    least = _empirical_prior._least(_empirical_prior._mean_problem(data, *where), 1.0)
+    least = _empirical_prior._least_deviation(_empirical_prior._mean_problem(data, *where), 1.0)
     assert 0.03 < least < 0.4
     problem = _empirical_prior._Problem(data, *where)
-    assert _empirical_prior._likeliest(problem, 1.0, least).deviation[0] >= least
+    assert _empirical_prior._likeliest_deviation(problem, 1.0, least).deviation[0] >= least
 
 
 class Unsettled(_empirical_prior._Problem):
@@ -435,18 +442,18 @@ class Unsettled(_empirical_prior._Problem):
 
 def test_a_prior_under_which_the_mean_does_not_settle_is_rejected():
     data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
-    mean = Unsettled(_empirical_prior._pooled(data, where[0]), *where)
+    mean = Unsettled(_empirical_prior._mean_profile(data, where[0]), *where)
     result = _empirical_prior._Problem(data, *where).afresh(0.1)
-    assert not _empirical_prior._unlikely(_empirical_prior._told(mean, result, 1.0))
+    assert not _empirical_prior._mean_improbable(_empirical_prior._solve_mean(mean, result, 1.0))
     mean.always = True
-    assert _empirical_prior._unlikely(_empirical_prior._told(mean, result, 1.0))
+    assert _empirical_prior._mean_improbable(_empirical_prior._solve_mean(mean, result, 1.0))
     told = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: mean)
     assert np.all(np.isinf(told.deviation))
 
 
 def test_a_mean_that_is_not_determined_speaks_against_no_prior():
     data, where = fifty(lambda _: homogeneous(1e-3), 0.1)
-    mean = _empirical_prior._Problem(_empirical_prior._pooled(data, where[0]), *where)
+    mean = _empirical_prior._Problem(_empirical_prior._mean_profile(data, where[0]), *where)
     mean.data.log_value[:] = np.nan
     assert mean.afresh(np.inf).status[0] == _joint_solution.UNDETERMINED
     told = _empirical_prior._solve_block(_empirical_prior._Problem(data, *where), lambda: mean)
@@ -454,8 +461,12 @@ def test_a_mean_that_is_not_determined_speaks_against_no_prior():
     assert np.isfinite(told.deviation[0])
     np.testing.assert_array_equal(told.logarithm, unasked.logarithm)
     # The field may deviate by as much as the weakest prior has it, and bend.
-    more = unasked.variance - unasked.believed
-    wide = unasked.believed + (4.0**2 - 1.0) / (2.0**2 - 1.0) * more + unasked.missed
+    more = unasked.variance - unasked.prior_true_variance
+    wide = (
+        unasked.prior_true_variance
+        + (4.0**2 - 1.0) / (2.0**2 - 1.0) * more
+        + unasked.excluded_variance
+    )
     np.testing.assert_allclose(told.variance, wide, rtol=1e-12)
 
 
@@ -465,13 +476,15 @@ def test_what_the_mean_leaves_open_is_told_with_the_weakest_prior(monkeypatch):
     mean = _empirical_prior._mean_problem(data, *where)
     told, free = mean.afresh(0.1), mean.afresh(np.inf)
     free.variance[0, 2] = np.nan
-    for other in ("of_noise", "of_field"):
+    for other in ("noise_bias_variance", "excluded_field_variance"):
         monkeypatch.setattr(_empirical_prior._block_errors, other, lambda *_: 0.0)
     factor = np.ones(result.variance.shape[1])
     for strength, wanted in ((1.0, 5.0), (2.0, 1.0), (4.0, 1.0)):
         factor[2] = wanted
-        found = _empirical_prior._widened(result, strength, told, free)
-        expected = result.believed + factor * (result.variance - result.believed)
+        found = _empirical_prior._add_block_errors(result, strength, told, free)
+        expected = result.prior_true_variance + factor * (
+            result.variance - result.prior_true_variance
+        )
         np.testing.assert_allclose(found.variance, expected, rtol=1e-12)
 
 
@@ -484,11 +497,11 @@ def asked(freedoms, whole=None):
     status = np.full(len(freedoms), _joint_solution.SOLVED)
     alone = SimpleNamespace(status=status, degrees_of_freedom=np.array(freedoms, dtype=float))
     if whole is None:
-        return _empirical_prior._tests(problem, alone, None)
+        return _empirical_prior._can_test_prior(problem, alone, None)
     freedom, errors = whole
     variance = np.array([[*np.square(errors), np.nan]])
     mean = SimpleNamespace(degrees_of_freedom=np.array([float(freedom)]), variance=variance)
-    return _empirical_prior._tests(problem, alone, mean)
+    return _empirical_prior._can_test_prior(problem, alone, mean)
 
 
 @pytest.mark.parametrize(
@@ -509,8 +522,8 @@ def test_a_quarter_of_the_profiles_is_enough_to_test_a_prior(most, told):
 
 def test_a_mean_that_does_not_settle_tells_no_least_deviation(monkeypatch):
     data, where = fifty(lambda _: homogeneous(2e-3), 0.1)
-    pooled = _empirical_prior._pooled(fifty(uneven, 0.1)[0], where[0])
-    for other in ("_unlikely", "_apart"):
+    pooled = _empirical_prior._mean_profile(fifty(uneven, 0.1)[0], where[0])
+    for other in ("_mean_improbable", "_off_mean_solution"):
         monkeypatch.setattr(_empirical_prior, other, lambda *_: False)
     asked = [
         _empirical_prior._solve_block(
@@ -527,7 +540,7 @@ def test_a_mean_that_does_not_settle_tells_no_least_deviation(monkeypatch):
 def test_the_mean_of_profiles_is_made_beam_by_beam():
     data, (layout, *rest) = fifty(lambda _: homogeneous(), 0.05, lost=0.25)
     assert data.usable.all(axis=1).sum() < 20
-    mean = _empirical_prior._pooled(data, layout)
+    mean = _empirical_prior._mean_profile(data, layout)
     assert mean.usable.all()
     for beam in range(6):
         mine = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
@@ -546,11 +559,11 @@ def test_a_mean_leaves_out_a_beam_that_is_far_louder_than_most(bad):
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     quiet = data.take(np.arange(50))
     quiet.usable[7, : layout.first_passage[1]] = 0
-    expected = _empirical_prior._pooled(quiet, layout)
+    expected = _empirical_prior._mean_profile(quiet, layout)
     # The variance of the beam's first integral alone.
     count = layout.first_passage[1]
     data.covariance[7, 2 * count * count] *= bad
-    found = _empirical_prior._pooled(data, layout)
+    found = _empirical_prior._mean_profile(data, layout)
     for one in ("log_value", "integral", "covariance", "usable", "slope"):
         np.testing.assert_array_equal(getattr(found, one), getattr(expected, one))
 
@@ -558,7 +571,7 @@ def test_a_mean_leaves_out_a_beam_that_is_far_louder_than_most(bad):
 def test_a_mean_of_which_hardly_a_profile_is_known_lacks_the_beam():
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     data.covariance[7:, : layout.offset[1]] = np.nan
-    found = _empirical_prior._pooled(data, layout)
+    found = _empirical_prior._mean_profile(data, layout)
     assert not found.usable[0, : layout.first_passage[1]].any()
     assert found.usable[0, layout.first_passage[1] :].all()
 
@@ -566,12 +579,12 @@ def test_a_mean_of_which_hardly_a_profile_is_known_lacks_the_beam():
 def test_a_mean_of_what_nobody_sees_is_none():
     data, (layout, *_) = fifty(lambda _: homogeneous(), 0.05)
     data.usable[7:] = 0
-    assert _empirical_prior._pooled(data, layout) is None
+    assert _empirical_prior._mean_profile(data, layout) is None
     # A value at a beam's first crossing alone is none.
     data, _ = fifty(lambda _: homogeneous(), 0.05)
     data.usable[:] = 0
     data.usable[:, layout.first_passage[:-1]] = 1
-    assert _empirical_prior._pooled(data, layout) is None
+    assert _empirical_prior._mean_profile(data, layout) is None
 
 
 @pytest.mark.parametrize(
@@ -586,4 +599,4 @@ def test_a_mean_of_what_nobody_sees_is_none():
     ],
 )
 def test_a_mean_takes_as_much_of_a_beam_as_most_values_see(reach, depth):
-    assert _empirical_prior._depth(np.array(reach, dtype=np.intp)) == depth
+    assert _empirical_prior._mean_depth(np.array(reach, dtype=np.intp)) == depth

@@ -160,6 +160,6 @@ def test_beams_are_as_many_as_beams():
 def test_bins_that_are_not_used_do_not_matter(monkeypatch):
     beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
     cut = solved(beams)
-    monkeypatch.setattr(labeled, "BEYOND", 10**6)
+    monkeypatch.setattr(labeled, "BINS_BEYOND", 10**6)
     xr.testing.assert_identical(cut, solved(beams))
     assert beams[0].averages.sizes["range"] > 700

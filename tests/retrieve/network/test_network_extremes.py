@@ -225,7 +225,7 @@ def test_noise_of_calm_profiles_is_pooled_as_ever():
     )
     block = np.repeat([0, 1], 6)
     members = [np.flatnonzero(block == b) for b in range(2)]
-    rows, row = _beam_signals._estimated(power, members, block)
+    rows, row = _beam_signals._estimate_variances(power, members, block)
     np.testing.assert_array_equal(row, block)
     assert rows.shape == (2, *power.shape[1:])
     np.testing.assert_allclose(np.sqrt(np.median(rows, axis=2)), 0.02, rtol=0.1)

@@ -1,1 +1,1 @@
-"""Signals of the beams of a network: averaged, with their noise and outlying bins."""
+"""Outlying bins of the beams of a network, and groups of profiles with similar noise."""

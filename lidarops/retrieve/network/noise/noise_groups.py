@@ -1,8 +1,8 @@
-"""Profiles of a block, parted where many are far noisier than many others.
+"""Groups of profiles with similar noise within a block.
 
-What is too weak, what is an unusual error and which field is likeliest is asked of a block as a
-whole. Where most of it is noisy, by background light or by thick air, the rest would lose beams
-that it hears well and state errors that it does not have; so each part is a block of its own.
+Weak signals, unusual errors and the most likely field are decided for a block as a whole. Where
+background light or dense air makes most of a block noisy, the quiet profiles would lose good beams
+and state too large errors. So each group becomes a block of its own.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
-FARTHER: Final = 5.0
-"""Times the relative variance, from which on profiles are of another kind."""
-_ENOUGH: Final = 8
-"""Profiles of a part: as many as tell a mean (`lidarops.retrieve.network._empirical_prior`)."""
-_SHARE: Final = 0.1
-"""Of a block, which a part has at least: noise of levels alone parts none."""
-_LEAST: Final = 1e-30
+SPLIT_RATIO: Final = 5.0
+"""Ratio of relative variances from which profiles belong to different groups."""
+_FEWEST_PROFILES: Final = 8
+"""Smallest group: the profiles that a mean needs (`lidarops.retrieve.network._empirical_prior`)."""
+_SMALLEST_SHARE: Final = 0.1
+"""Smallest fraction of a block in a group, so that noise of the levels alone splits none."""
+_SMALLEST_VARIANCE: Final = 1e-30
+"""Relative variance that stands for zero."""
 
 
 def split_by_noise(
@@ -30,22 +31,22 @@ def split_by_noise(
     row: Indices,
     block: Indices,
     passages: tuple[Indices, Indices, int],
-    loudest: float,
+    largest_error: float,
 ) -> Indices:
-    """Return blocks, numbered anew, of profiles of like noise about every crossing.
+    """Return new block numbers of profiles with similar noise around every crossing.
 
     Parameters
     ----------
     signal : (profile, beam, bin) float64
     rows : (row, beam, bin) float64
-        Variances as stated, in the signal's unit squared.
+        Stated variances, in the square of the unit of the signal.
     row : (profile,) intp
-        Of the variances of a profile.
+        Row of variances of each profile.
     block : (profile,) intp
         0, 1, ... without a gap.
     passages : (passage,) intp, (passage,) intp, int
-        Beams, first bins about the crossings, and how many bins there are.
-    loudest : float
+        Beams, first bins around the crossings, and number of bins.
+    largest_error : float
         Relative standard error of a bin, beyond which a signal is not used.
 
     Returns
@@ -54,63 +55,67 @@ def split_by_noise(
     """
     count = int(block.max(initial=-1)) + 1
     members = [np.flatnonzero(block == b) for b in range(count)]
-    if all(mine.size < 2 * _enough(mine.size) for mine in members):
+    if all(profiles.size < 2 * _smallest_group(profiles.size) for profiles in members):
         return block
-    noise = _relative(signal, rows, row, passages)
-    # All that is not used is alike, and what its chance levels are does not matter.
-    most = FARTHER * loudest**2
-    out, number = np.empty_like(block), 0
-    for mine in members:
-        for some in _parts(mine, _known(noise[mine], most)):
-            out[some] = number
+    noise = _relative_variances(signal, rows, row, passages)
+    # Unusable signals count as equal, whatever their chance levels.
+    largest = SPLIT_RATIO * largest_error**2
+    numbers, number = np.empty_like(block), 0
+    for profiles in members:
+        for group in _split(profiles, _bounded_noise(noise[profiles], largest)):
+            numbers[group] = number
             number += 1
-    return out
+    return numbers
 
 
-def _enough(size: int) -> int:
-    return max(_ENOUGH, int(np.ceil(_SHARE * size)))
+def _smallest_group(size: int) -> int:
+    """Return the smallest number of profiles in a group of a block of this size."""
+    return max(_FEWEST_PROFILES, int(np.ceil(_SMALLEST_SHARE * size)))
 
 
-def _relative(
+def _relative_variances(
     signal: Array, rows: Array, row: Indices, passages: tuple[Indices, Indices, int]
 ) -> Array:
-    """Return (profile, passage) relative variances of a bin; inf of what is not positive.
+    """Return (profile, passage) relative variances of a bin; inf where it is not positive.
 
-    Of the median level of the bins, which no single wild bin moves.
+    They use the median level of the bins, which is robust against single outlying bins.
     """
     beam = passages[0][:, np.newaxis]
-    bin = passages[1][:, np.newaxis] + np.arange(passages[2])
-    level, spread = np.median(signal[:, beam, bin], axis=2), np.median(rows[:, beam, bin], axis=2)
+    bins = passages[1][:, np.newaxis] + np.arange(passages[2])
+    level, spread = np.median(signal[:, beam, bins], axis=2), np.median(rows[:, beam, bins], axis=2)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         return np.where(level > 0.0, spread[row] / level**2, np.where(level <= 0.0, np.inf, np.nan))
 
 
-def _known(noise: Array, most: float) -> Array:
-    """Return relative variances of one block, within bounds; the median where there is none."""
-    out = np.clip(noise, _LEAST, most)
-    for c in np.flatnonzero(np.isnan(out).any(axis=0)):
-        lost = np.isnan(out[:, c])
-        out[lost, c] = most if lost.all() else np.median(out[~lost, c])
-    return out
+def _bounded_noise(noise: Array, largest: float) -> Array:
+    """Return bounded relative variances of one block; the median where a value is missing."""
+    bounded = np.clip(noise, _SMALLEST_VARIANCE, largest)
+    for c in np.flatnonzero(np.isnan(bounded).any(axis=0)):
+        missing = np.isnan(bounded[:, c])
+        bounded[missing, c] = largest if missing.all() else np.median(bounded[~missing, c])
+    return bounded
 
 
-def _parts(mine: Indices, noise: Array) -> list[Indices]:
-    """Part profiles between those that differ most, as long as enough are far from enough.
+def _split(profiles: Indices, noise: Array) -> list[Indices]:
+    """Split profiles at the largest step of noise, while both groups are large and distinct.
 
     Parameters
     ----------
-    mine : (profile,) intp
+    profiles : (profile,) intp
     noise : (profile, passage) float64
     """
-    least = _enough(mine.size)
-    if mine.size < 2 * least:
-        return [mine]
+    smallest = _smallest_group(profiles.size)
+    if profiles.size < 2 * smallest:
+        return [profiles]
     ordered = np.sort(noise, axis=0)
-    far = ordered[-least] / ordered[least - 1]
-    c = int(np.argmax(far)) if far.size else 0
-    if far.size == 0 or not far[c] > FARTHER:
-        return [mine]
+    ratio = ordered[-smallest] / ordered[smallest - 1]
+    c = int(np.argmax(ratio)) if ratio.size else 0
+    if ratio.size == 0 or not ratio[c] > SPLIT_RATIO:
+        return [profiles]
     column = ordered[:, c]
-    steps = column[least : mine.size - least + 1] / column[least - 1 : mine.size - least]
-    above = noise[:, c] > column[least - 1 + int(np.argmax(steps))]
-    return [*_parts(mine[~above], noise[~above]), *_parts(mine[above], noise[above])]
+    steps = (
+        column[smallest : profiles.size - smallest + 1]
+        / column[smallest - 1 : profiles.size - smallest]
+    )
+    above = noise[:, c] > column[smallest - 1 + int(np.argmax(steps))]
+    return [*_split(profiles[~above], noise[~above]), *_split(profiles[above], noise[above])]

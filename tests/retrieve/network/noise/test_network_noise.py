@@ -22,7 +22,7 @@ FULL = {"full_overlap_range": 100.0}
 
 def estimated(power):
     """Return (row, beam, bin) relative standard deviations of one block."""
-    rows, row = _beam_signals._estimated(
+    rows, row = _beam_signals._estimate_variances(
         power, [np.arange(len(power))], np.zeros(len(power), np.intp)
     )
     return np.sqrt(rows), row
@@ -165,11 +165,11 @@ def test_profiles_of_equal_levels_are_asked_in_any_order():
     rng = np.random.default_rng(6)
     squares = rng.random((40, 2, 90)) * np.where(np.arange(40) % 5, 1.0, 50.0)[:, None, None]
     known, level = rng.random(squares.shape) < 0.9, np.ones((40, 2))
-    usual = _beam_signals._usual_square(squares, known, level)
+    usual = _beam_signals._typical_squares(squares, known, level)
     for _ in range(3):
         order = rng.permutation(40)
         np.testing.assert_array_equal(
-            _beam_signals._usual_square(squares[order], known[order], level), usual
+            _beam_signals._typical_squares(squares[order], known[order], level), usual
         )
 
 
@@ -203,7 +203,7 @@ def correlated(shape, share, rng):
 
 def excess(logs):
     """Return (beam,) what sums of bins of the same noise in all profiles have more."""
-    return _beam_signals._excess(logs, np.isfinite(logs), np.ones(logs.shape[:2]))
+    return _beam_signals._correlation_factor(logs, np.isfinite(logs), np.ones(logs.shape[:2]))
 
 
 @pytest.mark.parametrize(("relative", "share"), [(0.003, 0.4), (0.02, 1.0)])
@@ -259,10 +259,10 @@ def test_noise_that_differs_between_profiles_is_not_taken_for_correlated():
         rng = np.random.default_rng(seed)
         level = np.where(rng.permutation(24) % 2, 1.0, 225.0)[:, np.newaxis] * np.ones(6)
         logs = 0.005 * np.sqrt(level)[..., np.newaxis] * rng.standard_normal((24, 6, 240))
-        found = _beam_signals._excess(logs, np.isfinite(logs), level)
+        found = _beam_signals._correlation_factor(logs, np.isfinite(logs), level)
         np.testing.assert_array_equal(found, 1.0)
         level[::5] = [np.inf, 0.0, np.nan, 1.0, 1.0, 1.0]
-        assert np.isfinite(_beam_signals._excess(logs, np.isfinite(logs), level)).all()
+        assert np.isfinite(_beam_signals._correlation_factor(logs, np.isfinite(logs), level)).all()
 
 
 def test_air_that_drifts_is_no_correlated_noise():
@@ -296,13 +296,13 @@ def test_profiles_are_loud_by_more_than_their_signal_is_strong():
     """Noise of counts grows with the signal: it is not what a detector out of order has."""
     signal, variances = np.ones((50, 40)), np.ones((50, 40))
     variances[3] = 90.0
-    np.testing.assert_allclose(_beam_signals._usual(variances, signal, signal[0]), 1.0)
+    np.testing.assert_allclose(_beam_signals._typical_variance(variances, signal, signal[0]), 1.0)
     signal[3] = 4.0
     np.testing.assert_allclose(
-        _beam_signals._usual(variances, signal, signal[0]), (49.0 + 90.0) / 50.0
+        _beam_signals._typical_variance(variances, signal, signal[0]), (49.0 + 90.0) / 50.0
     )
     variances[3] = 110.0
-    np.testing.assert_allclose(_beam_signals._usual(variances, signal, signal[0]), 1.0)
+    np.testing.assert_allclose(_beam_signals._typical_variance(variances, signal, signal[0]), 1.0)
 
 
 def test_a_beam_of_which_nothing_is_known_is_missing_and_not_weak():

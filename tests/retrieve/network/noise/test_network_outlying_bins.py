@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import BarycentricInterpolator
 from support.oracle_network import FIELDS, fan, grid, noisy, signals, three_by_two, triangle
 
-from lidarops.retrieve.network import _condensed_signals
+from lidarops.retrieve.network import _condensed_signals, _fit_layout
 from lidarops.retrieve.network.extinction_field import retrieve_network
 from lidarops.retrieve.network.noise import outlying_bins, outlying_runs
 
@@ -37,7 +37,7 @@ def solved(net, r, power, variance, **settings):
 
 def condensed(net, r, power, variance, *, screened=True, relative=False, nearest=100.0):
     ranges = np.tile(r, (net.beams, 1))
-    layout = _condensed_signals.lay_out(net, ranges, None, np.full(net.beams, nearest), BINS)
+    layout = _fit_layout.lay_out_fits(net, ranges, None, np.full(net.beams, nearest), BINS)
     rows = np.broadcast_to(variance, (1, *power.shape[1:]))
     data = _condensed_signals.condense(
         power, np.ascontiguousarray(rows), np.zeros(len(power), dtype=np.intp),
@@ -93,14 +93,14 @@ def test_what_is_left_of_bins_is_normal(relative):
     for n in range(rows):
         noise = (relative * np.exp(slope) / plain[n]) ** 2
         row = np.log(np.maximum(plain[n], 1e-9)), noise, plain[n], (relative * np.exp(slope)) ** 2
-        outlying_bins._measure(
+        outlying_bins._measure_deviations(
             row, 1.0, False, ranges, codes, (0, count, 0, count), (nodes, shares, 0.0 * air), off[n]
         )
     for many, chance in ((2.0, 4.55e-2), (3.0, 2.7e-3), (4.0, 6.3e-5)):
         expected = chance * off.size
         # A bin of noise shows in 7 of them: so many fewer are independent.
         assert abs(np.sum(off > many) - expected) < 4 * np.sqrt(7 * expected) + 3
-    assert off.max() < outlying_bins.OUTLYING
+    assert off.max() < outlying_bins.OUTLYING_SIGMAS
 
 
 def test_counts_at_low_light_are_not_taken_for_outliers():

@@ -134,7 +134,7 @@ def test_blocks_are_parted_each_for_itself():
 def test_profiles_of_three_kinds_come_into_three_blocks():
     noise = np.repeat([[1e-4], [1e-3], [1e-1]], [10, 20, 15], axis=0)
     noise = noise * np.random.default_rng(2).uniform(0.8, 1.25, noise.shape)
-    found = noise_groups._parts(np.arange(45), noise)
+    found = noise_groups._split(np.arange(45), noise)
     assert [mine.tolist() for mine in found] == [
         list(range(10)), list(range(10, 30)), list(range(30, 45))
     ]  # fmt: skip
