@@ -1,10 +1,10 @@
-"""What would my lidar see? Its signals by night and by day, and how far they reach.
+"""What would my lidar see? Signals by night and by day, and their range.
 
     python examples/what_would_my_lidar_see.py figure.png
 
 Change the laser, the telescope and the air below, and run it again. The lidar is simulated as a
-campaign of two files, one at midnight and one at noon; the files are read as those of any real
-instrument, and their noise is compared with what the truth says is there.
+campaign of two files, one at midnight and one at noon. The files are read like those of a real
+instrument, and the signals are compared with the truth.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 FULL_OVERLAP = 400.0  # m
 DEAD_TIME = 4e-9  # s
 
-# %% My lidar: a laser of 20 mJ at 50 Hz, a telescope of 20 cm, one minute a file.
+# %% The lidar: a laser of 20 mJ at 50 Hz, a telescope of 20 cm, files of one minute.
 LIDAR = {
     "kind": "lidar",
     "acquisition": {"interval": 43_200, "shots": 3000, "repetition_rate": 50, "bins": 4000},
@@ -43,7 +43,7 @@ LIDAR = {
     ],
 }
 
-# %% What it looks at: haze, a layer of dust, a thin cirrus.
+# %% The air: haze, a layer of dust, a thin cirrus.
 ATMOSPHERE = {
     "boundary_layer": {
         "extinction": 1.2e-4,
@@ -81,36 +81,36 @@ def campaign(archive: Path) -> Campaign:
     }
     return Campaign.model_validate(
         {
-            "name": "mine",
+            "name": "my-lidar",
             "title": "What would my lidar see",
             "archive": str(archive),
             "output": str(archive),
-            "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 0}},
-            "instruments": {"mine": {"station": "here", "files": "m*", "facts": [facts]}},
+            "stations": {"home": {"name": "Home", "latitude": 50, "longitude": 0}},
+            "instruments": {"lidar": {"station": "home", "files": "m*", "facts": [facts]}},
             "simulation": {
                 "seed": 1,
                 "start": "2025-06-21T00:00:00Z",
                 "duration": 43_200 + 60,
                 "atmosphere": ATMOSPHERE,
                 "truth": {"cells": 2048},
-                "instruments": {"mine": LIDAR},
+                "instruments": {"lidar": LIDAR},
             },
         }
     )
 
 
-# %% One minute of counts, and what it says of the air.
-def expected(result: SimulatedCampaign, row: int) -> tuple[Array, Array]:
-    """Return backscatter times transmission on the beam of the truth, and the range cells."""
-    profile = result.truth.isel(profile_mine=row, wavelength_mine=0)
-    depth = profile["profile_optical_depth_mine"].values
+# %% Truth and measurement: attenuated backscatter, and the rate of photons.
+def true_attenuated_backscatter(result: SimulatedCampaign, row: int) -> tuple[Array, Array]:
+    """Return the true attenuated backscatter, m-1 sr-1, and its range cells, m."""
+    profile = result.truth.isel(profile_lidar=row, wavelength_lidar=0)
+    depth = profile["profile_optical_depth_lidar"].values
     cell = np.diff(depth, prepend=0.0)
-    attenuated = profile["profile_backscatter_mine"].values * np.exp(-2.0 * (depth - cell / 2))
-    return attenuated, result.truth["range_mine"].values
+    attenuated = profile["profile_backscatter_lidar"].values * np.exp(-2.0 * (depth - cell / 2))
+    return attenuated, result.truth["range_lidar"].values
 
 
-def rate(signals: xr.Dataset, row: int) -> tuple[Array, Array]:
-    """Return the rate of photons without dead time and sky, MHz, and its standard error."""
+def photon_rate(signals: xr.Dataset, row: int) -> tuple[Array, Array]:
+    """Return the photon rate without dead time and background, MHz, and its standard error."""
     counted = signals["photon_532o"].values[row].astype(float)
     live = 1.0 - counted * DEAD_TIME * 1e6
     exposure = float(signals["photon_532o_shots"][row]) * 0.05  # bins of 50 ns, microseconds
@@ -120,23 +120,23 @@ def rate(signals: xr.Dataset, row: int) -> tuple[Array, Array]:
 
 
 def draw(result: SimulatedCampaign, signals: xr.Dataset, figure: Path) -> None:
-    """Draw the range-corrected signals over the truth, and their relative errors."""
+    """Draw the range-corrected signals with the truth, and their relative errors."""
     mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415 - after the choice of the backend
+    from matplotlib import pyplot as plt  # noqa: PLC0415 - the backend must be set before
 
     drawing, (left, right) = plt.subplots(1, 2, figsize=(9, 6), sharey=True, layout="constrained")
     distance = signals["range"].values
     usable = distance > FULL_OVERLAP
     for row, (name, colour) in enumerate({"midnight": "#1b4f9c", "noon": "#d1720f"}.items()):
-        signal, error = rate(signals, row)
-        truth, cells = expected(result, row)
+        signal, error = photon_rate(signals, row)
+        truth, cells = true_attenuated_backscatter(result, row)
         constant = np.median(
             (signal * distance**2)[usable][:100] / np.interp(distance[usable][:100], cells, truth)
         )
         left.plot(signal * distance**2 / constant, distance / 1e3, lw=0.4, color=colour, alpha=0.6)
         left.plot(truth, cells / 1e3, lw=1.2, color="black", ls="-" if row else "--")
-        beyond = np.interp(distance, cells, truth) * constant / distance**2
-        relative = error / beyond
+        true_signal = np.interp(distance, cells, truth) * constant / distance**2
+        relative = error / true_signal
         right.plot(relative[usable], distance[usable] / 1e3, lw=0.8, color=colour, label=name)
     left.set(xscale="log", xlim=(3e-8, 1e-5), ylim=(0, 15), ylabel="height (km)")
     left.set_xlabel("attenuated backscatter (m$^{-1}$ sr$^{-1}$), truth in black")
@@ -148,7 +148,7 @@ def draw(result: SimulatedCampaign, signals: xr.Dataset, figure: Path) -> None:
 
 
 def main(figure: str) -> None:
-    """Simulate, read, draw."""
+    """Simulate two files, read them and draw the figure."""
     with tempfile.TemporaryDirectory() as folder:
         result = simulate_campaign(campaign(Path(folder)))
         draw(result, open_archive(folder).load(), Path(figure))

@@ -1,4 +1,4 @@
-"""The scripts in examples/ run, and draw what they say."""
+"""The scripts in examples/ run and draw a figure."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def test_what_would_my_lidar_see(repository, tmp_path, monkeypatch):
     figure = tmp_path / "figure.png"
     monkeypatch.setattr("sys.argv", [script, str(figure)])
     runpy.run_path(script, run_name="__main__")
-    drawn = image.imread(figure)
-    assert drawn.shape[0] > 500
+    pixels = image.imread(figure)
+    assert pixels.shape[0] > 500
     # Neither blank nor black.
-    assert 0.5 < drawn[..., :3].mean() < 0.99
+    assert 0.5 < pixels[..., :3].mean() < 0.99
 
     monkeypatch.setattr("sys.argv", [script])
     with pytest.raises(SystemExit, match=r"figure\.png"):

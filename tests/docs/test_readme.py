@@ -1,4 +1,4 @@
-"""What stands in the README works."""
+"""The commands and code of the README work."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from lidarops.cli import app
 
 @pytest.fixture(scope="module")
 def readme(repository: Path) -> str:
-    """Its text."""
+    """Return the text of the README."""
     return (repository / "README.md").read_text(encoding="utf-8")
 
 
 def _block(readme: str, language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", readme, re.DOTALL)
-    assert found
-    return found[1]
+    match = re.search(rf"```{language}\n(.*?)```", readme, re.DOTALL)
+    assert match
+    return match[1]
 
 
 def test_it_is_short(readme: str) -> None:
@@ -44,7 +44,7 @@ def test_the_python_lines_run(readme: str, demo_archive: Path) -> None:
     assert fit["extinction"].sizes["time"] > 50
 
 
-def test_every_command_is_there(readme: str) -> None:
+def test_every_command_exists(readme: str) -> None:
     commands = set(re.findall(r"^    lidarops (\w+)", readme, re.MULTILINE))
     shown = CliRunner().invoke(app, ["--help"]).output
     assert {"simulate", "catalog", "plan", "reprocess", "report", "inspect", "bench"} < commands
@@ -53,7 +53,7 @@ def test_every_command_is_there(readme: str) -> None:
         assert "Example" in CliRunner().invoke(app, [command, "--help"]).output
 
 
-def test_files_that_it_names_exist(readme: str, repository: Path) -> None:
+def test_named_files_exist(readme: str, repository: Path) -> None:
     for name in re.findall(r"`([\w./-]+\.(?:py|toml|bib|md|yaml))`|\]\(([\w./-]+)\)", readme):
-        path = next(part for part in name if part)
+        path = next(text for text in name if text)
         assert (repository / path).exists(), path

@@ -25,7 +25,7 @@ def raw_file(
     data=None,
     last=b"\r\n",
 ) -> bytes:
-    """Bytes of a file, put together without the writer under test."""
+    """Return the bytes of a file, built without the writer under test."""
     lines = [line_1, line_2, line_3 or LINE_3.format(len(datasets)), *datasets]
     head = b"".join(line.ljust(78).encode("latin-1") + b"\r\n" for line in lines) + b"\r\n"
     if data is None:
@@ -34,7 +34,7 @@ def raw_file(
 
 
 def naive_read(content: bytes):
-    """Read a classic file the slow and obvious way: rows of (tokens, counts)."""
+    """Read a classic file in the simplest way; return lines and rows of (tokens, counts)."""
     lines, position = [], 0
     while True:
         end = content.index(b"\r\n", position)
@@ -55,7 +55,7 @@ def naive_read(content: bytes):
 
 
 def naive_physical(tokens, counts):
-    """mV or MHz, by the formulas of the format description."""
+    """Return mV or MHz by the formulas of the format description."""
     shots, width = int(tokens[13]), float(tokens[6])
     if tokens[1] == "0":
         return [c * float(tokens[14]) * 1000 / (shots * 2 ** int(tokens[12])) for c in counts]
@@ -134,7 +134,7 @@ HEADERS = headers()
 
 @st.composite
 def files(draw, headers=HEADERS):
-    """A header and counts for all that it stores."""
+    """Draw a header, and counts for all datasets that it stores."""
     header = draw(headers)
     seed = draw(st.integers(0, 2**32 - 1))
     random = np.random.default_rng(seed)
@@ -142,7 +142,7 @@ def files(draw, headers=HEADERS):
     for dataset in header.datasets:
         if dataset.offset is not None:
             values = random.integers(-(2**31), 2**31, dataset.bins, dtype=np.int64)
-            # CRLF inside the data, and the extremes.
+            # CRLF inside the data, and the extreme values.
             values[random.integers(dataset.bins)] = random.choice(
                 [0x0A0D0A0D, 0x0A0D, -(2**31), 2**31 - 1]
             )

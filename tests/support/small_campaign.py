@@ -1,4 +1,4 @@
-"""The tree of a small simulated campaign."""
+"""Settings of a small simulated campaign, as a dict."""
 
 from __future__ import annotations
 
