@@ -21,7 +21,7 @@ GROUPS: Final = 16
 """Groups of neighbouring bins whose mean residuals are tested."""
 FEWEST_GROUPS: Final = 4
 SINGULAR: Final = 1e-14
-"""Squared contrast of the shape, relative to its mean, below which rounding is all there is."""
+"""Squared contrast of the shape, relative to its mean, below which only rounding is left."""
 
 BACKGROUND: Final = 0
 AMPLITUDE: Final = 1
@@ -40,34 +40,42 @@ COLUMNS: Final = 13
 
 
 class ShapeNoise(NamedTuple):
-    """What the weights are made of."""
+    """Noise from which the weights follow."""
 
     variance: Array
     """(profile or 1, bin), in the square of the power's unit; not used for counts."""
     exposure: Array
-    """(profile or 1,), counts per unit of power; NaN for noise that is not Poisson's."""
+    """(profile or 1,), counts per unit of power; NaN where the noise is not Poisson noise."""
     known: bool
     """Whether the variance is known, or only its shape."""
 
 
 class Limits(NamedTuple):
-    """What a window may show to be taken for free of aerosol."""
+    """Limits of the two tests for a window free of aerosol."""
 
     waves: float
-    """Chi-square of the means of `GROUPS` groups, two degrees of freedom gone."""
+    """Of the chi-square of the mean residuals of `GROUPS` groups (2 degrees of freedom used)."""
     deviation: float
-    """Standard errors."""
+    """Of the curvature and of the differences of backgrounds, in standard errors."""
 
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+# A function that the compiler may reassociate has to be inlined. As a symbol of its own it would
+# be optimised once alone and once within each caller, with different last digits, and the linker
+# takes the one or the other depending on what was compiled before and what came from the cache.
+_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 _summing = numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    forceinline=True,
+    fastmath={"reassoc", "contract", "nsz"},
 )
 
 
 @_summing
 def _sums(values: Array, phi: Array, weights: Array) -> Any:
-    """Return weight, mean shape, mean power, their centred sums."""
+    """Return total weight, weighted means of shape and power, and their centred sums."""
     total = shape = power = 0.0
     for i in range(weights.size):
         total += weights[i]
@@ -85,7 +93,7 @@ def _sums(values: Array, phi: Array, weights: Array) -> Any:
 
 @_summing
 def _bend(phi: Array, lever: Array, weights: Array, shape: float) -> Any:
-    """Return the sum of the shape tilted along range, and its product with the shape."""
+    """Return the weighted sum of shape times distance, and its product with the centred shape."""
     bend = cross = 0.0
     for i in range(weights.size):
         tilted = weights[i] * phi[i] * lever[i]
@@ -96,34 +104,34 @@ def _bend(phi: Array, lever: Array, weights: Array, shape: float) -> Any:
 
 @_summing
 def _group(residuals: Array, phi: Array, lever: Array, weights: Array, tilt: Any) -> Any:
-    """Return chi-square, weight and sum of some residuals, norm and score of the curvature."""
+    """Return chi-square, weight and sum of residuals; norm and score of the curvature."""
     bend, slope, shape = tilt
     chi2 = weight = total = norm = score = 0.0
     for i in range(weights.size):
-        own = phi[i] * lever[i] - bend - slope * (phi[i] - shape)
+        curved = phi[i] * lever[i] - bend - slope * (phi[i] - shape)
         weighted = weights[i] * residuals[i]
         chi2 += weighted * residuals[i]
         weight += weights[i]
         total += weighted
-        norm += weights[i] * own * own
-        score += weighted * own
+        norm += weights[i] * curved * curved
+        score += weighted * curved
     return chi2, weight, total, norm, score
 
 
 @_compiled
 def _roughness(residuals: Array, weights: Array) -> float:
-    """Return the mean squared difference of neighbours over what their weights let expect."""
-    rough = before = last = 0.0
+    """Return the mean squared difference of neighbours over that expected from their weights."""
+    total = before = last = 0.0
     pairs = 0
     for i in range(weights.size):
         if weights[i] == 0.0:
             continue
         if last > 0.0:
             step = residuals[i] - before
-            rough += step * step * (weights[i] * last) / (weights[i] + last)
+            total += step * step * (weights[i] * last) / (weights[i] + last)
             pairs += 1
         before, last = residuals[i], weights[i]
-    return rough / pairs if pairs > 0 else math.nan
+    return total / pairs if pairs > 0 else math.nan
 
 
 @_summing
@@ -139,7 +147,7 @@ def _fill_counts(
         weights[i] = usable[i] * exposure / (background + amplitude * phi[i])
 
 
-@_compiled
+@_inlined
 def _weigh_counts(
     values: Array,
     phi: Array,
@@ -148,23 +156,23 @@ def _weigh_counts(
     bins: float,
     weights: Array,
 ) -> None:
-    """Weigh by the variance of counts as a fitted model has it, twice."""
+    """Fill the weights of counts by the variance of the fitted model, in two passes."""
     weights[:] = usable
     for _ in range(2):
         _, shape, power, square, product = _sums(values, phi, weights)
         amplitude = max(product / square, 0.0) if square > 0.0 else 0.0
         background = power - amplitude * shape
-        # A background of nothing is known to its standard error only, and to a count at best.
+        # A zero background is known to its standard error only, and to one count at best.
         level = max(power, 0.0) / (bins * exposure)
         least = math.sqrt(level) + 1.0 / (bins * exposure)
         _fill_counts(weights, phi, usable, exposure, max(background, least), amplitude)
 
 
-@_compiled
+@_inlined
 def _test_residuals(
     residuals: Array, phi: Array, lever: Array, weights: Array, sums: Any, row: Array
 ) -> None:
-    """Fill the chi-square of all residuals and of their groups, and the curvature."""
+    """Fill the chi-square of all residuals and of their group means, and the curvature."""
     total, shape, square = sums
     bend, cross = _bend(phi, lever, weights, shape)
     tilt = (bend / total, cross / square, shape)
@@ -172,17 +180,19 @@ def _test_residuals(
     groups = edge = 0
     for group in range(GROUPS):
         until = (group + 1) * weights.size // GROUPS
-        part = slice(edge, until)
-        parts = _group(residuals[part], phi[part], lever[part], weights[part], tilt)
-        chi2 += parts[0]
-        norm += parts[3]
-        score += parts[4]
-        if parts[1] > 0.0:
+        bins = slice(edge, until)
+        group_chi2, weight, total_residual, group_norm, group_score = _group(
+            residuals[bins], phi[bins], lever[bins], weights[bins], tilt
+        )
+        chi2 += group_chi2
+        norm += group_norm
+        score += group_score
+        if weight > 0.0:
             groups += 1
-            waves += parts[2] * parts[2] / parts[1]
+            waves += total_residual * total_residual / weight
         edge = until
     row[CHI2] = chi2
-    # The tilted shape may be nothing but a mixture of the shape and a constant.
+    # The tilted shape may be a mere combination of the shape and a constant.
     least = SINGULAR * square * lever[-1] ** 2
     row[CURVATURE] = score / math.sqrt(norm) if norm > least else 0.0
     row[WAVES] = waves if groups >= FEWEST_GROUPS else 0.0
@@ -216,7 +226,7 @@ def _is_constant(values: Array, usable: Array) -> bool:
     return True
 
 
-@_compiled
+@_inlined
 def _fit(
     values: Array,
     phi: Array,
@@ -258,7 +268,7 @@ def _fit(
 
 @_compiled
 def _level(row: Array, known: bool) -> float:
-    """Return the variance that a weight of one stands for, as differences of bins show it."""
+    """Return the variance of unit weight, estimated from differences of bins if not known."""
     return 1.0 if known else row[ROUGHNESS]
 
 
@@ -272,14 +282,14 @@ def _passes(row: Array, limits: Limits, known: bool) -> bool:
 
 @_compiled
 def _choose(rows: Array, limits: Limits, known: bool) -> int:
-    """Return the longest window that passes and agrees with all shorter ones, or the shortest."""
+    """Return the longest window that passes and agrees with all shorter ones, else the shortest."""
     shortest = rows.shape[0] - 1
     for k in range(shortest):
         if not (rows[k, BINS] > 0 and _passes(rows[k], limits, known)):
             continue
         agrees = True
         for j in range(k + 1, rows.shape[0]):
-            # The difference of nested fits has the difference of their variances.
+            # The variance of a difference of nested fits is the difference of their variances.
             gap = rows[j, BACKGROUND_VARIANCE] - rows[k, BACKGROUND_VARIANCE]
             step = rows[j, BACKGROUND] - rows[k, BACKGROUND]
             if step * step > limits.deviation**2 * gap * _level(rows[k], known):
@@ -299,7 +309,7 @@ def _prepare(
     values: Array,
     scaled: Array,
 ) -> float:
-    """Copy what can be used, the shape over its mean, and return that mean."""
+    """Copy usable bins, with the shape divided by its mean; return that mean."""
     total = count = 0.0
     for i in range(values.size):
         weight = 1.0 / variance[i]
@@ -325,7 +335,7 @@ def _tilt(range_: Array, lever: Array) -> None:
 
 @_compiled
 def fill_pasts(power: Any, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
-    """Lower the bins past each window to the one past its last usable bin.
+    """Lower the end of each window to the bin past its last usable bin.
 
     Parameters
     ----------
@@ -353,19 +363,20 @@ def fit_shape(
     limits: Limits,
     out: Array,
 ) -> None:
-    """Fit every profile in its windows, and keep the fit of one.
+    """Fit every profile in its windows, and keep the fit of the chosen window.
 
     Parameters
     ----------
     power : (profile, bin) float32 or float64
     shape, mask : (profile or 1, bin) float64
-        Bins are passed over where the mask is 0.
+        Bins are skipped where the mask is 0.
     range_ : (bin,) float64
         m, ascending.
-    noise : Noise
+    noise : ShapeNoise
     firsts : (profile or 1, window) int
         First bins of nested windows, the longest first.
     pasts : (profile or 1,) int
+        First bins past the windows.
     limits : Limits
     out : (profile, COLUMNS) float64
     """
@@ -376,9 +387,9 @@ def fit_shape(
     rows = np.empty((windows, COLUMNS))
     for k in range(count):
         exposure = noise.exposure[k % noise.exposure.shape[0]]
-        first_of = firsts[k % firsts.shape[0]]
+        first_bins = firsts[k % firsts.shape[0]]
         past = pasts[k % pasts.shape[0]]
-        full = slice(first_of[0], max(past, first_of[0]))
+        full = slice(first_bins[0], max(past, first_bins[0]))
         unit = _prepare(
             power[k][full],
             shape[k % shape.shape[0]][full],
@@ -389,17 +400,17 @@ def fit_shape(
             scaled[full],
         )
         for j in range(windows):
-            part = slice(first_of[j], max(past, first_of[j]))
-            _tilt(range_[part], lever[part])
+            window = slice(first_bins[j], max(past, first_bins[j]))
+            _tilt(range_[window], lever[window])
             _fit(
-                values[part],
-                scaled[part],
-                lever[part],
-                usable[part],
+                values[window],
+                scaled[window],
+                lever[window],
+                usable[window],
                 exposure,
                 noise.known,
-                weights[part],
-                residuals[part],
+                weights[window],
+                residuals[window],
                 rows[j],
             )
             rows[j, WINDOW] = j

@@ -1,12 +1,19 @@
-"""Compiled code is that of the sources as they are."""
+"""Compiled code is that of the present sources, and gives the same bits fresh and cached."""
 
 from __future__ import annotations
 
+import pkgutil
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from numba import config
+from numba.core.registry import CPUDispatcher
 
+from lidarops.retrieve import background, homogeneous
 from lidarops.retrieve.common.compiled_code import keep_apart
 from lidarops.retrieve.signal._signal_kernels import photon_profiles
 
@@ -30,10 +37,48 @@ def test_a_change_of_any_compiled_module_gives_another_folder(sources: Path):
     assert Path(config.CACHE_DIR).parent == sources / "__pycache__"
 
 
-def test_the_folder_that_a_user_names_is_kept_to(sources: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(config, "CACHE_DIR", str(sources / "mine"))
-    assert Path(keep_apart(sources)).parent == sources / "mine"
+def test_a_cache_folder_set_by_the_user_is_respected(
+    sources: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(config, "CACHE_DIR", str(sources / "cache"))
+    assert Path(keep_apart(sources)).parent == sources / "cache"
 
 
-def test_the_functions_of_the_package_keep_to_it():
+def test_the_functions_of_the_package_use_that_folder():
     assert keep_apart() in str(photon_profiles._cache.cache_path)
+
+
+# The same bits, fresh and cached -------------------------------------------------------------
+
+REWRITING = {"reassoc", "contract", "arcp", "afn", "fast"}
+"""Fast-math flags with which the bits of a result depend on the optimisation."""
+
+
+def compiled_functions(package: ModuleType) -> Iterator[CPUDispatcher]:
+    for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        for function in vars(import_module(info.name)).values():
+            if isinstance(function, CPUDispatcher):
+                yield function
+
+
+def callees(function: CPUDispatcher) -> list[CPUDispatcher]:
+    code, names = function.py_func.__code__, function.py_func.__globals__
+    values = (names.get(name) for name in code.co_names)
+    return [value for value in values if isinstance(value, CPUDispatcher)]
+
+
+@cache
+def depends_on_optimisation(function: CPUDispatcher) -> bool:
+    flags = function.targetoptions.get("fastmath") or set()
+    if flags is True or REWRITING & set(flags):
+        return True
+    return any(depends_on_optimisation(callee) for callee in callees(function))
+
+
+@pytest.mark.parametrize("package", [background, homogeneous])
+def test_called_functions_that_are_reassociated_are_inlined(package: ModuleType):
+    """A symbol of its own has other bits when compiled in this process than from the cache."""
+    called = {callee for function in compiled_functions(package) for callee in callees(function)}
+    fast = {function for function in called if depends_on_optimisation(function)}
+    assert fast
+    assert {f.py_func.__name__ for f in fast if not f.targetoptions.get("forceinline")} == set()
