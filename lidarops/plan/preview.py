@@ -1,7 +1,7 @@
-"""Plan -> plan, in the worker: a look at a few profiles leaves out what would give nothing.
+"""Refine a plan in the worker: leave out sections in which sampled profiles show no signal.
 
-The rules of `lidarops.plan.scene_plan` know headers alone. These know what some profiles show. What they
-leave out stands in the product as missing, with the quality bit that the retrieval would give.
+The rules of `lidarops.plan.scene_plan` know headers only; these rules see some profiles. Sections
+that they leave out are missing in the product, with the quality bit that the retrieval would set.
 """
 
 from __future__ import annotations
@@ -18,67 +18,73 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.plan.signal_rules import Decisions, Rule, StepName, applied
 from lidarops.records import Granule, LeftOut, Plan, Step
-from lidarops.retrieve.background.detectable_light import Look, look_for_light, spaced
+from lidarops.retrieve.background.detectable_light import (
+    LightDetection,
+    detect_light,
+    spaced_indices,
+)
 
 GAP: Final = timedelta(minutes=10)
-"""Longest time between profiles that are looked at where the first ones show nothing."""
+"""Longest time between sampled profiles where the first sample shows no signal."""
 DARK: Final = 3.0
-"""Significance below which no first profile shows light; a retrieval is accepted above 5. Noise
-alone lifts the largest of 16 above 3 in 2 % of scenes, above 1.7 in half."""
+"""Significance below which no profile of the first sample shows a signal; a retrieval is accepted
+above 5. Noise alone lifts the largest of 16 above 3 in 2 % of scenes, above 1.7 in half."""
 STILL_DARK: Final = 3.5
-"""The same for the many profiles of the second look, of which noise alone lifts some."""
-WITHOUT: Final = "left_out"
+"""The same for the second sample, which has more profiles and so larger noise maxima."""
+OMITTED: Final = "left_out"
 """Setting of a homogeneous step: sections that are not retrieved, with the bit that says why."""
 
 Profiles = Callable[[str, Sequence[Granule]], xr.Dataset]
-"""Gives power, variance and quality of a channel in some granules."""
+"""Returns power, variance and quality of a channel in some granules."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """What the rules of one section look at."""
+class SectionCase:
+    """One section of a homogeneous step, with what sampled profiles show there."""
 
     step: Step
     near: float
     """m."""
     far: float
     """m."""
-    first: Look
-    all: Look
-    """Of the second look, where there was one; else the first."""
+    first: LightDetection
+    all: LightDetection
+    """Of both samples together, where there was a second one; else `first`."""
 
     def without(self, reason: str, number: float) -> LeftOut:
         """Return the section as left out."""
-        told = f"section {self.near:g}-{self.far:g} m: {reason}"
-        return LeftOut(self.step.name, self.step.channel, told, self.step.instrument, number=number)
+        reason = f"section {self.near:g}-{self.far:g} m: {reason}"
+        return LeftOut(
+            self.step.name, self.step.channel, reason, self.step.instrument, number=number
+        )
 
 
-def _dark(sight: Sight) -> Decisions:
+def _dark(sight: SectionCase) -> Decisions:
     if sight.first.significance < DARK and sight.all.significance < STILL_DARK:
         most = max(sight.first.significance, sight.all.significance)
         reason = (
-            f"{sight.all.profiles} profiles, {GAP.total_seconds() / 60:g} min apart at most, show"
-            f" no light: {most:.1f} standard errors at most, and {STILL_DARK:g} are none"
+            f"no signal in {sight.all.profiles} profiles at most {GAP.total_seconds() / 60:g} min"
+            f" apart: at most {most:.1f} standard errors (limit {STILL_DARK:g})"
         )
         yield sight.without(reason, most)
 
 
-def _saturated(sight: Sight) -> Decisions:
+def _saturated(sight: SectionCase) -> Decisions:
     if sight.first.unsaturated == sight.all.unsaturated == 0:
         reason = (
-            f"all of {sight.all.profiles} profiles, {GAP.total_seconds() / 60:g} min apart at"
-            " most, are saturated"
+            f"all {sight.all.profiles} profiles, at most {GAP.total_seconds() / 60:g} min apart,"
+            " are saturated"
         )
         yield sight.without(reason, 0.0)
 
 
 SECTION_DARK: Final = Rule(
-    "section_dark", StepName.HOMOGENEOUS, "Does a profile show light in the section?", _dark
+    "section_dark", StepName.HOMOGENEOUS, "Does a profile show a signal in the section?", _dark
 )
 SECTION_SATURATED: Final = Rule(
     "section_saturated",
     StepName.HOMOGENEOUS,
-    "Is a profile not saturated in the section?",
+    "Is any profile unsaturated in the section?",
     _saturated,
 )
 REFINEMENTS: Final = (SECTION_SATURATED, SECTION_DARK)
@@ -89,23 +95,22 @@ _BITS: Final[Mapping[str, Quality]] = {
 
 
 def refine_plan(plan: Plan, granules: Sequence[Granule], profiles: Profiles) -> Plan:
-    """Leave out of a plan the sections in which there is nothing to retrieve.
+    """Return a plan without the sections in which there is nothing to retrieve.
 
     Parameters
     ----------
     plan : Plan
     granules : sequence of Granule
-        Usable ones of the scene, by time.
+        Usable granules of the scene, by time.
     profiles : callable
-        Of a channel and some of the granules.
+        Returns the profiles of a channel in some of the granules.
 
     Returns
     -------
     Plan
-        The same for the same files, whatever the chunks and workers; unchanged where it was
-        refined before.
+        Independent of chunks and workers; unchanged where it was refined before.
     """
-    looking = {
+    sample_sizes = {
         step.channel: int(step.settings["profiles"])
         for step in plan.steps
         if step.name == StepName.LOOK
@@ -113,10 +118,10 @@ def refine_plan(plan: Plan, granules: Sequence[Granule], profiles: Profiles) -> 
     steps = []
     left_out = list(plan.left_out)
     for step in plan.steps:
-        if step.name == StepName.HOMOGENEOUS and step.channel in looking and granules:
-            found = _sections(step, granules, profiles, looking[step.channel])
-            left_out += found.values()
-            steps.append(_without(step, found))
+        if step.name == StepName.HOMOGENEOUS and step.channel in sample_sizes and granules:
+            omitted = _sections(step, granules, profiles, sample_sizes[step.channel])
+            left_out += omitted.values()
+            steps.append(_without(step, omitted))
         else:
             steps.append(step)
     return replace(plan, steps=tuple(steps), left_out=tuple(left_out))
@@ -126,10 +131,10 @@ def _sections(
     step: Step, granules: Sequence[Granule], profiles: Profiles, most: int
 ) -> dict[tuple[float, float], LeftOut]:
     """Return the sections that are left out, and why."""
-    before = {(near, far) for near, far, _ in step.settings.get(WITHOUT, ())}
-    asked = [(n, f) for n, f in step.settings["sections"] if (n, f) not in before]
-    places = spaced(len(granules), most)
-    first = _looks(profiles(step.channel, [granules[k] for k in places]), asked)
+    before = {(near, far) for near, far, _ in step.settings.get(OMITTED, ())}
+    sections = [(n, f) for n, f in step.settings["sections"] if (n, f) not in before]
+    places = spaced_indices(len(granules), most)
+    first = _looks(profiles(step.channel, [granules[k] for k in places]), sections)
     doubtful = [
         section
         for section, seen in first.items()
@@ -137,26 +142,27 @@ def _sections(
     ]
     if not doubtful:
         return {}
-    rest = [granules[k] for k in _second(granules, places)]
-    # Together with the first, so that either look counts all that was looked at.
-    again = _looks(profiles(step.channel, rest), doubtful) if rest else {}
-    found = {}
+    rest = [granules[k] for k in _second_places(granules, places)]
+    second = _looks(profiles(step.channel, rest), doubtful) if rest else {}
+    omitted = {}
     for section in doubtful:
-        sight = Sight(step, *section, first[section], _joined(first[section], again.get(section)))
-        decision = next(applied(REFINEMENTS, sight), None)
+        both = _merged_looks(first[section], second.get(section))
+        decision = next(
+            applied(REFINEMENTS, SectionCase(step, *section, first[section], both)), None
+        )
         if isinstance(decision, LeftOut):
-            found[section] = decision
-    return found
+            omitted[section] = decision
+    return omitted
 
 
-def _second(granules: Sequence[Granule], places: npt.NDArray[np.int64]) -> list[int]:
-    """Return further places, so that no two that are looked at lie farther apart than `GAP`."""
-    looked = {int(place) for place in places}
+def _second_places(granules: Sequence[Granule], places: npt.NDArray[np.int64]) -> list[int]:
+    """Return the indices of further granules, so that samples are at most `GAP` apart."""
+    sampled = {int(place) for place in places}
     more = []
     last: datetime | None = None
     for place, granule in enumerate(granules):
         following = granules[place + 1].start if place + 1 < len(granules) else None
-        if place in looked:
+        if place in sampled:
             last = granule.start
         elif last is None or following is None or following - last > GAP:
             more.append(place)
@@ -164,10 +170,10 @@ def _second(granules: Sequence[Granule], places: npt.NDArray[np.int64]) -> list[
     return more
 
 
-def _joined(first: Look, second: Look | None) -> Look:
+def _merged_looks(first: LightDetection, second: LightDetection | None) -> LightDetection:
     if second is None:
         return first
-    return Look(
+    return LightDetection(
         first.profiles + second.profiles,
         max(first.significance, second.significance),
         first.unsaturated + second.unsaturated,
@@ -176,19 +182,19 @@ def _joined(first: Look, second: Look | None) -> Look:
 
 def _looks(
     profiles: xr.Dataset, sections: Sequence[tuple[float, float]]
-) -> dict[tuple[float, float], Look]:
+) -> dict[tuple[float, float], LightDetection]:
     power, variance, quality, distance = (
         profiles[name].to_numpy() for name in ("power", "variance", "quality", "range")
     )
     return {
-        (near, far): look_for_light(power, variance, quality, distance, near, far)
+        (near, far): detect_light(power, variance, quality, distance, near, far)
         for near, far in sections
     }
 
 
-def _without(step: Step, found: Mapping[tuple[float, float], LeftOut]) -> Step:
-    if not found:
+def _without(step: Step, omitted: Mapping[tuple[float, float], LeftOut]) -> Step:
+    if not omitted:
         return step
-    told: list[list[Any]] = [*step.settings.get(WITHOUT, ())]
-    told += [[*section, _BITS[left.rule].name] for section, left in found.items()]
-    return replace(step, settings={**step.settings, WITHOUT: told})
+    entries: list[list[Any]] = [*step.settings.get(OMITTED, ())]
+    entries += [[*section, _BITS[left.rule].name] for section, left in omitted.items()]
+    return replace(step, settings={**step.settings, OMITTED: entries})

@@ -22,7 +22,7 @@ from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.background import cubic_and_tail, known_shape
+from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
 from lidarops.retrieve.elastic import inversion, layers, reference_window
 from lidarops.retrieve.homogeneous import path_fit
 
@@ -40,7 +40,7 @@ CLEAN_FROM: Final = 6000.0
 OVERLAP: Final = 400.0
 """m, from where on the inversion uses the signal."""
 COMPARED: Final = (500.0, 6000.0)
-GIVEN: Final = (7000.0, 8000.0)
+GIVEN_WINDOW: Final = (7000.0, 8000.0)
 CANDIDATES: Final = reference_window.candidate_windows(4000.0, 12000.0, 1000.0, 250.0)
 
 _SEED: Final = 20040101
@@ -157,16 +157,16 @@ class BackgroundEstimates:
     """A quality bit that says not to use the value."""
 
 
-Way = Callable[[Array, SimulatedSky], BackgroundEstimates]
+BackgroundMethod = Callable[[Array, SimulatedSky], BackgroundEstimates]
 """From counts (profile, range) and the set they stem from to backgrounds."""
 
 KNOWN_SHAPE: Final = "known_shape"
-TOLD: Final = "known_shape, told 6 km"
+KNOWN_CLEAN_RANGE: Final = "known_shape, told 6 km"
 TAIL_MEAN: Final = "tail_mean"
 HOMOGENEOUS: Final = "homogeneous"
 
 
-def background_methods() -> dict[str, Way]:
+def background_methods() -> dict[str, BackgroundMethod]:
     """Return the ways to find the background by name.
 
     `homogeneous` and `cubic` solve for a path along which nothing changes, which a vertical one
@@ -174,7 +174,7 @@ def background_methods() -> dict[str, Way]:
     """
     return {
         KNOWN_SHAPE: _known_shape,
-        TOLD: _told,
+        KNOWN_CLEAN_RANGE: _told,
         TAIL_MEAN: _tail_mean,
         HOMOGENEOUS: _homogeneous,
         "cubic": _cubic,
@@ -200,7 +200,7 @@ def _tail_mean(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
 
 def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
-    variance = path_fit.mean_profile_variance(counts[:, far], SHOTS)
+    variance = photon_counts.mean_profile_variance(counts[:, far], SHOTS)
     found = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
     return _found(found.background, found.background_standard_error, found.quality)
 
@@ -247,23 +247,23 @@ class Inverted:
     """Profiles with a reference window."""
 
 
-def variance(counts: Array) -> Array:
+def count_variance(counts: Array) -> Array:
     """Return the variance of mean counts, as one who knows no truth has it."""
     # A bin without a count has one at most.
     return np.maximum(counts, 1.0 / SHOTS) / SHOTS
 
 
-def cleared(counts: Array, sky: SimulatedSky, found: BackgroundEstimates) -> Array:
+def subtract_background(counts: Array, sky: SimulatedSky, found: BackgroundEstimates) -> Array:
     """Return counts without background; NaN where the inversion is not to use them."""
     return np.where(sky.inverted, counts - found.background[:, np.newaxis], np.nan)
 
 
-def screened(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
+def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
     """Return the clouds, none of which are there."""
     return layers.find_layers(power, sky.range, noise, molecular_attenuated=sky.shape)
 
 
-def chosen_window(
+def choose_window(
     power: Array, noise: Array, sky: SimulatedSky, exclude: npt.NDArray[np.bool_] | None = None
 ) -> reference_window.ReferenceWindow:
     """Return the reference windows out of `CANDIDATES`."""
@@ -277,7 +277,7 @@ def chosen_window(
     )
 
 
-def particles_of(
+def invert_particles(
     power: Array,
     sky: SimulatedSky,
     edges: tuple[npt.ArrayLike, npt.ArrayLike],
@@ -307,7 +307,7 @@ class Chain:
     way: str
     """To find the background."""
     choose: bool = False
-    """The reference window, instead of `GIVEN`."""
+    """The reference window, instead of `GIVEN_WINDOW`."""
     carried: float = 0.0
     """What the particles that the noise hides in a chosen window may add to it: standard errors
     of the window, stated as error of the reference (`lidarops.retrieve.elastic.reference_window.choose_reference`)."""
@@ -334,15 +334,15 @@ def invert(counts: Array, sky: SimulatedSky, found: BackgroundEstimates, chain: 
         The background, as the chain finds it.
     chain : Chain
     """
-    power, noise = cleared(counts, sky, found), variance(counts)
-    edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN
+    power, noise = subtract_background(counts, sky, found), count_variance(counts)
+    edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
     calibrated = np.ones(len(counts), dtype=np.bool_)
     hidden: npt.ArrayLike = 0.0
     if chain.choose:
-        window = chosen_window(power, noise, sky, screened(power, noise, sky).mask)
+        window = choose_window(power, noise, sky, find_clouds(power, noise, sky).mask)
         edges, calibrated = window.edges, window.chosen
         hidden = np.nan_to_num(chain.carried * window.scale_standard_error / window.scale)
-    solved = particles_of(
+    solved = invert_particles(
         power,
         sky,
         edges,
@@ -374,11 +374,11 @@ def lstsq_backgrounds(counts: Array, sky: SimulatedSky) -> Array:
 def klett_python(power: Array, sky: SimulatedSky) -> Array:
     """Return the backscatter of particles by loops over profiles and bins, without errors.
 
-    fernald1984, backward and forward from the middle of `GIVEN`, by trapezoids.
+    fernald1984, backward and forward from the middle of `GIVEN_WINDOW`, by trapezoids.
     """
     distance = sky.range.tolist()
     air, loss = sky.molecular_backscatter.tolist(), sky.molecular_extinction.tolist()
-    inside = [k for k, r in enumerate(distance) if GIVEN[0] <= r <= GIVEN[1]]
+    inside = [k for k, r in enumerate(distance) if GIVEN_WINDOW[0] <= r <= GIVEN_WINDOW[1]]
     found = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
     return np.asarray(found)
 
@@ -410,7 +410,7 @@ def _klett(
 
 def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
     """Return the same as `klett_python` by cumulative sums, profile by profile."""
-    inside = np.flatnonzero((sky.range >= GIVEN[0]) & (sky.range <= GIVEN[1]))
+    inside = np.flatnonzero((sky.range >= GIVEN_WINDOW[0]) & (sky.range <= GIVEN_WINDOW[1]))
     start = inside[inside.size // 2]
     excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter
     found = np.empty(power.shape)
@@ -447,7 +447,7 @@ class Published:
     """Standard error of that truth, counts."""
 
 
-def published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]]:
+def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]]:
     """Read the files of the EARLINET elastic intercomparison at 532 nm.
 
     Parameters
@@ -459,7 +459,7 @@ def published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]]:
     Returns
     -------
     Sky
-        The backscatter is that of the noise-free signal with the reference window `GIVEN`.
+        The backscatter is that of the noise-free signal with the reference window `GIVEN_WINDOW`.
     list of Published
         By rising background.
 
@@ -507,7 +507,7 @@ def _published_sky(folder: Path) -> SimulatedSky:
     clean = _raw_counts(folder / "noise_free.licel")
     sky = _sky(air, clean, np.full(RANGE.size, np.nan))
     power = np.where(sky.inverted, sky.signal, np.nan)
-    return replace(sky, backscatter=particles_of(power, sky, GIVEN).backscatter)
+    return replace(sky, backscatter=invert_particles(power, sky, GIVEN_WINDOW).backscatter)
 
 
 def _published(file: Path, level: float, sky: SimulatedSky) -> Published:

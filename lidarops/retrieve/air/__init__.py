@@ -1,1 +1,14 @@
-"""Molecular atmosphere and visibility."""
+"""Air: its molecules and its visibility.
+
+`molecular` gives number density, extinction and backscatter of molecules from the US Standard
+Atmosphere or a sounding (`MolecularProfile`). `visibility` converts extinction to 550 nm
+(`at_reference_wavelength`) and then to visibility (`visibility_from_extinction`).
+
+`labeled.visibility_of_extinction` does the latter on `xarray` data; import it from its module, so
+that the numerics stay free of xarray.
+"""
+
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.air.visibility import at_reference_wavelength, visibility_from_extinction
+
+__all__ = ["MolecularProfile", "at_reference_wavelength", "visibility_from_extinction"]

@@ -1,4 +1,4 @@
-"""Visibility over xarray: `lidarops.retrieve.air.visibility` of extinction with two kinds of errors."""
+"""Visibility over xarray, from extinction with a random and a systematic error."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ NAMES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """What visibility is."""
+    """Definition of visibility: wavelength of extinction, contrast threshold, wavelength law."""
 
     wavelength: float
-    """m, of extinction."""
+    """m, at which extinction is measured."""
     contrast: float = visibility.MOR_CONTRAST
     law: str = "none"
-    """How extinction is brought to 550 nm."""
+    """Law that converts extinction to 550 nm."""
     angstrom_exponent: float | None = None
     exponent_standard_error: float = 0.0
-    """Of the law's exponent of wavelength."""
+    """Standard error of the exponent of the law."""
 
     @property
     def words(self) -> str:
-        """What visibility is, in words."""
+        """The definition in words, for attributes."""
         colour = f"at {self.wavelength * 1e9:g} nm"
         if self.law != visibility.WavelengthLaw.NONE:
             colour = f"brought from {self.wavelength * 1e9:g} to 550 nm by the law {self.law}"
@@ -51,7 +51,7 @@ def visibility_of_extinction(
     systematic_error: xr.DataArray,
     definition: Definition,
 ) -> xr.Dataset:
-    """Return visibility, its random standard error, and its interval by all errors.
+    """Return visibility, its random standard error, and its interval from both errors.
 
     Parameters
     ----------
@@ -64,52 +64,52 @@ def visibility_of_extinction(
     xr.Dataset
         ``visibility_in_air``, ``visibility_in_air_standard_error``, ``visibility_in_air_lower``
         and ``visibility_in_air_upper``, m: NaN where extinction is missing or not positive. The
-        interval is that of extinction plus and minus the root of the sum of squares of both
-        errors, turned over; its upper end is inf where that reaches zero.
+        interval follows from extinction plus and minus the root of the sum of squares of both
+        errors; its upper end is inf where that reaches zero.
 
     Raises
     ------
     RetrievalInputError
-        For a contrast, law or wavelength that cannot be right.
+        For an invalid contrast, law or wavelength.
     """
-    found = xr.apply_ufunc(
-        _seen,
+    values = xr.apply_ufunc(
+        _visibility,
         extinction,
         standard_error,
         systematic_error,
         output_core_dims=[[]] * len(NAMES),
         kwargs={"definition": definition},
     )
-    return xr.Dataset(dict(zip(NAMES, found, strict=True)))
+    return xr.Dataset(dict(zip(NAMES, values, strict=True)))
 
 
-def _seen(
+def _visibility(
     extinction: npt.NDArray[Any],
     standard_error: npt.NDArray[Any],
     systematic_error: npt.NDArray[Any],
     definition: Definition,
 ) -> tuple[Array, ...]:
-    whole = np.hypot(standard_error.astype(np.float64), systematic_error)
-    first, last = (
-        _from(extinction, error, spread, definition)
+    total_error = np.hypot(standard_error.astype(np.float64), systematic_error)
+    random, total = (
+        _at_550_nm(extinction, error, spread, definition)
         for error, spread in (
             (standard_error, 0.0),
-            (whole, definition.exponent_standard_error),
+            (total_error, definition.exponent_standard_error),
         )
     )
     return (
-        first.visibility,
-        first.visibility_standard_error,
-        last.visibility_lower,
-        # Where nothing is seen, no limit of it is.
-        np.where(np.isfinite(first.visibility), last.visibility_upper, np.nan),
+        random.visibility,
+        random.visibility_standard_error,
+        total.visibility_lower,
+        # No limit without a visibility.
+        np.where(np.isfinite(random.visibility), total.visibility_upper, np.nan),
     )
 
 
-def _from(
+def _at_550_nm(
     extinction: npt.NDArray[Any], error: npt.NDArray[Any], spread: float, definition: Definition
 ) -> visibility.VisibilityResult:
-    brought = visibility.at_reference_wavelength(
+    reference = visibility.at_reference_wavelength(
         extinction,
         error,
         wavelength=definition.wavelength,
@@ -118,5 +118,5 @@ def _from(
         exponent_standard_error=spread,
     )
     return visibility.visibility_from_extinction(
-        brought.extinction, brought.extinction_standard_error, contrast=definition.contrast
+        reference.extinction, reference.extinction_standard_error, contrast=definition.contrast
     )

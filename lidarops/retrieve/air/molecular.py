@@ -1,7 +1,7 @@
-"""The clear atmosphere: how many molecules it holds, and how they scatter.
+"""Number density and Rayleigh scattering of the molecular atmosphere.
 
 Pressure and temperature are those of the US Standard Atmosphere 1976 or of a sounding; Rayleigh
-scattering follows from the number of molecules in a volume.
+scattering follows from the number density.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ SEA_LEVEL_PRESSURE: Final = 101_325.0
 """Pa (`us1976`)."""
 
 LOWEST: Final = -5_000.0
-"""m, where the standard atmosphere begins here."""
+"""m, lower end of the standard atmosphere as implemented here."""
 
 HIGHEST: Final = 84_000.0
-"""m. Above, the mean molar mass of air falls and the formula here no longer holds."""
+"""m. Above, the molar mass of air decreases and the formula no longer holds."""
 
 CARBON_DIOXIDE: Final = 360e-6
 """Mole fraction of the fit of `bodhaine1999`; 420 ppm raise the cross section by 3e-5."""
 
-# The constants of `us1976`: they define the standard and are not to be modernised.
+# Constants of `us1976`: they define the standard; do not update them.
 _GRAVITY: Final = 9.80665
 _MOLAR_MASS: Final = 0.0289644
 _GAS_CONSTANT: Final = 8.31432
@@ -45,14 +45,14 @@ _BASE_TEMPERATURE: Final = np.concatenate(
 )
 
 _MOLECULES: Final = 2.546899e25
-"""m-3 at 288.15 K and 1013.25 hPa, where the refractive index holds (`bodhaine1999`)."""
+"""m-3 at 288.15 K and 1013.25 hPa, the conditions of the refractive index (`bodhaine1999`)."""
 
 _COLDEST: Final = 120.0
 _WARMEST: Final = 350.0
 """K; no air below 84 km is colder or warmer."""
 
 _SURFACE: Final = 9_000.0
-"""m, up to which there is ground for a profile to begin at."""
+"""m, highest ground at which a profile may begin."""
 
 
 def _pressure_ratio(layer: NDArray[np.intp], rise: Array) -> Array:
@@ -115,7 +115,7 @@ def us_standard(altitude: ArrayLike) -> tuple[Array, Array]:
 
 
 def number_density(pressure: Array, temperature: Array) -> Array:
-    """Return the molecules in a volume of ideal gas, m-3, from Pa and K."""
+    """Return the number density of an ideal gas, m-3, from Pa and K."""
     return pressure / (BOLTZMANN_CONSTANT * temperature)
 
 
@@ -151,8 +151,8 @@ def king_factor(wavelength: ArrayLike) -> Array:
     nitrogen = 1.034 + 3.17e-4 * s2
     oxygen = 1.096 + 1.385e-3 * s2 + 1.448e-4 * s2**2
     dioxide = 100.0 * CARBON_DIOXIDE
-    parts = 78.084 * nitrogen + 20.946 * oxygen + 0.934 * 1.00 + dioxide * 1.15
-    return np.asarray(parts / (78.084 + 20.946 + 0.934 + dioxide))
+    weighted_sum = 78.084 * nitrogen + 20.946 * oxygen + 0.934 * 1.00 + dioxide * 1.15
+    return np.asarray(weighted_sum / (78.084 + 20.946 + 0.934 + dioxide))
 
 
 def rayleigh_cross_section(wavelength: ArrayLike) -> Array:
@@ -210,26 +210,26 @@ def molecular_lidar_ratio(wavelength: ArrayLike) -> Array:
 
 
 class Extrapolation(StrEnum):
-    """What a profile says of altitudes that it does not reach."""
+    """Treatment of altitudes beyond the levels of a profile."""
 
     SCALED_STANDARD = "scaled_standard"
-    """The US Standard Atmosphere, scaled to meet the pressure and temperature of its end."""
+    """US Standard Atmosphere, scaled to the pressure and temperature of the last level."""
     REFUSED = "refused"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MolecularProfile:
-    """Pressure and temperature of the air over altitude, and how its molecules scatter.
+    """Pressure and temperature of the air over altitude, with its molecular scattering.
 
     Between levels the logarithm of pressure and the temperature are linear in altitude. Above
-    84 km there is nothing: less than 1e-5 of the air at the ground is left there.
+    84 km the number density is 0: less than 1e-5 of that at the ground remains.
 
     Raises
     ------
     RetrievalInputError
-        Where the levels are not air: altitude that does not rise or is in km or feet, pressure
-        in hPa, temperature in Celsius, or levels that contradict the hydrostatic equation by
-        more than a tenth.
+        Where the levels are not those of air: altitude not ascending or in km or feet, pressure
+        in hPa, temperature in Celsius, or a deviation from hydrostatic balance of more than a
+        tenth.
     """
 
     altitude: Array
@@ -262,12 +262,12 @@ class MolecularProfile:
         Parameters
         ----------
         altitude : array_like, m, optional
-            Ascending, -5 to 84 km; every 100 m and where the lapse rate changes where not given,
-            so that the number of molecules is interpolated to 6e-6.
+            Ascending, -5 to 84 km. Where not given, levels are every 100 m and where the lapse
+            rate changes, which interpolates the number density to 6e-6.
         """
         if altitude is None:
-            bends = _EARTH_RADIUS * _BASE / (_EARTH_RADIUS - _BASE)
-            altitude = np.union1d(np.linspace(LOWEST, HIGHEST, 891), bends)
+            layer_bases = _EARTH_RADIUS * _BASE / (_EARTH_RADIUS - _BASE)
+            altitude = np.union1d(np.linspace(LOWEST, HIGHEST, 891), layer_bases)
         return cls(np.asarray(altitude, dtype=np.float64), *us_standard(altitude))
 
     @classmethod
@@ -289,15 +289,15 @@ class MolecularProfile:
         pressure : array_like
         temperature : array_like, K
         pressure_unit : {"Pa", "hPa"}, optional
-            Told from the lowest level where not given: near 1013 it is hPa, near 101300 Pa.
-            A unit that is given must agree with it.
+            Detected from the lowest level where not given: near 1013 it is hPa, near 101300 Pa.
+            A given unit must agree with it.
         extrapolation : Extrapolation
 
         Raises
         ------
         RetrievalInputError
             Where the lowest pressure is neither near that of the standard atmosphere in Pa nor
-            in hPa, or anything else is not air.
+            in hPa, or the levels are not those of air.
         """
         z, p = _levels("altitude", altitude), _levels("pressure", pressure)
         _check_altitude(z)
@@ -338,7 +338,7 @@ class MolecularProfile:
         )
 
     def number_density(self, altitude: ArrayLike) -> Array:
-        """Return molecules per volume, m-3; 0 above 84 km.
+        """Return the number density of molecules, m-3; 0 above 84 km.
 
         Parameters
         ----------
@@ -372,7 +372,7 @@ class MolecularProfile:
         return self.extinction(altitude, wavelength) / molecular_lidar_ratio(wavelength)
 
     def column(self, bottom: float, top: float) -> float:
-        """Return the molecules above a unit of area between two altitudes, m-2.
+        """Return the column of molecules between two altitudes, m-2.
 
         Parameters
         ----------
@@ -386,7 +386,7 @@ class MolecularProfile:
 
         Notes
         -----
-        Gauss quadrature of two nodes in every 50 m: 1e-6 of the integral of the interpolation.
+        Gauss quadrature with two nodes per 50 m, accurate to 1e-6.
         """
         if not (math.isfinite(bottom) and bottom < top < math.inf):
             raise RetrievalInputError(f"{top:g} m is not higher than {bottom:g} m", field="top")
@@ -431,7 +431,7 @@ def _levels(field: str, values: ArrayLike) -> Array:
         raise RetrievalInputError("needs at least 2 levels on one axis", field=field)
     if not np.all(np.isfinite(levels)):
         raise RetrievalInputError(
-            "has values that are not finite", field=field, remedy="leave such levels out"
+            "has values that are not finite", field=field, remedy="remove such levels"
         )
     levels.setflags(write=False)
     return levels
@@ -439,9 +439,7 @@ def _levels(field: str, values: ArrayLike) -> Array:
 
 def _check_altitude(altitude: Array) -> None:
     if not np.all(np.diff(altitude) > 0.0):
-        raise RetrievalInputError(
-            "must rise from level to level", field="altitude", remedy="sort the levels"
-        )
+        raise RetrievalInputError("is not ascending", field="altitude", remedy="sort the levels")
     if altitude[0] < LOWEST or altitude[-1] > HIGHEST:
         raise RetrievalInputError(
             f"reaches from {altitude[0]:g} to {altitude[-1]:g} m",
@@ -468,7 +466,7 @@ def _unit(altitude: float, pressure: float, named: str | None) -> str:
         raise RetrievalInputError(
             f"is {named!r}", field="pressure_unit", remedy=f"choose one of {', '.join(_UNITS)}"
         )
-    # Weather changes the pressure of the ground by a tenth, that of the stratosphere by half.
+    # Weather changes the pressure at the ground by a tenth, in the stratosphere by half.
     slack = 1.25 if altitude <= _SURFACE else 2.0
     standard = float(us_standard(altitude)[0])
     for unit, scale in _UNITS.items():
@@ -488,7 +486,7 @@ def _unit(altitude: float, pressure: float, named: str | None) -> str:
 
 def _check_pressure(altitude: Array, pressure: Array) -> None:
     if not (pressure[-1] > 0.0 and np.all(np.diff(pressure) < 0.0)):
-        raise RetrievalInputError("must be positive and fall with altitude", field="pressure")
+        raise RetrievalInputError("must be positive and decrease with altitude", field="pressure")
     if _unit(float(altitude[0]), float(pressure[0]), None) != "Pa":
         raise RetrievalInputError(
             f"{pressure[0]:g} at {altitude[0]:g} m is hPa",
@@ -498,12 +496,12 @@ def _check_pressure(altitude: Array, pressure: Array) -> None:
 
 
 def _check_balance(altitude: Array, pressure: Array, temperature: Array) -> None:
-    """Refuse levels whose distances do not follow from pressure and temperature."""
+    """Reject levels that are not in hydrostatic balance with pressure and temperature."""
     mean = (temperature[:-1] + temperature[1:]) / 2.0
     scale = _GAS_CONSTANT / (_MOLAR_MASS * _GRAVITY)
     expected = np.cumsum(-scale * mean * np.diff(np.log(pressure)))
     rise = altitude[1:] - altitude[0]
-    # 200 m: soundings round pressure to a tenth of hPa, which is much where little is left.
+    # 200 m: soundings round pressure to 0.1 hPa, a large share of low pressures.
     wrong = np.abs(expected - rise) > 0.1 * expected + 200.0
     if not np.any(wrong):
         return

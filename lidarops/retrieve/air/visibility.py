@@ -1,4 +1,4 @@
-"""Meteorological visibility from extinction: Koschmieder's law, and the step to 550 nm."""
+"""Meteorological visibility from extinction: conversion to 550 nm and Koschmieder's law."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ PAPER_CONTRAST: Final = float(np.exp(-3.0))
 REFERENCE_WAVELENGTH: Final = 550e-9
 """m, where visibility is defined."""
 LARGEST_EXTINCTION: Final = 10.0
-"""m-1, ten times that of the densest smoke: a guard of units."""
+"""m-1, ten times that of the densest smoke; larger values must be in km-1."""
 LARGE_RELATIVE_ERROR: Final = 0.1
-"""Of extinction; above, the interval of visibility is asymmetric by more than 10 percent."""
+"""Relative error of extinction above which the interval of visibility is asymmetric by more than
+10 percent."""
 
 _KRUSE_NEAR: Final = 6000.0
 _KRUSE_FAR: Final = 50_000.0
 _KRUSE_PASSES: Final = 60
-"""Of a fixed point that contracts by at least 0.7 a pass at any wavelength from 200 nm to 2 um."""
+"""Passes of a fixed-point iteration that contracts by at least 0.7 per pass from 200 nm to 2 um."""
 
 
 class WavelengthLaw(StrEnum):
-    """How extinction changes with wavelength."""
+    """Dependence of extinction on wavelength."""
 
     NONE = "none"
     """Visibility at the wavelength of the lidar."""
@@ -48,14 +49,14 @@ class WavelengthLaw(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ReferenceExtinction:
-    """Extinction at 550 nm, with the shape of the extinction that it was made of."""
+    """Extinction at 550 nm, with the shape of the input."""
 
     extinction: Array
     """m-1."""
     extinction_standard_error: Array
     """m-1."""
     exponent: Array
-    """1, of wavelength, with the sign changed (the Angstrom exponent)."""
+    """1, the Angstrom exponent: the negative exponent of wavelength."""
     ambiguous: Booleans
     """True where two visibilities obey the law; the lower is taken."""
     law: WavelengthLaw
@@ -63,12 +64,12 @@ class ReferenceExtinction:
 
 @dataclass(frozen=True, slots=True)
 class VisibilityResult:
-    """Visibility, with the shape of the extinction that it was made of."""
+    """Visibility, with the shape of the extinction."""
 
     visibility: Array
     """m; NaN where extinction is missing or not positive."""
     visibility_standard_error: Array
-    """m, linear; where `asymmetric`, use the interval."""
+    """m, to first order; where `asymmetric`, use the interval."""
     visibility_lower: Array
     """m, of extinction plus its standard error."""
     visibility_upper: Array
@@ -76,7 +77,7 @@ class VisibilityResult:
     asymmetric: Booleans
     """True where the relative standard error of extinction exceeds 0.1."""
     unbounded: Booleans
-    """True where no upper end can be told."""
+    """True where the interval has no upper end."""
     contrast: float
     """1, the contrast threshold of the definition."""
 
@@ -104,12 +105,12 @@ def visibility_from_extinction(
     *,
     contrast: float = MOR_CONTRAST,
 ) -> VisibilityResult:
-    r"""Return the distance at which a black object's contrast falls to a threshold.
+    r"""Return the distance at which the contrast of a black object falls to a threshold.
 
     .. math:: V = -\ln(\epsilon) / \sigma
 
-    Visibility is the reciprocal of a quantity with a standard error: its interval is that of
-    extinction, turned over. The linear standard error is its half-width to first order only.
+    The interval of visibility follows from that of extinction. The standard error is its
+    half-width to first order only.
 
     Parameters
     ----------
@@ -128,7 +129,7 @@ def visibility_from_extinction(
     ------
     RetrievalInputError
         For a contrast not between 0 and 1, negative errors, shapes that do not fit, or
-        extinction above 10 m-1, which is in km-1.
+        extinction above 10 m-1, which must be in km-1.
 
     References
     ----------
@@ -168,9 +169,9 @@ def at_reference_wavelength(
     .. math:: \sigma_{550} = \sigma_\lambda (\lambda / 550\,\mathrm{nm})^{q}
 
     Kruse's exponent depends on the visibility V (contrast 0.02) itself: q = 1.6 above 50 km,
-    1.3 from 6 km, 0.585 (V / km)^(1/3) below. V is found from its implicit equation. The law
-    jumps at 6 and 50 km: a jump is bridged at its visibility where no branch holds (beyond
-    550 nm), and the lower visibility is taken, and marked, where two hold.
+    1.3 from 6 km, 0.585 (V / km)^(1/3) below, so that V follows from an implicit equation. The
+    law jumps at 6 and 50 km. Where no branch holds (beyond 550 nm), visibility is that of the
+    jump; where two hold, the lower visibility is taken and marked as ambiguous.
 
     Parameters
     ----------
@@ -182,7 +183,7 @@ def at_reference_wavelength(
     exponent : (...) float, optional
         Angstrom exponent, for "angstrom" only.
     exponent_standard_error : float
-        Its standard error, or the spread of the law's exponent; propagated.
+        Standard error of the exponent, or spread of the exponent of the law; propagated.
 
     Returns
     -------
@@ -192,7 +193,7 @@ def at_reference_wavelength(
     ------
     RetrievalInputError
         For an unknown law, a wavelength outside 200 nm to 2 um, or an exponent that is missing
-        or not wanted.
+        or does not apply.
 
     References
     ----------
@@ -206,7 +207,7 @@ def at_reference_wavelength(
         )
     if (exponent is None) == (chosen is WavelengthLaw.ANGSTROM):
         raise RetrievalInputError(
-            f"goes with the law 'angstrom' only, which needs it; the law is '{chosen}'",
+            f"belongs to the law 'angstrom' only, which requires it; the law is '{chosen}'",
             field="exponent",
         )
     if not exponent_standard_error >= 0:
@@ -228,10 +229,11 @@ def at_reference_wavelength(
 
 
 def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array, Booleans]:
-    """Return Kruse's exponent, d ln(extinction at 550 nm) / d ln(extinction), and ambiguity.
+    """Return Kruse's exponent, the gain and ambiguity.
 
-    Where no branch holds, visibility stands still at the jump and the gain is 0; it is set to 1
-    there, so that the error is never understated.
+    The gain is d ln(extinction at 550 nm) / d ln(extinction). Where no branch holds, visibility
+    is constant at the jump and the gain is 0; it is set to 1 there, so that the error is not
+    underestimated.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         positive = np.isfinite(extinction) & (extinction > 0)

@@ -1,1 +1,26 @@
-"""The background of a profile: tail mean, cubic of a homogeneous path, known shape."""
+"""Background of a profile: the power that a recorder shows without backscatter.
+
+Choose one of three estimates: `tail_mean` averages the far bins, `cubic` solves the quartic of a
+homogeneous path in closed form, `fit_known_shape` fits background and amplitude of clear air
+(`molecular_shape`). Beside them, `photon_counts` gives the variance of counts, and
+`detectable_light` tests on a few profiles whether a stretch of range holds any backscatter.
+Kernels are in the modules with an underscore.
+"""
+
+from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, cubic, tail_mean
+from lidarops.retrieve.background.known_shape import (
+    KnownShapeResult,
+    fit_known_shape,
+    molecular_shape,
+)
+from lidarops.retrieve.background.photon_counts import mean_profile_variance
+
+__all__ = [
+    "BackgroundResult",
+    "KnownShapeResult",
+    "cubic",
+    "fit_known_shape",
+    "mean_profile_variance",
+    "molecular_shape",
+    "tail_mean",
+]

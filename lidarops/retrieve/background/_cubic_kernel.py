@@ -1,10 +1,10 @@
-"""Compiled cubic of the background, in a form that keeps its digits, one profile at a time.
+"""Compiled cubic of the background, free of cancellation, one profile at a time.
 
 Three bins at equal distance, ``r0 < r1 < r2``, of a homogeneous path obey
 ``(P0 - x) r0^2 (P2 - x) r2^2 = (P1 - x)^2 r1^4`` at the background x. The sum over all triples of
-the squared differences is a quartic in x; its derivative is the cubic of `bobrovsky2024`, here
-with the outer square and the coefficient that the paper misprints, an arbitrary lag, the
-expectation of the noise in the coefficients subtracted, and no difference of large numbers.
+the squared differences is a quartic in x; its derivative is the cubic of `bobrovsky2024`. Here it
+has the outer square and the coefficient that the paper misprints, and an arbitrary lag. The
+expectation of the noise is subtracted from the coefficients, and no large numbers cancel.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -20,20 +20,20 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 HUGE: Final = 1e150
-"""Powers beyond this are taken as not finite: the quartic needs their fourth power."""
+"""Larger powers count as not finite: the quartic needs their fourth power."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-# What became of a profile.
+# Status of a profile.
 SOLVED: Final = 0
 MISSING: Final = 1
 CONSTANT: Final = 2
 LOST: Final = 3
 
-STATUS, BACKGROUND, VARIANCE, CONTRAST, MISTAKEN = range(5)
+STATUS, BACKGROUND, VARIANCE, CONTRAST, CURVATURE_SHIFT = range(5)
 COLUMNS: Final = 5
-"""Status, background, its variance, the curvature of the quartic over what noise adds, and by how
-many standard errors curvature of the signal that is taken for noise has moved the background."""
+"""Status; background; its variance; curvature of the quartic over the contribution of the noise;
+shift of the background, in standard errors, by signal curvature mistaken for noise."""
 
 
 class Triples(NamedTuple):
@@ -49,16 +49,16 @@ class Triples(NamedTuple):
 
 
 class _Coefficients(NamedTuple):
-    """Of half the derivative of the quartic: cubic, square, linear, constant, and its noise."""
+    """Coefficients of half the derivative of the quartic."""
 
     cubic: float
     square: float
     linear: float
     constant: float
     noise: float
-    """What was subtracted from the linear one."""
+    """Noise subtracted from the linear coefficient."""
     moved: float
-    """What noise has added to the constant one."""
+    """Noise in the constant coefficient."""
 
 
 def make_triples(range_: Array, lag: int) -> Triples:
@@ -103,7 +103,7 @@ def largest_root(a: float, b: float, c: float) -> float:
         product = p * radius
         cosine = min(max(3.0 * q / product, -1.0), 1.0) if product != 0.0 else 1.0
         return radius * math.cos(math.acos(cosine) / 3.0) - a / 3.0
-    # The summand without cancellation, and the other from their product -p / 3.
+    # The summand without cancellation; the other follows from their product -p / 3.
     cube = 0.5 * abs(q) + math.sqrt(max(discriminant, 0.0))
     big = -math.copysign(cube ** (1.0 / 3.0), q)
     small = -p / (3.0 * big) if big != 0.0 else 0.0
@@ -112,7 +112,7 @@ def largest_root(a: float, b: float, c: float) -> float:
 
 @_compiled
 def _load(power: Any, p: Array) -> bool:
-    """Copy one profile; return whether all of it can be used."""
+    """Copy one profile; return whether all bins are usable."""
     whole = True
     for i in range(p.size):
         p[i] = power[i]
@@ -134,10 +134,10 @@ def _difference_variance(p: Array, relative: Array) -> float:
 
 @_compiled
 def _curved_share(p: Array) -> float:
-    """Return which share of the squared fourth differences is no noise.
+    """Return the share of the squared fourth differences that is signal, not noise.
 
-    Neighbours of them are correlated by -56 / 70 where they are noise, and alike where they are
-    the curvature of the signal.
+    Neighbouring differences have a correlation of -56 / 70 where they are noise, and of 1 where
+    they are curvature of the signal.
     """
     total = product = before = 0.0
     for i in range(p.size - 4):
@@ -206,7 +206,7 @@ def _spread(p: Array, centre: float) -> float:
 
 @_compiled
 def _coarse(value: float, step: float) -> float:
-    """Round to a multiple of a power of two, so that what it is subtracted from keeps its bits."""
+    """Round to a multiple of `step`, a power of two, so that subtracting it is exact."""
     return math.floor(value / step + 0.5) * step
 
 
@@ -242,12 +242,12 @@ def _solve_profile(
         gradient[i] /= -s.linear
         variance += gradient[i] * gradient[i] * v[i]
     row[VARIANCE] = variance * scale * scale
-    row[MISTAKEN] = curved * abs(s.moved / s.linear) / math.sqrt(variance)
+    row[CURVATURE_SHIFT] = curved * abs(s.moved / s.linear) / math.sqrt(variance)
 
 
 @_compiled
 def _all_alike(variance: Array) -> bool:
-    """Whether all bins are noisy, or none is: a variance of 0 among others says nothing."""
+    """Return whether all variances are positive, or all 0; a 0 among others is not usable."""
     noisy = variance[0] > 0.0
     for value in variance:  # noqa: SIM110 - compiled
         if not (value > 0.0 if noisy else value == 0.0):
@@ -278,8 +278,8 @@ def solve_cubic_profiles(
     t : Triples
         Of `make_triples`.
     gradients : (profile or 1, bin) float64
-        Gets the derivatives of the backgrounds with respect to the power; one row where nobody
-        wants them.
+        Receives the derivatives of the backgrounds with respect to the power; one row where
+        they are not needed.
     out : (profile, column) float64
         Filled with NaN.
     """
@@ -295,5 +295,5 @@ def solve_cubic_profiles(
             continue
         curved = 0.0 if known_variance or unit > 0.0 else _curved_share(p)
         _solve_profile(p, v, t, unit, curved, gradients[k % gradients.shape[0]], out[k])
-        # Without a noise level nothing was subtracted, and there is no standard error.
+        # Without a noise level there is no standard error: 0 / 0 gives NaN.
         out[k, VARIANCE] *= level / level

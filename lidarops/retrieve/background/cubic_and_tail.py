@@ -1,4 +1,4 @@
-"""The background of a profile: by the cubic of a homogeneous path, or as the mean of its tail."""
+"""Find the background of a profile by the cubic of a homogeneous path, or by its tail mean."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ Flags = npt.NDArray[np.int32]
 FEWEST_BINS: Final = 8
 _LAG_SHARE: Final = 0.4
 LOWEST_CONTRAST: Final = 10.0
-"""Curvature of the quartic at its minimum over what the noise adds to it; below, the minimum may
-be another one, and the standard error understates by a factor of 2 (simulations)."""
-MOST_MISTAKEN: Final = 1.0
-"""Standard errors by which the background may be moved by curvature of the signal that is taken
-for noise."""
+"""Least curvature of the quartic at its minimum over the contribution of the noise. Below, it may
+be the wrong minimum, and the standard error is too small by a factor of 2 (simulations)."""
+LARGEST_SHIFT: Final = 1.0
+"""Standard errors by which signal curvature, mistaken for noise, may shift the background."""
 _UNIFORM: Final = 2.0**-22
-"""Largest deviation from a uniform grid over the last range: what float32 ranges need."""
+"""Largest deviation from a uniform grid, over the last range: rounding of float32 ranges."""
 
 _QUALITY_OF_STATUS: Final = {
     _cubic_kernel.MISSING: Quality.INPUT_MISSING,
@@ -36,7 +35,7 @@ _QUALITY_OF_STATUS: Final = {
 
 
 class Statistics(StrEnum):
-    """How the noise of a power is distributed."""
+    """Distribution of the noise of the power."""
 
     GAUSS = "gauss"
     POISSON = "poisson"
@@ -44,17 +43,17 @@ class Statistics(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class BackgroundResult:
-    """Backgrounds, one of each for every profile, with the leading axes of the power."""
+    """Background of every profile, with the leading axes of the power."""
 
     background: Array
-    """In the unit of the power; NaN where it could not be found."""
+    """In the unit of the power; NaN where there is none."""
     background_standard_error: Array
     quality: Flags
     """Bits of `lidarops.flags.Quality`; 0 where no test failed."""
 
 
 def default_lag(bins: int) -> int:
-    """Return the lag at which the cubic scatters least, 0.4 of the bins."""
+    """Return the lag with the least scatter of the cubic, 0.4 of the bins."""
     return max(min(round(_LAG_SHARE * bins), (bins - 1) // 2), 1)
 
 
@@ -67,7 +66,7 @@ def cubic(
     statistics: str = "gauss",
     shots: npt.ArrayLike | None = None,
 ) -> BackgroundResult:
-    r"""Find the background of a homogeneous path without iteration.
+    r"""Return the background of a homogeneous path, without iteration.
 
     On a homogeneous path, three bins at a distance of `lag` obey
     :math:`(P_0 - P^*) R_0^2 (P_2 - P^*) R_2^2 = (P_1 - P^*)^2 R_1^4`. The sum of the squared
@@ -75,17 +74,18 @@ def cubic(
 
     .. math:: S(x) = \sum_i (a_i x^2 + b_i x + c_i)^2,
 
-    has its minimum at the largest real root of the cubic :math:`S'(x) = 0`, which is
-    evaluated in a form that keeps its digits. What the noise adds to the coefficients on
-    average is subtracted first; without that, a short lag gives a background that is too high.
+    has its minimum at the largest real root of the cubic :math:`S'(x) = 0`, which is evaluated
+    without cancellation. The expectation of the noise in the coefficients is subtracted first;
+    otherwise a short lag biases the background high.
 
-    The scatter is 1.3 to 2.1 times the least possible one (`lidarops.retrieve.homogeneous.path_fit`
-    reaches that), and the start of the section must stand out of the noise.
+    The scatter is 1.3 to 2.1 times the least possible one, which
+    `lidarops.retrieve.homogeneous.path_fit` reaches. The signal at the start of the section must
+    exceed the noise.
 
     Parameters
     ----------
     power : (..., range) float
-        Any unit; of a section that begins beyond full overlap.
+        Any unit; a section that begins beyond full overlap.
     range : (range,) float
         m, uniform.
     lag : int, optional
@@ -94,7 +94,7 @@ def cubic(
         Noise variance in the square of the power's unit, broadcast against `power`. Where not
         given, one variance for the profile is estimated from differences along range.
     statistics : {"gauss", "poisson"}
-        "poisson" takes `power` as mean counts per shot, which are their own variance.
+        "poisson" takes `power` as mean counts per shot, with Poisson variance.
     shots : (...) float, optional
         Number of shots of which `power` is the mean count; 1 where not given. Needs "poisson".
 
@@ -102,17 +102,16 @@ def cubic(
     -------
     BackgroundResult
         The standard error follows from the implicit derivative of the root with respect to the
-        power of each bin. INPUT_MISSING where a bin is not finite, or its variance is 0 where
-        that of others is not; TOO_FEW_BINS below 8 bins (NaN below 3), NO_SIGNAL where the
-        profile is constant, LOW_SIGNAL where the noise may
-        have moved the minimum to another root (or, where no variance is given and the bins are few
-        or a lag short, curvature of the signal that is taken for noise), NO_REAL_SOLUTION where
-        the root is no minimum.
+        power of each bin. INPUT_MISSING: a bin is not finite, or its variance is 0 while others
+        are not. TOO_FEW_BINS: below 8 bins (NaN below 3). NO_SIGNAL: the profile is constant.
+        LOW_SIGNAL: noise may have moved the minimum to another root, or, without a given
+        variance and with few bins or a short lag, signal curvature mistaken for noise may have.
+        NO_REAL_SOLUTION: the root is no minimum.
 
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right, among them a range that is not uniform.
+        For invalid arguments, including a range that is not uniform.
 
     References
     ----------
@@ -124,7 +123,7 @@ def cubic(
     poisson = inputs.choice(statistics, Statistics, "statistics") is Statistics.POISSON
     if poisson and variance is not None:
         raise RetrievalInputError(
-            "is given for counts, which are their own variance",
+            "is given for counts, whose variance follows from their mean",
             field="variance",
             remedy="leave it out, or choose statistics='gauss'",
         )
@@ -157,18 +156,18 @@ def solve_cubic(
     shots: Array | None = None,
     want_gradients: bool = False,
 ) -> tuple[BackgroundResult, Array]:
-    """Solve `cubic` on arrays that `lidarops.retrieve.common.inputs` has prepared.
+    """Return the result of `cubic` and its gradients, for arrays checked by `common.inputs`.
 
     Parameters
     ----------
     power, variance : (profile, bin) float
-        The variance may be one row, and relative where it is not known.
+        The variance may be one row; it is relative where not known.
     range_ : (bin,) float
         m, ascending.
     lag : int, optional
     known_variance : bool
     shots : (profile or 1,) float, optional
-        Where the power are mean counts of so many shots.
+        Shots per mean count; None for Gaussian noise.
     want_gradients : bool
         Whether to return the derivatives of the backgrounds with respect to the power.
 
@@ -177,7 +176,7 @@ def solve_cubic(
     BackgroundResult
         (profile,).
     gradients : (profile, bin) float
-        One row of no meaning where not wanted.
+        One row without meaning where `want_gradients` is False.
     """
     _require_uniform(range_)
     count, bins = power.shape
@@ -194,7 +193,7 @@ def solve_cubic(
     for code, bit in _QUALITY_OF_STATUS.items():
         quality[status == code] |= np.int32(bit)
     moved = (out[:, _cubic_kernel.CONTRAST] < LOWEST_CONTRAST) | (
-        out[:, _cubic_kernel.MISTAKEN] > MOST_MISTAKEN
+        out[:, _cubic_kernel.CURVATURE_SHIFT] > LARGEST_SHIFT
     )
     quality[moved] |= np.int32(Quality.LOW_SIGNAL)
     if bins < FEWEST_BINS:
@@ -212,22 +211,22 @@ def tail_mean(
     start: float | None = None,
     variance: npt.ArrayLike | None = None,
 ) -> BackgroundResult:
-    """Take the mean of the far end of a profile as its background, as the field does.
+    """Return the mean of the far end of a profile as its background, the usual practice.
 
-    What is left of the signal there is part of the mean: the background is too high by it.
+    Signal that remains there biases the background high.
 
     Parameters
     ----------
     power : (..., range) float
-        Any unit; bins that are not finite are passed over.
+        Any unit; bins that are not finite are skipped.
     range : (range,) float
         m.
     start : float, optional
         m; bins from here on are averaged, the last tenth of the bins where not given.
     variance : (..., range) float, optional
-        Noise variance in the square of the power's unit, broadcast against `power`; bins where
-        it is not finite, or 0 and that of others is not, are passed over. Where not given, the
-        scatter of the averaged bins tells it.
+        Noise variance in the square of the power's unit, broadcast against `power`. Bins are
+        skipped where it is not finite, or 0 while that of others is not. Where not given, it is
+        estimated from the scatter of the averaged bins.
 
     Returns
     -------
@@ -237,7 +236,7 @@ def tail_mean(
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right, among them a start beyond the range.
+        For invalid arguments, including a start beyond the range.
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
@@ -247,7 +246,7 @@ def tail_mean(
     noise = np.broadcast_to(noise[:, first:], values.shape)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         valid = np.isfinite(values) & np.isfinite(noise)
-        # A variance of 0 among others says nothing; that of all bins says that there is no noise.
+        # A variance of 0 among others is not usable; of all bins it means that there is no noise.
         valid &= (noise > 0) | ~np.any(noise > 0, axis=-1, keepdims=True)
         bins = valid.sum(axis=-1)
         mean = np.where(valid, values, 0.0).sum(axis=-1) / bins
@@ -264,7 +263,7 @@ def tail_mean(
 def solve_tail(
     power: inputs.Floats, range_: Array, start: float | None, noise: Array
 ) -> tuple[BackgroundResult, Array]:
-    """Solve `tail_mean` on arrays that `lidarops.retrieve.common.inputs` has prepared.
+    """Return the result of `tail_mean` and its gradients, for arrays checked by `common.inputs`.
 
     Parameters
     ----------
@@ -274,12 +273,12 @@ def solve_tail(
     start : float, optional
         m.
     noise : (profile or 1, bin) float
-        Variances or weights; where not positive and finite, a bin is passed over.
+        Variances or weights; a bin is skipped where these are not positive and finite.
 
     Returns
     -------
     BackgroundResult
-        (profile,); no standard errors, which follow from the gradients.
+        (profile,), without standard errors, which follow from the gradients.
     gradients : (profile, bin) float
         Derivatives of the backgrounds with respect to the power.
     """
@@ -328,7 +327,7 @@ def _require_uniform(range_: Array) -> None:
     grid = np.linspace(range_[0], range_[-1], range_.size)
     if np.max(np.abs(range_ - grid)) > _UNIFORM * range_[-1]:
         raise RetrievalInputError(
-            "is not uniform, as the cubic needs it",
+            "is not uniform, which the cubic requires",
             field="range",
-            remedy="use the method 'direct' of lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path",
+            remedy="use the method 'direct' of lidarops.retrieve.homogeneous.fit_homogeneous_path",
         )

@@ -1,6 +1,6 @@
-"""What a few profiles show of a scene: whether a stretch of range holds any light at all.
+"""Test on a few profiles of a scene whether a stretch of range holds any backscatter.
 
-A look at evenly spaced profiles tells what need not be computed. It never gives a result.
+The plan skips what this test excludes. It never yields a result.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 
 _TAIL: Final = 0.1
-"""Share of the bins, the farthest, that tell the background."""
+"""Share of the bins, the farthest, whose power is the background."""
 _FEWEST: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What some profiles show of one stretch of range."""
+class LightDetection:
+    """Backscatter that some profiles show in a stretch of range."""
 
     profiles: int
-    """That were looked at and have values there, saturated ones too."""
+    """Profiles tested that have values there, saturated ones included."""
     significance: float
     """Largest backscatter of a profile over its standard error; 0 where there is none."""
     unsaturated: int
     """Profiles without a saturated bin there."""
 
 
-def spaced(count: int, most: int) -> npt.NDArray[np.int64]:
-    """Return the places of at most `most` of `count` profiles, evenly spaced, ends included.
+def spaced_indices(count: int, most: int) -> npt.NDArray[np.int64]:
+    """Return the indices of at most `most` of `count` profiles, evenly spaced, ends included.
 
     Parameters
     ----------
@@ -46,19 +46,19 @@ def spaced(count: int, most: int) -> npt.NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-def look_for_light(
+def detect_light(
     power: npt.ArrayLike,
     variance: npt.ArrayLike,
     quality: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the term of the field
     near: float,
     far: float,
-) -> Look:
-    """Look for backscatter between two ranges.
+) -> LightDetection:
+    """Return the significance of backscatter between two ranges.
 
-    The weighted least squares fit of ``P = b + A r**-2`` to the bins of the stretch and to the
-    last tenth of the bins; the significance of a profile is `A` over its standard error, with
-    unit variance where there is only noise.
+    By the weighted least-squares fit of ``P = b + A r**-2`` to the bins of the stretch and to the
+    last tenth of the bins; the significance of a profile is `A` over its standard error, which
+    has unit variance for pure noise.
 
     Parameters
     ----------
@@ -80,30 +80,30 @@ def look_for_light(
     RetrievalInputError
         Where the shapes do not fit.
     """
-    power, variance = (np.asarray(part, dtype=np.float64) for part in (power, variance))
+    power, variance = (np.asarray(values, dtype=np.float64) for values in (power, variance))
     flags, r = np.asarray(quality), np.asarray(range, dtype=np.float64)
     if power.ndim != 2 or not power.shape == variance.shape == flags.shape == (len(power), r.size):
         raise RetrievalInputError(
             f"shapes {power.shape}, {variance.shape}, {flags.shape} and {r.shape} do not fit",
             field="power",
-            remedy="give profiles over range, and one range a bin",
+            remedy="give profiles over range, and one range per bin",
         )
-    told = (np.arange(r.size) >= (1.0 - _TAIL) * r.size) & (r > 0.0)
-    used = np.flatnonzero(told | ((r >= near) & (r <= far) & (r > 0.0)))
+    tail = (np.arange(r.size) >= (1.0 - _TAIL) * r.size) & (r > 0.0)
+    used = np.flatnonzero(tail | ((r >= near) & (r <= far) & (r > 0.0)))
     power, variance, flags, r = power[:, used], variance[:, used], flags[:, used], r[used]
-    inside, told = (r >= near) & (r <= far), told[used]
+    inside, tail = (r >= near) & (r <= far), tail[used]
     measured = np.isfinite(power) & np.isfinite(variance) & (variance > 0.0)
     measured &= (flags & int(Quality.INPUT_MISSING)) == 0
     saturated = (flags & int(Quality.SATURATED)) != 0
     seen = ((measured | saturated) & inside).sum(axis=1) >= _FEWEST
-    fitted = measured & (inside | told)
+    fitted = measured & (inside | tail)
     significance = _significance(power, variance, fitted, r)
     clipped = np.any(saturated & inside, axis=1)
-    lit = (measured & inside).sum(axis=1) >= _FEWEST
-    found = significance[lit & np.isfinite(significance)]
-    return Look(
+    testable = (measured & inside).sum(axis=1) >= _FEWEST
+    significances = significance[testable & np.isfinite(significance)]
+    return LightDetection(
         profiles=int(seen.sum()),
-        significance=max(float(found.max()), 0.0) if found.size else 0.0,
+        significance=max(float(significances.max()), 0.0) if significances.size else 0.0,
         unsaturated=int(np.sum(seen & ~clipped)),
     )
 
@@ -119,5 +119,5 @@ def _significance(
         shape = r**-2.0
         total = weight.sum(axis=1)
         centred = shape - ((weight * shape).sum(axis=1) / total)[:, np.newaxis]
-        bright = (weight * centred * np.where(fitted, power, 0.0)).sum(axis=1)
-        return np.asarray(bright / np.sqrt((weight * centred**2).sum(axis=1)))
+        projection = (weight * centred * np.where(fitted, power, 0.0)).sum(axis=1)
+        return np.asarray(projection / np.sqrt((weight * centred**2).sum(axis=1)))

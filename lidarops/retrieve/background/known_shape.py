@@ -1,4 +1,4 @@
-"""The background of a profile whose far range is free of aerosol: a fit of the molecular shape."""
+"""Fit the background of a profile whose far range is free of aerosol, by the molecular shape."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ Flags = npt.NDArray[np.int32]
 Booleans = npt.NDArray[np.bool_]
 
 START_SHARES: Final = (0.3, 0.4, 0.5, 0.6, 0.7)
-"""Where the windows begin that are tried when none is given, over the farthest usable range."""
+"""Starts of the windows that are tried where none is given, over the farthest usable range."""
 FEWEST_BINS: Final = 8
 FALSE_ALARM: Final = 1e-4
-"""Probability that either test of the residuals says `poor_fit` where the shape is right; of
-fewer than 100 bins of unknown variance less."""
+"""Probability that either test of the residuals raises `poor_fit` where the shape is right;
+lower with fewer than 100 bins of unknown variance."""
 REJECTION: Final = 1e-2
-"""The same for leaving a window out that might be chosen."""
+"""Probability that the tests reject a window where the shape is right."""
 NEGATIVE: Final = 3.0
-"""Standard errors below zero from which on an amplitude is called negative."""
+"""Standard errors below zero beyond which an amplitude is flagged negative."""
 LARGEST_CONDITION: Final = 30.0
 """Standard error of the background over that of the mean of the same bins."""
 FAR: Final = 4.0
 """Standard errors beyond which a value lies no more often than with a known variance."""
 _LEAST_FREEDOM: Final = (54.0, 18.0)
-"""Degrees of freedom of the noise in the tests of waves and curvature. The few bins of which there
-are less have part of the tested misfit in what they show of the noise, which bounds the ratio: the
-largest quantiles at 8 to 60 bins, from 1 percent to 1e-4 false alarms, are those (simulations)."""
+"""Least degrees of freedom of the noise in the tests of waves and curvature. In short windows the
+estimated noise contains part of the tested misfit, which bounds the ratio: these are the largest
+quantiles at 8 to 60 bins, from 1 percent to 1e-4 false alarms (simulations)."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownShapeResult:
-    """Backgrounds and amplitudes, one of each for every profile, and what speaks against them."""
+    """Background and amplitude of every profile, with their errors, tests and quality bits."""
 
     background: Array
-    """In the unit of the power; NaN where it could not be found."""
+    """In the unit of the power; NaN where there is none."""
     background_standard_error: Array
     amplitude: Array
     """Power over shape."""
@@ -55,15 +55,15 @@ class KnownShapeResult:
     chi2: Array
     """Sum of the squared residuals over their variances; over 1 where no variance is known."""
     degrees_of_freedom: npt.NDArray[np.int64]
-    """Bins less 2; never below 0."""
+    """Bins less 2, at least 0."""
     condition: Array
     """Standard error of the background over that of the mean of the same bins: 1 where the shape
-    dies away in the window, infinite where it cannot be told from a constant."""
+    dies away in the window, infinite where it cannot be distinguished from a constant."""
     curvature: Array
-    """Slope of the residuals, relative to the shape, along range, in standard errors: above 0
-    where the signal falls less than the shape."""
+    """Slope along range of the residuals relative to the shape, in standard errors; positive
+    where the signal falls less steeply than the shape."""
     waves: Array
-    """Chi-square of the mean residuals of 16 equal parts of the window; 14 are expected."""
+    """Chi-square of the mean residuals of 16 equal parts of the window; the expectation is 14."""
     start: Array
     """m, range of the first bin of the window."""
     stop: Array
@@ -72,11 +72,11 @@ class KnownShapeResult:
     """The residuals vary systematically along range: the window is not free of aerosol, the
     shape is not that of the air, or the noise is not white along range."""
     singular: Booleans
-    """The window is too short for the shape to differ from a constant (`LARGEST_CONDITION`):
-    another method has to give the background."""
+    """The window is too short for the shape to differ from a constant (`LARGEST_CONDITION`);
+    use another method."""
     quality: Flags
-    """INPUT_MISSING, TOO_FEW_BINS, NO_SIGNAL (all bins of a window alike, but for counts: no noise
-    is like that), NEGATIVE_AMPLITUDE, NOT_HOMOGENEOUS (where `poor_fit`)."""
+    """INPUT_MISSING, TOO_FEW_BINS, NO_SIGNAL (all bins of a window equal, which noise never gives;
+    not for counts), NEGATIVE_AMPLITUDE, NOT_HOMOGENEOUS (where `poor_fit`)."""
 
 
 def molecular_shape(
@@ -84,11 +84,11 @@ def molecular_shape(
     extinction: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
 ) -> Array:
-    r"""Return the shape of the signal from air alone.
+    r"""Return the signal of clear air up to a constant factor.
 
     .. math:: \varphi(R) = \frac{\beta(R)}{R^2} \exp\left(-2 \int_0^R \alpha \, dr\right)
 
-    by trapezoids from the first bin on; nearer, the extinction is taken as that of the first bin.
+    by trapezoids from the first bin on; nearer, the extinction is that of the first bin.
 
     Parameters
     ----------
@@ -139,34 +139,34 @@ def fit_known_shape(
                        {\sum w (\varphi - \bar\varphi)^2}, \qquad
               b = \bar P - C \bar\varphi
 
-    with weighted means and :math:`w = 1 / v`; it is potapova2023's equation (4) with the
-    molecular shape in place of that of a homogeneous path. Nothing iterates.
+    with weighted means and :math:`w = 1 / v`. This is equation (4) of potapova2023 with the
+    molecular shape in place of that of a homogeneous path. There is no iteration.
 
     The variance of counts is that of the fitted model, :math:`v = (b + C \varphi) / E`, from two
-    fixed passes after an unweighted one: weights made of the counts themselves would follow
-    their noise and put the background too low.
+    fixed passes after an unweighted one. Weights from the counts themselves would follow their
+    noise and bias the background low.
 
     Parameters
     ----------
     power : (..., range) float
-        Any unit; bins that are not finite are passed over.
+        Any unit; bins that are not finite are skipped.
     range : (range,) float
         m.
     shape : (..., range) float
-        Any unit, broadcast against `power`; bins where it is not positive and finite are passed
-        over. See `molecular_shape`.
+        Any unit, broadcast against `power`; bins where it is not positive and finite are
+        skipped. See `molecular_shape`.
     variance : (..., range) float, optional
         Noise variance in the square of the power's unit, broadcast against `power`. It must not
         follow the noise of the single bin. Where neither it nor `exposure` is given, all bins
-        weigh the same and the residuals tell the level.
+        weigh the same and the noise level is estimated from the residuals.
     exposure : (...) float, optional
         For Poisson counts: counts per unit of power. That is the number of shots where power is
         a mean count per shot, and shots times bin time in microseconds where it is in MHz.
     start, stop : (...) float, optional
         m, ends of the window. Where `start` is not given, windows from each of `start_shares`
-        of the farthest usable range are tried. The longest one is taken whose residuals show
-        neither curvature nor waves, and whose background agrees with those of all shorter ones
-        (each at 1 % false alarms); the shortest where there is none.
+        of the farthest usable range are tried. The result is that of the longest window whose
+        residuals show neither curvature nor waves and whose background agrees with those of all
+        shorter windows (each at 1 % false alarms), else that of the shortest.
     mask : (..., range) bool, optional
         True where a bin may be used; broadcast against `power`.
     start_shares : sequence of float
@@ -175,18 +175,18 @@ def fit_known_shape(
     Returns
     -------
     KnownShapeResult
-        With the leading axes of `power`. The standard errors are those of the noise, widened
-        where it is estimated, so that 4 of them hold as often; what an
-        untrue shape does to the background is not in them, but in `curvature` and `waves`. These
-        see it only where it is larger than noise: where haze of 0.6 to 3 times the backscatter of
-        air, with a scale height of 3 km, is in the shape and not in the air, 11 percent of the
-        backgrounds that are not `poor_fit` are off by more than 4 standard errors, nearly all of
-        them by what no test of the window could tell (`lidarops bench stability`).
+        With the leading axes of `power`. The standard errors cover random noise. Where the noise
+        level is estimated they are widened, so that 4 standard errors have the same coverage.
+        They do not cover an error of the shape, which `curvature` and `waves` show only where it
+        exceeds the noise. With haze of 0.6 to 3 times the backscatter of air (scale height 3 km)
+        in the shape but not in the air, 11 percent of the backgrounds that are not `poor_fit` are
+        off by more than 4 standard errors, nearly all by an amount that no test of the window
+        could detect (`lidarops bench stability`).
 
     Raises
     ------
     RetrievalInputError
-        For arguments that cannot be right.
+        For invalid arguments.
 
     References
     ----------
@@ -210,7 +210,7 @@ def fit_known_shape(
         np.broadcast_to(firsts, (len(rows), firsts.shape[1])), window[:, np.newaxis], axis=1
     )[:, 0]
     if exposure is not None:
-        # No light may well be no count over a whole window.
+        # In the dark, a whole window may be without a count.
         out[:, _shape_fit.CONSTANT] = 0.0
     return _result(out, noise.known, grid.values, first, pasts, leading)
 
@@ -223,7 +223,7 @@ def _noise(
 ) -> _shape_fit.ShapeNoise:
     if variance is not None and exposure is not None:
         raise RetrievalInputError(
-            "is given for counts, which tell their own variance",
+            "is given for counts, whose variance follows from the fit",
             field="variance",
             remedy="leave out either the variance or the exposure",
         )
@@ -259,7 +259,7 @@ def _pasts(
     range_: Array,
     leading: tuple[int, ...],
 ) -> npt.NDArray[np.intp]:
-    """Return the bin past the window of each profile: past its last usable one, or its stop."""
+    """Return the bin past the window of each profile: past its last usable bin, or its stop."""
     pasts = np.full(len(rows), range_.size, dtype=np.intp)
     stops = inputs.profile_values(stop, "stop", leading)
     if stops is not None:
@@ -283,41 +283,45 @@ def _firsts(
                 f"lies beyond the range, which ends at {range_[-1]:g} m", field="start"
             )
         return np.searchsorted(range_, starts, side="left").astype(np.intp)[:, np.newaxis]
-    tried = np.asarray(shares, dtype=np.float64)
-    inside = tried.size > 0 and tried[0] > 0 and tried[-1] < 1
-    if not inside or np.any(np.diff(tried) <= 0):
+    start_shares = np.asarray(shares, dtype=np.float64)
+    inside = start_shares.size > 0 and start_shares[0] > 0 and start_shares[-1] < 1
+    if not inside or np.any(np.diff(start_shares) <= 0):
         raise RetrievalInputError(
-            f"are {tuple(shares)}", field="start_shares", remedy="let them rise within 0 and 1"
+            f"are {tuple(shares)}",
+            field="start_shares",
+            remedy="give ascending values between 0 and 1",
         )
     farthest = range_[np.maximum(pasts - 1, 0)]
-    return np.searchsorted(range_, farthest[:, np.newaxis] * tried, side="left").astype(np.intp)
+    return np.searchsorted(range_, farthest[:, np.newaxis] * start_shares, side="left").astype(
+        np.intp
+    )
 
 
 def _limits(false_alarm: float) -> _shape_fit.Limits:
-    """Return the limits of the two tests that together raise so many false alarms."""
-    each = 0.5 * false_alarm
-    waves = special.chdtri(_shape_fit.GROUPS - 2.0, each)
-    return _shape_fit.Limits(float(waves), float(-special.ndtri(0.5 * each)))
+    """Return the limits of waves and curvature for a joint rate of false alarms."""
+    rate = 0.5 * false_alarm
+    waves = special.chdtri(_shape_fit.GROUPS - 2.0, rate)
+    return _shape_fit.Limits(float(waves), float(-special.ndtri(0.5 * rate)))
 
 
 def _estimated_limits(false_alarm: float, bins: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-    r"""Return the limits of waves and curvature over a noise that differences of bins show.
+    r"""Return the limits of waves and curvature over a noise estimated from differences of bins.
 
-    The mean square of n - 1 differences of neighbours is known as well as a variance with
+    The mean square of n - 1 differences of neighbours scatters like a variance with
     :math:`2 (n - 1)^2 / (3 n - 4)` degrees of freedom (vonneumann1941).
     """
-    each = 0.5 * false_alarm
+    rate = 0.5 * false_alarm
     counts, kind = np.unique(bins, return_inverse=True)
     count = np.maximum(counts.astype(np.float64), 2.0)
     freedom = 2.0 * (count - 1.0) ** 2 / (3.0 * count - 4.0)
-    of_waves, of_curvature = (np.maximum(freedom, least) for least in _LEAST_FREEDOM)
+    waves_freedom, curvature_freedom = (np.maximum(freedom, least) for least in _LEAST_FREEDOM)
     groups = _shape_fit.GROUPS - 2.0
-    waves = groups * special.fdtri(groups, of_waves, 1.0 - each)
-    return waves[kind], -special.stdtrit(of_curvature, 0.5 * each)[kind]
+    waves = groups * special.fdtri(groups, waves_freedom, 1.0 - rate)
+    return waves[kind], -special.stdtrit(curvature_freedom, 0.5 * rate)[kind]
 
 
 def _level(chi2: Array, freedom: npt.NDArray[np.int64]) -> Array:
-    """Return the factor on variances of weight one: of the noise, widened as it is estimated.
+    """Return the factor on variances of unit weight: the estimated noise, widened for its scatter.
 
     An error over its estimate follows Student's distribution.
     """

@@ -1,4 +1,4 @@
-"""Photon counts: what they must be, and the variance that their mean profile gives."""
+"""Photon counts: their validation, and their variance from the mean profile of a block."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from lidarops.retrieve.common import inputs
 Array = npt.NDArray[np.float64]
 
 ENOUGH_COUNTS: Final = 1000.0
-"""Counts that tell a variance to 3 percent."""
+"""Counts that give a variance to 3 percent."""
 WIDEST: Final = 7
-"""Bins to either side over which a mean profile is averaged at most."""
+"""Most bins to either side over which a mean profile is averaged."""
 
 
 def checked_shots(
@@ -40,8 +40,36 @@ def checked_shots(
     return values
 
 
-def mean_profile_variance(power: npt.ArrayLike, shots: npt.ArrayLike) -> Array:
-    """See `lidarops.retrieve.homogeneous.path_fit.mean_profile_variance`."""
+def mean_profile_variance(power: npt.ArrayLike, shots: npt.ArrayLike = 1.0) -> Array:
+    """Return the variance of photon counts, from the mean profile of a block.
+
+    Weights from a profile's own counts favour the bins that happen to be low, and bias the fit.
+    Weights from the mean profile of a block with the same shape do not, and are as good: over a
+    dynamic range of 1e4 the scatter is within 2 percent of the least possible one.
+
+    The mean profile is averaged along range only until it holds 1000 counts, at most over 15
+    bins, so that steep strong signals keep their shape. Choose the block once and pass the result
+    with every part of it: no solver pools profiles, since results would then depend on how an
+    archive is cut.
+
+    Parameters
+    ----------
+    power : (..., range) float
+        Mean counts per shot. Bins that are not finite are skipped.
+    shots : (...) float
+        Number of shots of which each profile is the mean count.
+
+    Returns
+    -------
+    (..., range) float
+        Variance of `power`: the mean profile over the number of shots; (range,) for one number
+        of shots. NaN where no profile has a finite value.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where counts are negative or shots not positive.
+    """
     counts = inputs.real_array(power, "power").astype(np.float64, copy=False)
     if counts.ndim == 0:
         raise RetrievalInputError(
@@ -49,22 +77,22 @@ def mean_profile_variance(power: npt.ArrayLike, shots: npt.ArrayLike) -> Array:
         )
     leading = counts.shape[:-1]
     rows = counts.reshape(-1, counts.shape[-1])
-    of_profile = checked_shots(rows, shots, leading)
-    weight = np.where(np.isfinite(rows), of_profile[:, np.newaxis], 0.0)
-    shots_of_bin = weight.sum(axis=0)
-    counts_of_bin = np.where(weight > 0, rows * weight, 0.0).sum(axis=0)
-    mean = _averaged(counts_of_bin, shots_of_bin)
-    if of_profile.size == 1:
-        shared: Array = mean / of_profile[0]
+    profile_shots = checked_shots(rows, shots, leading)
+    weight = np.where(np.isfinite(rows), profile_shots[:, np.newaxis], 0.0)
+    bin_shots = weight.sum(axis=0)
+    bin_counts = np.where(weight > 0, rows * weight, 0.0).sum(axis=0)
+    mean = _averaged(bin_counts, bin_shots)
+    if profile_shots.size == 1:
+        shared: Array = mean / profile_shots[0]
         return shared
-    own: Array = mean / of_profile[:, np.newaxis]
-    return own.reshape(counts.shape)
+    variance: Array = mean / profile_shots[:, np.newaxis]
+    return variance.reshape(counts.shape)
 
 
 def _averaged(counts: Array, shots: Array) -> Array:
-    """Average counts per shot along range, as far as it takes to hold `ENOUGH_COUNTS`."""
+    """Average counts per shot along range until they hold `ENOUGH_COUNTS`."""
     mean = np.full(counts.size, np.nan)
-    open_ = np.ones(counts.size, dtype=bool)
+    too_few = np.ones(counts.size, dtype=bool)
     total_counts = np.concatenate([[0.0], np.cumsum(counts)])
     total_shots = np.concatenate([[0.0], np.cumsum(shots)])
     bins = np.arange(counts.size)
@@ -73,7 +101,7 @@ def _averaged(counts: Array, shots: Array) -> Array:
         held = total_counts[high] - total_counts[low]
         spread = total_shots[high] - total_shots[low]
         with np.errstate(invalid="ignore", divide="ignore"):
-            # Half a count at least: where none was seen, the variance is small, not zero.
-            mean = np.where(open_, np.maximum(held, 0.5) / spread, mean)
-        open_ &= held < ENOUGH_COUNTS
+            # At least half a count: without any count, the variance is small, not zero.
+            mean = np.where(too_few, np.maximum(held, 0.5) / spread, mean)
+        too_few &= held < ENOUGH_COUNTS
     return np.where(shots > 0, mean, np.nan)

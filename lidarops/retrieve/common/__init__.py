@@ -1,1 +1,7 @@
-"""What all retrievals share: checks of their inputs, and the cache of compiled code."""
+"""Shared by all retrievals: input checks, array layout and the cache of compiled code.
+
+`inputs` turns arguments into contiguous (profile, bin) arrays or raises `RetrievalInputError`.
+`frozen_arrays.frozen` gives compiled functions arrays of one type. `compiled_code.keep_apart`
+gives every state of the sources its own cache of compiled code; importing `lidarops.retrieve`
+calls it once.
+"""

@@ -1,4 +1,4 @@
-"""Where numba keeps compiled code: apart for every state of the sources."""
+"""Cache of compiled code, separate for every state of the sources."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ _SOURCES: Final = Path(__file__).parents[1]
 
 
 def keep_apart(sources: Path = _SOURCES) -> str:
-    """Have numba keep what it compiles in a folder named after the sources of all that it compiles.
+    """Set the cache folder of numba to one named after a hash of all compiled sources.
 
-    Numba looks whether the file of a function has changed, not whether those have that hold the
-    functions it calls: their old code would go on to be used.
+    Numba checks whether the file of a function has changed, but not the files of the functions
+    that it calls: it would keep using their old code.
 
     Parameters
     ----------
     sources : Path
-        Folder of the modules, in folders of its own too.
+        Folder of the modules, searched recursively.
 
     Returns
     -------
     str
-        The folder: in that of ``NUMBA_CACHE_DIR``, else beside the sources. Where it cannot be
-        written numba looks for another.
+        The cache folder: within ``NUMBA_CACHE_DIR``, else beside the sources. Where it is not
+        writable, numba chooses another.
     """
     digest = hashlib.sha256()
     for path in sorted(sources.rglob("*.py")):
@@ -35,8 +35,8 @@ def keep_apart(sources: Path = _SOURCES) -> str:
             digest.update(content)
     name = f"lidarops-{digest.hexdigest()[:16]}"
     settings = vars(config)
-    kept = Path(settings["CACHE_DIR"] or sources / "__pycache__")
-    # A second time where it was set before.
-    folder = str((kept.parent if kept.name.startswith("lidarops-") else kept) / name)
+    base = Path(settings["CACHE_DIR"] or sources / "__pycache__")
+    # A former call may have set the folder already.
+    folder = str((base.parent if base.name.startswith("lidarops-") else base) / name)
     settings["CACHE_DIR"] = folder
     return folder

@@ -1,4 +1,4 @@
-"""Arrays as compiled functions get them: one type, whoever made them."""
+"""Read-only contiguous arrays, the one array type that compiled functions receive."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _Array = TypeVar("_Array", bound=npt.NDArray[Any])
 
 
 def frozen(values: _Array) -> _Array:
-    """Return a contiguous view that cannot be written to, copied only where it must be.
+    """Return a contiguous read-only view; copy only where necessary.
 
-    A compiled function takes what can be written to and what cannot for different types, and
-    would be compiled anew for every mixture of them.
+    Numba treats writable and read-only arrays as different types, and would compile a function
+    again for every combination of them.
     """
     view: Any = np.ascontiguousarray(values).view()
     view.flags.writeable = False

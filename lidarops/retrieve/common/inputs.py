@@ -1,4 +1,4 @@
-"""What the retrievals along range accept, and the one shape in which their kernels get it."""
+"""Checks of the input of retrievals along range, and its conversion for compiled kernels."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 _Choice = TypeVar("_Choice", bound=StrEnum)
 
 SHORTEST_REACH = 100.0
-"""m. No lidar section ends nearer, and every section in km ends nearer: a guard of units."""
+"""m. No lidar section ends nearer, but every section in km does: detects wrong units."""
 
 
 @dataclass(frozen=True, slots=True)
 class RangeGrid:
-    """A range grid, ascending, and how to turn other arrays the same way."""
+    """An ascending range grid, and whether the original was descending."""
 
     values: Array
     """m."""
@@ -33,12 +33,12 @@ class RangeGrid:
         return int(self.values.size)
 
     def turn(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return `values` with their last axis ascending in range."""
+        """Return `values` with the last axis ascending in range."""
         return values[..., ::-1] if self.descending and values.shape[-1] > 1 else values
 
 
 def real_array(values: npt.ArrayLike, name: str) -> Floats:
-    """Return `values` as float32 (where they are) or float64, masked entries as NaN.
+    """Return `values` as float32 if they are, else float64; masked entries as NaN.
 
     Raises
     ------
@@ -58,13 +58,13 @@ def real_array(values: npt.ArrayLike, name: str) -> Floats:
 
 
 def range_grid(values: npt.ArrayLike) -> RangeGrid:
-    """Check a range axis in m.
+    """Return the checked range axis, m.
 
     Raises
     ------
     RetrievalInputError
-        Where it is not one-dimensional, finite, positive and strictly monotonic, or ends nearer
-        than 100 m, as ranges in km do.
+        Where it is not one-dimensional, finite, positive and strictly monotonic, or ends below
+        100 m, as ranges in km do.
     """
     grid = real_array(values, "range").astype(np.float64)
     if grid.ndim != 1 or grid.size == 0:
@@ -78,7 +78,9 @@ def range_grid(values: npt.ArrayLike) -> RangeGrid:
     grid = np.ascontiguousarray(grid[::-1] if descending else grid)
     if grid[0] <= 0:
         raise RetrievalInputError(
-            f"starts at {grid[0]:g} m", field="range", remedy="cut the bins at and behind the lidar"
+            f"starts at {grid[0]:g} m",
+            field="range",
+            remedy="remove the bins at and behind the lidar",
         )
     if grid[-1] < SHORTEST_REACH:
         raise RetrievalInputError(
@@ -95,7 +97,7 @@ def profiles(power: npt.ArrayLike, grid: RangeGrid) -> tuple[Floats, tuple[int, 
     Raises
     ------
     RetrievalInputError
-        Where the last axis does not fit the range.
+        Where the last axis does not match the range.
     """
     array = real_array(power, "power")
     if array.ndim == 0 or array.shape[-1] != grid.size:
@@ -185,12 +187,12 @@ def profile_values(
 
 
 def choice(name: str, kind: type[_Choice], field: str) -> _Choice:
-    """Return the member of an enumeration of that name.
+    """Return the member of an enumeration with this name.
 
     Raises
     ------
     RetrievalInputError
-        Where there is none; the message lists them all.
+        Where there is none; the message lists all names.
     """
     try:
         return kind(name)

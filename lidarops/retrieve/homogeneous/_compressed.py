@@ -1,14 +1,14 @@
-"""Least squares of the homogeneous path from a handful of linear functionals of each profile.
+"""Least squares of the homogeneous path from a few linear functionals of each profile.
 
-For profiles without gaps, on a uniform grid, with common weights. A profile is read once,
-multiplied with the basis of `lidarops.retrieve.homogeneous._functional_tables` in registers, and is then K numbers y.
-The extinction is found from them by a look-up, one step to the right cell and three Newton steps
-on the polynomial of the cell: no exponential, no loop over bins. A second look at the bins, still
-in the cache, takes the residuals.
+For profiles without gaps, on a uniform grid, with common weights. A profile is read once and
+multiplied with the basis of `lidarops.retrieve.homogeneous._functional_tables`, which reduces it
+to K numbers y. The extinction follows from y by a look-up, one step to the right cell and three
+Newton steps on the polynomial of the cell, without exponentials or loops over bins. A second pass
+over the bins, which are still in the cache, computes the residuals.
 
-Profiles go in blocks of `BLOCK`; the last is filled up with zeros and runs through the same code.
-Every profile has its own accumulators, summed in the order of the bins. So the bits of a result
-depend on nothing but the profile.
+Profiles are processed in blocks of `BLOCK`; the last block is padded with zeros and runs through
+the same code. Every profile has its own accumulators, summed in the order of the bins, so that
+the bits of a result depend on the profile alone.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -41,22 +41,22 @@ Flags = npt.NDArray[np.int32]
 BLOCK: Final = 48
 """Profiles in a block: whole tiles of 4 and of 6, and whole vectors of any processor."""
 _LONGEST_LEAP: Final = 20.0
-"""Cells that the first step may cross."""
+"""Most cells that the first step may cross."""
 _EDGE: Final = 1.02
-"""Half widths from the centre of a cell beyond which its polynomial is left for the next one's."""
+"""Half widths from the centre of a cell beyond which the polynomial of the next cell is used."""
 _MOVES: Final = 40
-"""From cell to cell, one and a half at most; thin sections start some 20 cells off. What has not
-settled then is routed to others."""
+"""Most moves from cell to cell, by 1.5 cells at most; thin sections start some 20 cells off.
+Profiles that have not settled then are routed to other solvers."""
 HUGE: Final = 1e140
 _TINY: Final = 1e-140
 CURVATURES: Final = 7
-"""Functionals in which misfit is looked for: further ones hold more noise than misfit."""
+"""Functionals that are tested for misfit: further ones hold more noise than misfit."""
 _INTERPOLATED: Final = 1e-22
 """Squared error of the direction of a shape, from the polynomials of the tables."""
 _OK: Final = 0
 _CONSTANT: Final = 1
 ROUTED: Final = 2
-"""State of a profile that this solver cannot take: it has gaps, or leaves the range of floats."""
+"""State of a profile that this solver cannot handle: it has gaps, or exceeds the float range."""
 
 RESULTS: Final = (
     "background",
@@ -95,11 +95,11 @@ _summing = numba.njit(
 
 
 class Mode(NamedTuple):
-    """How a call wants its profiles judged."""
+    """Options of a call: noise and tests."""
 
     known_variance: bool
     with_residuals: bool
-    """Without, chi-square and outliers are left out; only for a known variance."""
+    """False skips chi-square and outliers; for a known variance only."""
     rounding: float
     """Relative rounding error of the power."""
 
@@ -114,7 +114,7 @@ class _Scratch(NamedTuple):
     """(8, profile): F at the centre of the cell and the polynomial of its derivative."""
     t: Array
     scalars: Array
-    found: Array
+    fit: Array
     row: Array
     left: Array
     powers: Array
@@ -128,7 +128,7 @@ class _Scratch(NamedTuple):
     bits: Flags
 
 
-# Rows of `_Scratch.found`.
+# Rows of `_Scratch.fit`.
 _F: Final = 0
 _B: Final = 1
 _P: Final = 2
@@ -139,11 +139,11 @@ _P_ERROR: Final = 6
 _CURVATURE: Final = 7
 _ENERGY: Final = 8
 _LARGEST: Final = 9
-_BENDS: Final = 10
+_DIFFERENCES: Final = 10
 _BOUNDED: Final = 11
 _NOISE: Final = 12
 _SQUARE: Final = 13
-_FOUND: Final = 14
+_FIT_ROWS: Final = 14
 
 
 @_compiled
@@ -158,7 +158,7 @@ def _scratch(power: Any, root: Any, envelope: Any, lanes: int) -> _Scratch:
         np.zeros((8, BLOCK)),
         np.zeros(BLOCK),
         np.zeros((_functional_tables.SCALARS, BLOCK)),
-        np.zeros((_FOUND, BLOCK)),
+        np.zeros((_FIT_ROWS, BLOCK)),
         np.zeros(12),
         np.zeros(12),
         np.ones(_functional_tables.DEGREE + 2),
@@ -186,19 +186,19 @@ def _project(block: Any, tables: Tables, s: _Scratch) -> None:
             profile, tile = block[k + j], s.tile[j]
             reference = np.float64(profile[bins - 1])
             s.reference[k + j] = reference
-            # Over the size of the array itself, for which the compiler needs no checks.
+            # A loop over the size of the array itself needs no bounds checks.
             for i in range(profile.size):
                 tile[i] = np.float64(profile[i]) - reference
-        ahead, here = after + (k + rows) * bins * width, out + 8 * lanes * k
+        ahead, target = after + (k + rows) * bins * width, out + 8 * lanes * k
         if lanes == 8:
-            project_6_8(values, stride, columns, bins, here, ahead, rows * width)
+            project_6_8(values, stride, columns, bins, target, ahead, rows * width)
         else:
-            project_4_12(values, stride, columns, bins, here, ahead, rows * width)
+            project_4_12(values, stride, columns, bins, target, ahead, rows * width)
 
 
 @_compiled
 def _classify(tables: Tables, s: _Scratch) -> None:
-    """Set aside what cannot be solved here, so that only numbers go on; turn signals upright."""
+    """Set aside profiles that cannot be solved here; change the sign of inverted signals."""
     size = tables.size
     for p in range(BLOCK):
         y = s.y[p]
@@ -232,11 +232,11 @@ def _start(tables: Tables, s: _Scratch) -> None:
     """Look up the cell by the direction of the first two components."""
     for p in range(BLOCK):
         y0, y1 = s.y[p, 0], s.y[p, 1]
-        part = y1 / (abs(y0) + abs(y1))
-        turn = part if y0 >= 0.0 else (2.0 - part if y1 >= 0.0 else -2.0 - part)
+        share = y1 / (abs(y0) + abs(y1))
+        turn = share if y0 >= 0.0 else (2.0 - share if y1 >= 0.0 else -2.0 - share)
         turn = turn if abs(turn) <= 2.0 else 0.0
-        place = int((turn + 2.0) * (_functional_tables.START_BINS // 4))
-        s.cell[p] = tables.lookup[min(place, _functional_tables.START_BINS - 1)]
+        index = int((turn + 2.0) * (_functional_tables.START_BINS // 4))
+        s.cell[p] = tables.lookup[min(index, _functional_tables.START_BINS - 1)]
 
 
 @_compiled
@@ -312,7 +312,7 @@ def _settle(tables: Tables, s: _Scratch) -> None:
 
 @_compiled
 def _read_scalars(tables: Tables, s: _Scratch) -> None:
-    """Evaluate what the results need at the extinctions found."""
+    """Evaluate the scalars of the results at the fitted extinctions."""
     last, row, powers = tables.centres.size - 1, s.row, s.powers
     out, terms = row.ctypes.data, powers.size - 1
     for p in range(BLOCK):
@@ -320,21 +320,21 @@ def _read_scalars(tables: Tables, s: _Scratch) -> None:
         at_end = (cell == 0 and t <= -1.0) or (cell == last and t >= 1.0)
         t = min(max(t, -1.0), 1.0) if at_end else t
         s.t[p] = t
-        s.found[_BOUNDED, p] = 1.0 if at_end else 0.0
-        s.found[_TAU, p] = tables.centres[cell] + tables.halves[cell] * t
+        s.fit[_BOUNDED, p] = 1.0 if at_end else 0.0
+        s.fit[_TAU, p] = tables.centres[cell] + tables.halves[cell] * t
         square = t * t
         powers[1], powers[2], powers[3] = t, square, square * t
         powers[4], powers[5], powers[6] = square * square, square * square * t, square**3
-        here = tables.scalars.ctypes.data + 8 * _functional_tables.SCALARS * terms * cell
-        project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
+        matrix = tables.scalars.ctypes.data + 8 * _functional_tables.SCALARS * terms * cell
+        project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         for j in range(_functional_tables.SCALARS):
             s.scalars[j, p] = row[j]
 
 
 @_compiled
 def _estimate(tables: Tables, s: _Scratch) -> None:
-    """Fill what was found and its errors, in the scaled variables, for unit noise."""
-    f, c, found = s.f, s.scalars, s.found
+    """Fill the parameters and their errors, in the scaled variables, for unit noise."""
+    f, c, fit = s.f, s.scalars, s.fit
     leverage = 2.0 * tables.start / tables.length
     level = 1.0 / tables.total_weight
     for p in range(BLOCK):
@@ -351,77 +351,77 @@ def _estimate(tables: Tables, s: _Scratch) -> None:
         # Extinction moves the logarithm of B, which is the amplitude at range zero.
         lever = (leverage - coupling / (inverse_norm * inverse_slope)) * error
         shape, slope = c[_functional_tables.LEVEL_SHAPE, p], c[_functional_tables.LEVEL_SLOPE, p]
-        found[_F, p] = size
-        found[_B, p] = s.sign[p] * size * inverse_norm
-        found[_TAU_ERROR, p] = error
-        found[_B_ERROR, p] = math.sqrt(1.0 / (size * size) + lever * lever)
-        found[_P_ERROR, p] = math.sqrt(level + shape * shape + slope * slope)
+        fit[_F, p] = size
+        fit[_B, p] = s.sign[p] * size * inverse_norm
+        fit[_TAU_ERROR, p] = error
+        fit[_B_ERROR, p] = math.sqrt(1.0 / (size * size) + lever * lever)
+        fit[_P_ERROR, p] = math.sqrt(level + shape * shape + slope * slope)
 
 
 @_compiled
-def _seek_curvature(tables: Tables, s: _Scratch) -> None:
-    """Fill the energy of the first functionals that the model leaves over.
+def _measure_misfit(tables: Tables, s: _Scratch) -> None:
+    """Fill the energy of the residuals in the first functionals.
 
-    And what all of them leave over along the square of the shape, where a detector leaves its
-    trace that is not linear or driven into saturation.
+    Also fill the projection of all residuals on the square of the shape, where a nonlinear or
+    saturated detector shows.
     """
     lanes, terms, row, powers = s.y.shape[1], s.f.shape[0], s.row, s.powers
     out = row.ctypes.data
     for p in range(BLOCK):
-        t, size = s.t[p], s.found[_F, p]
+        t, size = s.t[p], s.fit[_F, p]
         square = t * t
         powers[1], powers[2], powers[3] = t, square, square * t
         powers[4], powers[5] = square * square, square * square * t
         powers[6], powers[7] = square**3, square**3 * t
-        here = tables.directions.ctypes.data + 8 * terms * lanes * s.cell[p]
+        matrix = tables.directions.ctypes.data + 8 * terms * lanes * s.cell[p]
         if lanes == 8:
-            project_1_8(powers.ctypes.data, 8, here, terms, out, out, 0)
+            project_1_8(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         else:
-            project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
+            project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         energy = 0.0
         for j in range(tables.size):
             s.left[j] = s.y[p, j] - size * row[j]
         for j in range(CURVATURES):
             energy += s.left[j] * s.left[j]
-        s.found[_CURVATURE, p] = energy - _INTERPOLATED * size * size
-        here = tables.squares.ctypes.data + 8 * terms * lanes * s.cell[p]
+        s.fit[_CURVATURE, p] = energy - _INTERPOLATED * size * size
+        matrix = tables.squares.ctypes.data + 8 * terms * lanes * s.cell[p]
         if lanes == 8:
-            project_1_8(powers.ctypes.data, 8, here, terms, out, out, 0)
+            project_1_8(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         else:
-            project_1_12(powers.ctypes.data, 8, here, terms, out, out, 0)
+            project_1_12(powers.ctypes.data, 8, matrix, terms, out, out, 0)
         along = 0.0
         for j in range(tables.size):
             along += s.left[j] * row[j]
-        s.found[_SQUARE, p] = abs(along) - math.sqrt(_INTERPOLATED) * size
+        s.fit[_SQUARE, p] = abs(along) - math.sqrt(_INTERPOLATED) * size
 
 
 @_compiled
 def _place_background(tables: Tables, s: _Scratch) -> None:
     for p in range(BLOCK):
-        above = s.found[_B, p] * s.scalars[_functional_tables.MEAN_SHAPE, p]
-        s.found[_P, p] = s.reference[p] + (s.y[p, tables.size] - above)
+        above = s.fit[_B, p] * s.scalars[_functional_tables.MEAN_SHAPE, p]
+        s.fit[_P, p] = s.reference[p] + (s.y[p, tables.size] - above)
 
 
 @_summing
-def _bends(residual: Any) -> float:
+def _second_differences(residual: Any) -> float:
     """Sum the squared second differences of the residuals."""
     total = residual.dtype.type(0.0)
     last, middle = residual[2:], residual[1:]
     for i in range(last.size):
-        bend = last[i] - 2 * middle[i] + residual[i]
-        total += bend * bend
+        difference = last[i] - 2 * middle[i] + residual[i]
+        total += difference * difference
     return np.float64(total)
 
 
 @_compiled
-def _look_back(block: Any, s: _Scratch, want_bends: bool) -> None:
-    """Take the residuals of the profiles, in units of the noise."""
+def _take_residuals(block: Any, s: _Scratch, want_differences: bool) -> None:
+    """Compute the residuals of the profiles, in units of the noise."""
     bins = block.shape[1]
     steps = (bins - 1) // STRIDE + 1
     rest = bins - STRIDE * (steps - 1)
     width = block.itemsize * bins
     for p in range(BLOCK):
-        profile, background = block[p], s.found[_P, p]
+        profile, background = block[p], s.fit[_P, p]
         for j in range(STRIDE):
             s.tail[j] = background
         for j in range(rest):
@@ -429,7 +429,7 @@ def _look_back(block: Any, s: _Scratch, want_bends: bool) -> None:
         decay = s.scalars[_functional_tables.DECAY, p]
         e2 = decay * decay
         e4 = e2 * e2
-        s.found[_ENERGY, p], s.found[_LARGEST, p] = residuals(
+        s.fit[_ENERGY, p], s.fit[_LARGEST, p] = residuals(
             block,
             block.ctypes.data + width * p,
             s.tail.ctypes.data,
@@ -440,48 +440,48 @@ def _look_back(block: Any, s: _Scratch, want_bends: bool) -> None:
             e2,
             e4,
             e4 * e4,
-            s.found[_B, p],
+            s.fit[_B, p],
             background,
             s.residual.ctypes.data,
         )
-        if want_bends:
-            s.found[_BENDS, p] = _bends(s.residual[:bins])
+        if want_differences:
+            s.fit[_DIFFERENCES, p] = _second_differences(s.residual[:bins])
 
 
 @_compiled
 def _set_noise(tables: Tables, s: _Scratch, bins: int, mode: Mode) -> None:
-    """Fill the variance of the noise over that of unit weight."""
+    """Fill the noise variance of unit weight."""
     scale = mode.rounding**2 * tables.unit * tables.total_weight / bins
     for p in range(BLOCK):
-        largest = abs(s.reference[p]) + abs(s.found[_B, p])
+        largest = abs(s.reference[p]) + abs(s.fit[_B, p])
         floor = scale * largest * largest
-        noise = s.found[_BENDS, p] / (6.0 * (bins - 2))
+        noise = s.fit[_DIFFERENCES, p] / (6.0 * (bins - 2))
         noise = noise if noise > floor else floor
-        s.found[_NOISE, p] = 1.0 if mode.known_variance else noise
+        s.fit[_NOISE, p] = 1.0 if mode.known_variance else noise
 
 
 @_compiled
 def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
     """Fill the results in SI units."""
-    found, results = s.found, s.results
+    fit, results = s.fit, s.results
     for p in range(BLOCK):
-        extinction = found[_TAU, p] / tables.length
+        extinction = fit[_TAU, p] / tables.length
         results[2, p] = math.exp(2.0 * extinction * tables.start) * tables.start**2
     for p in range(BLOCK):
-        noise = found[_NOISE, p]
+        noise = fit[_NOISE, p]
         root = math.sqrt(noise / tables.unit)
-        size = found[_B, p]
+        size = fit[_B, p]
         amplitude = size * results[2, p]
-        results[0, p] = found[_P, p]
+        results[0, p] = fit[_P, p]
         wide = root * widening
-        results[1, p] = found[_P_ERROR, p] * wide
+        results[1, p] = fit[_P_ERROR, p] * wide
         results[2, p] = amplitude
-        results[3, p] = abs(amplitude) * (found[_B_ERROR, p] * wide)
-        results[4, p] = found[_TAU, p] / tables.length
-        results[5, p] = found[_TAU_ERROR, p] * wide / tables.length
-        results[6, p] = s.sign[p] * found[_F, p] / root
-        results[7, p] = found[_ENERGY, p] / (noise * (bins - 3))
-        curvature = found[_CURVATURE, p]
+        results[3, p] = abs(amplitude) * (fit[_B_ERROR, p] * wide)
+        results[4, p] = fit[_TAU, p] / tables.length
+        results[5, p] = fit[_TAU_ERROR, p] * wide / tables.length
+        results[6, p] = s.sign[p] * fit[_F, p] / root
+        results[7, p] = fit[_ENERGY, p] / (noise * (bins - 3))
+        curvature = fit[_CURVATURE, p]
         results[8, p] = (curvature if curvature > 0.0 else 0.0) * tables.unit / noise
         results[9, p] = size * s.scalars[_functional_tables.BACKGROUND_BEND, p] * tables.length
         results[10, p] = s.scalars[_functional_tables.EXTINCTION_BEND, p]
@@ -489,8 +489,8 @@ def _convert(tables: Tables, s: _Scratch, bins: int, widening: float) -> None:
 
 @_compiled
 def _judge(tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> None:
-    """Fill the quality. Passed, not failed, is asked for: NaN does not pass."""
-    found, results = s.found, s.results
+    """Fill the quality bits. Tests are for a pass, so that NaN fails."""
+    fit, results = s.fit, s.results
     steepest = 1.0 / tables.mean_range
     for p in range(BLOCK):
         relative = results[5, p] / (results[4, p] + steepest)
@@ -498,22 +498,22 @@ def _judge(tables: Tables, s: _Scratch, mode: Mode, limits: CommonLimits) -> Non
         determined &= results[3, p] < HUGE * HUGE
         misfit = results[7, p]
         fits = (limits.least_misfit <= misfit) & (misfit <= limits.most_misfit)
-        largest = limits.outlier * math.sqrt(found[_NOISE, p])
+        largest = limits.outlier * math.sqrt(fit[_NOISE, p])
         bits = 0 if abs(results[6, p]) > limits.lowest_signal else _LOW_SIGNAL
         bits |= 0 if determined else _POORLY_DETERMINED
         bits |= 0 if s.sign[p] > 0.0 else _NEGATIVE_AMPLITUDE
-        bits |= 0 if found[_BOUNDED, p] == 0.0 else _AT_BOUND
+        bits |= 0 if fit[_BOUNDED, p] == 0.0 else _AT_BOUND
         straight = results[8, p] <= limits.curvature
-        straight &= found[_SQUARE, p] * math.sqrt(tables.unit / found[_NOISE, p]) <= limits.square
+        straight &= fit[_SQUARE, p] * math.sqrt(tables.unit / fit[_NOISE, p]) <= limits.square
         bits |= 0 if straight else _NOT_HOMOGENEOUS
         tested = 0 if fits else _POOR_FIT
-        tested |= 0 if found[_LARGEST, p] <= largest else _OUTLIER
+        tested |= 0 if fit[_LARGEST, p] <= largest else _OUTLIER
         s.bits[p] = bits | (tested if mode.with_residuals else 0)
 
 
 @_compiled
 def _settle_exceptions(tables: Tables, s: _Scratch, mode: Mode) -> None:
-    """Overwrite what holds for constant profiles, and what was not asked for."""
+    """Overwrite the results of constant profiles, and residual results that were not computed."""
     if not mode.with_residuals:
         s.results[7, :] = math.nan
     for p in range(BLOCK):
@@ -535,10 +535,10 @@ def _solve_block(block: Any, tables: Tables, s: _Scratch, mode: Mode, limits: Co
     _settle(tables, s)
     _read_scalars(tables, s)
     _estimate(tables, s)
-    _seek_curvature(tables, s)
+    _measure_misfit(tables, s)
     _place_background(tables, s)
     if mode.with_residuals:
-        _look_back(block, s, not mode.known_variance)
+        _take_residuals(block, s, not mode.known_variance)
     bins = block.shape[1]
     _set_noise(tables, s, bins, mode)
     _convert(tables, s, bins, limits.widening)
@@ -574,28 +574,28 @@ def solve_compressed(
     out : (len(RESULTS), profile) float64
     quality : (profile,) int32
     state : (profile,) int64
-        `ROUTED` where the profile is left to others; its results mean nothing.
+        `ROUTED` where the profile is left to another solver; its results mean nothing.
     """
     count = power.shape[0]
     s = _scratch(power, root, envelope, tables.columns.shape[1])
     for first in range(0, count, BLOCK):
-        here = min(BLOCK, count - first)
-        if here == BLOCK:
+        profiles = min(BLOCK, count - first)
+        if profiles == BLOCK:
             _solve_block(power[first : first + BLOCK], tables, s, mode, limits)
         else:
-            s.padded[:here] = power[first:]
-            s.padded[here:] = 0
+            s.padded[:profiles] = power[first:]
+            s.padded[profiles:] = 0
             _solve_block(s.padded, tables, s, mode, limits)
         for j in range(out.shape[0]):
-            row, results = out[j, first : first + here], s.results[j]
-            for p in range(here):
+            row, results = out[j, first : first + profiles], s.results[j]
+            for p in range(profiles):
                 row[p] = results[p]
-        quality[first : first + here] = s.bits[:here]
-        state[first : first + here] = s.state[:here]
+        quality[first : first + profiles] = s.bits[:profiles]
+        state[first : first + profiles] = s.state[:profiles]
 
 
 def weight_roots(tables: Tables, weights: Array, like: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the square roots of the weights as `solve_compressed` wants them."""
+    """Return the square roots of the weights in the layout of `solve_compressed`."""
     padded = np.zeros(tables.envelope.size, like.dtype)
     padded[: weights.size] = np.sqrt(weights)
     return padded

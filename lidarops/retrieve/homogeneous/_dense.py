@@ -1,4 +1,4 @@
-"""The compressed solver behind `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`: who takes which profile."""
+"""Compressed methods of the homogeneous path: which solver takes which profile."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _compressed, _methods
 from lidarops.retrieve.homogeneous._fit_quality import common_limits
 from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
-from lidarops.retrieve.homogeneous._problem import Array, Flat, PathProblem
+from lidarops.retrieve.homogeneous._problem import Array, PathProblem, PathSolution
 
 FEWEST_BINS: Final = 32
-"""Below, the direct fit is as fast, and a basis of 11 shapes is most of the profile."""
+"""Below, the direct fit is as fast, and a basis of 11 shapes would span most of the profile."""
 MOST_BINS: Final = 4096
-"""Above, making the tables would hold more than 100 MB, for longer than a fit takes."""
+"""Above, the tables would need more than 100 MB and longer than a fit takes."""
 DEFAULT_SIZE: Final = 11
 FAST_SIZE: Final = 7
 THINNEST: Final = 0.15
-"""Length over first range, below which shapes are so nearly straight lines that the cells of a
-table are too coarse for them."""
+"""Least length over first range. In thinner sections the shapes are nearly straight lines, for
+which the cells of the tables are too coarse."""
 _UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
 
 
-def compressed(problem: PathProblem) -> Flat:
-    """Solve by 11 functionals of each profile, and by Newton steps what has gaps."""
+def compressed(problem: PathProblem) -> PathSolution:
+    """Solve by 11 functionals of each profile; profiles with gaps by Newton steps."""
     return _solve(problem, DEFAULT_SIZE, with_residuals=True)
 
 
-def fast(problem: PathProblem) -> Flat:
-    """Solve by 7 functionals, without a look at the residuals where the variance is known."""
+def fast(problem: PathProblem) -> PathSolution:
+    """Solve by 7 functionals; residuals are not computed where the variance is known."""
     return _solve(problem, FAST_SIZE, with_residuals=not problem.known_variance)
 
 
-def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> Flat:
+def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> PathSolution:
     if not _is_regular(problem):
         return _methods.solve_by_direct_fit(problem)
     tables = _tables(problem, size)
@@ -59,7 +59,7 @@ def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> Flat:
         quality,
         state,
     )
-    found = Flat(
+    solution = PathSolution(
         **dict(zip(_compressed.RESULTS, out, strict=True)),
         mean_range=np.where(quality & int(Quality.NO_SIGNAL), math.nan, tables.mean_range),
         valid_bins=np.full(count, bins, np.int32),
@@ -67,8 +67,8 @@ def _solve(problem: PathProblem, size: int, *, with_residuals: bool) -> Flat:
     )
     routed = np.flatnonzero(state == _compressed.ROUTED)
     if routed.size == 0:
-        return found
-    return found.updated(
+        return solution
+    return solution.updated(
         routed, _methods.solve_by_masked_fit(problem.select(routed, problem.power[routed]))
     )
 
@@ -83,7 +83,7 @@ def _is_regular(problem: PathProblem) -> bool:
 
 
 def _tables(problem: PathProblem, size: int) -> Tables | None:
-    """Return the tables, or None where profiles of this kind have none."""
+    """Return the tables, or None where they do not apply."""
     if not problem.common_noise or problem.range.size > MOST_BINS:
         return None
     weights = _weights(problem)

@@ -1,9 +1,9 @@
 """Compiled least squares of the homogeneous path, one profile at a time.
 
-The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is evaluated on
-fixed nodes, and the best node is improved by a fixed number of Newton steps, whose residuals are
-taken explicitly. Every sum runs over the bins of one profile in a fixed order: a result does not
-depend on what else is in the batch.
+The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is
+evaluated on fixed nodes. A fixed number of Newton steps, with explicit residuals, improves the
+best node. Every sum runs over the bins of one profile in a fixed order: a result does not depend
+on the rest of the batch.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -21,7 +21,6 @@ from lidarops.retrieve.homogeneous._estimate import (
     BACKGROUND,
     BACKGROUND_BEND,
     BACKGROUND_VARIANCE,
-    BENDS,
     BINS,
     BOUNDED,
     CONSTANT,
@@ -33,6 +32,7 @@ from lidarops.retrieve.homogeneous._estimate import (
     MEAN_RANGE,
     MISFIT,
     ROUNDING,
+    SECOND_DIFFERENCES,
     SIGNAL_ENERGY,
     STATUS,
     TOO_SHORT,
@@ -63,11 +63,11 @@ from lidarops.retrieve.homogeneous._projection import (
 Array = npt.NDArray[np.float64]
 
 STEPS: Final = 7
-"""Newton steps after the start, which is good to some hundredths of the spacing of nodes."""
+"""Newton steps from a start that is off by some hundredths of the spacing of nodes."""
 HUGE: Final = 1e300
 TINY: Final = 1e-280
 
-# What is asked of the extinction.
+# Treatment of the extinction.
 FREE: Final = 0
 GIVEN: Final = 1
 STEP: Final = 2
@@ -78,7 +78,7 @@ STEP_ABOUT_ZERO: Final = 3
 
 @compiled
 def _weight(value: float, noise: float, is_variance: bool) -> float:
-    """Return the weight of a bin, 0 where value or weight cannot be used."""
+    """Return the weight of a bin, 0 where value or weight is not usable."""
     weight = 1.0 / noise if is_variance else noise
     return weight if abs(value) < HUGE and 0.0 < weight < HUGE else 0.0
 
@@ -95,7 +95,7 @@ def _last_valid(power: Any, noise: Array, is_variance: bool) -> int:
 def _load(
     power: Any, noise: Array, is_variance: bool, reference: float, s: ProjectionScratch
 ) -> int:
-    """Copy one profile less its reference, 0 where it cannot be used; return the valid bins."""
+    """Copy one profile less its reference, 0 where not usable; return the number of valid bins."""
     count = 0
     for i in range(noise.size):
         value = np.float64(power[i])
@@ -117,7 +117,7 @@ def _project(shape: Array, w: Array, z: Array, w0: float, wz: float, free: float
         s2 += weighted * shape[i]
         sz += weighted * z[i]
     norm = s2 - free * s1 * s1 / w0
-    # A shape that is flat over the valid bins, or gone before the first, tells nothing.
+    # A shape that is flat over the valid bins, or gone before the first, holds no information.
     if not (norm > 1e-13 * s2 and s2 > TINY):
         return 0.0
     return float((sz - free * s1 * wz / w0) / math.sqrt(norm))
@@ -127,27 +127,27 @@ def _project(shape: Array, w: Array, z: Array, w0: float, wz: float, free: float
 def _start(
     g: Grid, s: ProjectionScratch, w0: float, wz: float, free: float
 ) -> tuple[float, float, float]:
-    """Return tau at the vertex about the best node, and the nodes that bracket it."""
+    """Return tau at the peak of a parabola through the best node, and the nodes that bracket it."""
     shapes, nodes, w, z, lengths = g.shapes, g.nodes, s.w, s.z, s.lengths
     best = 0
     for j in range(NODES):
         lengths[j] = _project(shapes[j], w, z, w0, wz, free)
         if abs(lengths[j]) > abs(lengths[best]):
             best = j
-    # At an end of the grid, the vertex is extrapolated from the last three nodes.
+    # At an end of the grid, the peak is extrapolated from the last three nodes.
     middle = min(max(best, 1), NODES - 2)
     sign = math.copysign(1.0, lengths[best])
-    before, here, after = (
+    before, centre, after = (
         sign * lengths[middle - 1],
         sign * lengths[middle],
         sign * lengths[middle + 1],
     )
     low, high = nodes[max(best - 1, 0)], nodes[min(best + 1, NODES - 1)]
     start = nodes[best]
-    bend = before - 2.0 * here + after
+    bend = before - 2.0 * centre + after
     if bend < 0.0:
-        vertex = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
-        start = min(max(NODE_SCALE * math.sinh(vertex), low), high)
+        peak = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
+        start = min(max(NODE_SCALE * math.sinh(peak), low), high)
     return start, low, high
 
 
@@ -181,7 +181,7 @@ def _describe(g: Grid, p: Point, tau: float, w0: float, free: float, row: Array)
 
 @compiled
 def _describe_given(p: Point, w0: float, free: float, row: Array) -> None:
-    """Write the variances over: the extinction has none."""
+    """Overwrite the variances for a given extinction, whose variance is 0."""
     row[EXTINCTION_VARIANCE] = 0.0
     row[BACKGROUND_VARIANCE] = free / w0 + p.mean_phi * p.mean_phi / p.norm
     row[AMPLITUDE_RELATIVE_VARIANCE] = 1.0 / row[SIGNAL_ENERGY]
@@ -189,7 +189,7 @@ def _describe_given(p: Point, w0: float, free: float, row: Array) -> None:
 
 @compiled
 def _step(g: Grid, p: Point, kind: int, tau: float, row: Array) -> None:
-    """Write the linear step from a prior; errors to first order in the two coefficients."""
+    """Write the linear step from a prior, with errors to first order in the two coefficients."""
     slope = p.gradient / (p.b * p.slope_norm)
     centroid = g.start / g.length + p.centroid
     origin = centroid if kind == STEP else 0.0
@@ -197,11 +197,13 @@ def _step(g: Grid, p: Point, kind: int, tau: float, row: Array) -> None:
     shift = 2.0 * (centroid - origin)
     b = p.b + shift * slope
     step = slope / b
-    of_slope, of_b = 1.0 / p.slope_norm, 1.0 / p.norm
+    slope_variance, b_variance = 1.0 / p.slope_norm, 1.0 / p.norm
     by_slope, by_b = p.b / (b * b), -slope / (b * b)
-    row[EXTINCTION_VARIANCE] = by_slope * by_slope * of_slope + by_b * by_b * of_b
+    row[EXTINCTION_VARIANCE] = by_slope * by_slope * slope_variance + by_b * by_b * b_variance
     by_slope, by_b = shift / b + 2.0 * origin * by_slope, 1.0 / b + 2.0 * origin * by_b
-    row[AMPLITUDE_RELATIVE_VARIANCE] = by_slope * by_slope * of_slope + by_b * by_b * of_b
+    row[AMPLITUDE_RELATIVE_VARIANCE] = (
+        by_slope * by_slope * slope_variance + by_b * by_b * b_variance
+    )
     row[BACKGROUND] -= slope * p.mean_t
     row[EXTINCTION] = tau + step
     row[AMPLITUDE] = b * math.exp(2.0 * step * (origin - g.start / g.length))
@@ -209,7 +211,7 @@ def _step(g: Grid, p: Point, kind: int, tau: float, row: Array) -> None:
 
 @compiled
 def _moved(p: Point, row: Array) -> Point:
-    """Return a point with the background and amplitude of a row."""
+    """Return the point with the background and amplitude of a row."""
     return Point(
         row[AMPLITUDE],
         row[BACKGROUND] + row[AMPLITUDE] * p.mean_phi,
@@ -225,7 +227,7 @@ def _moved(p: Point, row: Array) -> Point:
 
 @compiled
 def _fit(g: Grid, s: ProjectionScratch, free: float, kind: int, tau: float, row: Array) -> None:
-    """Fit one loaded profile and write what became of it, in the scaled variables."""
+    """Fit one loaded profile and write its row, in the scaled variables."""
     w0, wz = total_of(s.w), product(s.w, s.z)
     if kind == FREE:
         tau, low, high = _start(g, s, w0, wz, free)
@@ -250,7 +252,7 @@ def _fit(g: Grid, s: ProjectionScratch, free: float, kind: int, tau: float, row:
 
 @compiled
 def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> None:
-    """Turn a row from the scaled variables into SI units; noise terms into units of the noise."""
+    """Convert a row from scaled variables to SI units; noise terms to units of the noise."""
     energy = scale * (scale * unit)
     sign = math.copysign(1.0, row[AMPLITUDE])
     logarithm = math.log(abs(row[AMPLITUDE])) + math.log(scale)
@@ -264,7 +266,7 @@ def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> 
     row[EXTINCTION_VARIANCE] /= energy * g.length * g.length
     row[SIGNAL_ENERGY] *= energy
     row[MISFIT] *= energy
-    row[BENDS] *= energy
+    row[SECOND_DIFFERENCES] *= energy
     row[TREND] *= energy
     row[LARGEST] *= math.sqrt(energy)
     row[MEAN_RANGE] = g.start + g.length * row[MEAN_RANGE]
@@ -323,7 +325,7 @@ def solve_direct(
         Variances or weights; a bin is left out where its weight is not positive and finite.
     is_variance : bool
     background : (profile or 1,) float64
-        Given backgrounds, NaN where the background is to be fitted.
+        Given backgrounds; NaN where the background is fitted.
     kind : int
         `FREE`, `GIVEN`, `STEP` or `STEP_ABOUT_ZERO`.
     extinction : (profile or 1,) float64
@@ -333,10 +335,10 @@ def solve_direct(
     g : Grid
         Of `make_grid`.
     out : (profile, column) float64
-        Filled with NaN; gets the columns of `lidarops.retrieve.homogeneous._estimate`.
+        Filled with NaN; receives the columns of `lidarops.retrieve.homogeneous._estimate`.
     """
     s = make_scratch(g.x.size)
     for k in range(power.shape[0]):
-        given = extinction[k % extinction.size]
-        mode = (is_variance, background[k % background.size], rounding, kind, given)
+        prior = extinction[k % extinction.size]
+        mode = (is_variance, background[k % background.size], rounding, kind, prior)
         _solve_profile(power[k], noise[k % noise.shape[0]], mode, g, s, out[k])

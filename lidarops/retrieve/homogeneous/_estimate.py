@@ -1,4 +1,4 @@
-"""What a kernel of the homogeneous path finds out about a profile, before it is judged."""
+"""The fit of a homogeneous path as the kernels return it, before it is judged."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-# What became of a profile.
+# Status of a profile.
 FITTED: Final = 0
 EMPTY: Final = 1
 CONSTANT: Final = 2
@@ -19,9 +19,9 @@ TOO_SHORT: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class PathEstimate:
-    """What a solver knows of a batch of profiles, one value each, before it is judged.
+    """Fit of a batch of profiles, one value each, before it is judged.
 
-    Variances and energies are for noise of unit variance where the weights are relative.
+    Where the weights are relative, variances and energies are those for noise of unit variance.
     """
 
     status: Array
@@ -38,29 +38,31 @@ class PathEstimate:
     """Squared amplitude over its variance at known extinction."""
     misfit: Array
     """Weighted sum of squared residuals."""
-    bends: Array
-    """Sum of squared second differences of the weighted residuals, and their number."""
-    bend_count: Array
+    second_differences: Array
+    """Sum of squared second differences of the weighted residuals."""
+    difference_count: Array
+    """Number of second differences."""
     largest: Array
-    """Largest weighted residual."""
+    """Largest absolute weighted residual."""
     trend: Array
-    """Energy of the residuals in shapes that the model lacks, and the number of shapes."""
+    """Energy of the residuals in the test shapes that the model lacks."""
     trend_count: Array
+    """Number of test shapes."""
     rounding: Array
-    """Variance that the rounding of the power alone explains."""
+    """Variance due to rounding of the power alone."""
     mean_range: Array
     """Weighted, m."""
     bounded: Array
     """1 where the extinction lies at a bound."""
     background_bend: Array
-    """What a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1 along the section,
-    does to the background, in the unit of the power times the length of the section."""
+    """Change of the background by a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1
+    along the section; unit of the power times the length of the section."""
     extinction_bend: Array
-    """The same of the extinction, times the length of the section."""
+    """The same for the extinction, times the length of the section."""
 
 
 COLUMNS: Final = tuple(field.name for field in fields(PathEstimate))
-"""The fields of an `PathEstimate`, as columns of the table that a kernel fills."""
+"""Fields of `PathEstimate`: the columns of the table that a kernel fills."""
 (
     STATUS,
     BINS,
@@ -72,8 +74,8 @@ COLUMNS: Final = tuple(field.name for field in fields(PathEstimate))
     EXTINCTION_VARIANCE,
     SIGNAL_ENERGY,
     MISFIT,
-    BENDS,
-    BEND_COUNT,
+    SECOND_DIFFERENCES,
+    DIFFERENCE_COUNT,
     LARGEST,
     TREND,
     TREND_COUNT,

@@ -1,8 +1,8 @@
-"""Whether a fit of a homogeneous path can be believed: noise level, misfit, quality bits.
+"""Judge the fit of a homogeneous path: noise level, misfit, quality bits.
 
-Every test on residuals has a false-alarm rate of `FALSE_ALARM` at any number of bins. Where the
-variance of the noise is not known, it is estimated from second differences of the residuals,
-which smooth misfit hardly touches, and the tests allow for the scatter of that estimate.
+Every test of residuals has a false-alarm rate of `FALSE_ALARM` at any number of bins. Where the
+noise variance is not known, it is estimated from second differences of the residuals, which
+smooth misfit hardly affects; the tests allow for the scatter of that estimate.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
 FALSE_ALARM: Final = 4e-4
-"""Rate at which one test flags a profile that is as it should be."""
+"""Rate at which one test flags a profile that obeys the model."""
 LOWEST_SIGNAL: Final = 5.0
 """Amplitude over its standard error at known extinction."""
 LARGEST_RELATIVE_ERROR: Final = 0.15
@@ -30,12 +30,12 @@ LARGEST_RELATIVE_ERROR: Final = 0.15
 OUTLIER: Final = 5.0
 """Least deviation, in standard deviations of the noise, that makes an outlier."""
 FEWEST_BINS: Final = 8
-FEWEST_BENDS: Final = 5
-"""Second differences below which the noise is taken from the residuals themselves."""
+FEWEST_DIFFERENCES: Final = 5
+"""With fewer second differences, the noise is estimated from the residuals themselves."""
 
 FAR: Final = 4.0
-"""Standard errors beyond which a value must not lie more often than with a known variance."""
-_BEND_DOF: Final = 18.0 / 35.0
+"""Standard errors at which widened intervals have the coverage of a known variance."""
+_DIFFERENCE_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
 
 
@@ -45,14 +45,14 @@ class Verdict:
 
     noise: Array
     widening: Array
-    """Of standard errors that rest on `noise`: 1 where the variance is known."""
+    """Factor on standard errors, for the scatter of `noise`; 1 where the variance is known."""
     reduced_chi2: Array
     quality: Flags
 
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """Beyond which values the tests fail."""
+    """Limits beyond which the tests fail."""
 
     least_misfit: Array
     """Of the reduced chi-square."""
@@ -63,7 +63,7 @@ class _Limits:
 
 
 class CommonLimits(NamedTuple):
-    """Beyond which values the tests fail, for profiles that share their number of bins."""
+    """Limits beyond which the tests fail, for profiles with the same number of bins."""
 
     lowest_signal: float
     largest_relative_error: float
@@ -74,7 +74,7 @@ class CommonLimits(NamedTuple):
     """Of the residuals along the square of the shape, in standard deviations."""
     outlier: float
     widening: float
-    """Of standard errors, which is no limit but depends on the same counts."""
+    """Factor on standard errors; not a limit, but a function of the same counts."""
 
 
 def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimits:
@@ -87,10 +87,9 @@ def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimi
         Degrees of freedom of the curvature misfit.
     known_variance : bool
     """
-    of_kind = _known_limits if known_variance else _estimated_limits
-    one, bends, other = (np.array([float(count)]) for count in (bins, bins - 2, shapes))
-    tests = (float(limit[0]) for limit in of_kind(one, bends, other, 3))
-    least, most, _, outlier, widening = tests
+    limits_of = _known_limits if known_variance else _estimated_limits
+    counts = (np.array([float(count)]) for count in (bins, bins - 2, shapes))
+    least, most, _, outlier, widening = (float(limit[0]) for limit in limits_of(*counts, 3))
     curvature, square = _shape_limits(bins, shapes, known_variance=known_variance)
     return CommonLimits(
         LOWEST_SIGNAL, LARGEST_RELATIVE_ERROR, least, most, curvature, square, outlier, widening
@@ -98,11 +97,11 @@ def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimi
 
 
 def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[float, float]:
-    """Return the limits of two tests for shapes, which share the rate of one."""
+    """Return the limits of the tests of curvature and square, each at half the rate."""
     rate = 0.5 * FALSE_ALARM
     if known_variance:
         return float(special.chdtri(shapes, rate)), -float(special.ndtri(0.5 * rate))
-    dof = _BEND_DOF * (bins - 2)
+    dof = _DIFFERENCE_DOF * (bins - 2)
     energy = shapes * special.fdtri(shapes, dof, 1.0 - rate)
     return float(energy), -float(special.stdtrit(dof, 0.5 * rate))
 
@@ -112,11 +111,11 @@ def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> 
 
     Parameters
     ----------
-    fit : Estimate
+    fit : PathEstimate
     known_variance : bool
-        Whether the weights were inverse variances.
+        Whether the weights are inverse variances.
     unknowns : int
-        Parameters that were fitted.
+        Number of fitted parameters.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         noise = np.ones_like(fit.status) if known_variance else _estimated_noise(fit, unknowns)
@@ -132,7 +131,7 @@ def judge_fit(fit: PathEstimate, *, known_variance: bool, unknowns: int = 3) -> 
             (Quality.NOT_HOMOGENEOUS, fit.trend / noise <= limits.trend),
             (Quality.OUTLIER, fit.largest / np.sqrt(noise) <= limits.outlier),
         )
-        # Passed, not failed, is asked for: what compares with NaN does not pass.
+        # Test for a pass, not for a failure: a comparison with NaN does not pass.
         quality = np.zeros(fit.status.shape, dtype=np.int32)
         fitted = fit.status == _estimate.FITTED
         for bit, passed in tests:
@@ -148,9 +147,10 @@ def _residual_dof(bins: Array, unknowns: int) -> Array:
 
 
 def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
-    from_bends = fit.bends / (6.0 * fit.bend_count)
+    from_differences = fit.second_differences / (6.0 * fit.difference_count)
     from_residuals = fit.misfit / _residual_dof(fit.bins, unknowns)
-    variance = np.where(fit.bend_count >= FEWEST_BENDS, from_bends, from_residuals)
+    enough = fit.difference_count >= FEWEST_DIFFERENCES
+    variance = np.where(enough, from_differences, from_residuals)
     return np.maximum(variance, fit.rounding)
 
 
@@ -163,15 +163,14 @@ def _determined(fit: PathEstimate, noise: Array, widening: Array) -> npt.NDArray
 
 
 def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limits:
-    counts = [np.nan_to_num(count) for count in (fit.bins, fit.bend_count, fit.trend_count)]
-    # Limits depend on counts alone, which most profiles share: evaluate each kind once.
+    counts = [np.nan_to_num(count) for count in (fit.bins, fit.difference_count, fit.trend_count)]
+    # Limits depend on counts alone, which most profiles share: evaluate each combination once.
     key = np.zeros(fit.status.shape, dtype=np.int64)
     for count in counts:
         key = (key << 20) + count.astype(np.int64)
     _, sample, kind = np.unique(key, return_index=True, return_inverse=True)
-    of_kinds = _known_limits if known_variance else _estimated_limits
-    bins, bends, shapes = (count[sample] for count in counts)
-    limits = of_kinds(bins, bends, shapes, unknowns)
+    limits_of = _known_limits if known_variance else _estimated_limits
+    limits = limits_of(*(count[sample] for count in counts), unknowns)
     return _Limits(*(limit[kind] for limit in limits))
 
 
@@ -186,12 +185,14 @@ def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[
     )
 
 
-def _estimated_limits(bins: Array, bends: Array, shapes: Array, unknowns: int) -> tuple[Array, ...]:
-    independent = bends >= FEWEST_BENDS
-    dof = np.where(independent, _BEND_DOF * bends, _residual_dof(bins, unknowns))
-    # The ratio of two estimates of one variance from the same residuals: the logarithm of its
-    # quantile, 4.611 = 3.353 sqrt(17 / 9), with a term for short sections fitted to simulations.
-    neighbours = bends + 2.0
+def _estimated_limits(
+    bins: Array, differences: Array, shapes: Array, unknowns: int
+) -> tuple[Array, ...]:
+    independent = differences >= FEWEST_DIFFERENCES
+    dof = np.where(independent, _DIFFERENCE_DOF * differences, _residual_dof(bins, unknowns))
+    # Quantile of the ratio of two estimates of one variance from the same residuals; its logarithm
+    # has 4.611 = 3.353 sqrt(17 / 9) and a term for short sections, fitted to simulations.
+    neighbours = differences + 2.0
     ratio = np.exp(4.611 / np.sqrt(neighbours) + 7.3 / neighbours)
     return (
         np.zeros_like(bins),

@@ -1,16 +1,17 @@
-r"""Tables that turn the homogeneous path into a handful of linear functionals of a profile.
+r"""Tables that reduce the homogeneous path to a few linear functionals of a profile.
 
-The shapes :math:`\varphi_\tau(x) = e^{-2 \tau x} (R_0 / R)^2` of all extinctions span, to the last
-digit that matters, a space of few dimensions. With its orthonormal basis U, what a profile says
-of the extinction is in y = U^T P alone, and the best extinction is the maximum of
-:math:`F(\tau) = q(\tau) \cdot y` with :math:`q = U^T \varphi / |U^T \varphi|`, whose
-derivative within a cell of extinctions is a polynomial with coefficients linear in y.
+The shapes :math:`\varphi_\tau(x) = e^{-2 \tau x} (R_0 / R)^2` of all extinctions span, within
+rounding, a space of few dimensions. With its orthonormal basis U, y = U^T P holds all information
+of a profile on the extinction. The best extinction is the maximum of
+:math:`F(\tau) = q(\tau) \cdot y` with :math:`q = U^T \varphi / |U^T \varphi|`, whose derivative
+within a cell of extinctions is a polynomial with coefficients linear in y.
 
-Projecting is linear and the tables hold the projection of the family itself, by the very numbers
-that profiles are multiplied with: leaving dimensions out loses information (`Tables.size`
-says how much), but never shifts a result. Everything is computed in the longest float there is.
+The projection is linear, and the tables project the shapes with the same numbers that multiply
+the profiles. A smaller basis therefore loses information (`Tables.size`) but never biases a
+result. The tables are computed in the longest float type.
 
-Variables are scaled as in `lidarops.retrieve.homogeneous._direct`: x = (R - R_0) / L and tau = extinction * L.
+Variables are scaled as in `lidarops.retrieve.homogeneous._projection`: x = (R - R_0) / L and
+tau = extinction * L.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ _Long = npt.NDArray[np.longdouble]
 
 CELLS: Final = 128
 DEGREE: Final = 6
-"""Of the polynomials within a cell: the interpolation error of an extinction is 1e-11."""
+"""Degree of the polynomials within a cell; the interpolation error of an extinction is 1e-11."""
 START_BINS: Final = 2048
 _WIDEST_SCALE: Final = 0.3
 
 _TRAINING: Final = 400
 _ROOM: Final = 2**17
-"""Numbers of one array of shapes at a time: 2 MB."""
+"""Most numbers in one array of shapes: 2 MB."""
 
 # Columns of `Tables.scalars`.
 INVERSE_NORM: Final = 0
@@ -52,11 +53,11 @@ SCALARS: Final = 12
 
 
 class Tables(NamedTuple):
-    """What all profiles of one range grid, one set of weights and one pair of bounds share."""
+    """Tables for all profiles of one range grid, one set of weights and one pair of bounds."""
 
     size: int
-    """Dimensions K of the basis. 7 lose up to 0.7 percent of the information on extinction, 11
-    up to 1e-6 of it."""
+    """Dimensions K of the basis: 7 lose up to 0.7 percent of the information on extinction, 11
+    up to 1e-6."""
     columns: Array
     """(bin, lanes): K weighted basis vectors, then the weights of the mean, then zeros."""
     starts: Array
@@ -66,10 +67,10 @@ class Tables(NamedTuple):
     directions: Array
     """(cell, power, lanes): polynomials of q."""
     squares: Array
-    """(cell, power, lanes): polynomials of the unit vector along what the model leaves over of
-    ``phi^2`` in the basis."""
+    """(cell, power, lanes): polynomials of the unit vector along the part of ``phi^2`` that is
+    orthogonal to the model."""
     scalars: Array
-    """(cell, power, SCALARS): polynomials of what the results need beside y."""
+    """(cell, power, SCALARS): polynomials of the scalars that the results need beside y."""
     steepness: Array
     """(cell,): squared length of h dq/dtau at the centre."""
     centres: Array
@@ -79,10 +80,10 @@ class Tables(NamedTuple):
     lookup: npt.NDArray[np.int64]
     """Cell by the direction of (y_0, y_1)."""
     envelope: Array
-    """``(R_0 / R)^2``, padded to whole steps of `lidarops.retrieve.homogeneous._vector_loops.residuals`."""
+    """``(R_0 / R)^2``, padded to whole steps of `_vector_loops.residuals`."""
     total_weight: float
     unit: float
-    """Power of two that was taken out of the weights."""
+    """Power of two by which the weights were divided."""
     start: float
     """R_0, m."""
     length: float
@@ -90,12 +91,12 @@ class Tables(NamedTuple):
     mean_range: float
     """Weighted, m."""
     monotonic: bool
-    """Whether the direction of (y_0, y_1) tells the extinction. Where it does not, the tables
-    cannot be used: bounds that allow extinctions near -1 / range do that."""
+    """Whether the direction of (y_0, y_1) determines the extinction. If not, as with bounds that
+    allow extinctions near -1 / range, the tables cannot be used."""
 
 
 def make_tables(range_: Array, weights: Array, bounds: tuple[float, float], size: int) -> Tables:
-    """Return the tables of a range grid, from a cache where they were made before.
+    """Return the tables of a range grid, from a cache if they were made before.
 
     Parameters
     ----------
@@ -131,7 +132,7 @@ class _Family:
         self.total = self.weights.sum()
 
     def blocks(self, count: int) -> Iterator[slice]:
-        """Cut a number of shapes into what there is room for at a time."""
+        """Split a number of shapes into blocks of limited size."""
         step = max(_ROOM // self.x.size, 1)
         return (slice(first, first + step) for first in range(0, count, step))
 
@@ -149,14 +150,14 @@ class _Family:
         """Return the basis, (bin, size), orthonormal and free of the mean."""
         both = np.empty((2, tau.size, self.x.size))
         for rows in self.blocks(tau.size):
-            shape, slope = (self.centred(part) for part in self.shapes(tau[rows]))
+            shape, slope = (self.centred(family) for family in self.shapes(tau[rows]))
             shape = shape / _norm(shape)[:, np.newaxis]
             slope = slope - (slope * shape).sum(axis=1)[:, np.newaxis] * shape
             both[0, rows], both[1, rows] = shape, slope / _norm(slope)[:, np.newaxis]
         both = both.reshape(2 * tau.size, self.x.size)
         basis = np.linalg.svd(both.T, full_matrices=False)[0][:, :size]
         level = (self.root / np.sqrt(self.total)).astype(np.float64)
-        # The vectors of small singular values keep traces of the mean: twice is enough.
+        # Vectors of small singular values keep traces of the mean; two passes remove them.
         for _ in range(2):
             basis = np.linalg.qr(basis - np.outer(level, level @ basis))[0]
         upright: Array = basis * np.where(basis[0] < 0, -1.0, 1.0)
@@ -171,7 +172,7 @@ class _Projected(NamedTuple):
     """Derivative of the direction by tau."""
     scalars: _Long
     square: _Long
-    """Unit vector along what level, shape and slope leave over of the squared shape."""
+    """Unit vector along the part of the squared shape orthogonal to level, shape and slope."""
 
 
 def _norm(rows: _Long) -> _Long:
@@ -179,14 +180,14 @@ def _norm(rows: _Long) -> _Long:
 
 
 def _project(family: _Family, columns: Array, tau: _Long, size: int) -> _Projected:
-    parts = [_project_block(family, columns, tau[rows], size) for rows in family.blocks(tau.size)]
-    return _Projected(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    blocks = [_project_block(family, columns, tau[rows], size) for rows in family.blocks(tau.size)]
+    return _Projected(*(np.concatenate(arrays) for arrays in zip(*blocks, strict=True)))
 
 
 def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _Projected:
     shapes, slopes = family.shapes(tau)
     exact = columns.astype(np.longdouble)
-    # Profiles are taken relative to their last bin, and so are shapes.
+    # Shapes are relative to their last bin, like profiles.
     shape = (shapes - shapes[:, -1:]) @ exact
     slope = (slopes - slopes[:, -1:]) @ exact
     mean, mean_slope = shape[:, size] + shapes[:, -1], slope[:, size] + slopes[:, -1]
@@ -213,7 +214,7 @@ def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _P
     square = shapes * shapes
     square = (square - square[:, -1:]) @ exact[:, :size]
     turned = turning / turn[:, np.newaxis]
-    # Twice, since little is left over.
+    # Twice, since the remainder is small.
     for _ in range(2):
         square = square - (square * direction).sum(axis=1)[:, np.newaxis] * direction
         square = square - (square * turned).sum(axis=1)[:, np.newaxis] * turned
@@ -222,28 +223,30 @@ def _project_block(family: _Family, columns: Array, tau: _Long, size: int) -> _P
 
 
 def _bend(family: _Family, shapes: _Long) -> tuple[_Long, _Long]:
-    """Return what a signal bent by ``(x - 1/2)^2`` does to background and tau, by amplitude.
+    """Return the effect of a signal bent by ``(x - 1/2)^2`` on background and tau, by amplitude.
 
-    The normal equations of level, phi and phi x for a right-hand side of phi x^2, with x from the
-    middle.
+    By the normal equations of level, phi and phi x for a right-hand side of phi x^2, with x from
+    the middle.
     """
     powers = (family.x - np.longdouble(0.5))[:, np.newaxis] ** np.arange(4)
     powers *= family.weights[:, np.newaxis]
     once, twice = (shapes @ powers[:, :3]).T, ((shapes * shapes) @ powers).T
 
-    def left(i: int, j: int) -> _Long:
+    def centred_product(i: int, j: int) -> _Long:
         """Return the product of phi x^i and phi x^j without their means."""
         return np.asarray(twice[i + j] - once[i] * once[j] / family.total, np.longdouble)
 
-    along = left(0, 1) / left(0, 0)
-    of_slope = (left(1, 2) - along * left(0, 2)) / (left(1, 1) - along * left(0, 1))
-    of_shape = (left(0, 2) - of_slope * left(0, 1)) / left(0, 0)
-    level = (once[2] - of_shape * once[0] - of_slope * once[1]) / family.total
-    return np.asarray(level, np.longdouble), np.asarray(-of_slope / 2, np.longdouble)
+    along = centred_product(0, 1) / centred_product(0, 0)
+    slope = (centred_product(1, 2) - along * centred_product(0, 2)) / (
+        centred_product(1, 1) - along * centred_product(0, 1)
+    )
+    shape = (centred_product(0, 2) - slope * centred_product(0, 1)) / centred_product(0, 0)
+    level = (once[2] - shape * once[0] - slope * once[1]) / family.total
+    return np.asarray(level, np.longdouble), np.asarray(-slope / 2, np.longdouble)
 
 
 def _interpolation(nodes: _Long) -> _Long:
-    """Return the matrix from values at nodes to the coefficients of the polynomial."""
+    """Return the matrix that maps values at nodes to coefficients of the polynomial."""
     matrix = np.zeros((nodes.size, nodes.size), np.longdouble)
     for i, node in enumerate(nodes):
         coefficients = np.ones(1, np.longdouble)
@@ -258,8 +261,8 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
     unit = math.ldexp(1.0, math.frexp(float(weights.max()))[1])
     family = _Family(range_, weights / unit)
     lowest, highest = (bound * float(family.length) for bound in bounds)
-    # Cells are uniform in asinh(tau / scale). In a thin section the shape is a slope that is
-    # gone at tau = -L / R: the cells have to be small against the distance to that.
+    # Cells are uniform in asinh(tau / scale). In a thin section the shape is nearly a line, whose
+    # slope vanishes at tau = -L / R: the cells have to be small against the distance to that.
     scale = min(_WIDEST_SCALE, _WIDEST_SCALE * float(family.length) / float(range_[0]))
     ends = np.arcsinh(np.array([lowest, highest]) / scale)
 
@@ -281,24 +284,24 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
     nodes = np.cos((2 * np.arange(order) + 1) * np.pi / (2 * order)).astype(np.longdouble)
     inside = (centres[:, np.newaxis] + halves[:, np.newaxis] * nodes).ravel()
     matrix = _interpolation(nodes)
-    at = _project(family, columns, inside, size)
+    inner = _project(family, columns, inside, size)
     middle = _project(family, columns, centres, size)
-    turning = (np.repeat(halves, order)[:, np.newaxis] * at.slope).reshape(CELLS, order, size)
+    turning = (np.repeat(halves, order)[:, np.newaxis] * inner.slope).reshape(CELLS, order, size)
 
     slopes = np.empty((CELLS, size, order + 1))
     slopes[:, :, 0] = middle.direction
     slopes[:, :, 1:] = np.einsum("ij,cjk->cki", matrix, turning)
-    # F is q . y, so that the integral of the slopes is the direction itself.
+    # F is q . y: the integral of the slopes is the direction itself.
     directions = np.zeros((CELLS, order + 1, columns.shape[1]))
     directions[:, :, :size] = np.swapaxes(slopes, 1, 2)
     directions[:, 1:] /= np.arange(1, order + 1)[:, np.newaxis]
     squares = np.zeros_like(directions)
     squares[:, :order, :size] = np.einsum(
-        "ij,cjk->cik", matrix, at.square.reshape(CELLS, order, size)
+        "ij,cjk->cik", matrix, inner.square.reshape(CELLS, order, size)
     )
     starts = np.zeros((CELLS, size, 4))
     starts[:, :, :2] = slopes[:, :, :2]
-    scalars = np.einsum("ij,cjk->cik", matrix, at.scalars.reshape(CELLS, order, -1))
+    scalars = np.einsum("ij,cjk->cik", matrix, inner.scalars.reshape(CELLS, order, -1))
     steepness = (halves * _norm(middle.slope)) ** 2
     lookup, monotonic = _lookup(middle.direction.astype(np.float64))
     padded = np.zeros(-(-range_.size // 16) * 16)
@@ -326,7 +329,7 @@ def _make(range_: Array, weights: Array, bounds: tuple[float, float], size: int)
 
 
 def _lookup(direction: Array) -> tuple[npt.NDArray[np.int64], bool]:
-    """Return the cell by the direction of the first two components, as `_compressed` has it."""
+    """Return the cell for each direction of (y_0, y_1), and whether directions are monotonic."""
     angle = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
     turns = np.diff(angle)
     monotonic = bool(np.all(turns > 0) or np.all(turns < 0)) and np.ptp(angle) < np.pi
@@ -335,8 +338,8 @@ def _lookup(direction: Array) -> tuple[npt.NDArray[np.int64], bool]:
     first = 1.0 - np.abs(diamond)
     second = np.where(np.abs(diamond) <= 1.0, diamond, np.copysign(2.0 - np.abs(diamond), diamond))
     middle = 0.5 * (angle.min() + angle.max())
-    wanted = np.arctan2(second, first)
-    wanted = middle + np.remainder(wanted - middle + np.pi, 2.0 * np.pi) - np.pi
+    target = np.arctan2(second, first)
+    target = middle + np.remainder(target - middle + np.pi, 2.0 * np.pi) - np.pi
     order = np.argsort(angle)
-    cell = np.interp(wanted, angle[order], order.astype(np.float64))
+    cell = np.interp(target, angle[order], order.astype(np.float64))
     return np.rint(cell).astype(np.int64), monotonic

@@ -1,4 +1,4 @@
-"""Compiled error of second order of the linearised method."""
+"""Compiled estimate of the second-order error of the linearised method."""
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
@@ -23,7 +23,7 @@ class _Model(NamedTuple):
     x: Array
     shape: Array
     slope: Array
-    """-2 (x - centroid) times the shape, less its mean and clear of the shape."""
+    """-2 (x - centroid) times the shape, less its mean and orthogonal to the shape."""
     weights: Array
 
 
@@ -38,7 +38,7 @@ def _mean(values: Array, weights: Array) -> float:
 
 @_compiled
 def _ratio(a: Array, b: Array, weights: Array) -> float:
-    """Return the coefficient of b in a."""
+    """Return the weighted least-squares coefficient of b in a."""
     product = norm = 0.0
     for i in range(a.size):
         product += weights[i] * a[i] * b[i]
@@ -58,7 +58,7 @@ def _centroid(model: _Model, centred: Array) -> float:
 
 @_compiled
 def _shift(model: _Model, tau: float, zero: float, about_zero: bool, b: float, row: Array) -> None:
-    """Fill what the neglected term ``2 b tau^2 (x - x_c)^2 phi`` does to the parameters.
+    """Fill the shifts of the parameters by the neglected term ``2 b tau^2 (x - x_c)^2 phi``.
 
     Here tau is the step in extinction, b the coefficient of the shape and `zero` the x of range
     zero.
@@ -74,13 +74,13 @@ def _shift(model: _Model, tau: float, zero: float, about_zero: bool, b: float, r
     neglected = 2.0 * b * tau * tau * (model.x - origin) ** 2 * model.shape
     mean = _mean(neglected, weights)
     neglected -= mean
-    of_slope = _ratio(neglected, slope, weights)
-    of_shape = _ratio(neglected, centred, weights)
-    row[0] = mean - of_shape * mean_shape - of_slope * mean_slope
+    slope_coefficient = _ratio(neglected, slope, weights)
+    shape_coefficient = _ratio(neglected, centred, weights)
+    row[0] = mean - shape_coefficient * mean_shape - slope_coefficient * mean_slope
     # In terms of the expansion about the origin, tau = g / b.
-    of_shape += 2.0 * (centroid - origin) * of_slope
-    row[2] = (of_slope - tau * of_shape) / b
-    row[1] = of_shape / b + 2.0 * (origin - zero) * row[2]
+    shape_coefficient += 2.0 * (centroid - origin) * slope_coefficient
+    row[2] = (slope_coefficient - tau * shape_coefficient) / b
+    row[1] = shape_coefficient / b + 2.0 * (origin - zero) * row[2]
 
 
 @_compiled
@@ -95,13 +95,13 @@ def neglected(
     amplitude: Array,
     out: Array,
 ) -> None:
-    """Estimate what the term of second order in the step does to the parameters.
+    """Estimate the shifts of the parameters by the second-order term of the step.
 
     Parameters
     ----------
     power : (profile, bin) float32 or float64
     noise : (profile or 1, bin) float64
-        Variances or weights, as the fit had them.
+        Variances or weights, as in the fit.
     is_variance : bool
     range_ : (bin,) float
         m, ascending.
@@ -110,20 +110,20 @@ def neglected(
     about_zero : bool
         Whether the expansion is about range zero, else about the centroid of information.
     extinction, amplitude : (profile,) float
-        m-1, power times m2: what one step found.
+        m-1, power times m2: the result of one step.
     out : (profile, 3) float64
-        Gets the shifts of the background, the logarithm of the amplitude and the extinction.
+        Receives the shifts of the background, the logarithm of the amplitude and the extinction.
     """
     n, length = range_.size, max(range_[-1] - range_[0], 1.0)
     zero = -range_[0] / length
     model = _Model((range_ - range_[0]) / length, np.empty(n), np.empty(n), np.empty(n))
     for k in range(power.shape[0]):
-        before = prior[k % prior.size]
+        expansion = prior[k % prior.size]
         fill_linear_weights(power[k], noise[k % noise.shape[0]], is_variance, model.weights)
         for i in range(n):
-            falling = math.exp(-2.0 * before * length * model.x[i])
+            falling = math.exp(-2.0 * expansion * length * model.x[i])
             model.shape[i] = falling * (range_[0] / range_[i]) ** 2
-        # At the first bin, by the extinction found; the shift is of second order already.
+        # At the first bin, with the fitted extinction: the shift is of second order already.
         b = amplitude[k] * math.exp(-2.0 * extinction[k] * range_[0]) / range_[0] ** 2
-        _shift(model, (extinction[k] - before) * length, zero, about_zero, b, out[k])
+        _shift(model, (extinction[k] - expansion) * length, zero, about_zero, b, out[k])
         out[k, 2] /= length

@@ -1,12 +1,13 @@
 """Least squares of profiles with gaps or weights of their own, in a few passes over the bins.
 
-The fit of `lidarops.retrieve.homogeneous._direct`, sped up: the best of a few extinctions is sought on sums
-over groups of bins, then Newton steps for all three unknowns go over the bins, each in one
-vectorised pass. From a start that is good to some percent each step squares the error, and three
-or four do. The result is that of converged least squares; `lidarops.retrieve.homogeneous._fit_quality` judges it.
+A faster form of `lidarops.retrieve.homogeneous._direct`. The best of a few extinctions is found on
+sums over groups of bins; Newton steps for all three unknowns follow, each in one vectorised pass
+over the bins. From a start within some percent each step squares the error, so that three or four
+suffice. The result is that of converged least squares, judged by
+`lidarops.retrieve.homogeneous._fit_quality`.
 
-Everything is scaled as in `lidarops.retrieve.homogeneous._projection`. Profiles for which this does not work
-out (nearly flat ones, numbers at the end of the floats) are left to the direct fit.
+Everything is scaled as in `lidarops.retrieve.homogeneous._projection`. Profiles for which this
+fails (nearly flat, or numbers at the limits of the float range) are left to the direct fit.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -26,10 +27,9 @@ from lidarops.retrieve.homogeneous._estimate import (
     BACKGROUND,
     BACKGROUND_BEND,
     BACKGROUND_VARIANCE,
-    BEND_COUNT,
-    BENDS,
     BINS,
     BOUNDED,
+    DIFFERENCE_COUNT,
     EXTINCTION,
     EXTINCTION_BEND,
     EXTINCTION_VARIANCE,
@@ -38,6 +38,7 @@ from lidarops.retrieve.homogeneous._estimate import (
     MEAN_RANGE,
     MISFIT,
     ROUNDING,
+    SECOND_DIFFERENCES,
     SIGNAL_ENERGY,
     STATUS,
     TREND,
@@ -62,17 +63,17 @@ NODES: Final = 16
 _SCALE: Final = 0.3
 _HUGE: Final = 1e140
 _LEAST: Final = 1e-3
-"""Share of the weight per bin that a shape must keep without its mean to be tried as a start:
-one that is gone before the first bin that is left would fit anything."""
+"""Least share of the weight per bin that a shape keeps without its mean, to be tried as a start:
+a shape that has decayed before the first valid bin would fit anything."""
 
 _LATEST: Final = 0.2
-"""Share of the section that may be missing at its start."""
+"""Largest share of the section that may be missing at its start."""
 _DEEPEST: Final = 0.5
-"""Optical depth that may be missing there."""
+"""Largest optical depth that may be missing there."""
 CONVERGED: Final = 1e-7
-"""Size of a step, over extinction, whose square is nothing: no other follows."""
+"""Step over extinction whose square is negligible: the iteration ends."""
 CLOSE: Final = 1e-3
-"""Size of the step before it: where steps fall as their squares do, none is so small at once."""
+"""Limit of the step before it: with quadratic convergence, no step is small all at once."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 _finding = numba.njit(
@@ -88,7 +89,7 @@ _summing = numba.njit(
 
 
 class Plan(NamedTuple):
-    """What the profiles of a call share."""
+    """Tables common to the profiles of a call."""
 
     x: Array
     """Scaled range, padded to whole steps."""
@@ -96,7 +97,7 @@ class Plan(NamedTuple):
     """``(R_0 / R)^2``, zero where padded."""
     step: float
     edges: npt.NDArray[np.int64]
-    """Of the groups of bins, which widen along range."""
+    """Edges of the groups of bins, which widen along range."""
     shapes: Array
     """(group, node): phi at the middle of each group."""
     powers: Array
@@ -131,7 +132,7 @@ class _Fit(NamedTuple):
 
 
 def make_plan(range_: Array, bounds: tuple[float, float]) -> Plan:
-    """Tabulate what the profiles of a call share.
+    """Return the tables common to the profiles of a call.
 
     Parameters
     ----------
@@ -182,7 +183,7 @@ def _edges(bins: int) -> npt.NDArray[np.int64]:
 
 @_compiled
 def _load(power: Any, weights: Array, s: _Scratch) -> tuple[float, float, float]:
-    """Copy a profile; return its valid bins, its reference and its largest weight."""
+    """Copy a profile; return its number of valid bins, reference and largest weight."""
     w, z, used = s.w[: weights.size], s.z[: weights.size], s.used[: weights.size]
     for i in range(weights.size):
         weight = weights[i]
@@ -235,22 +236,22 @@ def _take_roots(values: Array, roots: Array) -> None:
 
 @_compiled
 def _group(g: Plan, s: _Scratch) -> tuple[float, float]:
-    """Sum weights, and weighted values, over the groups; return the sums over all."""
+    """Sum weights and weighted values over the groups; return both sums over all bins."""
     whole = value = 0.0
     for k in range(g.edges.size - 1):
-        of_weights = of_values = 0.0
+        group_weight = group_value = 0.0
         for i in range(g.edges[k], g.edges[k + 1]):
-            of_weights += s.w[i]
-            of_values += s.w[i] * s.z[i]
-        s.weights[k], s.values[k] = of_weights, of_values
-        whole += of_weights
-        value += of_values
+            group_weight += s.w[i]
+            group_value += s.w[i] * s.z[i]
+        s.weights[k], s.values[k] = group_weight, group_value
+        whole += group_weight
+        value += group_value
     return whole, value
 
 
 @_compiled
 def _seek(g: Plan, s: _Scratch, whole: float, value: float, count: float) -> _Fit:
-    """Return the best node on the groups, moved to the vertex of a parabola through it."""
+    """Return the best node on the groups, moved to the peak of a parabola through it."""
     groups, out = g.edges.size - 1, s.sums.ctypes.data
     weights, values, after = s.weights.ctypes.data, s.values.ctypes.data, g.x.ctypes.data
     project_1_32(weights, 8, g.powers.ctypes.data, groups, out, after, 0)
@@ -261,7 +262,7 @@ def _seek(g: Plan, s: _Scratch, whole: float, value: float, count: float) -> _Fi
         if s.lengths[j] > s.lengths[best]:
             best = j
     if best < NODES - 1 and s.lengths[best + 1] == 0.0:
-        # The next node says nothing, or is gone before the first bin that is left.
+        # The next node holds no information, or has decayed before the first valid bin.
         return _Fit(0.0, math.nan, math.nan, 0.0, 0.0)
     tau = _vertex(g, s, best)
     one, norm = s.sums[0, best] / whole, s.sums[1, best] - s.sums[0, best] ** 2 / whole
@@ -271,7 +272,7 @@ def _seek(g: Plan, s: _Scratch, whole: float, value: float, count: float) -> _Fi
 
 @_compiled
 def _energies(sums: Array, energies: Array, value: float, whole: float, least: float) -> None:
-    """Fill what each node explains of the squared profile."""
+    """Fill the energy of the profile along the shape of each node."""
     ones, twos, products = sums[0], sums[1], sums[2]
     for j in range(energies.size):
         norm = twos[j] - ones[j] * ones[j] / whole
@@ -282,21 +283,22 @@ def _energies(sums: Array, energies: Array, value: float, whole: float, least: f
 @_compiled
 def _vertex(g: Plan, s: _Scratch, best: int) -> float:
     middle = min(max(best, 1), NODES - 2)
-    before, here = math.sqrt(s.lengths[middle - 1]), math.sqrt(s.lengths[middle])
+    before, centre = math.sqrt(s.lengths[middle - 1]), math.sqrt(s.lengths[middle])
     after = math.sqrt(s.lengths[middle + 1])
-    bend = before - 2.0 * here + after
+    bend = before - 2.0 * centre + after
     if not bend < 0.0:
         return float(g.nodes[best])
-    at = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
+    peak = g.first + (middle + 0.5 * (before - after) / bend) * g.spacing
     low, high = g.nodes[max(best - 1, 0)], g.nodes[min(best + 1, NODES - 1)]
-    return float(min(max(g.scale * math.sinh(at), low), high))
+    return float(min(max(g.scale * math.sinh(peak), low), high))
 
 
 @_compiled
 def _normal(sums: tuple[float, ...], whole: float) -> tuple[float, float, float, float, float]:
-    """Return the normal equations of the slope, level and shape projected out.
+    """Return the normal equation of the slope, with level and shape projected out.
 
-    Its norm and right-hand side, its products with level and shape, and the norm of the shape.
+    These are its norm and right-hand side, its products with level and shape, and the norm of
+    the shape.
     """
     d, dd, g, gd, gg, _, _, rg, _ = sums
     shape = dd - d * d / whole
@@ -345,7 +347,7 @@ def _describe(
     energy = after.amplitude * after.amplitude * shape
     extinction = 1.0 / (4.0 * after.amplitude * after.amplitude * norm)
     mean = before.mean + sums[0] / whole
-    # What a change of the slope does to the level, once the shape has followed.
+    # Effect of the slope on the level, with the shape adjusted.
     level = of_level - of_shape * mean
     lever = 2.0 * (g.start / g.length + before.centre + of_shape)
     row[BACKGROUND] = after.level
@@ -358,10 +360,13 @@ def _describe(
 
 
 @_compiled
-def _left(
+def _remainder(
     product: float, a: tuple[float, float, float], b: tuple[float, float, float], whole: float
 ) -> float:
-    """Return what level, shape and slope leave over; `a` and `b` in units of their norms."""
+    """Return the part of a product orthogonal to level, shape and slope.
+
+    `a` and `b` are the components of both vectors in units of their norms.
+    """
     return product - (a[0] * b[0] / whole + a[1] * b[1] + a[2] * b[2])
 
 
@@ -380,7 +385,7 @@ def _components(
 def _describe_bend(
     before: _Fit, sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array
 ) -> None:
-    """Write what a bent signal does to the fit, as `lidarops.retrieve.homogeneous._misfit` has it."""
+    """Write the effect of a bent signal on the fit, as `_misfit.describe_bend`."""
     norm, _, of_level, of_shape, shape = _normal(sums, whole)
     one, along, across = _components(bent[0], bent[1], bent[2], sums, whole)
     along, across = along / math.sqrt(shape), across / math.sqrt(norm)
@@ -393,53 +398,53 @@ def _describe_bend(
 def _trend(sums: tuple[float, ...], bent: tuple[float, ...], whole: float, row: Array) -> None:
     """Write the misfit, and the energy of the residuals in two shapes that the model lacks.
 
-    One is backscatter that bends along the path, the other a detector that is not linear, as in
+    One is backscatter that bends along the path, the other a nonlinear detector, as in
     `lidarops.retrieve.homogeneous._misfit`.
     """
     p = _components(bent[0], bent[1], bent[2], sums, whole)
     q = _components(bent[3], bent[4], bent[5], sums, whole)
-    # What the last step still took out of the residuals.
+    # Components that the last step removed from the residuals.
     r = _components(sums[5], sums[6], sums[7], sums, whole)
-    row[MISFIT], row[LARGEST] = _left(bent[11], r, r, whole), math.sqrt(bent[12])
-    pulled = _left(bent[9], p, r, whole)
+    row[MISFIT], row[LARGEST] = _remainder(bent[11], r, r, whole), math.sqrt(bent[12])
+    pulled = _remainder(bent[9], p, r, whole)
     energy = count = shared = 0.0
-    norm = _left(bent[6], p, p, whole)
+    norm = _remainder(bent[6], p, p, whole)
     if norm > DEPENDENT * bent[6]:
         energy += pulled * pulled / norm
         count += 1.0
-        shared = _left(bent[7], p, q, whole) / norm
-    rest = _left(bent[8], q, q, whole) - shared * shared * norm
+        shared = _remainder(bent[7], p, q, whole) / norm
+    rest = _remainder(bent[8], q, q, whole) - shared * shared * norm
     if rest > DEPENDENT * bent[8]:
-        own = _left(bent[10], q, r, whole) - shared * pulled
-        energy += own * own / rest
+        along = _remainder(bent[10], q, r, whole) - shared * pulled
+        energy += along * along / rest
         count += 1.0
     row[TREND], row[TREND_COUNT] = energy, count
 
 
 @_summing
-def _bends(residual: Array, used: Array) -> tuple[float, float]:
+def _second_differences(residual: Array, used: Array) -> tuple[float, float]:
     total = terms = 0.0
     last, middle = residual[2:], residual[1:]
     used_last, used_middle = used[2:], used[1:]
     for i in range(last.size):
-        bend = last[i] - 2.0 * middle[i] + residual[i]
+        difference = last[i] - 2.0 * middle[i] + residual[i]
         whole = used_last[i] * used_middle[i] * used[i]
-        total += whole * bend * bend
+        total += whole * difference * difference
         terms += whole
     return total, terms
 
 
 @_compiled
-def _look_back(g: Plan, s: _Scratch, fit: _Fit, row: Array) -> None:
-    """Take the second differences of the residuals, which tell the noise."""
+def _take_residuals(g: Plan, s: _Scratch, fit: _Fit, row: Array) -> None:
+    """Fill the second differences of the residuals, from which the noise is estimated."""
     decay, e4 = _decays(g, fit.tau)
     steps = g.x.size // STRIDE
-    here = s.z.ctypes.data
+    address = s.z.ctypes.data
     _take_roots(s.w, s.root)
     residuals(
         s.z,
-        here,
-        here + 8 * STRIDE * (steps - 1),
+        address,
+        address + 8 * STRIDE * (steps - 1),
         steps,
         g.envelope.ctypes.data,
         s.root.ctypes.data,
@@ -451,12 +456,12 @@ def _look_back(g: Plan, s: _Scratch, fit: _Fit, row: Array) -> None:
         fit.level,
         s.residual.ctypes.data,
     )
-    row[BENDS], row[BEND_COUNT] = _bends(s.residual, s.used)
+    row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s.residual, s.used)
 
 
 @_compiled
-def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bool:
-    """Fit one loaded profile; return whether that worked out."""
+def _fit(g: Plan, s: _Scratch, count: float, want_differences: bool, row: Array) -> bool:
+    """Fit one loaded profile; return whether the fit succeeded."""
     whole, value = _group(g, s)
     after = _seek(g, s, whole, value, count)
     bounds = g.nodes[0], g.nodes[-1]
@@ -465,7 +470,7 @@ def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bo
     steps = g.x.size // LANES
     moved, settled = math.inf, False
     for k in range(MOST_PASSES):
-        # The first steps may be small by chance: they start from the amplitude of the node.
+        # The first steps may be small by chance, since they start from the amplitude of the node.
         if k > 2 and settled:
             break
         before, last = after, moved
@@ -474,7 +479,7 @@ def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bo
         after = _step(before, sums, whole, bounds)
         moved = abs(after.tau - before.tau)
         size = abs(after.tau) + g.scale
-        # A step about a centre that lies nowhere is small whatever is left to go.
+        # A step about a stray centre is small at any distance from the solution.
         strayed = abs(after.centre - before.centre) > 0.1 * (1.0 + abs(after.centre))
         settled = moved < CONVERGED * size and last < CLOSE * size and not strayed
     _describe(g, before, after, sums, whole, row)
@@ -482,16 +487,16 @@ def _fit(g: Plan, s: _Scratch, count: float, want_bends: bool, row: Array) -> bo
     bent = bend_sums(*arrays, steps, e1, e4, *before[:2], before.mean, before.centre)
     _trend(sums, bent, whole, row)
     _describe_bend(before, sums, bent, whole, row)
-    row[BENDS], row[BEND_COUNT] = 0.0, 0.0
-    if want_bends:
-        _look_back(g, s, after, row)
+    row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = 0.0, 0.0
+    if want_differences:
+        _take_residuals(g, s, after, row)
     row[MEAN_RANGE] = _mean_range(g, s, whole)
     row[ROUNDING] = whole
     row[BOUNDED] = 1.0 if after.tau <= bounds[0] or after.tau >= bounds[1] else 0.0
     first = 0
     while s.used[first] == 0.0:
         first += 1
-    # Seen from far behind the start of the section, shapes are too much alike for these sums.
+    # Where the start of the section is missing, the shapes are too similar for these sums.
     if g.x[first] > _LATEST or after.tau * g.x[first] > _DEEPEST:
         return False
     return settled and math.isfinite(row[EXTINCTION_VARIANCE] + row[MISFIT] + row[TREND])
@@ -523,7 +528,13 @@ def _scratch(g: Plan) -> _Scratch:
 
 @_compiled
 def _solve_profile(
-    power: Any, weights: Array, want_bends: bool, rounding: float, g: Plan, s: _Scratch, row: Array
+    power: Any,
+    weights: Array,
+    want_differences: bool,
+    rounding: float,
+    g: Plan,
+    s: _Scratch,
+    row: Array,
 ) -> bool:
     count, reference, unit = _load(power, weights, s)
     row[BINS] = count
@@ -531,7 +542,7 @@ def _solve_profile(
         return False
     _shift(s.z[: weights.size], s.used[: weights.size], reference)
     _multiply(s.w, 1.0 / unit)
-    if not _fit(g, s, count, want_bends, row):
+    if not _fit(g, s, count, want_differences, row):
         return False
     row[STATUS] = FITTED
     largest = abs(reference) + abs(row[AMPLITUDE])
@@ -544,7 +555,7 @@ def _solve_profile(
 def solve_masked(
     power: Any,
     weights: Array,
-    want_bends: bool,
+    want_differences: bool,
     rounding: float,
     g: Plan,
     out: Array,
@@ -558,18 +569,18 @@ def solve_masked(
     weights : (profile or 1, bin) float64
         A bin is left out where its weight is not positive and finite.
     want_bends : bool
-        Whether the second differences of the residuals are taken, 0 otherwise.
+        Whether the second differences of the residuals are computed; 0 otherwise.
     rounding : float
         Relative rounding error of the power.
     g : Plan
         Of `make_plan`.
     out : (profile, column) float64
-        Gets the columns of `lidarops.retrieve.homogeneous._estimate`.
+        Receives the columns of `lidarops.retrieve.homogeneous._estimate`.
     solved : (profile,) bool
         False where a profile is left to the direct fit; its columns mean nothing.
     """
     s = _scratch(g)
     for k in range(power.shape[0]):
         solved[k] = _solve_profile(
-            power[k], weights[k % weights.shape[0]], want_bends, rounding, g, s, out[k]
+            power[k], weights[k % weights.shape[0]], want_differences, rounding, g, s, out[k]
         )

@@ -1,4 +1,4 @@
-"""Solvers of the homogeneous path over the compiled direct fit."""
+"""Solvers of the homogeneous path on top of the compiled direct fit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from lidarops.retrieve.background.cubic_and_tail import solve_cubic, solve_tail
 from lidarops.retrieve.homogeneous import _direct, _linearized, _masked, _propagation
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
 from lidarops.retrieve.homogeneous._fit_quality import judge_fit
-from lidarops.retrieve.homogeneous._problem import Array, Centre, Flags, Flat, PathProblem
+from lidarops.retrieve.homogeneous._problem import (
+    Array,
+    Centre,
+    Flags,
+    PathProblem,
+    PathSolution,
+)
 from lidarops.retrieve.homogeneous._projection import make_grid
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
@@ -20,21 +26,21 @@ _KINDS: Final = {Centre.CENTROID: _direct.STEP, Centre.ZERO: _direct.STEP_ABOUT_
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
-    """What a background from elsewhere adds to the variances, in absolute terms."""
+class _AddedVariances:
+    """Variances from sources other than the noise of the fit, in absolute terms."""
 
     background: Array
     amplitude_relative: Array
     extinction: Array
 
 
-def solve_by_direct_fit(problem: PathProblem) -> Flat:
+def solve_by_direct_fit(problem: PathProblem) -> PathSolution:
     """Solve by least squares for all three unknowns."""
-    return _flat(_estimate(problem), problem)
+    return _solution(_estimate(problem), problem)
 
 
-def solve_by_masked_fit(problem: PathProblem) -> Flat:
-    """Solve as `solve_by_direct_fit` does, in fewer passes over the bins where the range is uniform."""
+def solve_by_masked_fit(problem: PathProblem) -> PathSolution:
+    """Solve as `solve_by_direct_fit`, in fewer passes over the bins; the range must be uniform."""
     plan = _masked.make_plan(problem.range, problem.bounds)
     count = problem.power.shape[0]
     table, solved = np.empty((count, len(COLUMNS))), np.empty(count, np.bool_)
@@ -53,10 +59,10 @@ def solve_by_masked_fit(problem: PathProblem) -> Flat:
     if others.size:
         rest = problem.select(others, problem.power[others])
         table[others] = _table(rest, np.full(1, np.nan), _direct.FREE, np.full(1, np.nan))
-    return _flat(PathEstimate(**dict(zip(COLUMNS, table.T, strict=True))), problem)
+    return _solution(PathEstimate(**dict(zip(COLUMNS, table.T, strict=True))), problem)
 
 
-def solve_by_linearization(problem: PathProblem) -> Flat:
+def solve_by_linearization(problem: PathProblem) -> PathSolution:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
     fit = _estimate(problem, kind=_KINDS[problem.centre], extinction=prior)
@@ -73,32 +79,34 @@ def solve_by_linearization(problem: PathProblem) -> Flat:
         shifts,
     )
     with np.errstate(over="ignore", invalid="ignore"):
-        given = _Given(*(shifts**2).T)
-    return _flat(fit, problem, given=given)
+        added = _AddedVariances(*(shifts**2).T)
+    return _solution(fit, problem, added=added)
 
 
-def solve_with_known_extinction(problem: PathProblem) -> Flat:
+def solve_with_known_extinction(problem: PathProblem) -> PathSolution:
     """Solve for background and amplitude at the given extinction."""
     fit = _estimate(problem, kind=_direct.GIVEN, extinction=problem.extinction)
-    return _flat(fit, problem, unknowns=2)
+    return _solution(fit, problem, unknowns=2)
 
 
-def solve_with_known_background(problem: PathProblem) -> Flat:
+def solve_with_known_background(problem: PathProblem) -> PathSolution:
     """Solve for amplitude and extinction above the given background."""
     background = np.zeros(1) if problem.background is None else problem.background
     variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
     fit = _estimate(problem, background=background)
     spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
     with np.errstate(over="ignore", invalid="ignore"):
-        given = _Given(variance, variance * spread[:, 3] ** 2, variance * spread[:, 4] ** 2)
-    return _flat(fit, problem, unknowns=2, given=given)
+        added = _AddedVariances(
+            variance, variance * spread[:, 3] ** 2, variance * spread[:, 4] ** 2
+        )
+    return _solution(fit, problem, unknowns=2, added=added)
 
 
-def solve_by_cubic(problem: PathProblem) -> Flat:
-    """Take the background from the cubic and propagate its error into the rest."""
+def solve_by_cubic(problem: PathProblem) -> PathSolution:
+    """Take the background from the cubic and propagate its error into the other parameters."""
     with np.errstate(divide="ignore"):
         variance = problem.noise if problem.known_variance else 1.0 / problem.noise
-    found, gradients = solve_cubic(
+    estimate, gradients = solve_cubic(
         problem.power,
         problem.range,
         problem.lag,
@@ -107,20 +115,24 @@ def solve_by_cubic(problem: PathProblem) -> Flat:
         shots=problem.shots,
         want_gradients=True,
     )
-    fit = _above(problem, found.background, gradients)
-    fit = replace(fit, status=np.where(np.isnan(found.background), np.nan, fit.status))
-    return _flat(fit, problem, quality=found.quality)
+    fit = _fit_above_background(problem, estimate.background, gradients)
+    fit = replace(fit, status=np.where(np.isnan(estimate.background), np.nan, fit.status))
+    return _solution(fit, problem, quality=estimate.quality)
 
 
-def solve_by_tail_mean(problem: PathProblem) -> Flat:
-    """Take the background from the mean of the tail and propagate its noise into the rest."""
-    found, gradients = solve_tail(problem.power, problem.range, problem.tail_start, problem.noise)
-    fit = _above(problem, found.background, gradients)
-    fit = replace(fit, status=np.where(np.isnan(found.background), np.nan, fit.status))
-    return _flat(fit, problem, quality=found.quality)
+def solve_by_tail_mean(problem: PathProblem) -> PathSolution:
+    """Take the background from the tail mean and propagate its noise into the other parameters."""
+    estimate, gradients = solve_tail(
+        problem.power, problem.range, problem.tail_start, problem.noise
+    )
+    fit = _fit_above_background(problem, estimate.background, gradients)
+    fit = replace(fit, status=np.where(np.isnan(estimate.background), np.nan, fit.status))
+    return _solution(fit, problem, quality=estimate.quality)
 
 
-def _above(problem: PathProblem, background: Array, gradients: Array) -> PathEstimate:
+def _fit_above_background(
+    problem: PathProblem, background: Array, gradients: Array
+) -> PathEstimate:
     """Fit amplitude and extinction above a background that depends on the same power."""
     fit = _estimate(problem, background=background)
     spread = _propagated(problem, fit, gradients)
@@ -157,13 +169,13 @@ def _estimate(
     kind: int = _direct.FREE,
     extinction: Array | None = None,
 ) -> PathEstimate:
-    """Run the kernel, with the background fitted where it is NaN."""
-    nowhere = np.full(1, np.nan)
+    """Run the kernel; the background is fitted where none is given."""
+    free = np.full(1, np.nan)
     table = _table(
         problem,
-        nowhere if background is None else background,
+        free if background is None else background,
         kind,
-        nowhere if extinction is None else extinction,
+        free if extinction is None else extinction,
     )
     return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
 
@@ -185,48 +197,48 @@ def _table(problem: PathProblem, background: Array, kind: int, extinction: Array
 
 
 def _rounding(problem: PathProblem) -> float:
-    """Half a unit in the last place, as a standard deviation, and what the kernels lose."""
+    """Return the relative rounding error of the power and the kernels, as a standard deviation."""
     return 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
 
 
-def _flat(
+def _solution(
     fit: PathEstimate,
     problem: PathProblem,
     *,
     unknowns: int = 3,
     quality: Flags = _NOTHING,
-    given: _Given | None = None,
-) -> Flat:
-    """Judge an estimate and turn it into what is reported."""
-    if given is None:
-        given = _Given(np.zeros(1), np.zeros(1), np.zeros(1))
+    added: _AddedVariances | None = None,
+) -> PathSolution:
+    """Judge an estimate and return the solution."""
+    if added is None:
+        added = _AddedVariances(np.zeros(1), np.zeros(1), np.zeros(1))
     verdict = judge_fit(fit, known_variance=problem.known_variance, unknowns=unknowns)
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         level = verdict.noise * verdict.widening**2
-        background_error = np.sqrt(fit.background_variance * level + given.background)
-        relative_error = np.sqrt(fit.amplitude_relative_variance * level + given.amplitude_relative)
-        extinction_error = np.sqrt(fit.extinction_variance * level + given.extinction)
+        background_error = np.sqrt(fit.background_variance * level + added.background)
+        relative_error = np.sqrt(fit.amplitude_relative_variance * level + added.amplitude_relative)
+        extinction_error = np.sqrt(fit.extinction_variance * level + added.extinction)
         signal_to_noise = np.copysign(np.sqrt(fit.signal_energy / verdict.noise), fit.amplitude)
         amplitude_error = np.abs(fit.amplitude) * relative_error
 
-    def of(values: Array, where: npt.NDArray[np.bool_]) -> Array:
-        return np.where(where, values, np.nan)
+    def masked(values: Array, valid: npt.NDArray[np.bool_]) -> Array:
+        return np.where(valid, values, np.nan)
 
     known = constant & problem.known_variance
-    return Flat(
-        background=of(fit.background, fitted | constant),
-        background_standard_error=of(background_error, fitted | known),
-        amplitude=np.where(constant, 0.0, of(fit.amplitude, fitted)),
-        amplitude_standard_error=of(amplitude_error, fitted),
-        extinction=of(fit.extinction, fitted),
-        extinction_standard_error=of(extinction_error, fitted),
-        signal_to_noise=of(signal_to_noise, fitted),
-        reduced_chi2=of(verdict.reduced_chi2, fitted),
+    return PathSolution(
+        background=masked(fit.background, fitted | constant),
+        background_standard_error=masked(background_error, fitted | known),
+        amplitude=np.where(constant, 0.0, masked(fit.amplitude, fitted)),
+        amplitude_standard_error=masked(amplitude_error, fitted),
+        extinction=masked(fit.extinction, fitted),
+        extinction_standard_error=masked(extinction_error, fitted),
+        signal_to_noise=masked(signal_to_noise, fitted),
+        reduced_chi2=masked(verdict.reduced_chi2, fitted),
         curvature_misfit=np.full(fit.status.shape, np.nan),
-        mean_range=of(fit.mean_range, fitted),
-        background_bend=of(fit.background_bend, fitted),
-        extinction_bend=of(fit.extinction_bend, fitted),
+        mean_range=masked(fit.mean_range, fitted),
+        background_bend=masked(fit.background_bend, fitted),
+        extinction_bend=masked(fit.extinction_bend, fitted),
         valid_bins=np.nan_to_num(fit.bins).astype(np.int32),
         quality=verdict.quality | quality,
     )

@@ -1,4 +1,4 @@
-"""Compiled tests of what a fit of the homogeneous path leaves over."""
+"""Compiled tests of the residuals of a homogeneous path."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy.typing as npt
 
 from lidarops.retrieve.homogeneous._estimate import (
     BACKGROUND_BEND,
-    BEND_COUNT,
-    BENDS,
     BOUNDED,
+    DIFFERENCE_COUNT,
     EXTINCTION_BEND,
     LARGEST,
     MISFIT,
+    SECOND_DIFFERENCES,
     TREND,
     TREND_COUNT,
 )
@@ -33,12 +33,12 @@ from lidarops.retrieve.homogeneous._projection import (
 Array = npt.NDArray[np.float64]
 
 DEPENDENT: Final = 1e-9
-"""Squared part of a shape that other shapes must leave over for it to count as another."""
+"""Least squared share of a shape outside the span of others, for it to count as independent."""
 
 
 @compiled
 def _residuals(s: ProjectionScratch, p: Point) -> None:
-    """Fill the residuals in units of the noise, and times weight; 0 for bins not used."""
+    """Fill the residuals in units of the noise, and times weight; 0 for unused bins."""
     for i in range(s.z.size):
         residual = s.z[i] - p.mean_z - p.b * (s.phi[i] - p.mean_phi)
         s.residual[i] = math.sqrt(s.w[i]) * residual
@@ -46,22 +46,22 @@ def _residuals(s: ProjectionScratch, p: Point) -> None:
 
 
 @summing
-def _bends(s: ProjectionScratch) -> tuple[float, float]:
+def _second_differences(s: ProjectionScratch) -> tuple[float, float]:
     """Sum the squared second differences of the residuals between neighbours; count them."""
     total = terms = 0.0
-    # Slices, since an index that might be negative keeps a loop from vectorising.
+    # Slices: an index that might be negative keeps a loop from vectorising.
     last, middle = s.residual[2:], s.residual[1:]
     used_last, used_middle = s.used[2:], s.used[1:]
     for i in range(last.size):
-        bend = last[i] - 2.0 * middle[i] + s.residual[i]
+        difference = last[i] - 2.0 * middle[i] + s.residual[i]
         whole = used_last[i] * used_middle[i] * s.used[i]
-        total += whole * bend * bend
+        total += whole * difference * difference
         terms += whole
     return total, terms
 
 
 @summing
-def _along(weighted: Array, g: Grid, phi: Array, p: Point) -> tuple[float, float, float]:
+def _model_products(weighted: Array, g: Grid, phi: Array, p: Point) -> tuple[float, float, float]:
     """Return the products of a weighted vector with the orthogonal shapes of the model."""
     one = shape = slope = 0.0
     for i in range(weighted.size):
@@ -72,14 +72,14 @@ def _along(weighted: Array, g: Grid, phi: Array, p: Point) -> tuple[float, float
 
 
 @compiled
-def _left(
+def _remainder(
     product: float,
     a: tuple[float, float, float],
     b: tuple[float, float, float],
     p: Point,
     w0: float,
 ) -> float:
-    """Return what the model leaves over of the product of two vectors."""
+    """Return the part of the product of two vectors that is orthogonal to the model."""
     return product - (a[0] * b[0] / w0 + a[1] * b[1] / p.norm + a[2] * b[2] / p.slope_norm)
 
 
@@ -87,8 +87,8 @@ def _left(
 def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, float]:
     """Return the energy of the residuals in two shapes that the model lacks, and their number.
 
-    One is backscatter that bends along the path, ``phi x^2``, the other a detector that is not
-    linear, ``phi^2``; both are orthogonalised against the model.
+    One is backscatter that bends along the path, ``phi x^2``, the other a nonlinear detector,
+    ``phi^2``; both are orthogonalised against the model.
     """
     bent, square, weighted_bent, weighted_square = s.tests
     for i in range(g.x.size):
@@ -97,28 +97,33 @@ def _trend(g: Grid, s: ProjectionScratch, p: Point, w0: float) -> tuple[float, f
         square[i] = s.phi[i] * s.phi[i]
         weighted_bent[i] = s.w[i] * bent[i]
         weighted_square[i] = s.w[i] * square[i]
-    of_bent = _along(weighted_bent, g, s.phi, p)
-    of_square = _along(weighted_square, g, s.phi, p)
-    of_residual = _along(s.pull, g, s.phi, p)
+    bent_products = _model_products(weighted_bent, g, s.phi, p)
+    square_products = _model_products(weighted_square, g, s.phi, p)
+    residual_products = _model_products(s.pull, g, s.phi, p)
     energy = count = shared = 0.0
     whole = product(bent, weighted_bent)
-    norm = _left(whole, of_bent, of_bent, p, w0)
-    pulled = _left(product(bent, s.pull), of_bent, of_residual, p, w0)
+    norm = _remainder(whole, bent_products, bent_products, p, w0)
+    pulled = _remainder(product(bent, s.pull), bent_products, residual_products, p, w0)
     if norm > DEPENDENT * whole:
         energy += pulled * pulled / norm
         count += 1.0
-        shared = _left(product(bent, weighted_square), of_bent, of_square, p, w0) / norm
+        shared = (
+            _remainder(product(bent, weighted_square), bent_products, square_products, p, w0) / norm
+        )
     whole = product(square, weighted_square)
-    norm = _left(whole, of_square, of_square, p, w0) - shared * shared * norm
+    norm = _remainder(whole, square_products, square_products, p, w0) - shared * shared * norm
     if norm > DEPENDENT * whole:
-        own = _left(product(square, s.pull), of_square, of_residual, p, w0) - shared * pulled
-        energy += own * own / norm
+        along = (
+            _remainder(product(square, s.pull), square_products, residual_products, p, w0)
+            - shared * pulled
+        )
+        energy += along * along / norm
         count += 1.0
     return energy, count
 
 
 @summing
-def _bent(g: Grid, s: ProjectionScratch, p: Point) -> tuple[float, float, float]:
+def _bent_signal_products(g: Grid, s: ProjectionScratch, p: Point) -> tuple[float, float, float]:
     """Return the products of ``phi (x - centroid)^2`` with the orthogonal shapes of the model."""
     one = shape = slope = 0.0
     for i in range(g.x.size):
@@ -134,12 +139,12 @@ def _bent(g: Grid, s: ProjectionScratch, p: Point) -> tuple[float, float, float]
 def describe_bend(
     g: Grid, s: ProjectionScratch, p: Point, w0: float, free: float, row: Array
 ) -> None:
-    """Write what a bent signal does to the fit, relative to its amplitude.
+    """Write the effect of a bent signal on the fit, relative to the amplitude.
 
-    About whichever range it bends, the parabolas differ by shapes of the model: the background
-    does not notice, the extinction is carried over to the middle of the section.
+    Parabolas about different ranges differ by shapes of the model only: the background is the
+    same, and the extinction is converted to the middle of the section.
     """
-    one, shape, slope = _bent(g, s, p)
+    one, shape, slope = _bent_signal_products(g, s, p)
     across = slope / p.slope_norm
     row[BACKGROUND_BEND] = free * one / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
     row[EXTINCTION_BEND] = across + 0.5 - p.centroid
@@ -147,7 +152,7 @@ def describe_bend(
 
 @compiled
 def describe_bend_given(p: Point, row: Array) -> None:
-    """Write the same over for a given extinction, which takes up neither bend nor slope.
+    """Overwrite the same for a given extinction, which absorbs neither bend nor slope.
 
     The slope is as large as that of the bend at either end, and independent of it.
     """
@@ -169,9 +174,9 @@ def judge_residuals(
     w0, wz, free = sums
     _residuals(s, p)
     row[MISFIT] = product(s.residual, s.residual)
-    row[BENDS], row[BEND_COUNT] = _bends(s)
+    row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s)
     row[LARGEST] = largest_of(s.residual)
-    # The test shapes are clear of the background even where the background was given.
+    # The test shapes are orthogonal to the background even where it is given.
     full = p if free > 0.0 else evaluate(tau, g, s, w0, wz, 1.0)
     row[TREND], row[TREND_COUNT] = _trend(g, s, full, w0)
     row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]

@@ -1,4 +1,4 @@
-"""What a solver of the homogeneous path is asked, and what it answers."""
+"""Input and output of the solvers of a homogeneous path."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Centre(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PathProblem:
-    """Profiles of one section and all that a solver may need to know of them.
+    """Profiles of one section, with all settings of the solvers.
 
     "(profile or 1,)" stands for one value for each profile, or one for all.
     """
@@ -36,44 +36,44 @@ class PathProblem:
     """(profile or 1, bin): variances or weights; a bin is left out where that is not positive
     and finite."""
     common_noise: bool
-    """Whether `noise` was given for all profiles at once. That a batch of one profile has one row
-    of noise does not make it common: what solves a profile must not depend on its batch."""
+    """Whether `noise` was given for all profiles together. One row for a batch of one profile is
+    not common noise: the choice of the solver must not depend on the batch."""
     known_variance: bool
     """Whether `noise` holds variances, else weights up to a common factor."""
     bounds: tuple[float, float]
     """Lowest and highest extinction, m-1."""
     extinction: Array | None = None
-    """(profile or 1,), m-1: the prior of the linearised method, or given."""
+    """(profile or 1,), m-1: the prior of the linearised method, or the known extinction."""
     background: Array | None = None
-    """(profile or 1,): given."""
+    """(profile or 1,): the known background."""
     background_variance: Array | None = None
-    """(profile or 1,): of the given background."""
+    """(profile or 1,): variance of the known background."""
     shots: Array | None = None
     """(profile or 1,): shots of which the power is the mean count; None for Gaussian noise."""
     lag: int | None = None
-    """Of the cubic."""
+    """Lag of the cubic, in bins."""
     centre: Centre = Centre.CENTROID
     tail_start: float | None = None
-    """m: of the bins whose mean is the background of the tail."""
+    """m: start of the tail whose mean is the background."""
 
     def select(self, rows: npt.NDArray[np.intp], power: Floats) -> PathProblem:
-        """Return the problem of some profiles, with other power."""
+        """Return the problem of the selected profiles, with new power."""
 
-        def chosen(values: Array | None) -> Array | None:
+        def selected(values: Array | None) -> Array | None:
             return values if values is None or values.shape[0] == 1 else values[rows]
 
         return replace(
             self,
             power=power,
             noise=self.noise if self.noise.shape[0] == 1 else self.noise[rows],
-            extinction=chosen(self.extinction),
-            background=chosen(self.background),
-            background_variance=chosen(self.background_variance),
-            shots=chosen(self.shots),
+            extinction=selected(self.extinction),
+            background=selected(self.background),
+            background_variance=selected(self.background_variance),
+            shots=selected(self.shots),
         )
 
     def cut(self, bins: slice, bounds: tuple[float, float]) -> PathProblem:
-        """Return the problem of some neighbouring bins."""
+        """Return the problem of a slice of bins."""
         return replace(
             self,
             power=_contiguous(self.power[:, bins]),
@@ -90,8 +90,8 @@ def _contiguous(power: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Flat:
-    """What a solver found, (profile,) each; the fields of `homogeneous.HomogeneousResult`."""
+class PathSolution:
+    """Solution of a batch, (profile,) each; see `path_fit.HomogeneousResult` for the fields."""
 
     background: Array
     background_standard_error: Array
@@ -107,18 +107,18 @@ class Flat:
     mean_range: Array
     """m, weighted over the bins used; NaN where nothing was fitted."""
     background_bend: Array
-    """What a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1 along the section,
-    does to the background, times the length of the section; NaN where nothing was fitted."""
+    """Change of the background by a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1
+    along the section, times the length of the section; NaN where nothing was fitted."""
     extinction_bend: Array
-    """The same of the extinction."""
+    """The same for the extinction."""
     valid_bins: Flags
     quality: Flags
 
-    def updated(self, rows: npt.NDArray[np.intp], other: Flat) -> Flat:
-        """Return a copy in which some profiles are taken from another result."""
+    def updated(self, rows: npt.NDArray[np.intp], other: PathSolution) -> PathSolution:
+        """Return a copy with the selected profiles replaced by those of `other`."""
         merged = {}
         for field in fields(self):
             values = getattr(self, field.name).copy()
             values[rows] = getattr(other, field.name)
             merged[field.name] = values
-        return Flat(**merged)
+        return PathSolution(**merged)

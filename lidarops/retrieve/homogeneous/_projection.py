@@ -5,7 +5,7 @@ extinction alone: the variable projection of `golub1973`.
 
 Everything is scaled: ``x = (R - R_0) / L`` with the length L of the section, extinction as
 ``tau = extinction * L``, the shape ``phi = exp(-2 tau x) (R_0 / R)^2``, the power less a reference
-and over a power of two, the weights over a power of two.
+and divided by a power of two, the weights divided by a power of two.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ NODE_SCALE: Final = 0.3
 BLOCK: Final = 16
 """Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
 
-# Reassociation lets sums vectorise; NaN and infinity keep their meaning.
+# Reassociation lets sums vectorise; NaN and infinity keep their meaning. Functions that may be
+# reassociated have to be inlined: see `lidarops.retrieve.background._shape_fit`.
 _SUMS: Final = {"reassoc", "contract", "nsz"}
-# Inlining by force spares the reference counts of arrays that pass from function to function.
+# Forced inlining also saves reference counting of arrays passed between functions.
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 summing = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath=_SUMS)
 finding = numba.njit(
@@ -36,7 +37,7 @@ finding = numba.njit(
 
 
 class Grid(NamedTuple):
-    """What all profiles of a call share, in the scaled variables."""
+    """Tables common to the profiles of a call, in the scaled variables."""
 
     x: Array
     envelope: Array
@@ -82,7 +83,7 @@ class Point(NamedTuple):
 
 
 def make_grid(range_: Array, bounds: tuple[float, float]) -> Grid:
-    """Tabulate what the profiles of a call share.
+    """Return the tables common to the profiles of a call.
 
     Parameters
     ----------
@@ -172,7 +173,7 @@ def _shape(tau: float, x: Array, envelope: Array, step: float, phi: Array, fine:
         for i in range(n):
             phi[i] = math.exp(-2.0 * tau * x[i]) * envelope[i]
         return
-    # Two short geometric series instead of many exponentials: few roundings, no long chain.
+    # Two short geometric series instead of many exponentials: few roundings and no long chain.
     ratio = math.exp(-2.0 * tau * step)
     fine[0] = 1.0
     for j in range(1, BLOCK):

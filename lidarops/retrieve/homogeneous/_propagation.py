@@ -1,4 +1,4 @@
-"""Compiled propagation of noise into what is fitted above a background from elsewhere."""
+"""Compiled propagation of noise into a fit above a separately estimated background."""
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _propagate_profile(
     gradient: Array,
     row: Array,
 ) -> None:
-    """Fill the random variances of one profile, and what its background does to the rest."""
+    """Fill the random variances of one profile, and its derivatives by the background."""
     norm = moment = 0.0
     for i in range(phi.size):
         norm += phi[i] * phi[i] * weights[i]
@@ -56,13 +56,13 @@ def _propagate_profile(
         row[5] += gradient[i] * b * phi[i] * (range_[i] - middle) ** 2 / length
         weighted = phi[i] * weights[i]
         lever = -2.0 * (range_[i] - centroid)
-        of_extinction = lever * weighted / (b * slope)
-        of_logarithm = weighted / (b * norm) + 2.0 * centroid * of_extinction
-        of_extinction += row[4] * gradient[i]
-        of_logarithm += row[3] * gradient[i]
+        extinction_gradient = lever * weighted / (b * slope)
+        logarithm_gradient = weighted / (b * norm) + 2.0 * centroid * extinction_gradient
+        extinction_gradient += row[4] * gradient[i]
+        logarithm_gradient += row[3] * gradient[i]
         row[0] += gradient[i] * gradient[i] / weights[i]
-        row[1] += of_logarithm * of_logarithm / weights[i]
-        row[2] += of_extinction * of_extinction / weights[i]
+        row[1] += logarithm_gradient * logarithm_gradient / weights[i]
+        row[2] += extinction_gradient * extinction_gradient / weights[i]
 
 
 @_compiled
@@ -82,19 +82,19 @@ def propagate(
     ----------
     power : (profile, bin) float32 or float64
     noise : (profile or 1, bin) float64
-        Variances or weights, as the fit had them.
+        Variances or weights, as in the fit.
     is_variance : bool
     extinction, amplitude : (profile,) float
-        m-1, power times m2: the weighted fit to the power less the background.
+        m-1, power times m2: from the weighted fit to the power less the background.
     range_ : (bin,) float
         m.
     gradients : (profile or 1, bin) float64
         Derivatives of the background with respect to the power.
     out : (profile, 6) float64
-        Gets the variance of the background, the relative variance of the amplitude and the
-        variance of the extinction; then the derivatives of the logarithm of the amplitude and
-        of the extinction with respect to the background; and what a signal bent by
-        ``(x - 1/2)^2`` does to the background, times the length of the section.
+        Receives the variance of the background, the relative variance of the amplitude and the
+        variance of the extinction; the derivatives of the logarithm of the amplitude and of the
+        extinction with respect to the background; and the change of the background by a signal
+        bent by ``(x - 1/2)^2``, times the length of the section.
     """
     start, phi, weights = range_[0], np.empty(range_.size), np.empty(range_.size)
     for k in range(extinction.size):

@@ -1,4 +1,4 @@
-"""Repeated fits without the bins that lie far off."""
+"""Repeated fits without outlying bins."""
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.flags import Quality
-from lidarops.retrieve.homogeneous._problem import Array, Flat, PathProblem
+from lidarops.retrieve.homogeneous._problem import Array, PathProblem, PathSolution
 
 FARTHEST: Final = 4.0
-"""Deviation, in standard deviations of the noise, beyond which a bin is left out."""
+"""Deviation, in standard deviations of the noise, beyond which a bin is excluded."""
 _MEDIAN: Final = 1.4826
 """Standard deviation over the median of absolute deviations."""
 _HUGE: Final = 1e300
@@ -25,45 +25,45 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
-class Robust:
-    """A solver that leaves out outlying bins and fits again, a fixed number of times."""
+class RobustSolver:
+    """A solver that excludes outlying bins and fits again, a fixed number of times."""
 
-    solver: Callable[[PathProblem], Flat]
+    solver: Callable[[PathProblem], PathSolution]
     passes: int
 
-    def __call__(self, problem: PathProblem) -> Flat:
-        """Solve; each profile on its own."""
-        found = self.solver(problem)
+    def __call__(self, problem: PathProblem) -> PathSolution:
+        """Return the solution; every profile is solved on its own."""
+        solution = self.solver(problem)
         if self.passes == 0:
-            return found
-        left_out = np.zeros(problem.power.shape, dtype=np.bool_)
+            return solution
+        excluded = np.zeros(problem.power.shape, dtype=np.bool_)
         for _ in range(self.passes):
-            changed = _find_far(problem, found, left_out)
+            changed = _mark_outliers(problem, solution, excluded)
             if changed.size == 0:
                 break
             power = problem.power[changed]
-            power[left_out[changed]] = np.nan
+            power[excluded[changed]] = np.nan
             again = self.solver(problem.select(changed, power))
-            found = found.updated(changed, again)
-        far = np.any(left_out, axis=-1)
+            solution = solution.updated(changed, again)
+        far = np.any(excluded, axis=-1)
         outlier = np.where(far, np.int32(Quality.OUTLIER), np.int32(0))
-        return replace(found, quality=found.quality | outlier)
+        return replace(solution, quality=solution.quality | outlier)
 
 
-def _find_far(
-    problem: PathProblem, found: Flat, left_out: npt.NDArray[np.bool_]
+def _mark_outliers(
+    problem: PathProblem, solution: PathSolution, excluded: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.intp]:
-    """Update which bins are left out; return the profiles for which that changed."""
+    """Update the excluded bins; return the profiles for which they changed."""
     changed = np.zeros(problem.power.shape[0], dtype=np.bool_)
     _mark(
         problem.power,
         problem.noise,
         problem.known_variance,
         problem.range,
-        found.background,
-        found.amplitude,
-        found.extinction,
-        left_out,
+        solution.background,
+        solution.amplitude,
+        solution.extinction,
+        excluded,
         changed,
     )
     return np.flatnonzero(changed)
@@ -73,12 +73,12 @@ def _find_far(
 def _deviations(
     power: Any, noise: Array, is_variance: bool, fit: Array, out: Array, rounding: float
 ) -> None:
-    """Fill the absolute deviations in units of the noise, NaN where a bin is not used."""
+    """Fill the absolute deviations in units of the noise, NaN for unused bins."""
     for i in range(out.size):
         value = np.float64(power[i])
         weight = 1.0 / noise[i] if is_variance else noise[i]
         usable = abs(value) < _HUGE and 0.0 < weight < _HUGE
-        # What rounding explains is not far off, however exact the rest.
+        # A deviation within rounding is no outlier, however small the noise.
         excess = max(abs(value - fit[i]) - rounding * abs(value), 0.0)
         out[i] = excess * math.sqrt(weight) if usable else np.nan
 
@@ -92,7 +92,7 @@ def _mark(
     background: Array,
     amplitude: Array,
     extinction: Array,
-    left_out: npt.NDArray[np.bool_],
+    excluded: npt.NDArray[np.bool_],
     changed: npt.NDArray[np.bool_],
 ) -> None:
     fit, deviation = np.empty(range_.size), np.empty(range_.size)
@@ -107,9 +107,9 @@ def _mark(
             fit[i] = background[k] + sign * math.exp(falling)
         _deviations(power[k], noise[k % noise.shape[0]], is_variance, fit, deviation, rounding)
         scale = _MEDIAN * np.nanmedian(deviation)
-        # A bad fit must not shed most of its bins: no more than half lie beyond the median.
+        # The median keeps a bad fit from excluding most of its bins: at most half exceed it.
         limit = FARTHEST * (max(scale, 1.0) if is_variance else scale)
         for i in range(range_.size):
             far = deviation[i] > limit
-            changed[k] = changed[k] or far != left_out[k, i]
-            left_out[k, i] = far
+            changed[k] = changed[k] or far != excluded[k, i]
+            excluded[k, i] = far

@@ -1,4 +1,4 @@
-"""Sections of a range grid."""
+"""Find the bins of the sections of a range grid."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.homogeneous._problem import Array
 
 FEWEST_BINS: Final = 4
-"""Of a section: below, the model has as many unknowns as there are values."""
+"""Fewest bins of a section; with fewer, there are no more values than unknowns."""
 
 
 def section_bins(sections: Sequence[tuple[float, float]] | None, range_: Array) -> list[slice]:
-    """Return the bins of each section, all for None.
+    """Return the bins of each section; all bins for None.
 
     Parameters
     ----------
     sections : sequence of (float, float)
-        m; of each, the bins with near <= R < far.
+        m; a section holds the bins with near <= R < far.
     range_ : (bin,) float
         m, ascending.
 
     Raises
     ------
     RetrievalInputError
-        Where these are no pairs of rising ranges, or where the grid has fewer than 4 bins in one.
+        Where these are not pairs of ascending ranges, or a section has fewer than 4 bins.
     """
     if sections is None:
         return [slice(0, range_.size)]

@@ -1,8 +1,8 @@
-"""Inner loops written in generic LLVM vectors, where a compiler does not find them by itself.
+"""Inner loops in generic LLVM vectors, which the compiler does not generate by itself.
 
-Nothing here names a processor: LLVM lowers the vectors to whatever registers there are, and
-fused multiply-adds are rounded once wherever they run, so that the bits are the same
-everywhere. Addresses are given as integers (``array.ctypes.data``); the caller keeps the arrays
+No code depends on the processor: LLVM lowers the vectors to the available registers, and fused
+multiply-adds are rounded once everywhere, so that the bits are the same on all machines.
+ Addresses are given as integers (``array.ctypes.data``); the caller keeps the arrays
 alive and their sizes right.
 """
 
@@ -76,7 +76,7 @@ class _Lanes:
         self.b.store(vector, pointer, align=self.size)
 
     def where(self, other: Any, bit: int) -> Any:
-        """Return a vector of ones, with `other` in the lanes whose number has `bit`."""
+        """Return a vector of ones, with `other` in the lanes whose number has `bit` set."""
         one = ir.Constant(self.type, [1.0] * self.count)
         chosen = [self.count + j if j & bit else j for j in range(self.count)]
         return self.b.shuffle_vector(one, other, _pattern(chosen))
@@ -108,7 +108,7 @@ class _Loop:
         self.more = builder.icmp_signed("<", self._next, count)
 
     def carried(self, kind: Any, start: Any) -> Any:
-        """Return a value that a step hands to the next one."""
+        """Return a value that each step passes on to the next."""
         self._b.position_at_start(self._body)
         value = self._b.phi(kind)
         value.add_incoming(start, self._before)
@@ -116,7 +116,7 @@ class _Loop:
         return value
 
     def close(self, pairs: Sequence[tuple[Any, Any]]) -> None:
-        """End the loop; `pairs` are carried values and what the next step gets."""
+        """End the loop; `pairs` are carried values and their values in the next step."""
         for value, following in [(self.index, self._next), *pairs]:
             value.add_incoming(following, self._body)
         self._b.cbranch(self.more, self._body, self._after)
@@ -132,7 +132,7 @@ def _prefetch(builder: Any, address: Any) -> None:
 
 
 def _projection(rows: int, vectors: int) -> Any:
-    """Make the product of `rows` rows with a matrix of `vectors` * LANES columns.
+    """Return the intrinsic that multiplies `rows` rows with a matrix of `vectors` * LANES columns.
 
     All sums stay in registers: rows * vectors of them, with one vector of the matrix each.
     """
@@ -151,10 +151,10 @@ def _projection(rows: int, vectors: int) -> Any:
             sums = [[loop.carried(v.type, v.zero) for _ in range(vectors)] for _ in range(rows)]
             row = b.add(matrix, b.mul(loop.index, _integer(vectors * width)))
             columns = [v.load(b.add(row, _integer(j * width))) for j in range(vectors)]
-            here = b.add(values, b.mul(loop.index, _integer(8)))
+            first_row = b.add(values, b.mul(loop.index, _integer(8)))
             pairs = []
             for k in range(rows):
-                address = b.add(here, b.mul(stride, _integer(k)))
+                address = b.add(first_row, b.mul(stride, _integer(k)))
                 value = v.splat(b.load(b.inttoptr(address, _DOUBLE.as_pointer()), align=8))
                 pairs += [(s, v.fma(value, c, s)) for s, c in zip(sums[k], columns, strict=True)]
             _prefetch(b, b.add(ahead, b.mul(loop.index, ahead_step)))
@@ -171,7 +171,7 @@ def _projection(rows: int, vectors: int) -> Any:
 project_6_8 = _projection(rows=6, vectors=2)
 """``project_6_8(values, stride, matrix, terms, out, ahead, ahead_step)``: write the (6, 8)
 products of 6 rows of float64 `values`, `stride` bytes apart, with the (terms, 8) `matrix`, each
-summed over the terms in their order; while at it, fetch memory from the address `ahead`."""
+summed over the terms in order; prefetch memory from the address `ahead` meanwhile."""
 project_4_12 = _projection(rows=4, vectors=3)
 project_1_32 = _projection(rows=1, vectors=8)
 project_1_16 = _projection(rows=1, vectors=4)
@@ -196,9 +196,9 @@ class _Walk:
     def totals(self, terms: Sequence[tuple[Any, Any]], peak: Any = None) -> list[Any]:
         """End the pass; return the sums of products and the largest of `peak`, as doubles."""
         pairs = []
-        for one, other in terms:
+        for x, y in terms:
             total = self._loop.carried(self.v.type, self.v.zero)
-            pairs.append((total, self.v.fma(one, other, total)))
+            pairs.append((total, self.v.fma(x, y, total)))
         largest = self._loop.carried(self.v.type, self.v.zero)
         highest = largest if peak is None else self.v.larger(peak, largest)
         steps = [(self._factor, self._b.fmul(self._factor, self._e4)), (largest, highest)]
@@ -220,19 +220,19 @@ def _step_sums(  # type: ignore[no-untyped-def]
     signature = types.UniTuple(types.float64, 9)(*[types.intp] * 5, *[types.float64] * 6)
 
     def generate(target: Any, b: Any, _: Any, given: Any) -> Any:
-        x, w, z, envelope, steps, e1, e4, *others = given
+        x, w, z, envelope, steps, e1, e4, *parameters = given
         v = _Lanes(b, _DOUBLE, LANES, f"v{LANES}f64")
-        level, amplitude, mean, centre = (v.splat(other) for other in others)
+        level, amplitude, mean, centre = (v.splat(parameter) for parameter in parameters)
         walk = _Walk(b, (x, w, z, envelope), steps, e1, e4)
-        here, weight, value = walk.values
-        d, lever = b.fsub(walk.phi, mean), b.fsub(here, centre)
+        distance, weight, value = walk.values
+        d, lever = b.fsub(walk.phi, mean), b.fsub(distance, centre)
         g = b.fmul(walk.phi, lever)
         r = v.fma(b.fneg(amplitude), walk.phi, b.fsub(value, level))
-        wd, wg, wr = (b.fmul(weight, part) for part in (d, g, r))
+        wd, wg, wr = (b.fmul(weight, term) for term in (d, g, r))
         wrg = b.fmul(wr, g)
         one = ir.Constant(v.type, [1.0] * LANES)
-        of_shapes = [(wd, one), (wd, d), (wg, one), (wg, d), (wg, g)]
-        totals = walk.totals([*of_shapes, (wr, one), (wr, d), (wrg, one), (wrg, lever)])
+        shape_terms = [(wd, one), (wd, d), (wg, one), (wg, d), (wg, g)]
+        totals = walk.totals([*shape_terms, (wr, one), (wr, d), (wrg, one), (wrg, lever)])
         return target.make_tuple(b, signature.return_type, totals)
 
     return signature, generate
@@ -242,7 +242,7 @@ def _step_sums(  # type: ignore[no-untyped-def]
 def _bend_sums(  # type: ignore[no-untyped-def]
     context, x, w, z, envelope, steps, e1, e4, level, amplitude, mean, centre
 ):
-    """Return the sums that tell of misfit and of shapes which the model lacks.
+    """Return the sums for the misfit and the test shapes that the model lacks.
 
     With the terms of `step_sums` and p = phi (x - centre)^2, q = phi^2, the weighted sums of p,
     p d, p g, q, q d, q g, p p, p q, q q, p r, q r, r r, and the largest weighted r r.
@@ -250,27 +250,27 @@ def _bend_sums(  # type: ignore[no-untyped-def]
     signature = types.UniTuple(types.float64, 13)(*[types.intp] * 5, *[types.float64] * 6)
 
     def generate(target: Any, b: Any, _: Any, given: Any) -> Any:
-        x, w, z, envelope, steps, e1, e4, *others = given
+        x, w, z, envelope, steps, e1, e4, *parameters = given
         v = _Lanes(b, _DOUBLE, LANES, f"v{LANES}f64")
-        level, amplitude, mean, centre = (v.splat(other) for other in others)
+        level, amplitude, mean, centre = (v.splat(parameter) for parameter in parameters)
         walk = _Walk(b, (x, w, z, envelope), steps, e1, e4)
-        here, weight, value = walk.values
-        d, lever = b.fsub(walk.phi, mean), b.fsub(here, centre)
+        distance, weight, value = walk.values
+        d, lever = b.fsub(walk.phi, mean), b.fsub(distance, centre)
         g = b.fmul(walk.phi, lever)
         r = v.fma(b.fneg(amplitude), walk.phi, b.fsub(value, level))
         p, q = b.fmul(g, lever), b.fmul(walk.phi, walk.phi)
         wp, wq = b.fmul(weight, p), b.fmul(weight, q)
         one = ir.Constant(v.type, [1.0] * LANES)
-        of_model = [(part, other) for part in (wp, wq) for other in (one, d, g)]
+        model_terms = [(test, shape) for test in (wp, wq) for shape in (one, d, g)]
         wr = b.fmul(weight, r)
-        of_rest = [(wp, p), (wp, q), (wq, q), (wp, r), (wq, r), (wr, r)]
-        totals = walk.totals([*of_model, *of_rest], b.fmul(wr, r))
+        residual_terms = [(wp, p), (wp, q), (wq, q), (wp, r), (wq, r), (wr, r)]
+        totals = walk.totals([*model_terms, *residual_terms], b.fmul(wr, r))
         return target.make_tuple(b, signature.return_type, totals)
 
     return signature, generate
 
 
-# Compiled code gives no context, which type checkers do not know.
+# Numba passes the context argument, which type checkers do not know.
 step_sums: Any = _step_sums
 bend_sums: Any = _bend_sums
 
@@ -290,8 +290,8 @@ def _residual_pass(*, single: bool) -> Any:
             level = v.splat(v.cast(background))
             first = v.where(v.splat(v.cast(e1)), 1)
             for power, bit in ((e2, 2), (e4, 4)):
-                part = v.where(v.splat(v.cast(power)), bit)
-                first = b.fmul(first, part)
+                factors = v.where(v.splat(v.cast(power)), bit)
+                first = b.fmul(first, factors)
             decays = [first, b.fmul(first, v.splat(v.cast(e8)))]
             e16 = b.fmul(e8, e8)
             loop = _Loop(b, steps)
@@ -357,7 +357,7 @@ def residuals(
     amplitude, background : float
         The signal is ``background + amplitude * e1**i * envelope[i]``.
     """
-    raise TypeError("is for compiled code only: numba puts the overload below in its place")
+    raise TypeError("is for compiled code only, where numba replaces it by the overload below")
 
 
 def _single(  # type: ignore[no-untyped-def]

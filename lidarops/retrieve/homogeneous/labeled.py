@@ -1,4 +1,4 @@
-"""The retrievals along range over xarray: units checked, sections cut, quality merged."""
+"""Homogeneous path and tail mean over xarray: checks units, cuts sections, merges quality."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from lidarops.retrieve.background import cubic_and_tail as _background
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
 
 EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
-"""Bits of a bin that keep it out of a fit."""
+"""Bits that exclude a bin from a fit."""
 CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
-"""Bits of a bin that its section carries too."""
+"""Bits that a section takes over from its bins."""
 FEWEST_BINS: Final = 4
 LEVEL: Final = 100.0
-"""m; largest change of height along a section that counts as level. Aerosol falls off with a
-scale height of 1 to 2 km, so that more fakes an extinction of more than some percent."""
+"""m; largest change of height along a section that counts as level. Aerosol decreases with a scale
+height of 1 to 2 km; a larger change mimics an extinction of more than some percent."""
 
 _METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
 _TAIL: Final = {"background": "{}", "background_standard_error": "{}"}
@@ -51,26 +51,27 @@ def fit_homogeneous_path(
     method: str = "auto",
     relative_variance: bool = False,
 ) -> xr.Dataset:
-    """Retrieve background, amplitude and extinction of sections of range.
+    """Return background, amplitude and extinction of sections of range.
 
     Parameters
     ----------
     power : xr.DataArray, (..., range)
         Any unit; the coordinate of ``range`` in m. May be dask-backed, chunked in any way.
     sections : sequence of (float, float)
-        m; of each, the bins with near <= range < far.
+        m; a section holds the bins with near <= range < far.
     variance : xr.DataArray or float, optional
         Noise variance in the square of the power's unit. Its dimensions are among those of
         `power`.
     quality : xr.DataArray, optional
         Bits of `lidarops.flags.Quality` of each bin. Missing, saturated and incompletely
-        overlapping bins are left out; a section carries SATURATED, PILE_UP and
-        INCOMPLETE_OVERLAP of its bins.
+        overlapping bins are excluded; a section takes over SATURATED, PILE_UP and
+        INCOMPLETE_OVERLAP from its bins.
     method : str
-        See `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`; one that needs nothing but the power.
+        A method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path` that needs no
+        argument other than the power.
     relative_variance : bool
-        Whether `variance` holds up to a factor, which each section then finds for itself: for a
-        variance that was estimated from the same data.
+        Whether `variance` is known up to a factor only, which each section estimates: for a
+        variance estimated from the same data.
 
     Returns
     -------
@@ -78,26 +79,25 @@ def fit_homogeneous_path(
         ``background``, ``amplitude``, ``extinction``, each with ``_standard_error``,
         ``background_model_error``, ``extinction_model_error``, ``reduced_chi2``, ``valid_bins``
         and ``quality_flag``, with the coordinates ``section``, ``section_range`` (its middle)
-        and ``section_bounds``; as lazy as the input, and the same to the last bit for any
-        chunking.
+        and ``section_bounds``. As lazy as the input, with the same bits for any chunking.
 
     Raises
     ------
     RetrievalInputError
-        Where units, dimensions or sections cannot be right.
+        Where units, dimensions or sections are invalid.
     """
     distance = _distance(power)
     edges = _edges(sections)
     inputs = _Inputs.gather(power, variance, quality)
     bins = [_bins(distance, near, far) for near, far in edges]
-    reached = slice(min(part.start for part in bins), max(part.stop for part in bins))
-    outputs = inputs.isel(reached).map(
+    used = slice(min(section.start for section in bins), max(section.stop for section in bins))
+    outputs = inputs.isel(used).map(
         _solve,
         len(_SECTION),
         2,
         {
-            "range": distance[reached],
-            "sections": [slice(b.start - reached.start, b.stop - reached.start) for b in bins],
+            "range": distance[used],
+            "sections": [slice(b.start - used.start, b.stop - used.start) for b in bins],
             "method": method,
             "relative": relative_variance,
         },
@@ -105,32 +105,32 @@ def fit_homogeneous_path(
     )
     result = xr.Dataset(dict(zip((*_SECTION, *_COUNTS), outputs, strict=True)))
     _set_units(result, _SECTION, power.attrs.get("units", "1"))
-    return result.assign_coords(_places(edges))
+    return result.assign_coords(_section_coordinates(edges))
 
 
 def empty_fit(
     profiles: xr.DataArray, *, unit: str, sections: Sequence[tuple[float, float]]
 ) -> xr.Dataset:
-    """Return sections as of `fit_homogeneous_path`, without values, and without any power.
+    """Return a result of `fit_homogeneous_path` without values, for scenes without power.
 
     Parameters
     ----------
     profiles : xr.DataArray, (...)
-        Whatever the profiles have one of each; its coordinates are kept.
+        Any array with one value per profile; its coordinates are kept.
     unit : str
-        Of the power.
+        Unit of the power.
     sections : sequence of (float, float)
         m.
 
     Returns
     -------
     xr.Dataset, (..., section)
-        In memory: NaN, 0 valid bins, and a ``quality_flag`` of 0, to be filled.
+        In memory: NaN, 0 valid bins, and a ``quality_flag`` of 0, to be filled by the caller.
 
     Raises
     ------
     RetrievalInputError
-        Where the sections cannot be right.
+        Where the sections are invalid.
     """
     edges = _edges(sections)
     dims = (*profiles.dims, "section")
@@ -141,10 +141,10 @@ def empty_fit(
         coords=profiles.coords,
     )
     _set_units(result, _SECTION, unit)
-    return result.assign_coords(_places(edges))
+    return result.assign_coords(_section_coordinates(edges))
 
 
-def _places(edges: npt.NDArray[np.float64]) -> dict[str, tuple[Any, ...]]:
+def _section_coordinates(edges: npt.NDArray[np.float64]) -> dict[str, tuple[Any, ...]]:
     return {
         "section": ("section", np.arange(len(edges), dtype=np.int32)),
         "section_range": ("section", edges.mean(axis=1), {"units": "m"}),
@@ -153,10 +153,10 @@ def _places(edges: npt.NDArray[np.float64]) -> dict[str, tuple[Any, ...]]:
 
 
 def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
-    r"""Return NOT_LEVEL for the sections along which a beam changes its height too much.
+    r"""Return NOT_LEVEL for the sections along which the height of the beam changes too much.
 
-    Backscatter that falls with height as :math:`e^{-z/H}` looks exactly like an additional
-    extinction of :math:`\cos\theta / 2H`: no residual tells, the geometry does.
+    Backscatter that decreases with height as :math:`e^{-z/H}` mimics an additional extinction of
+    :math:`\cos\theta / 2H` exactly. Residuals do not show it; the geometry does.
 
     Parameters
     ----------
@@ -168,11 +168,11 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
     Returns
     -------
     xr.DataArray
-        Bits to be merged into ``quality_flag``.
+        Bits to merge into ``quality_flag``.
     """
     length = result["section_bounds"].isel(nv=1) - result["section_bounds"].isel(nv=0)
     climb = length * np.abs(np.cos(np.deg2rad(zenith_angle)))
-    # Compared so that an unknown angle is not taken for a level one.
+    # Negated, so that an unknown angle does not count as level.
     bits: xr.DataArray = (~(climb <= LEVEL)).astype(np.int32) * np.int32(Quality.NOT_LEVEL)
     return bits.drop_vars(bits.coords)
 
@@ -183,7 +183,9 @@ def tail_mean(
     start: float | None = None,
     variance: xr.DataArray | float | None = None,
 ) -> xr.Dataset:
-    """Take the mean of the far bins as background; see `lidarops.retrieve.background.cubic_and_tail.tail_mean`.
+    """Return the mean of the far bins as background.
+
+    See `lidarops.retrieve.background.cubic_and_tail.tail_mean`.
 
     Parameters
     ----------
@@ -202,7 +204,7 @@ def tail_mean(
     Raises
     ------
     RetrievalInputError
-        Where units, dimensions or `start` cannot be right.
+        Where units, dimensions or `start` are invalid.
     """
     distance = _distance(power)
     inputs = _Inputs.gather(power, variance, None)
@@ -213,7 +215,7 @@ def tail_mean(
 
 
 class _Inputs:
-    """Power and what comes with it, aligned, the range of each in one chunk."""
+    """Power, variance and quality, aligned, each with its range in one chunk."""
 
     def __init__(self, arrays: Mapping[str, xr.DataArray], variance: float | None) -> None:
         self._arrays = arrays
@@ -258,9 +260,9 @@ class _Inputs:
         *,
         along: tuple[str, int] | None = None,
     ) -> tuple[xr.DataArray, ...]:
-        """Map a function of blocks that gives `values` floats and `counts` integers a profile.
+        """Map a function of blocks that returns `values` floats and `counts` integers per profile.
 
-        Each is an array along the dimension and of the length `along`, where that is given.
+        Each is an array along the dimension and of the length `along`, where given.
         """
         core = [] if along is None else [along[0]]
         outputs: tuple[xr.DataArray, ...] = xr.apply_ufunc(
@@ -286,7 +288,7 @@ class _Inputs:
 def _on_blocks(
     *blocks: _Block, function: _Function, ranged: Mapping[str, bool], settings: Mapping[str, Any]
 ) -> tuple[_Block, ...]:
-    # What holds for whole profiles broadcasts along range.
+    # Values of whole profiles broadcast along range.
     arguments = {
         name: block if along else np.asarray(block)[..., np.newaxis]
         for (name, along), block in zip(ranged.items(), blocks, strict=True)
@@ -317,7 +319,7 @@ def _solve(
     relative: bool,
 ) -> tuple[_Block, ...]:
     """Return the values of all sections, stacked along a last axis."""
-    found = [
+    solutions = [
         _solve_section(
             power[..., bins],
             variance[..., bins] if _along_range(variance) else variance,
@@ -328,11 +330,11 @@ def _solve(
         )
         for bins in sections
     ]
-    return tuple(np.stack(parts, axis=-1) for parts in zip(*found, strict=True))
+    return tuple(np.stack(values, axis=-1) for values in zip(*solutions, strict=True))
 
 
 def _along_range(block: Any) -> TypeGuard[_Block]:
-    # What holds for whole profiles has one bin.
+    # Values of whole profiles have one bin.
     return isinstance(block, np.ndarray) and block.shape[-1] > 1
 
 
@@ -353,11 +355,11 @@ def _solve_section(
     if relative and variance is not None:
         with np.errstate(divide="ignore"):
             variance, weights = None, 1.0 / np.asarray(variance)
-    found = _homogeneous.fit_homogeneous_path(
+    fit = _homogeneous.fit_homogeneous_path(
         power, range, variance=variance, weights=weights, method=method
     )
-    values = tuple(getattr(found, name) for name in _SECTION)
-    return (*values, found.valid_bins, found.quality | carried)
+    values = tuple(getattr(fit, name) for name in _SECTION)
+    return (*values, fit.valid_bins, fit.quality | carried)
 
 
 def _tail_mean(
@@ -367,8 +369,8 @@ def _tail_mean(
     range: _Block,  # noqa: A002 - the field's word
     start: float | None,
 ) -> tuple[_Block, ...]:
-    found = _background.tail_mean(power, range, start=start, variance=variance)
-    return found.background, found.background_standard_error, found.quality
+    tail = _background.tail_mean(power, range, start=start, variance=variance)
+    return tail.background, tail.background_standard_error, tail.quality
 
 
 def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:

@@ -203,7 +203,7 @@ def _with(name, change):
         ("temperature", lambda t: t * 1.8, "temperature", "give K"),
         ("temperature", lambda t: np.where(t < 250, np.nan, t), "temperature", "finite"),
         ("temperature", lambda t: t[:, None], "temperature", "one axis"),
-        ("pressure", lambda p: p[[0, 2, 1, 3, 4, 5, 6]], "pressure", "fall"),
+        ("pressure", lambda p: p[[0, 2, 1, 3, 4, 5, 6]], "pressure", "decrease"),
         ("pressure", lambda p: p - p[-1], "pressure", "positive"),
         ("pressure", lambda p: ["?"] * p.size, "pressure", "numbers"),
         ("pressure_unit", lambda _: "mbar", "pressure_unit", "Pa, hPa"),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.background.detectable_light import look_for_light, spaced
+from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 
 RANGE = (np.arange(1000) + 0.5) * 7.5
 SHAPE = (20, RANGE.size)
@@ -26,7 +26,7 @@ def flags():
 def test_pure_noise_has_unit_significance():
     variance = np.full(SHAPE, 0.01)
     largest = [
-        look_for_light(
+        detect_light(
             noise(seed)[:1], variance[:1], flags()[:1], RANGE, 500.0, 4000.0
         ).significance
         for seed in range(400)
@@ -38,7 +38,7 @@ def test_pure_noise_has_unit_significance():
 def test_significance_is_that_of_least_squares():
     amplitude = 4e4
     power = 3.0 + amplitude / RANGE**2 + np.zeros(SHAPE)
-    found = look_for_light(power, np.full(SHAPE, 0.01), flags(), RANGE, 500.0, 4000.0)
+    found = detect_light(power, np.full(SHAPE, 0.01), flags(), RANGE, 500.0, 4000.0)
     inside = ((RANGE >= 500) & (RANGE <= 4000)) | (np.arange(RANGE.size) >= 900)
     design = np.stack([np.ones(inside.sum()), RANGE[inside] ** -2.0], axis=1)
     error = np.sqrt(np.linalg.inv(design.T @ design / 0.01)[1, 1])
@@ -50,8 +50,8 @@ def test_saturated_profiles_are_counted_inside_the_stretch_only():
     quality = flags()
     quality[:5, 100] = int(Quality.SATURATED)
     variance = np.full(SHAPE, 0.01)
-    assert look_for_light(noise(), variance, quality, RANGE, 500.0, 4000.0).unsaturated == 15
-    assert look_for_light(noise(), variance, quality, RANGE, 2000.0, 4000.0).unsaturated == 20
+    assert detect_light(noise(), variance, quality, RANGE, 500.0, 4000.0).unsaturated == 15
+    assert detect_light(noise(), variance, quality, RANGE, 2000.0, 4000.0).unsaturated == 20
 
 
 def test_missing_profiles_do_not_count():
@@ -59,15 +59,15 @@ def test_missing_profiles_do_not_count():
     power[:4] = np.nan
     quality[4:6] = int(Quality.INPUT_MISSING)
     variance = np.full(SHAPE, 0.01)
-    assert look_for_light(power, variance, quality, RANGE, 500.0, 4000.0).profiles == 14
-    nothing = look_for_light(np.full(SHAPE, np.nan), variance, flags(), RANGE, 500.0, 4000.0)
+    assert detect_light(power, variance, quality, RANGE, 500.0, 4000.0).profiles == 14
+    nothing = detect_light(np.full(SHAPE, np.nan), variance, flags(), RANGE, 500.0, 4000.0)
     assert (nothing.profiles, nothing.significance, nothing.unsaturated) == (0, 0.0, 0)
-    assert look_for_light(power, variance, quality, RANGE, 9e5, 1e6).profiles == 0
+    assert detect_light(power, variance, quality, RANGE, 9e5, 1e6).profiles == 0
 
 
 @given(st.integers(1, 500), st.integers(1, 40))
 def test_spaced_profiles_are_few_and_hold_both_ends(count, most):
-    places = spaced(count, most)
+    places = spaced_indices(count, most)
     assert len(places) <= min(count, most)
     assert np.all(np.diff(places) > 0)
     assert places[0] == 0
@@ -77,21 +77,21 @@ def test_spaced_profiles_are_few_and_hold_both_ends(count, most):
 
 def test_wrong_shapes_are_told():
     with pytest.raises(RetrievalInputError, match="do not fit"):
-        look_for_light(noise(), noise()[:, :5], flags(), RANGE, 0.0, 1e3)
+        detect_light(noise(), noise()[:, :5], flags(), RANGE, 0.0, 1e3)
     with pytest.raises(RetrievalInputError, match="cannot be chosen"):
-        spaced(0, 3)
+        spaced_indices(0, 3)
 
 
 def test_saturated_bins_were_looked_at_though_they_have_no_values():
     power, quality = noise(), flags()
     power[:, 100:500] = np.nan
     quality[:, 100:500] = int(Quality.SATURATED | Quality.INPUT_MISSING)
-    found = look_for_light(power, np.full(SHAPE, 0.01), quality, RANGE, 1000.0, 3000.0)
+    found = detect_light(power, np.full(SHAPE, 0.01), quality, RANGE, 1000.0, 3000.0)
     assert (found.profiles, found.unsaturated, found.significance) == (20, 0, 0.0)
 
 
 def test_bins_between_the_stretch_and_the_tail_tell_nothing():
     power, variance = noise(), np.full(SHAPE, 0.01)
-    plain = look_for_light(power, variance, flags(), RANGE, 500.0, 4000.0)
+    plain = detect_light(power, variance, flags(), RANGE, 500.0, 4000.0)
     power[:, 600:850] = 1e9
-    assert look_for_light(power, variance, flags(), RANGE, 500.0, 4000.0) == plain
+    assert detect_light(power, variance, flags(), RANGE, 500.0, 4000.0) == plain

@@ -20,11 +20,8 @@ from support.oracle_homogeneous import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
-from lidarops.retrieve.homogeneous.path_fit import (
-    HomogeneousResult,
-    fit_homogeneous_path,
-    mean_profile_variance,
-)
+from lidarops.retrieve.background.photon_counts import mean_profile_variance
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 
 KM = 1e-3
 LONG = section(2500.0, 8000.0)

@@ -259,9 +259,9 @@ def test_one_pass_gives_the_bits_of_two(data_root):
             )
             conditioned = labeled_signal.condition(archive, channel, full_overlap_range=500.0)
             far = (27_000.0, 30_000.0)
-            results.append(labeled_signal.corrected(conditioned, far).load())
+            results.append(labeled_signal.correct_for_range(conditioned, far).load())
             results.append(
-                labeled_signal.signals(
+                labeled_signal.range_corrected_signals(
                     archive, channel, background_range=far, full_overlap_range=500.0
                 ).load()
             )

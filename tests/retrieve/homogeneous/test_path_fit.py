@@ -556,8 +556,8 @@ def test_descending_range_turns_variance_too():
         ({"weights": np.ones(7)}, "weights", "broadcast"),
         ({"variance": 1.0, "weights": 1.0}, "weights", "one of the two"),
         ({"method": "klett"}, "method", "auto, compressed, fast, direct, cubic"),
-        ({"extinction_bounds": (1.0, 0.0)}, "extinction_bounds", "rising"),
-        ({"extinction_bounds": (0.0, np.nan)}, "extinction_bounds", "rising"),
+        ({"extinction_bounds": (1.0, 0.0)}, "extinction_bounds", "ascending"),
+        ({"extinction_bounds": (0.0, np.nan)}, "extinction_bounds", "ascending"),
         ({"extinction_bounds": (-1.0, 1.0)}, "extinction_bounds", "300"),
     ],
 )
