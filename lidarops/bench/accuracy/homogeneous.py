@@ -1,6 +1,6 @@
-"""How accurate the solvers of a homogeneous path are, against the least possible error.
+"""Measure the accuracy of the solvers of a homogeneous path against the least possible error.
 
-The scores of the elastic retrieval are here too; `lidarops.bench.accuracy.elastic` measures it.
+The scores of the elastic retrieval are here too; `lidarops.bench.accuracy.elastic` uses them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 PROFILES: Final = 10_000
 QUICK_PROFILES: Final = 4_000
 _SLOW: Final = "scipy"
-"""Ways whose names begin so are too slow for every profile."""
+"""Prefix of the names of solvers that are too slow for all profiles."""
 _SLOW_SHARE: Final = 20
 _WARM: Final = 64
 _TWO_SIDED: Final = 1.959963984540054
@@ -48,7 +48,7 @@ _AVERAGED: Final = 100
 
 @dataclass(frozen=True, slots=True)
 class MonteCarloFigure:
-    """A figure from random profiles, with its Monte Carlo standard error."""
+    """Statistic of random profiles, with its Monte Carlo standard error."""
 
     value: float
     error: float
@@ -56,7 +56,7 @@ class MonteCarloFigure:
 
 @dataclass(frozen=True, slots=True)
 class PathScore:
-    """Errors of one unknown over the profiles that were not rejected."""
+    """Errors of one unknown, over the profiles that are not rejected."""
 
     rmse: MonteCarloFigure
     """Over the Cramér-Rao bound."""
@@ -70,26 +70,26 @@ class PathScore:
 
 @dataclass(frozen=True, slots=True)
 class SolverOutcome:
-    """What one way to solve did with one scenario."""
+    """Errors, flags and time of one solver on one scenario."""
 
     way: str
     profiles: int
     flagged: float
     """Share of profiles with any quality bit."""
     rejected: float
-    """Share of profiles with a quality bit that says not to use the value."""
+    """Share of profiles with a rejecting quality bit."""
     nanoseconds: float
-    """CPU time a profile, of one run."""
+    """CPU time per profile, of one run."""
     scores: Mapping[str, PathScore]
-    """By unknown; without those that the way was given, or rejected throughout."""
+    """By unknown; without those that are given to the solver or always rejected."""
     distances: Mapping[str, float]
     """Largest difference from the direct method over the Cramér-Rao bound, by unknown, over the
-    profiles that neither rejects; without those that the way was given."""
+    profiles that neither rejects; without those that are given to the solver."""
 
 
 @dataclass(frozen=True, slots=True)
 class AccuracyCase:
-    """One scenario with what all ways did with it."""
+    """One scenario with the outcomes of all solvers."""
 
     scenario: Scenario
     difficulty: float
@@ -109,20 +109,20 @@ class Offset:
     averaged: int
     """Profiles averaged before they are solved."""
     lag_1: MonteCarloFigure
-    """Of the cubic with a lag of one bin, without correction for the noise, in noise units."""
+    """Of the cubic with a lag of one bin and no noise correction, in units of the noise."""
     compressed: MonteCarloFigure
-    """Of `solve`, in noise units; every profile, flagged or not."""
+    """Of the compressed method, in units of the noise; all profiles, flagged or not."""
     scatter: float
-    """Standard deviation of the latter."""
+    """Standard deviation of the background of the compressed method, in units of the noise."""
     expected: float
     """Second-order bias of least squares."""
     flagged: float
-    """Share of profiles that `solve` flags."""
+    """Share of profiles that the compressed method flags."""
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """The accuracy benchmark."""
+    """Result of the accuracy benchmark."""
 
     date: str
     machine: Machine
@@ -137,18 +137,18 @@ def measure_homogeneous(
     profiles: int | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> Accuracy:
-    """Solve simulated profiles by every method of `solve` and by iterative peers.
+    """Solve simulated profiles by every method of `fit_homogeneous_path` and by iterative peers.
 
     Parameters
     ----------
     quick : bool
         8 scenarios, fewer profiles.
     date : str
-        When it is run, as it is to be stated.
+        Date to state.
     profiles : int, optional
-        Of each scenario; the peers of scipy get a twentieth of them, at least 16.
+        Per scenario; the peers of scipy get a twentieth of them, at least 16.
     progress : callable
-        Is given 1 after each scenario.
+        Called with 1 after each scenario.
     """
     count = profiles or (QUICK_PROFILES if quick else PROFILES)
     ways = {**methods(), **iterative_peers()}
@@ -160,10 +160,10 @@ def measure_homogeneous(
 
 
 def offsets(count: int) -> list[Offset]:
-    """Return the errors of background on the signals of the published tables.
+    """Return the errors of background for the signals of the published tables.
 
-    The tables do not state the signal: 17 times the noise at 2.5 km, bins of 15 m and an
-    extinction of 0.03 km-1 reproduce how the published background falls with the length.
+    The tables do not state the signal. A signal of 17 times the noise at 2.5 km, bins of 15 m and
+    an extinction of 0.03 km-1 reproduce the decrease of the published background with length.
     """
     fade = np.exp(-2 * _PAPER_EXTINCTION * (10500.0 - 2500.0)) * (2500.0 / 10500.0) ** 2
     signals = {2500.0: _PAPER_SIGNAL, 10500.0: float(_PAPER_SIGNAL * fade)}
@@ -188,7 +188,7 @@ def offsets(count: int) -> list[Offset]:
 def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
     # The mean of white noise is white noise: powers in units of its standard deviation.
     scale = float(np.sqrt(averaged))
-    louder = Scenario(
+    averaged_path = Scenario(
         path.start,
         path.length,
         path.extinction,
@@ -196,20 +196,20 @@ def _offset(path: Scenario, averaged: int, count: int, seed: int) -> Offset:
         background=path.background * scale,
         bins=path.bins,
     )
-    power = louder.powers(count, seed)
-    # A variance of 0 is taken for no noise, which leaves its bias in, as published.
-    published = cubic(power, louder.range, lag=1, variance=0.0).background
-    found = methods()[HomogeneousMethod.COMPRESSED](power, louder)
-    ours = found.values["background"]
+    power = averaged_path.powers(count, seed)
+    # A variance of 0 means no noise, so that its bias is not subtracted, as published.
+    published = cubic(power, averaged_path.range, lag=1, variance=0.0).background
+    solution = methods()[HomogeneousMethod.COMPRESSED](power, averaged_path)
+    background = solution.values["background"]
     return Offset(
         start=path.start,
         length=path.length,
         averaged=averaged,
-        lag_1=mean((published - louder.background) / scale),
-        compressed=mean((ours - louder.background) / scale),
-        scatter=float(np.nanstd(ours)) / scale,
-        expected=background_bias(louder) / scale,
-        flagged=float(found.flagged.mean()),
+        lag_1=mean((published - averaged_path.background) / scale),
+        compressed=mean((background - averaged_path.background) / scale),
+        scatter=float(np.nanstd(background)) / scale,
+        expected=background_bias(averaged_path) / scale,
+        flagged=float(solution.flagged.mean()),
     )
 
 
@@ -234,31 +234,32 @@ def _outcome(
         power = power[: max(len(power) // _SLOW_SHARE, 16)]
     way(power[:_WARM], scenario)
     begin = time.process_time()
-    found = way(power, scenario)
+    solution = way(power, scenario)
     spent = time.process_time() - begin
     scores = {
         quantity: score
         for quantity in QUANTITIES
-        if (score := _score(found, quantity, scenario.truth[quantity], least[quantity]))
+        if (score := _score(solution, quantity, scenario.truth[quantity], least[quantity]))
     }
     return SolverOutcome(
         way=name,
         profiles=len(power),
-        flagged=float(found.flagged.mean()),
-        rejected=float(found.rejected.mean()),
+        flagged=float(solution.flagged.mean()),
+        rejected=float(solution.rejected.mean()),
         nanoseconds=1e9 * spent / len(power),
         scores=scores,
         distances={
-            quantity: _distance(found, converged, quantity) / least[quantity] for quantity in scores
+            quantity: _distance(solution, converged, quantity) / least[quantity]
+            for quantity in scores
         },
     )
 
 
-def _score(found: Estimates, quantity: str, truth: float, least: float) -> PathScore | None:
-    error = (found.values[quantity] - truth) / least
-    stated = found.standard_errors[quantity] / least
+def _score(solution: Estimates, quantity: str, truth: float, least: float) -> PathScore | None:
+    error = (solution.values[quantity] - truth) / least
+    stated = solution.standard_errors[quantity] / least
     finite = np.isfinite(error)
-    kept = finite & ~found.rejected
+    kept = finite & ~solution.rejected
     if kept.sum() < 2 or not np.any(stated[kept] > 0):
         return None
     squares = error[kept] ** 2
@@ -272,11 +273,11 @@ def _score(found: Estimates, quantity: str, truth: float, least: float) -> PathS
     )
 
 
-def _distance(found: Estimates, converged: Estimates, quantity: str) -> float:
-    count = len(found.rejected)
-    kept = ~found.rejected & ~converged.rejected[:count]
-    between = np.abs(found.values[quantity] - converged.values[quantity][:count])[kept]
-    return float(np.nanmax(between, initial=0.0))
+def _distance(solution: Estimates, converged: Estimates, quantity: str) -> float:
+    count = len(solution.rejected)
+    kept = ~solution.rejected & ~converged.rejected[:count]
+    distance = np.abs(solution.values[quantity] - converged.values[quantity][:count])[kept]
+    return float(np.nanmax(distance, initial=0.0))
 
 
 def mean(values: Array) -> MonteCarloFigure:
@@ -286,16 +287,16 @@ def mean(values: Array) -> MonteCarloFigure:
 
 
 def share_inside(inside: npt.NDArray[np.bool_]) -> MonteCarloFigure:
-    """Return how many of independent profiles are inside, with its Monte Carlo error."""
+    """Return the share of independent profiles that are inside, with its Monte Carlo error."""
     # Where all or none are inside, half a profile keeps the error from being zero.
-    likely = (inside.sum() + 0.5) / (inside.size + 1)
+    probability = (inside.sum() + 0.5) / (inside.size + 1)
     return MonteCarloFigure(
-        float(inside.mean()), float(np.sqrt(likely * (1 - likely) / inside.size))
+        float(inside.mean()), float(np.sqrt(probability * (1 - probability) / inside.size))
     )
 
 
 def outcomes_of(accuracy: Accuracy, way: str) -> Sequence[tuple[AccuracyCase, SolverOutcome]]:
-    """Return what one way did, scenario by scenario."""
+    """Return the outcomes of one solver, with their cases."""
     return [
         (case, outcome)
         for case in accuracy.cases
@@ -312,7 +313,7 @@ SIGMAS: Final = (1.0, _TWO_SIDED)
 
 @dataclass(frozen=True, slots=True)
 class BackgroundScore:
-    """Errors of one way, in counts, over the profiles that it did not reject."""
+    """Errors of one method, in counts, over the profiles that it does not reject."""
 
     profiles: int
     bias: MonteCarloFigure
@@ -321,9 +322,9 @@ class BackgroundScore:
     stated: float
     """Median of the stated standard errors."""
     deviation: MonteCarloFigure
-    """Mean error over its own stated standard error."""
+    """Mean of error over stated standard error."""
     spread: MonteCarloFigure
-    """Root mean square of the same; 1 where errors are as stated."""
+    """Root mean square of the same; 1 where the stated errors are right."""
     coverage: tuple[MonteCarloFigure, MonteCarloFigure]
     """Share of profiles whose truth is within 1 and 1.96 stated standard errors."""
 
@@ -333,9 +334,9 @@ class InversionScore:
     """Errors of backscatter from 0.5 to 6 km, relative to its mean there."""
 
     profiles: int
-    """With any value in these bins."""
+    """Profiles with any value in these bins."""
     solved: float
-    """Share of these bins, of all profiles, that have a value; the others are withheld."""
+    """Share of these bins, over all profiles, that have a value; the others are withheld."""
     bias: MonteCarloFigure
     """Mean error of a profile."""
     scatter: float
@@ -351,7 +352,7 @@ class InversionScore:
 def background_score(
     error: Array, stated: Array, rejected: npt.NDArray[np.bool_]
 ) -> BackgroundScore | None:
-    """Return the errors of backgrounds; None where less than two are usable.
+    """Return the errors of backgrounds; None where fewer than two are usable.
 
     Parameters
     ----------
@@ -378,7 +379,7 @@ def background_score(
 
 
 def inversion_score(error: Array, stated: Array, scale: float) -> InversionScore | None:
-    """Return the errors of backscatter; None where less than two of many profiles have a value.
+    """Return the errors of backscatter; None where fewer than two of many profiles have a value.
 
     Parameters
     ----------

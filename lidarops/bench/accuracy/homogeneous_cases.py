@@ -1,4 +1,4 @@
-"""Homogeneous paths whose truth is known: signals, bounds of accuracy, and who solves them."""
+"""Homogeneous paths with known truth: signals, bounds of accuracy, and solvers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Array = npt.NDArray[np.float64]
 
 BINS: Final = 225
 BACKGROUND: Final = 370.0
-"""In standard deviations of the noise, as every power here."""
+"""In standard deviations of the noise, like all powers here."""
 QUANTITIES: Final = ("extinction", "background", "log_amplitude")
-"""B is the signal extrapolated to the range zero, by up to an optical depth of 100 here: it is
-its logarithm that has a distribution near normal, with the relative error of B as its own."""
+"""B is the signal extrapolated to range zero, by an optical depth of up to 100 here. Its logarithm
+is nearly normally distributed, with the relative error of B."""
 SOLVED: Final = ("extinction", "background", "amplitude")
 """The unknowns as the solvers return them."""
 WRONG_PRIOR: Final = 0.8
-"""Prior extinction of what needs one, as a share of the truth."""
+"""Prior extinction, where one is needed, as a share of the truth."""
 
 _STARTS: Final = (2500.0, 10500.0)
 _LENGTHS: Final = (1700.0, 8000.0)
@@ -38,7 +38,7 @@ _SEED: Final = 20240915
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One homogeneous path seen through white noise of unit variance."""
+    """One homogeneous path with white noise of unit variance."""
 
     start: float
     """m."""
@@ -63,9 +63,9 @@ class Scenario:
 
     @property
     def truth(self) -> Mapping[str, float]:
-        """Of the three unknowns, by name."""
-        found = (self.extinction, self.background, float(np.log(self.amplitude)))
-        return dict(zip(QUANTITIES, found, strict=True))
+        """Truth of the three unknowns, by name."""
+        values = (self.extinction, self.background, float(np.log(self.amplitude)))
+        return dict(zip(QUANTITIES, values, strict=True))
 
     @property
     def mean(self) -> Array:
@@ -77,7 +77,7 @@ class Scenario:
 
     @property
     def label(self) -> str:
-        """What tells it from the others, in km and km-1."""
+        """Description, in km and km-1."""
         return (
             f"{self.start / 1e3:g} + {self.length / 1e3:g} km, "
             f"{1e3 * self.extinction:g} km-1, signal {self.signal:g}"
@@ -97,8 +97,8 @@ def least_errors(scenario: Scenario) -> dict[str, float]:
     .. math:: F = J^T J, \quad J = [1, \; \phi, \; -2 R B \phi],
         \quad \phi = R^{-2} e^{-2 \sigma R}
 
-    (kay1993). It is inverted in ``b = B phi`` at the mean range, where it is well conditioned,
-    and carried over to log B by the exact derivatives.
+    (kay1993). It is inverted in terms of ``b = B phi`` at the mean range, where it is well
+    conditioned, and converted to log B by the exact derivatives.
     """
     height, covariance = _information(scenario)[1:]
     middle = float(scenario.range.mean())
@@ -111,7 +111,7 @@ def least_errors(scenario: Scenario) -> dict[str, float]:
 
 
 def background_bias(scenario: Scenario) -> float:
-    r"""Return the bias of the background that every least-squares solution has.
+    r"""Return the bias of the background common to all least-squares solutions.
 
     To second order, with the inverse Fisher matrix C and the second derivatives H of the model
     (box1971),
@@ -148,35 +148,35 @@ def difficulty(scenario: Scenario) -> float:
 
 
 def scenarios(*, quick: bool = False) -> list[Scenario]:
-    """Return the paths of the benchmark: all whose `difficulty` is 0.1 or less, or 8 of them."""
+    """Return the paths of the benchmark: those with a `difficulty` of at most 0.1, or 8 of them."""
     grid = product(_STARTS, _LENGTHS, _EXTINCTIONS, _AMPLITUDES)
     solvable = [s for values in grid if difficulty(s := Scenario(*values)) <= _SOLVABLE]
     if not quick:
         return solvable
-    picked = np.linspace(0, len(solvable) - 1, _QUICK).round().astype(int)
-    return [solvable[k] for k in picked]
+    selected = np.linspace(0, len(solvable) - 1, _QUICK).round().astype(int)
+    return [solvable[k] for k in selected]
 
 
 @dataclass(frozen=True, slots=True)
 class Estimates:
-    """What a way to solve found, one value a profile."""
+    """Estimates of a solver, one value per profile."""
 
     values: Mapping[str, Array]
     standard_errors: Mapping[str, Array]
     flagged: npt.NDArray[np.bool_]
     """Any quality bit."""
     rejected: npt.NDArray[np.bool_]
-    """A quality bit that says not to use the value."""
+    """A rejecting quality bit."""
 
 
 Way = Callable[[Any, Scenario], Estimates]
-"""From powers (profile, range) and the scenario they stem from to estimates."""
+"""Solver: returns estimates from powers (profile, range) and their scenario."""
 
 
 def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str, float]:
-    """Return what a method of `solve` needs besides the power.
+    """Return the arguments that a method needs besides the power.
 
-    What is known is known exactly, the prior of "linearized" is 20 percent low.
+    Known values are exact; the prior of "linearized" is 20 percent low.
     """
     match method:
         case HomogeneousMethod.LINEARIZED:
@@ -190,7 +190,7 @@ def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str,
 
 
 def methods() -> dict[str, Way]:
-    """Return every method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path` under its own name."""
+    """Return a solver for every method of `fit_homogeneous_path`, by name."""
     return {
         str(method): _way(method)
         for method in HomogeneousMethod
@@ -200,25 +200,25 @@ def methods() -> dict[str, Way]:
 
 def _way(method: HomogeneousMethod) -> Way:
     def solve(power: Any, scenario: Scenario) -> Estimates:
-        found = path_fit.fit_homogeneous_path(
+        fit = path_fit.fit_homogeneous_path(
             power,
             scenario.range,
             variance=1.0,
             method=method.value,
             **method_arguments(method, scenario),  # type: ignore[arg-type]
         )
-        return estimates(found)
+        return estimates(fit)
 
     return solve
 
 
-def estimates(found: HomogeneousResult) -> Estimates:
-    """Return a result of `solve` as the benchmark compares it."""
+def estimates(fit: HomogeneousResult) -> Estimates:
+    """Return the estimates of a fit."""
     return estimated(
-        {name: getattr(found, name) for name in SOLVED},
-        {name: getattr(found, f"{name}_standard_error") for name in SOLVED},
-        flagged=found.quality != 0,
-        rejected=(found.quality & Quality.rejecting()) != 0,
+        {name: getattr(fit, name) for name in SOLVED},
+        {name: getattr(fit, f"{name}_standard_error") for name in SOLVED},
+        flagged=fit.quality != 0,
+        rejected=(fit.quality & Quality.rejecting()) != 0,
     )
 
 
@@ -229,7 +229,7 @@ def estimated(
     flagged: Any,
     rejected: Any,
 ) -> Estimates:
-    """Return estimates of `SOLVED` with the logarithm of the amplitude; NaN where it has none."""
+    """Return the estimates of `SOLVED`, with the logarithm of the amplitude or NaN."""
     amplitude = values["amplitude"]
     with np.errstate(invalid="ignore", divide="ignore"):
         logarithm = np.log(amplitude)

@@ -1,4 +1,4 @@
-"""What the benchmarks found, as tables and charts; `lidarops.bench.accuracy.elastic` tells the rest."""
+"""Report pages of the homogeneous, reader and elastic throughput benchmarks."""
 
 from __future__ import annotations
 
@@ -39,36 +39,36 @@ _HELPED: Final = frozenset(
         HomogeneousMethod.KNOWN_EXTINCTION,
     }
 )
-"""Methods that are told more than the profile."""
+"""Methods that are given more than the profile."""
 _PUBLISHED: Final = {1e3: 10.6, 4e3: 6.5, 6e3: 1.5, 8e3: 1.2}
 """bobrovsky2024, table 1, less an assumed truth of 37.00, over an assumed noise of 0.1."""
 _GAIN: Final = 0.98
-"""A smaller gain in RMSE is Monte Carlo noise."""
+"""Ratio of RMSE; a smaller gain is Monte Carlo noise."""
 _UNSOLVED: Final = "-"
 
 
-def homogeneous_accuracy_report(found: Accuracy, data: str = "") -> BenchmarkReport:
+def homogeneous_accuracy_report(result: Accuracy, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
     return BenchmarkReport(
         title="Homogeneous path: error against the Cramér-Rao bound",
-        facts=facts(found.date, found.machine),
-        parts=(_overview(found), _by_difficulty(found), _offsets(found.offsets)),
+        facts=facts(result.date, result.machine),
+        parts=(_overview(result), _by_difficulty(result), _offsets(result.offsets)),
         data=data,
     )
 
 
-def homogeneous_throughput_report(found: SolverThroughput, data: str = "") -> BenchmarkReport:
+def homogeneous_throughput_report(result: SolverThroughput, data: str = "") -> BenchmarkReport:
     """Return the page of the throughput benchmark."""
     return BenchmarkReport(
         title="Homogeneous path: time per profile",
-        facts=facts(found.date, found.machine),
-        parts=(_times(found), _threads(found)),
+        facts=facts(result.date, result.machine),
+        parts=(_times(result), _threads(result)),
         data=data,
     )
 
 
 def reader_report(
-    found: Sequence[readers.ReaderThroughput], date: str, machine: Machine, data: str = ""
+    result: Sequence[readers.ReaderThroughput], date: str, machine: Machine, data: str = ""
 ) -> BenchmarkReport:
     """Return the page of the reader's benchmark."""
     table = Table(
@@ -81,7 +81,7 @@ def reader_report(
                 f"{way.megabytes_per_second:,.0f}",
                 f"{way.times_floor:.2f}",
             )
-            for way in found
+            for way in result
         ),
     )
     text = "Raw files to arrays, from the page cache, against floors measured in the same run."
@@ -94,53 +94,53 @@ def reader_report(
 
 
 def facts(date: str, machine: Machine) -> tuple[tuple[str, str], ...]:
-    """Return where, when and with what a benchmark ran."""
+    """Return date, machine and software of a benchmark run."""
     packages = ", ".join(f"{name} {version}" for name, version in machine.packages.items())
     known = (("Date", date), ("Processor", machine.processor), ("Python", machine.python))
     return tuple(fact for fact in (*known, ("Packages", packages)) if fact[1])
 
 
-def _ways(found: Accuracy) -> list[str]:
-    return [outcome.way for outcome in found.cases[0].outcomes]
+def _ways(result: Accuracy) -> list[str]:
+    return [outcome.way for outcome in result.cases[0].outcomes]
 
 
 # Accuracy ------------------------------------------------------------------------------------
 
 
-def _overview(found: Accuracy) -> Part:
-    count = len(found.cases)
-    profiles = found.cases[0].outcomes[0].profiles
+def _overview(result: Accuracy) -> Part:
+    count = len(result.cases)
+    profiles = result.cases[0].outcomes[0].profiles
     return Part(
         title="Error against time",
         text=f"{count} paths of 225 bins through white noise, from 2.5 or 10.5 km over 1.7 or "
         f"8 km, extinction 0.01 to 5 per km, signal 15 to 100 000 times the noise, background "
         f"370; {profiles:,} profiles each, fewer for scipy. The bound is the inverse Fisher "
-        "matrix of background, amplitude and extinction. Of the amplitude, which is the signal "
-        "extrapolated to the range zero, it is the logarithm that is compared. Profiles that a "
-        "method rejects do not count for its error. The iterative peers start from the true "
+        "matrix of background, amplitude and extinction. The amplitude is the signal extrapolated "
+        "to range zero; its logarithm is compared. Profiles that a method rejects do not count "
+        "for its error. The iterative peers start from the true "
         "background and amplitude and 0.8 of the true extinction.",
-        charts=(_work_precision(found), _convergence(found)),
-        tables=(_costs(found), *(_summary(found, quantity) for quantity in QUANTITIES)),
-        details=tuple(_table(found, way) for way in _ways(found)),
+        charts=(_work_precision(result), _convergence(result)),
+        tables=(_costs(result), *(_summary(result, quantity) for quantity in QUANTITIES)),
+        details=tuple(_table(result, way) for way in _ways(result)),
     )
 
 
-def _work_precision(found: Accuracy) -> Chart:
+def _work_precision(result: Accuracy) -> Chart:
     return Chart(
         name="work-precision",
         title="Error against CPU time per profile",
         caption="Median over the paths of RMSE over the Cramér-Rao bound, with bars from the "
-        "least to the largest; CPU time of one run. Hollow: told more than the profile, or "
-        "rejects every profile of some paths; these do not count for the Pareto front.",
-        panels=tuple(_work_panel(found, quantity) for quantity in QUANTITIES),
+        "least to the largest; CPU time of one run. Hollow: methods that are given more than the "
+        "profile, or reject every profile of some paths; these are not part of the Pareto front.",
+        panels=tuple(_work_panel(result, quantity) for quantity in QUANTITIES),
     )
 
 
-def _work_panel(found: Accuracy, quantity: str) -> Panel:
+def _work_panel(result: Accuracy, quantity: str) -> Panel:
     series = []
     points = []
-    for way in _ways(found):
-        pairs = outcomes_of(found, way)
+    for way in _ways(result):
+        pairs = outcomes_of(result, way)
         errors = [o.scores[quantity].rmse.value for _, o in pairs if quantity in o.scores]
         cost = float(np.median([o.nanoseconds for _, o in pairs]))
         complete = way not in _HELPED and len(errors) == len(pairs)
@@ -157,22 +157,22 @@ def _work_panel(found: Accuracy, quantity: str) -> Panel:
     )
 
 
-def _convergence(found: Accuracy) -> Chart:
+def _convergence(result: Accuracy) -> Chart:
     return Chart(
         name="convergence",
         title="Distance from converged least squares against CPU time per profile",
         caption="Largest distance from the solution of the direct method, in units of the "
         "Cramér-Rao bound: median over the paths, with bars from the least to the largest. "
         "Hollow as above.",
-        panels=tuple(_convergence_panel(found, quantity) for quantity in QUANTITIES),
+        panels=tuple(_convergence_panel(result, quantity) for quantity in QUANTITIES),
     )
 
 
-def _convergence_panel(found: Accuracy, quantity: str) -> Panel:
+def _convergence_panel(result: Accuracy, quantity: str) -> Panel:
     series = []
     points = []
-    for way in _ways(found):
-        pairs = outcomes_of(found, way)
+    for way in _ways(result):
+        pairs = outcomes_of(result, way)
         distances = [o.distances[quantity] for _, o in pairs if o.distances.get(quantity)]
         cost = float(np.median([o.nanoseconds for _, o in pairs]))
         complete = way not in _HELPED and len(distances) == len(pairs)
@@ -195,10 +195,10 @@ def _point(way: str, cost: float, errors: Sequence[float], *, hollow: bool) -> S
     return Series(way, (cost,), (middle,), (min(errors),), (max(errors),), hollow=hollow)
 
 
-def _costs(found: Accuracy) -> Table:
+def _costs(result: Accuracy) -> Table:
     rows = []
-    for way in _ways(found):
-        outcomes = [outcome for _, outcome in outcomes_of(found, way)]
+    for way in _ways(result):
+        outcomes = [outcome for _, outcome in outcomes_of(result, way)]
         rows.append(
             (
                 way,
@@ -209,16 +209,16 @@ def _costs(found: Accuracy) -> Table:
             )
         )
     return Table(
-        title="All paths together",
-        columns=("way", "profiles", "flagged", "rejected", "ns each"),
+        title="All paths",
+        columns=("method", "profiles", "flagged", "rejected", "ns each"),
         rows=tuple(rows),
     )
 
 
-def _summary(found: Accuracy, quantity: str) -> Table:
+def _summary(result: Accuracy, quantity: str) -> Table:
     rows = []
-    for way in _ways(found):
-        pairs = outcomes_of(found, way)
+    for way in _ways(result):
+        pairs = outcomes_of(result, way)
         scores = [outcome.scores[quantity] for _, outcome in pairs if quantity in outcome.scores]
         if scores:
             coverage = sorted((score.coverage for score in scores), key=lambda m: m.value)
@@ -234,18 +234,18 @@ def _summary(found: Accuracy, quantity: str) -> Table:
                 )
             )
     return Table(
-        title=f"{_spelled(quantity).capitalize()}, all paths together",
-        columns=("way", "solved", "RMSE", "worst", "bias", "95 %", "to"),
+        title=f"{_spelled(quantity).capitalize()}, all paths",
+        columns=("method", "solved", "RMSE", "worst", "bias", "95 %", "to"),
         rows=tuple(rows),
         note="Paths solved; RMSE over the bound, median and worst path; bias over the bound, "
         "worst path; least and largest coverage of the 95 percent interval. In brackets the "
         "Monte Carlo standard error in the last digits; the worst of many paths exceeds the "
-        "typical one by two or three of these.",
+        "typical one by two or three of these errors.",
     )
 
 
-def _table(found: Accuracy, way: str) -> Table:
-    pairs = outcomes_of(found, way)
+def _table(result: Accuracy, way: str) -> Table:
+    pairs = outcomes_of(result, way)
     columns = [
         f"{_spelled(q)}: {what}" for q in QUANTITIES for what in ("RMSE", "bias", "coverage")
     ]
@@ -253,7 +253,7 @@ def _table(found: Accuracy, way: str) -> Table:
         title=f"{way}, path by path",
         columns=("path", "difficulty", *columns, "flagged", "rejected", "ns per profile"),
         rows=tuple(_row(case, outcome) for case, outcome in pairs),
-        note=f"{pairs[0][1].profiles:,} profiles a path. RMSE and bias over the bound. "
+        note=f"{pairs[0][1].profiles:,} profiles per path. RMSE and bias over the bound. "
         "Difficulty: least standard error of extinction over extinction + 1 / mean range.",
     )
 
@@ -277,38 +277,37 @@ def _value(figure: MonteCarloFigure) -> str:
     return f"{figure.value:.3f}({1e3 * figure.error:.0f})"
 
 
-def _by_difficulty(found: Accuracy) -> Part:
-    ways = [way for way in ("compressed", "fast", "direct", "cubic") if way in _ways(found)]
+def _by_difficulty(result: Accuracy) -> Part:
+    ways = [way for way in ("compressed", "fast", "direct", "cubic") if way in _ways(result)]
     return Part(
         title="Error against difficulty",
-        text="The same errors, path by path, against how well the best possible estimate could "
-        "know the extinction.",
+        text="The same errors, path by path, against the least possible error of extinction.",
         charts=(
             Chart(
                 name="difficulty",
                 title="Error against difficulty",
                 caption="RMSE over the Cramér-Rao bound against the least standard error of "
                 "extinction over extinction + 1 / mean range, with Monte Carlo errors.",
-                panels=tuple(_difficulty_panel(found, ways, q) for q in QUANTITIES),
+                panels=tuple(_difficulty_panel(result, ways, q) for q in QUANTITIES),
             ),
         ),
     )
 
 
-def _difficulty_panel(found: Accuracy, ways: Sequence[str], quantity: str) -> Panel:
+def _difficulty_panel(result: Accuracy, ways: Sequence[str], quantity: str) -> Panel:
     return Panel(
         title=_spelled(quantity),
         x_label="difficulty",
         y_label="RMSE over bound" if quantity == QUANTITIES[0] else "",
-        series=tuple(_difficulties(found, way, quantity) for way in ways),
+        series=tuple(_difficulties(result, way, quantity) for way in ways),
         level=1.0,
     )
 
 
-def _difficulties(found: Accuracy, way: str, quantity: str) -> Series:
+def _difficulties(result: Accuracy, way: str, quantity: str) -> Series:
     points = [
         (case.difficulty, outcome.scores[quantity].rmse)
-        for case, outcome in outcomes_of(found, way)
+        for case, outcome in outcomes_of(result, way)
         if quantity in outcome.scores
     ]
     return Series(
@@ -324,12 +323,12 @@ def _difficulties(found: Accuracy, way: str, quantity: str) -> Series:
 def _offsets(offsets: Sequence[Offset]) -> Part:
     return Part(
         title="Background of the published cubic",
-        text="Tables 1 and 2 of bobrovsky2024 give a background that falls with the length of "
-        "the section. The noise does that: with a lag of one bin and no correction for the "
-        "noise, the cubic takes what is left of the signal for background, by as much however "
-        "many profiles are averaged. The signal is not in the tables; 17 times the noise at 2.5 "
-        "km, 15 m bins and 0.03 per km are assumed. What is left of ours is the bias that "
-        "every least-squares solution has to second order in the noise; averaging removes it.",
+        text="Tables 1 and 2 of bobrovsky2024 give a background that decreases with the length of "
+        "the section. This is due to noise: with a lag of one bin and no correction for the "
+        "noise, the cubic counts part of the signal as background, however many profiles are "
+        "averaged. The tables do not state the signal; 17 times the noise at 2.5 km, 15 m bins "
+        "and 0.03 per km are assumed. The remaining error of the compressed method is the bias "
+        "of all least-squares solutions to second order in the noise; averaging removes it.",
         charts=(_offset_chart(offsets),),
         tables=(_offset_table(offsets),),
     )
@@ -390,7 +389,7 @@ def _offset_table(offsets: Sequence[Offset]) -> Table:
             "section",
             "mean of",
             "lag 1",
-            "ours",
+            "compressed",
             "scatter",
             "expected",
             "flagged",
@@ -409,20 +408,20 @@ def _offset_table(offsets: Sequence[Offset]) -> Table:
         ),
         note="Mean error and, in brackets, its standard error in the last digits: of the cubic "
         "with a lag of one bin, and of the compressed method with its scatter. Expected: "
-        "second-order bias of least squares, left out where it exceeds the scatter and means "
-        "nothing.",
+        "second-order bias of least squares, omitted where it exceeds the scatter and is not "
+        "meaningful.",
     )
 
 
 # Throughput ----------------------------------------------------------------------------------
 
 
-def _times(found: SolverThroughput) -> Part:
-    by_setting = {setting: _speeds(found, setting) for setting in settings()}
-    names = list(dict.fromkeys(speed.way for speed in found.speeds))
+def _times(result: SolverThroughput) -> Part:
+    by_setting = {setting: _speeds(result, setting) for setting in settings()}
+    names = list(dict.fromkeys(speed.way for speed in result.speeds))
     return Part(
         title="CPU time per profile",
-        text=f"Path {found.path.label}, {found.path.bins} bins; all outputs and flags, one "
+        text=f"Path {result.path.label}, {result.path.bins} bins; all outputs and flags, one "
         "thread, least CPU time of interleaved repeats. The read is a vectorised maximum of the "
         "same array in the same run. JAX and numba are timed once compiled.",
         charts=(_ladder(names, by_setting),),
@@ -430,11 +429,11 @@ def _times(found: SolverThroughput) -> Part:
     )
 
 
-def _speeds(found: SolverThroughput, setting: Setting) -> dict[str, Speed]:
-    return {speed.way: speed for speed in found.speeds if speed.setting == setting}
+def _speeds(result: SolverThroughput, setting: Setting) -> dict[str, Speed]:
+    return {speed.way: speed for speed in result.speeds if speed.setting == setting}
 
 
-def _ladder(names: Sequence[str], found: Mapping[Setting, Mapping[str, Speed]]) -> Ladder:
+def _ladder(names: Sequence[str], result: Mapping[Setting, Mapping[str, Speed]]) -> Ladder:
     return Ladder(
         name="time",
         title="CPU time per profile of 225 bins",
@@ -446,7 +445,7 @@ def _ladder(names: Sequence[str], found: Mapping[Setting, Mapping[str, Speed]]) 
                 f"{setting.dtype}, {'gaps' if setting.missing else 'dense'}",
                 tuple(speeds[name].nanoseconds if name in speeds else None for name in names),
             )
-            for setting, speeds in found.items()
+            for setting, speeds in result.items()
             if setting.known_variance
         ),
     )
@@ -456,7 +455,7 @@ def _speed_table(setting: Setting, speeds: Mapping[str, Speed]) -> Table:
     best = speeds.get(HomogeneousMethod.COMPRESSED)
     return Table(
         title=setting.label,
-        columns=("way", "profiles", "ns each", "reads", "ratio"),
+        columns=("method", "profiles", "ns each", "reads", "ratio"),
         rows=tuple(
             (
                 speed.way,
@@ -467,20 +466,20 @@ def _speed_table(setting: Setting, speeds: Mapping[str, Speed]) -> Table:
             )
             for speed in speeds.values()
         ),
-        note=f"Reads: multiples of {READ}. Ratio: to the compressed method. Profiles: of one call.",
+        note=f"Reads: multiples of {READ}. Ratio: to the compressed method. Profiles: per call.",
     )
 
 
-def _threads(found: SolverThroughput) -> Part:
+def _threads(result: SolverThroughput) -> Part:
     return Part(
         title="Two threads",
-        text="Time on the wall of one thread over that of two with half of the profiles each. It "
-        "says something only of a machine with two idle cores.",
+        text="Wall time of one thread over that of two threads with half of the profiles each. It "
+        "is meaningful only on a machine with two idle cores.",
         tables=(
             Table(
                 title="Gain of two threads",
-                columns=("way", "data", "gain"),
-                rows=tuple((t.way, t.dtype, f"{t.gain:.2f}") for t in found.threads),
+                columns=("method", "data", "gain"),
+                rows=tuple((t.way, t.dtype, f"{t.gain:.2f}") for t in result.threads),
             ),
         ),
     )
@@ -489,26 +488,26 @@ def _threads(found: SolverThroughput) -> Part:
 # Elastic retrieval ---------------------------------------------------------------------------
 
 
-def elastic_throughput_report(found: ElasticThroughput, data: str = "") -> BenchmarkReport:
-    """Return the page of the throughput benchmark."""
+def elastic_throughput_report(result: ElasticThroughput, data: str = "") -> BenchmarkReport:
+    """Return the page of the elastic throughput benchmark."""
     return BenchmarkReport(
         title="Elastic inversion: time per profile",
-        facts=facts(found.date, found.machine),
-        parts=(cost_part(found.costs, found.bins),),
+        facts=facts(result.date, result.machine),
+        parts=(cost_part(result.costs, result.bins),),
         data=data,
     )
 
 
 def cost_part(costs: tuple[StepCost, ...], bins: int) -> Part:
-    """Return the chapter of the CPU time of the steps of the elastic retrieval."""
+    """Return the section on the CPU time of the steps of the elastic retrieval."""
     batches = sorted({cost.batch for cost in costs})
     return Part(
         title="CPU time per profile",
         text=f"Profiles of {bins} bins, float64, one thread, least CPU time of interleaved "
-        "repeats. Ours with all errors and flags; all steps: background, clouds, reference "
-        "window and inversion with its error budget. The peers give values without errors: a "
-        "weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy and in "
-        "plain Python. The read is a vectorised maximum of the same array in the same run.",
+        "repeats. Steps of lidarops compute all errors and flags; all steps: background, clouds, "
+        "reference window and inversion with its error budget. The peers give values without "
+        "errors: a weighted numpy.linalg.lstsq and a Klett inversion for each profile, in numpy and "
+        "in plain Python. The read is a vectorised maximum of the same array in the same run.",
         charts=(_cost_ladder(costs, batches, bins),),
         tables=tuple(_cost_table(costs, batch) for batch in batches),
     )
@@ -520,7 +519,7 @@ def _cost_ladder(costs: tuple[StepCost, ...], batches: list[int], bins: int) -> 
     return Ladder(
         name="elastic-time",
         title=f"CPU time per profile of {bins} bins",
-        caption="By the number of profiles that a call is given.",
+        caption="By the number of profiles per call.",
         x_label="CPU time per profile (µs)",
         rows=tuple(steps),
         series=tuple(
@@ -533,11 +532,11 @@ def _cost_ladder(costs: tuple[StepCost, ...], batches: list[int], bins: int) -> 
 def _cost_table(costs: tuple[StepCost, ...], batch: int) -> Table:
     return Table(
         title=f"Calls of {counted(batch, 'profile')}",
-        columns=("step", "whose", "profiles", "µs each", "reads"),
+        columns=("step", "code", "profiles", "µs each", "reads"),
         rows=tuple(
             (
                 cost.step,
-                "ours" if cost.ours else "peer" if cost.step != READ else "floor",
+                "lidarops" if cost.ours else "peer" if cost.step != READ else "floor",
                 f"{cost.profiles:,}",
                 f"{cost.nanoseconds / 1e3:,.2f}",
                 f"{cost.reads:,.1f}",
@@ -545,5 +544,5 @@ def _cost_table(costs: tuple[StepCost, ...], batch: int) -> Table:
             for cost in costs
             if cost.batch == batch
         ),
-        note=f"Reads: multiples of {READ}. Profiles: of one call, fewer where it is slow.",
+        note=f"Reads: multiples of {READ}. Profiles: per call, fewer for slow steps.",
     )

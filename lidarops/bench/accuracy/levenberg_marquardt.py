@@ -12,9 +12,9 @@ Array = npt.NDArray[np.float64]
 
 UNKNOWNS: Final = 3
 _MOST: Final = 60
-"""Iterations after which a fit is given up."""
+"""Most iterations of a fit."""
 _TOLERANCE: Final = 1e-10
-"""Relative fall of the sum of squares below which a fit has converged."""
+"""Relative decrease of the sum of squares below which a fit has converged."""
 _DAMPING: Final = 1e-3
 _LARGEST_DAMPING: Final = 1e12
 
@@ -75,7 +75,7 @@ def _inverse(matrix: Array, damping: float, inverse: Array) -> None:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fit(power: Any, ratio: Array, depth: Array, unknowns: Array, inverse: Array) -> int:
     matrix, side = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-    shape, tried, trial = np.empty(ratio.size), np.empty(ratio.size), np.empty(UNKNOWNS)
+    shape, trial_shape, trial = np.empty(ratio.size), np.empty(ratio.size), np.empty(UNKNOWNS)
     _model(unknowns, ratio, depth, shape)
     squares = _squares(power, unknowns, shape)
     if not np.isfinite(squares):
@@ -92,21 +92,21 @@ def _fit(power: Any, ratio: Array, depth: Array, unknowns: Array, inverse: Array
             _inverse(matrix, damping, inverse)
             for j in range(UNKNOWNS):
                 trial[j] = unknowns[j] + np.sum(inverse[j] * side)
-            _model(trial, ratio, depth, tried)
-            found = _squares(power, trial, tried)
-            if found <= squares:
+            _model(trial, ratio, depth, trial_shape)
+            trial_squares = _squares(power, trial, trial_shape)
+            if trial_squares <= squares:
                 damping *= 0.1
                 break
             damping *= 10.0
             if damping > _LARGEST_DAMPING:
-                found = squares
+                trial_squares = squares
                 trial[:] = unknowns
-                tried[:] = shape
+                trial_shape[:] = shape
                 break
-        done = squares - found <= _TOLERANCE * squares
-        squares = found
+        done = squares - trial_squares <= _TOLERANCE * squares
+        squares = trial_squares
         unknowns[:] = trial
-        shape[:] = tried
+        shape[:] = trial_shape
     _normal_equations(power, unknowns, depth, shape, matrix, side)
     _inverse(matrix, 0.0, inverse)
     return iterations
@@ -126,7 +126,7 @@ def fit_levenberg_marquardt(
     depth : (range,) float64
         Range less the first range, in the inverse unit of the extinction.
     start : (3,) float64
-        Where every fit starts.
+        Start values of every fit.
     unknowns : (profile, 3) float64
         Filled; NaN where a bin is not finite.
     covariance : (profile, 3, 3) float64

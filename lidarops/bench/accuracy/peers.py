@@ -1,8 +1,8 @@
-"""Iterative least squares as others do it, for comparison.
+"""Iterative least-squares fits by common tools, for comparison.
 
 All fit background, signal at the first range and extinction in km-1, which suits them best, with
-exact derivatives, from the true background and signal and 0.8 of the true extinction: a start
-better than any they would get from data.
+exact derivatives. They start from the true background and signal and 0.8 of the true extinction,
+which is better than any start from data.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ _JAX_DAMPING: Final = 1e-6
 
 
 def iterative_peers() -> dict[str, Way]:
-    """Return the iterative solvers by name; the one in JAX only where that is installed."""
-    found: dict[str, Way] = {
+    """Return the iterative solvers by name; the JAX solver only if JAX is installed."""
+    peers: dict[str, Way] = {
         JIT: compiled,
         "scipy curve_fit": _one_by_one(_curve_fit),
         "scipy least_squares": _one_by_one(_least_squares),
     }
     if find_spec("jax") is not None:
-        found[JAX] = vectorised
-    return found
+        peers[JAX] = vectorised
+    return peers
 
 
 def start(scenario: Scenario) -> Array:
-    """Return where the fits of a scenario start."""
+    """Return the start values of the fits of a scenario."""
     extinction = WRONG_PRIOR * scenario.extinction * KILOMETRE
     return np.array([scenario.background, scenario.signal, extinction])
 
@@ -74,7 +74,7 @@ def vectorised(power: Any, scenario: Scenario) -> Estimates:
 @cache
 def _jax_solver() -> Callable[..., Any]:
     jax: Any = import_module("jax")
-    # Single precision, its default, does not reach the least scatter where the background is large.
+    # Single precision, the default, does not reach the least scatter with a large background.
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003 - the signature of JAX
     numpy = jax.numpy
 
@@ -116,7 +116,7 @@ _Single = Callable[[Array, tuple[Array, Array], Array], tuple[Array, Array]]
 
 
 def _curve_fit(power: Array, geometry: tuple[Array, Array], begin: Array) -> tuple[Array, Array]:
-    found, covariance = curve_fit(
+    unknowns, covariance = curve_fit(
         _model,
         geometry,
         power,
@@ -125,20 +125,20 @@ def _curve_fit(power: Array, geometry: tuple[Array, Array], begin: Array) -> tup
         absolute_sigma=True,
         jac=_slopes,
     )
-    return found, covariance
+    return unknowns, covariance
 
 
 def _least_squares(
     power: Array, geometry: tuple[Array, Array], begin: Array
 ) -> tuple[Array, Array]:
-    found = least_squares(
+    solution = least_squares(
         lambda unknowns: _model(geometry, *unknowns) - power,
         begin,
         jac=lambda unknowns: _slopes(geometry, *unknowns),
         method="lm",
         x_scale="jac",
     )
-    return found.x, np.linalg.inv(found.jac.T @ found.jac)
+    return solution.x, np.linalg.inv(solution.jac.T @ solution.jac)
 
 
 def _one_by_one(single: _Single) -> Way:
@@ -152,7 +152,7 @@ def _one_by_one(single: _Single) -> Way:
 
 
 def _estimates(unknowns: Array, covariance: Array, scenario: Scenario) -> Estimates:
-    """Carry the signal at the first range over to the amplitude, with its standard error."""
+    """Convert the signal at the first range to the amplitude, with its standard error."""
     background, signal, sigma = unknowns.T
     near = scenario.start
     amplitude = signal * near**2 * np.exp(2.0 * sigma / KILOMETRE * near)

@@ -1,6 +1,6 @@
-"""How fast the solvers of a homogeneous path, and the steps of an elastic inversion, are.
+"""Time the solvers of a homogeneous path and the steps of an elastic inversion.
 
-Times stand beside that of a vectorised read of the same array in the same run.
+Times are compared with a vectorised read of the same array in the same run.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _QUICK_REPEATS: Final = 3
 _MISSING: Final = 0.3
 _TRIED: Final = 16
 _LONGEST: Final = 0.06
-"""Seconds that one round of one way may take; slower ones get fewer profiles."""
+"""Longest time of one round of a solver, s; slower solvers get fewer profiles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """The data that a way to solve is given."""
+    """Data for which the solvers are timed."""
 
     dtype: str
     known_variance: bool
@@ -45,7 +45,7 @@ class Setting:
 
     @property
     def label(self) -> str:
-        """In words."""
+        """Description in words."""
         gaps = f"{100 * self.missing:.0f} % of bins missing" if self.missing else "dense"
         variance = "variance given" if self.known_variance else "variance estimated"
         return f"{self.dtype}, {gaps}, {variance}"
@@ -53,20 +53,20 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """CPU time of one way to solve in one setting."""
+    """CPU time of one solver in one setting."""
 
     way: str
     setting: Setting
     profiles: int
     nanoseconds: float
-    """A profile, least of the repeats."""
+    """Per profile, least of the repeats."""
     reads: float
     """The same as a multiple of the read of the same array in the same run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Threads:
-    """Time on the wall with one thread over that with two, each with half of the profiles."""
+    """Wall time of one thread over that of two, each with half of the profiles."""
 
     way: str
     dtype: str
@@ -75,7 +75,7 @@ class Threads:
 
 @dataclass(frozen=True, slots=True)
 class SolverThroughput:
-    """The throughput benchmark of the homogeneous path."""
+    """Result of the throughput benchmark of the homogeneous path."""
 
     date: str
     machine: Machine
@@ -99,11 +99,11 @@ def measure_solvers(
     quick : bool
         Fewer profiles and repeats.
     date : str
-        When it is run, as it is to be stated.
+        Date to state.
     profiles, repeats : int, optional
-        Most profiles of one call; counted rounds, of which the least time counts.
+        Most profiles per call; timed rounds, of which the least counts.
     progress : callable
-        Is given 1 after each setting.
+        Called with 1 after each setting.
     """
     count = profiles or (_QUICK_PROFILES if quick else _PROFILES)
     rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
@@ -147,8 +147,8 @@ def _speeds(setting: Setting, count: int, repeats: int) -> Iterator[Speed]:
     times = least_times(calls, repeats)
     read = times[READ] / count
     for name, seconds in times.items():
-        each = seconds / sizes[name]
-        yield Speed(name, setting, sizes[name], 1e9 * each, each / read)
+        per_profile = seconds / sizes[name]
+        yield Speed(name, setting, sizes[name], 1e9 * per_profile, per_profile / read)
 
 
 def _ways(setting: Setting) -> Mapping[str, Callable[[Any, Scenario], object]]:
@@ -159,7 +159,7 @@ def _ways(setting: Setting) -> Mapping[str, Callable[[Any, Scenario], object]]:
         if m is not HomogeneousMethod.AUTO
     }
     if setting.missing:
-        # The cubic takes no gaps, and says so at once.
+        # The cubic allows no gaps: it raises an error at once.
         return {name: way for name, way in ours.items() if name != HomogeneousMethod.CUBIC}
     others: dict[str, Way] = iterative_peers() if setting.known_variance else {}
     return {**ours, **others}
@@ -180,18 +180,18 @@ def _first(way: Callable[[Any, Scenario], object], power: Any) -> Callable[[int]
 
 
 def _affordable(call: Callable[[int], object], most: int) -> int:
-    """Return how many profiles a call may get; it takes a number of profiles."""
-    # What a call costs before the first profile counts for less, the more profiles it gets.
+    """Return how many profiles a call may get; the call takes a number of profiles."""
+    # The fixed cost of a call counts less with more profiles: estimate twice.
     few = _within(call, min(_TRIED, most), most)
     return few if few == most else _within(call, few, most)
 
 
-def _within(call: Callable[[int], object], tried: int, most: int) -> int:
-    call(tried)
+def _within(call: Callable[[int], object], count: int, most: int) -> int:
+    call(count)
     begin = time.perf_counter()
-    call(tried)
-    each = (time.perf_counter() - begin) / tried
-    return int(min(most, max(round(_LONGEST / each), _TRIED)))
+    call(count)
+    per_profile = (time.perf_counter() - begin) / count
+    return int(min(most, max(round(_LONGEST / per_profile), _TRIED)))
 
 
 def _threads(way: str, dtype: str, count: int, repeats: int) -> Threads:
@@ -201,7 +201,7 @@ def _threads(way: str, dtype: str, count: int, repeats: int) -> Threads:
     times = least_times(
         {
             "one": lambda: call(power, PATH),
-            "two": lambda: in_threads(lambda part: call(halves[part], PATH), 2),
+            "two": lambda: in_threads(lambda half: call(halves[half], PATH), 2),
         },
         repeats,
         clock="perf_counter",
@@ -213,7 +213,7 @@ def _threads(way: str, dtype: str, count: int, repeats: int) -> Threads:
 
 ALL_STEPS: Final = "all steps"
 ELASTIC_LEVEL: Final = 1e4
-"""Background of the profiles that are timed, counts a shot."""
+"""Background of the timed profiles, counts per shot."""
 _BATCHES: Final = (1, 100, 2000)
 _QUICK_BATCHES: Final = (1, 400)
 
@@ -224,11 +224,11 @@ class StepCost:
 
     step: str
     batch: int
-    """Profiles that a call would get."""
+    """Profiles per call."""
     profiles: int
-    """Profiles that it got: fewer where it is slow."""
+    """Profiles actually used: fewer for slow steps."""
     nanoseconds: float
-    """A profile, least of the repeats."""
+    """Per profile, least of the repeats."""
     reads: float
     """The same as a multiple of the read of the same array in the same run."""
     ours: bool
@@ -236,13 +236,13 @@ class StepCost:
 
 @dataclass(frozen=True, slots=True)
 class ElasticThroughput:
-    """The throughput benchmark of the elastic retrieval."""
+    """Result of the throughput benchmark of the elastic retrieval."""
 
     date: str
     machine: Machine
     bins: int
     level: float
-    """Background, counts a shot."""
+    """Background, counts per shot."""
     costs: tuple[StepCost, ...]
 
 
@@ -254,20 +254,20 @@ def measure_elastic(
     repeats: int | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> ElasticThroughput:
-    """Time every step from counts to backscatter, and plain peers, on the simulated set.
+    """Time every step from counts to backscatter, and simple peers, on the simulated set.
 
     Parameters
     ----------
     quick : bool
         Fewer profiles and repeats.
     date : str
-        When it is run, as it is to be stated.
+        Date to state.
     batches : sequence of int, optional
-        Profiles of one call.
+        Profiles per call.
     repeats : int, optional
-        Counted rounds, of which the least time counts.
+        Timed rounds, of which the least counts.
     progress : callable
-        Is given 1 after each batch.
+        Called with 1 after each batch.
     """
     sizes = batches or (_QUICK_BATCHES if quick else _BATCHES)
     rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
@@ -284,9 +284,9 @@ def elastic_costs(batch: int, repeats: int) -> list[StepCost]:
     Parameters
     ----------
     batch : int
-        Profiles of one call; slow peers get fewer.
+        Profiles per call; slow peers get fewer.
     repeats : int
-        Counted rounds.
+        Timed rounds.
     """
     steps, others = _steps(elastic_cases.simulated_sky().counts(ELASTIC_LEVEL, batch))
     sizes = {name: _affordable(step, batch) for name, step in (steps | others).items()}
@@ -308,40 +308,47 @@ def elastic_costs(batch: int, repeats: int) -> list[StepCost]:
 
 
 _Step = Callable[[int], object]
-"""What is done with so many profiles."""
+"""Runs a step for a number of profiles."""
 
 
 def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
-    """Return our steps, with the read, and the peers."""
+    """Return the steps of lidarops with the read, and the peers."""
     sky = elastic_cases.simulated_sky()
-    find = elastic_cases.background_methods()
-    found = find[elastic_cases.KNOWN_SHAPE](counts, sky)
-    power, noise = elastic_cases.cleared(counts, sky, found), elastic_cases.variance(counts)
-    # The peers take no gaps: they get the bins of incomplete overlap too.
-    whole = counts - found.background[:, np.newaxis]
+    methods = elastic_cases.background_methods()
+    estimate = methods[elastic_cases.KNOWN_SHAPE](counts, sky)
+    power, noise = (
+        elastic_cases.subtract_background(counts, sky, estimate),
+        elastic_cases.count_variance(counts),
+    )
+    # The peers allow no gaps: they get the bins of incomplete overlap too.
+    whole = counts - estimate.background[:, np.newaxis]
 
     def solve_particles(few: int) -> object:
-        return elastic_cases.particles_of(
+        return elastic_cases.invert_particles(
             power[:few],
             sky,
-            elastic_cases.GIVEN,
+            elastic_cases.GIVEN_WINDOW,
             noise=noise[:few],
-            background_error=found.standard_error[:few],
+            background_error=estimate.standard_error[:few],
         )
 
     whole_way = elastic_cases.Chain(elastic_cases.KNOWN_SHAPE, choose=True)
 
     def everything(few: int) -> object:
-        part = counts[:few]
-        return elastic_cases.invert(part, sky, find[whole_way.way](part, sky), whole_way)
+        first = counts[:few]
+        return elastic_cases.invert(first, sky, methods[whole_way.way](first, sky), whole_way)
 
     ours: dict[str, _Step] = {
         READ: lambda few: np.max(counts[:few]),
-        elastic_cases.TAIL_MEAN: lambda few: find[elastic_cases.TAIL_MEAN](counts[:few], sky),
-        elastic_cases.KNOWN_SHAPE: lambda few: find[elastic_cases.KNOWN_SHAPE](counts[:few], sky),
-        elastic_cases.TOLD: lambda few: find[elastic_cases.TOLD](counts[:few], sky),
-        "layers.screen": lambda few: elastic_cases.screened(power[:few], noise[:few], sky),
-        "reference.choose": lambda few: elastic_cases.chosen_window(power[:few], noise[:few], sky),
+        elastic_cases.TAIL_MEAN: lambda few: methods[elastic_cases.TAIL_MEAN](counts[:few], sky),
+        elastic_cases.KNOWN_SHAPE: lambda few: methods[elastic_cases.KNOWN_SHAPE](
+            counts[:few], sky
+        ),
+        elastic_cases.KNOWN_CLEAN_RANGE: lambda few: methods[elastic_cases.KNOWN_CLEAN_RANGE](
+            counts[:few], sky
+        ),
+        "layers.screen": lambda few: elastic_cases.find_clouds(power[:few], noise[:few], sky),
+        "reference.choose": lambda few: elastic_cases.choose_window(power[:few], noise[:few], sky),
         "elastic.solve": solve_particles,
         ALL_STEPS: everything,
     }
