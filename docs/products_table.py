@@ -1,4 +1,4 @@
-"""Write the tables of docs/products.md again: python docs/products_table.py."""
+"""Regenerate the tables of ``docs/products.md``: ``python docs/products_table.py``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarops.flags import Quality
-from lidarops.netcdf.variables import NO_NAME, Row
+from lidarops.netcdf.variables import NO_STANDARD_NAME, Row
 from lidarops.products.layouts import LAYOUTS
 
 PAGE = Path(__file__).with_name("products.md")
@@ -30,33 +30,33 @@ def _kinds() -> Iterator[str]:
 def _line(row: Row) -> str:
     units = (row.units or "").replace("{signal}", "mV or MHz")
     name = (row.standard_name or "none").replace(" standard_error", " + standard_error")
-    text = row.long_name + (" (where there is one)" if row.optional else "")
+    text = row.long_name + (" (not in every product)" if row.optional else "")
     if row.error_kind is not None and not row.uncertain:
         text += f"; {row.error_kind}"
-    remark = (row.comment or "").replace(NO_NAME, "").strip()
-    told = f"{text}. {remark}".strip() if remark else text
-    cells = (f"`{row.name}`", ", ".join(row.dims) or "none", units or "none", name, told)
+    remark = (row.comment or "").replace(NO_STANDARD_NAME, "").strip()
+    about = f"{text}. {remark}".strip() if remark else text
+    cells = (f"`{row.name}`", ", ".join(row.dims) or "none", units or "none", name, about)
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
 def _bits() -> Iterator[str]:
     yield "\n## Bits of `quality_flag`\n"
-    yield "| bit | value | severity | the value carries it where | in |"
+    yield "| bit | value | severity | meaning | products |"
     yield "| --- | --- | --- | --- | --- |"
     for bit in Quality:
-        held = [
+        carriers = [
             str(kind)
             for kind, layout in LAYOUTS.items()
             if bit & (layout.row("quality_flag").flags or Quality(0))
         ]
         name, severity = str(bit.name).lower(), bit.severity.name.lower()
-        yield f"| `{name}` | {int(bit)} | {severity} | {bit.description} | {', '.join(held)} |"
+        yield f"| `{name}` | {int(bit)} | {severity} | {bit.description} | {', '.join(carriers)} |"
 
 
 def main() -> None:
     """Replace the generated part of the page."""
-    written = PAGE.read_text(encoding="utf-8").partition(BEGIN)[0]
-    PAGE.write_text(written + tables(), encoding="utf-8")
+    by_hand = PAGE.read_text(encoding="utf-8").partition(BEGIN)[0]
+    PAGE.write_text(by_hand + tables(), encoding="utf-8")
 
 
 if __name__ == "__main__":

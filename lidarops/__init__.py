@@ -10,7 +10,7 @@ __all__ = ["__version__", "find_products", "open_archive", "open_products"]
 
 __version__ = _version("lidarops")
 
-# Imported on first use: xarray and dask take a second, and `lidarops --help` must not wait.
+# Imported on first use: xarray and dask take a second to import, too long for `lidarops --help`.
 _MODULES: Final = {
     "open_archive": "lidarops.raw.archive",
     "open_products": "lidarops.aggregate.open_products",

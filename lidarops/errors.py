@@ -1,7 +1,7 @@
-"""The errors that lidarops raises: one base, few leaves.
+"""The exceptions that lidarops raises: one base class and one class a source of errors.
 
-Every message names what was wrong, where, and what to do about it, so that it can be
-shown to a user as it is.
+A message states the problem, the file and field concerned, and a remedy. It is meant to be shown
+to the user.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 NO_FILE: Final = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
-"""What opening raises of a name that is not one of a file: another one was meant."""
+"""What `open` raises for a path that is not that of a file."""
 
 
 class LidarOpsError(Exception):
@@ -21,14 +21,14 @@ class LidarOpsError(Exception):
     problem : str
         What is wrong, in one sentence.
     file : path or str, optional
-        The file in which it was found.
+        The file concerned.
     field : str, optional
-        The field, key, variable or argument in which it was found.
+        The field, key, variable or argument concerned.
     remedy : str, optional
         What the user can do about it.
     wrong_use : bool, optional
-        Whether it is what was asked for that cannot be meant, so that to ask again will not help;
-        that of the class where not given.
+        Whether the request itself is invalid, so that a retry cannot help; by default that of the
+        class.
     """
 
     wrong_use: bool = False
@@ -51,14 +51,14 @@ class LidarOpsError(Exception):
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        where = ": ".join(part for part in (self.file, self.field) if part)
+        where = ": ".join(place for place in (self.file, self.field) if place)
         text = f"{where}: {self.problem}" if where else self.problem
         return f"{text} ({self.remedy})" if self.remedy else text
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Keyword-only arguments are lost by the default, and errors cross process borders.
-        told = (self.problem, self.file, self.field, self.remedy, self.wrong_use)
-        return _rebuild, (type(self), *told)
+        # The default loses keyword-only arguments, and errors are pickled between processes.
+        arguments = (self.problem, self.file, self.field, self.remedy, self.wrong_use)
+        return _rebuild, (type(self), *arguments)
 
 
 def _rebuild(
@@ -67,23 +67,23 @@ def _rebuild(
     file: str | None,
     field: str | None,
     remedy: str | None,
-    wrong_use: bool,  # noqa: FBT001 - pickle gives what it was given by position
+    wrong_use: bool,  # noqa: FBT001 - pickle passes arguments by position
 ) -> LidarOpsError:
     return kind(problem, file=file, field=field, remedy=remedy, wrong_use=wrong_use)
 
 
 class RawFormatError(LidarOpsError, ValueError):
-    """A raw file that cannot be read as the format it claims."""
+    """A raw file that cannot be read in its format."""
 
 
 class CampaignError(LidarOpsError, ValueError):
-    """A campaign file that is missing, unreadable or inconsistent, or not what it is asked for."""
+    """A campaign file that is missing, unreadable, inconsistent or unsuitable for the request."""
 
     wrong_use = True
 
 
 class AncillaryError(LidarOpsError, ValueError):
-    """A sounding or overlap file that is missing, unreadable or holds something else."""
+    """A sounding or overlap file that is missing, unreadable or of other content."""
 
 
 class CatalogError(LidarOpsError):
@@ -95,7 +95,7 @@ class SceneError(LidarOpsError):
 
 
 class RetrievalInputError(LidarOpsError, ValueError):
-    """Arguments of a retrieval whose shapes, units or values cannot be right."""
+    """Arguments of a retrieval with invalid shapes, units or values."""
 
     wrong_use = True
 

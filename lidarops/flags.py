@@ -1,6 +1,9 @@
-"""Quality of a retrieved or measured value: the one source of every CF flag attribute.
+"""Quality flags: the bits of ``quality_flag``, with their severity and description.
 
-A value is a bit mask; 0 means that no test failed.
+The CF flag attributes of every product follow from this module. A value of ``quality_flag`` is a
+bit mask; 0 means that no test failed. The retrievals in `lidarops.retrieve` and the steps in
+`lidarops.process` raise the bits. `lidarops/products/KIND/variables.py` lists the bits that a kind
+of product can carry.
 """
 
 from __future__ import annotations
@@ -9,16 +12,16 @@ from enum import IntEnum, IntFlag
 
 
 class Severity(IntEnum):
-    """What a raised bit asks of the person who uses the value."""
+    """What a raised bit means for the use of the value."""
 
     CARE = 1
-    """Use with care: the value stands, its uncertainty may be understated."""
+    """Use with care: the value is valid, but its stated uncertainty may be too small."""
     REJECT = 2
-    """Do not use: the value does not mean what its name says."""
+    """Do not use: the value does not represent the named quantity."""
 
 
 class Quality(IntFlag):
-    """Quality bits of every product. Names become CF ``flag_meanings`` in lower case."""
+    """Quality bits of all products. Their names in lower case are the CF ``flag_meanings``."""
 
     INPUT_MISSING = 1 << 0
     SATURATED = 1 << 1
@@ -54,12 +57,12 @@ class Quality(IntFlag):
 
     @property
     def description(self) -> str:
-        """One sentence on what the single bit means."""
+        """What a single bit means, as a phrase without a full stop."""
         return _ABOUT[self][1]
 
     @property
     def severity(self) -> Severity:
-        """What the single bit asks of the user."""
+        """Severity of a single bit."""
         return _ABOUT[self][0]
 
     @classmethod
@@ -73,49 +76,70 @@ class Quality(IntFlag):
 
 
 _ABOUT: dict[Quality, tuple[Severity, str]] = {
-    Quality.INPUT_MISSING: (Severity.REJECT, "the raw data are missing or not finite"),
+    Quality.INPUT_MISSING: (
+        Severity.REJECT,
+        "the raw data are missing or not finite",
+    ),
     Quality.SATURATED: (
         Severity.REJECT,
         (
-            "the digitiser is at full scale, in some shots at least, or the photon counter is"
-            " paralysed"
+            "the digitiser is at full scale in at least some shots, or the photon counter is "
+            "paralysed"
         ),
     ),
     Quality.PILE_UP: (
         Severity.CARE,
         (
-            "the dead-time effect on the count rate exceeds 10 percent, or 1 percent where the"
-            " dead time is not known"
+            "the dead-time effect on the count rate exceeds 10 percent, or 1 percent where the "
+            "dead time is unknown"
         ),
     ),
     Quality.INCOMPLETE_OVERLAP: (
         Severity.REJECT,
-        "nearer than the range of full overlap of beam and telescope",
+        (
+            "the range is shorter than that of full overlap between laser beam and telescope "
+            "field of view"
+        ),
     ),
-    Quality.TOO_FEW_BINS: (Severity.REJECT, "fewer than 8 valid range bins in the section"),
-    Quality.NO_SIGNAL: (Severity.REJECT, "the profile is constant: it holds no backscatter"),
+    Quality.TOO_FEW_BINS: (
+        Severity.REJECT,
+        "the section has fewer than 8 valid range bins",
+    ),
+    Quality.NO_SIGNAL: (
+        Severity.REJECT,
+        "the profile is constant: it contains no backscatter",
+    ),
     Quality.LOW_SIGNAL: (
         Severity.REJECT,
         (
-            "the backscattered signal is less than 5 times its standard error,"
-            " or so small that noise may have moved the root of the cubic"
+            "the backscatter signal is less than 5 times its standard error, or so small that "
+            "noise may have shifted the root of the cubic"
         ),
     ),
     Quality.POORLY_DETERMINED: (
         Severity.REJECT,
-        "the standard error of extinction exceeds 15 percent of extinction plus 1 / mean range",
+        "the standard error of extinction exceeds 15 percent of (extinction + 1 / mean range)",
     ),
-    Quality.NEGATIVE_AMPLITUDE: (Severity.REJECT, "the fitted amplitude is not positive"),
-    Quality.AT_BOUND: (Severity.REJECT, "the extinction lies at a bound of its physical range"),
+    Quality.NEGATIVE_AMPLITUDE: (
+        Severity.REJECT,
+        "the fitted amplitude is not positive",
+    ),
+    Quality.AT_BOUND: (
+        Severity.REJECT,
+        "the extinction lies at a bound of its physical range",
+    ),
     Quality.POOR_FIT: (
         Severity.REJECT,
-        "the residuals are larger or smaller than the noise allows (reduced chi-square)",
+        "the residuals are larger or smaller than the noise explains (reduced chi-square)",
     ),
     Quality.NOT_HOMOGENEOUS: (
         Severity.REJECT,
-        "the residuals vary systematically along range: the path is not homogeneous",
+        "the residuals vary systematically with range: the path is not homogeneous",
     ),
-    Quality.OUTLIER: (Severity.CARE, "at least one bin lies more than 5 standard errors off"),
+    Quality.OUTLIER: (
+        Severity.CARE,
+        "at least one bin deviates by more than 5 standard errors",
+    ),
     Quality.NO_REAL_SOLUTION: (
         Severity.REJECT,
         "the estimating equation has no admissible real root",
@@ -123,81 +147,87 @@ _ABOUT: dict[Quality, tuple[Severity, str]] = {
     Quality.NOT_LEVEL: (
         Severity.REJECT,
         (
-            "the path changes its height by more than 100 m along the section, so that extinction"
-            " cannot be told from backscatter that changes with height"
+            "the altitude of the path changes by more than 100 m along the section; a vertical "
+            "gradient of backscatter would mimic extinction"
         ),
     ),
     Quality.BACKGROUND_UNCERTAIN: (
         Severity.CARE,
-        (
-            "the far range does not look like air without aerosol, so that signal may be left in"
-            " the background"
-        ),
+        ("the far range does not look like aerosol-free air, so the background may contain signal"),
     ),
     Quality.NO_GLUING: (
         Severity.REJECT,
-        "no range where analog and photon counting signals are both linear: they are not joined",
+        (
+            "there is no range in which the analog and the photon-counting signal are both "
+            "linear; they are not glued"
+        ),
     ),
     Quality.CLOUD: (
         Severity.CARE,
         (
-            "in a cloud, or behind one as seen from where the inversion starts, where the lidar"
-            " ratio of aerosol does not hold"
+            "in a cloud, or behind one as seen from the start of the inversion; the lidar ratio "
+            "of aerosol does not hold there"
         ),
     ),
     Quality.NO_REFERENCE: (
         Severity.REJECT,
-        "no range window passes the tests of air without aerosol, so that nothing is calibrated",
+        "no range window passes the tests for aerosol-free air; the profile is not calibrated",
     ),
     Quality.UNSTABLE_INVERSION: (
         Severity.REJECT,
-        "the inversion divides by nearly nothing, or lies beyond what its boundary value reaches",
+        (
+            "numerically unstable (near-zero denominator), or beyond the range that the boundary "
+            "value constrains"
+        ),
     ),
     Quality.NO_LEVERAGE: (
         Severity.REJECT,
-        "the angles are too few or too much alike for an optical depth",
+        "the zenith angles are too few or too similar to determine an optical depth",
     ),
     Quality.POOR_STRATIFICATION: (
         Severity.REJECT,
-        "the air differs along the slant paths more than layers that are level allow for",
+        "the signals of the slant paths differ by more than level layers allow",
     ),
     Quality.PRIOR_DOMINATED: (
         Severity.CARE,
-        "smoothness, or another prior, decides the extinction more than the data do",
+        "smoothness or another prior determines the extinction more than the data do",
     ),
     Quality.EXTRAPOLATED: (
         Severity.REJECT,
-        "beyond the reach of the signals, where only the prior would speak",
+        "beyond the reach of the signals, where only the prior would determine the value",
     ),
     Quality.INTERPOLATED: (
         Severity.CARE,
-        "in a gap of the data, bridged from the heights above and below",
+        "in a gap of the data, interpolated from the altitudes above and below",
     ),
     Quality.ONE_SIDED: (
         Severity.CARE,
         (
-            "the scan looks to one side only, so that a horizontal gradient is not seen; its"
-            " systematic error is given apart"
+            "the scan covers one side of the zenith only, so a horizontal gradient cannot be "
+            "detected; its systematic error is stated separately"
         ),
     ),
     Quality.LOW_LEVERAGE: (
         Severity.CARE,
-        "the slant paths differ little, so that small errors of the signal count much",
+        "the slant paths differ little, so the result is sensitive to small signal errors",
     ),
     Quality.NO_RESIDUAL: (
         Severity.CARE,
-        "as many unknowns as angles: nothing tests the result",
+        "there are as many unknowns as angles, so no residual tests the result",
     ),
     Quality.UNDERSMOOTHED: (
         Severity.CARE,
-        "more structure over height than the errors allow for",
+        "the profile has more vertical structure than its errors explain",
     ),
     Quality.HIGH_CORRELATION: (
         Severity.CARE,
-        "errors of neighbouring heights are alike by more than 0.85: intervals are too narrow",
+        (
+            "errors of neighbouring altitudes are correlated by more than 0.85: confidence "
+            "intervals are too narrow"
+        ),
     ),
     Quality.HORIZONTAL_GRADIENT: (
         Severity.REJECT,
-        "the residuals over angle show a horizontal gradient",
+        "the residuals over zenith angle show a horizontal gradient",
     ),
 }

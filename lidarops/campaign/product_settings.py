@@ -20,7 +20,7 @@ def _utc(value: datetime) -> datetime:
     return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
-def as_list(value: Any) -> Any:
+def _as_list(value: Any) -> Any:
     """Return a single text as a list of it."""
     return [value] if isinstance(value, str) else value
 
@@ -48,7 +48,7 @@ def as_interval(value: Any) -> Any:
 
 Instant = Annotated[datetime, AfterValidator(_utc)]
 Patterns = Annotated[
-    list[Annotated[str, AfterValidator(_clean_pattern)]], BeforeValidator(as_list), Field()
+    list[Annotated[str, AfterValidator(_clean_pattern)]], BeforeValidator(_as_list), Field()
 ]
 Inside = Annotated[str, AfterValidator(_clean_pattern)]
 """Path relative to the campaign file, and below it."""

@@ -77,19 +77,19 @@ def explain_yaml_error(
         keys = [str(key) for key in problem["loc"] if key != _KEY]
         line = _line_of(tree, keys)
         place = ".".join(keys) or "top level"
-        said = _said(problem, keys, model, words)
+        said = _message(problem, keys, model, words)
         lines.append(f"{f'line {line}: ' if line else ''}{place}: {said}")
     return lines
 
 
-def _said(
+def _message(
     problem: ErrorDetails, keys: list[str], model: type[BaseModel], words: Mapping[str, str]
 ) -> str:
     pattern = str(problem.get("ctx", {}).get("pattern"))
     if problem["type"] == "string_pattern_mismatch" and pattern in words:
         return f"must be {words[pattern]}, not {problem['input']!r}"
     if problem["type"] == "extra_forbidden":
-        known = _known(model, keys[:-1])
+        known = _known_keys(model, keys[:-1])
         if known:
             near = difflib.get_close_matches(keys[-1], known, n=3)
             others = [name for name in known if name not in near]
@@ -97,7 +97,7 @@ def _said(
     return problem["msg"]
 
 
-def _known(model: type[BaseModel], keys: Sequence[str]) -> list[str]:
+def _known_keys(model: type[BaseModel], keys: Sequence[str]) -> list[str]:
     """Return the keys that a part of a file may have, by name."""
     there: list[Any] = [model]
     for key in keys:

@@ -20,7 +20,7 @@ _LEVEL: Final = 2
 Offset = tuple[int, ...]
 
 
-def deflated(
+def deflate_chunks(
     values: NDArray[Any], chunk: tuple[int, ...], fill_value: Any
 ) -> Iterator[tuple[Offset, bytes]]:
     """Cut an array into chunks, and shuffle and deflate each.
@@ -56,14 +56,14 @@ def deflated(
 def _deflate(part: NDArray[Any]) -> bytes:
     compressor = isal_zlib.compressobj(_LEVEL)
     pieces: list[bytes] = []
-    for plane in planes(part):
+    for plane in _planes(part):
         # A plane has its own statistics, and nothing that is found again in another.
         pieces += compressor.compress(plane), compressor.flush(isal_zlib.Z_FULL_FLUSH)
     return b"".join((*pieces, compressor.flush()))
 
 
-def inflated(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Undo what `deflated` did to a chunk.
+def inflate_chunk(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Undo what `deflate_chunks` did to a chunk.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def inflated(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     return whole
 
 
-def planes(part: NDArray[Any]) -> Iterator[NDArray[np.uint8]]:
+def _planes(part: NDArray[Any]) -> Iterator[NDArray[np.uint8]]:
     """Give the first byte of every element, then every second: the order of HDF5's `shuffle`.
 
     Parameters

@@ -17,7 +17,7 @@ from lidarops.netcdf.context import Context, product_path
 from lidarops.netcdf.coordinates import Coordinate, locate_product
 from lidarops.netcdf.global_attributes import global_attributes
 from lidarops.netcdf.input_checks import (
-    Intake,
+    CheckedInput,
     Values,
     check_flagged,
     check_flags,
@@ -64,7 +64,7 @@ def build_dataset(data: xr.Dataset, context: Context, layout: Layout) -> xr.Data
         missing without a quality bit; where coordinates are not finite and rising.
     """
     _refuse_mismatch(context)
-    source = Intake(data, layout)
+    source = CheckedInput(data, layout)
     coordinates, extents = locate_product(source, layout, context)
     product = xr.Dataset(
         {
@@ -104,7 +104,7 @@ def _place(coordinates: list[Coordinate], mode: DetectionMode) -> dict[str, xr.V
 
 
 def _measured(
-    source: Intake, layout: Layout, coordinates: list[Coordinate], mode: DetectionMode
+    source: CheckedInput, layout: Layout, coordinates: list[Coordinate], mode: DetectionMode
 ) -> dict[str, xr.Variable]:
     judged = layout.row(rows.QUALITY_FLAG)
     flags = whole_numbers(judged, source.take(judged.name, judged.dims))
@@ -113,7 +113,7 @@ def _measured(
     for row in layout.variables:
         if row.optional and row.name not in source:
             continue
-        stored = rows.sum_up(flags) if row.summary else _stored(source, row, judged, flags)
+        stored = rows.summarize_flags(flags) if row.summary else _stored(source, row, judged, flags)
         found_attributes = attributes(row, mode=mode, coordinates=_listed(row, coordinates))
         variables[row.name] = xr.Variable(row.dims, stored, found_attributes)
     _refuse_parts(layout, variables)
@@ -128,7 +128,7 @@ def _refuse_parts(layout: Layout, variables: dict[str, xr.Variable]) -> None:
             raise ProductError("is missing", field=missing[0], remedy=f"{row.name} needs it")
 
 
-def _stored(source: Intake, row: Row, judged: Row, flags: Values) -> Values:
+def _stored(source: CheckedInput, row: Row, judged: Row, flags: Values) -> Values:
     values = source.take(row.name, row.dims)
     check_range(row, values)
     if row.dtype.startswith("i"):

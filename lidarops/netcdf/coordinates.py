@@ -12,8 +12,8 @@ import numpy as np
 from lidarops.errors import ProductError
 from lidarops.netcdf.context import Context
 from lidarops.netcdf.global_attributes import Extents
-from lidarops.netcdf.input_checks import Intake, Values, check_range, whole_numbers
-from lidarops.netcdf.sounded_air import sounded
+from lidarops.netcdf.input_checks import CheckedInput, Values, check_range, whole_numbers
+from lidarops.netcdf.sounded_air import beam_positions
 from lidarops.netcdf.variables import BOUNDS_DIM, Layout, Row, deployment
 
 NEAR_VERTICAL: Final = 10.0
@@ -38,7 +38,7 @@ class Coordinate:
 
 
 def locate_product(
-    source: Intake, layout: Layout, context: Context
+    source: CheckedInput, layout: Layout, context: Context
 ) -> tuple[list[Coordinate], Extents]:
     """Return the coordinates of a product in the order of its layout, and what they cover.
 
@@ -62,7 +62,7 @@ def locate_product(
     place = _PLACES.get(layout.sampled, _beam_place)
     found, vertical = place(source, layout, context.station.altitude, time.values.size)
     found["time"] = time
-    bins = {} if vertical.profiles else _sounded(found, layout, context)
+    bins = {} if vertical.profiles else _air_positions(found, layout, context)
     for name, value in _fixed(context).items():
         if name in found or not any(row.name == name for row in layout.coordinates):
             continue
@@ -97,7 +97,7 @@ class _Vertical:
 _Place = tuple[dict[str, Coordinate], _Vertical]
 
 
-def _beam_place(source: Intake, layout: Layout, station: float, profiles: int) -> _Place:
+def _beam_place(source: CheckedInput, layout: Layout, station: float, profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie along the beam."""
     names = _ALONG[layout.sampled]
     found = {name: _along(source, layout.row(name)) for name in names}
@@ -111,7 +111,7 @@ def _beam_place(source: Intake, layout: Layout, station: float, profiles: int) -
     return found, _Vertical(altitude.values, exact, vertical)
 
 
-def _sounded(
+def _air_positions(
     found: Mapping[str, Coordinate], layout: Layout, context: Context
 ) -> dict[str, Coordinate]:
     """Return latitude and longitude of what lies along a slanting beam of known azimuth."""
@@ -126,7 +126,9 @@ def _sounded(
     zenith, azimuth = (found[name].values for name in ("zenith_angle", "azimuth"))
     angle = np.deg2rad(zenith)
     ahead, up = along.values * np.sin(angle), along.values * np.cos(angle)
-    places = sounded(station.latitude, station.longitude, station.altitude, ahead, azimuth, up)
+    places = beam_positions(
+        station.latitude, station.longitude, station.altitude, ahead, azimuth, up
+    )
     bins = {}
     for name, values in zip(("bin_latitude", "bin_longitude"), places, strict=True):
         row = layout.row(name)
@@ -135,7 +137,7 @@ def _sounded(
     return bins
 
 
-def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) -> _Place:
+def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie at altitudes seen by several beams."""
     names = ["beam", "beam_zenith_angle"]
     names += [name for name in ("beam_azimuth",) if name in source]
@@ -153,7 +155,7 @@ def _scan_place(source: Intake, layout: Layout, station: float, _profiles: int) 
     return found, _Vertical(values, values, profiles=False)
 
 
-def _network_place(source: Intake, layout: Layout, _station: float, _profiles: int) -> _Place:
+def _network_place(source: CheckedInput, layout: Layout, _station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie where beams of several lidars meet."""
     angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
     beams = (f"beam_{name}" for name in angles)
@@ -183,7 +185,7 @@ _ALONG: Final = {"range": ("range",), "section": ("section", "section_range")}
 """Coordinates along the beam; the last holds metres."""
 
 
-def _time(source: Intake, row: Row) -> Coordinate:
+def _time(source: CheckedInput, row: Row) -> Coordinate:
     moments, bounds = _moments(source)
     if np.isnat(moments).any() or np.isnat(bounds).any():
         raise ProductError("holds times that are not set", field=row.name)
@@ -196,7 +198,7 @@ def _time(source: Intake, row: Row) -> Coordinate:
     return _celled(row, _seconds(moments), _seconds(bounds))
 
 
-def _moments(source: Intake) -> tuple[Values, Values]:
+def _moments(source: CheckedInput) -> tuple[Values, Values]:
     values = []
     for name, dims in (("time", ("time",)), ("time_bnds", ("time", BOUNDS_DIM))):
         taken = source.take(name, dims)
@@ -211,7 +213,7 @@ def _seconds(moments: Values) -> Values:
     return seconds
 
 
-def _along(source: Intake, row: Row) -> Coordinate:
+def _along(source: CheckedInput, row: Row) -> Coordinate:
     values = source.take(row.name, row.dims)
     values = whole_numbers(row, values) if row.dtype.startswith("i") else _finite(row.name, values)
     # The middles of sections may come in any order: sections overlap as the user likes.
@@ -256,7 +258,7 @@ def _celled(row: Row, values: Values, bounds: Values) -> Coordinate:
     return Coordinate(row, row.dims, values, bounds)
 
 
-def _beam(source: Intake, row: Row, profiles: int) -> Coordinate:
+def _beam(source: CheckedInput, row: Row, profiles: int) -> Coordinate:
     """Return an angle of the beam: one number where it stands still, else over time."""
     dims = ("time",) if row.name in source and source.dims(row.name) else ()
     values = _finite(row.name, source.take(row.name, dims))
@@ -282,7 +284,7 @@ def _altitude(
     return Coordinate(row, (*zenith.dims, *row.dims), exact.astype(row.dtype), bounds), exact
 
 
-def _extents(source: Intake, vertical: _Vertical, horizontal: list[Values]) -> Extents:
+def _extents(source: CheckedInput, vertical: _Vertical, horizontal: list[Values]) -> Extents:
     moments, bounds = _moments(source)
     intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
     steps = np.abs(np.diff(vertical.exact, axis=-1))

@@ -15,7 +15,7 @@ from lidarops.netcdf.variables import Layout, Row
 Values = npt.NDArray[Any]
 
 
-class Intake:
+class CheckedInput:
     """A dataset whose variables are taken one by one, each as its row wants it.
 
     Parameters

@@ -23,7 +23,7 @@ from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 from xarray.core import indexing
 
 from lidarops.errors import ProductError
-from lidarops.netcdf._deflate import inflated
+from lidarops.netcdf._deflate import inflate_chunk
 from lidarops.netcdf.write import BULK_BYTES
 
 _ATTRIBUTES: Final = (
@@ -180,7 +180,7 @@ class _Stored(BackendArray):
         self._file = file
         self._dataset = dataset
         self._fill = fill
-        self._deflated = _is_ours(dataset)
+        self._deflated = _is_deflated(dataset)
         self.shape = dataset.shape
         self.dtype = dataset.dtype
 
@@ -222,7 +222,7 @@ class _Stored(BackendArray):
                 inside = (slice(at, at + step) for at, step in zip(corner, chunk, strict=True))
                 return np.asarray(self._dataset[tuple(inside)])
         try:
-            return inflated(data, chunk, self.dtype)
+            return inflate_chunk(data, chunk, self.dtype)
         except ValueError as error:
             raise self._file.damaged(error) from error
 
@@ -233,7 +233,7 @@ def _shared(span: range, corner: int, step: int) -> tuple[slice, slice]:
     return slice(first - span.start, last - span.start), slice(first - corner, last - corner)
 
 
-def _is_ours(dataset: h5py.Dataset) -> bool:
+def _is_deflated(dataset: h5py.Dataset) -> bool:
     """Whether every chunk is there, shuffled and deflated, and nothing else was done to it."""
     if dataset.chunks is None:
         return False
@@ -247,7 +247,7 @@ def _is_ours(dataset: h5py.Dataset) -> bool:
 def _own_fill(dtype: np.dtype[Any], attributes: dict[str, Any]) -> np.floating[Any] | None:
     """Take out the fill value of a number that nothing else is said of, as in our products."""
     fill = attributes.get("_FillValue")
-    alone = attributes.keys() <= {"units", "_FillValue"} and not _told_as_time(attributes)
+    alone = attributes.keys() <= {"units", "_FillValue"} and not _has_time_units(attributes)
     if isinstance(fill, np.floating) and dtype == fill.dtype and dtype.isnative and alone:
         del attributes["_FillValue"]
         return fill
@@ -262,11 +262,11 @@ def _unfilled(values: NDArray[Any], fill: np.floating[Any] | None) -> NDArray[An
 
 def _is_plain(stored: xr.Variable) -> bool:
     """Whether a variable holds what is in the file: a number that nothing says how to take."""
-    coded = stored.attrs.keys() - {"units"} or _told_as_time(stored.attrs)
+    coded = stored.attrs.keys() - {"units"} or _has_time_units(stored.attrs)
     return stored.dtype.kind in "iuf" and not coded
 
 
-def _told_as_time(attributes: Mapping[str, Any]) -> bool:
+def _has_time_units(attributes: Mapping[str, Any]) -> bool:
     return " since " in str(attributes.get("units", ""))
 
 
@@ -296,7 +296,7 @@ def _dimensions(dataset: h5py.Dataset, name: str) -> tuple[str, ...]:
 def _attributes(dataset: h5py.Dataset) -> dict[str, Any]:
     there = [name for name in _ATTRIBUTES if h5py.h5a.exists(dataset.id, name.encode())]
     found = {name: _attribute(dataset, name) for name in there}
-    if _told_as_time(found) and "bounds" in dataset.attrs:
+    if _has_time_units(found) and "bounds" in dataset.attrs:
         found["bounds"] = _attribute(dataset, "bounds")
     return found
 

@@ -16,7 +16,7 @@ _ECCENTRICITY: Final = _FLATTENING * (2.0 - _FLATTENING)
 """Square of the first eccentricity."""
 
 
-def sounded(
+def beam_positions(
     latitude: float, longitude: float, altitude: float, ahead: Array, azimuth: Array, up: Array
 ) -> tuple[Array, Array]:
     r"""Return latitude and longitude of points on a straight beam.

@@ -1,9 +1,10 @@
-"""What a variable of a product is, and the attributes that follow from it.
+"""Describe the variables of a product: one `Row` a variable, one `Layout` a kind of product.
 
-A row says what a variable is; its CF and ACDD attributes follow from the row. The row of a
-standard error follows from the row of its quantity. Standard names are those of the CF table
-v93; a quantity that the table does not know has none, because none is better than a wrong one
-(`cf111`, section 3.3).
+The CF and ACDD attributes of a variable follow from its row, and the row of a standard error from
+that of its quantity. `lidarops/products/KIND/variables.py` holds the rows of a kind, where a
+variable gets its CF standard name, long name and comment; this module holds what all kinds share.
+Standard names are those of the CF table v93. A quantity without an entry there has no standard
+name, because none is better than a wrong one (`cf111`, section 3.3).
 """
 
 from __future__ import annotations
@@ -26,26 +27,25 @@ STANDARD_NAME_TABLE: Final = "CF Standard Name Table v93"
 FILL_VALUE: Final = np.float32(9.969209968386869e36)
 """The netCDF default fill value of floats, on float data only."""
 TIME_UNITS: Final = "seconds since 1970-01-01 00:00:00"
-"""One epoch for all files, so that tools which do not decode time can still join them."""
+"""All files share one epoch, so that tools that do not decode time can join them."""
 BOUNDS_DIM: Final = "nv"
 
 _SIGNAL_UNITS: Final = {DetectionMode.ANALOG: "mV", DetectionMode.PHOTON: "MHz"}
 _ERROR_BITS: Final = 8
 """Significant bits of the standard error of a rounded quantity: 0.2 percent at worst."""
-NO_NAME: Final = f"No standard name of the {STANDARD_NAME_TABLE} means this quantity."
-
+NO_STANDARD_NAME: Final = f"The {STANDARD_NAME_TABLE} has no name for this quantity."
 
 QUALITY_FLAG: Final = "quality_flag"
 USABLE: Final = "usable"
 
 
 class ErrorKind(StrEnum):
-    """How the errors of different values hang together: attribute ``error_kind``."""
+    """Correlation of an error between profiles: attribute ``error_kind``."""
 
     RANDOM = "random"
-    """New in every profile: a mean over time makes it smaller."""
+    """Independent from profile to profile: a mean over time reduces it."""
     SYSTEMATIC = "systematic"
-    """Alike in all profiles: no mean makes it smaller."""
+    """Common to all profiles: a mean does not reduce it."""
     BOTH = "random and systematic"
 
 
@@ -61,7 +61,7 @@ class Coverage(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """What one variable of a product is."""
+    """Description of one variable of a product."""
 
     name: str
     dims: tuple[str, ...]
@@ -70,30 +70,30 @@ class Row:
     long_name: str
     coverage: Coverage
     units: str | None = None
-    """May hold ``{signal}``: mV in analog detection, MHz in photon counting."""
+    """``{signal}`` stands for mV in analog detection and MHz in photon counting."""
     standard_name: str | None = None
     axis: str | None = None
     positive: str | None = None
     bounds: str | None = None
-    """Name of the variable of the cell limits; it has one dimension more and no attributes."""
+    """Name of the variable with the cell bounds; it has one more dimension and no attributes."""
     cell_methods: str | None = None
     valid_min: float | None = None
     valid_max: float | None = None
     ancillaries: tuple[str, ...] = ()
     significant_bits: int | None = None
-    """Bits of the mantissa that are kept; None keeps all."""
+    """Bits of the mantissa that are stored; None stores all."""
     uncertain: bool = False
-    """Whether ``<name>_standard_error`` stands beside it."""
+    """Whether the product also holds ``<name>_standard_error``."""
     optional: bool = False
     """Whether a product may lack it."""
     follows_beam: bool = False
-    """Whether ``time`` becomes the first dimension where the beam moves."""
+    """Whether the variable gets ``time`` as first dimension where the beam moves."""
     flags: Quality | None = None
     """The bits that a flag variable can carry."""
     summary: bool = False
-    """Whether it is `usable`: computed from the flags, never handed over."""
+    """Whether it is `usable`, which is computed from the flags and never passed in."""
     error_kind: ErrorKind | None = None
-    """Of a variable that tells an error; of another, of its standard error."""
+    """Kind of the error that the variable holds, or else of the variable's standard error."""
     cf_role: str | None = None
     algorithm: str | None = None
     comment: str | None = None
@@ -113,13 +113,13 @@ class Row:
             significant_bits=self.significant_bits and _ERROR_BITS,
             uncertain=False,
             error_kind=self.error_kind or ErrorKind.RANDOM,
-            comment=None if self.standard_name else NO_NAME,
+            comment=None if self.standard_name else NO_STANDARD_NAME,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """What a kind of product holds, and what is said of the whole."""
+    """Variables and global texts of one kind of product."""
 
     title: str
     summary: str
@@ -130,20 +130,20 @@ class Layout:
     sampled: str
     """The dimension besides time."""
     unused_steps: frozenset[str]
-    """Steps of a scene's plan that other kinds need and this one does not."""
+    """Steps of a scene's plan that only other kinds need."""
     coordinates: tuple[Row, ...]
     data: tuple[Row, ...]
     feature_type: str | None = None
-    """Of the discrete sampling geometry (CF, chapter 9), where it does not depend on the beam."""
+    """CF ``featureType`` (discrete sampling geometry, chapter 9), unless it depends on the beam."""
 
     @property
     def variables(self) -> tuple[Row, ...]:
-        """Data rows, each followed by what derives from it: standard error, summary of flags."""
+        """Data rows, each followed by its derived rows: standard error, summary of flags."""
         return tuple(_with_derived(self.data))
 
     @property
     def rounded(self) -> bool:
-        """Whether any variable is stored with fewer significant bits than it has."""
+        """Whether any variable is stored with a shortened mantissa."""
         return any(row.significant_bits for row in self.variables)
 
     def row(self, name: str) -> Row:
@@ -157,9 +157,9 @@ class Layout:
         rows = {row.name: row for row in (*self.coordinates, *self.variables)}
         if name not in rows:
             raise ProductError(
-                "is no variable of this kind of product",
+                "is not a variable of this kind of product",
                 field=name,
-                remedy=f"the variables are {', '.join(rows)}",
+                remedy=f"its variables are {', '.join(rows)}",
             )
         return rows[name]
 
@@ -185,38 +185,38 @@ def _with_summary(names: tuple[str, ...]) -> Iterator[str]:
 
 
 def usable(flags: Row) -> Row:
-    """Return the row that sums up quality bits for those who do not want to read them."""
+    """Return the row of ``usable``, which summarizes the bits of ``quality_flag``."""
     return Row(
         name=USABLE,
         dims=flags.dims,
         dtype="i1",
         units="1",
         standard_name="aggregate_quality_flag",
-        long_name="whether the value may be used, from the bits of quality_flag",
+        long_name="usability of the value, from the bits of quality_flag",
         coverage=Coverage.QUALITY,
         summary=True,
-        comment="do_not_use: a bit of severity reject is set in quality_flag. use_with_care: only"
-        " bits of severity care are. good: no test failed. The comment of quality_flag tells the"
+        comment="do_not_use: quality_flag has a bit of severity reject. use_with_care: it has bits"
+        " of severity care only. good: no test failed. The comment of quality_flag states the"
         " severity of each bit.",
     )
 
 
-def sum_up(flags: NDArray[np.int32]) -> NDArray[np.int8]:
-    """Return `usable` of quality bits: the severity of the worst bit, 0 where there is none.
+def summarize_flags(flags: NDArray[np.int32]) -> NDArray[np.int8]:
+    """Return the values of ``usable``: the severity of the worst bit, 0 without any bit.
 
     Parameters
     ----------
     flags : ndarray of int32
-        Of `lidarops.flags.Quality`.
+        Bits of `lidarops.flags.Quality`.
 
     Returns
     -------
     ndarray of int8
         0 good, 1 use with care, 2 do not use.
     """
-    found = np.where(flags == 0, 0, int(Severity.CARE)).astype(np.int8)
-    found[(flags & np.int32(Quality.rejecting())) != 0] = int(Severity.REJECT)
-    return found
+    severity = np.where(flags == 0, 0, int(Severity.CARE)).astype(np.int8)
+    severity[(flags & np.int32(Quality.rejecting())) != 0] = int(Severity.REJECT)
+    return severity
 
 
 def attributes(
@@ -228,9 +228,9 @@ def attributes(
     ----------
     row : Row
     mode : DetectionMode
-        Settles the unit of the signal.
+        Determines the unit of the signal.
     coordinates : tuple of str
-        Auxiliary coordinates that the product holds for this variable.
+        Names of the variable's auxiliary coordinates.
 
     Returns
     -------
@@ -238,7 +238,7 @@ def attributes(
     """
     stored = np.dtype(row.dtype)
     limit = stored.type if stored.kind in "if" else None
-    found: dict[str, Any] = {
+    attrs: dict[str, Any] = {
         "standard_name": row.standard_name,
         "long_name": row.long_name,
         "units": units(row, mode),
@@ -258,19 +258,19 @@ def attributes(
         "_Encoding": "utf-8" if stored.kind == "S" else None,
     }
     if row.significant_bits is not None:
-        found["quantization"] = QUANTIZATION.name
-        found["quantization_nsb"] = np.int32(row.significant_bits)
+        attrs["quantization"] = QUANTIZATION.name
+        attrs["quantization_nsb"] = np.int32(row.significant_bits)
     if row.error_kind is not None and not row.uncertain:
-        found["error_kind"] = row.error_kind.value
+        attrs["error_kind"] = row.error_kind.value
     if row.summary:
-        found["flag_values"] = np.array([0, *Severity], dtype=stored)
-        found["flag_meanings"] = "good use_with_care do_not_use"
+        attrs["flag_values"] = np.array([0, *Severity], dtype=stored)
+        attrs["flag_meanings"] = "good use_with_care do_not_use"
     if row.flags is not None:
-        found |= _flag_attributes(row.flags, stored)
-    found["comment"] = (
-        " ".join(text for text in (found.get("comment"), row.comment) if text) or None
+        attrs |= _flag_attributes(row.flags, stored)
+    attrs["comment"] = (
+        " ".join(text for text in (attrs.get("comment"), row.comment) if text) or None
     )
-    return {key: value for key, value in found.items() if value is not None}
+    return {key: value for key, value in attrs.items() if value is not None}
 
 
 def units(row: Row, mode: DetectionMode) -> str | None:
@@ -292,8 +292,8 @@ def _flag_attributes(flags: Quality, stored: np.dtype[Any]) -> dict[str, Any]:
             f"{str(bit.name).lower()} ({bit.severity.name.lower()}): {bit.description}"
             for bit in bits
         )
-        + ". reject: do not use the value; care: the value stands, its uncertainty may be"
-        " understated.",
+        + ". reject: do not use the value; care: the value is valid, but its stated uncertainty"
+        " may be too small.",
     }
 
 
@@ -303,7 +303,7 @@ TIME = Row(
     dtype="f8",
     units=TIME_UNITS,
     standard_name="time",
-    long_name="middle of the averaging interval, UTC",
+    long_name="midpoint of the averaging interval, UTC",
     coverage=Coverage.COORDINATE,
     axis="T",
     bounds="time_bnds",
@@ -330,7 +330,7 @@ SECTION_RANGE = Row(
     dims=("section",),
     dtype="f8",
     units="m",
-    long_name="distance from the lidar along the beam, middle of the range section",
+    long_name="distance from the lidar along the beam, midpoint of the range section",
     coverage=Coverage.COORDINATE,
     bounds="section_bounds",
 )
@@ -350,8 +350,8 @@ def altitude(along: str, bounds: str | None = None) -> Row:
         positive="up",
         bounds=bounds,
         follows_beam=True,
-        comment="Station altitude + range x cos(zenith angle): straight beam over a flat Earth."
-        " Curvature adds (range x sin(zenith angle))^2 / 12742 km.",
+        comment="Station altitude + range x cos(zenith angle), for a straight beam over a flat"
+        " Earth. Curvature of the Earth adds (range x sin(zenith angle))^2 / 12742 km.",
     )
 
 
@@ -432,28 +432,28 @@ SOUNDED = tuple(
         valid_min=-limit,
         valid_max=limit,
         follows_beam=True,
-        comment="Of a straight beam, on the WGS 84 ellipsoid.",
+        comment="For a straight beam, on the WGS 84 ellipsoid.",
     )
     for name, units, limit in (
         ("latitude", "degrees_north", 90.0),
         ("longitude", "degrees_east", 180.0),
     )
 )
-"""Of a slanting beam whose azimuth is known; `dims` is what lies along the beam."""
+"""Position of the sounded air along a slant beam of known azimuth; `coordinates` sets `dims`."""
 
 
 def deployment(row: Row) -> Row:
-    """Return the row of the station's latitude or longitude where that of the air is another.
+    """Return the row of a station's latitude or longitude where the sounded air lies elsewhere.
 
-    One latitude is that of the values: generic readers, which tell it by standard name or unit,
-    must not find two.
+    Generic readers identify the latitude of the values by its standard name or unit, which the
+    station's must therefore not carry.
     """
     direction = "north" if row.name == "latitude" else "east"
     return replace(
         row,
         standard_name=f"deployment_{row.name}",
         units="degree",
-        comment=f"Positive {direction}. bin_{row.name} is that of the sounded air.",
+        comment=f"Positive {direction}. bin_{row.name} is the {row.name} of the sounded air.",
     )
 
 
@@ -469,11 +469,11 @@ QUANTIZATION: Final = Row(
     name="quantization_info",
     dims=(),
     dtype="i4",
-    long_name="how values were rounded to fewer significant bits",
+    long_name="rounding of values to fewer significant bits",
     coverage=Coverage.REFERENCE,
     algorithm="bitround",
 )
-"""The container that CF-1.12, section 8.4, describes; the value means nothing."""
+"""Container variable of CF-1.12, section 8.4; its value has no meaning."""
 PROVENANCE: Final = Row(
     name="provenance",
     dims=("provenance_strlen",),
@@ -489,11 +489,11 @@ GLUING: Final = (
         dims=("time",),
         dtype="f4",
         units="MHz mV-1",
-        long_name="photon counting rate for an analog signal, from where both are linear",
+        long_name="slope of the photon-counting rate over the analog signal in the gluing window",
         coverage=Coverage.AUXILIARY,
         optional=True,
         uncertain=True,
-        comment=f"Missing where there is no such range. {NO_NAME}",
+        comment=f"Missing where there is no range in which both are linear. {NO_STANDARD_NAME}",
     ),
     *(
         Row(
@@ -501,15 +501,16 @@ GLUING: Final = (
             dims=("time",),
             dtype="f4",
             units="m",
-            long_name=f"range at which the window that joins both signals {verb}",
+            long_name=f"range at which the gluing window {verb}",
             coverage=Coverage.AUXILIARY,
             optional=True,
-            comment=f"Nearer the signal is analog, farther photon counting. {NO_NAME}",
+            comment="The glued signal is analog at shorter and photon counting at longer ranges."
+            f" {NO_STANDARD_NAME}",
         )
         for end, verb in (("bottom", "begins"), ("top", "ends"))
     ),
 )
-"""Of channels that are made of an analog and a photon counting one."""
+"""Variables of a channel that is glued from an analog and a photon-counting one."""
 
 
 def shots(*, of: str) -> Row:
@@ -535,18 +536,18 @@ def quality(dims: tuple[str, ...], flags: Quality) -> Row:
         dtype="i4",
         units="1",
         standard_name="quality_flag",
-        long_name="quality of the value, one bit for each failed test",
+        long_name="quality bits of the value, one for each failed test",
         coverage=Coverage.QUALITY,
         flags=flags,
     )
 
 
 def coordinates(along: tuple[Row, ...], altitude: Row) -> tuple[Row, ...]:
-    """Return the coordinates of a kind of product: time, along the beam, place."""
+    """Return the coordinates of a kind of product: time, along the beam, position."""
     sounded = (replace(row, dims=altitude.dims) for row in SOUNDED)
     return (TIME, *along, altitude, *sounded, *PLACE)
 
 
 def station(*, profiles: bool) -> Row:
-    """Return the row of the station's name, which identifies the series where it is one."""
+    """Return the row of the station's name; with `profiles` it identifies the time series."""
     return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION

@@ -18,7 +18,7 @@ import xarray as xr
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
-from lidarops.netcdf._deflate import Offset, deflated
+from lidarops.netcdf._deflate import Offset, deflate_chunks
 
 COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
@@ -171,7 +171,7 @@ def _deflated(variable: xr.Variable) -> list[tuple[Offset, bytes]]:
     native = variable.dtype.newbyteorder("=")
     fill = variable.attrs.get("_FillValue", netCDF4.default_fillvals[native.str[1:]])
     chunk = chunk_sizes(variable.shape, native.itemsize)
-    return list(deflated(variable.values.astype(native, copy=False), chunk, fill))
+    return list(deflate_chunks(variable.values.astype(native, copy=False), chunk, fill))
 
 
 def _filled(image: bytes, dataset: xr.Dataset, chunks: _Chunks) -> bytes:

@@ -1,8 +1,8 @@
-"""What a campaign asks for, or tells facts of, and the files do not hold.
+"""Find channels that a campaign requests or gives facts of, and that the files do not hold.
 
-The rules look at one layout of channels. Of single scenes they are asked by `lidarops.plan.scene_plan`; of
-all files of an archive by `unavailable`, as a name that no file has is a slip of the pen, and one that
-some have and others lack is a lidar that was changed.
+The rules compare one layout of channels with the campaign. `lidarops.plan.scene_plan` applies them
+to a scene, `unavailable_channels` to all files of an archive: a channel that no file holds is a
+typing error, one that some files lack is a lidar that was changed.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from lidarops.plan.signal_rules import (
     Rule,
     StepName,
     applied,
-    joined_channels,
-    parts_of,
+    glued_parts,
+    joined_layout,
 )
 from lidarops.records import ChannelLayout, Holding, LeftOut, ProductKind, Unmet
 
@@ -33,7 +33,7 @@ _LAST: Final = datetime.max.replace(tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What files hold, and what the campaign says of their instrument at their time."""
+    """The channels of some files, with their instrument and its facts at that time."""
 
     layout: tuple[ChannelLayout, ...]
     instrument: Instrument
@@ -43,137 +43,143 @@ class Held:
 def glued_channels(
     layout: Sequence[ChannelLayout], instrument: Instrument
 ) -> tuple[ChannelLayout, ...]:
-    """Return the channels that files give by joining analog and photon counting ones.
+    """Return the requested glued channels that can be made from files.
 
     Parameters
     ----------
     layout : sequence of ChannelLayout
-        Of the files.
+        Channels of the files.
     instrument : Instrument
-        Whose products ask for channels named ``glued_`` and a label.
+        Its products request glued channels by names such as ``glued_532o``.
 
     Returns
     -------
     tuple of ChannelLayout
-        Those of which the files hold both parts on one range grid; in photon counting units.
+        Channels whose analog and photon-counting parts have one bin width; in photon-counting
+        units.
     """
-    return joined_channels(layout, sorted(_asked_glued(instrument)))
+    return joined_layout(layout, sorted(_requested_glued(instrument)))
 
 
-def _asked_glued(instrument: Instrument) -> set[str]:
+def _requested_glued(instrument: Instrument) -> set[str]:
     products = instrument.products
-    asked = [
+    channels = [
         name
-        for wanted in (products.elastic, products.multiangle)
-        if wanted is not None
-        for name in wanted.channels
+        for settings in (products.elastic, products.multiangle)
+        if settings is not None
+        for name in settings.channels
     ]
     if products.signal is not None and products.signal.channels != "all":
-        asked += products.signal.channels
-    return {name for name in asked if name.startswith(GLUED)}
+        channels += products.signal.channels
+    return {name for name in channels if name.startswith(GLUED)}
 
 
-def _asked(instrument: Instrument) -> dict[StepName, Sequence[str]]:
+def _requested_channels(instrument: Instrument) -> dict[StepName, Sequence[str]]:
     """Return the channels that each kind of product names."""
     products = instrument.products
     return {
-        kind: wanted.channels
-        for kind, wanted in (
+        kind: settings.channels
+        for kind, settings in (
             (StepName.SIGNAL, products.signal),
             (StepName.HOMOGENEOUS, products.homogeneous),
             (StepName.ELASTIC, products.elastic),
             (StepName.MULTIANGLE, products.multiangle),
         )
-        if wanted is not None and wanted.channels != "all"
+        if settings is not None and settings.channels != "all"
     }
 
 
 def _absent(held: Held) -> Decisions:
-    """Name the channels that the campaign wants and the files lack."""
+    """Yield the channels that the campaign requests and the files lack."""
     channels = {channel.name: channel for channel in held.layout}
-    made = [channel.name for channel in glued_channels(held.layout, held.instrument)]
-    for kind, names in _asked(held.instrument).items():
+    glued = [channel.name for channel in glued_channels(held.layout, held.instrument)]
+    for kind, names in _requested_channels(held.instrument).items():
         for name in names:
             if kind is StepName.HOMOGENEOUS and name.startswith(GLUED):
-                yield LeftOut(kind.value, name, "each record is fitted with its own background")
-            elif name not in channels and name not in made:
+                reason = "not made of glued channels: each record is fitted with its own background"
+                yield LeftOut(kind.value, name, reason)
+            elif name not in channels and name not in glued:
                 yield LeftOut(kind.value, name, _why_absent(name, channels))
 
 
 def _why_absent(name: str, channels: Mapping[str, ChannelLayout]) -> str:
     if name.startswith(GLUED):
-        parts = parts_of(name)
+        parts = glued_parts(name)
         if set(parts) <= set(channels):
             widths = [f"{channels[part].bin_width:g} m" for part in parts]
-            return f"its parts have bins of {' and '.join(widths)}"
+            return f"its analog and photon-counting channels have bins of {' and '.join(widths)}"
         missing = [part for part in parts if part not in channels]
-        return f"the files hold no {' and no '.join(missing)} to join"
+        return f"the files hold no {' and no '.join(missing)} to glue"
     return f"the files hold no such channel, only {', '.join(channels)}"
 
 
-def _strange_facts(held: Held) -> Decisions:
-    """Name the channels of which the campaign tells facts, and which the files lack."""
+def _unmatched_facts(held: Held) -> Decisions:
+    """Yield the channels of the campaign's facts that the files lack."""
     present = [channel.name for channel in held.layout]
     for name, known in held.facts.channels.items():
         if name not in present:
-            reason = f"facts of a channel that the files do not hold, only {', '.join(present)}"
+            reason = f"the facts name a channel that the files lack; they hold {', '.join(present)}"
             yield LeftOut(StepName.READ.value, name, reason)
         elif known.lag is not None and not name.startswith("analog_"):
-            yield LeftOut(StepName.LAG.value, name, "a lag is a fact of the analog channel")
+            reason = "a lag belongs to the facts of the analog channel"
+            yield LeftOut(StepName.LAG.value, name, reason)
 
 
 ABSENT: Final = Rule(
-    "channel_present", StepName.READ, "Do the files hold what is asked for?", _absent
+    "channel_present", StepName.READ, "Do the files hold the requested channels?", _absent
 )
-STRANGE: Final = Rule(
-    "facts_fit", StepName.READ, "Do the campaign's facts fit the files?", _strange_facts
+UNMATCHED: Final = Rule(
+    "facts_fit", StepName.READ, "Do the campaign's facts fit the files?", _unmatched_facts
 )
-RULES: Final = (ABSENT, STRANGE)
+RULES: Final = (ABSENT, UNMATCHED)
 
 
-def edges(campaign: Campaign) -> list[datetime]:
-    """Return the times at which facts of some instrument change, rising."""
-    found = {
+def validity_edges(campaign: Campaign) -> list[datetime]:
+    """Return the times at which facts of any instrument change, rising."""
+    edges = {
         edge
         for instrument in campaign.instruments.values()
         for facts in instrument.facts
         for edge in (facts.valid_from, facts.valid_to)
     }
-    return sorted(found - {_FIRST, _LAST})
+    return sorted(edges - {_FIRST, _LAST})
 
 
-def lacks_any(campaign: Campaign, layouts: Iterable[tuple[str, tuple[ChannelLayout, ...]]]) -> bool:
-    """Return whether some files may lack something that the campaign names, at whatever time.
+def lacks_channels(
+    campaign: Campaign, layouts: Iterable[tuple[str, tuple[ChannelLayout, ...]]]
+) -> bool:
+    """Return whether files may lack a channel that the campaign names, at any time.
 
     Parameters
     ----------
     campaign : Campaign
     layouts : iterable of (str, tuple of ChannelLayout)
-        Instruments, and what files of theirs hold.
+        Instruments, and the channels of their files.
     """
     return any(
-        _lacked(Held(layout, owner, facts))
+        _lacking(Held(layout, owner, facts))
         for name, layout in layouts
         if (owner := campaign.instruments.get(name)) is not None
         for facts in owner.facts or (InstrumentFacts(),)
     )
 
 
-def names_any(campaign: Campaign) -> bool:
+def names_channels(campaign: Campaign) -> bool:
     """Return whether a campaign names channels, so that files may lack them."""
     return any(
-        any(_asked(instrument).values()) or any(facts.channels for facts in instrument.facts)
+        any(_requested_channels(instrument).values())
+        or any(facts.channels for facts in instrument.facts)
         for instrument in campaign.instruments.values()
     )
 
 
-def _lacked(held: Held) -> list[LeftOut]:
-    """Return what files lack; not what they hold and cannot be used as it is told."""
-    found = (each for each in applied(RULES, held) if isinstance(each, LeftOut))
-    return [left for left in found if left.name != StepName.LAG]
+def _lacking(held: Held) -> list[LeftOut]:
+    """Return the channels that files lack, without misplaced facts about a lag."""
+    omissions = (left for left in applied(RULES, held) if isinstance(left, LeftOut))
+    return [left for left in omissions if left.name != StepName.LAG]
 
 
-def unavailable(
+def unavailable_channels(
     campaign: Campaign,
     holdings: Iterable[Holding],
     *,
@@ -182,58 +188,62 @@ def unavailable(
     since: datetime | None = None,
     until: datetime | None = None,
 ) -> tuple[Unmet, ...]:
-    """Return what is asked for, or told of, and not in the files of an instrument.
+    """Return the channels that are requested or have facts, and that files of an instrument lack.
+
+    A requested channel is looked for in all files of its instrument, one with facts in the files
+    of the period of the facts.
 
     Parameters
     ----------
     campaign : Campaign
     holdings : iterable of Holding
-        Of all files, cut at `edges`: whatever is asked for, a channel is looked for in all files
-        of its instrument, and one of facts in those of their period.
+        Of all files, cut at `validity_edges`.
     instruments : collection of str, optional
-        Only of these.
+        Restricts the result to these instruments.
     kinds : collection of ProductKind
-        Only what these ask for, and facts; all where empty.
+        Restricts requested channels to these kinds of product; all where empty.
     since, until : datetime, optional
-        Only facts whose period touches [since, until).
+        Restricts facts to periods that touch [since, until).
 
     Returns
     -------
     tuple of Unmet
-        Those that no file has first.
+        Channels that no file holds come first.
     """
-    asked = {StepName(kind.value) for kind in kinds} or set(StepName)
+    requested = {StepName(kind.value) for kind in kinds} or set(StepName)
     all_files: dict[tuple[str, str], int] = defaultdict(int)
     lacking: dict[tuple[str, str, str], list[tuple[int, str]]] = defaultdict(list)
     held: dict[tuple[str, str], int] = defaultdict(int)
-    for each in holdings:
-        instrument = campaign.instruments.get(each.instrument)
-        if instrument is None or not (instruments is None or each.instrument in instruments):
+    for holding in holdings:
+        name = holding.instrument
+        instrument = campaign.instruments.get(name)
+        if instrument is None or not (instruments is None or name in instruments):
             continue
-        for there in each.layout:
-            held[each.instrument, there.name] += each.files
-        facts = instrument.facts_at(each.since)
+        for channel_layout in holding.layout:
+            held[name, channel_layout.name] += holding.files
+        facts = instrument.facts_at(holding.since)
         period = _period(facts)
-        for word in {"", period}:
-            all_files[each.instrument, word] += each.files
+        for requester in {"", period}:
+            all_files[name, requester] += holding.files
         touched = (since is None or facts.valid_to > since) and (
             until is None or facts.valid_from < until
         )
-        told = {}
-        for left in _lacked(Held(each.layout, instrument, facts)):
-            if left.rule == ABSENT.name and StepName(left.name) in asked:
-                told[left.name, left.channel] = left.reason
-            elif left.rule == STRANGE.name and touched:
-                told[period, left.channel] = left.reason
-        for (word, channel), reason in told.items():
-            lacking[each.instrument, word, channel].append((each.files, reason))
-    found = []
-    for (name, word, channel), without in lacking.items():
-        of_facts = word.startswith(FACTS)
-        files, whole = sum(count for count, _ in without), all_files[name, word if of_facts else ""]
-        holding = held[name, channel] if of_facts else whole - files
-        found.append(Unmet(name, channel, word, max(without)[1], files, whole, holding))
-    return tuple(sorted(found, key=lambda each: (not each.nowhere, each.instrument)))
+        reasons = {}
+        for left in _lacking(Held(holding.layout, instrument, facts)):
+            if left.rule == ABSENT.name and StepName(left.name) in requested:
+                reasons[left.name, left.channel] = left.reason
+            elif left.rule == UNMATCHED.name and touched:
+                reasons[period, left.channel] = left.reason
+        for (requester, channel), reason in reasons.items():
+            lacking[name, requester, channel].append((holding.files, reason))
+    unmet = []
+    for (name, requester, channel), counts in lacking.items():
+        of_facts = requester.startswith(FACTS)
+        files = sum(count for count, _ in counts)
+        whole = all_files[name, requester if of_facts else ""]
+        having = held[name, channel] if of_facts else whole - files
+        unmet.append(Unmet(name, channel, requester, max(counts)[1], files, whole, having))
+    return tuple(sorted(unmet, key=lambda request: (not request.nowhere, request.instrument)))
 
 
 def _period(facts: InstrumentFacts) -> str:

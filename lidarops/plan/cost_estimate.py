@@ -1,7 +1,7 @@
-"""Scene and plan -> estimated CPU time, from what each thing costs on this machine.
+"""Estimate the CPU time of a scene from its plan and from unit costs of this machine.
 
-The estimate is a sum over `Term`: how much there is of it, times what one of it costs. Amounts
-follow from the plan alone, costs from a calibration (`lidarops bench throughput --case costs`).
+The estimate is a sum over `Term` of amount times unit cost. Amounts follow from the plan, unit
+costs from a calibration (`lidarops bench throughput --case costs`).
 """
 
 from __future__ import annotations
@@ -20,86 +20,86 @@ from pathlib import Path
 from typing import Any, Final
 
 from lidarops.errors import CatalogError
-from lidarops.plan.signal_rules import GLUED, StepName, parts_of, read_windows
-from lidarops.raw.model import bins_of
+from lidarops.plan.signal_rules import GLUED, StepName, glued_parts, read_windows
+from lidarops.raw.model import count_bins
 from lidarops.records import Granule, Plan, ProductKind, Scene, Step
 
 _FORMAT: Final = "lidarops costs"
 _CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
 MOST_FIGURES: Final = 40
-"""Groups of products that a report draws."""
+"""Number of groups of products that a report draws."""
 
 
 class Term(StrEnum):
-    """What CPU time goes into."""
+    """A term of the CPU time."""
 
     RUN = "run"
-    """A run: its process, what it imports, ledger."""
+    """A run: process, imports, ledger."""
     LOAD = "load"
-    """What the first scene of a process loads, whatever it is."""
+    """Compiled code that the first scene of a process loads, for any product."""
     HOMOGENEOUS_LOAD = "homogeneous_load"
-    """Compiled code that is loaded with the first scene that has such a product."""
+    """Compiled code that the first scene with such a product loads."""
     ELASTIC_LOAD = "elastic_load"
     MULTIANGLE_LOAD = "multiangle_load"
     VISIBILITY_LOAD = "visibility_load"
     SCENE = "scene"
     FILE = "file"
-    """A raw file of a scene, dark ones too."""
+    """A raw file of a scene, dark files included."""
     DIGEST = "digest"
-    """A byte of raw files whose digest is not known yet."""
+    """A byte of a raw file whose digest is not known yet."""
     CHANNEL = "channel"
     """A channel that is read."""
     VALUE = "value"
-    """A profile times a bin, read and conditioned."""
+    """One bin of one profile, read and conditioned."""
     DARK = "dark"
-    """A channel of which dark files are subtracted."""
+    """A channel from which dark files are subtracted."""
     LOOK = "look"
     SIGNAL = "signal"
     SIGNAL_VALUE = "signal_value"
-    """A profile times a bin, written."""
+    """One bin of one profile, written."""
     HOMOGENEOUS = "homogeneous"
     HOMOGENEOUS_VALUE = "homogeneous_value"
-    """A profile times a bin of a section."""
+    """One bin of a section of one profile."""
     ELASTIC = "elastic"
     ELASTIC_VALUE = "elastic_value"
-    """An average times a bin."""
+    """One bin of one average."""
     MULTIANGLE = "multiangle"
     MULTIANGLE_VALUE = "multiangle_value"
-    """A profile times an altitude."""
+    """One altitude of one profile."""
     VISIBILITY = "visibility"
     VISIBILITY_VALUE = "visibility_value"
-    """An average of a beam."""
+    """One average of one beam."""
     PAGE = "page"
     """The page of a report."""
     SIGNAL_FIGURE = "signal_figure"
-    """The figures of an instrument's channel, all scenes together."""
+    """The figures of one channel of an instrument, for all scenes together."""
     HOMOGENEOUS_FIGURE = "homogeneous_figure"
     ELASTIC_FIGURE = "elastic_figure"
     MULTIANGLE_FIGURE = "multiangle_figure"
     VISIBILITY_FIGURE = "visibility_figure"
     FIGURE_VALUE = "figure_value"
-    """A profile times a bin that figures are made of."""
+    """One bin of one profile in a figure."""
 
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """What one of each term costs on a machine."""
+    """Unit costs of all terms on a machine."""
 
     seconds: Mapping[Term, float]
-    """CPU time in s, of every term."""
+    """Term -> CPU time in s for one unit."""
     processor: str = ""
     date: str = ""
-    """Of the calibration; empty for the costs that come with lidarops."""
+    """Date of the calibration; empty for `DEFAULTS`."""
     note: str = ""
     """Why these costs are not those of this machine; empty where they are."""
 
     def of(self, amounts: Mapping[Term, float]) -> float:
-        """Return the CPU time of some amounts, s."""
+        """Return the CPU time of amounts, s."""
         return math.fsum(self.seconds[term] * amount for term, amount in amounts.items())
 
     @property
     def words(self) -> str:
-        """Whence the costs are, for people."""
+        """Source of the costs, in words."""
         return self.note or f"calibrated on this machine on {self.date}"
 
 
@@ -138,7 +138,7 @@ DEFAULTS: Final[Mapping[Term, float]] = {
     Term.VISIBILITY_FIGURE: 1.2,
     Term.FIGURE_VALUE: 3e-7,
 }
-"""Costs of a common server core, where nothing was measured."""
+"""Costs on a common server core, used without a calibration."""
 
 
 @dataclass(slots=True)
@@ -149,7 +149,7 @@ class Tally:
     scenes: float = 0.0
     """s, of all scenes."""
     count: int = 0
-    """Of scenes in which something is done."""
+    """Number of scenes with products."""
     _figures: set[tuple[str, str, str]] = field(default_factory=set)
     _values: float = 0.0
 
@@ -160,31 +160,31 @@ class Tally:
         self.count += bool(made)
         self._figures |= made
         self._values += terms.get(Term.SIGNAL_VALUE, 0.0) + terms.get(Term.ELASTIC_VALUE, 0.0)
-        found = self.costs.of(terms)
-        self.scenes += found
-        return found
+        seconds = self.costs.of(terms)
+        self.scenes += seconds
+        return seconds
 
     @property
     def loading(self) -> float:
-        """What scenes cost once, s: compiled code, by kinds of products."""
+        """CPU time to load compiled code once, by kinds of products, s."""
         kinds = {kind for kind, _, _ in self._figures}
         return self.costs.of(
-            {load_of(kind): 1.0 for kind in kinds}
+            {load_term(kind): 1.0 for kind in kinds}
             | dict.fromkeys([Term.LOAD] if kinds else [], 1.0)
         )
 
     @property
     def start(self) -> float:
-        """What a run costs once, s: its process, compiled code, ledger."""
+        """CPU time of a run besides scenes and report, s: process, compiled code, ledger."""
         return self.loading + self.costs.of({Term.RUN: 1.0}) if self.count else 0.0
 
     @property
     def report(self) -> float:
-        """What the report costs, s."""
+        """CPU time of the report, s."""
         if not self.count:
             return 0.0
         drawn = Counter(kind for kind, _, _ in sorted(self._figures)[:MOST_FIGURES])
-        terms = {figure(kind): float(number) for kind, number in drawn.items()}
+        terms = {figure_term(kind): float(number) for kind, number in drawn.items()}
         return self.costs.of({Term.PAGE: 1.0, Term.FIGURE_VALUE: self._values, **terms})
 
     @property
@@ -194,7 +194,7 @@ class Tally:
 
     @property
     def parts(self) -> dict[str, float]:
-        """CPU time of scenes, start and report, and of all, s."""
+        """CPU time of scenes, start, report and all together, s."""
         return {
             "scenes": self.scenes,
             "start": self.start,
@@ -203,53 +203,54 @@ class Tally:
         }
 
 
-def load_of(kind: str) -> Term:
-    """Return the term of what is loaded with the first product of a kind."""
-    # What signals load is what all products do.
+def load_term(kind: str) -> Term:
+    """Return the term of the code that the first product of a kind loads."""
+    # The signal product loads nothing beyond what all products load.
     return Term.LOAD if kind == ProductKind.SIGNAL else Term(f"{kind}_load")
 
 
-def figure(kind: str) -> Term:
+def figure_term(kind: str) -> Term:
     """Return the term of the figures of a kind of product."""
     return Term(f"{kind}_figure")
 
 
 def amounts(scene: Scene, plan: Plan, *, whole: bool = False) -> dict[Term, float]:
-    """Return how much of each term a scene takes.
+    """Return the amount of each term in a scene.
 
     Parameters
     ----------
     scene : Scene
     plan : Plan
-        What is to be done; before files are looked at, so that what a look leaves out counts.
+        Before it is refined in the worker: sections that are left out there still count.
     whole : bool
-        Whether every file is read whole, as with ``--all-steps``.
+        Whether every file is read in full, as with ``--all-steps``.
 
     Returns
     -------
     dict of Term to float
-        Without what there is nothing of; empty where the plan gives no product.
+        Terms with an amount above 0; empty where the plan makes no product.
     """
     products = _products(plan)
     if not products:
         return {}
-    parts = scene.members or (scene,)
-    reading = [step.channel for step in plan.steps if step.name == StepName.READ]
+    members = scene.members or (scene,)
+    channels = [step.channel for step in plan.steps if step.name == StepName.READ]
     files = (*scene.granules, *scene.dark)
-    found: dict[Term, float] = defaultdict(float)
-    found[Term.SCENE] = 1
-    found[Term.FILE] = sum(
-        len(part.granules) + len(part.dark) * _darkened(plan, part.instrument) for part in parts
+    terms: dict[Term, float] = defaultdict(float)
+    terms[Term.SCENE] = 1
+    terms[Term.FILE] = sum(
+        len(member.granules) + len(member.dark) * _subtracts_dark(plan, member.instrument)
+        for member in members
     )
-    found[Term.DIGEST] = sum(each.size for each in files if whole or each.sha256 is None)
-    found[Term.CHANNEL] = sum(not name.startswith(GLUED) for name in reading)
-    found[Term.VALUE] = sum(_conditioned(part, plan) for part in parts)
-    found[Term.DARK] = sum(step.name == StepName.DARK for step in plan.steps)
-    found[Term.LOOK] = sum(step.name == StepName.LOOK for step in plan.steps)
+    terms[Term.DIGEST] = sum(file.size for file in files if whole or file.sha256 is None)
+    terms[Term.CHANNEL] = sum(not name.startswith(GLUED) for name in channels)
+    terms[Term.VALUE] = sum(_conditioned(member, plan) for member in members)
+    terms[Term.DARK] = sum(step.name == StepName.DARK for step in plan.steps)
+    terms[Term.LOOK] = sum(step.name == StepName.LOOK for step in plan.steps)
     for step in products:
-        found[Term(step.name)] += 1
-        found[Term(f"{step.name}_value")] += _values(step, scene, plan)
-    return {term: float(amount) for term, amount in found.items() if amount}
+        terms[Term(step.name)] += 1
+        terms[Term(f"{step.name}_value")] += _values(step, scene, plan)
+    return {term: float(amount) for term, amount in terms.items() if amount}
 
 
 def _products(plan: Plan) -> list[Step]:
@@ -257,37 +258,38 @@ def _products(plan: Plan) -> list[Step]:
     return [step for step in plan.steps if step.name in kinds]
 
 
-def _darkened(plan: Plan, instrument: str) -> bool:
+def _subtracts_dark(plan: Plan, instrument: str) -> bool:
     return any(
         step.name == StepName.DARK and step.instrument in ("", instrument) for step in plan.steps
     )
 
 
-def _of(plan: Plan, part: Scene) -> Iterator[Step]:
-    """Give the steps of a scene, or of a member of one."""
-    return (step for step in plan.steps if step.instrument in ("", part.instrument))
+def _steps_of(plan: Plan, member: Scene) -> Iterator[Step]:
+    """Yield the steps of a scene, or of a member of one."""
+    return (step for step in plan.steps if step.instrument in ("", member.instrument))
 
 
-def _bins(part: Scene) -> dict[str, int]:
-    return {channel.name: channel.bins for channel in part.layout}
+def _bins(scene: Scene) -> dict[str, int]:
+    return {channel.name: channel.bins for channel in scene.layout}
 
 
-def _conditioned(part: Scene, plan: Plan) -> float:
-    """Return profiles times bins that are read and conditioned; joined channels read their own."""
-    held = _bins(part)
-    windows = read_windows(tuple(_of(plan, part)))
+def _conditioned(member: Scene, plan: Plan) -> float:
+    """Return the number of values that are read and conditioned; glued channels read both parts."""
+    bins = _bins(member)
+    windows = read_windows(tuple(_steps_of(plan, member)))
     total = 0
-    for step in _of(plan, part):
-        if step.name == StepName.READ and not _only_a_part(step.channel, plan):
-            names = parts_of(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
+    for step in _steps_of(plan, member):
+        if step.name == StepName.READ and not _only_glued(step.channel, plan):
+            names = glued_parts(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
             total += sum(
-                bins_of(windows[name]) if name in windows else held.get(name, 0) for name in names
+                count_bins(windows[name]) if name in windows else bins.get(name, 0)
+                for name in names
             )
-    return float(len(part.granules) * total)
+    return float(len(member.granules) * total)
 
 
-def _only_a_part(channel: str, plan: Plan) -> bool:
-    """Return whether a channel is read for joined ones alone."""
+def _only_glued(channel: str, plan: Plan) -> bool:
+    """Return whether a channel is read for glued channels only."""
     glued = {value for step in plan.steps if step.name == StepName.GLUE
              for value in step.settings.values()}  # fmt: skip
     return channel in glued and channel not in {step.channel for step in _products(plan)}
@@ -308,9 +310,9 @@ def _values(step: Step, scene: Scene, plan: Plan) -> float:
         return float(profiles * sum((far - near) / width for near, far in settings["sections"]))
     if step.name == ProductKind.MULTIANGLE:
         return float(profiles * settings["highest"] / settings["step"])
-    held = _bins(scene)
-    names = parts_of(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
-    bins = min(held[name] for name in names)
+    by_channel = _bins(scene)
+    names = glued_parts(step.channel) if step.channel.startswith(GLUED) else (step.channel,)
+    bins = min(by_channel[name] for name in names)
     if step.name == ProductKind.ELASTIC:
         return float(_intervals(scene.granules, _average(step, plan)) * bins)
     return float(profiles * bins)
@@ -325,7 +327,7 @@ def _average(product: Step, plan: Plan) -> float:
 
 
 def _intervals(granules: Iterable[Granule], seconds: float) -> int:
-    """Return how many intervals of the clock hold profiles."""
+    """Return the number of clock intervals that hold profiles."""
     starts = (granule.start for granule in granules)
     return len({math.floor(start.timestamp() / seconds) for start in starts if start})
 
@@ -345,30 +347,30 @@ def processor() -> str:
 
 
 def calibration_path() -> Path:
-    """Return where this user's calibration of this machine is kept.
+    """Return the path of this user's calibration of this machine.
 
     Raises
     ------
     CatalogError
-        Where neither the environment nor the system tells.
+        If neither the environment nor the system gives a home folder.
     """
     try:
         folder = os.environ.get(_CACHE_VARIABLE) or str(Path.home() / ".cache")
     except RuntimeError as error:
-        # A container may run as a user that it does not know.
+        # A container may run as a user without a home folder.
         raise CatalogError(
-            f"a calibration has no place: {error}", remedy=f"set {_CACHE_VARIABLE}"
+            f"there is no folder for a calibration: {error}", remedy=f"set {_CACHE_VARIABLE}"
         ) from error
     return Path(folder) / "lidarops" / "costs.json"
 
 
 def save_calibration(costs: Costs, path: Path | None = None) -> Path:
-    """Keep a calibration.
+    """Write a calibration, and return its path.
 
     Raises
     ------
     CatalogError
-        Where the file cannot be written, or has no place.
+        If the file cannot be written, or there is no folder for it.
     """
     target = path or calibration_path()
     document = {
@@ -379,7 +381,7 @@ def save_calibration(costs: Costs, path: Path | None = None) -> Path:
     }
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        # Renamed, as another process may be reading it.
+        # Replaced atomically, because another process may read it.
         with tempfile.NamedTemporaryFile(
             "w", dir=target.parent, prefix=f".{target.name}.", encoding="utf-8", delete=False
         ) as stream:
@@ -393,14 +395,10 @@ def save_calibration(costs: Costs, path: Path | None = None) -> Path:
 
 
 def load_calibration(path: Path | None = None) -> Costs:
-    """Return the costs of this machine: calibrated where they are, with a note where not.
+    """Return the costs of this machine: calibrated ones, or `DEFAULTS` with a note.
 
-    A calibration of another processor is not used, as home directories move.
-
-    Returns
-    -------
-    Costs
-        Never raises: an estimate is no reason for a command to fail.
+    A calibration of another processor is not used, because home directories are shared between
+    machines. Never raises, because a missing estimate must not stop a command.
     """
     source = path
     try:
@@ -418,10 +416,10 @@ def load_calibration(path: Path | None = None) -> Costs:
 
 def _read(document: Any) -> Costs:
     if document["format"] != _FORMAT:
-        raise ValueError("it is no calibration")
+        raise ValueError("it is not a calibration")
     if document["processor"] != processor():
-        raise ValueError(f"it is of another machine, {document['processor']}")
+        raise ValueError(f"it is for another processor, {document['processor']}")
     seconds = {term: float(document["seconds"][term.value]) for term in Term}
-    if not all(math.isfinite(each) and each >= 0 for each in seconds.values()):
-        raise ValueError("a cost is no time")
+    if not all(math.isfinite(cost) and cost >= 0 for cost in seconds.values()):
+        raise ValueError("a cost is not a finite, non-negative time")
     return Costs(seconds, processor=processor(), date=str(document["date"]))

@@ -1,4 +1,4 @@
-"""Scene of a network -> plan: which beams meet where, what runs, what is left out, and why."""
+"""Make the plan of a scene of a network: where beams cross, which steps run, and why."""
 
 from __future__ import annotations
 
@@ -15,34 +15,37 @@ from lidarops.campaign.product_settings import NetworkVisibilitySettings, Visibi
 from lidarops.errors import RetrievalInputError
 from lidarops.plan.signal_rules import (
     ALL_STEPS,
+    ANALOG_NOISE,
     GLUED,
+    NO_WAVELENGTH,
     Case,
     Decisions,
     Rule,
     StepName,
     applied,
+    bins_with_noise,
+    bins_within,
     conditioning,
     glue_rules,
-    joined_channels,
-    parts_of,
+    glued_parts,
+    joined_layout,
+    range_channel,
     range_offset,
-    ranged_by,
-    reaching,
+    required_by,
+    tail_mean_reason,
     wavelength,
-    within,
 )
 from lidarops.records import ChannelLayout, DetectionMode, Granule, LeftOut, Plan, Scene, Step
 from lidarops.retrieve.network import geometry
-from lidarops.retrieve.network.labeled import BEFORE_TAIL, BEYOND
+from lidarops.retrieve.network.labeled import BEFORE_TAIL, BINS_BEYOND
 
 SAME_POINTING: Final = 0.1
-"""degree, within which beams of one instrument point alike: what headers tell."""
-_SAME_COLOUR: Final = 1e-9
-"""m, within which wavelengths of instruments are one."""
+"""degree; pointings of one instrument within this angle are one beam (resolution of headers)."""
+_SAME_WAVELENGTH: Final = 1e-9
+"""m; largest difference between equal wavelengths of instruments."""
 
-
-SIGHT: Final = ("contrast", "law", "angstrom_exponent", "exponent_standard_error")
-"""Settings of a step that say what visibility is."""
+VISIBILITY_KEYS: Final = ("contrast", "law", "angstrom_exponent", "exponent_standard_error")
+"""Settings of a step that define visibility."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +58,13 @@ class BeamPlan:
     azimuth: float
     """degree."""
     nearest: float
-    """m, range from which on the signal is used."""
+    """m, smallest range at which the signal is used."""
     farthest: float
     """m."""
     exponent: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain JSON types."""
+        """Return the beam as plain JSON types."""
         return {
             "instrument": self.instrument,
             "zenith_angle": self.zenith_angle,
@@ -78,36 +81,36 @@ def plan_network(scene: Scene, campaign: Campaign) -> Plan:
     Parameters
     ----------
     scene : Scene
-        With members.
+        Scene with members.
     campaign : Campaign
 
     Returns
     -------
     Plan
-        Steps of every member's channels, then the one that joins them, whose settings name the
-        beams. Without steps where the beams do not meet; its `left_out` says why.
+        Steps of the channels of every member, then those of the network, whose settings name the
+        beams. Without steps where the beams do not cross; `left_out` then states why.
     """
-    asked = NetworkCase(scene, campaign)
+    case = NetworkCase(scene, campaign)
     steps: list[Step] = []
     left_out: list[LeftOut] = []
-    _sort(applied((PRESENT,), asked), steps, left_out)
+    _sort(applied((PRESENT,), case), steps, left_out)
     for member in scene.members:
-        _sort(applied(MEMBER, MemberCase(member, campaign, asked.settings)), steps, left_out)
+        _sort(applied(MEMBER, MemberCase(member, campaign, case.settings)), steps, left_out)
     able = {step.instrument for step in steps}
     beams = [
         beam
         for member in scene.members
         if member.instrument in able
-        for beam in MemberCase(member, campaign, asked.settings).pointings()
+        for beam in MemberCase(member, campaign, case.settings).pointings()
     ]
-    colours = [step.settings["wavelength"] for step in steps if step.name == StepName.READ]
-    found = Meeting(asked, tuple(beams), tuple(colours))
-    _sort(applied(MEETING, found), [], left_out)
-    if found.reason:
+    wavelengths = [step.settings["wavelength"] for step in steps if step.name == StepName.READ]
+    crossings = CrossingsCase(case, tuple(beams), tuple(wavelengths))
+    _sort(applied(CROSSINGS, crossings), [], left_out)
+    if crossings.reason:
         return Plan(scene.id, (), tuple(left_out))
-    used = {beam.instrument for beam in found.kept}
+    used = {beam.instrument for beam in crossings.kept}
     steps = [step for step in steps if step.instrument in used]
-    _sort(applied(JOINT, found), steps, left_out)
+    _sort(applied(JOINT, crossings), steps, left_out)
     return Plan(scene.id, tuple(steps), tuple(left_out))
 
 
@@ -116,8 +119,8 @@ def _sort(decisions: Decisions, steps: list[Step], left_out: list[LeftOut]) -> N
         (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
 
 
-def sight(settings: VisibilitySettings) -> dict[str, Any]:
-    """Return how visibility follows from extinction, as settings of a step."""
+def visibility_settings(settings: VisibilitySettings) -> dict[str, Any]:
+    """Return the definition of visibility as settings of a step."""
     return {
         "contrast": settings.threshold,
         "law": settings.law,
@@ -129,7 +132,7 @@ def sight(settings: VisibilitySettings) -> dict[str, Any]:
 def beams_of(
     beams: Sequence[BeamPlan], scene: Scene, campaign: Campaign
 ) -> tuple[geometry.Beam, ...]:
-    """Return the beams in space."""
+    """Return the position and direction of the beams."""
     stations = {member.instrument: campaign.stations[member.station] for member in scene.members}
     return tuple(
         geometry.Beam(
@@ -143,22 +146,22 @@ def beams_of(
     )
 
 
-def channel_of(member: Scene, name: str) -> ChannelLayout:
-    """Return a channel that a member's files hold, or that is joined of two of them."""
+def member_channel(member: Scene, name: str) -> ChannelLayout:
+    """Return a channel of the files of a member, or one glued from two of them."""
     if name.startswith(GLUED):
-        return joined_channels(member.layout, [name])[0]
+        return joined_layout(member.layout, [name])[0]
     return next(channel for channel in member.layout if channel.name == name)
 
 
-def ranges_of(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArray[np.float64]:
-    """Return the ranges of the middles of the bins of a channel, m."""
-    ranged = replace(channel, name=ranged_by(channel.name))
+def channel_ranges(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArray[np.float64]:
+    """Return the ranges of the bin centres of a channel, m."""
+    ranged = replace(channel, name=range_channel(channel.name))
     middles = (np.arange(channel.bins) + 0.5) * channel.bin_width
     return np.asarray(middles + range_offset(ranged, facts))
 
 
-def pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | None:
-    """Return zenith angle and azimuth of a granule; what the campaign says wins over headers."""
+def granule_pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | None:
+    """Return zenith angle and azimuth of a granule; facts of the campaign override headers."""
     zenith = granule.zenith_angle if facts.zenith_angle is None else facts.zenith_angle
     azimuth = granule.azimuth if facts.azimuth is None else facts.azimuth
     if zenith is None or azimuth is None:
@@ -168,97 +171,97 @@ def pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | 
 
 @dataclass(frozen=True, slots=True)
 class NetworkCase:
-    """What the rules of a network look at."""
+    """A scene of a network, as the rules see it."""
 
     scene: Scene
     campaign: Campaign
 
     @property
     def settings(self) -> NetworkVisibilitySettings:
-        """Of the product."""
+        """Settings of the product."""
         return self.campaign.networks[self.scene.instrument].visibility
 
     def step(
         self, name: StepName, reason: str, *, number: float | None = None, **settings: Any
     ) -> Step:
-        """Return a step that joins the members."""
+        """Return a step of the whole network."""
         return Step(name.value, self.settings.channel, settings, reason, number=number)
 
     def without(self, name: StepName, reason: str, *, number: float | None = None) -> LeftOut:
-        """Return what is left out for all members."""
+        """Return a step that is left out for the whole network."""
         return LeftOut(name.value, self.settings.channel, reason, number=number)
 
 
 @dataclass(frozen=True, slots=True)
 class MemberCase:
-    """What the rules of one member of a network look at."""
+    """The scene of one member of a network, as the rules see it."""
 
     scene: Scene
-    """Of the member."""
+    """Scene of the member."""
     campaign: Campaign
     settings: NetworkVisibilitySettings
 
     @property
     def facts(self) -> InstrumentFacts:
-        """What is known of the instrument."""
+        """Facts about the instrument."""
         instrument = self.campaign.instruments[self.scene.instrument]
         return instrument.facts_at(self.scene.granules[0].start or self.scene.start)
 
     @property
     def channel(self) -> ChannelLayout:
-        """The channel that the network wants."""
-        return channel_of(self.scene, self.settings.channel)
+        """The channel that the network uses."""
+        return member_channel(self.scene, self.settings.channel)
 
     @property
     def tail(self) -> tuple[float, float]:
-        """The ranges in m whose mean is the background."""
+        """Limits in m of the range whose mean is the background."""
         last = self.channel.bins * self.channel.bin_width
         start, stop = self.settings.background_range or (0.9 * last, last)
         return start, min(stop, last)
 
-    def of(self, channel: ChannelLayout) -> Case:
-        """Return what the rules of a channel look at."""
+    def channel_case(self, channel: ChannelLayout) -> Case:
+        """Return the case of a channel."""
         known = channel_facts(self.facts, channel.name)
         return Case(self.scene, channel, self.facts, known, self.scene.instrument)
 
     def why_not(self) -> tuple[str, float | None]:
-        """Return why a member cannot take part, nothing where it can, and the number."""
+        """Return why a member cannot take part (empty where it can), and the deciding number."""
         name, facts = self.settings.channel, self.facts
-        joined = joined_channels(self.scene.layout, [name]) if name.startswith(GLUED) else ()
-        held = [channel.name for channel in (*self.scene.layout, *joined)]
+        glued = joined_layout(self.scene.layout, [name]) if name.startswith(GLUED) else ()
+        held = [channel.name for channel in (*self.scene.layout, *glued)]
         if name not in held:
             return f"the files hold no {name}, only {', '.join(held)}", None
-        photon = channel_facts(facts, ranged_by(name))
+        photon = channel_facts(facts, range_channel(name))
         if math.isnan(wavelength(self.channel, photon)):
-            return "the header's wavelength is implausible and the campaign's facts give none", None
+            return NO_WAVELENGTH, None
         if not (facts.overlap_profile or facts.full_overlap_range > 0):
             return (
-                "the campaign gives neither full_overlap_range nor overlap_profile: 1 percent of"
-                " overlap at the nearest point changes extinction there by 5 percent"
+                "the campaign gives neither full_overlap_range nor overlap_profile: an overlap"
+                " error of 1 percent at the nearest crossing changes extinction there by 5 percent"
             ), facts.full_overlap_range
         last = self.channel.bins * self.channel.bin_width
         if self.settings.background_range and self.settings.background_range[0] >= last:
-            return f"background_range begins beyond the bins, which end at {last:g} m", last
-        if any(pointing(granule, facts) is None for granule in self.scene.granules):
-            return "neither headers nor campaign tell where all beams point", None
+            return f"background_range begins beyond the last bin, which ends at {last:g} m", last
+        if any(granule_pointing(granule, facts) is None for granule in self.scene.granules):
+            return "neither headers nor campaign give the pointing of all beams", None
         return "", None
 
     def pointings(self) -> Iterator[BeamPlan]:
-        """Give the beams of the member, each once."""
-        told = sorted(
+        """Yield the beams of the member, each once."""
+        directions = sorted(
             {
-                found
+                direction
                 for granule in self.scene.granules
-                if (found := pointing(granule, self.facts)) is not None
+                if (direction := granule_pointing(granule, self.facts)) is not None
             }
         )
-        end = float(ranges_of(self.channel, self.facts)[-1])
+        end = float(channel_ranges(self.channel, self.facts)[-1])
         farthest = min(end, self.settings.farthest or end)
-        kept: list[tuple[float, float]] = []
-        for found in told:
-            if not any(apart(found, other) <= SAME_POINTING for other in kept):
-                kept.append(found)
-        for zenith, azimuth in kept:
+        distinct: list[tuple[float, float]] = []
+        for direction in directions:
+            if not any(angle_between(direction, other) <= SAME_POINTING for other in distinct):
+                distinct.append(direction)
+        for zenith, azimuth in distinct:
             yield BeamPlan(
                 self.scene.instrument,
                 zenith,
@@ -272,8 +275,8 @@ class MemberCase:
 def _left(
     settings: NetworkVisibilitySettings, member: str, reason: str, number: float | None = None
 ) -> LeftOut:
-    told = f"{member}: {reason}"
-    return LeftOut(StepName.VISIBILITY.value, settings.channel, told, member, number=number)
+    reason = f"{member}: {reason}"
+    return LeftOut(StepName.VISIBILITY.value, settings.channel, reason, member, number=number)
 
 
 def _present(case: NetworkCase) -> Decisions:
@@ -290,48 +293,44 @@ def _fits(case: MemberCase) -> Decisions:
 
 
 def _signals(case: MemberCase) -> Decisions:
-    """Decide on what makes a signal of the counts of a member, by the rules of any channel."""
+    """Decide on the steps from the counts of a member to its signal, by the rules of a channel."""
     if case.why_not()[0]:
         return
     name = case.settings.channel
     present = {channel.name: channel for channel in case.scene.layout}
-    for part in parts_of(name) if name.startswith(GLUED) else (name,):
-        of_part = case.of(present[part])
-        yield _reading(of_part, wavelength(of_part.channel, of_part.known))
-        yield from conditioning(of_part)
+    for part in glued_parts(name) if name.startswith(GLUED) else (name,):
+        part_case = case.channel_case(present[part])
+        yield _read(part_case, wavelength(part_case.channel, part_case.known))
+        yield from conditioning(part_case)
     if name.startswith(GLUED):
-        joined = case.of(case.channel)
-        photon = channel_facts(case.facts, parts_of(name)[1])
-        yield _reading(joined, wavelength(joined.channel, photon))
-        yield from glue_rules(joined)
+        glued_case = case.channel_case(case.channel)
+        photon = channel_facts(case.facts, glued_parts(name)[1])
+        yield _read(glued_case, wavelength(glued_case.channel, photon))
+        yield from glue_rules(glued_case)
 
 
-def _reading(case: Case, colour: float) -> Step:
-    told = f"asked for by {StepName.VISIBILITY}"
-    read = case.step(StepName.READ, told, number=colour, wavelength=colour)
-    return replace(read, rule=_MEMBER_CHANNEL)
+def _read(case: Case, metres: float) -> Step:
+    """Return the step that reads a channel at a wavelength in m."""
+    reason = required_by([StepName.VISIBILITY])
+    step = case.step(StepName.READ, reason, number=metres, wavelength=metres)
+    return replace(step, rule=_MEMBER_CHANNEL)
 
 
 def _background(case: MemberCase) -> Decisions:
     if case.why_not()[0]:
         return
-    channel, told = case.channel, case.settings.background_range
-    reason = (
-        "the last tenth of the bins: signal left there biases it"
-        if told is None
-        else "background_range of the campaign: signal left there biases it"
-    )
+    channel = case.channel
     start, stop = case.tail
-    yield case.of(channel).step(
+    yield case.channel_case(channel).step(
         StepName.BACKGROUND,
-        reason,
+        tail_mean_reason(case.settings.background_range),
         number=(stop - start) / channel.bin_width,
         method="tail_mean",
         range=[start, stop],
     )
 
 
-def apart(one: tuple[float, float], other: tuple[float, float]) -> float:
+def angle_between(pointing: tuple[float, float], other: tuple[float, float]) -> float:
     """Return the angle between two pointings (zenith angle, azimuth), all in degree."""
     first, second = (
         (
@@ -339,12 +338,12 @@ def apart(one: tuple[float, float], other: tuple[float, float]) -> float:
             math.sin(math.radians(zenith)) * math.cos(math.radians(azimuth)),
             math.cos(math.radians(zenith)),
         )
-        for zenith, azimuth in (one, other)
+        for zenith, azimuth in (pointing, other)
     )
     return math.degrees(2.0 * math.asin(min(1.0, 0.5 * math.dist(first, second))))
 
 
-def meeting_of(
+def network_of(
     beams: Sequence[BeamPlan],
     scene: Scene,
     campaign: Campaign,
@@ -352,7 +351,7 @@ def meeting_of(
     tolerance: float,
     smallest_angle: float,
 ) -> geometry.Network:
-    """Return where beams meet; see `lidarops.retrieve.network.geometry.build_network`."""
+    """Return the crossings of beams; see `lidarops.retrieve.network.geometry.build_network`."""
     return geometry.build_network(
         beams_of(beams, scene, campaign),
         tolerance=tolerance,
@@ -362,116 +361,116 @@ def meeting_of(
     )
 
 
-class Meeting:
-    """What the rules of beams that may meet look at: those that do, found on the way."""
+class CrossingsCase:
+    """The beams of a network, as the rules see them, which determine those that cross."""
 
     def __init__(
-        self, asked: NetworkCase, beams: Sequence[BeamPlan], colours: Sequence[float]
+        self, whole: NetworkCase, beams: Sequence[BeamPlan], wavelengths: Sequence[float]
     ) -> None:
-        self.asked = asked
+        self.whole = whole
         self.beams = tuple(beams)
-        self.colours = tuple(colours)
+        self.wavelengths = tuple(wavelengths)
         self.kept: tuple[BeamPlan, ...] = ()
         self.reason = ""
         """Why there is no network; empty where there is one."""
 
-    def net(self, beams: Sequence[BeamPlan]) -> geometry.Network:
-        """Return where beams meet."""
-        settings = self.asked.settings
-        return meeting_of(
-            beams, self.asked.scene, self.asked.campaign,
+    def crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
+        """Return the crossings of beams."""
+        settings = self.whole.settings
+        return network_of(
+            beams, self.whole.scene, self.whole.campaign,
             tolerance=settings.tolerance, smallest_angle=settings.smallest_angle,
         )  # fmt: skip
 
-    def none(self, reason: str, number: float | None = None) -> LeftOut:
-        """Return the product as left out."""
+    def no_network(self, reason: str, number: float | None = None) -> LeftOut:
+        """Keep the reason why there is no network, and return the product as left out."""
         self.reason = reason
-        return self.asked.without(StepName.VISIBILITY, reason, number=number)
+        return self.whole.without(StepName.VISIBILITY, reason, number=number)
 
 
-def _one_colour(case: Meeting) -> Decisions:
-    if case.colours and max(case.colours) - min(case.colours) > _SAME_COLOUR:
-        told = ", ".join(f"{colour * 1e9:g}" for colour in sorted(set(case.colours)))
-        reason = f"the instruments see different wavelengths: {told} nm"
-        yield case.none(reason, max(case.colours) - min(case.colours))
+def _one_wavelength(case: CrossingsCase) -> Decisions:
+    wavelengths = case.wavelengths
+    if wavelengths and max(wavelengths) - min(wavelengths) > _SAME_WAVELENGTH:
+        listed = ", ".join(f"{metres * 1e9:g}" for metres in sorted(set(wavelengths)))
+        reason = f"the instruments have different wavelengths: {listed} nm"
+        yield case.no_network(reason, max(wavelengths) - min(wavelengths))
 
 
-def _few_enough(case: Meeting) -> Decisions:
+def _few_enough(case: CrossingsCase) -> Decisions:
     if not case.reason and len(case.beams) > geometry.MOST_BEAMS:
-        reason = f"{len(case.beams)} beams are more than {geometry.MOST_BEAMS}"
-        yield case.none(reason, float(len(case.beams)))
+        reason = f"{len(case.beams)} beams exceed the limit of {geometry.MOST_BEAMS}"
+        yield case.no_network(reason, float(len(case.beams)))
 
 
-def _beams_meet(case: Meeting) -> Decisions:
-    """Leave out beams that meet fewer than two others, until all that are left meet."""
+def _beams_meet(case: CrossingsCase) -> Decisions:
+    """Leave out beams with fewer than two crossings, until all remaining beams have two."""
     if case.reason:
         return
     kept = list(case.beams)
     while kept:
-        net = case.net(kept)
-        points = {beam: int(net.on_beam(n)[0].size) for n, beam in enumerate(kept)}
-        lost = [beam for beam in kept if points[beam] < 2]
+        network = case.crossings(kept)
+        counts = {beam: int(network.on_beam(n)[0].size) for n, beam in enumerate(kept)}
+        lost = [beam for beam in kept if counts[beam] < 2]
         for beam in lost:
-            told = f"the beam at {beam.zenith_angle:g} degree, azimuth {beam.azimuth:g}, meets"
-            reason = f"{told} fewer than two points that others see"
-            yield _left(case.asked.settings, beam.instrument, reason, float(points[beam]))
+            pointing = f"zenith angle {beam.zenith_angle:g} and azimuth {beam.azimuth:g} degree"
+            reason = f"the beam at {pointing} has fewer than two crossings with other beams"
+            yield _left(case.whole.settings, beam.instrument, reason, float(counts[beam]))
         if not lost:
             break
         kept = [beam for beam in kept if beam not in lost]
     case.kept = tuple(kept)
 
 
-def _some_meet(case: Meeting) -> Decisions:
+def _some_left(case: CrossingsCase) -> Decisions:
     if not case.reason and not case.kept:
-        reason = "no beam meets others in two points, between which extinction attenuates it"
-        yield case.none(reason, 0.0)
+        reason = "no beam has two crossings with other beams, between which it is attenuated"
+        yield case.no_network(reason, 0.0)
 
 
-def _cycle(case: Meeting) -> Decisions:
-    method = case.asked.settings.method
+def _cycle(case: CrossingsCase) -> Decisions:
+    method = case.whole.settings.method
     if case.reason or method not in {"cycle", "multiplier", "unbiased"}:
         return
     try:
-        geometry.build_cycle(case.net(case.kept))
+        geometry.build_cycle(case.crossings(case.kept))
     except RetrievalInputError as error:
-        yield case.none(f"method {method}: {error}", float(len(case.kept)))
+        yield case.no_network(f"method {method}: {error}", float(len(case.kept)))
 
 
-def _range_window(case: Meeting) -> Decisions:
-    """Decide, for every instrument, which bins its beams and its background need."""
-    net = case.net(case.kept)
-    for member in case.asked.scene.members:
-        mine = [n for n, beam in enumerate(case.kept) if beam.instrument == member.instrument]
-        if mine:
-            farthest = max(float(net.on_beam(n)[1][-1]) for n in mine)
+def _range_window(case: CrossingsCase) -> Decisions:
+    """Decide, for every instrument, which bins its crossings and its background need."""
+    network = case.crossings(case.kept)
+    for member in case.whole.scene.members:
+        numbers = [n for n, beam in enumerate(case.kept) if beam.instrument == member.instrument]
+        if numbers:
+            farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
             yield _member_window(
-                MemberCase(member, case.asked.campaign, case.asked.settings), farthest
+                MemberCase(member, case.whole.campaign, case.whole.settings), farthest
             )
 
 
 def _member_window(case: MemberCase, farthest: float) -> Step | LeftOut:
     channel = case.channel
-    counts = case.of(channel)
+    counts = case.channel_case(channel)
     if channel.name.startswith(GLUED) or channel.mode is not DetectionMode.PHOTON:
-        reason = "noise of analog records is estimated from the whole of them"
-        return counts.without(StepName.RANGE_WINDOW, reason)
+        return counts.without(StepName.RANGE_WINDOW, ANALOG_NOISE)
     if case.campaign.all_steps:
         return counts.without(StepName.RANGE_WINDOW, ALL_STEPS)
     width, (start, stop) = channel.bin_width, case.tail
     low, high = (share * (start + width) for share in BEFORE_TAIL)
-    near = reaching(0.0, farthest + BEYOND * width, counts)
-    far = (within(low - width, high, counts), within(start, stop, counts))
+    near = bins_with_noise(0.0, farthest + BINS_BEYOND * width, counts)
+    far = (bins_within(low - width, high, counts), bins_within(start, stop, counts))
     kept = _merged([near, *far], channel.bins)
     number = float(sum(past - first for first, past in kept))
     if len(kept) == 1 and number == channel.bins:
-        reason = "beams and background reach over all bins"
+        reason = "crossings and background need all bins"
         return counts.without(StepName.RANGE_WINDOW, reason, number=number)
-    reason = "no bins between the farthest point and those that tell the background are needed"
+    reason = "bins between the farthest crossing and the background range are not needed"
     return counts.step(StepName.RANGE_WINDOW, reason, number=number, bins=kept)
 
 
 def _merged(stretches: Iterable[tuple[int, int]], bins: int) -> list[list[int]]:
-    """Return stretches of bins, those that touch as one."""
+    """Return stretches of bins, with touching ones merged."""
     kept: list[list[int]] = []
     for first, past in sorted((first, min(past, bins)) for first, past in stretches):
         if kept and first <= kept[-1][1]:
@@ -481,40 +480,40 @@ def _merged(stretches: Iterable[tuple[int, int]], bins: int) -> list[list[int]]:
     return kept
 
 
-def _average(case: Meeting) -> Decisions:
-    seconds = case.asked.settings.average.total_seconds()
-    reason = "signals are averaged before they are solved: noise biases what is averaged afterwards"
-    yield case.asked.step(StepName.AVERAGE, reason, number=seconds, seconds=seconds)
+def _average(case: CrossingsCase) -> Decisions:
+    seconds = case.whole.settings.average.total_seconds()
+    reason = "signals are averaged before the retrieval: noise biases means of retrieved values"
+    yield case.whole.step(StepName.AVERAGE, reason, number=seconds, seconds=seconds)
 
 
-def _prior(case: Meeting) -> Decisions:
-    settings = case.asked.settings
+def _prior(case: CrossingsCase) -> Decisions:
+    settings = case.whole.settings
     if settings.method != "network":
-        reason = f"method {settings.method} takes no prior"
-        yield case.asked.without(StepName.PRIOR, reason)
+        reason = f"method {settings.method} uses no prior"
+        yield case.whole.without(StepName.PRIOR, reason)
     elif settings.prior == "none":
-        reason = "the campaign asks for none: gradients along beams pass for attenuation"
-        yield case.asked.without(StepName.PRIOR, reason)
+        reason = "the campaign requests no prior: gradients along beams mimic attenuation"
+        yield case.whole.without(StepName.PRIOR, reason)
     else:
         reason = (
-            "decided from the data: the strongest prior about the mean field of a block that its"
-            " beams do not contradict"
+            "decided from the data: the strongest prior about the mean field of a block that agrees"
+            " with its beams"
         )
         number = settings.block / settings.average
-        yield case.asked.step(StepName.PRIOR, reason, number=number)
+        yield case.whole.step(StepName.PRIOR, reason, number=number)
 
 
-def _visibility(case: Meeting) -> Decisions:
-    """Give the step that joins the members, which see light of one wavelength."""
-    settings, net = case.asked.settings, case.net(case.kept)
+def _visibility(case: CrossingsCase) -> Decisions:
+    """Yield the step that retrieves visibility from the beams of all members."""
+    settings, network = case.whole.settings, case.crossings(case.kept)
     beams = case.kept
-    yield case.asked.step(
+    yield case.whole.step(
         StepName.VISIBILITY,
-        f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments meet in"
-        f" {net.crossings} points, {int(net.near_crossing.sum())} of which are near ones",
-        number=float(net.crossings),
+        f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
+        f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones",
+        number=float(network.crossings),
         beams=[beam.as_dict() for beam in beams],
-        wavelength=min(case.colours),
+        wavelength=min(case.wavelengths),
         block_seconds=settings.block.total_seconds(),
         method=settings.method,
         prior=settings.prior,
@@ -523,7 +522,7 @@ def _visibility(case: Meeting) -> Decisions:
         exponent_relative_error=settings.exponent_relative_error,
         lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
         overlap_relative_error=settings.overlap_relative_error,
-        **sight(settings.visibility),
+        **visibility_settings(settings.visibility),
     )
 
 
@@ -534,27 +533,27 @@ PRESENT: Final = Rule(
 MEMBER: Final = (
     Rule("member", StepName.VISIBILITY, "Can the instrument take part?", _fits),
     Rule(_MEMBER_CHANNEL, StepName.READ, "Which channels does the network need?", _signals),
-    Rule("member_background", StepName.BACKGROUND, "Where is its background?", _background),
+    Rule("member_background", StepName.BACKGROUND, "Which bins give the background?", _background),
 )
-"""Of each instrument of a network."""
-MEETING: Final = (
-    Rule("one_colour", StepName.VISIBILITY, "Do all see one wavelength?", _one_colour),
-    Rule("few_beams", StepName.VISIBILITY, "Are there beams that can be solved?", _few_enough),
-    Rule("beams_meet", StepName.VISIBILITY, "Does the beam meet others twice?", _beams_meet),
-    Rule("some_meet", StepName.VISIBILITY, "Is a beam left that others meet?", _some_meet),
-    Rule("cycle", StepName.VISIBILITY, "Do the beams make what the method needs?", _cycle),
+"""Rules for each instrument of a network."""
+CROSSINGS: Final = (
+    Rule("one_colour", StepName.VISIBILITY, "Do all have one wavelength?", _one_wavelength),
+    Rule("few_beams", StepName.VISIBILITY, "Are there few enough beams?", _few_enough),
+    Rule("beams_meet", StepName.VISIBILITY, "Does the beam have two crossings?", _beams_meet),
+    Rule("some_meet", StepName.VISIBILITY, "Is a beam with crossings left?", _some_left),
+    Rule("cycle", StepName.VISIBILITY, "Do the beams form the cycle of the method?", _cycle),
 )
-"""Of all beams of a network; the first that finds that there is none ends it."""
+"""Rules for all beams of a network; the first that finds no network ends the planning."""
 JOINT: Final = (
     Rule(
         "member_window",
         StepName.RANGE_WINDOW,
-        "Which bins do beams and background need?",
+        "Which bins do crossings and background need?",
         _range_window,
     ),
     Rule("network_average", StepName.AVERAGE, "How long are signals averaged?", _average),
-    Rule("prior", StepName.PRIOR, "Is a mean field held beforehand?", _prior),
-    Rule("visibility", StepName.VISIBILITY, "Do beams meet, and where?", _visibility),
+    Rule("prior", StepName.PRIOR, "Is there a prior about the field?", _prior),
+    Rule("visibility", StepName.VISIBILITY, "Where do the beams cross?", _visibility),
 )
-"""Of the beams that meet."""
-NETWORK: Final = (PRESENT, *MEMBER, *MEETING, *JOINT)
+"""Rules for the beams that cross."""
+NETWORK: Final = (PRESENT, *MEMBER, *CROSSINGS, *JOINT)

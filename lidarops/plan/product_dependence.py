@@ -1,7 +1,7 @@
-"""What one product depends on: its part of the plan, of the campaign and of the inputs.
+"""Determine what one product depends on: its part of the plan, of the campaign and of the inputs.
 
-A scene gives several products. Each is fresh or stale by itself, so what is no part of it must
-neither be told in it nor make it stale.
+A scene gives several products, and each is up to date or stale by itself. Whatever a product does
+not depend on must neither appear in it nor make it stale.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import replace
 from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
-from lidarops.plan.signal_rules import GLUED, StepName, parts_of
+from lidarops.plan.signal_rules import GLUED, StepName, glued_parts, required_by
 from lidarops.records import InputRecord, Plan, ProductKind, Role, Scene, Step
 
-Wanted = tuple[ProductKind, str]
+ProductKey = tuple[ProductKind, str]
 """Kind and channel of a product."""
 
 _KINDS: Final = frozenset(kind.value for kind in ProductKind)
@@ -37,47 +37,47 @@ _ONLY_FOR: Final[Mapping[str, frozenset[str]]] = {
     StepName.KNOWN_SHAPE: frozenset({ProductKind.ELASTIC}),
     StepName.REFERENCE: frozenset({ProductKind.ELASTIC}),
 }
-"""Steps that serve some kinds only. Any other step counts for all."""
+"""Steps that serve only some kinds of product. All other steps serve every kind."""
 
 _OF_CAMPAIGN: Final = frozenset(
     {"all_steps", "archive", "output", "catalog", "superseded", "scenes", "simulation", "stations",
      "instruments", "networks"}
 )  # fmt: skip
 _OF_INSTRUMENT: Final = frozenset({"files", "dark_files", "header_position", "facts", "products"})
-"""Settings that no product depends on but by plan, scene and inputs. Any other setting counts."""
+"""Settings that affect products only through plan, scene and inputs. All others count."""
 _EDGES: Final = frozenset({"valid_from", "valid_to"})
 _PROFILES: Final = ("molecular_profile", "overlap_profile")
 
 
-def wanted(plan: Plan) -> tuple[Wanted, ...]:
-    """Return kind and channel of the products that a plan gives, in its order."""
-    found = ((ProductKind(step.name), step.channel) for step in plan.steps if step.name in _KINDS)
-    return tuple(dict.fromkeys(found))
+def planned_products(plan: Plan) -> tuple[ProductKey, ...]:
+    """Return kind and channel of the products that a plan makes, in its order."""
+    keys = ((ProductKind(step.name), step.channel) for step in plan.steps if step.name in _KINDS)
+    return tuple(dict.fromkeys(keys))
 
 
-def plan_closure(plan: Plan, products: Collection[Wanted]) -> Plan:
-    """Return the part of a plan that some of its products need.
+def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
+    """Return the part of a plan that the given products need.
 
     Parameters
     ----------
     plan : Plan
     products : collection of (ProductKind, str)
-        Kind and channel of each.
+        Kind and channel of each product.
 
     Returns
     -------
     Plan
-        Equal for a product whatever else the plan it was taken from holds.
+        The same for a product, whatever else the whole plan holds.
     """
     if any(step.instrument for step in plan.steps):
-        return _part_of_network(plan, {kind.value for kind, _ in products})
+        return _network_closure(plan, {kind.value for kind, _ in products})
     kinds: dict[str, set[str]] = {}
     for kind, channel in products:
         kinds.setdefault(channel, set()).add(kind.value)
-        for parent in parts_of(channel) if channel.startswith(GLUED) else ():
+        for parent in glued_parts(channel) if channel.startswith(GLUED) else ():
             kinds.setdefault(parent, set())
     steps = tuple(
-        _read_for(step, kinds)
+        _with_requesters(step, kinds)
         for step in plan.steps
         if step.channel in kinds and _serves(step.name, kinds[step.channel])
     )
@@ -89,27 +89,29 @@ def plan_closure(plan: Plan, products: Collection[Wanted]) -> Plan:
     return replace(plan, steps=steps, left_out=left_out)
 
 
-def of_kinds(plan: Plan, kinds: Collection[ProductKind]) -> Plan:
-    """Return what a plan tells of some kinds of products: what they need, and what is left out.
+def plan_of_kinds(plan: Plan, kinds: Collection[ProductKind]) -> Plan:
+    """Return the part of a plan that concerns some kinds of product: their steps and omissions.
 
     Parameters
     ----------
     plan : Plan
     kinds : collection of ProductKind
-        All where empty.
+        All kinds where empty.
     """
     if not kinds:
         return plan
-    products = [product for product in wanted(plan) if product[0] in kinds]
-    # What the members of a network share would stay without its product.
-    mine = plan_closure(plan, products) if products else replace(plan, steps=(), left_out=())
-    told = {*kinds, StepName.READ}
-    left_out = tuple(left for left in plan.left_out if left.name in told or left in mine.left_out)
-    return replace(mine, left_out=left_out)
+    products = [product for product in planned_products(plan) if product[0] in kinds]
+    # Without a product, steps that the members of a network share would remain.
+    closure = plan_closure(plan, products) if products else replace(plan, steps=(), left_out=())
+    names = {*kinds, StepName.READ}
+    left_out = tuple(
+        left for left in plan.left_out if left.name in names or left in closure.left_out
+    )
+    return replace(closure, left_out=left_out)
 
 
-def _part_of_network(plan: Plan, kinds: set[str]) -> Plan:
-    # All members and channels meet in each product.
+def _network_closure(plan: Plan, kinds: set[str]) -> Plan:
+    """Return the part of a network's plan for some kinds; they need all members and channels."""
     return replace(
         plan,
         steps=tuple(step for step in plan.steps if _serves(step.name, kinds)),
@@ -123,41 +125,43 @@ def _serves(step: str, kinds: set[str]) -> bool:
     return step not in _ONLY_FOR or not kinds.isdisjoint(_ONLY_FOR[step])
 
 
-def _read_for(step: Step, kinds: Mapping[str, set[str]]) -> Step:
-    """Tell of a reading only those who are here, as the others may change."""
+def _with_requesters(step: Step, kinds: Mapping[str, set[str]]) -> Step:
+    """Return a step whose reason, if it reads a channel, names only the requesters in `kinds`."""
     if step.name != StepName.READ:
         return step
-    asking = sorted(kinds[step.channel])
-    asking += [
-        name for name in sorted(kinds) if name.startswith(GLUED) and step.channel in parts_of(name)
+    requesters = sorted(kinds[step.channel])
+    requesters += [
+        name
+        for name in sorted(kinds)
+        if name.startswith(GLUED) and step.channel in glued_parts(name)
     ]
-    return replace(step, reason="asked for by " + " and ".join(asking))
+    return replace(step, reason=required_by(requesters))
 
 
 class Settings:
-    """The parts of a campaign that the contents of its products depend on."""
+    """The parts of a campaign on which the contents of its products depend."""
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
-        told = as_settings(campaign)
-        self._common = {key: told[key] for key in sorted(told.keys() - _OF_CAMPAIGN)}
-        self._stations = told["stations"]
-        self._networks = told.get("networks", {})
+        settings = as_settings(campaign)
+        self._common = {key: settings[key] for key in sorted(settings.keys() - _OF_CAMPAIGN)}
+        self._stations = settings["stations"]
+        self._networks = settings.get("networks", {})
         self._instruments = {
             name: {key: value for key, value in known.items() if key not in _OF_INSTRUMENT}
-            for name, known in told["instruments"].items()
+            for name, known in settings["instruments"].items()
         }
 
     def of(self, scene: Scene, plan: Plan, channel: str) -> dict[str, Any]:
-        """Return what a product of a scene depends on besides its inputs, as plain JSON types.
+        """Return what a product depends on besides its inputs, as plain JSON types.
 
         Parameters
         ----------
         scene : Scene
         plan : Plan
-            The product's, from `plan_closure`.
+            Plan of the product, from `plan_closure`.
         channel : str
-            Of the product.
+            Channel of the product.
         """
         members = scene.members or (scene,)
         return {
@@ -168,50 +172,52 @@ class Settings:
                 {
                     "station": self._stations[member.station],
                     "instrument": self._instruments[member.instrument],
-                    "facts": facts(facts_of(self._campaign, member), plan, channel),
+                    "facts": facts_settings(scene_facts(self._campaign, member), plan, channel),
                 }
                 for member in members
             ],
         }
 
 
-def facts_of(campaign: Campaign, scene: Scene) -> InstrumentFacts:
-    """Return what is known of the instrument of a scene at its time."""
+def scene_facts(campaign: Campaign, scene: Scene) -> InstrumentFacts:
+    """Return the facts about the instrument of a scene at its time."""
     moment = scene.granules[0].start if scene.granules else None
     return campaign.instruments[scene.instrument].facts_at(moment or scene.start)
 
 
-def facts(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str, Any]:
-    """Return what is known of an instrument as far as a product depends on it.
+def facts_settings(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str, Any]:
+    """Return the facts about an instrument on which a product depends.
 
     Parameters
     ----------
     known : InstrumentFacts
     plan : Plan
-        The product's, from `plan_closure`.
+        Plan of the product, from `plan_closure`.
     channel : str
-        Of the product.
+        Channel of the product.
 
     Returns
     -------
     dict
-        Plain JSON types, as those of `known`, without the edges of its validity period: a period
-        that is closed changes nothing within it.
+        `known` as plain JSON types, without the edges of its validity period, because closing a
+        period changes nothing within it.
     """
-    told = as_settings(known)
+    settings = as_settings(known)
     channels = {step.channel for step in plan.steps} | {channel}
     named = {value for step in plan.steps for value in step.settings.values() if _is_text(value)}
     for name in _PROFILES:
-        if told.get(name) not in named:
-            told = {**told, name: None}
+        if settings.get(name) not in named:
+            settings = {**settings, name: None}
     return {
-        **{key: value for key, value in told.items() if key not in _EDGES},
-        "channels": {name: fact for name, fact in told["channels"].items() if name in channels},
+        **{key: value for key, value in settings.items() if key not in _EDGES},
+        "channels": {name: fact for name, fact in settings["channels"].items() if name in channels},
     }
 
 
-def asked(products: Mapping[str, Any] | None, channel: str) -> dict[str, Any] | None:
-    """Return the settings of a kind of product as if they asked for one channel only."""
+def single_channel_settings(
+    products: Mapping[str, Any] | None, channel: str
+) -> dict[str, Any] | None:
+    """Return the settings of a kind of product as if only one channel were requested."""
     return None if products is None else {**products, "channels": [channel]}
 
 
@@ -219,22 +225,22 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str)
 
 
-def inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecord, ...]:
-    """Return those of a scene's files that a part of its plan reads.
+def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecord, ...]:
+    """Return the files of a scene that a part of its plan reads.
 
     Parameters
     ----------
     plan : Plan
-        From `plan_closure`.
+        Plan of the product, from `plan_closure`.
     files : iterable of InputRecord
-        Of the scene.
+        Files of the scene.
     """
     dark = any(step.name == StepName.DARK for step in plan.steps)
     named = {step.settings.get(key) for step in plan.steps for key in _PROFILES}
     return tuple(
-        used
-        for used in files
-        if used.role is Role.SIGNAL or (used.role is Role.DARK and dark) or used.path in named
+        file
+        for file in files
+        if file.role is Role.SIGNAL or (file.role is Role.DARK and dark) or file.path in named
     )
 
 
@@ -245,9 +251,9 @@ def digest(value: Any) -> str:
     ).hexdigest()
 
 
-def digest_of_inputs(files: Sequence[InputRecord]) -> str:
-    """Return the sha256 of the contents of files and their roles, whatever their names."""
-    # The JSON that `digest` would make of them, which has nothing to escape, at a quarter of the
-    # cost: there are thousands of files, and this is asked of every product.
-    contents = sorted([f'["{used.role}","{used.sha256}"]' for used in files])
+def inputs_digest(files: Sequence[InputRecord]) -> str:
+    """Return the sha256 of the contents and roles of files, independent of their names."""
+    # Writes the JSON of `digest` directly, at a quarter of its cost: every product needs this,
+    # for thousands of files.
+    contents = sorted([f'["{file.role}","{file.sha256}"]' for file in files])
     return hashlib.sha256(f"[{','.join(contents)}]".encode()).hexdigest()

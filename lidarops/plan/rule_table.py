@@ -1,10 +1,10 @@
-"""All rules of plans in one table: name, step, what is asked, and the function that answers."""
+"""The table of all rules: name, step, question, and the function that decides."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from lidarops.plan.availability import ABSENT, STRANGE
+from lidarops.plan.availability import ABSENT, UNMATCHED
 from lidarops.plan.network_plan import NETWORK
 from lidarops.plan.preview import REFINEMENTS
 from lidarops.plan.scene_plan import CHANNEL, PRODUCTS, RANGE_WINDOW
@@ -13,7 +13,7 @@ from lidarops.plan.signal_rules import CONDITIONING, GLUING, Rule
 RULES: Final[tuple[Rule, ...]] = tuple(
     dict.fromkeys(
         (
-            *(ABSENT, STRANGE, CHANNEL, RANGE_WINDOW),
+            *(ABSENT, UNMATCHED, CHANNEL, RANGE_WINDOW),
             *CONDITIONING,
             *GLUING,
             *PRODUCTS,
@@ -22,4 +22,4 @@ RULES: Final[tuple[Rule, ...]] = tuple(
         )
     )
 )
-"""In the order in which they are asked; the last ones in the worker, of some profiles."""
+"""In the order in which they apply; the `REFINEMENTS` apply in the worker, to some profiles."""

@@ -1,7 +1,7 @@
-"""Rules of scans: what of the multi-angle retrieval runs, from where the beams point.
+"""Rules for scans: which steps of the multi-angle retrieval run, from the pointing of the beams.
 
-What a retrieval decides from the data is left to it, where beams can show it at all; its product
-tells in the attribute ``steps`` how that came out.
+A step that the retrieval decides from the data is planned where the beams permit it. The attribute
+``lidarops_steps`` of the product states what was decided.
 """
 
 from __future__ import annotations
@@ -16,7 +16,15 @@ import numpy.typing as npt
 
 from lidarops.campaign.product_settings import MultiAngleSettings
 from lidarops.errors import RetrievalInputError
-from lidarops.plan.signal_rules import ChannelCase, Decisions, Rule, StepName, no_scan
+from lidarops.plan.signal_rules import (
+    NOT_REQUESTED,
+    REQUESTED,
+    ChannelCase,
+    Decisions,
+    Rule,
+    StepName,
+    no_scan,
+)
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 
@@ -24,14 +32,14 @@ Array = npt.NDArray[np.float64]
 
 _HALF_TURN: Final = 180.0
 _SIMPLE: Final = frozenset({"kano_hamilton", "two_angle"})
-"""Methods that take every altitude by itself."""
+"""Methods that treat each altitude independently."""
 _BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
-"""Methods that see no horizontal gradient."""
+"""Methods that cannot fit a horizontal gradient."""
 _JOINT: Final = frozenset({"auto", "joint"})
 
 
 def _scanned(case: ChannelCase) -> MultiAngleSettings | None:
-    """Return the settings of the multi-angle product, where there is one."""
+    """Return the settings of the multi-angle product; None where it is not made."""
     return None if no_scan(case) else case.multiangle
 
 
@@ -42,19 +50,19 @@ def altitude_steps(step: float, highest: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Beams:
-    """The directions of a scan that the retrieval uses."""
+    """The beam directions of a scan that the retrieval uses."""
 
     count: int
     sides_known: bool
-    """Whether an azimuth is told."""
+    """Whether any azimuth is known."""
     free: float
-    """degree, the largest angle around the zenith that is free of them."""
+    """degree, the largest azimuth sector without beams."""
     surround: bool
-    """Whether no half turn is free, so that a horizontal gradient can be retrieved."""
+    """Whether no half turn is free of beams, so that a horizontal gradient can be estimated."""
 
 
 def beams(case: ChannelCase, settings: MultiAngleSettings) -> Beams:
-    """Return the beams that the retrieval will find in the files of a scan."""
+    """Return the beam directions that the retrieval will use from the files of a scan."""
     side = case.facts.azimuth
     pointings = tuple(
         (_number(granule.zenith_angle), _number(granule.azimuth if side is None else side))
@@ -67,21 +75,22 @@ def _number(angle: float | None) -> float:
     return math.nan if angle is None else angle
 
 
-# The rules of a channel ask one after the other, and its channels look the same way.
+# All rules of a scene need the same beams.
 @lru_cache(maxsize=1)
 def _beams(pointings: tuple[tuple[float, float], ...], step: float, highest: float) -> Beams:
     zenith_angle, azimuth = np.array(pointings).T
     sides_known = bool(np.isfinite(azimuth).any())
     try:
-        found = scan_cycles.directions(zenith_angle, azimuth)
+        directions = scan_cycles.directions(zenith_angle, azimuth)
     except RetrievalInputError:
-        # The retrieval tells what is wrong with them.
+        # The retrieval raises the same error with its message.
         return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
     altitude = altitude_steps(step, highest)
-    up = slant_paths.rising_beams(found.zenith_angle, altitude)
+    up = slant_paths.rising_beams(directions.zenith_angle, altitude)
     if up.size == 0:
         return Beams(0, sides_known, 2 * _HALF_TURN, surround=False)
-    leaning = slant_paths.make_scan(found.zenith_angle[up], altitude, found.azimuth[up]).leaning
+    scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
+    leaning = scan.leaning
     free = math.degrees(slant_paths.widest_azimuth_gap(leaning))
     return Beams(up.size, sides_known, free, slant_paths.surrounds_zenith(leaning))
 
@@ -91,17 +100,17 @@ def _gradient(case: ChannelCase) -> Decisions:
         return
     largest = case.multiangle.largest_gradient
     if largest > 0:
-        reason = "backscatter may change along the horizontal: retrieved or allowed for"
+        reason = "backscatter may vary horizontally: retrieved, or part of the error"
         yield case.step(StepName.GRADIENT, reason, number=largest)
     else:
-        reason = "the campaign says that no horizontal gradient is to be allowed for"
+        reason = "largest_gradient of the campaign is 0"
         yield case.without(StepName.GRADIENT, reason, number=0.0)
 
 
 def _multiangle(case: ChannelCase) -> Decisions:
     settings = case.multiangle
     if settings is None:
-        yield case.without(StepName.MULTIANGLE, "the campaign does not ask for it")
+        yield case.without(StepName.MULTIANGLE, NOT_REQUESTED)
         return
     reason = no_scan(case)
     if reason:
@@ -109,7 +118,7 @@ def _multiangle(case: ChannelCase) -> Decisions:
         return
     yield case.step(
         StepName.MULTIANGLE,
-        "the campaign asks for it, and the beam scans",
+        f"{REQUESTED}, and the beam scans",
         highest=settings.highest,
         step=settings.step,
         method=settings.method,
@@ -123,19 +132,23 @@ def _regressor(case: ChannelCase) -> Decisions:
     settings = _scanned(case)
     if settings is None:
         return
-    found = beams(case, settings)
+    directions = beams(case, settings)
     if settings.method in _BLIND:
         reason = f"method {settings.method} fits no horizontal gradient"
         yield case.without(StepName.GRADIENT_REGRESSOR, reason)
-    elif not found.sides_known:
-        reason = "headers do not tell azimuths: beams are taken to lead to one side"
+    elif not directions.sides_known:
+        reason = "headers give no azimuths: all beams are assumed to point to one side"
         yield case.without(StepName.GRADIENT_REGRESSOR, reason)
-    elif not found.surround:
-        reason = f"{found.free:g} degree around the zenith are free of beams, more than a half turn"
-        yield case.without(StepName.GRADIENT_REGRESSOR, reason, number=found.free)
+    elif not directions.surround:
+        sector = f"an azimuth sector of {directions.free:g} degree"
+        reason = f"{sector}, more than a half turn, has no beams"
+        yield case.without(StepName.GRADIENT_REGRESSOR, reason, number=directions.free)
     else:
-        reason = "beams lead to all sides: decided from the data, at altitudes where their light is"
-        yield case.step(StepName.GRADIENT_REGRESSOR, reason, number=found.free)
+        reason = (
+            "beams point to all sides, so a horizontal gradient can be estimated; decided from the"
+            " data, at altitudes with signal"
+        )
+        yield case.step(StepName.GRADIENT_REGRESSOR, reason, number=directions.free)
 
 
 def _robust(case: ChannelCase) -> Decisions:
@@ -144,10 +157,10 @@ def _robust(case: ChannelCase) -> Decisions:
         return
     count = float(beams(case, settings).count)
     if count < FEWEST_BEAMS:
-        reason = f"fewer than {FEWEST_BEAMS} directions do not tell which of them is an outlier"
+        reason = f"fewer than {FEWEST_BEAMS} beam directions cannot identify an outlier"
         yield case.without(StepName.ROBUST, reason, number=count)
     else:
-        reason = "decided from the data: where a residual is too large for chance"
+        reason = "decided from the data: used where a residual is too large to be chance"
         yield case.step(StepName.ROBUST, reason, number=count)
 
 
@@ -158,13 +171,13 @@ def _vertical(case: ChannelCase) -> Decisions:
     count = beams(case, settings).count
     bins = float(round(settings.highest / settings.step))
     if settings.method in _SIMPLE:
-        reason = f"method {settings.method} takes every altitude by itself"
+        reason = f"method {settings.method} treats each altitude independently"
         yield case.without(StepName.VERTICAL, reason)
     elif settings.method == "auto" and count <= 2:
-        reason = "two directions are one difference an altitude, which is taken as it is"
+        reason = "two beam directions give one difference at each altitude, used without smoothing"
         yield case.without(StepName.VERTICAL, reason, number=float(count))
     else:
-        reason = "decided from the data: as smooth as noise makes single altitudes uncertain"
+        reason = "decided from the data: the smoothing increases with the noise of single altitudes"
         yield case.step(StepName.VERTICAL, reason, number=bins)
 
 
@@ -174,13 +187,13 @@ def _correlation(case: ChannelCase) -> Decisions:
         return
     spare = float(beams(case, settings).count - 2)
     if settings.method not in _JOINT:
-        reason = f"method {settings.method} takes the errors of altitudes as independent"
+        reason = f"method {settings.method} assumes independent errors at different altitudes"
         yield case.without(StepName.CORRELATION, reason)
     elif spare <= 0:
-        reason = "no direction is redundant, so that residuals tell no correlation along altitude"
+        reason = "no beam direction is redundant: residuals show no correlation along altitude"
         yield case.without(StepName.CORRELATION, reason, number=spare)
     else:
-        reason = "decided from the data: AR(1) along altitude, from residuals of spare directions"
+        reason = "decided from the data: AR(1) along altitude, from residuals of redundant beams"
         yield case.step(StepName.CORRELATION, reason, number=spare)
 
 
@@ -190,25 +203,25 @@ def _layers(case: ChannelCase) -> Decisions:
         return
     number = float(len(settings.layers))
     if settings.layers:
-        reason = "the campaign asks for the optical depth of layers: variables of them"
+        reason = "the campaign requests the optical depth of layers"
         yield case.step(StepName.LAYERS, reason, number=number)
     else:
-        reason = "the campaign names no layers: no variable of them"
+        reason = "the campaign requests no layers"
         yield case.without(StepName.LAYERS, reason, number=number)
 
 
 SCANS: Final = (
-    Rule("gradient", StepName.GRADIENT, "May the air differ along the horizontal?", _gradient),
+    Rule("gradient", StepName.GRADIENT, "May the air vary horizontally?", _gradient),
     Rule(
         "gradient_regressor",
         StepName.GRADIENT_REGRESSOR,
-        "Do beams lead to all sides, so that a gradient can be fitted?",
+        "Do beams point to all sides, so that a gradient can be fitted?",
         _regressor,
     ),
-    Rule("robust", StepName.ROBUST, "Are there directions enough to tell an outlier?", _robust),
+    Rule("robust", StepName.ROBUST, "Are there enough beams to identify an outlier?", _robust),
     Rule("vertical", StepName.VERTICAL, "Is the profile regularised along altitude?", _vertical),
-    Rule("correlation", StepName.CORRELATION, "Can residuals tell AR(1) noise?", _correlation),
-    Rule("layers", StepName.LAYERS, "Are variables of layers wanted?", _layers),
+    Rule("correlation", StepName.CORRELATION, "Can residuals show AR(1) noise?", _correlation),
+    Rule("layers", StepName.LAYERS, "Are layers requested?", _layers),
     Rule("multiangle", StepName.MULTIANGLE, "Does the beam scan over zenith angle?", _multiangle),
 )
-"""Of the multi-angle product of a channel."""
+"""Rules for the multi-angle product of a channel."""

@@ -1,6 +1,8 @@
-"""Scene -> plan: what runs for a scene, what is left out, and why.
+"""Make the plan of a scene of one instrument: the steps that run, those left out, and why.
 
-Every rule gives its reason in words that a user can check against the campaign file.
+One rule decides on one step; `CHANNEL`, `RANGE_WINDOW` and `PRODUCTS` list the rules. A reason is
+a sentence that a user can check against the campaign file. `plan_scene` is the entry point; it
+hands networks over to `lidarops.plan.network_plan`.
 """
 
 from __future__ import annotations
@@ -21,20 +23,27 @@ from lidarops.plan import availability, network_plan, scan_rules
 from lidarops.plan.availability import glued_channels
 from lidarops.plan.signal_rules import (
     ALL_STEPS,
+    ANALOG_NOISE,
     CONDITIONING,
     GLUED,
+    NO_PRODUCT,
+    NO_WAVELENGTH,
+    NOT_REQUESTED,
+    REQUESTED,
     ChannelCase,
     Decisions,
     Rule,
     StepName,
     applied,
+    bins_with_noise,
+    fixed_zenith,
     glue_rules,
+    glued_parts,
     no_scan,
-    parts_of,
+    range_channel,
     range_offset,
-    ranged_by,
-    reaching,
-    steady_zenith,
+    required_by,
+    tail_mean_reason,
     wavelength,
 )
 from lidarops.records import (
@@ -51,10 +60,10 @@ from lidarops.retrieve.homogeneous.labeled import LEVEL
 MIN_SECTION_BINS = 8
 
 LOOKED_AT: Final = 16
-"""Profiles of a scene that are looked at first."""
+"""Number of profiles of a scene that are sampled first."""
 
 _ROUNDING: Final = 1e-6
-"""Relative; angles of headers and of files are rounded in ways of their own."""
+"""Relative tolerance: headers and campaign files round angles differently."""
 
 _Settings = TypeVar(
     "_Settings", SignalSettings, HomogeneousSettings, ElasticSettings, MultiAngleSettings
@@ -62,14 +71,14 @@ _Settings = TypeVar(
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
-    """What the rules of a whole scene look at."""
+class _SceneCase:
+    """A scene of one instrument, with the campaign's facts about it."""
 
     scene: Scene
     instrument: Instrument
     facts: InstrumentFacts
     networks: Mapping[str, str]
-    """Those that the instrument is part of -> the channel that they want."""
+    """Networks of which the instrument is a member -> the channel that they use."""
 
 
 def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
@@ -83,13 +92,13 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
     Returns
     -------
     Plan
-        Steps by channel in the order in which they run. A plan without steps is possible; its
-        `left_out` says why.
+        Steps by channel in the order in which they run. It may have no steps; `left_out` then
+        states why.
     """
     if scene.members:
         return network_plan.plan_network(scene, campaign)
     instrument = campaign.instruments[scene.instrument]
-    # A scene never straddles an edge of a validity period, so its first granule speaks for all.
+    # A scene never spans an edge of a validity period, so the facts of its first granule hold.
     facts = instrument.facts_at(scene.granules[0].start or scene.start)
     steps: list[Step] = []
     networks = {
@@ -97,57 +106,58 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
         for name, network in campaign.networks.items()
         if scene.instrument in network.instruments
     }
-    asked = _Asked(scene, instrument, facts, networks)
+    case = _SceneCase(scene, instrument, facts, networks)
     held = availability.Held(scene.layout, instrument, facts)
     left_out = [left for left in applied(availability.RULES, held) if isinstance(left, LeftOut)]
     for channel in (*scene.layout, *glued_channels(scene.layout, instrument)):
-        for decision in _channel(channel, asked, all_steps=campaign.all_steps):
+        for decision in _channel(channel, case, all_steps=campaign.all_steps):
             (steps if isinstance(decision, Step) else left_out).append(decision)  # type: ignore[arg-type]
-    return _without_idle(Plan(scene.id, tuple(steps), tuple(left_out)))
+    return _drop_unused_channels(Plan(scene.id, tuple(steps), tuple(left_out)))
 
 
-def _without_idle(told: Plan) -> Plan:
-    """Leave out the channels of which every product is left out, as nothing reads them."""
+def _drop_unused_channels(plan: Plan) -> Plan:
+    """Return a plan without the channels of which no product is made."""
     kinds = tuple(ProductKind)
-    giving = {step.channel for step in told.steps if step.name in kinds}
-    for name in [name for name in giving if name.startswith(GLUED)]:
-        giving.update(parts_of(name))
-    idle = {step.channel for step in told.steps} - giving
-    reason = "nothing that this channel is asked for can be made"
+    used = {step.channel for step in plan.steps if step.name in kinds}
+    for name in [name for name in used if name.startswith(GLUED)]:
+        used.update(glued_parts(name))
+    unused = {step.channel for step in plan.steps} - used
+    reason = "no requested product of this channel can be made"
     return replace(
-        told,
-        steps=tuple(step for step in told.steps if step.channel in giving),
+        plan,
+        steps=tuple(step for step in plan.steps if step.channel in used),
         left_out=(
-            *(left for left in told.left_out if left.channel not in idle or left.name in kinds),
+            *(left for left in plan.left_out if left.channel not in unused or left.name in kinds),
             *(
                 LeftOut(step.name, step.channel, reason, rule=step.rule)
-                for step in told.steps
-                if step.channel in idle and step.name == StepName.READ
+                for step in plan.steps
+                if step.channel in unused and step.name == StepName.READ
             ),
         ),
     )
 
 
-def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decisions:
-    scene, instrument, facts = asked.scene, asked.instrument, asked.facts
+def _channel(channel: ChannelLayout, whole: _SceneCase, *, all_steps: bool) -> Decisions:
+    """Decide on the steps of one channel."""
+    scene, instrument, facts = whole.scene, whole.instrument, whole.facts
     products = instrument.products
-    made = [glued.name for glued in glued_channels(scene.layout, instrument)]
-    joined = channel.name in made
+    glued_names = [glued.name for glued in glued_channels(scene.layout, instrument)]
+    is_glued = channel.name in glued_names
     case = ChannelCase(
         scene=scene,
         channel=channel,
         facts=facts,
         known=channel_facts(facts, channel.name),
         member="",
-        signal=_wanted(products.signal, channel),
-        homogeneous=None if joined else _wanted(products.homogeneous, channel),
-        elastic=_wanted(products.elastic, channel),
-        multiangle=_wanted(products.multiangle, channel),
-        glued=tuple(name for name in made if channel.name in parts_of(name)),
+        signal=_settings_for(products.signal, channel),
+        homogeneous=None if is_glued else _settings_for(products.homogeneous, channel),
+        elastic=_settings_for(products.elastic, channel),
+        multiangle=_settings_for(products.multiangle, channel),
+        glued=tuple(name for name in glued_names if channel.name in glued_parts(name)),
         networks=tuple(
             name
-            for name, wanted in asked.networks.items()
-            if channel.name in (parts_of(wanted) if wanted.startswith(GLUED) else (wanted,))
+            for name, used in whole.networks.items()
+            if channel.name in (glued_parts(used) if used.startswith(GLUED) else (used,))
         ),
         all_steps=all_steps,
     )
@@ -155,41 +165,42 @@ def _channel(channel: ChannelLayout, asked: _Asked, *, all_steps: bool) -> Decis
     yield from reading
     if not any(isinstance(decision, Step) for decision in reading):
         return
-    yield from glue_rules(case) if joined else applied((RANGE_WINDOW, *CONDITIONING), case)
+    yield from glue_rules(case) if is_glued else applied((RANGE_WINDOW, *CONDITIONING), case)
     yield from applied(PRODUCTS, case)
 
 
 def _read(case: ChannelCase) -> Decisions:
-    asked = list(_asked(case))
-    if not asked:
-        reason = "no product of the campaign asks for this channel"
+    requesters = list(_requesters(case))
+    if not requesters:
+        reason = NO_PRODUCT
         if case.networks:
             word = "networks" if len(case.networks) > 1 else "network"
-            reason = f"used by {word} {' and '.join(case.networks)} alone"
+            reason = f"used only by {word} {' and '.join(case.networks)}"
         yield case.without(StepName.READ, reason)
         return
     name = case.channel.name
-    known = channel_facts(case.facts, parts_of(name)[1]) if name.startswith(GLUED) else case.known
+    known = (
+        channel_facts(case.facts, glued_parts(name)[1]) if name.startswith(GLUED) else case.known
+    )
     if math.isnan(wavelength(case.channel, known)):
-        reason = "the header's wavelength is implausible and the campaign's facts give none"
-        yield case.without(StepName.READ, reason)
+        yield case.without(StepName.READ, NO_WAVELENGTH)
         return
     yield case.step(
         StepName.READ,
-        "asked for by " + " and ".join(asked),
+        required_by(requesters),
         wavelength=wavelength(case.channel, known),
     )
 
 
-def _wanted(settings: _Settings | None, channel: ChannelLayout) -> _Settings | None:
+def _settings_for(settings: _Settings | None, channel: ChannelLayout) -> _Settings | None:
     if settings is None:
         return None
-    # All channels of the files: a joined one is made where it is asked for by name.
-    everything = settings.channels == "all" and not channel.name.startswith(GLUED)
-    return settings if everything or channel.name in settings.channels else None
+    # "all" means the channels of the files: a glued one has to be requested by name.
+    covers_all = settings.channels == "all" and not channel.name.startswith(GLUED)
+    return settings if covers_all or channel.name in settings.channels else None
 
 
-def _asked(case: ChannelCase) -> Iterator[str]:
+def _requesters(case: ChannelCase) -> Iterator[str]:
     if case.signal is not None:
         yield "signal"
     if case.homogeneous is not None:
@@ -205,8 +216,7 @@ def _range_window(case: ChannelCase) -> Decisions:
     if case.homogeneous is None:
         return
     if case.channel.mode is not DetectionMode.PHOTON:
-        reason = "noise of analog records is estimated from the whole of them"
-        yield case.without(StepName.RANGE_WINDOW, reason)
+        yield case.without(StepName.RANGE_WINDOW, ANALOG_NOISE)
         return
     if case.all_steps:
         yield case.without(StepName.RANGE_WINDOW, ALL_STEPS)
@@ -214,12 +224,12 @@ def _range_window(case: ChannelCase) -> Decisions:
     farthest = max((far for _, far in _level_sections(case)), default=math.nan)
     if math.isnan(farthest):
         return
-    bins = reaching(0.0, farthest, case)[1]
+    bins = bins_with_noise(0.0, farthest, case)[1]
     if not 0 < bins < case.channel.bins:
-        reason = "a section reaches the end of the bins"
+        reason = "a section extends to the last bin"
         yield case.without(StepName.RANGE_WINDOW, reason, number=float(case.channel.bins))
         return
-    reason = "homogeneous sections need no farther bins, and counts none to tell their noise"
+    reason = "neither homogeneous sections nor the noise of their counts need farther bins"
     yield case.step(StepName.RANGE_WINDOW, reason, number=float(bins), bins=[[0, bins]])
 
 
@@ -229,18 +239,17 @@ def _background(case: ChannelCase) -> Decisions:
     start, stop, bins = _tail(case, case.signal)
     if bins < MIN_SECTION_BINS:
         return
-    reason = (
-        "the last tenth of the bins: signal left there biases it"
-        if case.signal.background_range is None
-        else "background_range of the campaign: signal left there biases it"
-    )
     yield case.step(
-        StepName.BACKGROUND, reason, number=bins, method="tail_mean", range=[start, stop]
+        StepName.BACKGROUND,
+        tail_mean_reason(case.signal.background_range),
+        number=bins,
+        method="tail_mean",
+        range=[start, stop],
     )
 
 
 def _tail(case: ChannelCase, settings: SignalSettings) -> tuple[float, float, float]:
-    """Return the range whose mean is the background, m, and how many bins that holds."""
+    """Return the limits of the range whose mean is the background, m, and its number of bins."""
     start, stop = settings.background_range or (0.9 * case.last, case.last)
     stop = min(stop, case.last)
     return start, stop, (stop - start) / case.channel.bin_width
@@ -248,29 +257,29 @@ def _tail(case: ChannelCase, settings: SignalSettings) -> tuple[float, float, fl
 
 def _signal(case: ChannelCase) -> Decisions:
     if case.signal is None:
-        yield case.without(StepName.SIGNAL, "the campaign does not ask for it")
+        yield case.without(StepName.SIGNAL, NOT_REQUESTED)
         return
     start, _, bins = _tail(case, case.signal)
     if bins < MIN_SECTION_BINS:
         stop = case.signal.background_range[1] if case.signal.background_range else case.last
         reason = (
-            f"background_range {start:g}-{stop:g} m holds fewer than {MIN_SECTION_BINS} bins,"
-            f" which end at {case.last:g} m"
+            f"background_range {start:g}-{stop:g} m holds fewer than {MIN_SECTION_BINS} bins;"
+            f" the last bin ends at {case.last:g} m"
         )
         yield case.without(StepName.SIGNAL, reason, number=bins)
         return
-    yield case.step(StepName.SIGNAL, "the campaign asks for it")
+    yield case.step(StepName.SIGNAL, REQUESTED)
 
 
 def _inside(case: ChannelCase, near: float, far: float) -> float:
-    """Return how many bins hold a section; NaN where it reaches beyond them."""
+    """Return the number of bins of a section; NaN where it extends beyond the last bin."""
     return (far - near) / case.channel.bin_width if far <= case.last else math.nan
 
 
 def _sections(case: ChannelCase) -> list[tuple[float, float]]:
-    """Return the sections that lie inside the bins."""
-    wanted = [] if case.homogeneous is None else case.homogeneous.sections
-    return [(near, far) for near, far in wanted if _inside(case, near, far) >= MIN_SECTION_BINS]
+    """Return the sections that lie within the bins."""
+    requested = [] if case.homogeneous is None else case.homogeneous.sections
+    return [(near, far) for near, far in requested if _inside(case, near, far) >= MIN_SECTION_BINS]
 
 
 def _outside(case: ChannelCase) -> Decisions:
@@ -279,19 +288,19 @@ def _outside(case: ChannelCase) -> Decisions:
         if (near, far) not in inside:
             bins = (min(far, case.last) - near) / case.channel.bin_width
             reason = (
-                f"section {near:g}-{far:g} m does not lie inside the bins, which end at"
-                f" {case.last:g} m, with at least {MIN_SECTION_BINS} of them"
+                f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
+                f" holds fewer than {MIN_SECTION_BINS} bins"
             )
             yield case.without(StepName.HOMOGENEOUS, reason, number=bins)
 
 
 def _climb(case: ChannelCase, near: float, far: float) -> float:
-    """Return by how much the most level beam of a scene climbs along a section, m, or infinity.
+    """Return the climb of the most level beam of a scene along a section, m.
 
-    A beam of which nobody tells where it points is not taken for a level one.
+    Infinite where the zenith angle is unknown, so that the beam does not count as level.
     """
-    told = case.facts.zenith_angle
-    angles = [granule.zenith_angle if told is None else told for granule in case.scene.granules]
+    fixed = case.facts.zenith_angle
+    angles = [granule.zenith_angle if fixed is None else fixed for granule in case.scene.granules]
     return min(
         math.inf if angle is None else (far - near) * abs(math.cos(math.radians(angle)))
         for angle in angles
@@ -299,7 +308,7 @@ def _climb(case: ChannelCase, near: float, far: float) -> float:
 
 
 def _level_sections(case: ChannelCase) -> list[tuple[float, float]]:
-    """Return the sections that are retrieved: inside the bins, along a path that may be level."""
+    """Return the sections that are retrieved: within the bins, along a nearly level path."""
     return [
         (near, far)
         for near, far in _sections(case)
@@ -312,12 +321,13 @@ def _level(case: ChannelCase) -> Decisions:
     for near, far in _sections(case):
         if (near, far) not in kept:
             climb = _climb(case, near, far)
-            told = (
-                "neither headers nor campaign tell that it is level"
+            slope = (
+                "neither headers nor campaign give the zenith angle"
                 if math.isinf(climb)
-                else f"it climbs by {climb:.0f} m, and {LEVEL:g} m are level"
+                else f"the beam climbs {climb:.0f} m (limit {LEVEL:g} m)"
             )
-            reason = f"section {near:g}-{far:g} m: {told}: aerosol that thins fakes extinction"
+            reason = f"section {near:g}-{far:g} m: {slope}; a vertical gradient would mimic"
+            reason += " extinction"
             number = None if math.isinf(climb) else climb
             yield case.without(StepName.HOMOGENEOUS, reason, number=number)
 
@@ -328,80 +338,82 @@ def _look(case: ChannelCase) -> Decisions:
     if case.all_steps:
         yield case.without(StepName.LOOK, ALL_STEPS)
     else:
-        reason = "sections in which no profile shows light are not retrieved"
+        reason = "sections in which no sampled profile shows a signal are not retrieved"
         yield case.step(StepName.LOOK, reason, number=float(LOOKED_AT), profiles=LOOKED_AT)
 
 
 def _homogeneous(case: ChannelCase) -> Decisions:
     if case.homogeneous is None:
-        yield case.without(StepName.HOMOGENEOUS, "the campaign does not ask for it")
+        yield case.without(StepName.HOMOGENEOUS, NOT_REQUESTED)
         return
     sections = [[near, far] for near, far in _level_sections(case)]
     if sections:
-        reason = "the campaign asks for it; background is retrieved with extinction"
-        wanted = case.homogeneous.visibility
+        definition = case.homogeneous.visibility
         yield case.step(
             StepName.HOMOGENEOUS,
-            reason,
+            f"{REQUESTED}; background is retrieved together with extinction",
             number=float(len(sections)),
             method=case.homogeneous.method,
             sections=sections,
-            **({} if wanted is None else {"visibility": network_plan.sight(wanted)}),
+            **(
+                {}
+                if definition is None
+                else {"visibility": network_plan.visibility_settings(definition)}
+            ),
         )
 
 
 def _along_path(case: ChannelCase) -> Decisions:
     if case.homogeneous is None or not _level_sections(case):
         return
-    wanted = case.homogeneous.visibility
-    if wanted is None:
-        reason = "the campaign asks for no visibility along the sections: no such variable"
+    definition = case.homogeneous.visibility
+    if definition is None:
+        reason = "the campaign requests no visibility along the sections"
         yield case.without(StepName.ALONG_PATH, reason)
     else:
-        reason = "the campaign asks for visibility along the sections: variables of it"
-        yield case.step(StepName.ALONG_PATH, reason, number=wanted.threshold)
+        reason = "the campaign requests visibility along the sections"
+        yield case.step(StepName.ALONG_PATH, reason, number=definition.threshold)
 
 
 @dataclass(frozen=True, slots=True)
-class _Clean:
-    """Where along a beam air without aerosol is looked for."""
+class _ReferenceLimits:
+    """Limits within which the reference window may lie, m along the beam."""
 
     bottom: float
-    """m along the beam, as the others."""
     top: float
     width: float
     reason: str
-    """Why it is looked for nowhere; empty where it is."""
+    """Why there can be no reference window; empty where there can."""
 
 
-def _clean(case: ChannelCase, settings: ElasticSettings) -> _Clean:
-    zenith, reason = steady_zenith(case)
+def _reference_limits(case: ChannelCase, settings: ElasticSettings) -> _ReferenceLimits:
+    zenith, reason = fixed_zenith(case)
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     window = settings.reference
-    # Windows are sought among the middles of bins.
-    ranged = replace(case.channel, name=ranged_by(case.channel.name))
+    # A window is a set of bin centres.
+    ranged = replace(case.channel, name=range_channel(case.channel.name))
     offset = range_offset(ranged, case.facts)
     reach = case.last - 0.5 * case.channel.bin_width + offset
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
         reason = (
-            f"the bins end at {reach:g} m, nearer than a reference window of {window.width:g} m"
+            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
             f" above {window.lowest:g} m"
         )
-    return _Clean(bottom, top, window.width * stretch, reason)
+    return _ReferenceLimits(bottom, top, window.width * stretch, reason)
 
 
 def _elastic_settings(case: ChannelCase) -> ElasticSettings | None:
-    """Return the settings of the elastic product, where there is one."""
+    """Return the settings of the elastic product; None where it is not made."""
     settings = case.elastic
-    return None if settings is None or _clean(case, settings).reason else settings
+    return None if settings is None or _reference_limits(case, settings).reason else settings
 
 
 def _average(case: ChannelCase) -> Decisions:
     settings = _elastic_settings(case)
     if settings is not None:
         seconds = settings.average.total_seconds()
-        reason = "noise of a single profile is too large"
+        reason = "the noise of a single profile is too large for the inversion"
         yield case.step(StepName.AVERAGE, reason, number=seconds, seconds=seconds)
 
 
@@ -410,10 +422,10 @@ def _known_shape(case: ChannelCase) -> Decisions:
     if settings is None:
         return
     if settings.background == "known_shape":
-        reason = "the far range is taken as air without aerosol, and tested for it"
+        reason = "the far range is assumed to be aerosol-free, and tested"
         yield case.step(StepName.KNOWN_SHAPE, reason)
     else:
-        reason = "the campaign asks for tail_mean: signal left in the far range biases it"
+        reason = "the campaign requests tail_mean; signal in the far range biases it"
         yield case.without(StepName.KNOWN_SHAPE, reason)
 
 
@@ -421,15 +433,15 @@ def _reference(case: ChannelCase) -> Decisions:
     settings = _elastic_settings(case)
     if settings is None:
         return
-    clean = _clean(case, settings)
-    reason = "candidates within the campaign's limits are tested against the shape of air"
+    limits = _reference_limits(case, settings)
+    reason = "windows within the campaign's limits are tested against the molecular profile"
     yield case.step(
         StepName.REFERENCE,
         reason,
-        number=clean.top - clean.bottom,
-        lowest=clean.bottom,
-        highest=clean.top,
-        width=clean.width,
+        number=limits.top - limits.bottom,
+        lowest=limits.bottom,
+        highest=limits.top,
+        width=limits.width,
         scattering_ratio=settings.reference.scattering_ratio,
         relative_error=settings.reference.relative_error,
     )
@@ -438,15 +450,15 @@ def _reference(case: ChannelCase) -> Decisions:
 def _elastic(case: ChannelCase) -> Decisions:
     settings = case.elastic
     if settings is None:
-        yield case.without(StepName.ELASTIC, "the campaign does not ask for it")
+        yield case.without(StepName.ELASTIC, NOT_REQUESTED)
         return
-    clean = _clean(case, settings)
-    if clean.reason:
-        yield case.without(StepName.ELASTIC, clean.reason)
+    limits = _reference_limits(case, settings)
+    if limits.reason:
+        yield case.without(StepName.ELASTIC, limits.reason)
         return
     yield case.step(
         StepName.ELASTIC,
-        "the campaign asks for it",
+        REQUESTED,
         lidar_ratio=settings.lidar_ratio,
         lidar_ratio_standard_error=settings.lidar_ratio_standard_error,
         molecular_relative_error=settings.molecular_relative_error,
@@ -462,7 +474,7 @@ def _molecular(case: ChannelCase) -> Decisions:
         reason = "given by the campaign"
         yield case.step(StepName.MOLECULAR, reason, molecular_profile=source)
         return
-    reason = "the campaign gives no molecular_profile: US Standard Atmosphere 1976"
+    reason = "the campaign gives no molecular_profile; US Standard Atmosphere 1976 is used"
     yield case.step(StepName.MOLECULAR, reason)
 
 
@@ -472,22 +484,22 @@ CHANNEL: Final = Rule(
 RANGE_WINDOW: Final = Rule(
     "range_window",
     StepName.RANGE_WINDOW,
-    "Which bins do the sections of counts need?",
+    "Which bins do the sections of a photon-counting channel need?",
     _range_window,
 )
 PRODUCTS: Final = (
     Rule("background", StepName.BACKGROUND, "Does the far range hold enough bins?", _background),
-    Rule("signal", StepName.SIGNAL, "Is it asked for, and can background be told?", _signal),
-    Rule("section_inside", StepName.HOMOGENEOUS, "Do the bins hold the section?", _outside),
-    Rule("section_level", StepName.HOMOGENEOUS, "May the path be level?", _level),
-    Rule("look", StepName.LOOK, "May sections turn out to hold no light?", _look),
+    Rule("signal", StepName.SIGNAL, "Is it requested, with bins for the background?", _signal),
+    Rule("section_inside", StepName.HOMOGENEOUS, "Is the section within the bins?", _outside),
+    Rule("section_level", StepName.HOMOGENEOUS, "Is the path nearly level?", _level),
+    Rule("look", StepName.LOOK, "May sections contain no signal?", _look),
     Rule("homogeneous", StepName.HOMOGENEOUS, "Is a section left to retrieve?", _homogeneous),
-    Rule("along_path", StepName.ALONG_PATH, "Are variables of visibility wanted?", _along_path),
-    Rule("average", StepName.AVERAGE, "Does a retrieval need less noise?", _average),
-    Rule("molecular", StepName.MOLECULAR, "Does a retrieval need the air's density?", _molecular),
-    Rule("known_shape", StepName.KNOWN_SHAPE, "Which background is asked for?", _known_shape),
-    Rule("reference", StepName.REFERENCE, "Where may air be without aerosol?", _reference),
-    Rule("elastic", StepName.ELASTIC, "Does one beam reach air without aerosol?", _elastic),
+    Rule("along_path", StepName.ALONG_PATH, "Is visibility on the path requested?", _along_path),
+    Rule("average", StepName.AVERAGE, "Does a retrieval need averaged signals?", _average),
+    Rule("molecular", StepName.MOLECULAR, "Does a retrieval need the air density?", _molecular),
+    Rule("known_shape", StepName.KNOWN_SHAPE, "Which background is requested?", _known_shape),
+    Rule("reference", StepName.REFERENCE, "Where may the air be aerosol-free?", _reference),
+    Rule("elastic", StepName.ELASTIC, "Does a fixed beam reach aerosol-free air?", _elastic),
     *scan_rules.SCANS,
 )
-"""Of the products of a channel, in the order in which they run."""
+"""Rules for the products of a channel, in the order in which the steps run."""

@@ -1,11 +1,11 @@
-"""Granules -> scenes: what is processed together.
+"""Group granules into scenes, which are processed together.
 
-A scene holds the granules of one instrument over one window of the campaign (a UTC day or a
-part of it). It is cut where the facts about the instrument change, because one scene has one
-plan, and where the files' channels or range grid change, because one product has one grid.
+A scene holds the granules of one instrument in one window of the campaign (a UTC day or a part of
+it). It is split where the facts about the instrument change, because a scene has one plan, and
+where the channels or the range grid of the files change, because a product has one grid.
 
-A scene of a network holds one part a member instrument, over the same window; it is cut where
-the facts about any member change.
+A scene of a network holds one member scene for each instrument, in the same window. It is split
+where the facts about any member change.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from lidarops.errors import SceneError
 from lidarops.records import ChannelLayout, Granule, Role, Scene, Status
 
 DARK_REACH = timedelta(hours=24)
+"""Longest time between a scene and the dark files that it uses."""
 _STAMP = "%Y%m%dT%H%M%S"
-"""Of the start of a scene, in its name."""
-"""Dark files serve a scene when they were taken at most this long before or after it."""
+"""Format of the start time in the name of a scene."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """Scenes, and the granules that belong to none."""
+    """Scenes, and the granules that belong to no scene."""
 
     scenes: tuple[Scene, ...]
     set_aside: tuple[Granule, ...]
-    """Granules of the same instrument and time as another one, refused with that reason."""
+    """Granules that start at the time of another one of the instrument; refused for that reason."""
 
 
 def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
@@ -43,14 +43,14 @@ def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     Parameters
     ----------
     campaign : Campaign
-        Gives the window and the validity periods.
+        Defines the window and the validity periods.
     granules : iterable of Granule
-        In any order; refused ones are passed over.
+        In any order; refused ones are ignored.
 
     Returns
     -------
     Cut
-        Scenes by instrument and time, then those of networks, the same for any order of
+        Scenes by instrument and time, then those of networks, independent of the order of
         `granules`.
     """
     good = sorted(
@@ -77,10 +77,10 @@ def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
 def _of_network(
     campaign: Campaign, key: str, signal: list[Granule], dark: list[Granule]
 ) -> list[Scene]:
-    """Return the scenes of a network: windows in which two members at least have granules.
+    """Return the scenes of a network: windows in which at least two members have granules.
 
-    Where a member changed its range grid within a window, each grid makes a scene with the
-    others.
+    Where a member changed its range grid within a window, each grid makes a scene of its own with
+    the other members.
     """
     names = tuple(campaign.networks[key].instruments)
     groups: dict[tuple[datetime, datetime], dict[str, list[Granule]]] = defaultdict(
@@ -90,15 +90,15 @@ def _of_network(
     for granule, window in _in_windows(campaign, names, own):
         groups[window][granule.instrument].append(granule)
     scenes = []
-    for (start, stop), found in sorted(groups.items()):
-        parts = [
-            _by_layout(campaign, name, start, stop, found[name], dark)
+    for (start, stop), by_member in sorted(groups.items()):
+        member_scenes = [
+            _by_layout(campaign, name, start, stop, by_member[name], dark)
             for name in names
-            if name in found
+            if name in by_member
         ]
-        chosen = list(itertools.product(*parts)) if len(parts) > 1 else []
-        for members in chosen:
-            suffix = f"-{_grids_key(members)}" if len(chosen) > 1 else ""
+        combinations = list(itertools.product(*member_scenes)) if len(member_scenes) > 1 else []
+        for members in combinations:
+            suffix = f"-{_grids_key(members)}" if len(combinations) > 1 else ""
             scenes.append(
                 Scene(
                     id=f"{key}_{start:{_STAMP}}{suffix}",
@@ -124,17 +124,17 @@ def _grids_key(members: Sequence[Scene]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:6]
 
 
-def instrument_and_start(scene: str) -> tuple[str, datetime]:
-    """Return the instrument, or network, and the start that the name of a scene tells."""
+def parse_scene_id(scene: str) -> tuple[str, datetime]:
+    """Return the instrument or network, and the start time, from the id of a scene."""
     instrument, _, rest = scene.rpartition("_")
     return instrument, datetime.strptime(rest.partition("-")[0], _STAMP).replace(tzinfo=UTC)
 
 
-def stop_of(scene: str, campaign: Campaign) -> datetime:
-    """Return when a scene, which may be gone, ends by its name, as the campaign cuts scenes now."""
-    key, start = instrument_and_start(scene)
+def scene_stop(scene: str, campaign: Campaign) -> datetime:
+    """Return when a scene with this id would end with the present campaign file."""
+    key, start = parse_scene_id(scene)
     members = campaign.networks[key].instruments if key in campaign.networks else [key]
-    return _window(campaign, [each for each in members if each in campaign.instruments], start)[1]
+    return _window(campaign, [name for name in members if name in campaign.instruments], start)[1]
 
 
 def select_scenes(
@@ -149,7 +149,7 @@ def select_scenes(
     Raises
     ------
     SceneError
-        If an instrument has no scene, naming those that have.
+        If an instrument has no scene; the message names those that have.
     """
     known = sorted({scene.instrument for scene in scenes})
     for instrument in instruments:
@@ -169,7 +169,7 @@ def select_scenes(
 
 def _start(granule: Granule) -> datetime:
     if granule.start is None:
-        raise SceneError("a good granule without a start time", file=granule.path)
+        raise SceneError("has no start time", file=granule.path)
     return granule.start
 
 
@@ -191,7 +191,7 @@ def _without_twins(granules: list[Granule]) -> tuple[list[Granule], list[Granule
 def _in_windows(
     campaign: Campaign, instruments: Sequence[str], granules: Iterable[Granule]
 ) -> Iterator[tuple[Granule, tuple[datetime, datetime]]]:
-    """Give granules with their windows, quickly where they come by time."""
+    """Yield granules with their windows; fast where granules come in order of time."""
     opens = closes = datetime.min.replace(tzinfo=UTC)
     for granule in granules:
         if not opens <= _start(granule) < closes:
@@ -202,7 +202,7 @@ def _in_windows(
 def _window(
     campaign: Campaign, instruments: Sequence[str], start: datetime
 ) -> tuple[datetime, datetime]:
-    """Return the window of a granule by its start; no fact about the instruments changes in it."""
+    """Return the window that holds `start`, narrowed so that no fact changes within it."""
     length = timedelta(days=1) if campaign.scenes.window == "day" else campaign.scenes.window
     midnight = start.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
     opens = midnight + (start - midnight) // length * length
@@ -216,7 +216,7 @@ def _window(
 def _narrow(
     fact: InstrumentFacts, moment: datetime, opens: datetime, closes: datetime
 ) -> tuple[datetime, datetime]:
-    """Shrink a window around `moment` so that no edge of the validity period lies inside."""
+    """Narrow a window around `moment` so that no edge of the validity period lies inside."""
     for edge in (fact.valid_from, fact.valid_to):
         if opens < edge <= moment:
             opens = edge
@@ -266,7 +266,7 @@ def _layout_key(granule: Granule) -> str:
     return _key_of(granule.layout)
 
 
-# The files of an archive share few layouts.
+# An archive has few layouts.
 @lru_cache(maxsize=128)
 def _key_of(layout: tuple[ChannelLayout, ...]) -> str:
     text = repr([(c.name, c.bins, c.bin_width, c.adc_bits) for c in layout])

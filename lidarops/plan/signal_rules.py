@@ -1,4 +1,7 @@
-"""Rules that plans of single instruments and of networks share: what makes a signal of counts."""
+"""Rules for the steps from raw counts to a signal, shared by single instruments and networks.
+
+Also the base of all rules: names of steps, the case that a rule looks at, and `Rule` itself.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +26,22 @@ from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS, NOISE_WIND
 from lidarops.retrieve.signal.dark import SESSION_GAP
 
 GLUED = "glued_"
-"""Prefix of the channels that join ``analog_`` and ``photon_`` ones of the same light."""
+"""Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
 
-ALL_STEPS: Final = "all steps are asked for: nothing is left out for giving nothing"
+ALL_STEPS: Final = "all_steps is set: no bin, section or file is skipped"
+REQUESTED: Final = "requested by the campaign"
+NOT_REQUESTED: Final = "not requested by the campaign"
+NO_PRODUCT: Final = "no product of the campaign uses this channel"
+NO_WAVELENGTH: Final = "the wavelength in the header is implausible, and no facts give one"
+ANALOG_NOISE: Final = "the noise of an analog record is estimated from all its bins"
 
 STEEPEST = 80.0
-"""degree; largest zenith angle at which a beam reaches air without aerosol."""
-STEADY = 0.05
-"""degree; by which the zenith angle of a beam that stands still may differ between files."""
+"""degree; largest zenith angle at which a beam reaches aerosol-free air."""
+FIXED = 0.05
+"""degree; largest difference between the zenith angles of the files of a fixed beam."""
 
 LEAST_SPREAD = 5.0
-"""degree; smallest spread of zenith angles that is a scan."""
+"""degree; smallest span of zenith angles of a scan."""
 
 
 class StepName(StrEnum):
@@ -75,55 +83,60 @@ WHOLE: Final = (StepName.SIGNAL, StepName.ELASTIC, StepName.MULTIANGLE)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What the rules of one channel look at."""
+    """One channel of a scene, as the rules see it."""
 
     scene: Scene
     channel: ChannelLayout
     facts: InstrumentFacts
     known: ChannelFacts
     member: str
-    """Instrument, where it is part of a network; else empty."""
+    """Instrument of a network; empty for a single instrument."""
 
     def step(
         self, name: StepName, reason: str, *, number: float | None = None, **settings: Any
     ) -> Step:
-        """Return a step of the channel; `number` is the one that it was decided on."""
+        """Return a step of the channel; `number` is the number on which the rule decided."""
         return Step(
-            name.value, self.channel.name, settings, self._told(reason), self.member, number=number
+            name.value,
+            self.channel.name,
+            settings,
+            self._of_member(reason),
+            self.member,
+            number=number,
         )
 
     def without(self, name: StepName, reason: str, *, number: float | None = None) -> LeftOut:
-        """Return what is left out of the channel."""
+        """Return a step that is left out of the channel."""
         return LeftOut(
-            name.value, self.channel.name, self._told(reason), self.member, number=number
+            name.value, self.channel.name, self._of_member(reason), self.member, number=number
         )
 
-    def _told(self, reason: str) -> str:
+    def _of_member(self, reason: str) -> str:
         return f"{self.member}: {reason}" if self.member else reason
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelCase(Case):
-    """What the rules of one channel look at, and the products that are wanted of it."""
+    """One channel of a single instrument, with the settings of its requested products."""
 
     signal: SignalSettings | None
-    """Set where the channel's ``signal`` product is wanted."""
+    """None where the ``signal`` product of the channel is not requested."""
     homogeneous: HomogeneousSettings | None
-    """Set where the channel's ``homogeneous`` product is wanted."""
+    """None where the ``homogeneous`` product of the channel is not requested."""
     elastic: ElasticSettings | None
-    """Set where the channel's ``elastic`` product is wanted."""
+    """None where the ``elastic`` product of the channel is not requested."""
     multiangle: MultiAngleSettings | None
-    """Set where the channel's ``multiangle`` product is wanted."""
+    """None where the ``multiangle`` product of the channel is not requested."""
     glued: tuple[str, ...]
-    """Channels that this one is joined into."""
+    """Glued channels that use this one."""
     networks: tuple[str, ...]
     """Networks that use the channel."""
     all_steps: bool
-    """Whether nothing is left out because it would give nothing."""
+    """Whether steps without effect run too."""
 
     @property
     def last(self) -> float:
-        """Where the bins end, m, without an offset."""
+        """Far end of the last bin, m, without range offset."""
         return self.channel.bins * self.channel.bin_width
 
 
@@ -132,59 +145,74 @@ Decisions = Iterator[Step | LeftOut]
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One decision, by name: what it is about, what it asks, and the function that takes it."""
+    """A named rule: the step it concerns, its question, and the function that decides."""
 
     name: str
     step: StepName
-    asks: str
+    question: str
     decide: Callable[[Any], Decisions]
-    """Of a `Case`, or of what else the stage of the rule looks at; gives nothing where the
-    question does not arise."""
+    """Takes the case of its stage, mostly a `Case`; yields nothing where the question does not
+    arise."""
 
     def decisions(self, case: Any) -> Decisions:
-        """Give what the rule decides, with its name, unless that of a rule it asks is there."""
+        """Yield the decisions of the rule, with its name unless another rule has named them."""
         for decision in self.decide(case):
             yield replace(decision, rule=decision.rule or self.name)
 
 
 def applied(rules: Iterable[Rule], case: Any) -> Decisions:
-    """Give what rules decide, in their order."""
+    """Yield the decisions of rules, in their order."""
     for rule in rules:
         yield from rule.decisions(case)
 
 
-def parts_of(glued: str) -> tuple[str, str]:
-    """Return the names of the analog and the photon counting part of a glued channel."""
+def required_by(requesters: Iterable[str]) -> str:
+    """Return the reason why a channel is read: the products and glued channels that need it."""
+    return f"required by {' and '.join(requesters)}"
+
+
+def tail_mean_reason(background_range: tuple[float, float] | None) -> str:
+    """Return the reason for a background that is the mean of the far range."""
+    if background_range is None:
+        return "mean of the last tenth of the bins; signal there biases it"
+    return "mean over background_range of the campaign; signal there biases it"
+
+
+def glued_parts(glued: str) -> tuple[str, str]:
+    """Return the names of the analog and the photon-counting channel of a glued channel."""
     label = glued.removeprefix(GLUED)
     return f"analog_{label}", f"photon_{label}"
 
 
-def joined_channels(
+def joined_layout(
     layout: Iterable[ChannelLayout], names: Iterable[str]
 ) -> tuple[ChannelLayout, ...]:
-    """Return those ``glued_`` channels of which the files hold both parts on one range grid."""
+    """Return the glued channels whose two parts are in the files with one bin width."""
     present = {channel.name: channel for channel in layout}
-    found = []
+    glued = []
     for name in names:
-        analog, photon = (present.get(part) for part in parts_of(name))
+        analog, photon = (present.get(part) for part in glued_parts(name))
         if analog and photon and analog.bin_width == photon.bin_width:
-            found.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
-    return tuple(found)
+            glued.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
+    return tuple(glued)
 
 
 def wavelength(channel: ChannelLayout, known: ChannelFacts) -> float:
-    """Return the wavelength in m that the campaign or else the header gives; may be NaN."""
+    """Return the wavelength in m from the campaign or else the header; may be NaN."""
     return channel.wavelength if known.wavelength is None else known.wavelength
 
 
 def _overlap(case: Case) -> Decisions:
     full = case.facts.full_overlap_range
-    reason = "nearer bins are flagged and not retrieved from"
+    reason = "bins nearer than full overlap are flagged and excluded"
     if case.facts.overlap_profile:
-        told = f"given by the campaign; {reason}"
         profile = case.facts.overlap_profile
         yield case.step(
-            StepName.OVERLAP, told, number=full, full_overlap_range=full, overlap_profile=profile
+            StepName.OVERLAP,
+            f"overlap_profile given by the campaign; {reason}",
+            number=full,
+            full_overlap_range=full,
+            overlap_profile=profile,
         )
     elif full > 0:
         yield case.step(StepName.OVERLAP, reason, number=full, full_overlap_range=full)
@@ -197,10 +225,10 @@ def _range(case: Case) -> Decisions:
     if offset:
         reason = "given by the campaign"
         if isinstance(case.known.lag, float):
-            reason += f", with the lag of {case.known.lag:g} bins"
+            reason += f", including a lag of {case.known.lag:g} bins"
         yield case.step(StepName.RANGE_OFFSET, reason, number=offset, range_offset=offset)
     elif case.known.lag == "estimate":
-        reason = "a lag that is estimated moves joined channels only"
+        reason = "an estimated lag shifts glued channels only"
         yield case.without(StepName.RANGE_OFFSET, reason)
     else:
         yield case.without(StepName.RANGE_OFFSET, "the campaign gives no range_offset")
@@ -208,7 +236,7 @@ def _range(case: Case) -> Decisions:
 
 def _dark(case: Case) -> Decisions:
     if case.channel.mode is DetectionMode.PHOTON:
-        yield case.without(StepName.DARK, "dark counts are part of the photon background")
+        yield case.without(StepName.DARK, "dark counts are part of the photon-counting background")
         return
     count = len(case.scene.dark)
     if not count:
@@ -218,21 +246,21 @@ def _dark(case: Case) -> Decisions:
     profiles = [granule.start for granule in case.scene.granules if granule.start]
     around = times[0] < max(profiles) and min(profiles) < times[-1]
     sessions = _sessions(case.scene.dark)
-    # Within a single session there is nothing to interpolate between.
+    # Interpolation needs two sessions.
     if around and sessions > 1:
-        told, method = "interpolated in time", "interpolated"
+        use, method = "interpolated in time", "interpolated"
     elif sessions > 1:
-        told, method = "the nearest of them in time", "nearest"
+        use, method = "the nearest in time is used", "nearest"
     else:
-        told, method = "one session, which serves all profiles", "nearest"
-    lie = _where(times, min(profiles), max(profiles))
+        use, method = "one session, used for all profiles", "nearest"
+    order = _times_around(times, min(profiles), max(profiles))
     files = "1 dark file" if count == 1 else f"{count} dark files"
-    reason = f"{files} within 24 h of the scene, {lie}: {told}"
+    reason = f"{files} within 24 h of the scene, {order}: {use}"
     yield case.step(StepName.DARK, reason, number=float(count), files=count, method=method)
 
 
 def _sessions(dark: Iterable[Granule]) -> int:
-    """Return how many sessions dark files make, as the retrieval tells them apart."""
+    """Return the number of dark sessions, separated by `SESSION_GAP` as in the retrieval."""
     middles = sorted(
         granule.start + ((granule.stop or granule.start) - granule.start) / 2
         for granule in dark
@@ -242,16 +270,16 @@ def _sessions(dark: Iterable[Granule]) -> int:
     return 1 + sum(gap > SESSION_GAP for gap in gaps)
 
 
-def _where(times: Sequence[datetime], first: datetime, last: datetime) -> str:
-    """Say how many times lie before, among and after the profiles of a scene."""
-    places = {
+def _times_around(times: Sequence[datetime], first: datetime, last: datetime) -> str:
+    """Return in words how many times lie before, among and after the profiles of a scene."""
+    counts = {
         "before": sum(time < first for time in times),
         "among": sum(first <= time <= last for time in times),
         "after": sum(time > last for time in times),
     }
-    told = [f"{number} {place}" for place, number in places.items() if number]
-    *firsts, rest = told
-    return f"{', '.join(firsts)} and {rest} its profiles" if firsts else f"{rest} its profiles"
+    *firsts, last_count = [f"{number} {place}" for place, number in counts.items() if number]
+    words = f"{', '.join(firsts)} and {last_count}" if firsts else last_count
+    return f"{words} its profiles"
 
 
 def _dead_time(case: Case) -> Decisions:
@@ -259,7 +287,7 @@ def _dead_time(case: Case) -> Decisions:
     if case.channel.mode is not DetectionMode.PHOTON:
         yield case.without(StepName.DEAD_TIME, "analog detection has no dead time")
     elif dead_time is None:
-        reason = "the campaign gives no dead_time; pile-up is judged with 4 ns"
+        reason = "the campaign gives no dead_time; pile-up is flagged for an assumed 4 ns"
         yield case.without(StepName.DEAD_TIME, reason)
     else:
         reason = "given by the campaign"
@@ -267,24 +295,29 @@ def _dead_time(case: Case) -> Decisions:
 
 
 def _noise(case: Case) -> Decisions:
-    given = case.known.noise_variance
+    variance = case.known.noise_variance
     if case.channel.mode is DetectionMode.PHOTON:
         yield case.step(StepName.NOISE, "photon counts are Poisson distributed", method="poisson")
-    elif given is not None:
-        reason = "given by the campaign"
-        yield case.step(StepName.NOISE, reason, number=given, method="given", noise_variance=given)
+    elif variance is not None:
+        yield case.step(
+            StepName.NOISE,
+            "given by the campaign",
+            number=variance,
+            method="given",
+            noise_variance=variance,
+        )
     else:
-        reason = "the campaign gives no noise_variance; third differences along range"
+        reason = "the campaign gives no noise_variance; estimated from third differences over range"
         yield case.step(StepName.NOISE, reason, method="differences")
 
 
 def _lag(case: Case) -> Decisions:
-    lag = channel_facts(case.facts, parts_of(case.channel.name)[0]).lag
+    lag = channel_facts(case.facts, glued_parts(case.channel.name)[0]).lag
     if lag is None:
-        reason = "the campaign gives no lag and asks for no estimate; headers say 0"
+        reason = "the campaign gives no lag and requests no estimate; headers state 0"
         yield case.without(StepName.LAG, reason)
     elif lag == "estimate":
-        reason = "the campaign asks for an estimate, from noise that both records share"
+        reason = "the campaign requests an estimate, from noise common to both records"
         yield case.step(StepName.LAG, reason, method="estimate")
     else:
         reason = "given by the campaign"
@@ -292,32 +325,37 @@ def _lag(case: Case) -> Decisions:
 
 
 def _glue(case: Case) -> Decisions:
-    analog, photon = parts_of(case.channel.name)
-    reason = "the campaign asks for the joined channel"
+    analog, photon = glued_parts(case.channel.name)
+    reason = "the campaign requests the glued channel"
     yield case.step(StepName.GLUE, reason, analog=analog, photon=photon)
 
 
 _OVERLAP: Final = Rule(
-    "overlap", StepName.OVERLAP, "Does the campaign say where the beam is seen whole?", _overlap
+    "overlap", StepName.OVERLAP, "Does the campaign state the overlap?", _overlap
 )
 CONDITIONING: Final = (
     _OVERLAP,
-    Rule("range_offset", StepName.RANGE_OFFSET, "Are the ranges of the bins off?", _range),
+    Rule("range_offset", StepName.RANGE_OFFSET, "Do the ranges of the bins need a shift?", _range),
     Rule("dark", StepName.DARK, "Is it analog, with dark files within 24 h?", _dark),
-    Rule("dead_time", StepName.DEAD_TIME, "Does it count, with a known dead time?", _dead_time),
+    Rule(
+        "dead_time",
+        StepName.DEAD_TIME,
+        "Is it photon counting, with a known dead time?",
+        _dead_time,
+    ),
     Rule("noise", StepName.NOISE, "Is the noise given, Poisson, or to be estimated?", _noise),
 )
 """From the counts of a channel of the files to its signal."""
 GLUING: Final = (
     _OVERLAP,
-    Rule("lag", StepName.LAG, "Is one of the records known to be late?", _lag),
-    Rule("glue", StepName.GLUE, "Does a product ask for the joined channel?", _glue),
+    Rule("lag", StepName.LAG, "Is a lag between the records given or to be estimated?", _lag),
+    Rule("glue", StepName.GLUE, "Does a product need the glued channel?", _glue),
 )
-"""From two channels of the files to one that joins them."""
+"""From two channels of the files to the glued one."""
 
 
 def glue_rules(case: Case) -> Decisions:
-    """Decide on the steps that join two channels."""
+    """Decide on the steps that glue two channels."""
     return applied(GLUING, case)
 
 
@@ -327,14 +365,14 @@ def conditioning(case: Case) -> Decisions:
 
 
 def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
-    """Return what is added to the ranges of a channel, m: what is told, less a lag that is told."""
+    """Return the shift of the ranges of a channel, m: the given offset minus the given lag."""
     known = channel_facts(facts, channel.name)
     late = known.lag * channel.bin_width if isinstance(known.lag, float) else 0.0
     return (known.range_offset or 0.0) - late
 
 
 def read_windows(steps: Collection[Step]) -> dict[str, Stretches]:
-    """Return the channels of which only some bins are needed, and which."""
+    """Return the channels of which only some bins are needed, with these bins."""
     whole = _needing_all(steps)
     return {
         step.channel: tuple((first, past) for first, past in step.settings["bins"])
@@ -344,16 +382,16 @@ def read_windows(steps: Collection[Step]) -> dict[str, Stretches]:
 
 
 def idle_window(step: Step, steps: Collection[Step]) -> str:
-    """Return why a range window of a plan keeps no bin from being read; empty where it does, or is none.
+    """Return why a range window has no effect; empty where it has one, or for other steps.
 
-    It stands in the plan all the same: what a product tells of itself must not depend on which
-    others are made.
+    Such a window stays in the plan, because the plan stated in a product must not depend on the
+    other products of the scene.
 
     Parameters
     ----------
     step : Step
     steps : collection of Step
-        All that are carried out together.
+        All steps of the scene.
     """
     if step.name != StepName.RANGE_WINDOW:
         return ""
@@ -364,41 +402,41 @@ def idle_window(step: Step, steps: Collection[Step]) -> str:
 
 
 def _needing_all(steps: Collection[Step]) -> dict[tuple[str, str], list[str]]:
-    """Return instrument and channel -> what is made of it and needs all bins."""
-    found: dict[tuple[str, str], list[str]] = {}
+    """Return instrument and channel -> the products and glued channels that need all its bins."""
+    needing: dict[tuple[str, str], list[str]] = {}
     for step in steps:
         if step.name in WHOLE:
-            found.setdefault((step.instrument, step.channel), []).append(step.name)
+            needing.setdefault((step.instrument, step.channel), []).append(step.name)
         elif step.name == StepName.GLUE:
-            for part in step.settings.values():
-                found.setdefault((step.instrument, part), []).append(step.channel)
-    return found
+            for parent in step.settings.values():
+                needing.setdefault((step.instrument, parent), []).append(step.channel)
+    return needing
 
 
-def reaching(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
-    """Return the bins of counts between ranges in m, with those that tell their noise.
+def bins_with_noise(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m, with those that their noise needs.
 
-    The variance of counts is that of their mean over a share of the range on either side.
+    The variance of a count is that of the mean over a share of the range on either side.
 
     Returns
     -------
     (int, int)
-        The first, and the one past the last; it may lie beyond the bins of the channel.
+        The first bin, and the one past the last, which may lie beyond the channel.
     """
     width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
 
-    def beside(distance: float) -> int:
+    def margin(distance: float) -> int:
         # Two for rounding.
         return max(math.ceil(NOISE_WINDOW * distance / width), MIN_NOISE_BINS) + 2
 
-    first = math.floor((nearest - offset) / width) - beside(nearest)
-    return max(first, 0), math.ceil((farthest - offset) / width) + beside(farthest)
+    first = math.floor((nearest - offset) / width) - margin(nearest)
+    return max(first, 0), math.ceil((farthest - offset) / width) + margin(farthest)
 
 
-def within(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
-    """Return the bins of counts between ranges in m alone, as `reaching` does with more of them.
+def bins_within(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m, without a margin for their noise.
 
-    For bins of which a mean is all that is needed: the noise of those at the ends is that of fewer.
+    For bins that are averaged: the noise at the ends then comes from fewer bins.
     """
     width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
     # Two for rounding.
@@ -406,36 +444,39 @@ def within(nearest: float, farthest: float, case: Case) -> tuple[int, int]:
     return max(first, 0), max(math.ceil((farthest - offset) / width) + 2, 0)
 
 
-def ranged_by(channel: str) -> str:
-    """Return the channel whose ranges a channel has: a joined one those of its photons."""
-    return parts_of(channel)[1] if channel.startswith(GLUED) else channel
+def range_channel(channel: str) -> str:
+    """Return the channel that defines the ranges: for a glued one, the photon-counting one."""
+    return glued_parts(channel)[1] if channel.startswith(GLUED) else channel
 
 
 def no_scan(case: Case) -> str:
-    """Return why the files of a scene are no scan, nothing where they are."""
+    """Return why the files of a scene are not a scan; empty where they are."""
     if case.facts.zenith_angle is not None:
-        return f"the campaign says that the beam stands still at {case.facts.zenith_angle:g} degree"
-    told = [granule.zenith_angle for granule in case.scene.granules]
-    angles = [angle for angle in told if angle is not None]
-    if len(angles) < len(told):
-        return "headers do not tell all zenith angles"
+        angle = case.facts.zenith_angle
+        return f"the campaign states a fixed beam at a zenith angle of {angle:g} degree"
+    header_angles = [granule.zenith_angle for granule in case.scene.granules]
+    angles = [angle for angle in header_angles if angle is not None]
+    if len(angles) < len(header_angles):
+        return "headers lack zenith angles"
     spread = max(angles) - min(angles)
     if spread < LEAST_SPREAD:
-        return f"zenith angles spread over {spread:g} degree only: the beam does not scan"
+        return f"zenith angles span only {spread:g} degree: the beam does not scan"
     return ""
 
 
-def steady_zenith(case: Case) -> tuple[float, str]:
-    """Return the zenith angle of a beam that stands still, or why there is none."""
+def fixed_zenith(case: Case) -> tuple[float, str]:
+    """Return the zenith angle of a fixed beam in degree, or NaN and why there is none."""
     if case.facts.zenith_angle is not None:
         angles = [case.facts.zenith_angle]
     else:
-        told = [granule.zenith_angle for granule in case.scene.granules]
-        if any(angle is None for angle in told):
-            return math.nan, "neither headers nor campaign tell the zenith angle"
-        angles = [angle for angle in told if angle is not None]
-    if max(angles) - min(angles) > STEADY:
-        return math.nan, f"the beam moves, from {min(angles):g} to {max(angles):g} degree"
+        header_angles = [granule.zenith_angle for granule in case.scene.granules]
+        if any(angle is None for angle in header_angles):
+            return math.nan, "neither headers nor campaign give the zenith angle"
+        angles = [angle for angle in header_angles if angle is not None]
+    if max(angles) - min(angles) > FIXED:
+        reason = f"the zenith angle of the beam changes from {min(angles):g} to {max(angles):g}"
+        return math.nan, f"{reason} degree"
     if max(angles) > STEEPEST:
-        return math.nan, f"at {max(angles):g} degree the beam reaches no air without aerosol"
+        reason = f"at a zenith angle of {max(angles):g} degree the beam does not reach"
+        return math.nan, f"{reason} aerosol-free air"
     return max(angles), ""

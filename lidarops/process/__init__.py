@@ -1,1 +1,1 @@
-"""One scene: open its files, carry out its plan, build its products, write them."""
+"""Process one scene: open its files, carry out its plan, build its products, write them."""

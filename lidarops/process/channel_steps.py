@@ -1,4 +1,4 @@
-"""The steps of a plan, carried out for one channel: raw counts in, what its products hold out."""
+"""Carry out the steps of a plan for one channel: from raw counts to the data of its products."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from lidarops.retrieve.signal import (
 Array = npt.NDArray[np.float64]
 
 FULL_OVERLAP: Final = 0.99
-"""Overlap from which on a homogeneous section may begin."""
+"""Smallest overlap at which a homogeneous section may begin."""
 
 IN_MEMORY: Final = 2_000_000
-"""Bytes of counts up to which a scene is read before it is worked on: to put off so little costs
-more than to do it, and of more the arrays would leave the cache."""
+"""Bytes of counts up to which a scene is loaded at once: below, lazy arrays cost more than they
+save; above, the arrays no longer fit into the processor cache."""
 _GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """What the steps of all channels of a scene work on."""
+    """The data of a scene on which the steps of all its channels work."""
 
     plan: Plan
     archive: xr.Dataset
@@ -77,7 +77,7 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
     Raises
     ------
     LidarOpsError
-        Where the data cannot be what the plan says.
+        If the data do not agree with the plan.
     """
     steps = bench.steps(channel)
     if _is_read(steps):
@@ -94,17 +94,17 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
         lazy[ProductKind.ELASTIC] = source.averages(steps[StepName.AVERAGE].settings["seconds"])
     if StepName.MULTIANGLE in steps:
         lazy[ProductKind.MULTIANGLE] = _beams(source, steps, bench)
-    # Together, so that products of one channel share one reading of the files.
-    found = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
-    if ProductKind.HOMOGENEOUS in found and "visibility" in steps[StepName.HOMOGENEOUS].settings:
-        found[ProductKind.HOMOGENEOUS] = _with_visibility(found[ProductKind.HOMOGENEOUS], steps)
-    if ProductKind.ELASTIC in found:
-        averages = source.joined(found[ProductKind.ELASTIC])
-        found[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
-    if ProductKind.MULTIANGLE in found:
+    # Computed together, so that the products of a channel share one reading of the files.
+    data = dict(zip(lazy, compute(*lazy.values()), strict=True))  # type: ignore[no-untyped-call]
+    if ProductKind.HOMOGENEOUS in data and "visibility" in steps[StepName.HOMOGENEOUS].settings:
+        data[ProductKind.HOMOGENEOUS] = _with_visibility(data[ProductKind.HOMOGENEOUS], steps)
+    if ProductKind.ELASTIC in data:
+        averages = source.glued(data[ProductKind.ELASTIC])
+        data[ProductKind.ELASTIC] = _elastic(averages, steps, bench)
+    if ProductKind.MULTIANGLE in data:
         settings = steps[StepName.MULTIANGLE].settings
-        found[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve_optical_depth(
-            found[ProductKind.MULTIANGLE],
+        data[ProductKind.MULTIANGLE] = labeled_multiangle.retrieve_optical_depth(
+            data[ProductKind.MULTIANGLE],
             station_altitude=bench.station_altitude,
             method=settings["method"],
             largest_gradient=settings["largest_gradient"],
@@ -113,18 +113,18 @@ def process_channel(bench: Bench, channel: str) -> dict[ProductKind, xr.Dataset]
                 for low, high in settings["layers"]
             ],
         )
-    return found
+    return data
 
 
 def load_small(bench: Bench, channels: Sequence[str]) -> Bench:
-    """Return a bench with the counts of channels in memory, where they are few."""
+    """Return a bench with the counts of channels in memory, if they are at most `IN_MEMORY`."""
     counts = bench.archive[[name for name in channels if name in bench.archive]]
     small = counts.nbytes <= IN_MEMORY
     return replace(bench, archive=bench.archive.assign(counts.compute())) if small else bench
 
 
 def _is_read(steps: Mapping[str, Step]) -> bool:
-    """Whether a step looks at the counts of the channel."""
+    """Whether a step uses the counts of the channel."""
     if any(name in steps for name in WHOLE):
         return True
     settings = steps[StepName.HOMOGENEOUS].settings if StepName.HOMOGENEOUS in steps else {}
@@ -132,12 +132,14 @@ def _is_read(steps: Mapping[str, Step]) -> bool:
 
 
 def channel_source(bench: Bench, channel: str) -> FileChannel | GluedChannel:
-    """Return what gives the profiles of a channel."""
-    return GluedChannel(bench, channel) if channel.startswith(GLUED) else FileChannel(bench, channel)
+    """Return the source of the profiles of a channel."""
+    return (
+        GluedChannel(bench, channel) if channel.startswith(GLUED) else FileChannel(bench, channel)
+    )
 
 
 class FileChannel:
-    """A channel of the files."""
+    """A channel that the files hold."""
 
     def __init__(self, bench: Bench, channel: str) -> None:
         self._channel = channel
@@ -162,13 +164,13 @@ class FileChannel:
         return labeled_signal.condition(self._archive, self._channel, **self._settings)
 
     def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
-        """Return range-corrected signals without background of every profile."""
+        """Return background-subtracted, range-corrected signals of every profile."""
         return labeled_signal.range_corrected_signals(
             self._archive, self._channel, background_range=background_range, **self._settings
         )
 
     def averages(self, seconds: float) -> xr.Dataset:
-        """Return means over intervals of the clock, of every part of the channel."""
+        """Return means over clock intervals."""
         conditioned = self.profiles().assign_coords(self.geometry.variables)
         shared = None if self._dark is None else self._dark.variance
         averages = labeled_averaging.clock_average(
@@ -181,13 +183,13 @@ class FileChannel:
         }
         return averages.assign_coords(angles)
 
-    def joined(self, averages: xr.Dataset) -> xr.Dataset:
-        """Return computed averages as one channel."""
+    def glued(self, averages: xr.Dataset) -> xr.Dataset:
+        """Return computed averages as they are: there is nothing to glue."""
         return averages
 
 
 class GluedChannel:
-    """A channel made of an analog and a photon counting one."""
+    """A channel that is glued from an analog and a photon-counting one."""
 
     def __init__(self, bench: Bench, channel: str) -> None:
         steps = bench.steps(channel)
@@ -202,12 +204,12 @@ class GluedChannel:
         return labeled_gluing.glue(self._analog.profiles(), self._photon.profiles(), lag=self._lag)
 
     def signals(self, background_range: tuple[float, float]) -> xr.Dataset:
-        """Return range-corrected signals without background of every profile."""
+        """Return background-subtracted, range-corrected signals of every profile."""
         joined = self.profiles()
         return labeled_signal.correct_for_range(joined, background_range).assign(_gluing(joined))
 
     def averages(self, seconds: float) -> xr.Dataset:
-        """Return means over intervals of the clock, of every part of the channel."""
+        """Return means over clock intervals, of both parts of the channel."""
         parts = {"analog": self._analog, "photon": self._photon}
         named = [
             part.averages(seconds).rename(
@@ -220,8 +222,8 @@ class GluedChannel:
         only = analog[[f"analog_{name}" for name in ("power", "variance", "quality")]]
         return photon.assign({name: (v.dims, v.data, v.attrs) for name, v in only.items()})
 
-    def joined(self, averages: xr.Dataset) -> xr.Dataset:
-        """Return computed averages as one channel."""
+    def glued(self, averages: xr.Dataset) -> xr.Dataset:
+        """Return computed averages of both parts, glued to one channel."""
         parts = [
             averages.rename(
                 {f"{prefix}_{name}": name for name in ("power", "variance", "quality")}
@@ -236,7 +238,7 @@ class GluedChannel:
         parts = self._analog.profiles(), self._photon.profiles()
         if step is not None and step.settings["method"] == "estimate":
             return labeled_gluing.estimate_lag(*parts)
-        # A lag that is given has moved the ranges of the analog part.
+        # A given lag has already shifted the ranges of the analog part.
         return labeled_gluing.range_lag(*parts)
 
 
@@ -263,25 +265,25 @@ def _signal(
 
 
 def _gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return what is told of the joining of profiles, where they are joined."""
+    """Return the variables that describe the gluing; none where profiles are not glued."""
     return {str(name): array for name, array in profiles.items() if str(name).startswith("glue_")}
 
 
 def _homogeneous(bench: Bench, channel: str, source: FileChannel | GluedChannel) -> xr.Dataset:
     steps = bench.steps(channel)
     settings = steps[StepName.HOMOGENEOUS].settings
-    absent = {(near, far): Quality[bit] for near, far, bit in settings.get(OMITTED, ())}
+    omitted = {(near, far): Quality[bit] for near, far, bit in settings.get(OMITTED, ())}
     sections = [(near, far) for near, far in settings["sections"]]
-    kept = [section for section in sections if section not in absent]
+    kept = [section for section in sections if section not in omitted]
     parts = []
     if kept:
         parts.append(_retrieved(source.profiles(), kept, steps, bench.ancillaries))
-    if absent:
+    if omitted:
         unit = labeled_signal.channel_unit(bench.archive, channel)
-        parts.append(_absent(source.shots, unit, absent))
+        parts.append(_empty_sections(source.shots, unit, omitted))
     result = parts[0]
     if len(parts) > 1:
-        order = [[*kept, *absent].index(section) for section in sections]
+        order = [[*kept, *omitted].index(section) for section in sections]
         number = np.arange(len(sections), dtype=np.int32)
         joined: xr.Dataset = xr.concat(parts, dim="section")
         result = joined.isel(section=order).assign_coords(section=("section", number))
@@ -289,12 +291,12 @@ def _homogeneous(bench: Bench, channel: str, source: FileChannel | GluedChannel)
     return result.assign(quality_flag=result["quality_flag"] | slanted)
 
 
-def _absent(
-    shots: xr.DataArray, unit: str, absent: Mapping[tuple[float, float], Quality]
+def _empty_sections(
+    shots: xr.DataArray, unit: str, omitted: Mapping[tuple[float, float], Quality]
 ) -> xr.Dataset:
-    """Return sections without values, for which no bin is read."""
-    empty = labeled.empty_fit(shots, unit=unit, sections=list(absent))
-    bits = np.array([int(bit) for bit in absent.values()], dtype=np.int32)
+    """Return omitted sections, without values but with their quality bits."""
+    empty = labeled.empty_fit(shots, unit=unit, sections=list(omitted))
+    bits = np.array([int(bit) for bit in omitted.values()], dtype=np.int32)
     missing = np.where(shots.to_numpy() > 0, np.int32(0), np.int32(Quality.INPUT_MISSING))
     flags = bits | missing[:, np.newaxis]
     return empty.assign(quality_flag=empty["quality_flag"].copy(data=flags))
@@ -309,7 +311,8 @@ def _retrieved(
     quality = conditioned["quality"]
     overlap = overlap_at(steps, ancillaries, conditioned["range"].to_numpy())
     if overlap is not None:
-        # A signal with its background cannot be divided: where overlap is not full is left out.
+        # The signal still holds its background, so it cannot be divided by the overlap: bins with
+        # partial overlap are excluded.
         partial = np.where(overlap >= FULL_OVERLAP, 0, int(Quality.INCOMPLETE_OVERLAP))
         quality = quality | xr.DataArray(partial.astype(np.int32), dims="range")
     return labeled.fit_homogeneous_path(
@@ -318,30 +321,30 @@ def _retrieved(
         variance=conditioned["variance"],
         quality=quality,
         method=steps[StepName.HOMOGENEOUS].settings["method"],
-        # An estimate scatters, and its scatter must not pass for misfit.
+        # An estimated variance scatters, which must not count as misfit.
         relative_variance=steps[StepName.NOISE].settings["method"] == "differences",
     )
 
 
 def _with_visibility(result: xr.Dataset, steps: Mapping[str, Step]) -> xr.Dataset:
-    """Return sections, computed, with visibility along them."""
+    """Return computed sections with visibility along them."""
     settings = steps[StepName.HOMOGENEOUS].settings
     definition = Definition(
         wavelength=steps[StepName.READ].settings["wavelength"], **settings["visibility"]
     )
-    seen = labeled_visibility.visibility_of_extinction(
+    visibility = labeled_visibility.visibility_of_extinction(
         result["extinction"],
         result["extinction_standard_error"],
         result["extinction_model_error"],
         definition,
     )
-    return result.assign(seen.data_vars).assign_attrs(steps=definition.words)
+    return result.assign(visibility.data_vars).assign_attrs(steps=definition.words)
 
 
 def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
     settings = steps[StepName.ELASTIC].settings
     window = steps[StepName.REFERENCE].settings
-    found = labeled_elastic.invert_elastic(
+    inverted = labeled_elastic.invert_elastic(
         averages,
         molecules=_molecules(steps, bench.ancillaries),
         wavelength=steps[StepName.READ].settings["wavelength"],
@@ -359,11 +362,13 @@ def _elastic(averages: xr.Dataset, steps: Mapping[str, Step], bench: Bench) -> x
         known_shape=StepName.KNOWN_SHAPE in steps,
         overlap=overlap_at(steps, bench.ancillaries, averages["range"].to_numpy()),
     )
-    return found.assign(_gluing(averages))
+    return inverted.assign(_gluing(averages))
 
 
-def _beams(source: FileChannel | GluedChannel, steps: Mapping[str, Step], bench: Bench) -> xr.Dataset:
-    """Return the beams of every scan cycle on common altitudes, lazy."""
+def _beams(
+    source: FileChannel | GluedChannel, steps: Mapping[str, Step], bench: Bench
+) -> xr.Dataset:
+    """Return the beams of every scan cycle on common altitudes, as lazy arrays."""
     settings = steps[StepName.MULTIANGLE].settings
     profiles, geometry = source.profiles(), source.geometry
     near, far = settings["background_range"]
@@ -388,7 +393,7 @@ def _beams(source: FileChannel | GluedChannel, steps: Mapping[str, Step], bench:
 def overlap_at(
     steps: Mapping[str, Step], ancillaries: Ancillaries, distance: Array
 ) -> Array | None:
-    """Return the overlap at ranges where the campaign gives it."""
+    """Return the overlap at ranges in m; None where the campaign gives no profile."""
     source = _setting(steps, StepName.OVERLAP, "overlap_profile")
     return None if source is None else ancillaries.overlaps[source].at(distance)
 

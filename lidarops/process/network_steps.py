@@ -1,4 +1,4 @@
-"""The steps of a network's plan: raw counts of several lidars in, their ``visibility`` out."""
+"""Carry out the steps of a network's plan: from raw counts of several lidars to ``visibility``."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One instrument of a network, and what its steps work on."""
+    """One instrument of a network, with the data on which its steps work."""
 
     instrument: str
     station: Station
     bench: Bench | None
-    """Its plan holds the steps of the instrument alone; None where no granule can be read."""
+    """Holds the steps of this instrument only; None where no granule can be read."""
     range: npt.NDArray[np.float64]
-    """m, of the bins that the plan reckons with."""
+    """m, ranges of the bins according to the plan."""
 
 
 def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.Dataset:
@@ -47,7 +47,7 @@ def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.
     ----------
     members : sequence of Member
     joint : mapping of str to Step
-        The steps that join the members, by name.
+        The steps of the whole network, by name.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.
     Raises
     ------
     LidarOpsError
-        Where the data cannot be what the plan says.
+        If the data do not agree with the plan.
     """
     seconds = joint[StepName.AVERAGE].settings["seconds"]
     settings = joint[StepName.VISIBILITY].settings
@@ -68,7 +68,7 @@ def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.
         _Beam(by_name[beam_plan.instrument], beam_plan, channel, seconds)
         for beam_plan in beam_plans
     ]
-    # Together, so that the beams of one instrument share one reading of its files.
+    # Computed together, so that the beams of an instrument share one reading of its files.
     computed = compute(*(beam.lazy for beam in beams))  # type: ignore[no-untyped-call]
     signals = [beam.signals(data) for beam, data in zip(beams, computed, strict=True)]
     return labeled.retrieve_network(
@@ -78,7 +78,7 @@ def process_network(members: Sequence[Member], joint: Mapping[str, Step]) -> xr.
             block_intervals=round(settings["block_seconds"] / seconds),
             visibility=Definition(
                 wavelength=settings["wavelength"],
-                **{name: settings[name] for name in network_plan.SIGHT},
+                **{name: settings[name] for name in network_plan.VISIBILITY_KEYS},
             ),
             method=settings["method"],
             prior=settings["prior"],
@@ -105,25 +105,25 @@ def _network(
 
 
 class _Beam:
-    """One beam of a member: the profiles of its pointing, averaged."""
+    """One beam of a member: the averaged profiles of its pointing."""
 
     def __init__(self, member: Member, beam_plan: BeamPlan, channel: str, seconds: float) -> None:
         self._member, self._beam_plan, self._channel = member, beam_plan, channel
-        self._source: channel_steps.Plain | channel_steps.Glued | None = None
+        self._source: channel_steps.FileChannel | channel_steps.GluedChannel | None = None
         self._interval: Integers = np.zeros(0, dtype=np.int64)
-        self.lazy = _nothing(member.range)
+        self.lazy = _no_averages(member.range)
         bench = member.bench
-        mine = [] if bench is None else list(_of_pointing(bench.archive, beam_plan))
-        if bench is not None and mine:
-            archive = bench.archive.isel(time=mine)
-            self._source = channel_steps.source_of(replace(bench, archive=archive), channel)
+        profiles = [] if bench is None else list(_profiles_of(bench.archive, beam_plan))
+        if bench is not None and profiles:
+            archive = bench.archive.isel(time=profiles)
+            self._source = channel_steps.channel_source(replace(bench, archive=archive), channel)
             self._interval = _intervals(archive["time"].to_numpy(), seconds)
             self.lazy = self._source.averages(seconds)
 
     def signals(self, computed: xr.Dataset) -> BeamAverages:
-        """Return the averages with what the network needs to know of them."""
+        """Return the averages with the geometry and settings of the beam."""
         member, bench = self._member, self._member.bench
-        averages = computed if self._source is None else self._source.joined(computed)
+        averages = computed if self._source is None else self._source.glued(computed)
         planned = {} if bench is None else bench.steps(self._channel)
         distance = averages["range"].to_numpy().astype(np.float64)
         near, far = (
@@ -147,22 +147,22 @@ class _Beam:
         )
 
 
-def _of_pointing(archive: xr.Dataset, beam_plan: BeamPlan) -> Iterator[int]:
-    """Give the profiles of a beam."""
+def _profiles_of(archive: xr.Dataset, beam_plan: BeamPlan) -> Iterator[int]:
+    """Yield the indices of the profiles of a beam."""
+    planned = (beam_plan.zenith_angle, beam_plan.azimuth)
     pairs = zip(archive["zenith_angle"].to_numpy(), archive["azimuth"].to_numpy(), strict=True)
     for number, (zenith, azimuth) in enumerate(pairs):
-        found = network_plan.apart((zenith, azimuth), (beam_plan.zenith_angle, beam_plan.azimuth))
-        if found <= SAME_POINTING:
+        if network_plan.angle_between((zenith, azimuth), planned) <= SAME_POINTING:
             yield number
 
 
 def _intervals(moments: npt.NDArray[np.datetime64], seconds: float) -> Integers:
-    """Return the numbers of the intervals of the clock that hold profiles, each once."""
+    """Return the numbers of the clock intervals that hold profiles, each once."""
     length = np.timedelta64(round(seconds * 1e9), "ns")
     return np.unique((moments.astype("datetime64[ns]") - _EPOCH) // length).astype(np.int64)
 
 
-def _nothing(distance: npt.NDArray[np.float64]) -> xr.Dataset:
+def _no_averages(distance: npt.NDArray[np.float64]) -> xr.Dataset:
     """Return averages of a beam without profiles."""
     empty = np.zeros((0, distance.size))
     pair = ("time", "range")

@@ -1,6 +1,6 @@
-"""Process one scene: open -> retrieve -> build -> write.
+"""Process one scene: open its files, retrieve, build its products and write them.
 
-A scene is the unit of work: it becomes its product files or a stated failure.
+A scene is the unit of work. It gives its product files, or an outcome that states why not.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from lidarops.netcdf.context import Context, product_path
 from lidarops.plan import network_plan, product_dependence
 from lidarops.plan.availability import glued_channels
 from lidarops.plan.preview import refine_plan
-from lidarops.plan.signal_rules import StepName, read_windows
+from lidarops.plan.signal_rules import NO_PRODUCT, NOT_REQUESTED, StepName, read_windows
 from lidarops.process import channel_steps, network_steps
 from lidarops.products.layouts import build_product
 from lidarops.raw import licel
-from lidarops.raw.archive import counting, open_archive
+from lidarops.raw.archive import count_bytes_read, open_archive
 from lidarops.raw.model import Stretches
 from lidarops.records import (
     ChannelLayout,
@@ -50,9 +50,9 @@ from lidarops.records import (
 )
 from lidarops.system.stores import RemoteStore
 
-# What broken data, a broken disk or a broken library can raise; a bug in lidarops itself that
-# raises anything else must be seen, not entered in a report.
-_FAILURES = (
+# Raised by damaged data, disks or libraries. Anything else is a bug of lidarops, which must not
+# end up as an entry of a report.
+_SCENE_ERRORS = (
     LidarOpsError,
     OSError,
     ValueError,
@@ -75,21 +75,21 @@ class Job:
     plan: Plan
     profiles_per_chunk: int | None = None
     only: str | None = None
-    """The channel whose products are wanted; all where None."""
+    """The channel whose products are made; all channels where None."""
 
     def concerns(self, step: Step) -> bool:
-        """Whether the products of the step's channel are wanted."""
+        """Whether the products of the step's channel are made."""
         return self.only in (None, step.channel)
 
     @property
     def facts(self) -> InstrumentFacts:
-        """What is known of the instrument at the time of the scene."""
+        """Facts about the instrument at the time of the scene."""
         instrument = self.campaign.instruments[self.scene.instrument]
         return instrument.facts_at(self.scene.granules[0].start or self.scene.start)
 
 
 def process_scene(job: Job) -> SceneOutcome:
-    """Process one scene: its products, or why there are none.
+    """Process one scene and return its products, or why there are none.
 
     Parameters
     ----------
@@ -98,31 +98,33 @@ def process_scene(job: Job) -> SceneOutcome:
     Returns
     -------
     SceneOutcome
-        Never raises for bad data or a bad disk; the outcome tells.
+        Also for damaged data or a failing disk, which do not raise: `error` states the cause.
     """
     return attempt(job)[0]
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
-    """Process one scene, and tell whether the same inputs cannot but give the same outcome.
+    """Process one scene, and return whether a retry would give the same outcome.
 
     Returns
     -------
     outcome : SceneOutcome
     final : bool
-        False where a disk, a network or memory failed: another try may do better.
+        False where a disk, a network or memory failed, so that a retry may succeed.
     """
     begin = time.thread_time()
     try:
         with _Archive.of(job.campaign.archive).local(job.scene) as root:
             outcome = _process(job, root)
         return replace(outcome, cpu_seconds=time.thread_time() - begin), True
-    except _FAILURES as error:
+    except _SCENE_ERRORS as error:
         text = str(error) if isinstance(error, LidarOpsError | OSError) else repr(error)
-        return failed(job, text), not isinstance(error, ProductError | OSError | MemoryError)
+        return failed_outcome(job, text), not isinstance(
+            error, ProductError | OSError | MemoryError
+        )
 
 
-def failed(job: Job, error: str) -> SceneOutcome:
+def failed_outcome(job: Job, error: str) -> SceneOutcome:
     """Return the outcome of a scene that gave no product."""
     scene = job.scene
     return SceneOutcome(
@@ -138,21 +140,23 @@ def failed(job: Job, error: str) -> SceneOutcome:
 
 def _process(job: Job, root: Path) -> SceneOutcome:
     clock = _Clock()
-    wanted = [step for step in job.plan.steps if step.name in tuple(ProductKind)]
-    if not wanted:
-        return failed(job, nothing_to_do(job.plan))
+    product_steps = [step for step in job.plan.steps if step.name in tuple(ProductKind)]
+    if not product_steps:
+        return failed_outcome(job, nothing_to_do(job.plan))
     usable, inputs, refused, read = _digest(job, root)
     clock.lap("digest")
-    failure = replace(failed(job, ""), refused=refused, inputs=inputs, bytes_read=read)
+    failure = replace(failed_outcome(job, ""), refused=refused, inputs=inputs, bytes_read=read)
     if not usable.granules:
         return replace(failure, error="no granule of the scene can be read")
-    with dask.config.set(scheduler="synchronous"), counting() as tally:
+    with dask.config.set(scheduler="synchronous"), count_bytes_read() as tally:
         if usable.members:
             inputs, product = _network_product(job, usable, inputs, root, clock)
             products: tuple[ProductRecord, ...] = (product,)
         else:
-            channels = list(dict.fromkeys(step.channel for step in wanted if job.concerns(step)))
-            bench = _bench(job, usable, job.plan, root)
+            channels = list(
+                dict.fromkeys(step.channel for step in product_steps if job.concerns(step))
+            )
+            bench = _open_bench(job, usable, job.plan, root)
             job, bench = _refined(job, usable, bench, root)
             clock.lap("look")
             inputs += bench.ancillaries.inputs
@@ -172,24 +176,27 @@ def _process(job: Job, root: Path) -> SceneOutcome:
 
 
 def nothing_to_do(plan: Plan) -> str:
-    """Say why a plan gives no product: what was asked for first, what nobody asked for not."""
+    """Return why a plan makes no product: omissions of requested steps, those of products first."""
     kinds = tuple(ProductKind)
-    unasked = ("does not ask", "no product of the campaign asks")
-    asked = [left for left in plan.left_out if not any(word in left.reason for word in unasked)]
-    told = sorted(asked or plan.left_out, key=lambda left: left.name not in kinds)
-    reasons = dict.fromkeys(f"{left.name} of {left.channel}: {left.reason}" for left in told)
+    requested = [
+        left
+        for left in plan.left_out
+        if not any(words in left.reason for words in (NOT_REQUESTED, NO_PRODUCT))
+    ]
+    omissions = sorted(requested or plan.left_out, key=lambda left: left.name not in kinds)
+    reasons = dict.fromkeys(f"{left.name} of {left.channel}: {left.reason}" for left in omissions)
     return "nothing to do: " + "; ".join(reasons)
 
 
 def _refined(
     job: Job, scene: Scene, bench: channel_steps.Bench, root: Path
 ) -> tuple[Job, channel_steps.Bench]:
-    """Leave out what a look at some profiles says will give nothing."""
+    """Return job and bench with the plan refined from some profiles of the scene."""
 
     def profiles(channel: str, granules: Sequence[Granule]) -> xr.Dataset:
-        some = _open(job, scene, granules, root, [channel])
-        looked_at = channel_steps.at_hand(replace(bench, archive=some), [channel])
-        return channel_steps.Plain(looked_at, channel).profiles().compute()
+        archive = _open(job, scene, granules, root, [channel])
+        sample = channel_steps.load_small(replace(bench, archive=archive), [channel])
+        return channel_steps.FileChannel(sample, channel).profiles().compute()
 
     plan = refine_plan(job.plan, scene.granules, profiles)
     return replace(job, plan=plan), replace(bench, plan=plan)
@@ -211,10 +218,19 @@ class _Clock:
 def _digest(
     job: Job, root: Path
 ) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...], int]:
-    """Take the digest of every file, and say whether it is still what the catalog says.
+    """Check every file against the catalog, and take its digest.
 
-    A file of the size and modification time of the catalog's has the digest that it noted, where
-    it did, and its header need not be read. Returns the bytes that were read at the end.
+    A file of unchanged size and modification time keeps the digest in the catalog, if there is
+    one, and its header is not read again.
+
+    Returns
+    -------
+    scene : Scene
+        With usable granules only.
+    inputs : tuple of InputRecord
+    refused : tuple of Granule
+    read : int
+        Number of bytes read.
     """
     scene = job.scene
     usable: dict[str, Granule] = {}
@@ -224,10 +240,10 @@ def _digest(
     for granule in (*scene.granules, *scene.dark):
         try:
             same = not job.campaign.all_steps and _is_unchanged(granule, root)
-            known = granule.sha256 if same else None
-            if known is None:
+            sha256 = granule.sha256 if same else None
+            if sha256 is None:
                 read += granule.size
-                known = _read_digest(granule, root)
+                sha256 = _read_digest(granule, root)
         except FileNotFoundError:
             refused.append(replace(granule, status=Status.REFUSED, reason=_VANISHED))
         except (LidarOpsError, OSError) as error:
@@ -235,21 +251,21 @@ def _digest(
             refused.append(replace(granule, status=Status.REFUSED, reason=reason))
         else:
             usable[granule.path] = granule if same else replace(granule, header_digest=None)
-            inputs.append(InputRecord(granule.path, granule.role, known))
+            inputs.append(InputRecord(granule.path, granule.role, sha256))
     return _without(scene, usable), tuple(inputs), tuple(refused), read
 
 
 def _is_unchanged(granule: Granule, root: Path) -> bool:
-    """Tell whether a file is the one whose header was read, by its size and time of change."""
-    about = os.stat(f"{root}/{granule.path}")  # noqa: PTH116 - a Path takes twice as long
-    return (about.st_size, about.st_mtime_ns) == (granule.size, granule.mtime_ns)
+    """Return whether a file has the size and modification time of the catalog."""
+    status = os.stat(f"{root}/{granule.path}")  # noqa: PTH116 - a Path takes twice as long
+    return (status.st_size, status.st_mtime_ns) == (granule.size, granule.mtime_ns)
 
 
 def _read_digest(granule: Granule, root: Path) -> str:
     data = (root / granule.path).read_bytes()
     if len(data) != granule.size:
         raise SceneError(
-            f"holds {len(data)} bytes, the catalog says {granule.size}",
+            f"holds {len(data)} bytes, {granule.size} according to the catalog",
             remedy="run lidarops catalog again",
         )
     licel.parse_header(data, file=granule.path, size=len(data))
@@ -257,7 +273,7 @@ def _read_digest(granule: Granule, root: Path) -> str:
 
 
 def _without(scene: Scene, usable: Mapping[str, Granule]) -> Scene:
-    """Return a scene of its usable granules alone, as they were found."""
+    """Return a scene with its usable granules only."""
     return replace(
         scene,
         granules=tuple(usable[g.path] for g in scene.granules if g.path in usable),
@@ -283,19 +299,19 @@ def _open(
         header_position="ignore",
         stretches=stretches,
     )
-    # What the campaign says of the pointing wins over the headers.
-    facts = product_dependence.facts_of(job.campaign, scene)
-    told = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
+    # Facts of the campaign override the pointing in the headers.
+    facts = product_dependence.scene_facts(job.campaign, scene)
+    fixed = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
     pointing = {
         name: xr.full_like(archive["zenith_angle"], angle)
-        for name, angle in told.items()
+        for name, angle in fixed.items()
         if angle is not None
     }
     return archive.assign_coords(pointing) if pointing else archive
 
 
-def _bench(job: Job, scene: Scene, plan: Plan, root: Path) -> channel_steps.Bench:
-    """Open what the steps of a scene work on: of the raw files only the channels they read."""
+def _open_bench(job: Job, scene: Scene, plan: Plan, root: Path) -> channel_steps.Bench:
+    """Open the data that the steps of a scene work on: only the channels that they read."""
     read = dict.fromkeys(step.channel for step in plan.steps if step.name == StepName.READ)
     present = {channel.name for channel in scene.layout}
     subtracted = [step.channel for step in plan.steps if step.name == StepName.DARK]
@@ -327,8 +343,8 @@ def _channel_products(
     computed = channel_steps.process_channel(bench, name)
     clock.lap("retrieve")
     for kind, data in computed.items():
-        colour = bench.steps(name)[StepName.READ].settings["wavelength"]
-        context = _context(job, scene, kind, layout, colour, inputs)
+        wavelength = bench.steps(name)[StepName.READ].settings["wavelength"]
+        context = _context(job, scene, kind, layout, wavelength, inputs)
         yield _written(job, context, data, clock)
 
 
@@ -342,30 +358,30 @@ def _written(job: Job, context: Context, data: xr.Dataset, clock: _Clock) -> Pro
 def _network_product(
     job: Job, scene: Scene, inputs: tuple[InputRecord, ...], root: Path, clock: _Clock
 ) -> tuple[tuple[InputRecord, ...], ProductRecord]:
-    """Make the product of a network; return its inputs with the ancillary ones, and its record."""
+    """Make the product of a network; return its inputs, with ancillary files, and its record."""
     joint = {step.name: step for step in job.plan.steps if not step.instrument}
-    asked = joint[StepName.VISIBILITY]
+    retrieval = joint[StepName.VISIBILITY]
     members = []
     for planned, usable in zip(job.scene.members, scene.members, strict=True):
-        part = tuple(step for step in job.plan.steps if step.instrument == planned.instrument)
-        if not part:
+        steps = tuple(step for step in job.plan.steps if step.instrument == planned.instrument)
+        if not steps:
             continue
         bench = None
         if usable.granules:
-            bench = _bench(job, usable, Plan(job.plan.scene, part, ()), root)
-            inputs += tuple(used for used in bench.ancillaries.inputs if used not in inputs)
-        grid = network_plan.ranges_of(
-            network_plan.channel_of(planned, asked.channel),
-            product_dependence.facts_of(job.campaign, planned),
+            bench = _open_bench(job, usable, Plan(job.plan.scene, steps, ()), root)
+            inputs += tuple(file for file in bench.ancillaries.inputs if file not in inputs)
+        grid = network_plan.channel_ranges(
+            network_plan.member_channel(planned, retrieval.channel),
+            product_dependence.scene_facts(job.campaign, planned),
         )
         station = job.campaign.stations[planned.station]
         members.append(network_steps.Member(planned.instrument, station, bench, grid))
     data = network_steps.process_network(members, joint)
     clock.lap("retrieve")
     first = next(m for m in job.scene.members if m.instrument == members[0].instrument)
-    layout = network_plan.channel_of(first, asked.channel)
-    colour = asked.settings["wavelength"]
-    context = _context(job, scene, ProductKind.VISIBILITY, layout, colour, inputs)
+    layout = network_plan.member_channel(first, retrieval.channel)
+    wavelength = retrieval.settings["wavelength"]
+    context = _context(job, scene, ProductKind.VISIBILITY, layout, wavelength, inputs)
     return inputs, _written(job, context, data, clock)
 
 
@@ -384,8 +400,8 @@ def _context(
     inputs: tuple[InputRecord, ...],
 ) -> Context:
     campaign = job.campaign
-    # What the product does not depend on must not stand in it.
-    mine = product_dependence.plan_closure(job.plan, [(kind, channel.name)])
+    # A product states only what it depends on.
+    closure = product_dependence.plan_closure(job.plan, [(kind, channel.name)])
     return Context(
         kind=kind,
         channel=channel.name,
@@ -407,10 +423,10 @@ def _context(
             scene=scene.id,
             kind=kind,
             channel=channel.name,
-            inputs=product_dependence.inputs(mine, inputs),
-            plan=mine,
+            inputs=product_dependence.product_inputs(closure, inputs),
+            plan=closure,
             settings={
-                **_of_campaign(job, mine, kind, channel.name),
+                **_campaign_settings(job, closure, kind, channel.name),
                 "metadata": as_settings(campaign.metadata),
                 "keys": {"station": scene.station, "instrument": scene.instrument},
                 "campaign": {"title": campaign.title, "summary": campaign.summary},
@@ -422,17 +438,17 @@ def _context(
     )
 
 
-def _of_campaign(job: Job, plan: Plan, kind: ProductKind, channel: str) -> dict[str, Any]:
-    """Return what a product depends on of the stations and instruments of the campaign."""
+def _campaign_settings(job: Job, plan: Plan, kind: ProductKind, channel: str) -> dict[str, Any]:
+    """Return the settings of stations and instruments on which a product depends."""
     campaign, scene = job.campaign, job.scene
     if not scene.members:
         instrument = campaign.instruments[scene.instrument]
         return {
             "station": as_settings(campaign.stations[scene.station]),
-            "facts": product_dependence.facts(job.facts, plan, channel),
-            # What else `lidarops reproduce` needs to make the same bytes again.
+            "facts": product_dependence.facts_settings(job.facts, plan, channel),
+            # `lidarops reproduce` also needs these to make the same bytes.
             "instrument": instrument.name,
-            "products": product_dependence.asked(
+            "products": product_dependence.single_channel_settings(
                 as_settings(instrument.products).get(kind.value), channel
             ),
         }
@@ -441,12 +457,12 @@ def _of_campaign(job: Job, plan: Plan, kind: ProductKind, channel: str) -> dict[
         "members": {
             member.instrument: {
                 "station": as_settings(campaign.stations[member.station]),
-                "facts": product_dependence.facts(
-                    product_dependence.facts_of(campaign, member), plan, channel
+                "facts": product_dependence.facts_settings(
+                    product_dependence.scene_facts(campaign, member), plan, channel
                 ),
                 "instrument": campaign.instruments[member.instrument].name,
                 "keys": {"station": member.station, "instrument": member.instrument},
-                "files": sorted(used.path for used in (*member.granules, *member.dark)),
+                "files": sorted(file.path for file in (*member.granules, *member.dark)),
             }
             for member in scene.members
         },
@@ -454,7 +470,7 @@ def _of_campaign(job: Job, plan: Plan, kind: ProductKind, channel: str) -> dict[
 
 
 def _station(campaign: Campaign, scene: Scene) -> Station:
-    """Return where a scene was taken: of a network, the middle of its stations."""
+    """Return the station of a scene; for a network, the mean position of its stations."""
     if not scene.members:
         return campaign.stations[scene.station]
     places = [campaign.stations[member.station] for member in scene.members]
@@ -480,7 +496,7 @@ def _record(
     kind: ProductKind, channel: str, path: str, written: write.Written, data: xr.Dataset
 ) -> ProductRecord:
     flags = data["quality_flag"].to_numpy()
-    # Few bits occur in a product: the others need no look at every value.
+    # Few bits occur in a product: count only these.
     occurring = Quality(int(np.bitwise_or.reduce(flags, axis=None)))
     return ProductRecord(
         path=path,
@@ -496,7 +512,7 @@ def _record(
 
 
 class _Archive:
-    """The raw files of a scene, on a local disk."""
+    """An archive of raw files on a local disk."""
 
     def __init__(self, root: str) -> None:
         self._root = root
@@ -507,12 +523,12 @@ class _Archive:
 
     @contextmanager
     def local(self, scene: Scene) -> Iterator[Path]:  # noqa: ARG002 - the remote one needs it
-        """Give the folder under which the scene's granules can be opened."""
+        """Yield the folder under which the scene's granules can be opened."""
         yield Path(self._root)
 
 
 class _RemoteArchive(_Archive):
-    """Raw files behind an fsspec URL: fetched for the time of the scene."""
+    """An archive behind an fsspec URL: files are fetched for the time of the scene."""
 
     @contextmanager
     def local(self, scene: Scene) -> Iterator[Path]:

@@ -1,1 +1,1 @@
-"""NetCDF products: what they hold, how they are built, written and traced."""
+"""Kinds of product, one folder each: the table of their NetCDF variables and texts."""

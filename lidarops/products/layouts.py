@@ -1,4 +1,4 @@
-"""The layout of every kind of product, and products built by it."""
+"""The layout of every kind of product, and the dataset that is built with it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _OWN = {
 }
 
 LAYOUTS: Final[Mapping[ProductKind, Layout]] = {
-    # The step that makes a product is named after its kind, and makes nothing of another.
+    # The step that makes a product has the name of its kind and serves no other kind.
     kind: replace(layout, unused_steps=layout.unused_steps | (set(ProductKind) - {kind}))
     for kind, layout in _OWN.items()
 }
-"""What each kind of product holds."""
+"""Layout of each kind of product."""
 
 
 def build_product(data: xr.Dataset, context: Context) -> xr.Dataset:
@@ -40,9 +40,9 @@ def build_product(data: xr.Dataset, context: Context) -> xr.Dataset:
     Parameters
     ----------
     data : xr.Dataset
-        In memory: every variable of the kind; see `lidarops.netcdf.build.build_dataset`.
+        Every variable of the kind, in memory; see `lidarops.netcdf.build.build_dataset`.
     context : Context
-        What the product is of.
+        Kind, channel, station, instrument, campaign, scene and provenance of the product.
 
     Returns
     -------

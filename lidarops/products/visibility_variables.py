@@ -1,24 +1,24 @@
-"""The rows of visibility, which products of homogeneous paths and of networks share."""
+"""The variables of visibility, which the products ``homogeneous`` and ``visibility`` share."""
 
 from __future__ import annotations
 
-from lidarops.netcdf.variables import NO_NAME, Coverage, Row
+from lidarops.netcdf.variables import NO_STANDARD_NAME, Coverage, Row
 
 
 def visibility(
-    dims: tuple[str, ...], *, called: str, ancillaries: tuple[str, ...], optional: bool
+    dims: tuple[str, ...], *, place: str, ancillaries: tuple[str, ...], optional: bool
 ) -> tuple[Row, ...]:
-    """Return the rows of visibility and of its interval.
+    """Return the rows of visibility and of the limits of its uncertainty interval.
 
     Parameters
     ----------
     dims : tuple of str
-    called : str
-        What it is of, in words.
+    place : str
+        Where the visibility applies, as the end of a phrase.
     ancillaries : tuple of str
-        Of the extinction that it is made of.
+        Ancillary variables of the extinction from which visibility follows.
     optional : bool
-        Whether a product may lack it.
+        Whether a product may lack the variables.
     """
     limits = ("visibility_in_air_lower", "visibility_in_air_upper")
     return (
@@ -28,15 +28,15 @@ def visibility(
             dtype="f4",
             units="m",
             standard_name="visibility_in_air",
-            long_name=f"visibility {called}",
+            long_name=f"visibility {place}",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
             ancillaries=(*limits, *ancillaries),
             uncertain=True,
             optional=optional,
-            comment="-ln(contrast) / extinction of the interval, which is no mean of visibilities."
-            " lidarops_steps tells the contrast, and how extinction was brought to 550 nm where it"
-            " was. Missing where extinction is not positive.",
+            comment="-ln(contrast) / extinction of the averaging interval, not a mean of"
+            " visibilities. lidarops_steps states the contrast and, where applied, the conversion"
+            " of extinction to 550 nm. Missing where extinction is not positive.",
         ),
         *(
             Row(
@@ -44,12 +44,13 @@ def visibility(
                 dims=dims,
                 dtype="f4",
                 units="m",
-                long_name=f"{end} end of the interval of visibility {called}",
+                long_name=f"{end} limit of the uncertainty interval of visibility {place}",
                 coverage=Coverage.QUALITY,
                 valid_min=0.0,
                 optional=optional,
-                comment=f"Of extinction {sign} its random and systematic error, as the root of the"
-                f" sum of squares; the interval is not symmetric. {NO_NAME}",
+                comment=f"Visibility for extinction {sign} its combined random and systematic error"
+                " (root of the sum of squares); the interval is not symmetric."
+                f" {NO_STANDARD_NAME}",
             )
             for end, sign in (("lower", "plus"), ("upper", "minus"))
         ),

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from lidarops.netcdf._deflate import deflated, inflated, planes
+from lidarops.netcdf._deflate import deflate_chunks, inflate_chunk, _planes
 
 DTYPES = ["i1", "u1", "i2", "i4", "i8", "f4", "f8"]
 
@@ -27,7 +27,7 @@ def assembled(values: np.ndarray, chunk: tuple[int, ...], fill_value) -> np.ndar
     grid = [-(-size // step) * step for size, step in zip(values.shape, chunk, strict=True)]
     whole = np.zeros(grid, values.dtype)
     seen = set()
-    for offset, data in deflated(values, chunk, fill_value):
+    for offset, data in deflate_chunks(values, chunk, fill_value):
         assert offset not in seen
         seen.add(offset)
         place = tuple(slice(at, at + step) for at, step in zip(offset, chunk, strict=True))
@@ -61,8 +61,8 @@ def test_chunks_hold_the_array_and_beyond_its_edge_the_fill_value(cut):
 @given(cut=cut_arrays())
 def test_inflated_is_what_was_deflated(cut):
     values, chunk = cut
-    for offset, data in deflated(values, chunk, values.dtype.type(77)):
-        whole = inflated(data, chunk, values.dtype)
+    for offset, data in deflate_chunks(values, chunk, values.dtype.type(77)):
+        whole = inflate_chunk(data, chunk, values.dtype)
         assert whole.tobytes() == unshuffled(data, values.dtype, chunk).tobytes()
         assert whole[(0,) * whole.ndim].tobytes() == values[offset].tobytes()
 
@@ -70,7 +70,7 @@ def test_inflated_is_what_was_deflated(cut):
 @pytest.mark.parametrize("damage", ["cut", "flipped", "longer", "shorter", "empty"])
 def test_damaged_chunks_are_refused(damage):
     values = np.random.default_rng(2).normal(size=1000)
-    ((_, data),) = deflated(values, (1000,), 0.0)
+    ((_, data),) = deflate_chunks(values, (1000,), 0.0)
     damaged = {
         "cut": data[:-6],
         "flipped": data[:3000] + bytes([data[3000] ^ 0xFF]) + data[3001:],
@@ -79,7 +79,7 @@ def test_damaged_chunks_are_refused(damage):
         "empty": b"",
     }
     with pytest.raises(ValueError, match="a chunk"):
-        inflated(damaged[damage], (1000,), values.dtype)
+        inflate_chunk(damaged[damage], (1000,), values.dtype)
 
 
 def test_text_is_cut_as_numbers_are():
@@ -95,31 +95,31 @@ def test_layout_in_memory_does_not_matter(dtype: str):
     read_only.setflags(write=False)
     strided = np.zeros((24, 100), dtype)[::2, ::2]
     strided[:] = values
-    expected = list(deflated(values, (5, 50), 0))
+    expected = list(deflate_chunks(values, (5, 50), 0))
     for other in (read_only, strided, np.asfortranarray(values), values[::-1][::-1]):
-        assert list(deflated(other, (5, 50), 0)) == expected
+        assert list(deflate_chunks(other, (5, 50), 0)) == expected
 
 
 def test_planes_are_the_bytes_of_the_elements_in_order():
     values = np.array([[1.0, -2.5], [3e-300, np.pi]])
     expected = np.frombuffer(values.tobytes(), np.uint8).reshape(4, 8).T
-    np.testing.assert_array_equal(list(planes(values)), expected)
+    np.testing.assert_array_equal(list(_planes(values)), expected)
 
 
 def test_the_last_chunk_is_cut_at_every_edge():
     values = np.arange(7 * 5, dtype="i4").reshape(7, 5)
-    offsets = [offset for offset, _ in deflated(values, (3, 2), -1)]
+    offsets = [offset for offset, _ in deflate_chunks(values, (3, 2), -1)]
     assert offsets == list(itertools.product((0, 3, 6), (0, 2, 4)))
 
 
 def test_bytes_do_not_depend_on_what_was_compressed_before():
     rng = np.random.default_rng(3)
     values = rng.normal(size=(64, 1024)).astype("f4")
-    expected = list(deflated(values, (64, 1024), 0))
+    expected = list(deflate_chunks(values, (64, 1024), 0))
     for _ in range(20):
         other = rng.integers(0, 9, (64, int(rng.integers(100, 4000))), "i4")
-        list(deflated(other, other.shape, 0))
-        assert list(deflated(values, (64, 1024), 0)) == expected
+        list(deflate_chunks(other, other.shape, 0))
+        assert list(deflate_chunks(values, (64, 1024), 0)) == expected
 
 
 @pytest.mark.parametrize("bits", [8, 12, 23])
@@ -127,12 +127,12 @@ def test_noise_that_was_rounded_is_as_small_as_zlib_makes_it(bits: int):
     values = np.random.default_rng(4).normal(1e6, 1e4, (64, 4096)).astype("f4")
     step = np.uint32(1 << (23 - bits))
     rounded = (values.view("u4") // step * step).view("f4")
-    size = sum(len(data) for _, data in deflated(rounded, rounded.shape, 0))
+    size = sum(len(data) for _, data in deflate_chunks(rounded, rounded.shape, 0))
     shuffled = rounded.reshape(-1).view(np.uint8).reshape(-1, 4).T.tobytes()
     assert size <= 1.03 * len(zlib.compress(shuffled, 4))
 
 
 def test_a_constant_takes_next_to_nothing():
     values = np.full((128, 4096), 9.96921e36, "f4")
-    size = sum(len(data) for _, data in deflated(values, (64, 4096), 0))
+    size = sum(len(data) for _, data in deflate_chunks(values, (64, 4096), 0))
     assert size < values.nbytes / 500

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.made_products import MAKERS, STATION, context
 
 from lidarops.campaign.model import Station
-from lidarops.netcdf.sounded_air import sounded
+from lidarops.netcdf.sounded_air import beam_positions
 from lidarops.products.layouts import build_product
 from lidarops.records import ProductKind
 
@@ -38,7 +38,7 @@ def cartesian(latitude: float, longitude: float, altitude: float) -> np.ndarray:
     up=st.floats(-1e3, 60e3),
 )
 def test_places_lie_on_the_straight_beam(latitude, longitude, altitude, ahead, azimuth, up):
-    found = sounded(latitude, longitude, altitude, *map(np.float64, (ahead, azimuth, up)))
+    found = beam_positions(latitude, longitude, altitude, *map(np.float64, (ahead, azimuth, up)))
     lat, lon, direction = np.deg2rad([latitude, longitude, azimuth])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     north = np.array([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
@@ -58,7 +58,7 @@ def test_places_lie_on_the_straight_beam(latitude, longitude, altitude, ahead, a
 
 def test_north_and_east_are_what_they_are():
     east = np.array([0.0, 90.0])
-    latitude, longitude = sounded(0.0, 179.99, 0.0, np.float64(10e3), east, np.float64(0))
+    latitude, longitude = beam_positions(0.0, 179.99, 0.0, np.float64(10e3), east, np.float64(0))
     assert latitude[0] > 0.09
     assert longitude[0] == pytest.approx(179.99)
     assert longitude[1] == pytest.approx(-179.92, abs=0.001)

@@ -1,4 +1,4 @@
-"""A name that no file has is told from a channel that came or went with the lidar."""
+"""Channels that files lack: typing errors, and channels that came or went with the lidar."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from support import factories
 
 from lidarops.catalog.rows import row_of
 from lidarops.catalog.store import Store
-from lidarops.plan.availability import edges, lacks_any, names_any, unavailable
+from lidarops.plan.availability import (
+    lacks_channels,
+    names_channels,
+    unavailable_channels,
+    validity_edges,
+)
 from lidarops.records import Granule, ProductKind, Role, Unmet
 
 DAY = 1440
@@ -27,14 +32,16 @@ def _found(
     *granules: Granule,
     products: dict[str, Any] | None = None,
     folder: Path,
-    **asked: Any,
+    **selection: Any,
 ) -> list[Unmet]:
     campaign = factories.campaign(facts=facts, products=products or {"signal": {}})
     with Store(f"sqlite:///{folder}/catalog.sqlite", campaign.name) as store:
         store.replace([row_of(granule, campaign.name, "key") for granule in granules])
-        found = list(unavailable(campaign, store.holdings(edges(campaign)), **asked))
-        # The quick look finds whatever the long one finds.
-        assert lacks_any(campaign, store.layouts()) or not found
+        found = list(
+            unavailable_channels(campaign, store.holdings(validity_edges(campaign)), **selection)
+        )
+        # The quick check covers whatever the full one finds.
+        assert lacks_channels(campaign, store.layouts()) or not found
         return found
 
 
@@ -47,24 +54,26 @@ def _told(*channels: str) -> dict[str, Any]:
     return {"channels": {name: {"dead_time": 4e-9} for name in channels}}
 
 
-def test_a_name_that_no_file_has_is_told_with_its_number(tmp_path: Path) -> None:
-    wanted = {"homogeneous": {"channels": ["photon_999o"], "sections": [[750, 900]]}}
+def test_a_name_that_no_file_has_is_reported_with_counts(tmp_path: Path) -> None:
+    products = {"homogeneous": {"channels": ["photon_999o"], "sections": [[750, 900]]}}
     files = [_file(0, OLD), _file(1, OLD), _file(1, NEW, role=Role.DARK)]
     facts = [_told("photon_533o", "photon_532o")]
-    found = {each.channel: each for each in _found(facts, *files, products=wanted, folder=tmp_path)}
+    found = {
+        each.channel: each for each in _found(facts, *files, products=products, folder=tmp_path)
+    }
     assert found.keys() == {"photon_999o", "photon_533o"}
-    assert found["photon_999o"].asked == "homogeneous"
-    assert found["photon_533o"].asked == "facts"
+    assert found["photon_999o"].requested_by == "homogeneous"
+    assert found["photon_533o"].requested_by == "facts"
     for each in found.values():
         assert (each.nowhere, each.files, each.of) == (True, 2, 2)
         assert "photon_532o" in each.reason
 
 
-def test_a_channel_that_came_with_a_new_detector_is_no_slip(tmp_path: Path) -> None:
-    wanted = {"signal": {"channels": ["photon_607o", "photon_607o"]}}
+def test_a_channel_of_a_new_detector_is_not_a_typing_error(tmp_path: Path) -> None:
+    products = {"signal": {"channels": ["photon_607o", "photon_607o"]}}
     files = [_file(0, OLD), _file(1, OLD), _file(2, OLD, NEW)]
-    found = _found([_told("photon_607o")], *files, products=wanted, folder=tmp_path)
-    assert {(each.asked, each.nowhere, each.files, each.of) for each in found} == {
+    found = _found([_told("photon_607o")], *files, products=products, folder=tmp_path)
+    assert {(each.requested_by, each.nowhere, each.files, each.of) for each in found} == {
         ("signal", False, 2, 3),
         ("facts", False, 2, 3),
     }
@@ -77,8 +86,8 @@ def test_facts_are_compared_with_the_files_of_their_period(tmp_path: Path) -> No
     assert _found(right, *files, folder=tmp_path) == []
     wrong = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_532o")}]
     (each,) = _found(wrong, *files, folder=tmp_path)
-    assert (each.asked, each.files, each.of) == ("facts from 2026-03-02T00:00:00Z", 2, 2)
-    # It is told, and no trouble for ever: facts of two periods may share what they say.
+    assert (each.requested_by, each.files, each.of) == ("facts from 2026-03-02T00:00:00Z", 2, 2)
+    # Reported, but no failure: facts of two periods may name the same channels.
     assert each.held == 1
     assert not each.nowhere
     slip = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_606o")}]
@@ -86,13 +95,13 @@ def test_facts_are_compared_with_the_files_of_their_period(tmp_path: Path) -> No
     assert each.nowhere
 
 
-def test_facts_of_a_time_without_files_are_no_slip(tmp_path: Path) -> None:
+def test_facts_of_a_time_without_files_are_not_reported(tmp_path: Path) -> None:
     facts = [{**BEFORE, **_told("photon_532o")}, {**AFTER, **_told("photon_533o")}]
     assert _found(facts, _file(0, OLD), folder=tmp_path) == []
 
 
 @pytest.mark.parametrize(
-    ("asked", "channels"),
+    ("selection", "channels"),
     [
         ({}, {"photon_533o", "photon_999o"}),
         ({"since": datetime(2026, 3, 2, tzinfo=UTC)}, {"photon_999o"}),
@@ -102,23 +111,25 @@ def test_facts_of_a_time_without_files_are_no_slip(tmp_path: Path) -> None:
         ({"instruments": {"another"}}, set()),
     ],
 )
-def test_only_what_is_asked_for(asked: dict[str, Any], channels: set[str], tmp_path: Path) -> None:
-    wanted = {"signal": {"channels": ["photon_999o"]}}
+def test_the_selection_restricts_the_result(
+    selection: dict[str, Any], channels: set[str], tmp_path: Path
+) -> None:
+    products = {"signal": {"channels": ["photon_999o"]}}
     facts = [{**BEFORE, **_told("photon_533o")}, {**AFTER, **_told("photon_532o")}]
     files = [_file(0, OLD), _file(1, OLD)]
-    found = _found(facts, *files, products=wanted, folder=tmp_path, **asked)
+    found = _found(facts, *files, products=products, folder=tmp_path, **selection)
     assert {each.channel for each in found} == channels
 
 
-def test_a_campaign_that_names_no_channel_needs_no_look() -> None:
-    assert not names_any(factories.campaign(facts=[{}], products={"signal": {}}))
-    assert names_any(factories.campaign(facts=[_told("photon_532o")], products={"signal": {}}))
-    assert names_any(factories.campaign(facts=[{}], products={"signal": {"channels": ["a"]}}))
+def test_a_campaign_that_names_no_channel_needs_no_check() -> None:
+    assert not names_channels(factories.campaign(facts=[{}], products={"signal": {}}))
+    assert names_channels(factories.campaign(facts=[_told("photon_532o")], products={"signal": {}}))
+    assert names_channels(factories.campaign(facts=[{}], products={"signal": {"channels": ["a"]}}))
 
 
 def test_files_that_hold_all_need_no_count() -> None:
-    """As in most archives: a count over a million files takes seconds."""
+    """As in most archives; counting a million files takes seconds."""
     campaign = factories.campaign(facts=[_told("photon_532o")], products={"signal": {}})
-    assert not lacks_any(campaign, [("lidar", (OLD,)), ("lidar", (OLD, NEW))])
-    assert not lacks_any(campaign, [("another", (NEW,))])
-    assert lacks_any(campaign, [("lidar", (OLD, NEW)), ("lidar", (NEW,))])
+    assert not lacks_channels(campaign, [("lidar", (OLD,)), ("lidar", (OLD, NEW))])
+    assert not lacks_channels(campaign, [("another", (NEW,))])
+    assert lacks_channels(campaign, [("lidar", (OLD, NEW)), ("lidar", (NEW,))])

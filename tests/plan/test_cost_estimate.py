@@ -46,11 +46,11 @@ def of(**changes: Any) -> dict[Term, float]:
 
 def test_amounts_of_sections():
     found = of(count=10)
-    (bin,) = (s for s in planned()[1].steps if s.name == "range_window")
+    (window,) = (s for s in planned()[1].steps if s.name == "range_window")
     assert found[Term.FILE] == 10
     assert found[Term.DIGEST] == 10 * 1000
     assert found[Term.CHANNEL] == found[Term.HOMOGENEOUS] == found[Term.LOOK] == 1
-    assert found[Term.VALUE] == 10 * bin.number
+    assert found[Term.VALUE] == 10 * window.number
     assert found[Term.HOMOGENEOUS_VALUE] == 10 * (4500 - 750) / 7.5
     assert Term.SIGNAL not in found
 
@@ -151,14 +151,14 @@ def test_without_a_calibration_the_note_says_so(cache: Path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"processor": "abacus"}, "another machine, abacus"),
-        ({"format": "letter"}, "no calibration"),
+        ({"processor": "abacus"}, "another processor, abacus"),
+        ({"format": "letter"}, "not a calibration"),
         ({"seconds": {}}, "run"),
-        ({"seconds": dict.fromkeys(Term, -1.0)}, "no time"),
+        ({"seconds": dict.fromkeys(Term, -1.0)}, "not a finite, non-negative time"),
         ({"seconds": dict.fromkeys(Term, "soon")}, "soon"),
     ],
 )
-def test_a_strange_calibration_is_not_used_and_told(cache: Path, change: Any, said: str):
+def test_an_invalid_calibration_is_reported_and_not_used(cache: Path, change: Any, said: str):
     cost_estimate.save_calibration(
         Costs(DEFAULTS, processor=cost_estimate.processor(), date="2026-01-02")
     )

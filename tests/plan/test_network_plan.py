@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from support.factories import ANALOG, DAY, PHOTON, granule
 
 from lidarops.campaign.model import Campaign
-from lidarops.plan.network_plan import apart
+from lidarops.plan.network_plan import angle_between
 from lidarops.plan.rule_table import RULES
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
@@ -75,13 +75,13 @@ def granules(minutes: float = 0.0, **changes: Any) -> list[Granule]:
     ]
 
 
-def networks(told: Campaign, given_: list[Granule]) -> list[Scene]:
-    return [scene for scene in cut_scenes(told, given_).scenes if scene.members]
+def networks(settings: Campaign, files: list[Granule]) -> list[Scene]:
+    return [scene for scene in cut_scenes(settings, files).scenes if scene.members]
 
 
-def planned(told: Campaign, given_: list[Granule] | None = None) -> Plan:
-    (scene,) = networks(told, granules() if given_ is None else given_)
-    return plan_scene(scene, told)
+def planned(settings: Campaign, files: list[Granule] | None = None) -> Plan:
+    (scene,) = networks(settings, granules() if files is None else files)
+    return plan_scene(scene, settings)
 
 
 def reasons(found: Plan) -> str:
@@ -116,7 +116,7 @@ class TestCampaign:
             ({"method": "magic"}, "method"),
         ],
     )
-    def test_what_cannot_be_is_refused(self, visibility, said):
+    def test_invalid_settings_are_refused(self, visibility, said):
         with pytest.raises(ValidationError, match=said):
             campaign(visibility)
 
@@ -129,14 +129,14 @@ class TestCampaign:
         ],
     )
     def test_members_are_instruments(self, network, said):
-        told = {"valley": network | {"visibility": {"channel": "photon_532o"}}}
+        settings = {"valley": network | {"visibility": {"channel": "photon_532o"}}}
         with pytest.raises(ValidationError, match=said):
-            campaign(networks=told)
+            campaign(networks=settings)
 
-    def test_a_network_has_a_key_of_its_own(self):
-        told = {"west": {"instruments": MEMBERS, "visibility": {"channel": "photon_532o"}}}
+    def test_the_key_of_a_network_is_unique(self):
+        settings = {"west": {"instruments": MEMBERS, "visibility": {"channel": "photon_532o"}}}
         with pytest.raises(ValidationError, match="key of an instrument or station"):
-            campaign(networks=told)
+            campaign(networks=settings)
 
     @pytest.mark.parametrize(("contrast", "value"), [(0.02, 0.02), ("paper", 0.049787)])
     def test_contrasts(self, contrast, value):
@@ -146,8 +146,8 @@ class TestCampaign:
 
 class TestScenes:
     def test_members_keep_scenes_of_their_own(self):
-        told = campaign()
-        found = cut_scenes(told, granules()).scenes
+        settings = campaign()
+        found = cut_scenes(settings, granules()).scenes
         assert [scene.instrument for scene in found] == [*sorted(MEMBERS), "valley"]
         scene = found[-1]
         assert scene.id == "valley_20260301T000000"
@@ -161,11 +161,13 @@ class TestScenes:
             {"full_overlap_range": 150.0, "valid_to": noon},
             {"full_overlap_range": 300.0, "valid_from": noon},
         ]
-        told = campaign(facts={"east-lidar": changed})
-        first, second = networks(told, [*granules(10), *granules(721)])
+        settings = campaign(facts={"east-lidar": changed})
+        first, second = networks(settings, [*granules(10), *granules(721)])
         assert first.stop == noon == second.start
         assert [len(member.granules) for member in first.members] == [1, 1, 1]
-        near = [beam["nearest"] for beam in plan_scene(second, told).steps[-1].settings["beams"]]
+        near = [
+            beam["nearest"] for beam in plan_scene(second, settings).steps[-1].settings["beams"]
+        ]
         assert near == [150.0, 300.0, 150.0]
 
     def test_one_lidar_alone_is_no_network(self):
@@ -184,8 +186,10 @@ class TestScenes:
 
     @given(st.permutations(granules() + granules(10) + granules(20)))
     def test_the_order_of_files_does_not_matter(self, shuffled):
-        told = campaign()
-        assert networks(told, shuffled) == networks(told, granules() + granules(10) + granules(20))
+        settings = campaign()
+        assert networks(settings, shuffled) == networks(
+            settings, granules() + granules(10) + granules(20)
+        )
 
     def test_without_a_network_nothing_changes(self):
         with_one = [s for s in cut_scenes(campaign(), granules()).scenes if not s.members]
@@ -198,7 +202,7 @@ class TestPlans:
         step = found.steps[-1]
         assert step.name == "visibility"
         assert [beam["azimuth"] for beam in step.settings["beams"]] == [70.0, 310.0, 190.0]
-        assert "3 beams of 3 instruments meet in 3 points, 3 of which are near ones" in step.reason
+        assert "3 beams of 3 instruments have 3 crossings, 3 of them near ones" in step.reason
         per_member = [s for s in found.steps if s.instrument]
         assert {s.instrument for s in per_member} == set(MEMBERS)
         assert all(s.reason.startswith(f"{s.instrument}: ") for s in per_member)
@@ -208,15 +212,17 @@ class TestPlans:
         assert joint == ["average", "prior", "visibility"]
 
     def test_members_are_not_read_for_themselves(self):
-        told = campaign()
-        alone = next(s for s in cut_scenes(told, granules()).scenes if s.instrument == "west-lidar")
-        found = plan_scene(alone, told)
+        settings = campaign()
+        alone = next(
+            s for s in cut_scenes(settings, granules()).scenes if s.instrument == "west-lidar"
+        )
+        found = plan_scene(alone, settings)
         assert found.steps == ()
         left_out = {left.channel: left.reason for left in found.left_out}
-        assert left_out["photon_532o"] == "used by network valley alone"
-        assert left_out["analog_532o"] == "no product of the campaign asks for this channel"
-        joined = plan_scene(alone, campaign({"channel": "glued_532o"}))
-        assert {left.reason for left in joined.left_out} == {"used by network valley alone"}
+        assert left_out["photon_532o"] == "used only by network valley"
+        assert left_out["analog_532o"] == "no product of the campaign uses this channel"
+        glued = plan_scene(alone, campaign({"channel": "glued_532o"}))
+        assert {left.reason for left in glued.left_out} == {"used only by network valley"}
 
     def test_it_is_plain_data(self):
         found = planned(campaign({"exponents": {"east-lidar": 1.2}}))
@@ -229,40 +235,40 @@ class TestPlans:
         [
             ({"west-lidar": [{}]}, {}, "west-lidar: the campaign gives neither full_overlap_range"),
             ({}, {"layout": (ANALOG,)}, "the files hold no photon_532o, only analog_532o"),
-            ({}, {"zenith_angle": None}, "neither headers nor campaign tell where"),
+            ({}, {"zenith_angle": None}, "neither headers nor campaign give the pointing"),
             (
                 {},
                 {"layout": (replace(PHOTON, wavelength=float("nan")),)},
-                "wavelength is implausible",
+                "wavelength in the header is implausible",
             ),
         ],
     )
-    def test_what_a_member_lacks_is_told(self, facts, changes, said):
+    def test_the_reason_names_what_a_member_lacks(self, facts, changes, said):
         found = planned(campaign(facts=facts), granules(**changes))
         assert found.steps == ()
         assert said in reasons(found)
 
-    def test_beams_that_do_not_meet_are_told(self):
+    def test_the_reason_names_beams_without_crossings(self):
         found = planned(campaign(), granules(zenith_angle=0.0))
         assert found.steps == ()
-        assert "no beam meets others in two points" in reasons(found)
-        assert "fewer than two points that others see" in reasons(found)
+        assert "no beam has two crossings with other beams" in reasons(found)
+        assert "fewer than two crossings with other beams" in reasons(found)
 
-    def test_a_missing_member_is_told(self):
+    def test_the_reason_names_a_missing_member(self):
         found = planned(campaign(), granules()[:2])
         assert "north-lidar: no granule in the window" in reasons(found)
 
-    def test_colours_must_be_one(self):
+    def test_members_must_have_one_wavelength(self):
         other = (replace(PHOTON, wavelength=1064e-9),)
         red = [*granules()[:2], replace(granules()[2], layout=other)]
         assert "different wavelengths: 532, 1064 nm" in reasons(planned(campaign(), red))
 
-    def test_a_cycle_is_asked_of_one_cycle(self):
+    def test_the_method_cycle_takes_one_cycle(self):
         found = planned(campaign({"method": "cycle"}))
         assert found.steps[-1].settings["method"] == "cycle"
 
     @pytest.mark.parametrize(
-        ("rule", "told", "given_", "number"),
+        ("rule", "settings", "files", "number"),
         [
             ("member_present", {}, granules()[:2], 0.0),
             ("member", {"facts": {"west-lidar": [{}]}}, None, 0.0),
@@ -275,8 +281,8 @@ class TestPlans:
             ("prior", {"visibility": {"method": "klett"}}, None, None),
         ],
     )
-    def test_rules_of_what_cannot_be(self, rule, told, given_, number):
-        found = planned(campaign(**told), given_)
+    def test_rules_that_leave_out(self, rule, settings, files, number):
+        found = planned(campaign(**settings), files)
         left = [each for each in found.left_out if each.rule == rule]
         assert left
         assert all(each.number == pytest.approx(number) for each in left)
@@ -293,21 +299,21 @@ class TestPlans:
             ("visibility", 3.0),
         ],
     )
-    def test_rules_of_what_runs(self, rule, number):
+    def test_rules_that_run_steps(self, rule, number):
         found = planned(campaign())
         steps = [each for each in found.steps if each.rule == rule]
         assert steps
         assert all(each.number == pytest.approx(number) for each in steps)
-        apart_ = planned(campaign(), granules(zenith_angle=0.0))
-        assert not [each for each in apart_.steps if each.rule == rule]
+        without_crossings = planned(campaign(), granules(zenith_angle=0.0))
+        assert not [each for each in without_crossings.steps if each.rule == rule]
 
-    def test_the_bin_holds_beams_and_what_tells_their_background(self):
+    def test_the_range_window_holds_the_bins_of_crossings_and_background(self):
         found = planned(campaign())
-        bins = [step for step in found.steps if step.rule == "member_window"]
-        assert len(bins) == len(MEMBERS)
-        for bin in bins:
-            kept = bin.settings["bins"]
-            assert bin.number == sum(past - first for first, past in kept)
+        windows = [step for step in found.steps if step.rule == "member_window"]
+        assert len(windows) == len(MEMBERS)
+        for window in windows:
+            kept = window.settings["bins"]
+            assert window.number == sum(past - first for first, past in kept)
             assert kept[0][0] == 0
             assert kept[-1][1] == PHOTON.bins
             # The points are 4 km away; the tail begins at 13.5 km.
@@ -318,16 +324,16 @@ class TestPlans:
             assert 0.0 < before[1] * PHOTON.bin_width - 0.7 * 13_500 < 50.0
 
     @pytest.mark.parametrize(
-        ("told", "layout", "said"),
+        ("settings", "layout", "said"),
         [
-            ({"all_steps": True}, PHOTON, "all steps"),
-            ({"visibility": {"channel": "analog_532o"}}, ANALOG, "noise of analog records"),
-            ({}, replace(PHOTON, bins=650), "reach over all bins"),
+            ({"all_steps": True}, PHOTON, "all_steps is set"),
+            ({"visibility": {"channel": "analog_532o"}}, ANALOG, "noise of an analog record"),
+            ({}, replace(PHOTON, bins=650), "need all bins"),
         ],
     )
-    def test_all_bins_are_read_where_they_are_needed(self, told, layout, said):
-        given_ = granules(layout=(layout,))
-        found = planned(campaign(**told), given_)
+    def test_all_bins_are_read_where_they_are_needed(self, settings, layout, said):
+        files = granules(layout=(layout,))
+        found = planned(campaign(**settings), files)
         assert found.steps[-1].name == "visibility"
         left = [each for each in found.left_out if each.rule == "member_window"]
         assert len(left) == len(MEMBERS)
@@ -336,17 +342,17 @@ class TestPlans:
 
     def test_every_decision_has_a_rule_of_the_table(self):
         names = {rule.name for rule in RULES}
-        for given_ in (granules(), granules(zenith_angle=0.0), granules()[:2]):
-            found = planned(campaign(), given_)
+        for files in (granules(), granules(zenith_angle=0.0), granules()[:2]):
+            found = planned(campaign(), files)
             assert {each.rule for each in (*found.steps, *found.left_out)} <= names
 
-    def test_facts_win_over_headers(self):
+    def test_facts_override_headers(self):
         facts = [{"full_overlap_range": 150.0, "zenith_angle": 90.0, "azimuth": 70.0}]
         strange = [replace(granules()[0], azimuth=12.0, zenith_angle=3.0), *granules()[1:]]
         found = planned(campaign(facts={"west-lidar": facts}), strange)
         assert found.steps[-1].settings["beams"][0]["azimuth"] == 70.0
 
-    def test_beams_of_one_instrument_are_told_apart(self):
+    def test_beams_of_one_instrument_are_distinguished(self):
         other = [replace(g, azimuth=(g.azimuth or 0) + 2.0) for g in granules(10)]
         jitter = [replace(g, azimuth=(g.azimuth or 0) + 0.05) for g in granules(20)]
         beams = planned(campaign(), [*granules(), *other, *jitter]).steps[-1].settings["beams"]
@@ -355,9 +361,9 @@ class TestPlans:
 
 @given(st.floats(0, 180), st.floats(0, 360), st.floats(0, 180), st.floats(0, 360))
 def test_angles_between_pointings(zenith, azimuth, other_zenith, other_azimuth):
-    one, two = (zenith, azimuth), (other_zenith, other_azimuth)
-    assert apart(one, one) < 1e-5
-    assert apart(one, two) == pytest.approx(apart(two, one), abs=1e-9)
-    assert apart((zenith, 0.0), (other_zenith, 0.0)) == pytest.approx(
+    first, second = (zenith, azimuth), (other_zenith, other_azimuth)
+    assert angle_between(first, first) < 1e-5
+    assert angle_between(first, second) == pytest.approx(angle_between(second, first), abs=1e-9)
+    assert angle_between((zenith, 0.0), (other_zenith, 0.0)) == pytest.approx(
         abs(zenith - other_zenith), abs=1e-5
     )

@@ -1,4 +1,4 @@
-"""What a plan runs, what it leaves out, and that it says why."""
+"""Plans of single instruments: steps that run, steps that are left out, and their reasons."""
 
 from __future__ import annotations
 
@@ -44,25 +44,25 @@ def test_photon_channel() -> None:
     ]
     assert steps["dead_time"] == {"dead_time": 4e-9}
     assert steps["homogeneous"]["sections"] == [[750.0, 4500.0]]
-    assert "photon background" in _left_out(result, "photon_532o")["dark"]
+    assert "photon-counting background" in _left_out(result, "photon_532o")["dark"]
 
 
-def test_a_channel_that_nobody_wants_is_not_read() -> None:
+def test_a_channel_that_no_product_uses_is_not_read() -> None:
     result = plan_scene(_scene(), factories.campaign())
     assert not _steps(result, "analog_532o")
     assert "no product" in _left_out(result, "analog_532o")["read"]
 
 
-def test_a_channel_of_which_every_product_is_left_out_is_not_read() -> None:
-    wanted = {
+def test_a_channel_without_any_product_is_not_read() -> None:
+    products = {
         "homogeneous": {"channels": ["analog_532o"], "sections": [[14_000, 16_000]]},
         "signal": {"channels": ["photon_532o"]},
     }
-    result = plan_scene(_scene(), factories.campaign(products=wanted))
+    result = plan_scene(_scene(), factories.campaign(products=products))
     assert {step.channel for step in result.steps} == {"photon_532o"}
     left_out = _left_out(result, "analog_532o")
     assert set(left_out) == {"signal", "homogeneous", "elastic", "multiangle", "read"}
-    assert left_out["read"] == "nothing that this channel is asked for can be made"
+    assert left_out["read"] == "no requested product of this channel can be made"
     assert "14000-16000 m" in left_out["homogeneous"]
 
 
@@ -79,7 +79,7 @@ def test_a_channel_of_which_every_product_is_left_out_is_not_read() -> None:
 )
 def test_steps_of_a_plan_are_those_that_its_products_need(products: dict[str, object]) -> None:
     result = plan_scene(_scene(), factories.campaign(products=products))
-    needed = product_dependence.plan_closure(result, product_dependence.wanted(result))
+    needed = product_dependence.plan_closure(result, product_dependence.planned_products(result))
     assert [(s.channel, s.name, s.settings) for s in result.steps] == [
         (s.channel, s.name, s.settings) for s in needed.steps
     ]
@@ -99,22 +99,22 @@ def test_dark_only_where_there_are_dark_files(*, with_dark: bool) -> None:
     assert ("dark" in _left_out(result, "analog_532o")) is not with_dark
 
 
-def test_unknown_dead_time_is_said() -> None:
+def test_the_reason_names_an_unknown_dead_time() -> None:
     result = plan_scene(_scene(), factories.campaign(facts=[{}]))
     assert "dead_time" in _left_out(result, "photon_532o")["dead_time"]
     assert "full_overlap_range" in _left_out(result, "photon_532o")["overlap"]
 
 
 def test_a_channel_that_the_files_lack_is_named() -> None:
-    wanted = {"homogeneous": {"channels": ["photon_999x"], "sections": [[500, 900]]}}
-    reason = _left_out(plan_scene(_scene(), factories.campaign(products=wanted)), "photon_999x")
+    products = {"homogeneous": {"channels": ["photon_999x"], "sections": [[500, 900]]}}
+    reason = _left_out(plan_scene(_scene(), factories.campaign(products=products)), "photon_999x")
     assert "photon_532o" in reason["homogeneous"]
 
 
 @pytest.mark.parametrize("section", [[14_000, 16_000], [1000, 1030]])
 def test_a_section_outside_the_bins_is_left_out(section: list[float]) -> None:
-    wanted = {"homogeneous": {"channels": ["photon_532o"], "sections": [section, [750, 4500]]}}
-    result = plan_scene(_scene(), factories.campaign(products=wanted))
+    products = {"homogeneous": {"channels": ["photon_532o"], "sections": [section, [750, 4500]]}}
+    result = plan_scene(_scene(), factories.campaign(products=products))
     assert f"{section[0]}-{section[1]}" in _left_out(result, "photon_532o")["homogeneous"]
     assert _steps(result, "photon_532o")["homogeneous"]["sections"] == [[750.0, 4500.0]]
 
@@ -137,20 +137,20 @@ def test_the_hash_follows_every_setting() -> None:
 
 @pytest.mark.parametrize("background", [[14_990, 16_000], [20_000, 30_000], [100, 101]])
 def test_a_background_without_bins_leaves_the_signal_out(background: list[float]) -> None:
-    wanted = {"signal": {"channels": ["photon_532o"], "background_range": background}}
-    result = plan_scene(_scene(), factories.campaign(products=wanted))
+    products = {"signal": {"channels": ["photon_532o"], "background_range": background}}
+    result = plan_scene(_scene(), factories.campaign(products=products))
     assert "background_range" in _left_out(result, "photon_532o")["signal"]
     assert "signal" not in _steps(result, "photon_532o")
 
 
-# Averages, references and joined channels -----------------------------------------------------
+# Averages, references and glued channels -----------------------------------------------------
 
 
 def _elastic(*granules: object, facts: dict[str, object] | None = None, **settings: object) -> Plan:
     """Plan the elastic product of a vertical lidar whose bins end at 15 km."""
     told: dict[str, object] = {"zenith_angle": 0.0} if facts is None else facts
-    wanted = {"elastic": {"channels": ["photon_532o"], **settings}}
-    campaign = factories.campaign(products=wanted, facts=[told])
+    products = {"elastic": {"channels": ["photon_532o"], **settings}}
+    campaign = factories.campaign(products=products, facts=[told])
     return plan_scene(_scene(*granules), campaign)
 
 
@@ -183,8 +183,8 @@ def test_elastic_steps_in_their_order() -> None:
     reasons = {step.name: step.reason for step in result.steps}
     assert "US Standard Atmosphere 1976" in reasons["molecular"]
     assert all(reasons.values())
-    unwanted = plan_scene(_scene(), factories.campaign())
-    assert "does not ask" in _left_out(unwanted, "photon_532o")["elastic"]
+    without = plan_scene(_scene(), factories.campaign())
+    assert "not requested" in _left_out(without, "photon_532o")["elastic"]
 
 
 def test_what_the_campaign_gives_replaces_what_is_assumed() -> None:
@@ -214,7 +214,7 @@ def test_heights_of_the_reference_become_ranges_along_a_slanted_beam() -> None:
 def test_the_reference_ends_with_the_bins() -> None:
     window = {"lowest": 5000, "highest": 40_000}
     steps = _steps(_elastic(reference=window), "photon_532o")
-    # The middle of the last bin: windows are sought among the middles.
+    # The centre of the last bin, because a window is a set of bin centres.
     assert steps["reference"]["highest"] == 14_996.25
 
 
@@ -225,28 +225,28 @@ def test_the_reference_ends_with_the_bins() -> None:
             [factories.granule(0, zenith_angle=0.0), factories.granule(5, zenith_angle=10.0)],
             {},
             {},
-            "moves, from 0 to 10 degree",
+            "changes from 0 to 10 degree",
         ),
-        ([factories.granule(0, zenith_angle=90.0)], {}, {}, "at 90 degree"),
-        ([], {"zenith_angle": 81.0}, {}, "at 81 degree"),
-        ([], {"zenith_angle": 180.0}, {}, "at 180 degree"),
+        ([factories.granule(0, zenith_angle=90.0)], {}, {}, "of 90 degree the beam does not"),
+        ([], {"zenith_angle": 81.0}, {}, "of 81 degree the beam does not"),
+        ([], {"zenith_angle": 180.0}, {}, "of 180 degree the beam does not"),
         ([factories.granule(0, zenith_angle=None)], {}, {}, "neither headers nor campaign"),
         (
             [],
             {"zenith_angle": 0.0},
             {"reference": {"lowest": 14_100, "highest": 20_000}},
-            "bins end at 14996",
+            "the last bin at 14996",
         ),
         # 15 km along the beam are 5.1 km above the station.
         (
             [],
             {"zenith_angle": 70.0},
             {"reference": {"lowest": 4500, "highest": 9000}},
-            "bins end at 14996",
+            "the last bin at 14996",
         ),
     ],
 )
-def test_no_elastic_product_where_nothing_is_clean_or_known(
+def test_no_elastic_product_without_aerosol_free_air_or_zenith_angle(
     granules: list[object], facts: dict[str, object], settings: dict[str, object], words: str
 ) -> None:
     result = _elastic(*granules, facts=facts, **settings)
@@ -254,10 +254,10 @@ def test_no_elastic_product_where_nothing_is_clean_or_known(
     assert not {"average", "reference", "elastic"} & set(_steps(result, "photon_532o"))
 
 
-def test_a_beam_that_stands_still_but_for_its_readings_is_steady() -> None:
+def test_a_beam_is_fixed_despite_scattered_readings() -> None:
     still = [factories.granule(minute, zenith_angle=3.0 + 0.004 * minute) for minute in range(10)]
     assert "elastic" in _steps(_elastic(*still, facts={}), "photon_532o")
-    # What the campaign says wins over headers that say something else.
+    # Facts of the campaign override headers.
     moving = [factories.granule(minute, zenith_angle=9.0 * minute) for minute in range(10)]
     assert "elastic" in _steps(_elastic(*moving, facts={"zenith_angle": 5.0}), "photon_532o")
 
@@ -300,7 +300,7 @@ class TestDark:
     )
     def test_on_one_side_the_nearest(self, minutes: tuple[float, ...], where: str) -> None:
         assert self._step(*minutes) == {"files": len(minutes), "method": "nearest"}
-        assert self.reason == f"{where}: the nearest of them in time"
+        assert self.reason == f"{where}: the nearest in time is used"
 
     @pytest.mark.parametrize(
         ("minutes", "where"),
@@ -317,7 +317,7 @@ class TestDark:
     )
     def test_one_session_serves_all(self, minutes: tuple[float, ...], where: str) -> None:
         assert self._step(*minutes) == {"files": len(minutes), "method": "nearest"}
-        assert self.reason == f"{where}: one session, which serves all profiles"
+        assert self.reason == f"{where}: one session, used for all profiles"
 
     @pytest.mark.parametrize(
         ("minutes", "where"),
@@ -330,17 +330,17 @@ class TestDark:
     )
     def test_around_it_interpolated(self, minutes: tuple[float, ...], where: str) -> None:
         assert self._step(*minutes) == {"files": len(minutes), "method": "interpolated"}
-        told = f"{len(minutes)} dark files within 24 h of the scene, {where} its profiles"
-        assert self.reason == f"{told}: interpolated in time"
+        files = f"{len(minutes)} dark files within 24 h of the scene"
+        assert self.reason == f"{files}, {where} its profiles: interpolated in time"
 
     @pytest.mark.parametrize("minutes", [(90.0,), (60.0, 90.0), (100.0, 115.0, 125.0)])
     def test_of_one_session_either_method_gives_the_same(self, minutes: tuple[float, ...]) -> None:
         """So that calling it the nearest changes no product."""
         signals = np.random.default_rng(1).normal(size=(len(minutes), 8))
         times = np.array(minutes) * 60
-        wanted = np.array([60.0, 90.0, 120.0]) * 60
+        products = np.array([60.0, 90.0, 120.0]) * 60
         nearest, interpolated = (
-            dark_profile(signals, times, wanted, method=method)
+            dark_profile(signals, times, products, method=method)
             for method in ("nearest", "interpolated")
         )
         assert np.array_equal(nearest.dark, interpolated.dark)
@@ -349,7 +349,7 @@ class TestDark:
     def test_photon_counting_needs_none(self) -> None:
         dark = factories.granule(0, path="dark/d", role=Role.DARK)
         result = plan_scene(_scene(factories.granule(60), dark), factories.campaign())
-        assert "photon background" in _left_out(result, "photon_532o")["dark"]
+        assert "photon-counting background" in _left_out(result, "photon_532o")["dark"]
 
 
 class TestGlued:
@@ -365,17 +365,17 @@ class TestGlued:
             "channels": {"analog_532o": analog or {}, "photon_532o": {"dead_time": 4e-9}},
             **(facts or {}),
         }
-        wanted = products or {"elastic": {"channels": ["glued_532o"]}}
-        return plan_scene(_scene(*granules), factories.campaign(products=wanted, facts=[told]))
+        products = products or {"elastic": {"channels": ["glued_532o"]}}
+        return plan_scene(_scene(*granules), factories.campaign(products=products, facts=[told]))
 
-    def test_both_parts_are_read_and_joined(self) -> None:
+    def test_both_parts_are_read_and_glued(self) -> None:
         result = self._plan()
         for part in ("analog_532o", "photon_532o"):
             assert _steps(result, part)["read"]["wavelength"] == 532e-9
             assert "elastic" not in _steps(result, part)
             assert next(
                 s.reason for s in result.steps if (s.channel, s.name) == (part, "read")
-            ) == ("asked for by glued_532o")
+            ) == ("required by glued_532o")
         steps = _steps(result, "glued_532o")
         assert list(steps) == [
             "read",
@@ -421,29 +421,29 @@ class TestGlued:
         assert "photon_532o" not in reason
         assert not _steps(self._plan(alone), "glued_532o")
 
-    def test_parts_of_unlike_bins_are_not_joined(self) -> None:
+    def test_parts_of_different_bin_width_are_not_glued(self) -> None:
         odd = factories.granule(
             0, layout=(factories.PHOTON, replace(factories.ANALOG, bin_width=15))
         )
         assert "7.5 m" in _left_out(self._plan(odd), "glued_532o")["elastic"]
 
-    def test_the_joined_channel_ends_with_the_shorter_part(self) -> None:
+    def test_the_glued_channel_ends_with_the_shorter_part(self) -> None:
         short = factories.granule(0, layout=(factories.PHOTON, replace(factories.ANALOG, bins=500)))
         reason = _left_out(self._plan(short), "glued_532o")["elastic"]
-        assert "bins end at 3746" in reason
+        assert "the last bin at 3746" in reason
 
-    def test_a_joined_channel_is_made_only_where_asked_for(self) -> None:
+    def test_a_glued_channel_is_made_only_on_request(self) -> None:
         result = self._plan(products={"signal": {"channels": "all"}})
         assert not _steps(result, "glued_532o")
-        asked = self._plan(products={"signal": {"channels": ["glued_532o"]}})
-        assert list(_steps(asked, "glued_532o")) == ["read", "glue", "background", "signal"]
+        requested = self._plan(products={"signal": {"channels": ["glued_532o"]}})
+        assert list(_steps(requested, "glued_532o")) == ["read", "glue", "background", "signal"]
 
-    def test_a_joined_channel_has_no_homogeneous_product(self) -> None:
-        wanted = {
+    def test_a_glued_channel_has_no_homogeneous_product(self) -> None:
+        products = {
             "elastic": {"channels": ["glued_532o"]},
             "homogeneous": {"channels": ["glued_532o"], "sections": [[750, 4500]]},
         }
-        result = self._plan(products=wanted)
+        result = self._plan(products=products)
         assert "homogeneous" not in _steps(result, "glued_532o")
         reasons = [x.reason for x in result.left_out if x.channel == "glued_532o"]
         assert any("own background" in reason for reason in reasons)

@@ -10,7 +10,7 @@ import pytest
 from support import factories
 
 from lidarops.errors import SceneError
-from lidarops.plan.scenes import cut_scenes, select_scenes, stop_of
+from lidarops.plan.scenes import cut_scenes, scene_stop, select_scenes
 from lidarops.records import Role, Status
 
 
@@ -59,8 +59,8 @@ def test_the_end_of_a_scene_is_known_by_its_name() -> None:
         scenes = campaign.scenes.model_copy(update={"window": window})
         other = campaign.model_copy(update={"scenes": scenes})
         found = cut_scenes(other, [factories.granule(20 * k) for k in range(72)]).scenes
-        assert [stop_of(scene.id, other) for scene in found] == [scene.stop for scene in found]
-    assert stop_of("gone_20260301T000000", campaign) == factories.DAY + timedelta(days=1)
+        assert [scene_stop(scene.id, other) for scene in found] == [scene.stop for scene in found]
+    assert scene_stop("gone_20260301T000000", campaign) == factories.DAY + timedelta(days=1)
 
 
 def test_any_order_of_files_gives_the_same_scenes() -> None:

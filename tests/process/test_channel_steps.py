@@ -509,7 +509,7 @@ def test_the_background_is_found_as_the_campaign_asks() -> None:
 def test_counts_at_hand_are_not_those_of_the_caller():
     lazy = archive(profiles=3)
     bench = channel_steps.Bench(planned(campaign({"signal": {}})), lazy, None, NONE, STATION)
-    near = channel_steps.at_hand(bench, ["photon_532o"]).archive
+    near = channel_steps.load_small(bench, ["photon_532o"]).archive
     assert isinstance(near["photon_532o"].data, np.ndarray)
     assert isinstance(near["analog_532o"].data, da.Array)
     assert isinstance(lazy["photon_532o"].data, da.Array)

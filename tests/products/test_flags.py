@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.made_products import MAKERS, context
 
 from lidarops.flags import Quality, Severity
-from lidarops.netcdf.variables import sum_up
+from lidarops.netcdf.variables import summarize_flags
 from lidarops.netcdf.write import write_product
 from lidarops.products.layouts import LAYOUTS, build_product
 from lidarops.records import ProductKind
@@ -129,7 +129,7 @@ def test_every_bit_is_documented_in_some_kind_and_raised_by_some_scene(
 @given(bits=st.sets(st.sampled_from(BITS)))
 def test_usable_is_the_worst_of_any_set_of_bits(bits: set[Quality]):
     flags = np.array([sum(bits)], np.int32)
-    assert sum_up(flags)[0] == max((bit.severity for bit in bits), default=0)
+    assert summarize_flags(flags)[0] == max((bit.severity for bit in bits), default=0)
 
 
 @settings(

@@ -8,7 +8,7 @@ from typing import Final
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     GLUING,
-    NO_NAME,
+    NO_STANDARD_NAME,
     RANGE,
     STANDARD_NAME_TABLE,
     Coverage,
@@ -25,14 +25,34 @@ _BINS: Final = ("time", "range")
 _BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
 _BUDGET: Final = {
-    "noise": "Random: independent from profile to profile.",
-    "background": "Random in time, one error for all ranges of a profile.",
-    "reference": "Systematic: of the aerosol assumed in the reference window and of the window's"
-    " noise.",
-    "lidar_ratio": "Systematic: of the lidar ratio that is assumed.",
-    "molecular": "Systematic: of the molecular atmosphere.",
+    "noise": (
+        "the signal noise",
+        ErrorKind.RANDOM,
+        "Random: independent from profile to profile.",
+    ),
+    "background": (
+        "the background",
+        ErrorKind.RANDOM,
+        "Random in time, but common to all ranges of a profile.",
+    ),
+    "reference": (
+        "the reference value",
+        ErrorKind.SYSTEMATIC,
+        "Systematic: from the aerosol assumed in the reference window and the noise there.",
+    ),
+    "lidar_ratio": (
+        "the lidar ratio",
+        ErrorKind.SYSTEMATIC,
+        "Systematic: from the assumed lidar ratio.",
+    ),
+    "molecular": (
+        "the molecular backscatter",
+        ErrorKind.SYSTEMATIC,
+        "Systematic: from the molecular atmosphere.",
+    ),
 }
-"""Causes of error, in the order of `lidarops.retrieve.elastic.inversion.ErrorBudget`."""
+"""Source of error -> its name in texts, its kind and a comment, in the order of
+`lidarops.retrieve.elastic.inversion.ErrorBudget`."""
 
 FLAGS: Final = (
     Quality.INPUT_MISSING
@@ -48,34 +68,27 @@ FLAGS: Final = (
 )
 
 
-def _budget(quantity: str, called: str, units: str) -> Iterator[Row]:
-    """Give the rows of the error budget of a quantity."""
-    for cause, comment in _BUDGET.items():
+def _error_budget() -> Iterator[Row]:
+    """Yield the rows of the error budget of backscatter."""
+    for source, (words, kind, comment) in _BUDGET.items():
         yield Row(
-            name=f"{quantity}_error_{cause}",
+            name=f"backscatter_error_{source}",
             dims=_BINS,
             dtype="f4",
-            units=units,
-            long_name=f"error of {called} by one standard error of its {_CALLED[cause]}",
+            units="m-1 sr-1",
+            long_name=f"error of backscatter for one standard error of {words}",
             coverage=Coverage.QUALITY,
             significant_bits=8,
-            error_kind=ErrorKind(comment.partition(":")[0].partition(" ")[0].lower()),
-            comment=f"{comment} The standard error of {called} is the root of the sum of squares."
-            f" {NO_NAME}",
+            error_kind=kind,
+            comment=f"{comment} backscatter_standard_error is the root of the sum of squares of"
+            f" the error budget. {NO_STANDARD_NAME}",
         )
 
 
-_CALLED: Final = {
-    "noise": "signal noise",
-    "background": "background",
-    "reference": "reference value",
-    "lidar_ratio": "lidar ratio",
-    "molecular": "molecular backscatter",
-}
-_TERMS: Final = tuple(f"backscatter_error_{cause}" for cause in _BUDGET)
+_BUDGET_TERMS: Final = tuple(f"backscatter_error_{source}" for source in _BUDGET)
 
 ELASTIC: Final = Layout(
-    title="Aerosol backscatter and extinction of elastic signals",
+    title="Aerosol backscatter and extinction from elastic signals",
     summary="Backscatter and extinction of aerosol from elastic lidar signals by the"
     " two-component inversion of Klett, Fernald and Sasano, with an error budget.",
     keywords=(
@@ -88,16 +101,17 @@ ELASTIC: Final = Layout(
         "Fernald, F. G. (1984), Appl. Opt. 23, 652-653.",
         "Sasano, Y. et al. (1985), Appl. Opt. 24, 3929-3932.",
     ),
-    comment="extinction is backscatter times the lidar ratio that is assumed, no measurement of"
-    " its own. Profiles are means over time; range is along the beam. Particles in the reference"
-    " window that fall off with height nearly as air does look like air, and no test of the signal"
-    " tells them: only the error of the scattering ratio that the settings declare covers them. In"
-    " simulations with that of 0.02, of the values that no flag rejects 0.001 percent were off by"
-    " more than 4 standard errors where such haze scattered up to 3.5 percent of what air does at"
-    " 7 km, and 12 percent where it scattered 0.35 to 35 percent: declare more where air is hazy at"
-    " all heights. No elastic signal tells the lidar ratio either; its declared error has to cover"
-    " it. Values flagged outlier come from the ranges next to theirs: the signal there lies off on"
-    " its own, by more than noise.",
+    comment="extinction is backscatter times the assumed lidar ratio, not an independent"
+    " measurement. Profiles are means over time; range is along the beam. Particles in the"
+    " reference window that decrease with height nearly as molecules do look like aerosol-free air,"
+    " and no test of the signal detects them: only the error of the scattering ratio declared in"
+    " the settings covers them. In simulations with a declared error of 0.02, 0.001 percent of the"
+    " values without a rejecting flag deviated by more than 4 standard errors where such haze"
+    " scattered up to 3.5 percent of what molecules scatter at 7 km, and 12 percent where it"
+    " scattered 0.35 to 35 percent: declare a larger error where the air is hazy at all heights. An"
+    " elastic signal does not determine the lidar ratio either; its declared error has to cover"
+    " that. Values flagged outlier are taken from neighbouring ranges, because the signal of the"
+    " bin deviates from theirs by more than noise explains.",
     sampled="range",
     unused_steps=frozenset({"homogeneous", "signal", "background"}),
     coordinates=coordinates((RANGE,), altitude("range")),
@@ -112,12 +126,12 @@ ELASTIC: Final = Layout(
             long_name="backscatter coefficient of aerosol particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
-            ancillaries=(*_TERMS, "quality_flag", "profiles", "shots"),
+            ancillaries=(*_BUDGET_TERMS, "quality_flag", "profiles", "shots"),
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
         ),
-        *_budget("backscatter", "backscatter", "m-1 sr-1"),
+        *_error_budget(),
         Row(
             name="extinction",
             dims=_BINS,
@@ -128,7 +142,7 @@ ELASTIC: Final = Layout(
             long_name="extinction coefficient of aerosol particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
-            # Readers look for the ancillaries of a quantity, not for those of an ancillary.
+            # Readers do not follow the ancillaries of an ancillary: list the error here too.
             ancillaries=(
                 "lidar_ratio",
                 "lidar_ratio_standard_error",
@@ -139,22 +153,22 @@ ELASTIC: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment="backscatter x lidar_ratio.",
+            comment="backscatter times lidar_ratio.",
         ),
         Row(
             name="scattering_ratio",
             dims=_BINS,
             dtype="f4",
             units="1",
-            long_name="backscatter of particles and molecules over that of molecules",
+            long_name="ratio of backscatter of particles and molecules to that of molecules",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
             ancillaries=("quality_flag", "profiles", "shots"),
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment="Without attenuation, unlike backscattering_ratio_in_air of the"
-            f" {STANDARD_NAME_TABLE}. {NO_NAME}",
+            comment="Free of attenuation, unlike backscattering_ratio_in_air of the"
+            f" {STANDARD_NAME_TABLE}. {NO_STANDARD_NAME}",
         ),
         Row(
             name="attenuated_backscatter",
@@ -170,7 +184,7 @@ ELASTIC: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment="Calibrated by the reference window.",
+            comment="Calibrated in the reference window.",
         ),
         Row(
             name="molecular_backscatter",
@@ -179,7 +193,7 @@ ELASTIC: Final = Layout(
             units="m-1 sr-1",
             long_name="backscatter coefficient of molecules",
             coverage=Coverage.REFERENCE,
-            comment=f"Rayleigh scattering, rotational Raman lines included. {NO_NAME}",
+            comment=f"Rayleigh scattering including rotational Raman lines. {NO_STANDARD_NAME}",
         ),
         Row(
             name="molecular_extinction",
@@ -188,7 +202,7 @@ ELASTIC: Final = Layout(
             units="m-1",
             long_name="extinction coefficient of molecules",
             coverage=Coverage.REFERENCE,
-            comment=NO_NAME,
+            comment=NO_STANDARD_NAME,
         ),
         Row(
             name="lidar_ratio",
@@ -197,11 +211,11 @@ ELASTIC: Final = Layout(
             units="sr",
             standard_name="ratio_of_volume_extinction_coefficient_to_volume_backwards_scattering"
             "_coefficient_by_ranging_instrument_in_air_due_to_ambient_aerosol_particles",
-            long_name="extinction over backscatter of aerosol particles, as assumed",
+            long_name="assumed ratio of extinction to backscatter of aerosol particles",
             coverage=Coverage.REFERENCE,
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Given by the campaign, not measured.",
+            comment="Set by the campaign, not measured.",
         ),
         Row(
             name="reference_bottom",
@@ -210,7 +224,7 @@ ELASTIC: Final = Layout(
             units="m",
             long_name="range at which the reference window begins",
             coverage=Coverage.AUXILIARY,
-            comment=f"Missing where no window passed its tests. {NO_NAME}",
+            comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
         ),
         Row(
             name="reference_top",
@@ -219,7 +233,7 @@ ELASTIC: Final = Layout(
             units="m",
             long_name="range at which the reference window ends",
             coverage=Coverage.AUXILIARY,
-            comment=f"Missing where no window passed its tests. {NO_NAME}",
+            comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
         ),
         Row(
             name="cloud_base_range",
@@ -228,19 +242,19 @@ ELASTIC: Final = Layout(
             units="m",
             long_name="range at which the lowest cloud or dense layer begins",
             coverage=Coverage.AUXILIARY,
-            comment=f"Missing where none was found. {NO_NAME}",
+            comment=f"Missing where no cloud or dense layer was detected. {NO_STANDARD_NAME}",
         ),
         Row(
             name="background",
             dims=("time",),
             dtype="f4",
             units="{signal}",
-            long_name="background that was subtracted: sky light, dark current and offset",
+            long_name="subtracted background: sky light, dark current and offset",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
             ancillaries=("shots",),
             uncertain=True,
-            comment=f"Not calibrated. {NO_NAME}",
+            comment=f"Not calibrated. {NO_STANDARD_NAME}",
         ),
         *GLUING,
         quality(_BINS, FLAGS),
@@ -250,11 +264,11 @@ ELASTIC: Final = Layout(
             dtype="i4",
             units="1",
             standard_name="number_of_observations",
-            long_name="number of raw profiles of the mean",
+            long_name="number of raw profiles in the mean",
             coverage=Coverage.AUXILIARY,
             cell_methods="time: sum",
             valid_min=0.0,
         ),
-        shots(of="all profiles of the mean"),
+        shots(of="all profiles in the mean"),
     ),
 )

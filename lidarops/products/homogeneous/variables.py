@@ -6,7 +6,7 @@ from typing import Final
 
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
-    NO_NAME,
+    NO_STANDARD_NAME,
     SECTION,
     SECTION_RANGE,
     Coverage,
@@ -24,14 +24,14 @@ _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
 _OF_EXTINCTION = ("extinction_model_error", *_OF_FIT)
 
-_BENT = (
-    "whose logarithmic slope is off by 5 percent of that at mean range at one end of the section,"
-    " and by the opposite at the other"
+_CURVED_SIGNAL = (
+    "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
+    " section, and by the opposite amount at the other"
 )
-_UNTOLD = (
-    "No bound: violations of the model that its own shapes take up leave no trace for any test to"
-    " see. In simulated random violations, this share of the values that no flag rejects was off"
-    " by more than 4 times both errors together:"
+_UNDETECTED = (
+    "This is not an upper bound: departures from the model that its parameters absorb leave no"
+    " trace in the residuals. In simulated random departures, this share of the values without a"
+    " rejecting flag deviated by more than 4 combined standard errors:"
 )
 
 _FIT_FLAGS = Quality(sum(bit for bit in Quality if bit <= Quality.NOT_LEVEL))
@@ -39,7 +39,7 @@ _FIT_FLAGS = Quality(sum(bit for bit in Quality if bit <= Quality.NOT_LEVEL))
 HOMOGENEOUS: Final = Layout(
     title="Extinction of homogeneous range sections",
     summary="Background, amplitude and extinction of range sections in which the atmosphere is"
-    " taken as homogeneous along the beam, from the signals of one lidar channel, with standard"
+    " assumed homogeneous along the beam, from the signals of one lidar channel, with standard"
     " errors and a test of the assumption.",
     keywords=(
         "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
@@ -53,8 +53,8 @@ HOMOGENEOUS: Final = Layout(
         "Golub, G. H. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432.",
     ),
     comment="Model of a section: P(r) = background + amplitude r^-2 exp(-2 extinction r), with"
-    " range r. altitude, and with it geospatial_vertical_min and _max, is that of the middle of"
-    " a section; altitude_bnds holds its ends where the beam stands still.",
+    " range r. altitude, geospatial_vertical_min and geospatial_vertical_max refer to the midpoint"
+    " of a section; altitude_bnds holds its ends where the beam is fixed.",
     sampled="section",
     unused_steps=frozenset({"average", "background", "molecular", "known_shape", "reference"}),
     coordinates=coordinates((SECTION, SECTION_RANGE), altitude("section", "altitude_bnds")),
@@ -64,32 +64,31 @@ HOMOGENEOUS: Final = Layout(
             dims=_SECTIONS,
             dtype="f4",
             units="m-1",
-            long_name="extinction coefficient of air and aerosol together",
+            long_name="extinction coefficient of molecules and particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean section: mean",
             ancillaries=_OF_EXTINCTION,
             uncertain=True,
-            comment="Molecules and particles together, at the wavelength of the channel."
-            f" {NO_NAME}",
+            comment=f"At the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
         Row(
             name="extinction_model_error",
             dims=_SECTIONS,
             dtype="f4",
             units="m-1",
-            long_name="systematic error of the extinction coefficient to allow for",
+            long_name="model (systematic) uncertainty of extinction",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Apart from the random error in extinction_standard_error: 5 percent of"
-            " extinction + 1 / mean range, and in quadrature what the extinction takes up of a"
-            f" signal {_BENT}. {_UNTOLD} 7 percent with backscatter that changes along the section"
-            " as an exponential of range with a scale of 1 to 100 km, 10 with a plume, 8 where the"
-            " top of the signal is cut off, 2.5 where backscatter bends, 0.5 at most otherwise."
-            f" {NO_NAME}",
+            comment="Separate from the random error in extinction_standard_error. Root of the sum"
+            " of squares of 5 percent of (extinction + 1 / mean range), and of the extinction error"
+            f" caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED} 7 percent with backscatter that"
+            " changes exponentially along the section with a scale of 1 to 100 km, 10 percent with"
+            " a plume, 8 percent where the top of the signal is clipped, 2.5 percent where"
+            f" backscatter is curved, at most 0.5 percent otherwise. {NO_STANDARD_NAME}",
         ),
         *visibility(
-            _SECTIONS, called="along the section", ancillaries=_OF_EXTINCTION, optional=True
+            _SECTIONS, place="along the section", ancillaries=_OF_EXTINCTION, optional=True
         ),
         Row(
             name="amplitude",
@@ -101,33 +100,35 @@ HOMOGENEOUS: Final = Layout(
             cell_methods="time: mean",
             ancillaries=_OF_FIT,
             uncertain=True,
-            comment=f"System constant times backscatter coefficient, not calibrated. {NO_NAME}",
+            comment="System constant times backscatter coefficient, not calibrated."
+            f" {NO_STANDARD_NAME}",
         ),
         Row(
             name="background",
             dims=_SECTIONS,
             dtype="f4",
             units="{signal}",
-            long_name="background as fitted in the section",
+            long_name="background fitted in the section",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
             ancillaries=("background_model_error", *_OF_FIT),
             uncertain=True,
-            comment=f"Not calibrated. {NO_NAME}",
+            comment=f"Not calibrated. {NO_STANDARD_NAME}",
         ),
         Row(
             name="background_model_error",
             dims=_SECTIONS,
             dtype="f4",
             units="{signal}",
-            long_name="systematic error of the background to allow for",
+            long_name="model (systematic) uncertainty of the background",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Apart from the random error in background_standard_error: what the"
-            f" background takes up of a signal {_BENT}, as where backscatter bends along the path."
-            f" {_UNTOLD} 5 percent where it bends more, 2.4 with an afterpulse, 1.1 with a plume,"
-            f" 0.5 at most otherwise. {NO_NAME}",
+            comment="Separate from the random error in background_standard_error. Background error"
+            f" caused by a signal {_CURVED_SIGNAL}, as with backscatter that is curved along the"
+            f" path. {_UNDETECTED} 5 percent where it is curved more, 2.4 percent with an"
+            " afterpulse, 1.1 percent with a plume, at most 0.5 percent otherwise."
+            f" {NO_STANDARD_NAME}",
         ),
         Row(
             name="reduced_chi2",
@@ -137,7 +138,7 @@ HOMOGENEOUS: Final = Layout(
             long_name="reduced chi-square of the fit",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
-            comment=f"Near 1 where the model holds within the noise. {NO_NAME}",
+            comment=f"Close to 1 where the model holds within the noise. {NO_STANDARD_NAME}",
         ),
         Row(
             name="valid_bins",
@@ -145,7 +146,7 @@ HOMOGENEOUS: Final = Layout(
             dtype="i4",
             units="1",
             standard_name="number_of_observations",
-            long_name="number of range bins of the section that were fitted",
+            long_name="number of fitted range bins of the section",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
         ),
@@ -153,4 +154,4 @@ HOMOGENEOUS: Final = Layout(
         shots(of="the profile"),
     ),
 )
-"""What the product holds."""
+"""Layout of the product."""

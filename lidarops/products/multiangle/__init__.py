@@ -1,1 +1,1 @@
-"""The ``multiangle`` product: optical depth and extinction from scans."""
+"""The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""

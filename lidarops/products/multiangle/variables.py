@@ -7,7 +7,7 @@ from typing import Final
 
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
-    NO_NAME,
+    NO_STANDARD_NAME,
     PLACE,
     TIME,
     Coverage,
@@ -54,7 +54,7 @@ _ALTITUDE: Final = Row(
     axis="Z",
     positive="up",
     bounds="altitude_bnds",
-    comment="Top of the layer in altitude_bnds, which begins at the altitude below, or at the"
+    comment="Top of the layer given in altitude_bnds. Its bottom is the next lower altitude, or the"
     " station.",
 )
 _BEAM: Final = Row(
@@ -62,10 +62,10 @@ _BEAM: Final = Row(
     dims=("beam",),
     dtype="i4",
     units="1",
-    long_name="number of the direction of the beam",
+    long_name="number of the beam direction",
     coverage=Coverage.COORDINATE,
-    comment="In order of vertical planes of rising azimuth, from one horizon over the zenith to"
-    " the other.",
+    comment="Ordered by azimuth of the vertical plane, and in each plane from one horizon over the"
+    " zenith to the other.",
 )
 _LAYER: Final = Row(
     name="layer_altitude",
@@ -73,18 +73,18 @@ _LAYER: Final = Row(
     dtype="f8",
     units="m",
     standard_name="altitude",
-    long_name="altitude of the middle of the layer above the geoid",
+    long_name="altitude of the midpoint of the layer above the geoid",
     coverage=Coverage.COORDINATE,
     positive="up",
     bounds="layer_bnds",
     optional=True,
-    comment="Bottom and top in layer_bnds, moved to the nearest altitude of the profile or the"
-    " station.",
+    comment="layer_bnds holds bottom and top, moved to the nearest altitude of the profile or to"
+    " the station.",
 )
 
 
 def _direction(name: str) -> Row:
-    """Return the row of an angle of the beams."""
+    """Return the row of a pointing angle of the beams."""
     angle = next(row for row in PLACE if row.name == name)
     return replace(angle, name=f"beam_{name}", dims=("beam",), follows_beam=False)
 
@@ -92,27 +92,27 @@ def _direction(name: str) -> Row:
 _STATION: Final = tuple(row for row in PLACE if row.name not in ("zenith_angle", "azimuth"))
 
 
-def _gradient_error(quantity: str, called: str, units: str) -> Row:
+def _gradient_error(quantity: str, words: str, units: str) -> Row:
     return Row(
         name=f"{quantity}_gradient_error",
         dims=_LEVELS,
         dtype="f4",
         units=units,
-        long_name=f"systematic error of {called} by a horizontal gradient to allow for",
+        long_name=f"model (systematic) uncertainty of {words} from a horizontal gradient",
         coverage=Coverage.QUALITY,
         valid_min=0.0,
         significant_bits=8,
         error_kind=ErrorKind.SYSTEMATIC,
-        comment=f"Apart from {quantity}_standard_error, of noise and smoothing: what the largest"
-        " horizontal gradient of ln backscatter that the settings declare would do. Near 0 where"
-        f" beams lead to all sides. {NO_NAME}",
+        comment=f"Separate from {quantity}_standard_error, which covers noise and smoothing. Error"
+        " that the largest horizontal gradient of ln(backscatter) declared in the settings would"
+        f" cause. Close to 0 where beams point to all sides. {NO_STANDARD_NAME}",
     )
 
 
 MULTIANGLE: Final = Layout(
-    title="Optical depth and extinction of scans over zenith angles",
-    summary="Optical depth and extinction of air and aerosol together, from signals of one lidar"
-    " channel at several zenith angles, without a lidar ratio or a reference, with standard"
+    title="Optical depth and extinction from scans over zenith angle",
+    summary="Optical depth and extinction of molecules and particles together, from signals of one"
+    " lidar channel at several zenith angles, without lidar ratio or reference value, with standard"
     " errors.",
     keywords=(
         "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL OPTICAL DEPTH/THICKNESS",
@@ -125,12 +125,13 @@ MULTIANGLE: Final = Layout(
         "Hamilton, P. M. (1969), Atmos. Environ. 3, 221-223.",
         "DerSimonian, R. and Laird, N. (1986), Control. Clin. Trials 7, 177-188.",
     ),
-    comment="Model: the logarithm of the range-corrected signal at an altitude falls by twice the"
-    " optical depth times the slant path over the vertical one, in air that is level over the"
-    " scan. A profile is one scan cycle. Inhomogeneity and smoothness are common to all cycles"
-    " of the file. What smoothness takes from a profile it takes from every profile of one sky, so"
-    " that a mean over time does not make the errors of optical depth and extinction smaller;"
-    " methods that do not smooth state noise alone, which a mean over time then overstates.",
+    comment="Model: at a given altitude, the logarithm of the range-corrected signal decreases by"
+    " twice the optical depth times the ratio of slant to vertical path, in air that is"
+    " horizontally stratified over the scan. A profile is one scan cycle. Inhomogeneity and"
+    " smoothness are common to all cycles of the file. Smoothing changes all profiles of one sky"
+    " alike, so that a mean over time does not reduce the errors of optical depth and extinction."
+    " Methods without smoothing state noise alone; for them this rule overstates the error of a"
+    " mean.",
     sampled="altitude",
     unused_steps=frozenset({"average", "reference"}),
     coordinates=(
@@ -148,7 +149,7 @@ MULTIANGLE: Final = Layout(
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="optical depth of air and aerosol from the station to the altitude",
+            long_name="optical depth of molecules and particles from the station to the altitude",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: point",
             ancillaries=(
@@ -162,8 +163,7 @@ MULTIANGLE: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment="Vertical, molecules and particles together, at the wavelength of the channel."
-            f" {NO_NAME}",
+            comment=f"Along the vertical, at the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
         _gradient_error("optical_depth", "optical depth", "1"),
         Row(
@@ -171,21 +171,21 @@ MULTIANGLE: Final = Layout(
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="nearest to optical_depth that nowhere decreases with altitude",
+            long_name="profile nearest to optical_depth that nowhere decreases with altitude",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: point",
             ancillaries=("quality_flag",),
             significant_bits=_BITS,
             optional=True,
-            comment="For pictures of single profiles. Where the signal is weak, means over many"
-            f" profiles are biased high: take those of optical_depth. {NO_NAME}",
+            comment="For figures of single profiles. Where the signal is weak, its means over many"
+            f" profiles are biased high: average optical_depth instead. {NO_STANDARD_NAME}",
         ),
         Row(
             name="extinction",
             dims=_LEVELS,
             dtype="f4",
             units="m-1",
-            long_name="extinction coefficient of air and aerosol together",
+            long_name="extinction coefficient of molecules and particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: mean",
             ancillaries=(
@@ -199,63 +199,65 @@ MULTIANGLE: Final = Layout(
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment="Of the layer in altitude_bnds; molecules and particles together, at the"
-            f" wavelength of the channel. {NO_NAME}",
+            comment="Mean over the layer in altitude_bnds, at the wavelength of the channel."
+            f" {NO_STANDARD_NAME}",
         ),
-        _gradient_error("extinction", "the extinction coefficient", "m-1"),
+        _gradient_error("extinction", "extinction", "m-1"),
         Row(
             name="log_intercept",
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="natural logarithm of the range-corrected signal at an optical depth of zero",
+            long_name="natural logarithm of the range-corrected signal at zero optical depth",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean altitude: point",
             ancillaries=("quality_flag", "beams", "shots"),
             uncertain=True,
-            comment="Of the signal in mV m2 (analog) or MHz m2 (photon counting): system constant"
-            f" times backscatter coefficient, not calibrated. {NO_NAME}",
+            comment="Logarithm of the signal in mV m2 (analog) or MHz m2 (photon counting): system"
+            f" constant times backscatter coefficient, not calibrated. {NO_STANDARD_NAME}",
         ),
         Row(
             name="data_share",
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="share of the optical depth that the data give",
+            long_name="share of the optical depth that the data determine",
             coverage=Coverage.QUALITY,
             significant_bits=8,
-            comment=f"1 where neither smoothness nor a prior takes or adds anything. {NO_NAME}",
+            comment=f"1 where neither smoothness nor a prior has an effect. {NO_STANDARD_NAME}",
         ),
         Row(
             name="inhomogeneity",
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="standard deviation of the logarithms of the signals beyond their noise",
+            long_name="standard deviation of ln(signal) between beams in excess of noise",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             significant_bits=8,
-            comment=f"Of the air between the beams, common to all cycles of the file. {NO_NAME}",
+            comment="Inhomogeneity of the air between the beams, common to all cycles of the file."
+            f" {NO_STANDARD_NAME}",
         ),
         Row(
             name="reduced_chi2",
             dims=_LEVELS,
             dtype="f4",
             units="1",
-            long_name="squared residuals over the beams by their variances, per degree of freedom",
+            long_name="reduced chi-square of the fit over the beams",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             significant_bits=8,
             optional=True,
-            comment="About 1, as the inhomogeneity is found from the residuals; less where noise is"
-            f" overstated. Missing where no beam is redundant. {NO_NAME}",
+            comment="Sum of squared residuals divided by their variances, per degree of freedom."
+            " About 1, because the inhomogeneity is estimated from the residuals; less where the"
+            f" noise is overstated. Missing where no beam is redundant. {NO_STANDARD_NAME}",
         ),
         Row(
             name="layer_optical_depth",
             dims=("time", "layer"),
             dtype="f4",
             units="1",
-            long_name="optical depth of air and aerosol between the bounds of the layer",
+            long_name="optical depth of molecules and particles between the bounds of the layer",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
             ancillaries=("layer_optical_depth_gradient_error",),
@@ -263,9 +265,8 @@ MULTIANGLE: Final = Layout(
             uncertain=True,
             error_kind=ErrorKind.BOTH,
             optional=True,
-            comment="Vertical, molecules and particles together, at the wavelength of the channel."
-            " Missing where quality_flag at a bound of the layer forbids the use of a value."
-            f" {NO_NAME}",
+            comment="Along the vertical, at the wavelength of the channel. Missing where"
+            f" quality_flag rejects the value at a bound of the layer. {NO_STANDARD_NAME}",
         ),
         replace(
             _gradient_error("layer_optical_depth", "the optical depth of the layer", "1"),
@@ -277,10 +278,10 @@ MULTIANGLE: Final = Layout(
             dims=("time", "beam", "altitude"),
             dtype="f4",
             units="1",
-            long_name="natural logarithm of the signal of a beam less its fit over the beams",
+            long_name="natural logarithm of the signal of a beam minus the fit over the beams",
             coverage=Coverage.QUALITY,
             significant_bits=8,
-            comment=f"Missing where the beam has no usable signal. {NO_NAME}",
+            comment=f"Missing where the beam has no usable signal. {NO_STANDARD_NAME}",
         ),
         quality(_LEVELS, FLAGS),
         Row(
@@ -288,10 +289,10 @@ MULTIANGLE: Final = Layout(
             dims=("time",),
             dtype="f4",
             units="1",
-            long_name="how many independent numbers of the profile come from the data",
+            long_name="number of independent values of the profile that the data determine",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
-            comment=f"Missing where there is no profile. {NO_NAME}",
+            comment=f"Missing where there is no profile. {NO_STANDARD_NAME}",
         ),
         Row(
             name="reach",
@@ -300,7 +301,7 @@ MULTIANGLE: Final = Layout(
             units="m",
             long_name="highest altitude above the geoid with an estimate",
             coverage=Coverage.AUXILIARY,
-            comment=f"Missing where there is none. {NO_NAME}",
+            comment=f"Missing where there is no estimate. {NO_STANDARD_NAME}",
         ),
         Row(
             name="beams",
@@ -308,7 +309,7 @@ MULTIANGLE: Final = Layout(
             dtype="i4",
             units="1",
             standard_name="number_of_observations",
-            long_name="number of directions with a signal in the scan cycle",
+            long_name="number of beam directions with a signal in the scan cycle",
             coverage=Coverage.AUXILIARY,
             valid_min=0.0,
         ),

@@ -1,1 +1,1 @@
-"""The ``signal`` product: range-corrected signals of one channel."""
+"""The ``signal`` product: background-subtracted, range-corrected signals of one channel."""

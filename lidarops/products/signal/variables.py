@@ -7,7 +7,7 @@ from typing import Final
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     GLUING,
-    NO_NAME,
+    NO_STANDARD_NAME,
     RANGE,
     Coverage,
     Layout,
@@ -20,13 +20,13 @@ from lidarops.netcdf.variables import (
 
 SIGNAL: Final = Layout(
     title="Range-corrected lidar signals",
-    summary="Signals of one lidar channel, background-subtracted and range-corrected, with their"
+    summary="Background-subtracted and range-corrected signals of one lidar channel, with their"
     " standard errors.",
     keywords=("EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",),
     processing_level="L1: calibrated in range and time, not in power",
     references=("Licel GmbH (2023): Licel raw data format.",),
-    comment="The standard errors of the range bins of one profile share the error of its"
-    " background.",
+    comment="The standard errors of all range bins of a profile include the error of its"
+    " background, which is common to them.",
     sampled="range",
     unused_steps=frozenset({"average", "molecular", "known_shape", "reference"}),
     coordinates=coordinates((RANGE,), altitude("range")),
@@ -36,25 +36,25 @@ SIGNAL: Final = Layout(
             dims=("time", "range"),
             dtype="f4",
             units="{signal} m2",
-            long_name="background-subtracted signal times the square of range",
+            long_name="background-subtracted signal times range squared",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean range: mean",
             ancillaries=("quality_flag", "shots"),
             significant_bits=13,
             uncertain=True,
-            comment=f"Not calibrated. {NO_NAME}",
+            comment=f"Not calibrated. {NO_STANDARD_NAME}",
         ),
         Row(
             name="background",
             dims=("time",),
             dtype="f4",
             units="{signal}",
-            long_name="background that was subtracted: sky light, dark current and offset",
+            long_name="subtracted background: sky light, dark current and offset",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
             ancillaries=("shots",),
             uncertain=True,
-            comment=f"Not calibrated. {NO_NAME}",
+            comment=f"Not calibrated. {NO_STANDARD_NAME}",
         ),
         *GLUING,
         quality(
@@ -69,4 +69,4 @@ SIGNAL: Final = Layout(
         shots(of="the profile"),
     ),
 )
-"""What the product holds."""
+"""Layout of the product."""

@@ -7,7 +7,7 @@ from typing import Final
 
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
-    NO_NAME,
+    NO_STANDARD_NAME,
     PLACE,
     TIME,
     Coverage,
@@ -47,22 +47,22 @@ def _place(name: str) -> Row:
     return next(row for row in PLACE if row.name == name)
 
 
-def _of_crossing(name: str) -> Row:
-    """Return the row of where the crossings lie, in place of where a station stands."""
-    row = _place(name)
-    return replace(row, dims=("crossing",), long_name=f"{name} of the point where beams meet")
+def _crossing_position(name: str) -> Row:
+    """Return the row of the latitude or longitude of the crossings."""
+    return replace(_place(name), dims=("crossing",), long_name=f"{name} of the crossing of beams")
 
 
-def _of_beam(name: str, source: str, called: str) -> Row:
+def _beam_row(name: str, source: str, long_name: str) -> Row:
+    """Return the row of a coordinate of the lidars, one value a beam."""
     row = _place(source)
     if name in ("latitude", "longitude"):
-        # As of a station whose values lie elsewhere: one latitude is that of the values.
+        # The latitude of the values is that of the crossings.
         row = replace(deployment(row), comment=None)
     return replace(
         row,
         name=f"beam_{name}",
         dims=("beam",),
-        long_name=called,
+        long_name=long_name,
         follows_beam=False,
         coverage=Coverage.REFERENCE,
     )
@@ -74,23 +74,22 @@ _ALTITUDE: Final = Row(
     dtype="f8",
     units="m",
     standard_name="altitude",
-    long_name="altitude of the point where beams meet, above the geoid",
+    long_name="altitude of the crossing of beams above the geoid",
     coverage=Coverage.COORDINATE,
     axis="Z",
     positive="up",
-    comment="Beams are straight, on the WGS 84 ellipsoid, of which the geoid is taken for a"
-    " parallel.",
+    comment="For straight beams on the WGS 84 ellipsoid, to which the geoid is taken as parallel.",
 )
 _CROSSING: Final = Row(
     name="crossing_id",
     dims=("crossing",),
     dtype="i4",
     units="1",
-    long_name="number of the point in the network of beams",
+    long_name="number of the crossing in the network of beams",
     coverage=Coverage.COORDINATE,
     cf_role="timeseries_id",
-    comment="In order of the nearest range. Points that are the farthest on all of their beams"
-    " have a number too, but no value: nothing tells the attenuation beyond them.",
+    comment="Ordered by the nearest range. A crossing that is the farthest one on all of its beams"
+    " has a number but no value, because nothing constrains the attenuation beyond it.",
 )
 _BEAM: Final = Row(
     name="beam",
@@ -99,28 +98,29 @@ _BEAM: Final = Row(
     units="1",
     long_name="number of the beam",
     coverage=Coverage.COORDINATE,
-    comment="lidarops_steps names the instrument of each beam, and the points that lie on it.",
+    comment="lidarops_steps names the instrument of each beam and the crossings on it.",
 )
 
 
-def _per_time(name: str, called: str, comment: str) -> Row:
+def _time_series(name: str, long_name: str, comment: str) -> Row:
     return Row(
         name=name,
         dims=("time",),
         dtype="f4",
         units="1",
-        long_name=called,
+        long_name=long_name,
         coverage=Coverage.QUALITY,
         valid_min=0.0,
         significant_bits=8,
-        comment=f"{comment} {NO_NAME}",
+        comment=f"{comment} {NO_STANDARD_NAME}",
     )
 
 
 VISIBILITY: Final = Layout(
-    title="Visibility and extinction where beams of several lidars meet",
-    summary="Extinction of air and aerosol together, and visibility, at the points where the beams"
-    " of several lidars meet, without calibration, lidar ratio or reference, with standard errors.",
+    title="Visibility and extinction at crossings of the beams of several lidars",
+    summary="Extinction of molecules and particles together, and visibility, at the crossings of"
+    " the beams of several lidars, without calibration, lidar ratio or reference value, with"
+    " standard errors.",
     keywords=(
         "EARTH SCIENCE > ATMOSPHERE > AIR QUALITY > VISIBILITY",
         "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
@@ -133,42 +133,42 @@ VISIBILITY: Final = Layout(
         "Koschmieder, H. (1924), Beitr. Phys. freien Atmos. 12, 33-53.",
     ),
     comment="Model: along a beam, a = (P r^2 / overlap)^m is proportional to extinction times"
-    " exp(-2 m optical depth), with m the exponent of backscatter ~ extinction^(1/m); where two"
-    " beams meet, both see the same extinction. Signals were averaged before they were solved."
-    " Stations stand where beam_latitude, beam_longitude and beam_altitude say. A gradient over the"
-    " whole network looks like attenuation where air is thin or noise is high, and no test tells"
-    " it there: extinction_standard_error counts with twice the gradient that is typical, and"
-    " with a bend where the mean of a block's profiles allows it. In simulated random networks"
-    " 0.01(1) percent of the values that no flag rejects were off by more than 4 standard errors,"
-    " 0.005(3) in plumes that drift within a block. More profiles in a block and more beams tell"
-    " more. All profiles share what the prior allows, so"
-    " that a mean over time does not make it smaller.",
+    " exp(-2 m optical depth), where m is the exponent in backscatter ~ extinction^(1/m); at a"
+    " crossing, both beams see the same extinction. Signals were averaged before the retrieval."
+    " beam_latitude, beam_longitude and beam_altitude are the positions of the lidars. A gradient"
+    " over the whole network mimics attenuation where the air is optically thin or the noise is"
+    " high, and no test detects it there: extinction_standard_error allows for twice the typical"
+    " gradient, and for a curved field where the mean of a block of profiles permits it. In"
+    " simulated random networks 0.01(1) percent of the values without a rejecting flag deviated by"
+    " more than 4 standard errors, 0.005(3) percent in plumes that drift within a block. More"
+    " profiles in a block and more beams constrain the field better. The error that the prior"
+    " leaves is common to all profiles, so that a mean over time does not reduce it.",
     sampled="crossing",
     feature_type="timeSeries",
     unused_steps=frozenset({"molecular", "known_shape", "reference"}),
     coordinates=(
         TIME,
         _CROSSING,
-        _of_crossing("latitude"),
-        _of_crossing("longitude"),
+        _crossing_position("latitude"),
+        _crossing_position("longitude"),
         _ALTITUDE,
         _BEAM,
-        _of_beam("latitude", "latitude", "latitude of the lidar of the beam"),
-        _of_beam("longitude", "longitude", "longitude of the lidar of the beam"),
-        _of_beam(
+        _beam_row("latitude", "latitude", "latitude of the lidar of the beam"),
+        _beam_row("longitude", "longitude", "longitude of the lidar of the beam"),
+        _beam_row(
             "altitude", "station_altitude", "altitude of the lidar of the beam above the geoid"
         ),
-        _of_beam("zenith_angle", "zenith_angle", "zenith angle of the beam, 0 = up"),
-        _of_beam("azimuth", "azimuth", "azimuth of the beam, clockwise from north"),
+        _beam_row("zenith_angle", "zenith_angle", "zenith angle of the beam, 0 = up"),
+        _beam_row("azimuth", "azimuth", "azimuth of the beam, clockwise from north"),
         _place("wavelength"),
     ),
     data=(
         *(
-            # What the prior allows is most of the error, and the same for all profiles.
+            # Most of the error comes from the prior, which all profiles share.
             replace(row, error_kind=ErrorKind.BOTH) if row.uncertain else row
             for row in visibility(
                 _SERIES,
-                called="at the point where beams meet",
+                place="at the crossing of beams",
                 ancillaries=("extinction_systematic_error", *_OF_VALUE),
                 optional=False,
             )
@@ -178,85 +178,86 @@ VISIBILITY: Final = Layout(
             dims=_SERIES,
             dtype="f4",
             units="m-1",
-            long_name="extinction coefficient of air and aerosol together",
+            long_name="extinction coefficient of molecules and particles",
             coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
             ancillaries=("extinction_systematic_error", *_OF_VALUE),
             significant_bits=_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment="Molecules and particles together, at the wavelength of the channel."
-            f" {NO_NAME}",
+            comment=f"At the wavelength of the channel. {NO_STANDARD_NAME}",
         ),
         Row(
             name="extinction_systematic_error",
             dims=_SERIES,
             dtype="f4",
             units="m-1",
-            long_name="systematic error of the extinction coefficient to allow for",
+            long_name="model (systematic) uncertainty of extinction",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             significant_bits=8,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Apart from extinction_standard_error, of noise and prior: what the errors of"
-            " exponent, lidar ratio and overlap that the settings declare would do, and the signal"
-            f" that may be left in the background. {NO_NAME}",
+            comment="Separate from extinction_standard_error, which covers noise and prior. Effect"
+            " of the errors of exponent, lidar ratio and overlap declared in the settings, and of"
+            f" signal that may remain in the background. {NO_STANDARD_NAME}",
         ),
         Row(
             name="condition",
             dims=_SERIES,
             dtype="f4",
             units="1",
-            long_name="relative change of extinction over that of signals at near ends of beams",
+            long_name="relative change of extinction over that of the signals at the near ends of"
+            " the beams",
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             significant_bits=8,
-            comment="Root of the sum of squares over beams. The more, the more an error of the"
-            f" overlap counts. {NO_NAME}",
+            comment="Root of the sum of squares over the beams. Larger values mean higher"
+            f" sensitivity to overlap errors. {NO_STANDARD_NAME}",
         ),
         replace(
             quality(_SERIES, FLAGS),
-            comment="In this kind of product poorly_determined means a standard error above a third"
-            " of extinction, of the value or as the median of its block, before the doubt in the"
-            " prior is added, or beams too few to tell a field that is not as the prior has it;"
-            " low_leverage a beam that is too weak, or of a variance of zero, to be used beside"
-            " the others; poor_fit beams that disagree by more than"
-            " their noise allows, or a beam that ends before the point at bins that lie off their"
-            " neighbours; outlier a beam with bins that lie more than 6 standard errors off their"
-            " neighbours: these took the place of single ones, while several together, which may be"
-            " the edges of a layer, were left, and what they and the bins between two edges change"
-            " is part of the standard error. The value stands.",
+            comment="In this kind of product, poorly_determined means that the standard error,"
+            " without the uncertainty of the prior, exceeds a third of extinction, for the value or"
+            " as the median of its block, or that there are too few beams to determine a field that"
+            " departs from the prior. low_leverage: a beam is too noisy, or states a variance of"
+            " zero, and was left out; the value comes from the other beams. poor_fit: the beams"
+            " disagree by more than their noise explains, or a beam ends before the crossing at"
+            " bins that deviate from their neighbours. outlier: a beam has bins that deviate by"
+            " more than 6 standard errors from their neighbours. Single bins were replaced from"
+            " their neighbours. Several adjacent bins, which may be the edges of a layer, were"
+            " kept; the effect of these and of the bins between two edges is part of the standard"
+            " error. The value is valid.",
         ),
-        _per_time(
+        _time_series(
             "optical_depth",
-            "optical depth of the longest stretch between points of a beam",
-            "Of the mean extinction at the points.",
+            "optical depth of the longest distance between crossings of one beam",
+            "From the mean extinction at the crossings.",
         ),
-        _per_time(
+        _time_series(
             "reduced_chi2",
             "reduced chi-square of the network",
-            "Of the beams alone, free of the prior. Missing for methods that see one cycle, and"
-            " where nothing is left over.",
+            "From the beams alone, without the prior. Missing for methods that use a single cycle,"
+            " and where there are no degrees of freedom.",
         ),
-        _per_time(
+        _time_series(
             "degrees_of_freedom",
-            "equations of the network beyond its unknowns",
-            "Missing for methods that see one cycle, and where unknowns are more than equations.",
+            "number of equations of the network minus number of unknowns",
+            "Missing for methods that use a single cycle, and where unknowns outnumber equations.",
         ),
-        _per_time(
+        _time_series(
             "prior_deviation",
-            "standard deviation of ln extinction about the mean field, told beforehand",
-            "Found as the likeliest of the block of profiles. Missing where nothing is told.",
+            "prior standard deviation of ln(extinction) about the mean field",
+            "Most likely value for the block of profiles. Missing where there is no prior.",
         ),
         Row(
             name="beam_range",
             dims=("beam", "crossing"),
             dtype="f4",
             units="m",
-            long_name="distance of the point from the lidar along the beam",
+            long_name="distance of the crossing from the lidar along the beam",
             coverage=Coverage.REFERENCE,
             valid_min=0.0,
-            comment=f"Missing where the point does not lie on the beam. {NO_NAME}",
+            comment=f"Missing where the crossing does not lie on the beam. {NO_STANDARD_NAME}",
         ),
         shots(of="all beams of the interval"),
     ),
