@@ -1,4 +1,4 @@
-"""Datasets of one group, joined along time; what belongs to a whole product stands apart."""
+"""Joins datasets of one group along time, and their per-product variables along products."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import xarray as xr
 
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 
-_OF_ONE: Final = (
+_PER_PRODUCT: Final = (
     "date_", "history", "id", "lidarops_input_count", "lidarops_plan", "lidarops_scene",
     "lidarops_steps", "lidarops_window_", "time_coverage_",
 )  # fmt: skip
-"""How the names of attributes begin that are true of one product only."""
+"""Prefixes of global attributes that apply to one product only."""
 
 
-def shared_attributes(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the attributes that are equal in all and true of the whole, in their order."""
-    first = found[0]
+def shared_attributes(attributes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the global attributes that are equal in all products and apply to all, in order."""
+    first = attributes[0]
     return {
         key: value
         for key, value in first.items()
-        if not key.startswith(_OF_ONE)
-        and all(key in other and np.array_equal(other[key], value) for other in found[1:])
+        if not key.startswith(_PER_PRODUCT)
+        and all(key in other and np.array_equal(other[key], value) for other in attributes[1:])
     }
 
 
@@ -34,13 +34,13 @@ def join(pieces: Sequence[xr.Dataset]) -> xr.Dataset:
     Parameters
     ----------
     pieces : sequence of xr.Dataset
-        Of one group, each with ``product`` (product,) and ``product_index`` (time,) of its own.
-        What has neither dimension is equal in all.
+        Of one group, each with ``product`` (product,) and ``product_index`` (time,). Variables
+        with neither dimension must be equal in all.
 
     Returns
     -------
     xr.Dataset
-        In order of time.
+        Sorted by time.
     """
     joined = pieces[0] if len(pieces) == 1 else _joined(pieces)
     times = joined["time"].values
@@ -67,5 +67,5 @@ def _joined(pieces: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def _concat(parts: Sequence[xr.Variable], dim: str) -> xr.Variable:
-    found: xr.Variable = xr.Variable.concat(parts, dim)  # type: ignore[no-untyped-call]
-    return found
+    joined: xr.Variable = xr.Variable.concat(parts, dim)  # type: ignore[no-untyped-call]
+    return joined

@@ -1,4 +1,4 @@
-"""Packages that only some users have."""
+"""Imports of optional packages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def need(module: str, *, extra: str = "aggregate") -> Any:
     module : str
         Such as ``pyarrow.parquet``.
     extra : str
-        Of lidarops, that installs it.
+        Extra of lidarops that installs it.
 
     Returns
     -------
@@ -25,7 +25,7 @@ def need(module: str, *, extra: str = "aggregate") -> Any:
     Raises
     ------
     LidarOpsError
-        If it is not installed.
+        If the package is not installed.
     """
     try:
         return import_module(module)

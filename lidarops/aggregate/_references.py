@@ -1,8 +1,8 @@
-"""Where the chunks of products lie in their files, as kerchunk references to one Zarr hierarchy.
+"""Kerchunk references to the chunks of products, as one Zarr hierarchy.
 
-Format: version 1 of the kerchunk specification over Zarr version 2, which h5py's filters shuffle
-and deflate map to one by one. Products whose chunks do not fit one regular grid along time become
-several Zarr groups, called parts, because Zarr version 2 has regular chunks only.
+Format: version 1 of the kerchunk specification with Zarr version 2. The HDF5 filters shuffle and
+deflate map to Zarr filters one to one. Products whose chunks do not fit one regular grid along time
+become several Zarr groups, called parts, because Zarr version 2 supports only regular chunks.
 """
 
 from __future__ import annotations
@@ -34,39 +34,39 @@ _PLAIN_ENCODING: Final = {"zlib": True, "shuffle": True, "fletcher32": False}
 
 
 @dataclass(frozen=True, slots=True)
-class Lying:
-    """The chunks of one variable of one product, in its file."""
+class ChunkLocations:
+    """Locations of the chunks of one variable in the file of a product."""
 
     chunk: tuple[int, ...]
-    places: Mapping[tuple[int, ...], tuple[int, int]]
-    """Number of the chunk along each axis -> offset and size in bytes."""
+    bytes: Mapping[tuple[int, ...], tuple[int, int]]
+    """Index of the chunk along each axis -> offset and size in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One product, as references need it."""
+    """A product with its chunk locations and small variables."""
 
     facts: Facts
     seal: int
-    """Offset of the product's id in its file: what stands there tells whether it is still it."""
+    """Offset of the product's id in its file, to check later that the file is unchanged."""
     attributes: Mapping[str, Any]
     """Global attributes."""
     inline: Mapping[str, NDArray[Any]]
-    """Small variables along time, scalars of the product."""
-    lying: Mapping[str, Lying]
+    """Values of small variables along time and of scalars."""
+    chunks: Mapping[str, ChunkLocations]
 
 
 @dataclass(slots=True)
 class Part:
-    """Products whose chunks make one regular grid along time."""
+    """Products whose chunks form one regular grid along time."""
 
     chunks: Mapping[str, tuple[int, ...]]
     sources: list[Source] = field(default_factory=list)
     full: bool = False
-    """Whether the last chunk along time is not filled, so that nothing can follow it."""
+    """Whether the last chunk along time is incomplete, so that no product can follow."""
 
     def add(self, source: Source) -> None:
-        """Put a product at the end."""
+        """Append a product."""
         self.sources.append(source)
         profiles = source.facts.profiles
         self.full = any(profiles % chunk[0] for chunk in self.chunks.values())
@@ -74,82 +74,84 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """What all products of a group have alike, from the first of them."""
+    """Variables and static coordinates of a group, from its first product."""
 
     kind: ProductKind
     variables: Mapping[str, xr.Variable]
-    """With the values of the coordinates that do not change with time, without other values."""
+    """Values are loaded only for coordinates that do not change with time."""
 
     def along_time(self, name: str) -> bool:
-        """Say whether a variable changes with time."""
+        """Return whether a variable changes with time."""
         return "time" in self.variables[name].dims
 
     def is_static(self, name: str) -> bool:
-        """Say whether a variable is a coordinate that all products have alike."""
+        """Return whether a variable is a coordinate that is equal in all products."""
         return not self.along_time(name) and name in coordinate_names(self.kind)
 
     def is_inline(self, name: str) -> bool:
-        """Say whether the values of a variable stand among the references."""
+        """Return whether the values of a variable are stored with the references."""
         dims = set(self.variables[name].dims) - {"time", "nv"}
         return not dims
 
 
-def template(root: Path, first: Facts) -> Template:
-    """Read what all products of a group have alike."""
+def read_template(root: Path, first: Facts) -> Template:
+    """Read variables and static coordinates of a group from its first product."""
     with opened(within(root, first.path)) as product:
         names = [str(name) for name in product.variables if name not in UNSHARED]
-        found = Template(first.kind, {name: product.variables[name] for name in names})
+        alike = Template(first.kind, {name: product.variables[name] for name in names})
         for name in names:
-            if found.is_static(name):
-                found.variables[name].load()
-    return found
+            if alike.is_static(name):
+                alike.variables[name].load()
+    return alike
 
 
-def source(root: Path, facts: Facts, alike: Template) -> Source:
-    """Find where the chunks of a product lie.
+def read_source(root: Path, facts: Facts, alike: Template) -> Source:
+    """Read the chunk locations and small variables of a product.
 
     Raises
     ------
     ProductError
-        If the product changed since its facts were read, or is stored otherwise than lidarops
-        writes it.
+        If the product changed since its facts were read, or is not stored as lidarops stores
+        products.
     """
     file = within(root, facts.path)
     with opened(file) as product:
         if product.attrs["id"] != facts.id:
             raise ProductError("changed while it was read", file=facts.path, remedy="run again")
         names = [name for name in alike.variables if not alike.is_static(name)]
-        found = dict(product.attrs)
+        attrs = dict(product.attrs)
         inline = {n: product.variables[n].values for n in names if alike.is_inline(n)}
-        lying = [name for name in names if not alike.is_inline(name)]
-        for name in lying:
+        chunked = [name for name in names if not alike.is_inline(name)]
+        for name in chunked:
             _refuse_foreign_encoding(product.variables[name], name, facts)
     seal = file.read_bytes().find(facts.id.encode())
     if seal < 0:
         raise ProductError("does not hold its id as plain text", file=facts.path, field="id")
-    return Source(facts, seal, found, inline, _lying(file, lying))
+    return Source(facts, seal, attrs, inline, _chunk_locations(file, chunked))
 
 
 def _refuse_foreign_encoding(variable: xr.Variable, name: str, facts: Facts) -> None:
     encoding = variable.encoding
     if any(bool(encoding.get(key)) != value for key, value in _PLAIN_ENCODING.items()):
         raise ProductError(
-            "is not stored as lidarops stores it: shuffled and deflated",
+            "is not stored as lidarops stores it (shuffle and deflate)",
             file=facts.path,
             field=name,
             remedy="process the scene again, or open the files with lidarops.open_products",
         )
 
 
-def _lying(file: Path, names: Iterable[str]) -> dict[str, Lying]:
-    found = {}
+def _chunk_locations(file: Path, names: Iterable[str]) -> dict[str, ChunkLocations]:
+    locations = {}
     try:
         with h5py.File(file, "r") as stored:
             for name in names:
-                found[name] = Lying(stored[name].chunks, dict(_places(file, name, stored[name])))
+                locations[name] = ChunkLocations(
+                    stored[name].chunks, dict(_places(file, name, stored[name]))
+                )
     except (OSError, KeyError, RuntimeError) as error:
         raise ProductError(f"cannot be read: {error}", file=file) from error
-    return found
+    return locations
 
 
 def _places(
@@ -157,30 +159,34 @@ def _places(
 ) -> Iterator[tuple[tuple[int, ...], tuple[int, int]]]:
     for number in range(dataset.id.get_num_chunks()):
         info = dataset.id.get_chunk_info(number)
-        at = tuple(at // step for at, step in zip(info.chunk_offset, dataset.chunks, strict=True))
+        index = tuple(
+            start // step for start, step in zip(info.chunk_offset, dataset.chunks, strict=True)
+        )
         if info.filter_mask:
-            # HDF5 may leave out a filter for one chunk; Zarr knows no such chunk.
+            # HDF5 may skip a filter for single chunks; Zarr does not support this.
             raise ProductError("has a chunk that is not deflated", file=file, field=name)
-        yield at, (info.byte_offset, info.size)
+        yield index, (info.byte_offset, info.size)
 
 
-def parts(sources: Iterable[Source], alike: Template) -> list[Part]:
-    """Put products into as few parts as their chunks allow, in their order."""
+def group_parts(sources: Iterable[Source], alike: Template) -> list[Part]:
+    """Group products into as few parts as their chunks allow, in their order."""
     open_parts: dict[tuple[Any, ...], Part] = {}
-    found = []
-    for each in sources:
-        chunks = {name: lying.chunk for name, lying in each.lying.items() if alike.along_time(name)}
+    all_parts = []
+    for product in sources:
+        chunks = {
+            name: stored.chunk for name, stored in product.chunks.items() if alike.along_time(name)
+        }
         key = tuple(sorted(chunks.items()))
         part = open_parts.get(key)
         if part is None or part.full:
             part = open_parts[key] = Part(chunks)
-            found.append(part)
-        part.add(each)
-    return found
+            all_parts.append(part)
+        part.add(product)
+    return all_parts
 
 
 def references(part: Part, alike: Template, mode: DetectionMode, shared: Mapping[str, Any]) -> Refs:
-    """Write a part as Zarr metadata, small values, and places in files.
+    """Return a part as Zarr metadata, small values and chunk locations.
 
     Parameters
     ----------
@@ -188,12 +194,12 @@ def references(part: Part, alike: Template, mode: DetectionMode, shared: Mapping
     alike : Template
     mode : DetectionMode
     shared : mapping
-        Attributes of the whole.
+        Global attributes.
 
     Returns
     -------
     dict of str to str or list
-        Key in the Zarr group -> content, or address, offset and size.
+        Key in the Zarr group -> content, or file, offset and size.
     """
     refs: Refs = {
         ".zgroup": _json({"zarr_format": 2}),
@@ -206,21 +212,21 @@ def references(part: Part, alike: Template, mode: DetectionMode, shared: Mapping
             refs |= _small(name, part, alike)
         else:
             refs |= _referred(name, part, alike)
-    ids = np.array([each.facts.id for each in part.sources], "S")
-    counts = [each.facts.profiles for each in part.sources]
+    ids = np.array([source.facts.id for source in part.sources], "S")
+    counts = [source.facts.profiles for source in part.sources]
     index = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
     for row, values in ((PRODUCT, ids), (PRODUCT_INDEX, index)):
         refs |= _inlined(row.name, values, row.dims, _without_encoding(attributes(row, mode=mode)))
     return refs
 
 
-def _without_encoding(found: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in found.items() if key != "_Encoding"}
+def _without_encoding(attrs: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in attrs.items() if key != "_Encoding"}
 
 
 def _small(name: str, part: Part, alike: Template) -> Refs:
     variable = alike.variables[name]
-    values = [each.inline[name] for each in part.sources]
+    values = [source.inline[name] for source in part.sources]
     if alike.along_time(name):
         return _inlined(name, np.concatenate(values), variable.dims, variable.attrs)
     return _inlined(name, np.stack(values), ("product", *variable.dims), variable.attrs)
@@ -229,16 +235,16 @@ def _small(name: str, part: Part, alike: Template) -> Refs:
 def _referred(name: str, part: Part, alike: Template) -> Refs:
     variable = alike.variables[name]
     along_time = alike.along_time(name)
-    chunk = part.sources[0].lying[name].chunk
+    chunk = part.sources[0].chunks[name].chunk
     refs: Refs = {}
     profiles = first = 0
-    for number, each in enumerate(part.sources):
-        address = f"{{{{{TEMPLATE}}}}}/{each.facts.path}"
-        for at, lies in each.lying[name].places.items():
-            place = (first + at[0], *at[1:]) if along_time else (number, *at)
-            refs[f"{name}/{'.'.join(map(str, place))}"] = [address, *lies]
-        profiles += each.facts.profiles
-        first += -(-each.facts.profiles // chunk[0])
+    for number, source in enumerate(part.sources):
+        address = f"{{{{{TEMPLATE}}}}}/{source.facts.path}"
+        for index, location in source.chunks[name].bytes.items():
+            key = (first + index[0], *index[1:]) if along_time else (number, *index)
+            refs[f"{name}/{'.'.join(map(str, key))}"] = [address, *location]
+        profiles += source.facts.profiles
+        first += -(-source.facts.profiles // chunk[0])
     rest = variable.shape[1:] if along_time else variable.shape
     dims = variable.dims if along_time else ("product", *variable.dims)
     shape = (profiles if along_time else len(part.sources), *rest)
@@ -255,7 +261,7 @@ def _referred(name: str, part: Part, alike: Template) -> Refs:
 def _inlined(
     name: str, values: NDArray[Any], dims: tuple[Any, ...], attrs: Mapping[Any, Any]
 ) -> Refs:
-    """Write values as one chunk that stands among the references."""
+    """Return values as one chunk that is stored with the references."""
     stored = np.ascontiguousarray(values).reshape(values.shape)
     packed = _as_text(zlib.compress(stored.tobytes(), _LEVEL))
     key = ".".join("0" for _ in stored.shape) or "0"
@@ -278,7 +284,7 @@ def _described(
     attrs: Mapping[Any, Any],
     filters: list[dict[str, Any]],
 ) -> Refs:
-    told = {str(key): plain(value) for key, value in attrs.items() if key != "_FillValue"}
+    plain_attrs = {str(key): plain(value) for key, value in attrs.items() if key != "_FillValue"}
     fill = plain(attrs.get("_FillValue"))
     array = {
         "zarr_format": 2,
@@ -293,7 +299,7 @@ def _described(
     }
     return {
         f"{name}/.zarray": _json(array),
-        f"{name}/.zattrs": _json({"_ARRAY_DIMENSIONS": dims, **told}),
+        f"{name}/.zattrs": _json({"_ARRAY_DIMENSIONS": dims, **plain_attrs}),
     }
 
 

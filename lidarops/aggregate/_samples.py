@@ -1,4 +1,4 @@
-"""What means need of a product: quantities with the parts of their errors, flags, times."""
+"""Reads from a product what means need: values, error components, flags and times."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Profiles:
 
 
 def read_profiles(root: Path, facts: Facts) -> Profiles:
-    """Read what means need of a product, all of it, so that a damaged one spoils no sum.
+    """Read what means need from a product, completely, so that a damaged product affects no sum.
 
     Parameters
     ----------
@@ -54,72 +54,72 @@ def read_profiles(root: Path, facts: Facts) -> Profiles:
     Raises
     ------
     ProductError
-        If the product cannot be read, has changed since its facts were read.
+        If the product cannot be read, or has changed since its facts were read.
     """
     with opened(within(root, facts.path)) as product:
         if product.attrs["id"] != facts.id:
             raise ProductError("changed while it was read", file=facts.path, remedy="run again")
         flags = product[QUALITY_FLAG].values
-        wanted = (flags & np.int32(Quality.rejecting())) == 0
+        usable = (flags & np.int32(Quality.rejecting())) == 0
         rows = [row for row in averaged(facts.kind) if row.name in product]
         return Profiles(
             facts,
             dict(product.attrs),
             product["time"].values,
-            {row.name: _sample(product, facts.kind, row, wanted) for row in rows},
+            {row.name: _sample(product, facts.kind, row, usable) for row in rows},
             flags,
             product["shots"].values.astype(np.float64),
         )
 
 
-def _sample(product: xr.Dataset, kind: ProductKind, row: Row, wanted: NDArray[np.bool_]) -> Sample:
+def _sample(product: xr.Dataset, kind: ProductKind, row: Row, usable: NDArray[np.bool_]) -> Sample:
     values = numbers(product, row.name)
     errors = numbers(product, f"{row.name}_standard_error")
-    found = budget_of(kind, row.name)
-    random, shared = (errors, ()) if found is None else _divided(product, found, errors)
-    judged = row.dims == product[QUALITY_FLAG].dims
+    budget = budget_of(kind, row.name)
+    random, shared = (errors, ()) if budget is None else _divide(product, budget, errors)
+    has_flags = row.dims == product[QUALITY_FLAG].dims
     return Sample(
         values,
         errors,
         random,
         shared,
-        _apart(product, kind, row.name, values, errors),
-        wanted if judged else np.ones(values.shape, np.bool_),
+        _systematic_error(product, kind, row.name, values, errors),
+        usable if has_flags else np.ones(values.shape, np.bool_),
     )
 
 
-def _apart(
+def _systematic_error(
     product: xr.Dataset, kind: ProductKind, name: str, values: Array, errors: Array
 ) -> Array | None:
-    """Return the error that stands apart from the standard error, or that an interval tells."""
+    """Return the systematic error that is not part of the standard error; None without one."""
     if name in INTERVALS:
         with np.errstate(divide="ignore", invalid="ignore"):
             whole = values / numbers(product, INTERVALS[name]) - 1.0
-            # Where there is nearly no systematic error, rounding may leave less than nothing.
-            apart: Array = values * np.sqrt(np.maximum(whole**2 - (errors / values) ** 2, 0.0))
-        return apart
-    found = systematic(kind, name)
-    return numbers(product, found) if found and found in product else None
+            # With hardly any systematic error, rounding may give a negative difference.
+            error: Array = values * np.sqrt(np.maximum(whole**2 - (errors / values) ** 2, 0.0))
+        return error
+    variable = systematic(kind, name)
+    return numbers(product, variable) if variable and variable in product else None
 
 
-def _divided(product: xr.Dataset, found: Budget, errors: Array) -> tuple[Array, tuple[Array, ...]]:
-    """Divide a standard error into what is new in every profile and what is shared."""
+def _divide(product: xr.Dataset, budget: Budget, errors: Array) -> tuple[Array, tuple[Array, ...]]:
+    """Divide a standard error into a part independent between profiles and shared parts."""
     variance = np.zeros_like(errors)
-    for name in found.random:
+    for name in budget.random:
         variance += numbers(product, name) ** 2
     random = np.sqrt(variance)
-    if found.times:
-        random = random * numbers(product, found.times)
-    if found.over:
-        random = random / numbers(product, found.over)
-    if found.shared:
-        return random, tuple(numbers(product, name) for name in found.shared)
-    # Stored errors are rounded, so that the difference may be a little less than nothing.
+    if budget.times:
+        random = random * numbers(product, budget.times)
+    if budget.over:
+        random = random / numbers(product, budget.over)
+    if budget.shared:
+        return random, tuple(numbers(product, name) for name in budget.shared)
+    # Stored errors are rounded, so the difference may be slightly negative.
     return random, (np.sqrt(np.maximum(errors**2 - random**2, 0.0)),)
 
 
 def numbers(product: xr.Dataset, name: str) -> Array:
-    """Return a variable of a product that is not decoded, NaN where it is missing."""
+    """Return a variable of an undecoded product in double precision; missing values are NaN."""
     variable = product[name]
     values: Array = variable.values.astype(np.float64)
     fill = variable.attrs.get("_FillValue")

@@ -1,4 +1,4 @@
-"""Sums over profiles that means and their errors follow from, one product after the other."""
+"""Running sums over profiles, from which means and their errors follow."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ Counts = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A quantity in the profiles of one product, all of shape (time, ...)."""
+    """A quantity of one product; arrays of shape (time, ...)."""
 
     values: Array
     """NaN where missing."""
     errors: Array
     """Standard errors."""
     random: Array
-    """The part of `errors` that is new in every profile."""
+    """The part of `errors` that is independent between profiles."""
     shared: tuple[Array, ...]
-    """Errors that all profiles share, one array a cause, with signs."""
+    """Signed errors that all profiles share, one array per cause."""
     systematic: Array | None
-    """An error apart from `errors`, that all profiles share."""
-    wanted: NDArray[np.bool_]
-    """Where no quality bit rejects."""
+    """Systematic error that is not part of `errors`, shared by all profiles."""
+    usable: NDArray[np.bool_]
+    """Whether no quality bit rejects the value."""
 
     def take(self, chosen: NDArray[np.intp]) -> Sample:
         """Return some of the profiles."""
@@ -36,13 +36,13 @@ class Sample:
             self.random[chosen],
             tuple(part[chosen] for part in self.shared),
             None if self.systematic is None else self.systematic[chosen],
-            self.wanted[chosen],
+            self.usable[chosen],
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Mean:
-    """What follows for a period, all of shape (...); NaN where nothing could be used."""
+    """Mean and errors of a period; arrays of shape (...), NaN without a usable value."""
 
     mean: Array
     standard_error: Array
@@ -62,8 +62,8 @@ class Sums:
         \bar x = \sum_i w_i x_i / W, \quad W = \sum_i w_i, \quad
         \sigma^2 = \sum_i w_i^2 r_i^2 / W^2 + \sum_k \left(\sum_i w_i s_{ki} / W\right)^2 .
 
-    A shared error is fully correlated between profiles, and so is averaged before it is squared
-    (`gum2008`, section 5.2).
+    Shared errors are fully correlated between profiles, so they are averaged before they are
+    squared (`gum2008`, section 5.2).
     """
 
     inverse_variance: bool
@@ -74,31 +74,31 @@ class Sums:
     systematic: Array | None
     count: Counts
     centre: Array
-    """Unweighted mean so far, for the spread."""
+    """Unweighted mean so far, for `spread`."""
     spread: Array
-    """Sum of squared distances from it."""
+    """Sum of squared deviations from `centre`."""
 
     @classmethod
     def like(cls, sample: Sample, *, inverse_variance: bool) -> Sums:
-        """Return sums of nothing for samples of a shape.
+        """Return empty sums with the shape of a sample.
 
         Parameters
         ----------
         sample : Sample
         inverse_variance : bool
-            Whether a profile counts by 1 / standard_error^2, else all count alike.
+            Whether profiles are weighted by 1 / standard_error^2, else equally.
         """
-        nothing = np.zeros(sample.values.shape[1:])
+        zeros = np.zeros(sample.values.shape[1:])
         return cls(
             inverse_variance=inverse_variance,
-            weight=nothing.copy(),
-            value=nothing.copy(),
-            random=nothing.copy(),
-            shared=tuple(nothing.copy() for _ in sample.shared),
-            systematic=None if sample.systematic is None else nothing.copy(),
-            count=nothing.astype(np.int64),
-            centre=nothing.copy(),
-            spread=nothing.copy(),
+            weight=zeros.copy(),
+            value=zeros.copy(),
+            random=zeros.copy(),
+            shared=tuple(zeros.copy() for _ in sample.shared),
+            systematic=None if sample.systematic is None else zeros.copy(),
+            count=zeros.astype(np.int64),
+            centre=zeros.copy(),
+            spread=zeros.copy(),
         )
 
     def add(self, sample: Sample) -> None:
@@ -109,7 +109,7 @@ class Sums:
         sample : Sample
         """
         used = self._used(sample)
-        # What is not used must be a number too, as nothing times NaN is NaN.
+        # Unused values must be finite too, because 0 x NaN is NaN.
         weights = np.zeros(used.shape)
         weights[used] = sample.errors[used] ** -2.0 if self.inverse_variance else 1.0
         self.weight += weights.sum(axis=0)
@@ -124,13 +124,13 @@ class Sums:
     def _used(self, sample: Sample) -> NDArray[np.bool_]:
         parts = [sample.values, sample.errors, sample.random, *sample.shared]
         parts += [] if sample.systematic is None else [sample.systematic]
-        used = sample.wanted.copy()
+        used = sample.usable.copy()
         for part in parts:
             used &= np.isfinite(part)
         return used & (sample.errors > 0.0) if self.inverse_variance else used
 
     def _spread(self, values: Array, used: NDArray[np.bool_]) -> None:
-        """Merge the spread of a product with that so far (`chan1983`)."""
+        """Add the spread of a product (`chan1983`)."""
         count = used.sum(axis=0)
         total = self.count + count
         centre = values.sum(axis=0) / np.maximum(count, 1)
@@ -141,7 +141,7 @@ class Sums:
         self.count = total
 
     def mean(self) -> Mean:
-        """Return what follows from the sums."""
+        """Return the mean and its errors."""
         weight = np.where(self.count > 0, self.weight, np.nan)
         variance = self.random / weight**2
         for part in self.shared:

@@ -1,4 +1,4 @@
-"""All aggregates of an output that are asked for, made one after the other."""
+"""Makes the aggregates of an output: index, views, means, STAC catalog."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from lidarops.aggregate.facts import (
     Facts,
     ProductSelection,
     Refused,
+    grid_notes,
     groups,
     list_products,
     read_product_facts,
-    told_grids,
 )
 from lidarops.aggregate.index import write_index
 from lidarops.aggregate.means import MeansFile, write_means
@@ -28,19 +28,19 @@ Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What is asked for besides the views, which are always made."""
+class AggregateOptions:
+    """Which aggregates to make besides the views, which are always made."""
 
     selection: ProductSelection = EVERYTHING
     period: Period | None = None
-    """Of means; None for none."""
+    """Period of means; None for no means."""
     weights: Weights = Weights.PLAIN
     stac: bool = False
 
 
 @dataclass(slots=True)
-class Made:
-    """What was made, and what was not and why."""
+class AggregateResult:
+    """Aggregates that were made, and what failed and why."""
 
     root: Path
     products: int = 0
@@ -51,77 +51,82 @@ class Made:
     refused: list[Refused] = field(default_factory=list)
     """Products that could not be read."""
     failed: list[str] = field(default_factory=list)
-    """What could not be made, one sentence each."""
+    """Aggregates that could not be made, one sentence each."""
     told: list[str] = field(default_factory=list)
-    """What is to be known, one sentence each."""
+    """Notes, one sentence each."""
 
 
-def make_aggregates(root: Path, wanted: Wanted, *, progress: Progress = lambda _done: None) -> Made:
-    """Make the aggregates of an output; what fails is named, and the rest goes on.
+def make_aggregates(
+    root: Path, options: AggregateOptions, *, progress: Progress = lambda _done: None
+) -> AggregateResult:
+    """Make the aggregates of an output; a failure is reported and the others are made.
 
     Parameters
     ----------
     root : path
         Output of a campaign, or a folder of products; aggregates go to its ``aggregates``.
-    wanted : Wanted
+    options : AggregateOptions
     progress : callable
-        Told 1 for each product that was looked at.
+        Called with 1 for each product that was examined.
 
     Returns
     -------
-    Made
-        The index and the STAC catalog are made of all products only, not of a selection.
+    AggregateResult
+        Index and STAC catalog are made only without a selection, because they list all products.
 
     Raises
     ------
     ProductError
-        If there is no such folder, or it holds no product that is wanted.
+        If the folder is missing, or contains no selected product.
     LidarOpsError
         If a package is missing.
     OSError
         If a file cannot be written.
     """
-    made = Made(root)
-    products = _products(root, wanted.selection, made, progress)
+    made = AggregateResult(root)
+    products = _products(root, options.selection, made, progress)
     if not products:
-        _refuse_unknown(root, wanted.selection)
-        raise ProductError("no product is found", file=root, remedy=_remedy(made))
+        _refuse_unknown(root, options.selection)
+        raise ProductError("no product found", file=root, remedy=_remedy(made))
     made.products = len(products)
-    found = groups(products)
-    made.told += told_grids(found)
-    if wanted.selection == EVERYTHING:
+    by_group = groups(products)
+    made.told += grid_notes(by_group)
+    if options.selection == EVERYTHING:
         made.index = write_index(root, products)
     else:
-        made.told.append("the index is of all products: run without a selection to renew it")
-    for of_group in found.values():
-        _try(made, partial(_view, made, of_group))
-        if wanted.period is not None:
-            _try(made, partial(_means, made, of_group, wanted.period, wanted.weights))
-    if wanted.stac:
-        _try(made, partial(_stac, made, products, wanted.selection))
+        made.told.append("the index lists all products; run without a selection to update it")
+    for group_products in by_group.values():
+        _try(made, partial(_view, made, group_products))
+        if options.period is not None:
+            _try(made, partial(_means, made, group_products, options.period, options.weights))
+    if options.stac:
+        _try(made, partial(_stac, made, products, options.selection))
     return made
 
 
-def _products(root: Path, wanted: ProductSelection, made: Made, progress: Progress) -> list[Facts]:
+def _products(
+    root: Path, selection: ProductSelection, made: AggregateResult, progress: Progress
+) -> list[Facts]:
     products = []
     for path in list_products(root):
-        for found in read_product_facts(root, [path], wanted):
-            if isinstance(found, Refused):
-                made.refused.append(found)
+        for facts in read_product_facts(root, [path], selection):
+            if isinstance(facts, Refused):
+                made.refused.append(facts)
             else:
-                products.append(found)
+                products.append(facts)
         progress(1)
     return products
 
 
-def _refuse_unknown(root: Path, wanted: ProductSelection) -> None:
-    """Refuse what no product is of, and name what there is."""
-    there = _products(root, EVERYTHING, Made(root), lambda _done: None)
+def _refuse_unknown(root: Path, selection: ProductSelection) -> None:
+    """Refuse a selected channel, station or instrument that no product has."""
+    products = _products(root, EVERYTHING, AggregateResult(root), lambda _done: None)
     for name in ("channel", "station", "instrument"):
-        asked, known = getattr(wanted, name), sorted({getattr(each, name) for each in there})
-        if known and asked is not None and asked not in known:
+        selected = getattr(selection, name)
+        known = sorted({getattr(product, name) for product in products})
+        if known and selected is not None and selected not in known:
             raise ProductError(
-                f"no product is of {name} {asked!r}",
+                f"no product has the {name} {selected!r}",
                 file=root,
                 field=name,
                 remedy=f"known: {', '.join(known)}",
@@ -129,33 +134,37 @@ def _refuse_unknown(root: Path, wanted: ProductSelection) -> None:
             )
 
 
-def _remedy(made: Made) -> str:
+def _remedy(made: AggregateResult) -> str:
     if made.refused:
         first = made.refused[0]
-        return f"{len(made.refused)} files cannot be read, the first: {first.path}: {first.reason}"
-    return "process scenes first, or ask for less"
+        return (
+            f"{len(made.refused)} files cannot be read; the first is {first.path}: {first.reason}"
+        )
+    return "process scenes first, or select less strictly"
 
 
-def _try(made: Made, step: Callable[[], None]) -> None:
+def _try(made: AggregateResult, step: Callable[[], None]) -> None:
     try:
         step()
     except ProductError as error:
         made.failed.append(str(error))
 
 
-def _view(made: Made, products: Sequence[Facts]) -> None:
+def _view(made: AggregateResult, products: Sequence[Facts]) -> None:
     view = write_view(made.root, products)
     made.views.append(view)
     made.refused += view.refused
 
 
-def _means(made: Made, products: Sequence[Facts], period: Period, weights: Weights) -> None:
+def _means(
+    made: AggregateResult, products: Sequence[Facts], period: Period, weights: Weights
+) -> None:
     done = write_means(made.root, products, period, weights=weights)
     made.means += done.files
     made.refused += done.refused
 
 
-def _stac(made: Made, products: Sequence[Facts], selection: ProductSelection) -> None:
+def _stac(made: AggregateResult, products: Sequence[Facts], selection: ProductSelection) -> None:
     if selection != EVERYTHING:
-        raise ProductError("the STAC catalog is of all products", remedy="run without a selection")
+        raise ProductError("the STAC catalog lists all products", remedy="run without a selection")
     made.stac = write_stac(made.root, products)

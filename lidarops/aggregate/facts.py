@@ -1,4 +1,4 @@
-"""What an aggregate knows of a product: its facts, read from the file and from nothing else."""
+"""Facts of a product that aggregates need, read from its file; groups of products."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from lidarops.products.layouts import LAYOUTS
 from lidarops.records import ProductKind
 
 FOLDER: Final = "aggregates"
-"""Folder beside the products that aggregates are written to."""
+"""Folder of aggregates beside the products."""
 UNSHARED: Final = frozenset({PROVENANCE.name, "station", "quantization_info"})
-"""Variables about one product, which an aggregate does not hold."""
+"""Variables of single products that aggregates do not contain."""
 
 _SCHEMA_ATTRIBUTES: Final = ("units", "standard_name", "flag_masks", "flag_meanings")
 _GRID_DIGITS: Final = 16
@@ -32,7 +32,7 @@ _GRID_DIGITS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """One product as an aggregate sees it."""
+    """Facts of one product."""
 
     path: str
     """Relative to the folder of the aggregate's products, with forward slashes."""
@@ -44,33 +44,33 @@ class Facts:
     channel: str
     mode: str
     wavelength: float
-    """m; NaN where it is not known."""
+    """m; NaN if unknown."""
     start: datetime
     """Start of the first profile."""
     stop: datetime
     latitude: float
-    """degree, of the station; of the middle of a network of several."""
+    """degree, of the station; mean over the stations of a network."""
     longitude: float
     altitude: float
-    """m above the geoid, of the same."""
+    """m above the geoid, of the station or mean over the network."""
     sha256: str
     size: int
     profiles: int
     values: int
-    """Values that ``quality_flag`` judges."""
+    """Number of values of ``quality_flag``."""
     usable: int
-    """Those that no bit rejects."""
+    """Number of values that no bit rejects."""
     unflagged: int
-    """Those that carry no bit."""
+    """Number of values without any bit."""
     grid: str
-    """Digest of all that must be equal in products that are joined along time."""
+    """Digest of what must be equal in products that are joined along time."""
     code_version: str
     flagged: Mapping[str, int] = field(default_factory=dict)
-    """Quality bit name -> number of values that carry it, without the bits of none."""
+    """Quality bit name -> number of values that carry it, if any."""
 
     @property
     def group(self) -> Group:
-        """What the product can be joined with."""
+        """Group of products that this one can be joined with."""
         return Group(self.station, self.instrument, self.kind, self.channel, self.grid)
 
 
@@ -86,13 +86,13 @@ class Group:
 
     @property
     def name(self) -> str:
-        """A name for files."""
+        """Name of the group in file names."""
         return f"{self.station}_{self.instrument}_{self.kind.value}_{self.channel}_{self.grid[:8]}"
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """A file that is no product, or no whole one."""
+    """A file that is not a readable product."""
 
     path: str
     reason: str
@@ -100,16 +100,16 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class ProductSelection:
-    """Which products are wanted; None and empty mean all."""
+    """Selection of products; None selects all."""
 
     kind: ProductKind | None = None
     channel: str | None = None
     station: str | None = None
     instrument: str | None = None
     since: datetime | None = None
-    """Products that end after it."""
+    """Select products that end after this time."""
     until: datetime | None = None
-    """Products that start before it."""
+    """Select products that start before this time."""
 
     def admits(
         self,
@@ -120,11 +120,11 @@ class ProductSelection:
         start: datetime,
         stop: datetime,
     ) -> bool:
-        """Say whether a product is wanted."""
-        asked = (self.kind, self.station, self.instrument, self.channel)
-        found = (kind, station, instrument, channel)
+        """Return whether a product is selected."""
+        selected = (self.kind, self.station, self.instrument, self.channel)
+        stated = (kind, station, instrument, channel)
         return (
-            all(want is None or want == is_ for want, is_ in zip(asked, found, strict=True))
+            all(name is None or name == own for name, own in zip(selected, stated, strict=True))
             and (self.since is None or stop > self.since)
             and (self.until is None or start < self.until)
         )
@@ -134,13 +134,13 @@ EVERYTHING: Final = ProductSelection()
 
 
 def list_products(root: Path) -> list[str]:
-    """List the NetCDF files under a folder of output, or of products.
+    """List the NetCDF files of an output folder or a folder of products.
 
     Parameters
     ----------
     root : path
-        The output of a campaign, of which only ``products`` counts, or a folder of products.
-        Hidden files, and what lies in ``aggregates``, are left out.
+        Output of a campaign, of which only ``products`` is searched, or a folder of products.
+        Hidden files and the folder ``aggregates`` are left out.
 
     Returns
     -------
@@ -150,15 +150,15 @@ def list_products(root: Path) -> list[str]:
     Raises
     ------
     ProductError
-        If there is no such folder.
+        If the folder does not exist.
     """
     if not root.is_dir():
         raise ProductError(
-            "is no folder", file=root, remedy="give the folder of products", wrong_use=True
+            "is not a folder", file=root, remedy="give the folder of products", wrong_use=True
         )
     below = root / "products" if (root / "products").is_dir() else root
-    found = (file.relative_to(root) for file in below.rglob("*.nc"))
-    return sorted(path.as_posix() for path in found if _is_listed(path))
+    paths = (file.relative_to(root) for file in below.rglob("*.nc"))
+    return sorted(path.as_posix() for path in paths if _is_listed(path))
 
 
 def _is_listed(path: Path) -> bool:
@@ -166,7 +166,7 @@ def _is_listed(path: Path) -> bool:
 
 
 def within(root: Path, path: str) -> Path:
-    """Return a file of a folder, and refuse what leads out of it.
+    """Return a file of a folder; refuse paths that lead out of it.
 
     Parameters
     ----------
@@ -184,49 +184,49 @@ def within(root: Path, path: str) -> Path:
         If the path is absolute, goes up, or is a link to the outside.
     """
     pure = PurePosixPath(path)
-    found = root / path
+    file = root / path
     if pure.is_absolute() or ".." in pure.parts or "\\" in path or not path:
-        raise ProductError("is no path inside its folder", file=path)
-    if not found.resolve().is_relative_to(root.resolve()):
+        raise ProductError("is not a path inside its folder", file=path)
+    if not file.resolve().is_relative_to(root.resolve()):
         raise ProductError(f"leads out of {root}", file=path, remedy="replace the link by the file")
-    return found
+    return file
 
 
 def read_product_facts(
     root: Path, paths: Iterable[str], selection: ProductSelection = EVERYTHING
 ) -> Iterator[Facts | Refused]:
-    """Read the facts of the products that are wanted, and go on where one cannot be read.
+    """Read the facts of selected products; unreadable files do not stop the reading.
 
     Parameters
     ----------
     root : path
     paths : iterable of str
         From `list_products`.
-    selection : Selection
+    selection : ProductSelection
 
     Yields
     ------
     Facts or Refused
-        A file that cannot be read is refused whatever is wanted, as nothing tells what it is.
+        Unreadable files are refused whatever the selection, because their kind is unknown.
     """
     for path in paths:
         try:
-            if _is_wanted(within(root, path), selection):
+            if _is_selected(within(root, path), selection):
                 yield read_facts(root, path)
         except ProductError as error:
             yield Refused(path, error.problem)
 
 
-def _is_wanted(file: Path, selection: ProductSelection) -> bool:
-    """Look at the attributes of a product, which is faster than to read its facts."""
+def _is_selected(file: Path, selection: ProductSelection) -> bool:
+    """Return whether a product is selected, from its attributes alone."""
     if selection == EVERYTHING:
         return True
     with opened(file) as product:
-        found = product.attrs
+        attributes = product.attrs
         names = ("station", "instrument", "channel")
-        start, stop = (_moment(found[f"time_coverage_{end}"]) for end in ("start", "end"))
-        station, instrument, channel = (found[f"lidarops_{name}"] for name in names)
-        return selection.admits(kind_of(product, file), station, instrument, channel, start, stop)
+        start, stop = (_moment(attributes[f"time_coverage_{end}"]) for end in ("start", "end"))
+        station, instrument, channel = (attributes[f"lidarops_{name}"] for name in names)
+        return selection.admits(_kind_of(product, file), station, instrument, channel, start, stop)
 
 
 def read_facts(root: Path, path: str) -> Facts:
@@ -245,12 +245,12 @@ def read_facts(root: Path, path: str) -> Facts:
     Raises
     ------
     ProductError
-        If the file leads out of `root`, cannot be read, or is no product of lidarops.
+        If the file leads out of `root`, cannot be read, or is not a product of lidarops.
     """
     file = within(root, path)
     with opened(file) as product:
         attributes = product.attrs
-        kind = kind_of(product, file)
+        kind = _kind_of(product, file)
         flags = product["quality_flag"].values
         rejecting = np.int32(Quality.rejecting())
         height = "station_altitude" if "station_altitude" in product else "altitude"
@@ -275,7 +275,7 @@ def read_facts(root: Path, path: str) -> Facts:
             values=flags.size,
             usable=flags.size - int(np.count_nonzero(flags & rejecting)),
             unflagged=flags.size - int(np.count_nonzero(flags)),
-            grid=grid_digest(product, kind),
+            grid=_grid_digest(product, kind),
             code_version=attributes["lidarops_code_version"],
             flagged=_flagged(flags),
         )
@@ -283,7 +283,7 @@ def read_facts(root: Path, path: str) -> Facts:
 
 @contextmanager
 def opened(file: Path) -> Iterator[xr.Dataset]:
-    """Open a product as stored, and tell what is wrong with it in a sentence.
+    """Open a product without decoding; damage raises an error with a clear message.
 
     Parameters
     ----------
@@ -303,41 +303,41 @@ def opened(file: Path) -> Iterator[xr.Dataset]:
         with xr.open_dataset(file, engine="netcdf4", decode_cf=False, cache=False) as product:
             yield product
     except KeyError as error:
-        raise ProductError(f"is no product of lidarops: it has no {error}", file=file) from error
-    # A damaged file gives OSError or RuntimeError, wherever it is read.
+        raise ProductError(f"is not a product of lidarops: it has no {error}", file=file) from error
+    # Reading a damaged file raises OSError or RuntimeError.
     except (OSError, RuntimeError, ValueError) as error:
         raise ProductError(f"cannot be read: {error}", file=file) from error
 
 
-def kind_of(product: xr.Dataset, file: Path) -> ProductKind:
+def _kind_of(product: xr.Dataset, file: Path) -> ProductKind:
     """Return the kind of a product.
 
     Raises
     ------
     ProductError
-        If the file is no product, or of a kind that this version does not know.
+        If the file is not a product, or of an unknown kind.
     """
     kind = product.attrs.get("lidarops_kind")
     if kind not in set(ProductKind):
-        told = "is no product of lidarops" if kind is None else f"is of an unknown kind: {kind}"
-        raise ProductError(told, file=file)
+        problem = "is not a product of lidarops" if kind is None else f"has an unknown kind: {kind}"
+        raise ProductError(problem, file=file)
     if PERIOD in product.attrs:
-        raise ProductError("holds means of products, and is no product itself", file=file)
+        raise ProductError("holds means of products and is not a product itself", file=file)
     return ProductKind(kind)
 
 
 def coordinate_names(kind: ProductKind) -> frozenset[str]:
-    """Return the names of the coordinates of a kind of product, cell limits included."""
+    """Return the names of the coordinates of a product kind, including bounds."""
     rows = LAYOUTS[kind].coordinates
     bounds = (row.bounds for row in rows if row.bounds)
     return frozenset({*(row.name for row in rows), *bounds})
 
 
-def grid_digest(product: xr.Dataset, kind: ProductKind) -> str:
-    """Digest all that must be equal in products which are joined along time.
+def _grid_digest(product: xr.Dataset, kind: ProductKind) -> str:
+    """Return a digest of what must be equal in products that are joined along time.
 
-    That is: the names, types, dimensions, units and flags of their variables, and the values of
-    every coordinate that does not change with time, the place of the station included.
+    These are names, types, dimensions, units and flags of the variables, and the values of all
+    coordinates that do not change with time, including the position of the station.
 
     Parameters
     ----------
@@ -365,12 +365,12 @@ def grid_digest(product: xr.Dataset, kind: ProductKind) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return an attribute as JSON types."""
+    """Return an attribute as a JSON type."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def groups(products: Iterable[Facts]) -> dict[Group, list[Facts]]:
-    """Sort products into groups that can be joined, each by time.
+    """Group products that can be joined, each group sorted by time.
 
     Parameters
     ----------
@@ -379,20 +379,20 @@ def groups(products: Iterable[Facts]) -> dict[Group, list[Facts]]:
     Returns
     -------
     dict of Group to list of Facts
-        Groups by name, products by start, then path.
+        Groups sorted by name, products by start, then path.
     """
-    found: dict[Group, list[Facts]] = {}
-    for product in sorted(products, key=lambda each: (each.start, each.path)):
-        found.setdefault(product.group, []).append(product)
-    return dict(sorted(found.items()))
+    by_group: dict[Group, list[Facts]] = {}
+    for product in sorted(products, key=lambda facts: (facts.start, facts.path)):
+        by_group.setdefault(product.group, []).append(product)
+    return dict(sorted(by_group.items()))
 
 
-def told_grids(found: Iterable[Group]) -> list[str]:
-    """Say which instruments, kinds and channels have products of several grids.
+def grid_notes(all_groups: Iterable[Group]) -> list[str]:
+    """Return notes on instruments, kinds and channels with products of several grids.
 
     Parameters
     ----------
-    found : iterable of Group
+    all_groups : iterable of Group
 
     Returns
     -------
@@ -400,30 +400,31 @@ def told_grids(found: Iterable[Group]) -> list[str]:
         One sentence each.
     """
     grids: dict[tuple[str, str, str, str], list[str]] = {}
-    for group in found:
-        of = (group.station, group.instrument, group.kind.value, group.channel)
-        grids.setdefault(of, []).append(group.grid[:8])
+    for group in all_groups:
+        series = (group.station, group.instrument, group.kind.value, group.channel)
+        grids.setdefault(series, []).append(group.grid[:8])
     return [
-        f"{' '.join(of)}: products of {len(names)} grids, which are not joined: {', '.join(names)}"
-        for of, names in grids.items()
+        f"{' '.join(series)}: products of {len(names)} grids, which are not joined:"
+        f" {', '.join(names)}"
+        for series, names in grids.items()
         if len(names) > 1
     ]
 
 
 def refuse_duplicates(times: NDArray[np.float64], owners: list[str]) -> None:
-    """Refuse profiles at the same time, naming the products that hold them.
+    """Refuse several profiles at the same time, naming their products.
 
     Parameters
     ----------
     times : ndarray, shape (time,)
         In any order.
     owners : list of str
-        Path of the product of each.
+        Product path of each time.
 
     Raises
     ------
     ProductError
-        If a time comes twice.
+        If a time occurs twice.
     """
     order = np.argsort(times, kind="stable")
     same = np.flatnonzero(np.diff(times[order]) == 0)
@@ -442,7 +443,7 @@ def _moment(text: str) -> datetime:
 
 
 def _middle(product: xr.Dataset, name: str) -> float:
-    """Return a coordinate of the station, or the mean of those of a network; NaN without any."""
+    """Return a coordinate of the station, or its mean over a network; NaN if missing."""
     return float(product[name].values.mean()) if name in product else float("nan")
 
 

@@ -1,7 +1,7 @@
-"""The working catalogue of products: one Parquet file, one row a product.
+"""The index of products: a Parquet file with one row per product.
 
-It is derived from the products and can be written again at any time. What is found in it is
-checked against the files when these are opened.
+It is derived from the products and can be written again at any time. `open_products` checks the
+result of a query against the files.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import pandas as pd
 
 from lidarops.aggregate._optional_packages import need
 from lidarops.aggregate.facts import FOLDER, Facts, ProductSelection
-from lidarops.aggregate.selection import select
+from lidarops.aggregate.selection import parse_selection
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.records import ProductKind
@@ -31,49 +31,49 @@ _KEY: Final = b"lidarops_index"
 _PREFIX_BYTES: Final = 16
 _LEVEL: Final = 15
 _ENCODINGS: Final = {
-    # Neighbours begin alike: only what differs is stored.
+    # Neighbouring paths have equal beginnings.
     "path": "DELTA_BYTE_ARRAY",
     "start": "DELTA_BINARY_PACKED",
     "stop": "DELTA_BINARY_PACKED",
     "size": "DELTA_BINARY_PACKED",
-    # No two are alike: a dictionary of them would only be in the way.
+    # All values differ, so a dictionary would not help.
     "id": "PLAIN",
     "sha256_prefix": "PLAIN",
 }
 
 _Cell = Callable[[Facts], Any]
 _COLUMNS: Final[Mapping[str, tuple[str, _Cell]]] = {
-    "kind": ("dictionary", lambda each: each.kind.value),
-    "campaign": ("dictionary", lambda each: each.campaign),
-    "station": ("dictionary", lambda each: each.station),
-    "instrument": ("dictionary", lambda each: each.instrument),
-    "channel": ("dictionary", lambda each: each.channel),
-    "mode": ("dictionary", lambda each: each.mode),
-    "wavelength": ("float64", lambda each: each.wavelength),
-    "start": ("time", lambda each: each.start),
-    "stop": ("time", lambda each: each.stop),
-    "latitude": ("float64", lambda each: each.latitude),
-    "longitude": ("float64", lambda each: each.longitude),
-    "altitude": ("float64", lambda each: each.altitude),
-    "path": ("string", lambda each: each.path),
-    "id": ("bytes", lambda each: UUID(each.id).bytes),
-    "sha256_prefix": ("bytes", lambda each: bytes.fromhex(each.sha256)[:_PREFIX_BYTES]),
-    "size": ("int64", lambda each: each.size),
-    "profiles": ("int32", lambda each: each.profiles),
-    "values": ("int64", lambda each: each.values),
-    "usable": ("int64", lambda each: each.usable),
-    "unflagged": ("int64", lambda each: each.unflagged),
-    "grid": ("dictionary", lambda each: each.grid),
-    "code_version": ("dictionary", lambda each: each.code_version),
+    "kind": ("dictionary", lambda facts: facts.kind.value),
+    "campaign": ("dictionary", lambda facts: facts.campaign),
+    "station": ("dictionary", lambda facts: facts.station),
+    "instrument": ("dictionary", lambda facts: facts.instrument),
+    "channel": ("dictionary", lambda facts: facts.channel),
+    "mode": ("dictionary", lambda facts: facts.mode),
+    "wavelength": ("float64", lambda facts: facts.wavelength),
+    "start": ("time", lambda facts: facts.start),
+    "stop": ("time", lambda facts: facts.stop),
+    "latitude": ("float64", lambda facts: facts.latitude),
+    "longitude": ("float64", lambda facts: facts.longitude),
+    "altitude": ("float64", lambda facts: facts.altitude),
+    "path": ("string", lambda facts: facts.path),
+    "id": ("bytes", lambda facts: UUID(facts.id).bytes),
+    "sha256_prefix": ("bytes", lambda facts: bytes.fromhex(facts.sha256)[:_PREFIX_BYTES]),
+    "size": ("int64", lambda facts: facts.size),
+    "profiles": ("int32", lambda facts: facts.profiles),
+    "values": ("int64", lambda facts: facts.values),
+    "usable": ("int64", lambda facts: facts.usable),
+    "unflagged": ("int64", lambda facts: facts.unflagged),
+    "grid": ("dictionary", lambda facts: facts.grid),
+    "code_version": ("dictionary", lambda facts: facts.code_version),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What an index knows of products that were asked for."""
+class IndexedPaths:
+    """Paths of selected products in an index."""
 
     root: Path
-    """Folder that the paths start from."""
+    """Folder that the paths are relative to."""
     paths: tuple[str, ...]
 
 
@@ -83,7 +83,7 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
     Parameters
     ----------
     root : path
-        Folder that the products' paths start from; the index goes to its folder ``aggregates``.
+        Folder that product paths are relative to; the index is written to its ``aggregates``.
     products : iterable of Facts
 
     Returns
@@ -99,14 +99,14 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
         If the file cannot be written.
     """
     arrow, parquet = need("pyarrow"), need("pyarrow.parquet")
-    rows = sorted(products, key=lambda each: each.path)
+    rows = sorted(products, key=lambda facts: facts.path)
     types = _types(arrow)
     arrays = {
-        name: arrow.array([cell(each) for each in rows], types[kind])
+        name: arrow.array([cell(facts) for facts in rows], types[kind])
         for name, (kind, cell) in _COLUMNS.items()
     }
     for bit in Quality:
-        counts = [each.flagged.get(str(bit.name), 0) for each in rows]
+        counts = [facts.flagged.get(str(bit.name), 0) for facts in rows]
         arrays[_flag_column(bit)] = arrow.array(counts, arrow.int64())
     table = arrow.table(arrays).replace_schema_metadata({_KEY: FORMAT})
     stream = io.BytesIO()
@@ -157,24 +157,25 @@ def find_products(
     index : path or str
         ``aggregates/products.parquet`` of a campaign's output.
     kind, channel, station, instrument : str, optional
-        Only products of these.
+        Select products.
     since, until : datetime or ISO 8601 text, optional
-        Only products that end after, or start before, this time; UTC where no zone is told.
+        Only products that end after, or start before, this time; UTC without a time zone.
 
     Returns
     -------
     pandas.DataFrame
-        One row a product, by start, then path: ``path`` relative to ``attrs["root"]``, ``start``
-        and ``stop``, place (degree, m), ``wavelength`` (m), ``id``, ``sha256_prefix`` (the first
-        32 hexadecimal digits of the file's), ``size`` (bytes), counts of ``values``, of those
-        ``usable`` (no bit rejects them) and ``unflagged``, and one count a quality bit.
+        One row per product, sorted by start, then path: ``path`` relative to ``attrs["root"]``,
+        ``start`` and ``stop``, place (degree, m), ``wavelength`` (m), ``id``, ``sha256_prefix``
+        (first 32 hexadecimal digits of the sha256 of the file), ``size`` (bytes), numbers of
+        ``values``, ``usable`` values (no bit rejects them) and ``unflagged`` values, and a count
+        per quality bit.
 
     Raises
     ------
     ProductError
-        If the file is no index.
+        If the file is not an index.
     RetrievalInputError
-        If the kind is unknown or a time is no ISO 8601.
+        If the kind is unknown or a time is not ISO 8601.
     LidarOpsError
         If pyarrow is not installed.
 
@@ -183,56 +184,56 @@ def find_products(
     >>> found = lidarops.find_products("demo/aggregates/products.parquet", kind="elastic")
     >>> found.query("usable > 0").path.tolist()  # doctest: +SKIP
     """
-    wanted = select(kind, channel, station, instrument, since, until)
+    selection = parse_selection(kind, channel, station, instrument, since, until)
     path = Path(index)
-    table = _read(path, wanted, None).to_pandas()
+    table = _read(path, selection, None).to_pandas()
     found = table.sort_values(["start", "path"], ignore_index=True)
-    found["id"] = [str(UUID(bytes=each)) for each in found["id"]]
-    found["sha256_prefix"] = [each.hex() for each in found["sha256_prefix"]]
+    found["id"] = [str(UUID(bytes=uuid)) for uuid in found["id"]]
+    found["sha256_prefix"] = [prefix.hex() for prefix in found["sha256_prefix"]]
     found.attrs["root"] = str(_root(path))
     return found
 
 
-def find_in_index(index: Path, wanted: ProductSelection) -> Found:
-    """Return the paths of the products of an index that are wanted.
+def find_in_index(index: Path, selection: ProductSelection) -> IndexedPaths:
+    """Return the paths of selected products in an index.
 
     Raises
     ------
     ProductError
-        If the file is no index.
+        If the file is not an index.
     LidarOpsError
         If pyarrow is not installed.
     """
-    paths = _read(index, wanted, ["path"]).column("path").to_pylist()
-    return Found(_root(index), tuple(sorted(paths)))
+    paths = _read(index, selection, ["path"]).column("path").to_pylist()
+    return IndexedPaths(_root(index), tuple(sorted(paths)))
 
 
 def _root(index: Path) -> Path:
     return index.resolve().parents[1]
 
 
-def _read(index: Path, wanted: ProductSelection, columns: list[str] | None) -> Any:
+def _read(index: Path, selection: ProductSelection, columns: list[str] | None) -> Any:
     arrow, parquet = need("pyarrow"), need("pyarrow.parquet")
     try:
         metadata = parquet.read_schema(index).metadata or {}
         if metadata.get(_KEY) != FORMAT:
             raise ProductError(
-                "is no index of this version of lidarops",
+                "is not an index of this version of lidarops",
                 file=index,
                 remedy="write it again: lidarops aggregate",
             )
-        return parquet.read_table(index, columns=columns, filters=_filters(wanted))
+        return parquet.read_table(index, columns=columns, filters=_filters(selection))
     except (OSError, arrow.ArrowInvalid) as error:
         raise ProductError(f"cannot be read as an index: {error}", file=index) from error
 
 
-def _filters(wanted: ProductSelection) -> list[tuple[str, str, Any]] | None:
+def _filters(selection: ProductSelection) -> list[tuple[str, str, Any]] | None:
     names = ("channel", "station", "instrument")
-    told = [(name, "==", getattr(wanted, name)) for name in names if getattr(wanted, name)]
-    if wanted.kind is not None:
-        told.append(("kind", "==", wanted.kind.value))
-    if wanted.since is not None:
-        told.append(("stop", ">", wanted.since))
-    if wanted.until is not None:
-        told.append(("start", "<", wanted.until))
-    return told or None
+    filters = [(name, "==", getattr(selection, name)) for name in names if getattr(selection, name)]
+    if selection.kind is not None:
+        filters.append(("kind", "==", selection.kind.value))
+    if selection.since is not None:
+        filters.append(("stop", ">", selection.since))
+    if selection.until is not None:
+        filters.append(("start", "<", selection.until))
+    return filters or None

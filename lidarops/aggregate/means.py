@@ -1,4 +1,4 @@
-"""Daily and monthly means of products, with errors, as NetCDF files of their own."""
+"""Daily and monthly means of products with errors, written as NetCDF files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lidarops.aggregate.means_file import (
     means_version,
     read_frame,
 )
-from lidarops.aggregate.means_variables import About, Period, Weights, systematic
+from lidarops.aggregate.means_variables import MeansDescription, Period, Weights, systematic
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.netcdf.write import write_product
@@ -40,7 +40,7 @@ class MeansFile:
     """A file of means that was written."""
 
     path: str
-    """Relative to the folder of the products' root, with forward slashes."""
+    """Relative to the root of the products, with forward slashes."""
     sha256: str
     size: int
     periods: int
@@ -48,8 +48,8 @@ class MeansFile:
 
 
 @dataclass(frozen=True, slots=True)
-class Averaged:
-    """The files of means of one group, and the products that could not be read."""
+class MeansResult:
+    """Files of means of one group, and products that could not be read."""
 
     files: tuple[MeansFile, ...]
     refused: tuple[Refused, ...]
@@ -61,47 +61,48 @@ def write_means(
     period: Period,
     *,
     weights: Weights = Weights.PLAIN,
-) -> Averaged:
-    """Write the means of one group of products, one file a calendar year.
+) -> MeansResult:
+    """Write the means of one group of products, one file per calendar year.
 
-    Products are read one after the other, so that memory holds one product and the periods that
-    it reaches into. A product that cannot be read is named and left out.
+    Products are read one after the other, so that only one product and its periods are in memory.
+    Unreadable products are reported and left out.
 
     Parameters
     ----------
     root : path
-        Folder that the products' paths start from; the files go to its ``aggregates/means``.
+        Folder that product paths are relative to; files are written to its ``aggregates/means``.
     products : sequence of Facts
-        Of one group, in order of time (`lidarops.aggregate.facts.groups`).
+        Of one group, sorted by time (`lidarops.aggregate.facts.groups`).
     period : Period
     weights : Weights
 
     Returns
     -------
-    Averaged
+    MeansResult
 
     Raises
     ------
     ProductError
-        If the beam moves, two products hold the same time, or a file cannot be written.
+        If the beam moves, two products have a profile at the same time, or a file cannot be
+        written.
     """
     averaging = _Averaging(period, weights)
     frame: Frame | None = None
     refused = []
     for facts in products:
         try:
-            found = frame or read_frame(root, facts)
+            group_frame = frame or read_frame(root, facts)
             profiles = read_profiles(root, facts)
         except ProductError as error:
             refused.append(Refused(facts.path, error.problem))
             continue
         if frame is None:
-            found.refuse_moving_beam(facts.path)
-            frame = found
+            group_frame.refuse_moving_beam(facts.path)
+            frame = group_frame
         averaging.add(profiles)
     averaging.finish()
     files = () if frame is None else tuple(_written(root, products[0].group, frame, averaging))
-    return Averaged(files, tuple(refused))
+    return MeansResult(files, tuple(refused))
 
 
 @dataclass(slots=True)
@@ -113,7 +114,7 @@ class _PeriodSums:
     quantities: dict[str, Sums] = field(default_factory=dict)
     profiles: int = 0
     usable: Any = 0
-    """Profiles whose value no bit rejects, of the shape of the flags without time."""
+    """Number of usable profiles, with the shape of the flags without time."""
     flags: Any = 0
     """Bits of all values."""
     usable_flags: Any = 0
@@ -128,45 +129,45 @@ class _PeriodSums:
                 self.quantities[name] = Sums.like(part, inverse_variance=inverse)
             self.quantities[name].add(part)
         flags = profiles.flags[chosen]
-        wanted = (flags & np.int32(Quality.rejecting())) == 0
+        usable = (flags & np.int32(Quality.rejecting())) == 0
         self.profiles += chosen.size
-        self.usable = self.usable + wanted.sum(axis=0)
+        self.usable = self.usable + usable.sum(axis=0)
         self.flags = self.flags | np.bitwise_or.reduce(flags, axis=0)
-        kept = np.where(wanted, flags, np.int32(0))
+        kept = np.where(usable, flags, np.int32(0))
         self.usable_flags = self.usable_flags | np.bitwise_or.reduce(kept, axis=0)
         self.shots += float(profiles.shots[chosen].sum())
 
     def record(self) -> dict[str, NDArray[Any]]:
         """Return the variables of the period, without dimension time."""
         flags = np.where(self.usable > 0, self.usable_flags, self.flags)
-        found: dict[str, NDArray[Any]] = {
+        variables: dict[str, NDArray[Any]] = {
             "usable_share": self.usable / np.float64(self.profiles),
             "shots": np.asarray(self.shots),
         }
         for name, sums in self.quantities.items():
             mean = sums.mean()
-            found[name] = mean.mean
-            found[f"{name}_standard_error"] = mean.standard_error
-            found[f"{name}_standard_deviation"] = mean.standard_deviation
-            found[f"{name}_observations"] = mean.observations
+            variables[name] = mean.mean
+            variables[f"{name}_standard_error"] = mean.standard_error
+            variables[f"{name}_standard_deviation"] = mean.standard_deviation
+            variables[f"{name}_observations"] = mean.observations
             if mean.systematic is not None:
-                found[f"{systematic(self.kind, name)}"] = mean.systematic
+                variables[f"{systematic(self.kind, name)}"] = mean.systematic
             if mean.mean.shape == flags.shape:
-                # Usable, but without an error that it could be weighted by: say that it is missing.
-                silent = ~np.isfinite(mean.mean) & (flags == 0)
-                flags = np.where(silent, np.int32(Quality.INPUT_MISSING), flags)
-        return {**found, "quality_flag": flags}
+                # Usable values without an error for weighting give no mean: flag it as missing.
+                unflagged = ~np.isfinite(mean.mean) & (flags == 0)
+                flags = np.where(unflagged, np.int32(Quality.INPUT_MISSING), flags)
+        return {**variables, "quality_flag": flags}
 
 
 @dataclass(slots=True)
 class _Year:
-    """The means of one calendar year, and what they were made of."""
+    """Means of one calendar year and their inputs."""
 
     keys: list[np.datetime64] = field(default_factory=list)
     records: list[Record] = field(default_factory=list)
     inputs: dict[str, Facts] = field(default_factory=dict)
     shared: dict[str, Any] | None = None
-    """Attributes that all products so far have alike."""
+    """Attributes that are equal in all products so far."""
 
     def note(self, profiles: Profiles) -> None:
         path = profiles.facts.path
@@ -182,7 +183,7 @@ class _Year:
 
 @dataclass(slots=True)
 class _Averaging:
-    """Products in, years of means out."""
+    """Accumulates products and collects the means by year."""
 
     period: Period
     weights: Weights
@@ -192,7 +193,7 @@ class _Averaging:
     _owners: list[str] = field(default_factory=list)
 
     def add(self, profiles: Profiles) -> None:
-        """Add a product that starts no earlier than those before."""
+        """Add a product; products must be added in order of their start."""
         facts = profiles.facts
         self._close(before=np.datetime64(facts.start.replace(tzinfo=None), "ms"))
         self._times.append(profiles.times)
@@ -208,7 +209,7 @@ class _Averaging:
         Raises
         ------
         ProductError
-            If two products hold a profile at the same time.
+            If two products have a profile at the same time.
         """
         if self._times:
             refuse_duplicates(np.concatenate(self._times), self._owners)
@@ -220,7 +221,7 @@ class _Averaging:
             self.years[_year(key)].close(key, self._open.pop(key))
 
     def _periods(self, times: Array) -> Iterator[tuple[np.datetime64, NDArray[np.intp]]]:
-        # Whole milliseconds: the middle of a profile is not known better.
+        # Rounded to milliseconds, the accuracy of the middle of a profile.
         moments = np.datetime64(0, "ms") + np.rint(times * 1e3).astype("timedelta64[ms]")
         keys = moments.astype(f"datetime64[{_UNITS[self.period]}]")
         for key in np.unique(keys):
@@ -238,7 +239,9 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
         bounds = np.stack([keys, keys + 1], axis=-1).astype("datetime64[s]")
         start, stop = (_datetime(moment) for moment in (bounds[0, 0], bounds[-1, 1]))
         lineage = Lineage(tuple(year.inputs.values()), period, weights, start, stop)
-        about = About(lineage.id, period, weights, start, stop, len(year.inputs), means_version())
+        about = MeansDescription(
+            lineage.id, period, weights, start, stop, len(year.inputs), means_version()
+        )
         periods = Periods(bounds.astype(np.float64), year.records)
         dataset = encode_means(frame, periods, year.shared or {}, about, means_provenance(lineage))
         path = _path(group, period, weights, number)
@@ -247,9 +250,9 @@ def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> I
 
 
 def _path(group: Group, period: Period, weights: Weights, year: int) -> str:
-    of = f"{group.station}/{group.instrument}/{group.kind.value}/{period.value}"
+    folder = f"{group.station}/{group.instrument}/{group.kind.value}/{period.value}"
     weighted = "" if weights is Weights.PLAIN else f"_{weights.value}"
-    return f"{FOLDER}/means/{of}/{group.name}_{period.value}{weighted}_{year}.nc"
+    return f"{FOLDER}/means/{folder}/{group.name}_{period.value}{weighted}_{year}.nc"
 
 
 def _datetime(moment: np.datetime64) -> datetime:

@@ -1,4 +1,4 @@
-"""The NetCDF dataset of means: coordinates of the products, rows of the table, provenance."""
+"""The NetCDF dataset of means: coordinates, variables and provenance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate.facts import Facts, coordinate_names, opened, within
 from lidarops.aggregate.means_variables import (
-    About,
+    MeansDescription,
     Period,
     Weights,
     global_attributes,
@@ -36,36 +36,36 @@ _MOVING: Final = ("zenith_angle", "azimuth")
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What the means of a group have from any of its products."""
+    """Coordinates and attributes of means that are equal in all products of a group."""
 
     kind: ProductKind
     mode: DetectionMode
     variables: Mapping[str, xr.Variable]
-    """Coordinates that do not change with time, the station, in memory."""
+    """Coordinates that do not change with time, and the station; in memory."""
     listed: Mapping[tuple[str, ...], tuple[str, ...]]
     """Dimensions -> auxiliary coordinates of the data that have them."""
     moving: tuple[str, ...]
-    """Angles of the beam that change with time."""
+    """Names of beam angles that change with time."""
 
     def refuse_moving_beam(self, file: str) -> None:
-        """Refuse products of a beam that moves: several directions have no mean.
+        """Refuse products of a moving beam, because profiles of several directions have no mean.
 
         Raises
         ------
         ProductError
-            If they are such.
+            If the beam moves.
         """
         if self.moving:
             raise ProductError(
-                "the beam moves, and profiles of several directions have no mean",
+                "the beam moves; profiles of several directions have no mean",
                 file=file,
                 field=self.moving[0],
-                remedy="choose a kind that is made of scans, or instruments that stand still",
+                remedy="select a product kind made from scans, or instruments with a fixed beam",
             )
 
 
 def read_frame(root: Path, facts: Facts) -> Frame:
-    """Read what the means have from a product.
+    """Read static coordinates and attributes from a product.
 
     Raises
     ------
@@ -97,79 +97,83 @@ def read_frame(root: Path, facts: Facts) -> Frame:
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """The means of a file: when, and what."""
+    """Periods and means of a file."""
 
     bounds: NDArray[np.float64]
     """(time, 2), s since 1970."""
     records: Sequence[Mapping[str, NDArray[Any]]]
-    """One a period: variable -> values without time."""
+    """One per period: variable -> values without time."""
 
 
 def encode_means(
-    frame: Frame, periods: Periods, shared: Mapping[str, Any], about: About, provenance: str
+    frame: Frame,
+    periods: Periods,
+    shared: Mapping[str, Any],
+    about: MeansDescription,
+    provenance: str,
 ) -> xr.Dataset:
-    """Make the dataset of a file of means.
+    """Return the dataset of a file of means.
 
     Parameters
     ----------
     frame : Frame
     periods : Periods
     shared : mapping
-        Global attributes that the products have alike.
-    about : About
+        Global attributes that are equal in all products.
+    about : MeansDescription
     provenance : str
         From `means_provenance`.
 
     Returns
     -------
     xr.Dataset
-        Encoded, as `lidarops.netcdf.write.write_product` takes it.
+        Encoded, for `lidarops.netcdf.write.write_product`.
     """
-    found = layout(frame.kind, about.period, about.weights)
+    table = layout(frame.kind, about.period, about.weights)
     texts = {rows.PROVENANCE.name: _text(rows.PROVENANCE, provenance, frame.mode)}
     variables = {
-        **dict(_times(found, periods.bounds, frame.mode)),
-        **{name: each for name, each in frame.variables.items() if name != "station"},
-        **dict(_data(found, periods, frame)),
+        **dict(_times(table, periods.bounds, frame.mode)),
+        **{name: values for name, values in frame.variables.items() if name != "station"},
+        **dict(_data(table, periods, frame)),
         "station": frame.variables["station"],
         **texts,
     }
-    told = global_attributes(shared, found, about, frame.kind)
-    dataset = xr.Dataset(variables, attrs=told)
+    attrs = global_attributes(shared, table, about, frame.kind)
+    dataset = xr.Dataset(variables, attrs=attrs)
     dataset.encoding["unlimited_dims"] = {"time"}
     return dataset
 
 
 def _times(
-    found: Layout, bounds: NDArray[np.float64], mode: DetectionMode
+    table: Layout, bounds: NDArray[np.float64], mode: DetectionMode
 ) -> Iterator[tuple[str, xr.Variable]]:
-    row = found.row("time")
+    row = table.row("time")
     yield row.name, xr.Variable(row.dims, bounds.mean(axis=1), attributes(row, mode=mode))
     yield f"{row.bounds}", xr.Variable((*row.dims, rows.BOUNDS_DIM), bounds)
 
 
-def _data(found: Layout, periods: Periods, frame: Frame) -> Iterator[tuple[str, xr.Variable]]:
+def _data(table: Layout, periods: Periods, frame: Frame) -> Iterator[tuple[str, xr.Variable]]:
     flags = np.stack([record[rows.QUALITY_FLAG] for record in periods.records]).astype(np.int32)
-    for row in found.variables:
+    for row in table.variables:
         values: NDArray[Any]
         if row.summary:
-            values = rows.sum_up(flags)
+            values = rows.summarize_flags(flags)
         elif row.name == rows.QUALITY_FLAG:
             values = flags
         elif row.name in periods.records[0]:
             values = _stored(row, np.stack([record[row.name] for record in periods.records]))
         else:
-            # Optional in the products, and none of these has it.
+            # An optional variable that no product has.
             continue
         yield row.name, xr.Variable(row.dims, values, _attributes(row, frame))
 
 
 def _attributes(row: Row, frame: Frame) -> dict[str, Any]:
-    found = attributes(row, mode=frame.mode, coordinates=frame.listed.get(row.dims, ()))
+    attrs = attributes(row, mode=frame.mode, coordinates=frame.listed.get(row.dims, ()))
     if row.dtype == "f8":
-        # A sum of what is never missing; the fill value is one of 4 bytes.
-        del found["_FillValue"]
-    return found
+        # A sum that is never missing; the fill value is for 4 bytes only.
+        del attrs["_FillValue"]
+    return attrs
 
 
 def _stored(row: Row, values: NDArray[Any]) -> NDArray[Any]:
@@ -188,7 +192,7 @@ def _text(row: Row, text: str, mode: DetectionMode) -> xr.Variable:
 
 @dataclass(frozen=True, slots=True)
 class Lineage:
-    """What means were made of, and how."""
+    """Inputs and settings of means."""
 
     inputs: tuple[Facts, ...]
     period: Period
@@ -201,7 +205,7 @@ class Lineage:
         """UUID version 5 of the inputs' sha256, period, weights, time and code version."""
         content = {
             "means": {"period": self.period.value, "weights": self.weights.value},
-            "inputs": sorted(each.sha256 for each in self.inputs),
+            "inputs": sorted(facts.sha256 for facts in self.inputs),
             "time": [self.start.isoformat(), self.stop.isoformat()],
             "code_version": means_version(),
         }
@@ -209,7 +213,7 @@ class Lineage:
 
 
 def means_provenance(lineage: Lineage) -> str:
-    """Write the provenance of means as W3C PROV-JSON (`provo2013`).
+    """Return the provenance of means as W3C PROV-JSON (`provo2013`).
 
     Parameters
     ----------
@@ -218,9 +222,9 @@ def means_provenance(lineage: Lineage) -> str:
     Returns
     -------
     str
-        ASCII, keys sorted; equal for equal inputs, in whatever order they come.
+        ASCII with sorted keys; does not depend on the order of inputs.
     """
-    inputs = sorted(lineage.inputs, key=lambda each: (each.sha256, each.path))
+    inputs = sorted(lineage.inputs, key=lambda facts: (facts.sha256, facts.path))
     group = inputs[0].group
     software = [f"{name} {number}" for name, number in sorted(package_versions().items())]
     document = {
@@ -234,13 +238,13 @@ def means_provenance(lineage: Lineage) -> str:
                 "lidarops:grid": group.grid,
             },
             **{
-                f"sha256:{each.sha256}": {
+                f"sha256:{facts.sha256}": {
                     "prov:type": _type("lidarops:Product"),
-                    "lidarops:id": each.id,
-                    "lidarops:path": each.path,
-                    "lidarops:sha256": each.sha256,
+                    "lidarops:id": facts.id,
+                    "lidarops:path": facts.path,
+                    "lidarops:sha256": facts.sha256,
                 }
-                for each in inputs
+                for facts in inputs
             },
         },
         "activity": {
@@ -267,9 +271,9 @@ def means_provenance(lineage: Lineage) -> str:
         "used": {
             f"_:use{number}": {
                 "prov:activity": "lidarops:averaging",
-                "prov:entity": f"sha256:{each.sha256}",
+                "prov:entity": f"sha256:{facts.sha256}",
             }
-            for number, each in enumerate(inputs, start=1)
+            for number, facts in enumerate(inputs, start=1)
         },
         "wasAssociatedWith": {
             "_:association": {
@@ -283,7 +287,7 @@ def means_provenance(lineage: Lineage) -> str:
 
 @cache
 def means_version() -> str:
-    """Return a digest of the sources that means come from: those of the products, and these."""
+    """Return a digest of the code of products and means."""
     digest = hashlib.sha256(code_version().encode())
     for file in sorted(Path(__file__).resolve().parent.glob("*.py")):
         digest.update(f"{file.name}\0".encode() + file.read_bytes().replace(b"\r\n", b"\n"))

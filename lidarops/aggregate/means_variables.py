@@ -1,7 +1,7 @@
-"""What aggregates add to the variables of products, and what their means hold.
+"""Variables that aggregates add to products, and the variables of means.
 
-Every row here is new or follows from a row of `lidarops.products.layouts`; values are those of the
-products, so that units and names stay what they are there.
+Variables of means follow from the rows of `lidarops.products.layouts`, with the same units and
+names.
 """
 
 from __future__ import annotations
@@ -16,7 +16,14 @@ import numpy as np
 
 from lidarops import __version__
 from lidarops.netcdf.provenance import product_date
-from lidarops.netcdf.variables import NO_NAME, TIME, Coverage, ErrorKind, Layout, Row
+from lidarops.netcdf.variables import (
+    NO_STANDARD_NAME,
+    TIME,
+    Coverage,
+    ErrorKind,
+    Layout,
+    Row,
+)
 from lidarops.products.layouts import LAYOUTS
 from lidarops.records import ProductKind
 
@@ -32,13 +39,13 @@ PRODUCT_INDEX: Final = Row(
     dims=("time",),
     dtype="i4",
     units="1",
-    long_name="place along dimension product of the product that holds the profile",
+    long_name="index along dimension product of the product that contains the profile",
     coverage=Coverage.REFERENCE,
 )
 
 
 class Period(StrEnum):
-    """What a mean covers: a calendar day or month, UTC."""
+    """Period of a mean: a calendar day or month, UTC."""
 
     DAY = "day"
     MONTH = "month"
@@ -50,34 +57,34 @@ class Period(StrEnum):
 
 
 class Weights(StrEnum):
-    """What a profile counts in a mean."""
+    """Weights of profiles in a mean."""
 
     PLAIN = "plain"
-    """Each alike."""
+    """Equal weights."""
     INVERSE_VARIANCE = "inverse-variance"
-    """By the inverse square of its standard error."""
+    """Inverse squares of the standard errors."""
 
     @property
     def description(self) -> str:
-        """For the attributes of a file."""
+        """Description for the attributes of a file."""
         return {
-            "plain": "each usable profile counts alike",
-            "inverse-variance": "each usable profile counts by 1 / standard_error^2",
+            "plain": "usable profiles have equal weights",
+            "inverse-variance": "usable profiles have the weights 1 / standard_error^2",
         }[self.value]
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How the standard error of a quantity divides into what is new in every profile and what not.
+    """Division of a standard error into a part independent between profiles and shared parts.
 
-    The part that is new has the variance sum(random^2) x factor^2; the rest of the square of the
-    standard error is one error that all profiles share.
+    The independent part has the variance sum(random^2) x factor^2. The rest of the squared standard
+    error is an error that all profiles share.
     """
 
     random: tuple[str, ...]
-    """Variables of the error budget that are independent from profile to profile."""
+    """Variables of the error budget that are independent between profiles."""
     shared: tuple[str, ...] = ()
-    """Those that the profiles share, with signs; where there are none, what is left is shared."""
+    """Signed variables that all profiles share; if empty, the rest of the error is shared."""
     times: str | None = None
     """Variable without time that `random` is multiplied by."""
     over: str | None = None
@@ -92,86 +99,87 @@ BUDGETS: Final = {
     (ProductKind.ELASTIC, "backscatter"): Budget(_RANDOM, shared=_SHARED),
     (ProductKind.ELASTIC, "extinction"): Budget(_RANDOM, times="lidar_ratio"),
     (ProductKind.ELASTIC, "scattering_ratio"): Budget(_RANDOM, over="molecular_backscatter"),
-    # Nothing tells the noise of its calibration from that of its bins.
+    # Noise of the calibration and noise of the bins are not stated separately.
     (ProductKind.ELASTIC, "attenuated_backscatter"): Budget(()),
-    # Nothing tells noise from what smoothness takes, which profiles of one sky share.
+    # Noise and smoothing error, which profiles of the same air share, are not stated separately.
     (ProductKind.MULTIANGLE, "optical_depth"): Budget(()),
     (ProductKind.MULTIANGLE, "extinction"): Budget(()),
     (ProductKind.MULTIANGLE, "layer_optical_depth"): Budget(()),
-    # What the prior allows, which all profiles share, is most of them.
+    # Most of the error comes from the prior, which all profiles share.
     (ProductKind.VISIBILITY, "extinction"): Budget(()),
     (ProductKind.VISIBILITY, "visibility_in_air"): Budget(()),
 }
-"""Quantities whose errors are not all independent from profile to profile."""
+"""Quantities whose errors are not independent between profiles."""
 
 
 def systematic(kind: ProductKind, name: str) -> str | None:
-    """Return the error that stands apart from the standard error and that no mean makes smaller.
+    """Return the variable of the systematic error that is not part of the standard error.
 
     Parameters
     ----------
     kind : ProductKind
     name : str
-        Of the quantity.
+        Name of the quantity.
 
     Returns
     -------
     str or None
-        Such as ``extinction_model_error``; of products or, from `INTERVALS`, of means alone.
+        Such as ``extinction_model_error``; a variable of products or, for `INTERVALS`, of means
+        only.
     """
     if name in INTERVALS:
         return f"{name}_systematic_error"
     names = (row.name for row in LAYOUTS[kind].data)
-    found = (each for each in names if each.startswith(f"{name}_") and each.endswith("_error"))
-    return next(found, None)
+    errors = (error for error in names if error.startswith(f"{name}_") and error.endswith("_error"))
+    return next(errors, None)
 
 
 INTERVALS: Final = {"visibility_in_air": "visibility_in_air_lower"}
-"""Quantities whose systematic error products tell by the lower end of an interval alone.
+"""Quantities whose systematic error follows only from the lower end of an interval.
 
-They are reciprocals: of a quantity with the relative random and systematic errors r and s, the
-value over the lower end is 1 + sqrt(r^2 + s^2).
+They are reciprocals of a quantity with the relative random and systematic errors r and s; the value
+divided by the lower end is 1 + sqrt(r^2 + s^2).
 """
 
 
 _INDEPENDENT: Final = (
-    "Standard errors of the profiles are taken as independent: that of the mean is"
-    " sqrt(sum(weight^2 standard_error^2)) / sum(weight). What profiles of one scene share, such"
-    " as the error of a dark signal, is not told apart and may make it too small."
+    "Standard errors of the profiles are assumed to be independent: that of the mean is"
+    " sqrt(sum(weight^2 standard_error^2)) / sum(weight). It may be too small, because errors that"
+    " profiles of a scene share, such as that of a dark signal, are not stated separately."
 )
 _PARTLY: Final = (
-    "Noise and background are independent from profile to profile; the errors of reference, lidar"
-    " ratio and molecules are taken as shared by all profiles, so that they are averaged and do"
-    " not shrink with their number."
+    "Errors from noise and background are independent between profiles. Errors from reference,"
+    " lidar ratio and molecules are assumed to be shared by all profiles, so that they are averaged"
+    " and do not decrease with the number of profiles."
 )
 _ALL_SHARED: Final = (
-    "The errors of the profiles are taken as shared: they are averaged. What of them is noise,"
-    " which their number makes smaller, is not told apart."
+    "The errors of the profiles are assumed to be shared: they are averaged. Their noise, which"
+    " would decrease with the number of profiles, is not stated separately."
 )
 
 
-def error_comment(kind: ProductKind, name: str) -> str:
-    """Say how the standard error of a mean was found."""
-    found = budget_of(kind, name)
-    if found is None:
+def _error_comment(kind: ProductKind, name: str) -> str:
+    """Return how the standard error of a mean is computed."""
+    budget = budget_of(kind, name)
+    if budget is None:
         return _INDEPENDENT
-    return _PARTLY if found.random else _ALL_SHARED
+    return _PARTLY if budget.random else _ALL_SHARED
 
 
 def budget_of(kind: ProductKind, name: str) -> Budget | None:
-    """Return how the error of a quantity divides; None where it is new in every profile."""
+    """Return the error budget of a quantity; None if errors are independent between profiles."""
     row = LAYOUTS[kind].row(name)
     independent = row.error_kind in (None, ErrorKind.RANDOM)
     return BUDGETS.get((kind, name), None if independent else Budget(()))
 
 
 def averaged(kind: ProductKind) -> tuple[Row, ...]:
-    """Return the rows of a kind of product that a mean is taken of: those with standard errors."""
+    """Return the rows of a product kind that are averaged: those with standard errors."""
     return tuple(row for row in LAYOUTS[kind].data if row.uncertain and row.dims[:1] == ("time",))
 
 
 def layout(kind: ProductKind, period: Period, weights: Weights) -> Layout:
-    """Return what the means of a kind of product hold.
+    """Return the layout of the means of a product kind.
 
     Parameters
     ----------
@@ -183,7 +191,7 @@ def layout(kind: ProductKind, period: Period, weights: Weights) -> Layout:
     -------
     Layout
         ``<name>``, ``<name>_standard_error``, ``<name>_standard_deviation`` and
-        ``<name>_observations`` for each quantity with standard errors; systematic errors;
+        ``<name>_observations`` of each quantity with standard errors; systematic errors;
         ``usable_share``, ``quality_flag`` and ``shots``.
     """
     source = LAYOUTS[kind]
@@ -194,9 +202,10 @@ def layout(kind: ProductKind, period: Period, weights: Weights) -> Layout:
         summary=f"Means over the {period.value} of the usable values of products. {source.summary}",
         processing_level="L3: means over time of retrieved quantities",
         comment=f"Means over UTC {period.value}s: {weights.description}. Values that a quality"
-        " bit rejects, and values that are missing or have no standard error, are left out;"
-        " a profile belongs to the period that its middle lies in. A period covers all of its"
-        f" time, whatever part of it was measured. Of the products: {source.comment}",
+        " bit rejects, and values that are missing or have no standard error, are left out."
+        " A profile belongs to the period that contains its middle. The bounds of a period are"
+        f" those of the {period.value}, even if only part of it was measured. Comment of the"
+        f" products: {source.comment}",
         coordinates=tuple(time if row.name == "time" else row for row in source.coordinates),
         data=tuple(_rows(source, kind, weights)),
     )
@@ -206,40 +215,41 @@ _ADJECTIVE: Final = {Period.DAY: "Daily", Period.MONTH: "Monthly"}
 
 
 def _rows(source: Layout, kind: ProductKind, weights: Weights) -> Iterator[Row]:
-    judged = source.row("quality_flag")
+    flags = source.row("quality_flag")
     for row in averaged(kind):
-        apart = systematic(kind, row.name)
-        yield from _of(row, kind, weights, apart)
-        if apart:
-            of = _of_interval(row, apart) if row.name in INTERVALS else source.row(apart)
-            yield _averaged_error(of, row)
+        error = systematic(kind, row.name)
+        yield from _mean_rows(row, kind, weights, error)
+        if error:
+            systematic_row = (
+                _interval_error(row, error) if row.name in INTERVALS else source.row(error)
+            )
+            yield _averaged_error(systematic_row, row)
     yield Row(
         name="usable_share",
-        dims=judged.dims,
+        dims=flags.dims,
         dtype="f4",
         units="1",
         long_name="share of the profiles of the period whose value no quality bit rejects",
         coverage=Coverage.QUALITY,
         valid_min=0.0,
         valid_max=1.0,
-        comment=NO_NAME,
+        comment=NO_STANDARD_NAME,
     )
     yield replace(
-        judged,
-        comment="Of a mean: the bits of the values that it was taken of; where there is no usable"
-        " value, the bits of all values.",
+        flags,
+        comment="Bits of the values in the mean; if there is no usable value, bits of all values.",
     )
     shots = source.row("shots")
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
 
 
-def _of(row: Row, kind: ProductKind, weights: Weights, apart: str | None) -> Iterator[Row]:
-    """Give the rows of the mean of a quantity."""
-    weighed, errors = f"Weights: {weights.description}.", error_comment(kind, row.name)
+def _mean_rows(row: Row, kind: ProductKind, weights: Weights, error: str | None) -> Iterator[Row]:
+    """Yield the rows of the mean of a quantity."""
+    weighting, errors = f"Weights: {weights.description}.", _error_comment(kind, row.name)
     count, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
     ancillaries: tuple[str, ...] = (spread, count)
-    if apart:
-        ancillaries = (apart, *ancillaries)
+    if error:
+        ancillaries = (error, *ancillaries)
     if len(row.dims) > 1:
         ancillaries = (*ancillaries, "usable_share", "quality_flag")
     yield replace(
@@ -247,7 +257,7 @@ def _of(row: Row, kind: ProductKind, weights: Weights, apart: str | None) -> Ite
         long_name=f"mean over time of {row.long_name}",
         cell_methods=_cell_methods(row, "mean"),
         ancillaries=ancillaries,
-        comment=" ".join(text for text in (row.comment, weighed, errors) if text),
+        comment=" ".join(text for text in (row.comment, weighting, errors) if text),
     )
     yield replace(
         row,
@@ -259,8 +269,8 @@ def _of(row: Row, kind: ProductKind, weights: Weights, apart: str | None) -> Ite
         ancillaries=(),
         uncertain=False,
         error_kind=None,
-        comment="Unweighted, of the values that the mean was taken of, with n - 1; missing of"
-        f" fewer than two.{'' if row.standard_name else ' ' + NO_NAME}",
+        comment="Unweighted, over the values in the mean, with n - 1; missing for fewer than two"
+        f" values.{'' if row.standard_name else ' ' + NO_STANDARD_NAME}",
     )
     yield Row(
         name=count,
@@ -268,61 +278,59 @@ def _of(row: Row, kind: ProductKind, weights: Weights, apart: str | None) -> Ite
         dtype="i4",
         units="1",
         standard_name="number_of_observations",
-        long_name=f"number of profiles of the mean of {row.name}",
+        long_name=f"number of profiles in the mean of {row.name}",
         coverage=Coverage.QUALITY,
         valid_min=0.0,
     )
 
 
 def _cell_methods(row: Row, method: str) -> str:
-    """Return the cell methods of the products, then ours over time; CF lists them in that order."""
-    told = row.cell_methods or ""
-    rest = told.removeprefix("time: mean").strip()
-    ours = f"time: {method} (of usable profiles)"
-    return f"{ours} {rest}".strip()
+    """Return the cell methods of a mean over time, followed by other methods of the product."""
+    rest = (row.cell_methods or "").removeprefix("time: mean").strip()
+    return f"time: {method} (of usable profiles) {rest}".strip()
 
 
-def _of_interval(row: Row, name: str) -> Row:
-    """Return the row of the systematic error that the interval of a quantity tells."""
+def _interval_error(row: Row, name: str) -> Row:
+    """Return the row of the systematic error that follows from the interval of a quantity."""
     lower = INTERVALS[row.name]
     return replace(
         row,
         name=name,
-        long_name=f"systematic error of {row.long_name} to allow for",
+        long_name=f"model (systematic) uncertainty of {row.long_name}",
         coverage=Coverage.QUALITY,
         standard_name=None,
         valid_min=0.0,
         ancillaries=(),
         uncertain=False,
         error_kind=ErrorKind.SYSTEMATIC,
-        comment=f"Apart from {row.name}_standard_error: {row.name} times the relative systematic"
+        comment=f"Not part of {row.name}_standard_error: {row.name} times the relative systematic"
         f" error of extinction, sqrt(({row.name} / {lower} - 1)^2 - ({row.name}_standard_error /"
-        f" {row.name})^2) in each profile. {NO_NAME}",
+        f" {row.name})^2) in each profile. {NO_STANDARD_NAME}",
     )
 
 
-def _averaged_error(row: Row, of: Row) -> Row:
+def _averaged_error(row: Row, quantity: Row) -> Row:
     return replace(
         row,
         long_name=f"mean over time of {row.long_name}",
-        cell_methods=_cell_methods(of, "mean"),
-        comment=f"{row.comment} Averaged with the weights of {of.name}: it does not shrink with"
-        " the number of profiles.",
+        cell_methods=_cell_methods(quantity, "mean"),
+        comment=f"{row.comment} Averaged with the weights of {quantity.name}: it does not decrease"
+        " with the number of profiles.",
     )
 
 
 def global_attributes(
-    shared: Mapping[str, Any], found: Layout, about: About, kind: ProductKind
+    shared: Mapping[str, Any], table: Layout, about: MeansDescription, kind: ProductKind
 ) -> dict[str, Any]:
     """Return the global attributes of means, in the order in which they are written.
 
     Parameters
     ----------
     shared : mapping
-        What all products have alike and is true of more than one of them.
-    found : Layout
+        Global attributes that are equal in all products and apply to all.
+    table : Layout
         From `layout`.
-    about : About
+    about : MeansDescription
     kind : ProductKind
 
     Returns
@@ -330,25 +338,25 @@ def global_attributes(
     dict of str to str, float or numpy scalar
     """
     source = LAYOUTS[kind]
-    # The last sentence of a product is on its dates; ours are on ours.
+    # The comment of a product ends with a sentence on its dates, which is replaced.
     comment = shared.get("comment", "").partition(" Dates of creation")[0]
     made, why = product_date(about.stop)
     stamp = _iso(made)
     program = f"lidarops {__version__} ({about.code_version})"
     texts = {
-        "title": _replaced(shared.get("title", ""), source.title, found.title),
-        "summary": _replaced(shared.get("summary", ""), source.summary, found.summary),
+        "title": _replaced(shared.get("title", ""), source.title, table.title),
+        "summary": _replaced(shared.get("summary", ""), source.summary, table.summary),
     }
     dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
     return {
         **shared,
         **texts,
         "id": about.id,
-        "processing_level": found.processing_level,
+        "processing_level": table.processing_level,
         "product_version": f"{__version__}+{about.code_version}",
         "history": f"{stamp} averaged {about.inputs} products over UTC {about.period.value}s,"
         f" weights {about.weights.value} [{program}]",
-        "comment": f"{_replaced(comment, source.comment, found.comment)} Dates of creation and"
+        "comment": f"{_replaced(comment, source.comment, table.comment)} Dates of creation and"
         f" change are {why}, so that equal inputs give equal files.",
         "time_coverage_start": _iso(about.start),
         "time_coverage_end": _iso(about.stop),
@@ -363,12 +371,12 @@ def global_attributes(
 
 
 PERIOD: Final = "lidarops_period"
-"""The global attribute that tells means from products."""
+"""Global attribute that only means have, not products."""
 
 
 @dataclass(frozen=True, slots=True)
-class About:
-    """What means are of, besides their numbers."""
+class MeansDescription:
+    """Identity and period of means, for their global attributes."""
 
     id: str
     period: Period
@@ -382,7 +390,7 @@ class About:
 
 
 def _replaced(text: str, old: str, new: str) -> str:
-    """Return what a product says of itself with the words of its kind replaced by ours."""
+    """Return a text with the text of the product kind replaced by that of means."""
     return text.replace(old, new) if old in text else new
 
 

@@ -1,4 +1,4 @@
-"""Products as one lazy dataset: files, a folder, or what an index finds."""
+"""Opens products as one lazy dataset: from files, a folder or an index."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from lidarops.aggregate.facts import (
     refuse_duplicates,
     within,
 )
-from lidarops.aggregate.index import INDEX, Found, find_in_index
+from lidarops.aggregate.index import INDEX, IndexedPaths, find_in_index
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
-from lidarops.aggregate.selection import select
+from lidarops.aggregate.selection import parse_selection
 from lidarops.aggregate.usable import CARE, masked
 from lidarops.errors import ProductError
 from lidarops.netcdf.variables import attributes
@@ -53,113 +53,112 @@ def open_products(
     ----------
     source : path or str, or iterable of these
         Product files; or a folder of products or of a campaign's output; or an index that
-        `lidarops aggregate` wrote, which is much faster in a large archive.
+        `lidarops aggregate` wrote, which is much faster for a large archive.
     kind, channel, station, instrument : str, optional
-        Only products of these.
+        Select products.
     since, until : datetime or ISO 8601 text, optional
-        Only products that end after, or start before, this time; UTC where no zone is told.
-        Whole products are opened: their profiles are not cut.
+        Only products that end after, or start before, this time; UTC without a time
+        zone. Products are opened whole.
     usable : int
-        Worst values that are wanted: 0 good, 1 also those to use with care, 2 all. Others are
-        NaN. ``quality_flag`` and ``usable`` always stay.
+        Worst values to keep: 0 good, 1 also those to use with care, 2 all. Others are NaN.
+        ``quality_flag`` and ``usable`` are not masked.
 
     Returns
     -------
     xarray.Dataset
-        Decoded, with units as attributes, on dask arrays of one chunk a product or smaller.
-        ``product`` (product) is the id of each product, ``product_index`` (time) tells which one
-        holds a profile; what belongs to a product as a whole, such as the lidar ratio assumed,
-        has the dimension ``product``.
+        Decoded, with units as attributes, on dask arrays with one chunk per product or smaller.
+        ``product`` (product) is the id of each product, ``product_index`` (time) the index of the
+        product of each profile. Variables of a whole product, such as the assumed lidar ratio,
+        have the dimension ``product``.
 
     Raises
     ------
     ProductError
-        Naming the file, where one cannot be read, is no product, or holds a profile that another
-        holds too; where nothing is found; where what is found cannot be joined, naming the
-        instruments, kinds, channels and grids to choose from.
+        If a file cannot be read, is not a product, or has a profile that another file has too; if
+        no product is found; if the products cannot be joined (the message lists instruments,
+        kinds, channels and grids to choose from).
     RetrievalInputError
-        If `usable`, `kind` or a time is no such thing.
+        If `usable`, `kind` or a time is invalid.
 
     Examples
     --------
     >>> data = lidarops.open_products("demo", kind="homogeneous", channel="analog_532o")
     >>> data.extinction.resample(time="1D").mean()  # doctest: +SKIP
     """
-    selection = select(kind, channel, station, instrument, since, until)
-    root, found = _found(source, selection)
-    if not found:
-        raise ProductError("no product is found", file=_told(source), remedy="ask for less")
-    sorted_ = groups(found)
-    if len(sorted_) > 1:
+    selection = parse_selection(kind, channel, station, instrument, since, until)
+    root, all_products = _find(source, selection)
+    if not all_products:
+        raise ProductError("no product found", file=_path_of(source), remedy="select less strictly")
+    by_group = groups(all_products)
+    if len(by_group) > 1:
         raise ProductError(
-            f"products of {len(sorted_)} groups cannot be joined: {_choices(sorted_)}",
-            file=_told(source),
-            remedy="choose by kind, channel, station, instrument, or give the files of one grid",
+            f"products of {len(by_group)} groups cannot be joined: {_choices(by_group)}",
+            file=_path_of(source),
+            remedy="select by kind, channel, station or instrument, or give the files of one grid",
         )
-    (products,) = sorted_.values()
+    (products,) = by_group.values()
     return masked(_opened(root, products), usable)
 
 
-def _told(source: Paths) -> str | None:
+def _path_of(source: Paths) -> str | None:
     return os.fspath(source) if isinstance(source, str | os.PathLike) else None
 
 
-def _choices(found: Iterable[Group]) -> str:
+def _choices(all_groups: Iterable[Group]) -> str:
     return "; ".join(
-        f"{each.station} {each.instrument} {each.kind.value} {each.channel} grid {each.grid[:8]}"
-        for each in found
+        f"{group.station} {group.instrument} {group.kind.value} {group.channel}"
+        f" grid {group.grid[:8]}"
+        for group in all_groups
     )
 
 
-def _found(source: Paths, selection: ProductSelection) -> tuple[Path, list[Facts]]:
-    """Return the products that are asked for, and the folder that their paths start from."""
+def _find(source: Paths, selection: ProductSelection) -> tuple[Path, list[Facts]]:
+    """Return the selected products, and the folder that their paths are relative to."""
     if not isinstance(source, str | os.PathLike):
-        files = [Path(each) for each in source]
-        return _of_files(files, selection)
+        return _from_files([Path(file) for file in source], selection)
     path = Path(source)
     if path.name == INDEX:
-        return _indexed(find_in_index(path, selection))
+        return _from_index(find_in_index(path, selection))
     if path.is_dir():
         return path, _strictly(read_product_facts(path, list_products(path), selection))
-    return _of_files([path], selection)
+    return _from_files([path], selection)
 
 
-def _of_files(files: Sequence[Path], selection: ProductSelection) -> tuple[Path, list[Facts]]:
-    # Each in its own folder: nothing here joins two paths.
+def _from_files(files: Sequence[Path], selection: ProductSelection) -> tuple[Path, list[Facts]]:
     missing = [file for file in files if not file.is_file()]
     if missing:
-        raise ProductError("is no file", file=missing[0])
+        raise ProductError("is not a file", file=missing[0])
     root = Path(os.path.commonpath([file.resolve().parent for file in files])) if files else Path()
     names = [file.resolve().relative_to(root).as_posix() for file in files]
     return root, _strictly(read_product_facts(root, names, selection))
 
 
 def _strictly(scanned: Iterator[Facts | Refused]) -> list[Facts]:
-    found = []
-    for each in scanned:
-        if isinstance(each, Refused):
-            raise ProductError(each.reason, file=each.path, remedy="leave the file out")
-        found.append(each)
-    return found
+    products = []
+    for facts in scanned:
+        if isinstance(facts, Refused):
+            raise ProductError(facts.reason, file=facts.path, remedy="leave the file out")
+        products.append(facts)
+    return products
 
 
-def _indexed(found: Found) -> tuple[Path, list[Facts]]:
-    # The index is a view, not the truth: the facts are read from the files that it names.
-    return found.root, [read_facts(found.root, path) for path in found.paths]
+def _from_index(indexed: IndexedPaths) -> tuple[Path, list[Facts]]:
+    # The facts are read again from the files, because the index may be outdated.
+    return indexed.root, [read_facts(indexed.root, path) for path in indexed.paths]
 
 
 def _opened(root: Path, products: Sequence[Facts]) -> xr.Dataset:
-    pieces = [_piece(within(root, each.path), each) for each in products]
-    owners = [each.path for each in products for _ in range(each.profiles)]
+    pieces = [_piece(within(root, facts.path), facts) for facts in products]
+    owners = [facts.path for facts in products for _ in range(facts.profiles)]
     refuse_duplicates(np.concatenate([piece["time"].values for piece in pieces]), owners)
     joined = join(pieces)
     joined.attrs = shared_attributes([piece.attrs for piece in pieces])
-    # Once for all of them, which is much faster than one by one.
+    # Decoded once, which is much faster than decoding each piece.
     return xr.decode_cf(joined)
 
 
 def _piece(file: Path, facts: Facts) -> xr.Dataset:
-    """Open one product with what belongs to it as a whole along ``product``."""
+    """Open a product, with the dimension ``product`` for variables of the whole product."""
     try:
         opened = xr.open_dataset(
             file, engine="netcdf4", chunks={}, drop_variables=list(UNSHARED), decode_cf=False

@@ -1,4 +1,4 @@
-"""Which products are asked for, as a person writes it."""
+"""Parses a selection of products as given by a user."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.records import ProductKind
 
 
-def select(
+def parse_selection(
     kind: ProductKind | str | None,
     channel: str | None,
     station: str | None,
@@ -19,56 +19,56 @@ def select(
     since: datetime | str | None,
     until: datetime | str | None,
 ) -> ProductSelection:
-    """Check what is asked for.
+    """Return a selection from names and times.
 
     Raises
     ------
     RetrievalInputError
-        If the kind is unknown or a time is no ISO 8601.
+        If the kind is unknown or a time is not ISO 8601.
     """
     return ProductSelection(
-        None if kind is None else choice(ProductKind, kind, "kind"),
+        None if kind is None else parse_choice(ProductKind, kind, "kind"),
         channel,
         station,
         instrument,
-        moment(since, "since"),
-        moment(until, "until"),
+        _parse_time(since, "since"),
+        _parse_time(until, "until"),
     )
 
 
-def moment(told: datetime | str | None, name: str) -> datetime | None:
-    """Read a time; without a zone it is UTC.
+def _parse_time(text: datetime | str | None, name: str) -> datetime | None:
+    """Return a time; without a time zone it is UTC.
 
     Raises
     ------
     RetrievalInputError
-        If it is no ISO 8601.
+        If it is not ISO 8601.
     """
-    if told is None:
+    if text is None:
         return None
     try:
-        found = told if isinstance(told, datetime) else datetime.fromisoformat(told)
+        time = text if isinstance(text, datetime) else datetime.fromisoformat(text)
     except ValueError as error:
         raise RetrievalInputError(
-            f"is {told!r}", field=name, remedy="give a time such as 2026-03-01T12:00"
+            f"is {text!r}", field=name, remedy="give a time such as 2026-03-01T12:00"
         ) from error
-    return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
 
 
 _Choice = TypeVar("_Choice", bound=StrEnum)
 
 
-def choice(choices: type[_Choice], told: str, field: str) -> _Choice:
-    """Return what a word stands for.
+def parse_choice(choices: type[_Choice], word: str, field: str) -> _Choice:
+    """Return the member of an enumeration with this value.
 
     Raises
     ------
     RetrievalInputError
-        Naming the words, if it is none of them.
+        If there is none; the message lists the choices.
     """
     try:
-        return choices(told)
+        return choices(word)
     except ValueError as error:
         raise RetrievalInputError(
-            f"is {told!r}", field=field, remedy=f"choose one of {', '.join(choices)}"
+            f"is {word!r}", field=field, remedy=f"choose one of {', '.join(choices)}"
         ) from error

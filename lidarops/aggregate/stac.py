@@ -1,4 +1,4 @@
-"""Products as a static STAC catalog for tools outside: one Item a product, a Collection a kind."""
+"""Products as a static STAC catalog: one Item per product, one Collection per kind."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ _PREFIX: Final = "lidarops"
 
 
 def write_stac(root: Path, products: Sequence[Facts]) -> str:
-    """Write a self-contained STAC catalog of products, in place of the one before.
+    """Write a self-contained STAC catalog of products; replace a previous one.
 
-    All links are relative, those to the products too, so that the whole output can be moved or
-    served from anywhere. Nothing depends on when or where it is written.
+    All links are relative, including those to products, so that the whole output can be moved or
+    served from anywhere. The content does not depend on time or place of writing.
 
     Parameters
     ----------
     root : path
-        Folder that the products' paths start from; the catalog goes to its ``aggregates/stac``.
+        Folder that product paths are relative to; the catalog is written to its
+        ``aggregates/stac``.
     products : sequence of Facts
 
     Returns
@@ -39,7 +40,7 @@ def write_stac(root: Path, products: Sequence[Facts]) -> str:
     Raises
     ------
     ProductError
-        If two products have one file name, or there is none.
+        If two products have the same file name, or there are no products.
     LidarOpsError
         If pystac is not installed.
     OSError
@@ -55,13 +56,13 @@ def write_stac(root: Path, products: Sequence[Facts]) -> str:
     )
     target = root / FOLDER / "stac"
     for kind in ProductKind:
-        found = sorted((each for each in products if each.kind is kind), key=lambda each: each.path)
-        if found:
-            catalog.add_child(_collection(pystac, kind, found))
+        of_kind = sorted((p for p in products if p.kind is kind), key=lambda facts: facts.path)
+        if of_kind:
+            catalog.add_child(_collection(pystac, kind, of_kind))
     catalog.normalize_hrefs(target.resolve().as_posix(), skip_unresolved=False)
     for item in catalog.get_items(recursive=True):
         _link_product(item, root.resolve())
-    # Beside the old one, so that a reader finds the one or the other.
+    # Written beside the old catalog, so that readers find a complete one.
     building = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
         catalog.save(pystac.CatalogType.SELF_CONTAINED, dest_href=building.as_posix())
@@ -88,10 +89,10 @@ def _name(product: Facts) -> str:
 
 def _collection(pystac: Any, kind: ProductKind, products: Sequence[Facts]) -> Any:
     layout = LAYOUTS[kind]
-    places = [(each.longitude, each.latitude) for each in products]
+    places = [(product.longitude, product.latitude) for product in products]
     west, south = (min(axis) for axis in zip(*places, strict=True))
     east, north = (max(axis) for axis in zip(*places, strict=True))
-    times = [[min(each.start for each in products), max(each.stop for each in products)]]
+    times = [[min(p.start for p in products), max(p.stop for p in products)]]
     collection = pystac.Collection(
         id=kind.value,
         title=layout.title,
@@ -109,7 +110,7 @@ def _collection(pystac: Any, kind: ProductKind, products: Sequence[Facts]) -> An
 def _item(pystac: Any, product: Facts) -> Any:
     place = [product.longitude, product.latitude]
     wavelength = product.wavelength if math.isfinite(product.wavelength) else None
-    of_ours = {
+    own = {
         "id": product.id,
         "kind": product.kind.value,
         "channel": product.channel,
@@ -134,7 +135,7 @@ def _item(pystac: Any, product: Facts) -> Any:
             "platform": product.station,
             "instruments": [product.instrument],
             "mission": product.campaign,
-            **{f"{_PREFIX}:{name}": value for name, value in of_ours.items() if value is not None},
+            **{f"{_PREFIX}:{name}": value for name, value in own.items() if value is not None},
         },
     )
     asset = pystac.Asset(
@@ -148,7 +149,7 @@ def _item(pystac: Any, product: Facts) -> Any:
 
 
 def _link_product(item: Any, root: Path) -> None:
-    """Make the path of an item's product relative to the item."""
+    """Make the link to the product relative to the item."""
     asset = item.assets["product"]
     folder = Path(item.get_self_href()).parent
     asset.href = Path(os.path.relpath(root / asset.href, folder)).as_posix()

@@ -1,4 +1,4 @@
-"""Which values can be used: the summary of the quality bits, and its use as a mask."""
+"""Masks values by ``usable``, the summary of the quality bits."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ REJECTED: Final = 2
 
 
 def masked(data: xr.Dataset, worst: int) -> xr.Dataset:
-    """Make values missing whose ``usable`` is worse than asked for.
+    """Set values to missing whose ``usable`` is worse than `worst`.
 
     Parameters
     ----------
     data : xr.Dataset
         With ``usable``.
     worst : int
-        0 keeps what no test flagged, 1 also what asks for care, 2 everything.
+        0 keeps unflagged values, 1 also those to use with care, 2 all values.
 
     Returns
     -------
     xr.Dataset
-        The floating-point variables of the dimensions of ``usable`` are masked; flags stay.
+        Floating-point variables with the dimensions of ``usable`` are masked; flags are not.
 
     Raises
     ------
     RetrievalInputError
-        If `worst` is none of these.
+        If `worst` is not 0, 1 or 2.
     """
     if worst not in (GOOD, CARE, REJECTED):
         raise RetrievalInputError(
             f"is {worst!r}",
             field="usable",
-            remedy="0 keeps what no test flagged, 1 also what asks for care, 2 everything",
+            remedy="0 keeps unflagged values, 1 also those to use with care, 2 all values",
         )
     if worst == REJECTED:
         return data
-    judged = data[USABLE]
-    kept = judged <= worst
-    changed = {
+    quality = data[USABLE]
+    kept = quality <= worst
+    masked_values = {
         name: variable.where(kept)
         for name, variable in data.data_vars.items()
-        if variable.dtype.kind == "f" and variable.dims == judged.dims
+        if variable.dtype.kind == "f" and variable.dims == quality.dims
     }
-    return data.assign(changed)
+    return data.assign(masked_values)

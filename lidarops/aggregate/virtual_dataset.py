@@ -1,8 +1,8 @@
-"""One virtual dataset over all products of a kind, channel and grid.
+"""Views: virtual datasets over all products of one instrument, kind, channel and grid.
 
-A view is a JSON file of kerchunk references: no values are copied but the small ones along time.
-It is derived and can be thrown away at any time; the products are the truth. `open_view` refuses
-a view whose products have changed since.
+A view is a JSON file of kerchunk references; only small variables along time are copied. It is
+derived from the products and can be deleted and made again. `open_view` refuses a view whose
+products have changed.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from lidarops.aggregate._references import (
     Refs,
     Source,
     Template,
-    parts,
+    group_parts,
+    read_source,
+    read_template,
     references,
-    source,
-    template,
 )
 from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates, within
 from lidarops.aggregate.usable import CARE, masked
@@ -46,13 +46,13 @@ class View:
     """A view that was written."""
 
     path: str
-    """Relative to the folder of the products' root, with forward slashes."""
+    """Relative to the root of the products, with forward slashes."""
     products: int
     profiles: int
     parts: int
-    """Zarr groups in it: 1 where the chunks of all products fit one regular grid."""
+    """Number of Zarr groups: 1 if the chunks of all products fit one regular grid."""
     refused: tuple[Refused, ...] = ()
-    """Products that could not be read, and are not in it."""
+    """Products that could not be read and are not in the view."""
 
 
 def write_view(root: Path, products: Sequence[Facts]) -> View:
@@ -61,7 +61,7 @@ def write_view(root: Path, products: Sequence[Facts]) -> View:
     Parameters
     ----------
     root : path
-        The folder that the products' paths are relative to; the view goes to its folder
+        Folder that product paths are relative to; the view is written to its
         ``aggregates/views``.
     products : sequence of Facts
         Of one group (`lidarops.aggregate.facts.groups`).
@@ -73,19 +73,19 @@ def write_view(root: Path, products: Sequence[Facts]) -> View:
     Raises
     ------
     ProductError
-        If the products are not of one group, hold a time twice, or none of them can be read.
+        If the products are not of one group, have a time twice, or none can be read.
     """
     group = _group(products)
     alike, sources, refused = _sources(root, products)
     _refuse_duplicates(sources)
-    found = parts(sources, alike)
+    all_parts = group_parts(sources, alike)
     target = root / FOLDER / "views" / f"{group.name}.json"
-    content = _document(found, alike, DetectionMode(products[0].mode))
+    content = _document(all_parts, alike, DetectionMode(products[0].mode))
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
-    profiles = sum(each.facts.profiles for each in sources)
+    profiles = sum(source.facts.profiles for source in sources)
     path = target.relative_to(root).as_posix()
-    return View(path, len(sources), profiles, len(found), refused)
+    return View(path, len(sources), profiles, len(all_parts), refused)
 
 
 def _sources(
@@ -95,8 +95,8 @@ def _sources(
     sources, refused = [], []
     for product in products:
         try:
-            alike = alike or template(root, product)
-            sources.append(source(root, product, alike))
+            alike = alike or read_template(root, product)
+            sources.append(read_source(root, product, alike))
         except ProductError as error:
             refused.append(Refused(product.path, error.problem))
     if alike is None or not sources:
@@ -105,29 +105,29 @@ def _sources(
 
 
 def _group(products: Sequence[Facts]) -> Group:
-    found = {product.group for product in products}
-    if len(found) != 1:
-        names = ", ".join(sorted(group.name for group in found)) or "none"
-        raise ProductError(f"a view is of one group of products, not of {names}")
+    all_groups = {product.group for product in products}
+    if len(all_groups) != 1:
+        names = ", ".join(sorted(group.name for group in all_groups)) or "none"
+        raise ProductError(f"a view needs products of one group, not of {names}")
     for product in products:
         if any(brace in product.path for brace in _BRACES):
             raise ProductError(
                 "has braces in its path, which references cannot hold", file=product.path
             )
-    return found.pop()
+    return all_groups.pop()
 
 
 def _refuse_duplicates(sources: Sequence[Source]) -> None:
-    times = np.concatenate([each.inline["time"] for each in sources])
-    owners = [each.facts.path for each in sources for _ in range(each.facts.profiles)]
+    times = np.concatenate([source.inline["time"] for source in sources])
+    owners = [source.facts.path for source in sources for _ in range(source.facts.profiles)]
     refuse_duplicates(times, owners)
 
 
-def _document(found: Sequence[Part], alike: Template, mode: DetectionMode) -> dict[str, Any]:
-    shared = shared_attributes([each.attributes for part in found for each in part.sources])
-    names = [""] if len(found) == 1 else [f"part{number}" for number in range(len(found))]
+def _document(all_parts: Sequence[Part], alike: Template, mode: DetectionMode) -> dict[str, Any]:
+    shared = shared_attributes([source.attributes for part in all_parts for source in part.sources])
+    names = [""] if len(all_parts) == 1 else [f"part{number}" for number in range(len(all_parts))]
     refs: Refs = {}
-    for name, part in zip(names, found, strict=True):
+    for name, part in zip(names, all_parts, strict=True):
         inner = references(part, alike, mode, shared)
         refs |= {f"{name}/{key}".removeprefix("/"): value for key, value in inner.items()}
     refs.setdefault(".zgroup", json.dumps({"zarr_format": 2}))
@@ -140,40 +140,41 @@ def _document(found: Sequence[Part], alike: Template, mode: DetectionMode) -> di
             "parts": names,
             "products": [
                 {
-                    "path": each.facts.path,
-                    "size": each.facts.size,
-                    "sha256": each.facts.sha256,
-                    "id": each.facts.id,
-                    "seal": each.seal,
+                    "path": source.facts.path,
+                    "size": source.facts.size,
+                    "sha256": source.facts.sha256,
+                    "id": source.facts.id,
+                    "seal": source.seal,
                 }
-                for part in found
-                for each in part.sources
+                for part in all_parts
+                for source in part.sources
             ],
         },
     }
 
 
 def open_view(path: str | os.PathLike[str], *, usable: int = CARE) -> xr.Dataset:
-    """Open a view as one lazy dataset, in order of time.
+    """Open a view as one lazy dataset, sorted by time.
 
     Parameters
     ----------
     path : path or str
-        From `write_view`, in its place below the products' root.
+        File from `write_view`, at its place below the root of the products.
     usable : int
-        Worst values that are wanted: 0 good, 1 with care, 2 all. Others are NaN; flags stay.
+        Worst values to keep: 0 good, 1 also those to use with care, 2 all. Others are NaN; flags
+        are not masked.
 
     Returns
     -------
     xarray.Dataset
-        Decoded, on dask arrays, one chunk a product or smaller. ``product`` (product) is the
-        id of each product, ``product_index`` (time) tells which one holds a profile; what belongs
-        to a product as a whole has the dimension ``product``.
+        Decoded, on dask arrays with one chunk per product or smaller. ``product`` (product) is
+        the id of each product, ``product_index`` (time) the index of the product of each profile.
+        Variables of a whole product have the dimension ``product``.
 
     Raises
     ------
     ProductError
-        If the file is no view, or a product is missing or has changed since it was written.
+        If the file is not a view, or a product is missing or has changed since.
     LidarOpsError
         If zarr is not installed.
     """
@@ -187,13 +188,13 @@ def open_view(path: str | os.PathLike[str], *, usable: int = CARE) -> xr.Dataset
             refs[part][inner] = content
         elif "" in refs:
             refs[""][key] = content
-    pieces = [_part(root, each) for each in refs.values()]
+    pieces = [_part(root, part_refs) for part_refs in refs.values()]
     return masked(join(pieces), usable)
 
 
 def _part(root: Path, refs: Refs) -> xr.Dataset:
     zarr, fsspec = need("zarr"), need("fsspec")
-    # Zarr reads asynchronously; fsspec wraps the local files itself.
+    # Zarr reads asynchronously; fsspec wraps the local files.
     system = fsspec.filesystem(
         "reference",
         fo={"version": 1, "templates": {TEMPLATE: root.as_posix()}, "refs": refs},
@@ -201,10 +202,10 @@ def _part(root: Path, refs: Refs) -> xr.Dataset:
         asynchronous=True,
     )
     store = zarr.storage.FsspecStore(system, read_only=True)
-    found = xr.open_zarr(store, consolidated=False, zarr_format=2, chunks={}, decode_coords=True)
-    found = found.assign_coords(product=found["product"].astype(str, keep_attrs=True))
-    named: xr.Dataset = found.set_coords(["product", "product_index"])
-    return named
+    dataset = xr.open_zarr(store, consolidated=False, zarr_format=2, chunks={}, decode_coords=True)
+    dataset = dataset.assign_coords(product=dataset["product"].astype(str, keep_attrs=True))
+    with_coords: xr.Dataset = dataset.set_coords(["product", "product_index"])
+    return with_coords
 
 
 def _read(view: Path) -> dict[str, Any]:
@@ -212,10 +213,10 @@ def _read(view: Path) -> dict[str, Any]:
         document: Any = json.loads(view.read_bytes())
     except (OSError, ValueError) as error:
         raise ProductError(f"cannot be read as a view: {error}", file=view) from error
-    found = document.get("lidarops") if isinstance(document, dict) else None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
+    header = document.get("lidarops") if isinstance(document, dict) else None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ProductError(
-            "is no view of this version of lidarops",
+            "is not a view of this version of lidarops",
             file=view,
             remedy="write it again: lidarops aggregate",
         )
@@ -230,14 +231,14 @@ def _read(view: Path) -> dict[str, Any]:
 
 
 def _refuse_strange_array(array: dict[str, Any], view: Path, key: str) -> None:
-    """Refuse codecs that views do not have, some of which would run what they decode."""
+    """Refuse codecs that views do not use, because some codecs execute what they decode."""
     codecs = {codec["id"] for codec in array["filters"]}
     if array["compressor"] is not None or not codecs <= _CODECS or "O" in array["dtype"]:
-        raise ProductError("is stored as no view of lidarops is", file=view, field=key)
+        raise ProductError("is not stored as in views of lidarops", file=view, field=key)
 
 
 def _check_products(root: Path, document: dict[str, Any], view: Path) -> None:
-    """Refuse a view whose references may lie in files that are not what they were."""
+    """Refuse a view whose products have changed, or that refers to other files."""
     known = set()
     prefix = f"{{{{{TEMPLATE}}}}}/"
     for product in document["lidarops"]["products"]:
@@ -251,7 +252,9 @@ def _check_products(root: Path, document: dict[str, Any], view: Path) -> None:
             )
     for key, place in document["refs"].items():
         if isinstance(place, list) and place[0] not in known:
-            raise ProductError("refers to a file that is no product of it", file=view, field=key)
+            raise ProductError(
+                "refers to a file that is not one of its products", file=view, field=key
+            )
 
 
 def _is_unchanged(file: Path, product: dict[str, Any]) -> bool:
@@ -259,7 +262,7 @@ def _is_unchanged(file: Path, product: dict[str, Any]) -> bool:
         with file.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             stream.seek(product["seal"])
-            found = stream.read(len(product["id"]))
+            stored_id = stream.read(len(product["id"]))
     except OSError:
         return False
-    return bool(size == product["size"] and found == product["id"].encode())
+    return bool(size == product["size"] and stored_id == product["id"].encode())

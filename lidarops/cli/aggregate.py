@@ -23,7 +23,7 @@ from lidarops.cli.app import (
 )
 
 if TYPE_CHECKING:
-    from lidarops.aggregate.aggregates import Made
+    from lidarops.aggregate.aggregates import AggregateResult
 
 
 @app.command()
@@ -63,18 +63,18 @@ def aggregate(
 
     Example: lidarops aggregate demo --kind elastic --means month --weights inverse-variance
     """
-    from lidarops.aggregate.aggregates import Wanted, make_aggregates
+    from lidarops.aggregate.aggregates import AggregateOptions, make_aggregates
     from lidarops.aggregate.means_variables import Period, Weights
-    from lidarops.aggregate.selection import choice, select
+    from lidarops.aggregate.selection import parse_choice, parse_selection
 
-    wanted = Wanted(
-        select(kind, channel, station, instrument, utc(since), utc(until)),
-        None if means is None else choice(Period, means, "means"),
-        choice(Weights, weights, "weights"),
+    options = AggregateOptions(
+        parse_selection(kind, channel, station, instrument, utc(since), utc(until)),
+        None if means is None else parse_choice(Period, means, "means"),
+        parse_choice(Weights, weights, "weights"),
         stac,
     )
     with progress_bar("aggregate", None) as advance:
-        made = make_aggregates(_root(out), wanted, progress=advance)
+        made = make_aggregates(_root(out), options, progress=advance)
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:
@@ -90,7 +90,7 @@ def _root(out: Path) -> Path:
     return Path(load_campaign(out).output)
 
 
-def _tell(made: Made) -> None:
+def _tell(made: AggregateResult) -> None:
     views = make_table("Views", "file", "products", "profiles", "parts")
     for view in made.views:
         add_row(views, view.path, view.products, view.profiles, view.parts)

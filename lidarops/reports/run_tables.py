@@ -145,16 +145,16 @@ def verdict(record: RunRecord) -> str:
     if not record.scenes:
         tail = f" {counted(refused, 'granule')} refused." if refused else ""
         return f"There was no scene to process.{tail}"
-    empty = [scene.scene for scene in record.scenes if scene.unusable]
+    unusable = [scene.scene for scene in record.scenes if scene.unusable]
     rest = sum(
         p.usable == 0 for scene in record.scenes if not scene.unusable for p in scene.products
     )
     tail = f" {counted(rest, 'product')} without a usable value." if rest else ""
     parts = [f"{counted(failed, 'scene')} failed"] if failed else []
     parts += [f"{counted(refused, 'granule')} refused"] if refused else []
-    if empty:
-        number = counted(len(empty), "scene")
-        parts.append(f"{number} without a usable value: {listed(empty)}")
+    if unusable:
+        number = counted(len(unusable), "scene")
+        parts.append(f"{number} without a usable value: {listed(unusable)}")
     no_product = len(record.empty_scenes) + record.more_empty_scenes
     parts += [f"{counted(no_product, 'scene')} without product"] if no_product else []
     nowhere = {(unmet.instrument, unmet.channel) for unmet in record.unmet if unmet.nowhere}

@@ -66,7 +66,7 @@ def inside(folder: Path, path: str) -> Path:
     """
     pure = PurePosixPath(path)
     if pure.is_absolute() or ".." in pure.parts or not pure.parts:
-        raise ProductError("is no path inside its folder", file=path)
+        raise ProductError("is not a path inside its folder", file=path)
     file = folder / pure
     if not file.resolve().is_relative_to(folder.resolve()):
         raise ProductError(

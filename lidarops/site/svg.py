@@ -64,7 +64,7 @@ class Scale:
 
     def ticks(self, at_most: int = 6) -> list[float]:
         """Return round values between the ends."""
-        return _decades(self.low, self.high) if self.log else round_steps(*self.ends, at_most)
+        return _decades(self.low, self.high) if self.log else _round_steps(*self.ends, at_most)
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -72,7 +72,7 @@ class Scale:
         return min(self.low, self.high), max(self.low, self.high)
 
 
-def round_steps(low: float, high: float, at_most: int) -> list[float]:
+def _round_steps(low: float, high: float, at_most: int) -> list[float]:
     """Return multiples of 1, 2, 2.5 or 5 times a power of ten between two values."""
     rough = (high - low) / max(at_most, 1)
     power = 10.0 ** np.floor(np.log10(rough))

@@ -1,4 +1,4 @@
-"""The command line, and packages that are not there."""
+"""`lidarops aggregate`, and missing optional packages."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def test_everything_is_made(tmp_path: Path):
     assert code == 0
     assert made["products"] == 4
     assert len(made["views"]) == len(made["means"]) == 2
-    files = [made["index"], made["stac"], *(each["path"] for each in made["views"])]
-    files += [each["path"] for each in made["means"]]
+    files = [made["index"], made["stac"], *(view["path"] for view in made["views"])]
+    files += [means["path"] for means in made["means"]]
     assert all((tmp_path / file).is_file() for file in files)
 
 
-def test_the_line_of_the_readme_makes_what_it_says(repository: Path, tmp_path: Path):
+def test_the_command_of_the_readme_works(repository: Path, tmp_path: Path):
     for day in range(2):
         add_day(tmp_path, day)
     text = (repository / "README.md").read_text(encoding="utf-8")
@@ -49,18 +49,18 @@ def test_the_line_of_the_readme_makes_what_it_says(repository: Path, tmp_path: P
     made = json.loads(output)
     assert code == 0
     assert made["index"]
-    assert [each["periods"] for each in made["means"]] == [2]
+    assert [means["periods"] for means in made["means"]] == [2]
 
 
-def test_a_damaged_product_is_named_and_the_exit_code_is_1(tmp_path: Path):
+def test_a_damaged_product_is_listed_with_exit_code_1(tmp_path: Path):
     add_day(tmp_path, 0)
     damaged = add_day(tmp_path, 1)
     (tmp_path / damaged).write_bytes(b"nothing")
     code, output = run(tmp_path, "--json")
     made = json.loads(output)
     assert code == 1
-    assert [each["path"] for each in made["refused"]] == [damaged]
-    assert [each["products"] for each in made["views"]] == [1]
+    assert [product["path"] for product in made["refused"]] == [damaged]
+    assert [view["products"] for view in made["views"]] == [1]
 
 
 def test_a_selection_leaves_the_index_alone(tmp_path: Path):
@@ -74,10 +74,10 @@ def test_a_selection_leaves_the_index_alone(tmp_path: Path):
     assert "signal" in made["views"][0]["path"]
     code, output = run(tmp_path, "--kind", "signal", "--stac")
     assert code == 1
-    assert "of all products" in output
+    assert "lists all products" in output
 
 
-def test_what_cannot_be_averaged_is_told_and_the_rest_goes_on(tmp_path: Path):
+def test_a_failed_average_is_reported_and_the_others_are_made(tmp_path: Path):
     add_day(tmp_path, 0, zenith=[0.0, 10.0, 20.0, 30.0, 40.0])
     add_day(tmp_path, 1, ProductKind.SIGNAL)
     code, output = run(tmp_path, "--means", "day", "--json")
@@ -88,7 +88,7 @@ def test_what_cannot_be_averaged_is_told_and_the_rest_goes_on(tmp_path: Path):
     assert "the beam moves" in made["failed"][0]
 
 
-def test_a_person_is_told_of_grids(tmp_path: Path):
+def test_several_grids_give_a_note(tmp_path: Path):
     add_day(tmp_path, 0)
     add_day(tmp_path, 1, sections=3)
     code, output = run(tmp_path)
@@ -114,11 +114,11 @@ def test_a_folder_without_products_is_refused(tmp_path: Path):
     assert run(tmp_path / "nothing")[0] == 2
 
 
-def test_a_selection_without_products_names_what_there_is(tmp_path: Path):
+def test_a_selection_without_products_lists_known_names(tmp_path: Path):
     add_day(tmp_path, 0)
     code, output = run(tmp_path, "--station", "nope")
     assert (code, "known: " in output) == (2, True)
-    # There is such a kind, and may be one tomorrow.
+    # The kind exists, but this archive has no product of it yet.
     assert run(tmp_path, "--kind", "multiangle")[0] == 1
     assert run(tmp_path, "--since", "2030-01-01")[0] == 1
 

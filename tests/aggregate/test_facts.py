@@ -1,4 +1,4 @@
-"""Facts of products, their groups, and paths that stay in their folder."""
+"""Facts and groups of products; paths that lead out of their folder are refused."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lidarops.aggregate.facts import (
     Facts,
     ProductSelection,
     Refused,
+    grid_notes,
     groups,
     list_products,
     read_facts,
     read_product_facts,
-    told_grids,
     within,
 )
 from lidarops.errors import ProductError
@@ -29,7 +29,7 @@ from lidarops.netcdf.write import write_plain
 from lidarops.records import ProductKind
 
 
-def test_facts_are_what_the_file_holds(tmp_path: Path):
+def test_facts_are_those_of_the_file(tmp_path: Path):
     path = add_day(tmp_path, 2, profiles=5, sections=3)
     facts = read_facts(tmp_path, path)
     with xr.open_dataset(tmp_path / path) as product:
@@ -46,12 +46,12 @@ def test_facts_are_what_the_file_holds(tmp_path: Path):
     assert facts.size == (tmp_path / path).stat().st_size
 
 
-def test_products_of_one_grid_are_one_group_whatever_their_number_of_profiles(tmp_path: Path):
+def test_products_of_one_grid_form_one_group_for_any_number_of_profiles(tmp_path: Path):
     add_day(tmp_path, 0, profiles=5)
     add_day(tmp_path, 1, profiles=7)
-    found = groups(facts_of(tmp_path))
-    assert [len(products) for products in found.values()] == [2]
-    assert told_grids(found) == []
+    by_group = groups(facts_of(tmp_path))
+    assert [len(products) for products in by_group.values()] == [2]
+    assert grid_notes(by_group) == []
 
 
 @pytest.mark.parametrize(
@@ -64,26 +64,26 @@ def test_products_of_one_grid_are_one_group_whatever_their_number_of_profiles(tm
     ],
     ids=["sections", "zenith", "range", "wavelength"],
 )
-def test_products_of_another_grid_are_a_group_of_their_own_and_told(other, tmp_path: Path):
+def test_products_of_another_grid_form_another_group_with_a_note(other, tmp_path: Path):
     add_day(tmp_path, 0)
     add_day(tmp_path, 1, **other)
-    found = groups(facts_of(tmp_path))
-    assert [len(products) for products in found.values()] == [1, 1]
-    (sentence,) = told_grids(found)
+    by_group = groups(facts_of(tmp_path))
+    assert [len(products) for products in by_group.values()] == [1, 1]
+    (sentence,) = grid_notes(by_group)
     assert "odesa lidar-1 homogeneous photon_532o: products of 2 grids" in sentence
 
 
-def test_a_damaged_file_and_a_foreign_file_are_named_and_the_rest_goes_on(tmp_path: Path):
+def test_damaged_and_foreign_files_are_refused_and_others_read(tmp_path: Path):
     good = add_day(tmp_path, 0)
     damaged = add_day(tmp_path, 1)
     content = (tmp_path / damaged).read_bytes()
     (tmp_path / damaged).write_bytes(content[: len(content) // 2])
     write_plain(xr.Dataset({"a": ("x", np.arange(3.0))}), tmp_path / "products/foreign.nc")
     (tmp_path / "products/text.nc").write_text("no NetCDF")
-    found = {each.path: each for each in read_product_facts(tmp_path, list_products(tmp_path))}
-    assert isinstance(found.pop(good), Facts)
-    assert set(found) == {damaged, "products/foreign.nc", "products/text.nc"}
-    assert all(isinstance(each, Refused) and each.reason for each in found.values())
+    results = {facts.path: facts for facts in read_product_facts(tmp_path, list_products(tmp_path))}
+    assert isinstance(results.pop(good), Facts)
+    assert set(results) == {damaged, "products/foreign.nc", "products/text.nc"}
+    assert all(isinstance(file, Refused) and file.reason for file in results.values())
 
 
 def test_hidden_files_and_aggregates_are_not_listed(tmp_path: Path):
@@ -96,7 +96,7 @@ def test_hidden_files_and_aggregates_are_not_listed(tmp_path: Path):
 
 
 def test_a_missing_folder_is_refused(tmp_path: Path):
-    with pytest.raises(ProductError, match="is no folder"):
+    with pytest.raises(ProductError, match="is not a folder"):
         list_products(tmp_path / "nothing")
 
 
@@ -105,11 +105,11 @@ def test_no_path_leads_out(parts: list[str], absolute: bool):
     root = Path("/srv/out")
     path = ("/" if absolute else "") + "/".join(parts)
     try:
-        found = within(root, path)
+        file = within(root, path)
     except ProductError:
         return
-    assert found.resolve().is_relative_to(root.resolve())
-    assert ".." not in found.parts
+    assert file.resolve().is_relative_to(root.resolve())
+    assert ".." not in file.parts
 
 
 def test_a_link_to_the_outside_is_refused(tmp_path: Path):
@@ -117,19 +117,19 @@ def test_a_link_to_the_outside_is_refused(tmp_path: Path):
     root = tmp_path / "out"
     (root / "products").mkdir(parents=True)
     (root / "products/link.nc").symlink_to(tmp_path / "elsewhere" / outside)
-    (found,) = read_product_facts(root, list_products(root))
-    assert isinstance(found, Refused)
-    assert "leads out of" in found.reason
+    (refused,) = read_product_facts(root, list_products(root))
+    assert isinstance(refused, Refused)
+    assert "leads out of" in refused.reason
 
 
-def test_a_selection_admits_what_overlaps_in_time(tmp_path: Path):
+def test_a_selection_admits_products_that_overlap_in_time(tmp_path: Path):
     for day in range(4):
         add_day(tmp_path, day)
     add_day(tmp_path, 1, ProductKind.SIGNAL)
-    wanted = ProductSelection(
+    selection = ProductSelection(
         ProductKind.HOMOGENEOUS,
         since=datetime(2026, 3, 2, 10, 30, tzinfo=UTC),
         until=datetime(2026, 3, 3, 10, 10, tzinfo=UTC),
     )
-    found = list(read_product_facts(tmp_path, list_products(tmp_path), wanted))
-    assert [each.start.day for each in found if isinstance(each, Facts)] == [2, 3]
+    selected = list(read_product_facts(tmp_path, list_products(tmp_path), selection))
+    assert [facts.start.day for facts in selected if isinstance(facts, Facts)] == [2, 3]

@@ -1,4 +1,4 @@
-"""The index of products: what it finds, how large it is."""
+"""The index of products: queries and size."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ VALUES = {
 
 
 def fabricated(count: int) -> list[Facts]:
-    """Products of ten years as an archive has them, digests and counts at random."""
+    """Return facts of products of ten years, with random digests and counts."""
     rng = np.random.default_rng(3)
-    found = []
+    products = []
     for number in range(count):
         kind = list(VALUES)[number % len(VALUES)]
         channel = ("analog_532o", "photon_532o")[number // 4 % 2]
@@ -39,7 +39,7 @@ def fabricated(count: int) -> list[Facts]:
         values = VALUES[kind]
         usable = int(rng.integers(values // 3, values))
         cloudy = kind is ProductKind.ELASTIC and rng.random() < 0.4
-        found.append(
+        products.append(
             Facts(
                 path=f"products/odesa/lidar-1/{kind.value}/{start:%Y}/odesa_lidar-1_{kind.value}"
                 f"_{channel}_{start:%Y%m%dT%H%M%S}.nc",
@@ -70,7 +70,7 @@ def fabricated(count: int) -> list[Facts]:
                 },
             )
         )
-    return found
+    return products
 
 
 @pytest.fixture(scope="module")
@@ -84,32 +84,32 @@ def test_twenty_thousand_products_take_less_than_a_megabyte(archive: tuple[Path,
     assert archive[0].stat().st_size <= 1_000_000
 
 
-def test_a_query_finds_what_overlaps_and_nothing_else(archive: tuple[Path, list[Facts]]):
+def test_a_query_returns_exactly_the_products_that_overlap(archive: tuple[Path, list[Facts]]):
     index, products = archive
     since, until = "2018-02-03T12:00", datetime(2018, 5, 1, tzinfo=UTC)
     found = find_products(index, kind="elastic", channel="photon_532o", since=since, until=until)
-    wanted = ProductSelection(
+    selection = ProductSelection(
         ProductKind.ELASTIC,
         "photon_532o",
         since=datetime(2018, 2, 3, 12, tzinfo=UTC),
         until=datetime(2018, 5, 1, tzinfo=UTC),
     )
     expected = [
-        each
-        for each in products
-        if wanted.admits(
-            each.kind, each.station, each.instrument, each.channel, each.start, each.stop
+        facts
+        for facts in products
+        if selection.admits(
+            facts.kind, facts.station, facts.instrument, facts.channel, facts.start, facts.stop
         )
     ]
     assert 60 < len(expected) < 80
-    assert found.path.tolist() == [each.path for each in expected]
+    assert found.path.tolist() == [facts.path for facts in expected]
     assert found.attrs["root"] == str(index.parents[1])
 
 
-def test_every_fact_comes_back(archive: tuple[Path, list[Facts]]):
+def test_the_index_keeps_every_fact(archive: tuple[Path, list[Facts]]):
     index, products = archive
     found = find_products(index)
-    by_path = {each.path: each for each in products}
+    by_path = {facts.path: facts for facts in products}
     assert len(found) == len(products)
     for row in found.sample(50, random_state=1).itertuples():
         facts = by_path[row.path]
@@ -122,14 +122,14 @@ def test_every_fact_comes_back(archive: tuple[Path, list[Facts]]):
         assert row.flag_saturated == 0
 
 
-def test_a_query_that_finds_nothing_is_empty(archive: tuple[Path, list[Facts]]):
+def test_a_query_without_matches_is_empty(archive: tuple[Path, list[Facts]]):
     found = find_products(archive[0], station="nowhere")
     assert isinstance(found, pd.DataFrame)
     assert found.empty
     assert "path" in found
 
 
-def test_wrong_use_names_the_choices(archive: tuple[Path, list[Facts]]):
+def test_wrong_arguments_list_the_choices(archive: tuple[Path, list[Facts]]):
     with pytest.raises(RetrievalInputError, match=r"kind: is 'nothing'.*homogeneous"):
         find_products(archive[0], kind="nothing")
     with pytest.raises(RetrievalInputError, match="since: is 'yesterday'"):
@@ -142,7 +142,7 @@ def test_equal_products_give_equal_bytes_in_any_order(tmp_path: Path):
     assert (tmp_path / write_index(tmp_path, reversed(products))).read_bytes() == first
 
 
-def test_the_index_of_real_files_is_found_again(tmp_path: Path):
+def test_the_index_of_real_files_can_be_queried(tmp_path: Path):
     for day in range(3):
         add_day(tmp_path, day)
     index = tmp_path / write_index(tmp_path, facts_of(tmp_path))
@@ -159,13 +159,13 @@ def test_an_unknown_wavelength_is_missing(tmp_path: Path):
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 and something else PAR1"])
-def test_what_is_no_index_is_refused(content: bytes, tmp_path: Path):
+def test_other_files_are_refused(content: bytes, tmp_path: Path):
     (tmp_path / INDEX).write_bytes(content)
     with pytest.raises(ProductError, match="index"):
         find_products(tmp_path / INDEX)
 
 
-def test_a_table_of_others_is_refused(tmp_path: Path):
+def test_another_parquet_table_is_refused(tmp_path: Path):
     pd.DataFrame({"path": ["a"]}).to_parquet(tmp_path / INDEX)
-    with pytest.raises(ProductError, match="is no index of this version"):
+    with pytest.raises(ProductError, match="is not an index of this version"):
         find_products(tmp_path / INDEX)

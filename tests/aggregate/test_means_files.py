@@ -1,4 +1,4 @@
-"""Files of means against the products that they are of."""
+"""Files of means, compared with the products."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.aggregate_archive import add_day, facts_of
 from support.made_products import MAKERS
 
 from lidarops.aggregate.facts import Refused, groups, read_facts
-from lidarops.aggregate.means import Averaged, write_means
+from lidarops.aggregate.means import MeansResult, write_means
 from lidarops.aggregate.means_variables import (
     BUDGETS,
     Period,
@@ -35,7 +35,7 @@ from lidarops.retrieve.air.visibility import WavelengthLaw
 
 
 def findings(path: Path) -> list[set[str]]:
-    """What the checker has to say in strict mode: of CF, and of ACDD."""
+    """Return the messages of the compliance checker in strict mode, for CF and ACDD."""
     checks = ["cf:1.11", "acdd:1.3"]
     CheckSuite.load_all_available_checkers()
     report = path.with_suffix(".json")
@@ -44,23 +44,23 @@ def findings(path: Path) -> list[set[str]]:
     )
     results = json.loads(report.read_text(encoding="utf-8"))
     assert all(results[check]["possible_points"] > 90 for check in checks)
-    return [set(_said(results[check]["all_priorities"])) for check in checks]
+    return [set(_messages(results[check]["all_priorities"])) for check in checks]
 
 
-def _said(results: list[dict[str, Any]]) -> Iterator[str]:
+def _messages(results: list[dict[str, Any]]) -> Iterator[str]:
     for result in results:
         scored, possible = result["value"]
         if scored != possible:
             yield from (f"{result['name']} {message}" for message in result["msgs"])
-        yield from _said(result["children"])
+        yield from _messages(result["children"])
 
 
-def means_of(root: Path, period: Period = Period.DAY, **options) -> Averaged:
+def means_of(root: Path, period: Period = Period.DAY, **options) -> MeansResult:
     (products,) = groups(facts_of(root)).values()
     return write_means(root, products, period, **options)
 
 
-def only(root: Path, done: Averaged) -> xr.Dataset:
+def only(root: Path, done: MeansResult) -> xr.Dataset:
     (file,) = done.files
     with xr.open_dataset(root / file.path) as means:
         return means.load()
@@ -74,30 +74,30 @@ def test_daily_means_of_the_usable_values(tmp_path: Path):
     assert means.sizes["time"] == 3
     for day in range(3):
         values = data.isel(time=slice(6 * day, 6 * day + 6))
-        found = means.isel(time=day)
-        wanted = values.usable < 2
-        count = wanted.sum("time")
+        mean = means.isel(time=day)
+        usable = values.usable < 2
+        count = usable.sum("time")
         assert count.to_numpy().tolist() == [5, 6]
-        np.testing.assert_array_equal(found.extinction_observations, count)
-        np.testing.assert_allclose(found.usable_share, count / 6)
+        np.testing.assert_array_equal(mean.extinction_observations, count)
+        np.testing.assert_allclose(mean.usable_share, count / 6)
         x = values.extinction.astype(float)
-        np.testing.assert_allclose(found.extinction, x.mean("time"), rtol=1e-6)
+        np.testing.assert_allclose(mean.extinction, x.mean("time"), rtol=1e-6)
         np.testing.assert_allclose(
-            found.extinction_standard_error,
+            mean.extinction_standard_error,
             np.sqrt((values.extinction_standard_error.astype(float) ** 2).sum("time")) / count,
             rtol=1e-6,
         )
         np.testing.assert_allclose(
-            found.extinction_standard_deviation, x.std("time", ddof=1), rtol=1e-6
+            mean.extinction_standard_deviation, x.std("time", ddof=1), rtol=1e-6
         )
         np.testing.assert_allclose(
-            found.extinction_model_error, values.extinction_model_error.mean("time"), rtol=1e-6
+            mean.extinction_model_error, values.extinction_model_error.mean("time"), rtol=1e-6
         )
-        assert found.shots == 3600
+        assert mean.shots == 3600
     assert (means.quality_flag == 0).all()
 
 
-def test_weights_are_the_inverse_variance_where_asked(tmp_path: Path):
+def test_weights_are_the_inverse_variance_if_requested(tmp_path: Path):
     def uneven(data: xr.Dataset) -> xr.Dataset:
         data["extinction_standard_error"] *= xr.DataArray(np.arange(1.0, 6.0), dims="time")
         return data
@@ -115,7 +115,7 @@ def test_weights_are_the_inverse_variance_where_asked(tmp_path: Path):
     assert "1 / standard_error^2" in means.extinction.attrs["comment"]
 
 
-def test_errors_that_the_profiles_share_do_not_shrink(tmp_path: Path):
+def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Path):
     add_day(tmp_path, 0, ProductKind.ELASTIC, profiles=9)
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
     data = open_products(tmp_path).astype(np.float64).load()
@@ -158,10 +158,8 @@ def test_errors_that_the_profiles_share_do_not_shrink(tmp_path: Path):
         (ProductKind.VISIBILITY, ["extinction", "visibility_in_air"]),
     ],
 )
-def test_profiles_that_share_all_of_an_error_keep_it(
-    kind: ProductKind, names: list[str], tmp_path: Path
-):
-    """What smoothing takes from scans, and a prior from networks, it takes from all of them."""
+def test_fully_shared_errors_are_averaged(kind: ProductKind, names: list[str], tmp_path: Path):
+    """Smoothing of scans and the prior of networks affect all profiles alike."""
 
     def even(data: xr.Dataset) -> xr.Dataset:
         for name in names:
@@ -175,10 +173,10 @@ def test_profiles_that_share_all_of_an_error_keep_it(
     for name in names:
         assert float(means[f"{name}_observations"].max()) >= 4
         found = means[f"{name}_standard_error"].to_numpy()
-        told = data[f"{name}_standard_error"].max("time").to_numpy()
+        expected = data[f"{name}_standard_error"].max("time").to_numpy()
         some = np.isfinite(found)
         assert some.any()
-        np.testing.assert_allclose(found[some], told[some], rtol=1e-6)
+        np.testing.assert_allclose(found[some], expected[some], rtol=1e-6)
         assert "they are averaged" in means[name].attrs["comment"]
         assert data[f"{name}_standard_error"].attrs["error_kind"] == ErrorKind.BOTH
 
@@ -187,7 +185,7 @@ def test_means_of_visibility_state_the_systematic_error_of_extinction(tmp_path: 
     add_day(tmp_path, 0, ProductKind.VISIBILITY)
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
     data = open_products(tmp_path, usable=1).astype(np.float64).load()
-    # The retrieval that was made up has a systematic error of 3 percent, a random one of 2.
+    # The synthetic retrieval has a systematic error of 3 percent and a random error of 2 percent.
     expected = 0.03 * data.visibility_in_air.mean("time")
     found = means.visibility_in_air_systematic_error
     np.testing.assert_allclose(found, expected, rtol=1e-4)
@@ -196,39 +194,40 @@ def test_means_of_visibility_state_the_systematic_error_of_extinction(tmp_path: 
 
 
 @pytest.mark.parametrize("law", [WavelengthLaw.NONE, WavelengthLaw.KRUSE])
-def test_many_profiles_do_not_hide_what_the_model_does_to_visibility(
+def test_the_systematic_error_of_visibility_does_not_average_out(
     law: WavelengthLaw, tmp_path: Path
 ):
-    """Extinction is too large by its declared error in all profiles, which no mean removes."""
+    """Extinction is too large by its stated systematic error in all profiles."""
     definition = Definition(wavelength=532e-9, law=law)
     true, random, declared = 2e-4, 6e-6, 2e-5
 
     def off(data: xr.Dataset) -> xr.Dataset:
         noise = np.random.default_rng(8).normal(0.0, random, data.extinction.shape)
-        # `add_day` has scaled the extinction, which is none of ours.
+        # Replaces the extinction that `add_day` has scaled.
         data["extinction"] = data.extinction.dims, true + declared + noise
         data["extinction_standard_error"] = xr.full_like(data.extinction, random)
         data["extinction_model_error"] = xr.full_like(data.extinction, declared)
         data["quality_flag"] = xr.zeros_like(data.quality_flag)
-        seen = visibility_of_extinction(
+        visibility = visibility_of_extinction(
             data.extinction, data.extinction_standard_error, data.extinction_model_error, definition
         )
-        return data.assign(seen.data_vars)
+        return data.assign(visibility.data_vars)
 
     add_day(tmp_path, 0, profiles=100, change=off)
     means = only(tmp_path, means_of(tmp_path)).isel(time=0)
-    one = visibility_of_extinction(
+    expected = visibility_of_extinction(
         *(xr.DataArray(value) for value in (true, random, declared)), definition
     )
-    bias = np.abs(means.visibility_in_air - one.visibility_in_air)
-    error, apart = (means[f"visibility_in_air_{of}_error"] for of in ("standard", "systematic"))
+    bias = np.abs(means.visibility_in_air - expected.visibility_in_air)
+    error = means.visibility_in_air_standard_error
+    systematic_error = means.visibility_in_air_systematic_error
     assert (error < 0.02 * means.visibility_in_air).all()
     assert (bias > 4.0 * error).all()
-    assert (bias < 1.3 * apart).all()
-    assert (bias > 0.7 * apart).all()
+    assert (bias < 1.3 * systematic_error).all()
+    assert (bias > 0.7 * systematic_error).all()
 
 
-def test_a_month_holds_all_of_its_days_and_a_year_its_own_file(tmp_path: Path):
+def test_a_month_has_all_its_days_and_each_year_its_file(tmp_path: Path):
     # 1 March 2026 is day 0: these are in February and March 2026, and in December 2025.
     for day in (-62, -3, 2, 4):
         add_day(tmp_path, day)
@@ -249,7 +248,7 @@ def test_a_profile_belongs_to_the_day_of_its_middle(tmp_path: Path):
         shift = np.timedelta64(13 * 60 + 30, "m")
         return data.assign_coords(time=data.time + shift, time_bnds=data.time_bnds + shift)
 
-    # From 23:30 on: three profiles on the one day, two on the next, which has five more.
+    # From 23:30: three profiles on the first day, two on the next day, which has five more.
     add_day(tmp_path, 0, change=late)
     add_day(tmp_path, 1)
     means = only(tmp_path, means_of(tmp_path))
@@ -287,30 +286,30 @@ def test_means_comply(kind: ProductKind, period: Period, tmp_path: Path):
         for row in rows
         if row.standard_name is None
     }
-    # The checker wants the first middle where a mean covers its whole period.
-    other = {said for said in discovery if said not in nameless}
+    # The checker expects the first middle, but a mean covers its whole period.
+    other = {message for message in discovery if message not in nameless}
     assert len(other) == 2
-    assert all("mismatch between time_coverage_" in said for said in other)
+    assert all("mismatch between time_coverage_" in message for message in other)
 
 
-def test_the_provenance_names_every_product(tmp_path: Path):
+def test_the_provenance_lists_every_product(tmp_path: Path):
     for day in range(3):
         add_day(tmp_path, day)
     means = only(tmp_path, means_of(tmp_path))
     document = json.loads(means.provenance.item())
     facts = facts_of(tmp_path)
     inputs = {
-        (each["lidarops:sha256"], each["lidarops:id"], each["lidarops:path"])
-        for each in document["entity"].values()
-        if each["prov:type"]["$"] == "lidarops:Product"
+        (entity["lidarops:sha256"], entity["lidarops:id"], entity["lidarops:path"])
+        for entity in document["entity"].values()
+        if entity["prov:type"]["$"] == "lidarops:Product"
     }
-    assert inputs == {(each.sha256, each.id, each.path) for each in facts}
+    assert inputs == {(product.sha256, product.id, product.path) for product in facts}
     assert document["entity"]["lidarops:means"]["lidarops:id"] == means.attrs["id"]
     assert document["activity"]["lidarops:averaging"]["lidarops:weights"] == "plain"
     assert means.attrs["lidarops_input_count"] == 3
 
 
-def test_equal_products_give_equal_bytes_and_others_another_id(tmp_path: Path):
+def test_equal_products_give_equal_bytes_and_other_settings_another_id(tmp_path: Path):
     for root in "ab":
         for day in range(2):
             add_day(tmp_path / root, day)
@@ -323,12 +322,12 @@ def test_equal_products_give_equal_bytes_and_others_another_id(tmp_path: Path):
     assert len(ids) == 3
 
 
-def test_a_damaged_product_is_named_and_the_rest_goes_on(tmp_path: Path):
+def test_a_damaged_product_is_reported_and_the_others_averaged(tmp_path: Path):
     paths = [add_day(tmp_path, day) for day in range(2)]
     products = facts_of(tmp_path)
     (tmp_path / paths[0]).write_bytes(b"nothing")
     done = write_means(tmp_path, products, Period.DAY)
-    assert [each.path for each in done.refused] == [paths[0]]
+    assert [product.path for product in done.refused] == [paths[0]]
     assert [file.products for file in done.files] == [1]
 
 
@@ -343,17 +342,22 @@ def test_means_are_no_products(tmp_path: Path):
     (file,) = means_of(tmp_path).files
     with pytest.raises(ProductError, match="holds means of products"):
         read_facts(tmp_path, file.path)
-    assert not any(isinstance(each, Refused) for each in facts_of(tmp_path))
+    assert not any(isinstance(product, Refused) for product in facts_of(tmp_path))
 
 
 @pytest.mark.parametrize("kind", list(ProductKind))
-def test_every_error_that_is_not_random_has_its_rule(kind: ProductKind):
+def test_every_error_that_is_not_random_has_a_budget(kind: ProductKind):
     source = LAYOUTS[kind]
     for row in averaged(kind):
         if row.error_kind not in (None, ErrorKind.RANDOM):
             assert (kind, row.name) in BUDGETS
-    told = {systematic(kind, row.name) for row in averaged(kind)}
-    told |= {name for (of, _), each in BUDGETS.items() if of is kind for name in each.shared}
+    covered = {systematic(kind, row.name) for row in averaged(kind)}
+    covered |= {
+        name
+        for (budget_kind, _), budget in BUDGETS.items()
+        if budget_kind is kind
+        for name in budget.shared
+    }
     for row in source.data:
         if row.error_kind is ErrorKind.SYSTEMATIC and not row.uncertain and "time" in row.dims:
-            assert row.name in told, row.name
+            assert row.name in covered, row.name

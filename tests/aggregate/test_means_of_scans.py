@@ -1,4 +1,4 @@
-"""Means over many scans of one sky: what smoothing takes, it takes from every one."""
+"""Means over many scans of the same air, which share the smoothing error."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ CYCLES = 48
 
 
 @pytest.mark.parametrize("name", ["optical_depth", "extinction"])
-def test_means_of_one_sky_stay_within_their_errors(name: str):
+def test_means_stay_within_their_errors(name: str):
     rng = np.random.default_rng(5)
     scene = clear(3000.0, aerosol=2.0)
     step = np.diff(scene.altitude, prepend=0.0)
     truth = scene.truth if name == "optical_depth" else np.diff(scene.truth, prepend=0.0) / step
     sums, shares = None, []
     for days in range(1, 6):
-        found = estimates(scene, CYCLES, rng, 0.6)
+        depths = estimates(scene, CYCLES, rng, 0.6)
         smooth = smooth_profile.smooth_optical_depth(
-            found.optical_depth,
-            found.information,
+            depths.optical_depth,
+            depths.information,
             scene.altitude,
             station_altitude=0.0,
-            residuals=found.residuals,
+            residuals=depths.residuals,
         )
         errors = getattr(smooth, f"{name}_standard_error")
-        divided = budget_of(ProductKind.MULTIANGLE, name)
-        random, shared = (errors, ()) if divided is None else (np.zeros_like(errors), (errors,))
+        budget = budget_of(ProductKind.MULTIANGLE, name)
+        random, shared = (errors, ()) if budget is None else (np.zeros_like(errors), (errors,))
         usable = ~(smooth.extrapolated | smooth.prior_dominated)
         day = Sample(getattr(smooth, name), errors, random, shared, None, usable)
         sums = sums or Sums.like(day, inverse_variance=False)
         sums.add(day)
         if days in (1, 5):
             mean = sums.mean()
-            told = mean.observations > 0.9 * CYCLES * days
-            assert told.sum() > 50
-            shares.append(np.abs(mean.mean - truth)[told] / mean.standard_error[told])
+            frequent = mean.observations > 0.9 * CYCLES * days
+            assert frequent.sum() > 50
+            shares.append(np.abs(mean.mean - truth)[frequent] / mean.standard_error[frequent])
     assert all(np.mean(share > 2.0) < 0.05 for share in shares)
     assert all(share.max() < 4.0 for share in shares)

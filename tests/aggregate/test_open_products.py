@@ -14,7 +14,7 @@ from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.netcdf.variables import sum_up
+from lidarops.netcdf.variables import summarize_flags
 from lidarops.records import ProductKind
 
 
@@ -50,7 +50,7 @@ def test_unusable_values_are_missing(level: int, archive: Path):
     data = open_products(archive, kind="elastic", usable=level).load()
     everything = open_products(archive, kind="elastic", usable=2).load()
     flags = everything.quality_flag.to_numpy()
-    worst = sum_up(flags)
+    worst = summarize_flags(flags)
     np.testing.assert_array_equal(data.usable, worst)
     assert set(np.unique(worst)) == {0, 1, 2}
     np.testing.assert_array_equal(
@@ -61,17 +61,7 @@ def test_unusable_values_are_missing(level: int, archive: Path):
     assert data.backscatter.attrs == everything.backscatter.attrs
 
 
-def test_usable_is_derived_where_a_product_lacks_it(tmp_path: Path):
-    path = add_day(tmp_path, 0)
-    with xr.open_dataset(tmp_path / path, decode_cf=False) as product:
-        older = product.drop_vars("usable").load()
-    older.to_netcdf(tmp_path / "older.nc", format="NETCDF4_CLASSIC")
-    found, expected = (open_products(tmp_path / name).load() for name in ("older.nc", path))
-    xr.testing.assert_identical(found.usable.variable, expected.usable.variable)
-    assert found.usable.attrs["flag_meanings"] == "good use_with_care do_not_use"
-
-
-def test_what_belongs_to_a_whole_product_keeps_to_it(tmp_path: Path):
+def test_variables_of_a_whole_product_have_the_dimension_product(tmp_path: Path):
     for day in range(2):
         add_day(
             tmp_path,
@@ -84,25 +74,25 @@ def test_what_belongs_to_a_whole_product_keeps_to_it(tmp_path: Path):
     np.testing.assert_array_equal(data.lidar_ratio, [40.0, 41.0])
     ratio = data.lidar_ratio.isel(product=data.product_index)
     np.testing.assert_array_equal(ratio, np.repeat([40.0, 41.0], 5))
-    assert data["product"].to_numpy().tolist() == [each.id for each in facts_of(tmp_path)]
+    assert data["product"].to_numpy().tolist() == [product.id for product in facts_of(tmp_path)]
 
 
-def test_an_index_gives_the_same_as_the_folder(archive: Path):
+def test_an_index_gives_the_same_data_as_the_folder(archive: Path):
     pytest.importorskip("pyarrow")
     index = archive / write_index(archive, facts_of(archive))
-    asked = {"kind": "elastic", "since": "2026-03-02", "until": "2026-03-03T00:00"}
-    found = open_products(index, **asked).load()
+    selection = {"kind": "elastic", "since": "2026-03-02", "until": "2026-03-03T00:00"}
+    found = open_products(index, **selection).load()
     assert found.sizes["time"] == 5
-    xr.testing.assert_identical(found, open_products(archive, **asked).load())
+    xr.testing.assert_identical(found, open_products(archive, **selection).load())
 
 
 def test_files_open_in_any_order(archive: Path):
-    paths = [archive / each.path for each in facts_of(archive) if each.kind == "elastic"]
+    paths = [archive / facts.path for facts in facts_of(archive) if facts.kind == "elastic"]
     found = open_products(reversed(paths)).load()
     xr.testing.assert_identical(found, open_products(archive, kind="elastic").load())
 
 
-def test_several_groups_are_told_apart_not_mixed(archive: Path):
+def test_products_of_several_groups_are_not_mixed(archive: Path):
     with pytest.raises(ProductError, match=r"2 groups.*elastic photon_532o grid .*homogeneous"):
         open_products(archive)
 
@@ -122,7 +112,7 @@ def test_a_damaged_product_is_named(tmp_path: Path):
         open_products(tmp_path)
 
 
-def test_a_damaged_chunk_is_no_silent_value(tmp_path: Path):
+def test_a_damaged_chunk_raises_an_error(tmp_path: Path):
     path = tmp_path / add_day(tmp_path, 0, ProductKind.SIGNAL, profiles=30, bins=1000)
     content = bytearray(path.read_bytes())
     middle = len(content) // 2
@@ -132,18 +122,18 @@ def test_a_damaged_chunk_is_no_silent_value(tmp_path: Path):
         open_products(path, usable=2).load()
 
 
-def test_wrong_use_says_what_is_right(archive: Path, tmp_path: Path):
+def test_wrong_arguments_raise_clear_errors(archive: Path, tmp_path: Path):
     with pytest.raises(RetrievalInputError, match=r"usable: is 3 .*0 keeps"):
         open_products(archive, kind="elastic", usable=3)
-    with pytest.raises(ProductError, match="no product is found"):
+    with pytest.raises(ProductError, match="no product found"):
         open_products(archive, station="nowhere")
-    with pytest.raises(ProductError, match="no product is found"):
+    with pytest.raises(ProductError, match="no product found"):
         open_products([])
-    with pytest.raises(ProductError, match="is no file"):
+    with pytest.raises(ProductError, match="is not a file"):
         open_products(tmp_path / "nothing.nc")
 
 
 def test_rejecting_bits_are_those_of_the_flags():
     for bit in Quality:
         rejects = bool(bit & Quality.rejecting())
-        assert sum_up(np.array([int(bit)], np.int32))[0] == (2 if rejects else 1)
+        assert summarize_flags(np.array([int(bit)], np.int32))[0] == (2 if rejects else 1)

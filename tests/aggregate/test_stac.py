@@ -1,4 +1,4 @@
-"""The STAC catalog against the schemas that pystac holds, without a network."""
+"""The STAC catalog, validated with the schemas of pystac without a network."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def archive(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def test_the_catalog_is_valid_and_leads_to_the_products_wherever_it_lies(
+def test_the_catalog_is_valid_and_links_to_products_after_a_move(
     archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     path = write_stac(archive, facts_of(archive))
@@ -40,7 +40,7 @@ def test_the_catalog_is_valid_and_leads_to_the_products_wherever_it_lies(
     assert catalog.validate_all() == 4
     items = list(catalog.get_items(recursive=True))
     assert {item.collection_id for item in items} == {"homogeneous", "signal"}
-    by_id = {each.id: each for each in facts_of(moved)}
+    by_id = {facts.id: facts for facts in facts_of(moved)}
     for item in items:
         facts = by_id[item.properties["lidarops:id"]]
         product = Path(item.assets["product"].get_absolute_href())
@@ -59,12 +59,12 @@ def test_every_link_is_relative(archive: Path):
         assert all(href.startswith(("./", "../")) for href in hrefs), hrefs
 
 
-def test_a_second_catalog_takes_the_place_of_the_first(archive: Path):
+def test_a_second_catalog_replaces_the_first(archive: Path):
     catalog = archive / write_stac(archive, facts_of(archive))
     first = {file: file.read_bytes() for file in catalog.parent.rglob("*.json")}
     assert write_stac(archive, facts_of(archive))
     assert {file: file.read_bytes() for file in catalog.parent.rglob("*.json")} == first
-    write_stac(archive, [each for each in facts_of(archive) if each.kind == "signal"])
+    write_stac(archive, [facts for facts in facts_of(archive) if facts.kind == "signal"])
     assert not (catalog.parent / "homogeneous").exists()
 
 

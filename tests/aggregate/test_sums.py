@@ -1,4 +1,4 @@
-"""Means and their errors against formulas written out."""
+"""Means and their errors, compared with explicit formulas."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from scipy import stats
 from lidarops.aggregate._sums import Sample, Sums
 
 
-def sample(values, errors, *, random=None, shared=(), systematic=None, wanted=None) -> Sample:
-    values, errors = (np.asarray(each, np.float64) for each in (values, errors))
+def sample(values, errors, *, random=None, shared=(), systematic=None, usable=None) -> Sample:
+    values, errors = (np.asarray(array, np.float64) for array in (values, errors))
     return Sample(
         values,
         errors,
         errors if random is None else np.asarray(random, np.float64),
         tuple(np.asarray(part, np.float64) for part in shared),
         None if systematic is None else np.asarray(systematic, np.float64),
-        np.ones(values.shape, np.bool_) if wanted is None else np.asarray(wanted),
+        np.ones(values.shape, np.bool_) if usable is None else np.asarray(usable),
     )
 
 
 def mean(*samples: Sample, inverse_variance: bool = False):
     sums = Sums.like(samples[0], inverse_variance=inverse_variance)
-    for each in samples:
-        sums.add(each)
+    for part in samples:
+        sums.add(part)
     return sums.mean()
 
 
@@ -45,7 +45,7 @@ def test_a_weighted_mean_has_the_least_error():
     assert found.standard_error == pytest.approx(1.0 / np.sqrt(125.0))
 
 
-def test_shared_errors_do_not_shrink():
+def test_shared_errors_do_not_decrease():
     found = mean(sample([1.0] * 100, [0.5] * 100, random=[0.3] * 100, shared=([0.4] * 100,)))
     assert found.standard_error == pytest.approx(np.hypot(0.03, 0.4))
 
@@ -62,18 +62,18 @@ def test_systematic_errors_are_averaged_with_the_weights():
 
 
 @pytest.mark.parametrize("inverse_variance", [False, True])
-def test_what_is_not_wanted_or_missing_counts_for_nothing(inverse_variance: bool):
+def test_unusable_and_missing_values_do_not_count(inverse_variance: bool):
     values = [[1.0, np.nan], [3.0, 5.0], [1e30, 7.0], [2.0, 8.0]]
     errors = [[0.1, 0.1], [0.1, np.nan], [0.1, 0.1], [np.nan, 0.1]]
-    wanted = [[True, True], [True, True], [False, False], [True, False]]
-    found = mean(sample(values, errors, wanted=wanted), inverse_variance=inverse_variance)
+    usable = [[True, True], [True, True], [False, False], [True, False]]
+    found = mean(sample(values, errors, usable=usable), inverse_variance=inverse_variance)
     np.testing.assert_allclose(found.mean, [2.0, np.nan])
     np.testing.assert_array_equal(found.observations, [2, 0])
     assert np.isnan(found.standard_error[1])
     assert np.isnan(found.standard_deviation[1])
 
 
-def test_an_error_of_nothing_cannot_be_a_weight():
+def test_a_zero_error_cannot_be_a_weight():
     given_ = sample([1.0, 5.0], [0.0, 0.1])
     assert mean(given_, inverse_variance=True).mean == pytest.approx(5.0)
     assert mean(given_).mean == pytest.approx(3.0)
@@ -84,11 +84,13 @@ def test_an_error_of_nothing_cannot_be_a_weight():
     st.integers(0, 30),
     st.booleans(),
 )
-def test_products_give_what_their_profiles_give_together(values, cut, inverse_variance):
+def test_adding_in_parts_gives_the_same_mean(values, cut, inverse_variance):
     errors = np.linspace(1.0, 2.0, len(values))
     whole = sample(values, errors)
     parts = [whole.take(np.arange(len(values))[part]) for part in (slice(cut), slice(cut, None))]
-    found, expected = (mean(*each, inverse_variance=inverse_variance) for each in (parts, [whole]))
+    found, expected = (
+        mean(*samples, inverse_variance=inverse_variance) for samples in (parts, [whole])
+    )
     scale = 1e-12 * max(1.0, np.max(np.abs(values)))
     np.testing.assert_allclose(found.mean, expected.mean, atol=scale, rtol=1e-12)
     np.testing.assert_allclose(found.standard_error, expected.standard_error, rtol=1e-12)
@@ -121,6 +123,6 @@ def test_the_standard_error_covers_the_truth(inverse_variance: bool):
         inverse_variance=inverse_variance,
     )
     normalised = (found.mean - truth) / found.standard_error
-    # chi-square of the sample variance: one in a thousand would lie beyond.
+    # Chi-square limits of the sample variance, exceeded with a probability of 1e-3.
     low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], trials) / trials
     assert low < np.mean(normalised**2) < high

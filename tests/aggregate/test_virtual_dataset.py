@@ -1,4 +1,4 @@
-"""Views: virtual datasets against the products that they refer to."""
+"""Views: virtual datasets, compared with their products."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def view_of(root: Path) -> View:
 
 
 def eager(root: Path, name: str) -> np.ndarray:
-    """All values of a variable, product by product."""
+    """Return all values of a variable, read product by product."""
     parts = []
-    # Names end with the date.
+    # In order of time, because file names end with the date.
     for path in sorted((root / "products").rglob("*.nc")):
         with xr.open_dataset(path) as product:
             parts.append(product[name].to_numpy())
@@ -39,7 +39,7 @@ def eager(root: Path, name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MAKERS if kind is not ProductKind.HOMOGENEOUS])
-def test_a_view_is_what_the_products_hold(kind: ProductKind, tmp_path: Path):
+def test_a_view_has_the_content_of_the_products(kind: ProductKind, tmp_path: Path):
     for day in (2, 0, 1):
         add_day(tmp_path, day, kind)
     view = view_of(tmp_path)
@@ -62,7 +62,7 @@ def test_two_hundred_products_have_the_mean_of_the_eager_ones(tmp_path: Path):
     values = eager(tmp_path, "extinction").astype(np.float64)
     found = float(virtual.extinction.astype(np.float64).mean())
     assert found == pytest.approx(np.nanmean(values), rel=1e-6)
-    # No value has been read but those along time: what is opened is lazy.
+    # The dataset is lazy.
     assert virtual.extinction.chunks is not None
     assert len(virtual.extinction.chunks[0]) == 200
 
@@ -77,7 +77,7 @@ def test_products_of_unequal_length_are_joined_in_order_of_time(tmp_path: Path):
     np.testing.assert_array_equal(virtual.time, eager(tmp_path, "time"))
     counts = np.bincount(virtual.product_index.to_numpy())
     assert sorted(counts) == [5, 5, 6, 7, 7]
-    ids = {each.start: each.id for each in facts_of(tmp_path)}
+    ids = {facts.start: facts.id for facts in facts_of(tmp_path)}
     assert virtual["product"].to_numpy()[virtual.product_index.to_numpy()[0]] == ids[min(ids)]
 
 
@@ -91,7 +91,7 @@ def test_a_last_chunk_that_is_not_full_ends_a_part(tmp_path: Path):
     np.testing.assert_array_equal(virtual.signal, eager(tmp_path, "signal"))
 
 
-def test_a_chunk_that_is_not_deflated_is_refused_by_name_and_the_rest_goes_on(tmp_path: Path):
+def test_a_product_with_a_chunk_that_is_not_deflated_is_left_out(tmp_path: Path):
     good, odd = (add_day(tmp_path, day) for day in range(2))
     with h5py.File(tmp_path / odd, "r+") as file:
         stored = file["valid_bins"][...]
@@ -169,29 +169,32 @@ def test_a_product_that_changed_is_refused(tmp_path: Path):
         open_view(tmp_path / view.path)
 
 
-def test_a_view_that_names_files_outside_is_refused(tmp_path: Path):
+def test_a_view_that_refers_to_other_files_is_refused(tmp_path: Path):
     add_day(tmp_path / "out", 0, ProductKind.SIGNAL)
     view = tmp_path / "out" / view_of(tmp_path / "out").path
-    told = json.loads(view.read_text())
+    document = json.loads(view.read_text())
 
     def refused(change: dict[str, Any], match: str) -> None:
-        view.write_text(json.dumps(told | change))
+        view.write_text(json.dumps(document | change))
         with pytest.raises(ProductError, match=match):
             open_view(view)
 
     (tmp_path / "secret").write_text("x")
-    own = told["lidarops"]
+    own = document["lidarops"]
     product = {**own["products"][0], "path": "../secret"}
-    refused({"lidarops": {**own, "products": [product]}}, "no path inside")
-    stray = {**told["refs"], "signal/0.0": ["{{u}}/../secret", 0, 1]}
-    refused({"refs": stray}, "no product of it")
-    pickled = json.loads(told["refs"]["signal/.zarray"]) | {"filters": [{"id": "pickle"}]}
-    refused({"refs": {**told["refs"], "signal/.zarray": json.dumps(pickled)}}, "as no view")
-    refused({"lidarops": {**own, "format": 99}}, "no view of this version")
+    refused({"lidarops": {**own, "products": [product]}}, "not a path inside")
+    stray = {**document["refs"], "signal/0.0": ["{{u}}/../secret", 0, 1]}
+    refused({"refs": stray}, "not one of its products")
+    pickled = json.loads(document["refs"]["signal/.zarray"]) | {"filters": [{"id": "pickle"}]}
+    refused(
+        {"refs": {**document["refs"], "signal/.zarray": json.dumps(pickled)}},
+        "not stored as in views",
+    )
+    refused({"lidarops": {**own, "format": 99}}, "not a view of this version")
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"lidarops": {"format": 1}}'])
-def test_what_is_no_view_is_refused(content: bytes, tmp_path: Path):
+def test_other_files_are_refused(content: bytes, tmp_path: Path):
     (tmp_path / "aggregates/views").mkdir(parents=True)
     path = tmp_path / "aggregates/views/a.json"
     path.write_bytes(content)
@@ -199,7 +202,7 @@ def test_what_is_no_view_is_refused(content: bytes, tmp_path: Path):
         open_view(path)
 
 
-def test_profiles_at_the_same_time_are_refused_by_name(tmp_path: Path):
+def test_profiles_at_the_same_time_are_refused(tmp_path: Path):
     first = add_day(tmp_path, 0)
     copy = tmp_path / "products/copy.nc"
     shutil.copy(tmp_path / first, copy)

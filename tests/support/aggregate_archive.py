@@ -1,4 +1,4 @@
-"""Archives of made-up products, one a day."""
+"""Archives of synthetic products, one per day."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def add_day(
     folder: str = "products",
     **maker: Any,
 ) -> str:
-    """Write the product of a day, its values scaled by a number of that day; return its path."""
+    """Write the product of a day with values scaled by a random factor; return its path."""
     data = MAKERS[kind](**{"zenith": 0.0, **maker})
     shift = np.timedelta64(day, "D")
     data = data.assign_coords(time=data.time + shift, time_bnds=data.time_bnds + shift)
@@ -54,7 +54,7 @@ def add_day(
 
 
 def facts_of(root: Path) -> list[Facts]:
-    """The facts of all products of an archive, none of which is refused."""
-    found = list(read_product_facts(root, list_products(root)))
-    assert all(isinstance(each, Facts) for each in found), found
-    return [each for each in found if isinstance(each, Facts)]
+    """Return the facts of all products of an archive; none may be refused."""
+    results = list(read_product_facts(root, list_products(root)))
+    assert all(isinstance(facts, Facts) for facts in results), results
+    return [facts for facts in results if isinstance(facts, Facts)]
