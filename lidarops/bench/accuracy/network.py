@@ -1,4 +1,4 @@
-"""How right and how fast extinction is found where the beams of several lidars meet."""
+"""Accuracy and speed of the retrieval of extinction where the beams of several lidars cross."""
 
 from __future__ import annotations
 
@@ -13,8 +13,14 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.bench.accuracy import network_cases as known
-from lidarops.bench.accuracy.network_cases import Air, Array, FigurePoint, Place, Signals
+from lidarops.bench.accuracy import network_cases
+from lidarops.bench.accuracy.network_cases import (
+    Air,
+    Array,
+    FigurePoint,
+    LidarLine,
+    Signals,
+)
 from lidarops.bench.accuracy.network_report import (
     network_accuracy_report,
     network_throughput_report,
@@ -23,20 +29,20 @@ from lidarops.bench.accuracy.network_scores import (
     CLIPPED,
     READ,
     Comparison,
-    Errors,
-    MultiPosition,
-    MultiPositionThroughput,
+    CrossingErrors,
+    NetworkAccuracy,
     NetworkScenario,
-    Sight,
+    NetworkThroughput,
     SolverRate,
-    errors_of,
-    joined,
+    VisibilityScore,
+    crossing_errors,
+    join_errors,
     mean_by_block,
     root_by_block,
     score,
     share_by_block,
 )
-from lidarops.bench.harness.terms import RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
 from lidarops.bench.harness.timing import in_threads, least_times, machine
 from lidarops.retrieve.air import visibility as sight
 from lidarops.retrieve.network.cycles import solve_cycle, values_and_variances
@@ -46,6 +52,7 @@ Booleans = npt.NDArray[np.bool_]
 
 PROFILES: Final = 3000
 QUICK_PROFILES: Final = 500
+"""Profiles of each case, and of a quick run."""
 CONTRASTS: Final = (sight.MOR_CONTRAST, sight.KOSCHMIEDER_CONTRAST, sight.PAPER_CONTRAST)
 
 _PEER_PROFILES: Final = 150
@@ -54,21 +61,21 @@ _CHUNK_BLOCKS: Final = 5
 _TIMED_PROFILES: Final = 250
 _CYCLES: Final = {3: 500_000, 12: 100_000}
 _QUICK_CYCLES: Final = {3: 100_000, 12: 20_000}
-"""Cycles of a call by the beams of each."""
+"""Number of cycles in a call, by the number of beams of a cycle."""
 _REPEATS: Final = 7
 _QUICK_REPEATS: Final = 3
 _SHORTEST: Final = 1e-9
-"""The clock of a fast machine with little work may not have moved."""
+"""s. A short call may take less than one tick of the clock."""
 
-_Found = TypeVar("_Found")
+_Result = TypeVar("_Result")
 
 
 # Accuracy -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Chunks:
-    """Profiles are drawn and solved chunk by chunk, whole blocks each."""
+class _Chunks:
+    """Number and size of the chunks of profiles that are solved together: whole blocks."""
 
     number: int
     size: int
@@ -82,150 +89,165 @@ def measure_network(
     repeats: int | None = None,
     peer_profiles: int | None = None,
     progress: Callable[[int], object] = lambda _: None,
-) -> MultiPosition:
-    """Find extinction in every network, air and noise, in every way.
+) -> NetworkAccuracy:
+    """Retrieve extinction in every network, air and noise, with every solver.
 
     Parameters
     ----------
     quick : bool
-        Fewer profiles.
+        Use fewer profiles.
     date : str
-        When it is run, as it is to be stated.
+        Date of the run, for the report.
     profiles : int, optional
-        Of each case; whole blocks are drawn.
+        Number of profiles of each case, rounded up to whole blocks.
     repeats : int, optional
-        Counted rounds of the timing of cycles.
+        Number of timed repeats of the cycles.
     peer_profiles : int, optional
-        Of each comparison with a plain fit.
+        Number of profiles of each comparison with a plain fit.
     progress : callable
-        Is given 1 after each case.
+        Called with 1 after each case.
     """
-    count = profiles or (QUICK_PROFILES if quick else PROFILES)
-    blocks = -(-count // known.BLOCK)
-    chunks = Chunks(-(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * known.BLOCK)
+    profile_count = profiles or (QUICK_PROFILES if quick else PROFILES)
+    blocks = -(-profile_count // network_cases.BLOCK)
+    chunks = _Chunks(-(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * network_cases.BLOCK)
     peer_profiles = peer_profiles or (_QUICK_PEER_PROFILES if quick else _PEER_PROFILES)
-    cases, sights = [], []
-    for place in known.PLACES:
-        net = place.network()
-        seen = {air.name: known.signals(net, air) for air in known.AIRS}
-        for number, (air, noise) in enumerate(product(known.AIRS, known.NOISES)):
-            case, network = _case(place, air, noise, seen[air.name], chunks, number)
-            cases.append(case)
-            if place is known.THREE_BY_TWO and air is known.SIGHTS_AIR:
-                sights += _sights(network, seen[air.name], noise)
+    cases, visibility_scores = [], []
+    for lidars in network_cases.LIDAR_LINES:
+        net = lidars.network()
+        signals = {air.name: network_cases.signals(net, air) for air in network_cases.AIRS}
+        for index, (air, noise) in enumerate(product(network_cases.AIRS, network_cases.NOISES)):
+            scenario, results = _measure_case(lidars, air, noise, signals[air.name], chunks, index)
+            cases.append(scenario)
+            if lidars is network_cases.THREE_BY_TWO and air is network_cases.VISIBILITY_AIR:
+                visibility_scores += _visibility_scores(results, signals[air.name], noise)
             progress(1)
-    return MultiPosition(
+    return NetworkAccuracy(
         date=date,
         machine=machine(),
         cases=tuple(cases),
-        figure=figure(),
-        sights=tuple(sights),
+        figure=figure_points(),
+        sights=tuple(visibility_scores),
         comparisons=tuple(_comparisons(peer_profiles)),
-        cycles=tuple(cycle_rates(quick=True, repeats=repeats or _QUICK_REPEATS)),
+        cycles=tuple(_cycle_rates(quick=True, repeats=repeats or _QUICK_REPEATS)),
     )
 
 
-def figure() -> tuple[FigurePoint, ...]:
+def figure_points() -> tuple[FigurePoint, ...]:
     """Return the points of figure 2 of drabenko2021."""
     return tuple(
-        known.figure_point(first, elevation)
-        for first, elevation in product(known.FIGURE_FIRST_LIDARS, known.FIGURE_ELEVATIONS)
+        network_cases.figure_point(first_lidar, elevation)
+        for first_lidar, elevation in product(
+            network_cases.FIGURE_FIRST_LIDARS, network_cases.FIGURE_ELEVATIONS
+        )
     )
 
 
-def _case(
-    place: Place, air: Air, noise: float, seen: Signals, chunks: Chunks, seed: int
+def _measure_case(
+    lidars: LidarLine, air: Air, noise: float, signals: Signals, chunks: _Chunks, seed: int
 ) -> tuple[NetworkScenario, list[MultiPositionResult]]:
-    """Return the scores of every way, and what the network found."""
-    truth, near = seen.truth(chunks.size), seen.network.near_crossing
-    errors: dict[str, list[Errors]] = {way.name: [] for way in known.network_solvers(place)}
-    least = dict.fromkeys((READ, *errors), math.inf)
-    network = []
+    """Return the scores of every solver, and the results of the network method."""
+    truth, near = signals.truth(chunks.size), signals.network.near_crossing
+    errors: dict[str, list[CrossingErrors]] = {
+        solver.name: [] for solver in network_cases.network_solvers(lidars)
+    }
+    least_seconds = dict.fromkeys((READ, *errors), math.inf)
+    network_results = []
     for chunk in range(chunks.number):
-        power, variance = seen.draw(noise, chunks.size, len(seen.network.origin), seed, chunk)
-        least[READ] = min(least[READ], _timed(partial(np.max, power))[0])
-        for way in known.network_solvers(place):
-            solve = partial(way, power, variance, seen)
+        power, variance = signals.draw(noise, chunks.size, len(signals.network.origin), seed, chunk)
+        least_seconds[READ] = min(least_seconds[READ], _timed(partial(np.max, power))[0])
+        for solver in network_cases.network_solvers(lidars):
+            call_solver = partial(solver, power, variance, signals)
             if chunk == 0:
                 # The first call compiles and fills caches.
-                way(power[: known.BLOCK], variance[: known.BLOCK], seen)
-            seconds, found = _timed(solve)
-            least[way.name] = min(least[way.name], seconds)
-            errors[way.name].append(errors_of(found, truth, near))
-            network += [found] * (way is known.NETWORK)
+                solver(power[: network_cases.BLOCK], variance[: network_cases.BLOCK], signals)
+            seconds, result = _timed(call_solver)
+            least_seconds[solver.name] = min(least_seconds[solver.name], seconds)
+            errors[solver.name].append(crossing_errors(result, truth, near))
+            network_results += [result] * (solver is network_cases.NETWORK)
     scores = {
-        name: score(joined(parts), 1e6 * least[name] / chunks.size, least[name] / least[READ])
-        for name, parts in errors.items()
+        name: score(
+            join_errors(chunk_errors),
+            1e6 * least_seconds[name] / chunks.size,
+            least_seconds[name] / least_seconds[READ],
+        )
+        for name, chunk_errors in errors.items()
     }
     return NetworkScenario(
-        place.name, air.name, noise, chunks.number * chunks.size, scores
-    ), network
+        lidars.name, air.name, noise, chunks.number * chunks.size, scores
+    ), network_results
 
 
-def _timed(call: Callable[[], _Found]) -> tuple[float, _Found]:
-    """Return the CPU time of a call in seconds, and what it returns."""
-    begin = time.process_time()
-    found = call()
-    return max(time.process_time() - begin, _SHORTEST), found
+def _timed(call: Callable[[], _Result]) -> tuple[float, _Result]:
+    """Return the CPU time of a call in seconds, and its result."""
+    start = time.process_time()
+    result = call()
+    return max(time.process_time() - start, _SHORTEST), result
 
 
-def _sights(found: Sequence[MultiPositionResult], seen: Signals, noise: float) -> list[Sight]:
-    near = seen.network.near_crossing
-    truth = np.concatenate([seen.truth(len(one.extinction))[:, near] for one in found])
-    extinction = np.concatenate([one.extinction[:, near] for one in found])
-    stated = np.concatenate([one.extinction_standard_error[:, near] for one in found])
-    flagged = np.concatenate([one.flags.flagged[:, near] for one in found])
+def _visibility_scores(
+    results: Sequence[MultiPositionResult], signals: Signals, noise: float
+) -> list[VisibilityScore]:
+    near = signals.network.near_crossing
+    truth = np.concatenate([signals.truth(len(result.extinction))[:, near] for result in results])
+    extinction = np.concatenate([result.extinction[:, near] for result in results])
+    stated = np.concatenate([result.extinction_standard_error[:, near] for result in results])
+    flagged = np.concatenate([result.flags.flagged[:, near] for result in results])
     kept = ~flagged & np.isfinite(extinction) & np.isfinite(stated)
-    rows = [_sight(extinction, stated, truth, kept, c, noise) for c in CONTRASTS]
+    rows = [
+        _visibility_score(extinction, stated, truth, kept, contrast, noise)
+        for contrast in CONTRASTS
+    ]
     return [row for row in rows if row is not None]
 
 
-def _sight(
+def _visibility_score(
     extinction: Array, stated: Array, truth: Array, kept: Booleans, contrast: float, noise: float
-) -> Sight | None:
+) -> VisibilityScore | None:
     constant = sight.koschmieder_constant(contrast)
-    found = sight.visibility_from_extinction(extinction, stated, contrast=contrast)
+    visibility = sight.visibility_from_extinction(extinction, stated, contrast=contrast)
     true = constant / truth
-    error = found.visibility - true
+    error = visibility.visibility - true
     bias, rmse = mean_by_block(error, kept), root_by_block(error, kept)
-    linear = share_by_block(np.abs(error) <= found.visibility_standard_error, kept)
-    between = (found.visibility_lower <= true) & (true <= found.visibility_upper)
-    interval = share_by_block(between, kept)
-    if bias is None or rmse is None or linear is None or interval is None:
+    within_error = share_by_block(np.abs(error) <= visibility.visibility_standard_error, kept)
+    inside = (visibility.visibility_lower <= true) & (true <= visibility.visibility_upper)
+    within_interval = share_by_block(inside, kept)
+    if bias is None or rmse is None or within_error is None or within_interval is None:
         return None
-    return Sight(
+    return VisibilityScore(
         noise=noise,
         contrast=contrast,
         constant=constant,
         visibility=float(true[kept].mean()),
         bias=bias,
         rmse=rmse,
-        within_error=linear,
-        within_interval=interval,
+        within_error=within_error,
+        within_interval=within_interval,
     )
 
 
 def _comparisons(profiles: int) -> Iterator[Comparison]:
-    """Compare with a plain fit of each profile."""
-    airs = [air for air in known.AIRS if air.name != known.THIN]
-    for number, (place, air) in enumerate(product(known.PLACES, airs)):
-        seen = known.signals(place.network(), air)
-        power, variance = seen.draw(known.PEER_NOISE, profiles, 99, number)
+    """Yield comparisons with a plain fit of each profile."""
+    airs = [air for air in network_cases.AIRS if air.name != network_cases.THIN]
+    for seed, (lidars, air) in enumerate(product(network_cases.LIDAR_LINES, airs)):
+        signals = network_cases.signals(lidars.network(), air)
+        power, variance = signals.draw(network_cases.PEER_NOISE, profiles, 99, seed)
         truth, near = (
-            seen.truth(profiles)[:, seen.network.near_crossing],
-            seen.network.near_crossing,
+            signals.truth(profiles)[:, signals.network.near_crossing],
+            signals.network.near_crossing,
         )
-        ours_seconds, ours = _timed(partial(known.FREE, power, variance, seen))
-        seconds, fitted = _timed(partial(known.network_by_scipy, power, variance, seen))
-        found, stated = ours.extinction[:, near], ours.extinction_standard_error[:, near]
-        solved = np.isfinite(found) & np.isfinite(stated)
+        ours_seconds, ours = _timed(
+            partial(network_cases.NETWORK_WITHOUT_PRIOR, power, variance, signals)
+        )
+        seconds, fitted = _timed(partial(network_cases.network_by_scipy, power, variance, signals))
+        extinction, stated = ours.extinction[:, near], ours.extinction_standard_error[:, near]
+        solved = np.isfinite(extinction) & np.isfinite(stated)
         yield Comparison(
-            place=place.name,
+            place=lidars.name,
             air=air.name,
             profiles=profiles,
-            ours=_clipped_rms(found / truth - 1.0, solved),
+            ours=_clipped_rms(extinction / truth - 1.0, solved),
             peer=_clipped_rms(fitted[:, near] / truth - 1.0, solved),
-            apart=float(np.sqrt(np.mean((((fitted[:, near] - found) / stated)[solved]) ** 2))),
+            apart=float(np.sqrt(np.mean((((fitted[:, near] - extinction) / stated)[solved]) ** 2))),
             ours_microseconds=1e6 * ours_seconds / profiles,
             peer_microseconds=1e6 * seconds / profiles,
         )
@@ -244,63 +266,75 @@ def measure_network_throughput(
     date: str = "",
     repeats: int | None = None,
     progress: Callable[[int], object] = lambda _: None,
-) -> MultiPositionThroughput:
+) -> NetworkThroughput:
     """Time cycles, whole profiles of networks, and plain peers.
 
     Parameters
     ----------
     quick : bool
-        Fewer cycles and repeats.
+        Use fewer cycles and repeats.
     date : str
-        When it is run, as it is to be stated.
+        Date of the run, for the report.
     repeats : int, optional
-        Counted rounds, of which the least time counts.
+        Number of repeats; the shortest time counts.
     progress : callable
-        Is given 1 after cycles, and after each network.
+        Called with 1 after the cycles, and after each network.
     """
-    rounds = repeats or (_QUICK_REPEATS if quick else _REPEATS)
-    cycles = cycle_rates(quick=quick, repeats=rounds)
+    repeat_count = repeats or (_QUICK_REPEATS if quick else _REPEATS)
+    cycles = _cycle_rates(quick=quick, repeats=repeat_count)
     progress(1)
     profiles: list[SolverRate] = []
-    for place in known.PLACES:
-        profiles += _profile_rates(place, rounds)
+    for lidars in network_cases.LIDAR_LINES:
+        profiles += _profile_rates(lidars, repeat_count)
         progress(1)
-    return MultiPositionThroughput(
-        date, machine(), tuple(cycles), tuple(profiles), _gain(quick=quick, repeats=rounds)
+    return NetworkThroughput(
+        date,
+        machine(),
+        tuple(cycles),
+        tuple(profiles),
+        _thread_gain(quick=quick, repeats=repeat_count),
     )
 
 
-def cycle_rates(*, quick: bool, repeats: int) -> list[SolverRate]:
-    """Return the CPU time of cycles of 3 and of 12 beams in every way, the read first."""
+def _cycle_rates(*, quick: bool, repeats: int) -> list[SolverRate]:
+    """Return CPU times of cycles of 3 and 12 beams with every solver, the read first."""
     rates = []
     for beams, cycles in (_QUICK_CYCLES if quick else _CYCLES).items():
-        rows = known.random_rows(cycles, beams)
-        sizes = {name: min(cycles, most) for name, (_, most) in _CYCLE_WAYS.items()}
+        rows = network_cases.random_rows(cycles, beams)
+        sizes = {name: min(cycles, largest) for name, (_, largest) in _CYCLE_SOLVERS.items()}
         calls = {
-            name: partial(way, rows.first(sizes[name])) for name, (way, _) in _CYCLE_WAYS.items()
+            name: partial(solver, rows.first(sizes[name]))
+            for name, (solver, _) in _CYCLE_SOLVERS.items()
         }
         times = least_times(calls, repeats)
-        each = {name: 1e9 * seconds / sizes[name] for name, seconds in times.items()}
+        nanoseconds = {name: 1e9 * seconds / sizes[name] for name, seconds in times.items()}
         rates += [
-            SolverRate(name, beams, sizes[name], each[name], each[name] / each[READ], name in OURS)
+            SolverRate(
+                name,
+                beams,
+                sizes[name],
+                nanoseconds[name],
+                nanoseconds[name] / nanoseconds[READ],
+                name in OURS,
+            )
             for name in calls
         ]
     return rates
 
 
-def _read(rows: known.Rows) -> object:
+def _read(rows: network_cases.RandomRows) -> object:
     return [np.max(array) for array in rows.arrays]
 
 
-def _with_variance(rows: known.Rows) -> object:
+def _with_variance(rows: network_cases.RandomRows) -> object:
     return values_and_variances(*rows.arrays)
 
 
-def _with_one_variance(rows: known.Rows) -> object:
+def _with_one_variance(rows: network_cases.RandomRows) -> object:
     return values_and_variances(rows.start, rows.end, rows.integral, rows.variance[0])
 
 
-def _with_flags(rows: known.Rows) -> object:
+def _with_flags(rows: network_cases.RandomRows) -> object:
     return solve_cycle(rows.start, rows.end, rows.integral, relative_variance=rows.variance)
 
 
@@ -312,35 +346,38 @@ ONE_BY_ONE: Final = "numpy.linalg.solve, one by one"
 OURS: Final = frozenset({VALUES, SHARED, FLAGS})
 
 _ALL: Final = 10**9
-_CYCLE_WAYS: Final[Mapping[str, tuple[Callable[[known.Rows], object], int]]] = {
+_CYCLE_SOLVERS: Final[Mapping[str, tuple[Callable[[network_cases.RandomRows], object], int]]] = {
     READ: (_read, _ALL),
     VALUES: (_with_variance, _ALL),
     SHARED: (_with_one_variance, _ALL),
     FLAGS: (_with_flags, 100_000),
-    LU: (known.solve_by_lu, 50_000),
-    ONE_BY_ONE: (known.solve_by_lu_one_by_one, 5_000),
+    LU: (network_cases.solve_by_lu, 50_000),
+    ONE_BY_ONE: (network_cases.solve_by_lu_one_by_one, 5_000),
 }
-"""Each way with the most cycles that it gets."""
+"""Solvers of cycles, each with its largest number of cycles."""
 
 
-def _profile_rates(place: Place, repeats: int) -> list[SolverRate]:
-    """Return the CPU time of profiles of a network in every way, the read first."""
-    net, size = place.network(), _TIMED_PROFILES
-    seen = known.signals(net, known.AIRS[0])
-    power, variance = seen.draw(known.PEER_NOISE, size, 7)
+def _profile_rates(lidars: LidarLine, repeats: int) -> list[SolverRate]:
+    """Return CPU times of profiles of a network with every solver, the read first."""
+    network, size = lidars.network(), _TIMED_PROFILES
+    signals = network_cases.signals(network, network_cases.AIRS[0])
+    power, variance = signals.draw(network_cases.PEER_NOISE, size, 7)
     calls: dict[str, Callable[[], object]] = {READ: partial(np.max, power)}
-    for way in known.network_solvers(place):
-        calls[way.name] = partial(way, power, variance, seen)
+    for solver in network_cases.network_solvers(lidars):
+        calls[solver.name] = partial(solver, power, variance, signals)
     times = least_times(calls, repeats)
     return [
-        SolverRate(name, net.beams, size, 1e9 * s / size, s / times[READ], name != READ)
-        for name, s in times.items()
+        SolverRate(
+            name, network.beams, size, 1e9 * seconds / size, seconds / times[READ], name != READ
+        )
+        for name, seconds in times.items()
     ]
 
 
-def _gain(*, quick: bool, repeats: int) -> float:
+def _thread_gain(*, quick: bool, repeats: int) -> float:
+    """Return the wall time of one thread over that of two with half of the cycles each."""
     cycles = (_QUICK_CYCLES if quick else _CYCLES)[3]
-    rows = known.random_rows(cycles, 3)
+    rows = network_cases.random_rows(cycles, 3)
     halves = rows.first(cycles // 2), rows.last(cycles // 2)
     times = least_times(
         {
@@ -356,8 +393,8 @@ def _gain(*, quick: bool, repeats: int) -> float:
 # The command ----------------------------------------------------------------------------------
 
 
-def run_network(kind: Kind, *, effort: Effort) -> Finding:
-    """Run a benchmark of networks of lidars.
+def run_network(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
+    """Run the accuracy or throughput benchmark of networks of lidars.
 
     Parameters
     ----------
@@ -365,11 +402,11 @@ def run_network(kind: Kind, *, effort: Effort) -> Finding:
     effort : Effort
     """
     if kind is Kind.ACCURACY:
-        found = measure_network(
+        accuracy = measure_network(
             quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
         )
-        return Finding(found, network_accuracy_report(found, RESULT))
-    timed = measure_network_throughput(
+        return BenchmarkOutput(accuracy, network_accuracy_report(accuracy, RESULT))
+    throughput = measure_network_throughput(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
-    return Finding(timed, network_throughput_report(timed, RESULT))
+    return BenchmarkOutput(throughput, network_throughput_report(throughput, RESULT))

@@ -1,4 +1,4 @@
-"""Networks of lidars that look into known air, and ways to find its extinction."""
+"""Simulated networks of lidars in known air, and solvers for its extinction."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ FULL_OVERLAP: Final = 100.0
 NOISES: Final = (0.02, 0.05, 0.1)
 """Relative standard deviation of a bin."""
 PEER_NOISE: Final = NOISES[1]
-"""Of the profiles that peers solve too."""
+"""Noise of the profiles that peers solve too."""
 ADDITIVE: Final = 0.01
-"""Standard deviation that every bin has besides, over the power at the beam's first crossing."""
+"""Additional standard deviation of every bin, over the power at the first crossing of the beam."""
 BLOCK: Final = 50
 """Profiles that share a mean field and a multiplier."""
 
 _FIRST_BIN: Final = 100.3
+"""m, range of the first bin."""
 _BEYOND: Final = 60.0
-"""m that a signal goes on after the last crossing."""
+"""m, length of a signal after the last crossing."""
 _LEAST_SLOPE: Final = 1e-6
-"""m-1, from which a fit begins at least."""
+"""m-1, smallest extinction at the start of a fit."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -47,16 +48,16 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Lidars on a line, which look up into one vertical plane."""
+class LidarLine:
+    """Lidars on a line with beams in one vertical plane."""
 
     name: str
     east: tuple[float, ...]
     """m, of each lidar."""
     elevations: tuple[tuple[float, ...], ...]
-    """degree, of the beams of each lidar, from the east over the zenith."""
+    """degree, of the beams of each lidar, from the eastern horizon over the zenith."""
     farthest: float = np.inf
-    """m, to which signals are used."""
+    """m, largest range of the signals."""
 
     def network(self) -> geometry.Network:
         """Return beams and crossings."""
@@ -70,34 +71,34 @@ class Place:
         )
 
 
-TRIANGLE: Final = Place("triangle", (300.0, -500.0, 0.0), ((120.0,), (60.0,), (90.0,)))
-"""That of the paper (drabenko2021): lidars 1, 2 and 3."""
-THREE_BY_TWO: Final = Place(
+TRIANGLE: Final = LidarLine("triangle", (300.0, -500.0, 0.0), ((120.0,), (60.0,), (90.0,)))
+"""The triangle of the paper (drabenko2021): lidars 1, 2 and 3."""
+THREE_BY_TWO: Final = LidarLine(
     "3 x 2 beams",
     (-500.0, 0.0, 400.0),
     ((50.0, 68.0), (78.0, 103.0), (112.0, 130.0)),
     farthest=1000.0,
 )
-PLACES: Final = (TRIANGLE, THREE_BY_TWO)
+LIDAR_LINES: Final = (TRIANGLE, THREE_BY_TWO)
 
 
 # Air ------------------------------------------------------------------------------------------
 
 Extinction = Callable[[Array, Array], Array]
-"""From east and up in m to extinction in m-1."""
+"""Function from east and up in m to extinction in m-1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """A field of extinction, which may move from profile to profile."""
+    """A field of extinction that may move from profile to profile."""
 
     name: str
     at: Callable[[int], Extinction]
-    """Of a profile of the block."""
+    """Field of a profile of the block."""
     moving: bool = False
 
     def fields(self) -> list[Extinction]:
-        """Return the fields of a block's profiles; one where nothing moves."""
+        """Return the fields of the profiles of a block; one field if it does not move."""
         return [self.at(profile) for profile in range(BLOCK if self.moving else 1)]
 
 
@@ -111,8 +112,8 @@ def _gradient(_: Array, up: Array) -> Array:
 
 def _plume(east: float) -> Extinction:
     def plume(x: Array, up: Array) -> Array:
-        apart = ((x - east) ** 2 + (up - 650.0) ** 2) / (2.0 * 110.0**2)
-        return np.asarray(1.5e-3 + 2e-3 * np.exp(-apart))
+        square_distance = ((x - east) ** 2 + (up - 650.0) ** 2) / (2.0 * 110.0**2)
+        return np.asarray(1.5e-3 + 2e-3 * np.exp(-square_distance))
 
     return plume
 
@@ -125,10 +126,10 @@ AIRS: Final = (
     Air("drifting plume", lambda profile: _plume(-200.0 + 300.0 * profile / BLOCK), moving=True),
     Air(THIN, lambda _: _homogeneous(2e-4)),
 )
-"""2 per km at 600 m with a scale height of 1 km; 1.5 per km with 3.5 per km in the plume, which
-drifts by 300 m in a block."""
-SIGHTS_AIR: Final = AIRS[3]
-"""Of the errors of visibility."""
+"""The gradient is 2 per km at 600 m with a scale height of 1 km. The plume has 3.5 per km in air
+of 1.5 per km, and drifts by 300 m in a block."""
+VISIBILITY_AIR: Final = AIRS[3]
+"""Air of the errors of visibility."""
 
 
 # Signals --------------------------------------------------------------------------------------
@@ -136,24 +137,24 @@ SIGHTS_AIR: Final = AIRS[3]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
-    """What the lidars of a network see of the air, without noise."""
+    """Signals of the lidars of a network without noise."""
 
     network: geometry.Network
     range: Array
     """m."""
     power: Array
-    """(field, beam, range), unit constants."""
+    """(field, beam, range) for lidar constants of 1."""
     extinction: Array
     """(field, crossing) m-1, the truth."""
 
     def draw(
         self, noise: float, profiles: int, *seed: int, additive: float = ADDITIVE
     ) -> tuple[Array, Array]:
-        """Return (profile, beam, range) power and its variance; the same for the same seed."""
-        rows = np.arange(profiles) % len(self.power)
-        deviation = np.hypot(noise * self.power, additive * self._first[..., np.newaxis])[rows]
+        """Return (profile, beam, range) noisy power and its variance, reproducible by the seed."""
+        fields = np.arange(profiles) % len(self.power)
+        deviation = np.hypot(noise * self.power, additive * self._first[..., np.newaxis])[fields]
         random = np.random.default_rng(seed)
-        power = self.power[rows] + deviation * random.standard_normal(deviation.shape)
+        power = self.power[fields] + deviation * random.standard_normal(deviation.shape)
         return power, deviation**2
 
     def truth(self, profiles: int) -> Array:
@@ -163,35 +164,37 @@ class Signals:
     @property
     def _first(self) -> Array:
         """(field, beam) power at the first crossing of each beam."""
-        out = np.empty(self.power.shape[:2])
+        power = np.empty(self.power.shape[:2])
         for beam in range(self.network.beams):
-            near = self.network.on_beam(beam)[1][0]
-            out[:, beam] = [np.interp(near, self.range, each[beam]) for each in self.power]
-        return out
+            first_range = self.network.on_beam(beam)[1][0]
+            power[:, beam] = [
+                np.interp(first_range, self.range, field[beam]) for field in self.power
+            ]
+        return power
 
 
 def signals(net: geometry.Network, air: Air, first_bin: float = _FIRST_BIN) -> Signals:
-    """Return signals; optical depth by Gauss quadrature of 4 nodes from bin to bin."""
+    """Return signals, with optical depth by Gauss quadrature with 4 nodes from bin to bin."""
     bins = np.arange(first_bin, float(net.passages.range.max()) + _BEYOND, STEP)
     fields = air.fields()
     return Signals(
         net,
         bins,
-        np.stack([_power(net, bins, each) for each in fields]),
-        np.stack([each(net.crossing[:, 0], net.crossing[:, 2]) for each in fields]),
+        np.stack([_power(net, bins, field) for field in fields]),
+        np.stack([field(net.crossing[:, 0], net.crossing[:, 2]) for field in fields]),
     )
 
 
 def _power(net: geometry.Network, bins: Array, extinction: Extinction) -> Array:
     edges = np.concatenate([np.linspace(0.0, bins[0], 40, endpoint=False), bins])
-    half = 0.5 * np.diff(edges)
-    nodes = edges[:-1] + half * (1.0 + _NODES[:, np.newaxis])
+    half_width = 0.5 * np.diff(edges)
+    nodes = edges[:-1] + half_width * (1.0 + _NODES[:, np.newaxis])
     out = np.empty((net.beams, bins.size))
     for beam in range(net.beams):
-        along = extinction(*_points(net, beam, nodes))
-        depth = np.cumsum(np.sum(along * _WEIGHTS[:, np.newaxis], axis=0) * half)
-        here = extinction(*_points(net, beam, bins))
-        out[beam] = here * np.exp(-2.0 * depth[-bins.size :]) / bins**2
+        at_nodes = extinction(*_points(net, beam, nodes))
+        depth = np.cumsum(np.sum(at_nodes * _WEIGHTS[:, np.newaxis], axis=0) * half_width)
+        at_bins = extinction(*_points(net, beam, bins))
+        out[beam] = at_bins * np.exp(-2.0 * depth[-bins.size :]) / bins**2
     return out
 
 
@@ -200,12 +203,12 @@ def _points(net: geometry.Network, beam: int, distance: Array) -> tuple[Array, A
     return origin[0] + direction[0] * distance, origin[2] + direction[2] * distance
 
 
-# Ways -----------------------------------------------------------------------------------------
+# Solvers --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkSolver:
-    """One way to find extinction at the crossings."""
+    """A method, with its settings, to retrieve extinction at the crossings."""
 
     name: str
     method: NetworkMethod
@@ -213,13 +216,13 @@ class NetworkSolver:
     prior: FieldPrior = FieldPrior.BLOCK
 
     def __call__(
-        self, power: Array, variance: Array, seen: Signals, *, full_overlap: float = FULL_OVERLAP
+        self, power: Array, variance: Array, signals: Signals, *, full_overlap: float = FULL_OVERLAP
     ) -> MultiPositionResult:
         """Solve profiles (profile, beam, range), block by block."""
         return retrieve_network(
             power,
-            seen.range,
-            seen.network,
+            signals.range,
+            signals.network,
             method=self.method.value,
             variance=variance,
             full_overlap_range=full_overlap,
@@ -236,21 +239,23 @@ PAPER: Final = NetworkSolver("multiplier 0.8", NetworkMethod.MULTIPLIER, PAPER_M
 UNBIASED: Final = NetworkSolver("unbiased 0.25", NetworkMethod.UNBIASED, 0.25)
 SLOPE: Final = NetworkSolver("slope", NetworkMethod.SLOPE)
 KLETT: Final = NetworkSolver("Klett, far end", NetworkMethod.KLETT)
-FREE: Final = NetworkSolver("network, no prior", NetworkMethod.NETWORK, prior=FieldPrior.NONE)
+NETWORK_WITHOUT_PRIOR: Final = NetworkSolver(
+    "network, no prior", NetworkMethod.NETWORK, prior=FieldPrior.NONE
+)
 NETWORK: Final = NetworkSolver("network", NetworkMethod.NETWORK)
 
 
-def network_solvers(place: Place) -> tuple[NetworkSolver, ...]:
-    """Return the ways that a network allows: cycles want one cycle of beams."""
-    any_network = (SLOPE, KLETT, FREE, NETWORK)
-    if place is not TRIANGLE:
-        return any_network
-    others = (
+def network_solvers(lidars: LidarLine) -> tuple[NetworkSolver, ...]:
+    """Return the solvers for a network: those of cycles need a single cycle of beams."""
+    for_any_network = (SLOPE, KLETT, NETWORK_WITHOUT_PRIOR, NETWORK)
+    if lidars is not TRIANGLE:
+        return for_any_network
+    other_multipliers = (
         NetworkSolver("multiplier 0.95", NetworkMethod.MULTIPLIER, 0.95),
         PAPER,
         NetworkSolver("multiplier 0", NetworkMethod.MULTIPLIER, 0.0),
     )
-    return (EXACT, BEST, *others, UNBIASED, *any_network)
+    return (EXACT, BEST, *other_multipliers, UNBIASED, *for_any_network)
 
 
 # The paper's second figure --------------------------------------------------------------------
@@ -264,45 +269,45 @@ _FIGURE_FIRST_BIN: Final = 30.3
 
 @dataclass(frozen=True, slots=True)
 class FigurePoint:
-    """Systematic error (true - estimate) / true of visibility, of a homogeneous 2 per km."""
+    """Systematic error (true - estimate) / true of visibility in homogeneous air of 2 per km."""
 
     first_lidar: float
     """m."""
     elevation: float
     """degree."""
     printed: float
-    """With plain lengths in place of signed ones, the only reading that fits the figure's axis."""
+    """With unsigned lengths, the only reading that fits the axis of the figure."""
     signed: float | None
     """At crossing 1 with signs; None beyond the pole."""
     near: float | None
     """At a crossing from which the cycle leads away from the lidars."""
     simulated: float | None
-    """The same, of signals without noise; None where no lidar sees the crossing."""
+    """The same from signals without noise; None where no lidar sees the crossing."""
 
 
 def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
-    """Return one point of figure 2 of drabenko2021, without signs and with the right ones."""
-    place = Place("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
-    net = place.network()
+    """Return one point of figure 2 of drabenko2021, without signs and with correct ones."""
+    lidars = LidarLine("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
+    net = lidars.network()
     lengths = np.array([np.ptp(net.on_beam(beam)[1]) for beam in range(3)])
-    walk = geometry.build_cycle(net)
-    seen = signals(net, AIRS[0], _FIGURE_FIRST_BIN)
-    truth = float(seen.extinction[0, walk.crossing[0]])
+    cycle = geometry.build_cycle(net)
+    clean_signals = signals(net, AIRS[0], _FIGURE_FIRST_BIN)
+    truth = float(clean_signals.extinction[0, cycle.crossing[0]])
     depths = truth * lengths * [1.0, 1.0, -1.0]
-    away = _leads_away(net)
+    leads_away = _leads_away(net)
 
     def error(optical_depth: Array) -> float | None:
         return _finite(float(systematic_error(optical_depth, PAPER_MULTIPLIER)))
 
-    power = seen.power
-    solved = PAPER(power, 1e-12 * power**2, seen, full_overlap=_FIGURE_FIRST_BIN)
+    power = clean_signals.power
+    solved = PAPER(power, 1e-12 * power**2, clean_signals, full_overlap=_FIGURE_FIRST_BIN)
     return FigurePoint(
         first_lidar,
         elevation,
         printed=float(systematic_error(depths, PAPER_MULTIPLIER)),
-        signed=error(depths if away else -depths),
-        near=error(truth * (walk.end_range - walk.start_range)),
-        simulated=_finite(1.0 - truth / float(solved.extinction[0, walk.crossing[0]])),
+        signed=error(depths if leads_away else -depths),
+        near=error(truth * (cycle.end_range - cycle.start_range)),
+        simulated=_finite(1.0 - truth / float(solved.extinction[0, cycle.crossing[0]])),
     )
 
 
@@ -320,34 +325,34 @@ def _finite(value: float) -> float | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
-    """Random cycles, well conditioned: (cycle, row) arrays for `lidarops.retrieve.network.cycles`."""
+class RandomRows:
+    """Well-conditioned random cycles: (cycle, row) input of `lidarops.retrieve.network.cycles`."""
 
     start: Array
     end: Array
     integral: Array
     variance: Array
-    """(cycle, row, 3), relative."""
+    """(cycle, row, 3) relative variances."""
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """All that a solution has to read."""
+        """All arrays that a solution reads."""
         return self.start, self.end, self.integral, self.variance
 
-    def first(self, count: int) -> Rows:
+    def first(self, count: int) -> RandomRows:
         """Return the first cycles."""
-        return Rows(*(array[:count] for array in self.arrays))
+        return RandomRows(*(array[:count] for array in self.arrays))
 
-    def last(self, count: int) -> Rows:
+    def last(self, count: int) -> RandomRows:
         """Return the last cycles."""
-        return Rows(*(array[-count:] for array in self.arrays))
+        return RandomRows(*(array[-count:] for array in self.arrays))
 
 
-def random_rows(cycles: int, beams: int) -> Rows:
-    """Return cycles whose beams all lead away from their lidars."""
+def random_rows(cycles: int, beams: int) -> RandomRows:
+    """Return random cycles whose beams all lead away from their lidars."""
     random = np.random.default_rng((cycles, beams))
     start = random.uniform(1.0, 2.0, (cycles, beams))
-    return Rows(
+    return RandomRows(
         start,
         start * random.uniform(0.6, 0.9, start.shape),
         random.uniform(0.1, 0.3, start.shape),
@@ -355,58 +360,61 @@ def random_rows(cycles: int, beams: int) -> Rows:
     )
 
 
-def solve_by_lu(rows: Rows) -> Array:
-    """Return (cycle,) reciprocal extinction at the first crossing by `numpy.linalg.solve` at once."""
+def solve_by_lu(rows: RandomRows) -> Array:
+    """Return (cycle,) reciprocal extinction at the first crossing, by `numpy.linalg.solve`."""
     return np.asarray(np.linalg.solve(_matrices(rows), rows.integral[..., np.newaxis])[:, 0, 0])
 
 
-def solve_by_lu_one_by_one(rows: Rows) -> Array:
-    """Return the same by one call of `numpy.linalg.solve` for each cycle."""
+def solve_by_lu_one_by_one(rows: RandomRows) -> Array:
+    """Return the same with one call of `numpy.linalg.solve` per cycle."""
     pairs = zip(_matrices(rows), rows.integral, strict=True)
     return np.array([np.linalg.solve(matrix, side)[0] for matrix, side in pairs])
 
 
-def _matrices(rows: Rows) -> Array:
+def _matrices(rows: RandomRows) -> Array:
     cycles, k = rows.start.shape
     matrix = np.zeros((cycles, k, k))
-    here = np.arange(k)
-    matrix[:, here, here] = rows.start
-    matrix[:, here, (here + 1) % k] -= rows.end
+    rows_index = np.arange(k)
+    matrix[:, rows_index, rows_index] = rows.start
+    matrix[:, rows_index, (rows_index + 1) % k] -= rows.end
     return matrix
 
 
-def network_by_scipy(power: Array, variance: Array, seen: Signals) -> Array:
+def network_by_scipy(power: Array, variance: Array, signals: Signals) -> Array:
     """Return (profile, crossing) extinction by `scipy.optimize.least_squares`, without errors.
 
-    Of each profile, the logarithms of extinction at the crossings and of one constant per beam are
-    fitted to point values, weighted as if these were independent.
+    For each profile, the logarithms of extinction at the crossings and of one constant per beam
+    are fitted to point values, weighted as if these were independent.
     """
     return np.stack(
-        [_fit_network(*_condensed(p, v, seen), seen) for p, v in zip(power, variance, strict=True)]
+        [
+            _fit_network(*_point_values(profile, noise, signals), signals)
+            for profile, noise in zip(power, variance, strict=True)
+        ]
     )
 
 
-def _condensed(power: Array, variance: Array, seen: Signals) -> tuple[Array, Array, Array]:
-    """Return values, their relative errors, and integrals from the beam's first crossing on."""
+def _point_values(power: Array, variance: Array, signals: Signals) -> tuple[Array, Array, Array]:
+    """Return values, their relative errors, and integrals from the first crossing of each beam."""
     values, errors, integrals = [], [], []
-    # A bin that is not positive has no logarithm: it is taken for half its noise.
+    # A bin that is not positive has no logarithm and is replaced by half its noise.
     power = np.maximum(power, 0.5 * np.sqrt(variance))
-    for beam in range(seen.network.beams):
-        logarithm = np.log(power[beam] * seen.range**2)
-        where, points = seen.network.on_beam(beam)[1], []
-        for r in where:
-            middle = int(np.argmin(np.abs(seen.range - r)))
+    for beam in range(signals.network.beams):
+        logarithm = np.log(power[beam] * signals.range**2)
+        crossing_ranges, points = signals.network.on_beam(beam)[1], []
+        for distance in crossing_ranges:
+            middle = int(np.argmin(np.abs(signals.range - distance)))
             bins = slice(middle - DEFAULT_BINS // 2, middle + DEFAULT_BINS // 2 + 1)
-            fit = np.polynomial.Polynomial.fit(seen.range[bins] - r, logarithm[bins], 1)
+            fit = np.polynomial.Polynomial.fit(signals.range[bins] - distance, logarithm[bins], 1)
             points.append(float(fit(0.0)))
             noise = np.sqrt(variance[beam, bins]) / power[beam, bins]
             errors.append(float(noise.mean() / np.sqrt(DEFAULT_BINS)))
         values += points
         total = 0.0
-        for k, r in enumerate(where):
+        for k, distance in enumerate(crossing_ranges):
             if k:
-                inside = (seen.range > where[k - 1]) & (seen.range < r)
-                x = np.concatenate([[where[k - 1]], seen.range[inside], [r]])
+                inside = (signals.range > crossing_ranges[k - 1]) & (signals.range < distance)
+                x = np.concatenate([[crossing_ranges[k - 1]], signals.range[inside], [distance]])
                 y = np.concatenate([[points[k - 1]], logarithm[inside], [points[k]]])
                 total += _log_trapezoid(x, y)
             integrals.append(total)
@@ -414,24 +422,25 @@ def _condensed(power: Array, variance: Array, seen: Signals) -> tuple[Array, Arr
 
 
 def _log_trapezoid(x: Array, logarithm: Array) -> float:
+    """Return the integral of a function that is exponential between points."""
     rise = np.diff(logarithm)
-    level = np.abs(rise) < 1e-6
-    mean = np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
+    constant = np.abs(rise) < 1e-6
+    mean = np.where(constant, 1.0, np.expm1(rise) / np.where(constant, 1.0, rise))
     return float(np.sum(np.diff(x) * np.exp(logarithm[:-1]) * mean))
 
 
-def _fit_network(values: Array, errors: Array, integrals: Array, seen: Signals) -> Array:
-    net = seen.network
+def _fit_network(values: Array, errors: Array, integrals: Array, signals: Signals) -> Array:
+    net = signals.network
     beam, crossing = net.passages.beam, net.passages.crossing
     first = np.searchsorted(beam, np.arange(net.beams))
     last = np.searchsorted(beam, np.arange(net.beams), side="right") - 1
     drop = np.exp(values[first]) - np.exp(values[last])
     slope = max(float(np.median(drop / (2.0 * integrals[last]))), _LEAST_SLOPE)
-    begin = np.concatenate([np.full(net.crossings, np.log(slope)), values[first] - np.log(slope)])
+    start = np.concatenate([np.full(net.crossings, np.log(slope)), values[first] - np.log(slope)])
 
     def residuals(unknown: Array) -> Array:
         extinction, constant = unknown[crossing], np.exp(unknown[net.crossings + beam])
-        left = np.maximum(constant - 2.0 * integrals, 1e-9 * constant)
-        return np.asarray((np.log(left) + extinction - values) / errors)
+        remaining = np.maximum(constant - 2.0 * integrals, 1e-9 * constant)
+        return np.asarray((np.log(remaining) + extinction - values) / errors)
 
-    return np.asarray(np.exp(least_squares(residuals, begin, x_scale="jac").x[: net.crossings]))
+    return np.asarray(np.exp(least_squares(residuals, start, x_scale="jac").x[: net.crossings]))

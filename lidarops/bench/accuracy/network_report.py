@@ -1,4 +1,4 @@
-"""What the benchmark of networks of lidars found, as tables and charts."""
+"""Tables and charts of the benchmark of networks of lidars."""
 
 from __future__ import annotations
 
@@ -8,54 +8,54 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.bench.accuracy import network_cases as known
+from lidarops.bench.accuracy import network_cases
 from lidarops.bench.accuracy.homogeneous import MonteCarloFigure
 from lidarops.bench.accuracy.homogeneous_report import facts
-from lidarops.bench.accuracy.network_cases import FigurePoint, Place
+from lidarops.bench.accuracy.network_cases import FigurePoint, LidarLine
 from lidarops.bench.accuracy.network_scores import (
     READ,
     Comparison,
-    MultiPosition,
-    MultiPositionThroughput,
+    NetworkAccuracy,
     NetworkScenario,
     NetworkScore,
-    Sight,
+    NetworkThroughput,
     SolverRate,
+    VisibilityScore,
 )
 from lidarops.figures.charts import Chart, Panel, Series
 from lidarops.figures.wording import percent
 from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 _NONE: Final = "-"
-_DRAWN_AIRS: Final = tuple(air.name for air in known.AIRS if air.name != known.THIN)
-_LEFT_OUT: Final = frozenset({"multiplier 0.95", "multiplier 0"})
-"""Ways that the figures leave to the tables."""
+_DRAWN_AIRS: Final = tuple(air.name for air in network_cases.AIRS if air.name != network_cases.THIN)
+_NOT_DRAWN: Final = frozenset({"multiplier 0.95", "multiplier 0"})
+"""Solvers that are in the tables only."""
 _HIGHEST: Final = 2.0
-"""Systematic error up to which figure 2 is drawn."""
+"""Largest systematic error in figure 2."""
 
 
-def network_accuracy_report(found: MultiPosition, data: str = "") -> BenchmarkReport:
+def network_accuracy_report(result: NetworkAccuracy, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
     return BenchmarkReport(
         title="Networks of lidars: error of extinction and visibility against run time",
-        facts=facts(found.date, found.machine),
+        facts=facts(result.date, result.machine),
         parts=(
-            *(_errors(found, place) for place in known.PLACES),
-            _figure(found.figure),
-            _visibility(found.sights),
-            _peers(found.comparisons),
-            _cycles(found.cycles),
+            *(_errors(result, lidars) for lidars in network_cases.LIDAR_LINES),
+            _figure(result.figure),
+            _visibility(result.sights),
+            _peers(result.comparisons),
+            _cycles(result.cycles),
         ),
         data=data,
     )
 
 
-def network_throughput_report(found: MultiPositionThroughput, data: str = "") -> BenchmarkReport:
+def network_throughput_report(result: NetworkThroughput, data: str = "") -> BenchmarkReport:
     """Return the page of the throughput benchmark."""
     return BenchmarkReport(
         title="Networks of lidars: time per cycle and per profile",
-        facts=facts(found.date, found.machine),
-        parts=(_cycles(found.cycles), _profiles(found)),
+        facts=facts(result.date, result.machine),
+        parts=(_cycles(result.cycles), _profiles(result)),
         data=data,
     )
 
@@ -63,64 +63,76 @@ def network_throughput_report(found: MultiPositionThroughput, data: str = "") ->
 # Errors ---------------------------------------------------------------------------------------
 
 
-def _errors(found: MultiPosition, place: Place) -> Part:
-    cases = [case for case in found.cases if case.place == place.name]
-    net = place.network()
+def _errors(result: NetworkAccuracy, lidars: LidarLine) -> Part:
+    scenarios = [scenario for scenario in result.cases if scenario.place == lidars.name]
+    network = lidars.network()
     return Part(
-        title=f"{place.name.capitalize()}: error against run time",
-        text=f"{net.beams} beams, {net.crossings} crossings, of which {int(net.near_crossing.sum())} "
-        f"near ones; {cases[0].profiles:,} profiles of each case, bins of {known.STEP:g} m, "
-        "relative noise of each bin as given, and 1 % of the power at the beam's first crossing "
-        f"besides; blocks of {known.BLOCK} profiles. Extinction is 2 per km at 600 m with a scale "
-        "height of 1 km (gradient), or 1.5 per km with a plume of 3.5 per km, which stands still "
-        "or drifts by 300 m in a block. Multipliers below 1 are those of the paper, which "
-        "neglect a part of the solution; unbiased puts that part to the start crossing. Errors "
-        "are relative and clipped at 300 %, as a quotient of noise has no variance. Where noise "
-        "hides the attenuation (0.2 per km), most values are flagged, and the few that are not "
-        "are those that noise has made large: their error is not as stated.",
-        charts=(_chart(cases, place, found.comparisons),),
-        tables=(_first_crossing(cases, place), _network_table(cases, place)),
-        details=tuple(_case_table(case) for case in cases),
+        title=f"{lidars.name.capitalize()}: error against run time",
+        text=f"{network.beams} beams, {network.crossings} crossings, of which "
+        f"{int(network.near_crossing.sum())} near ones; {scenarios[0].profiles:,} profiles of each "
+        f"case, bins of {network_cases.STEP:g} m, "
+        "relative noise of each bin as given, plus 1 % of the power at the first crossing of the "
+        f"beam; blocks of {network_cases.BLOCK} profiles. Extinction is 2 per km at 600 m with a "
+        "scale "
+        "height of 1 km (gradient), or 1.5 per km with a plume of 3.5 per km that is fixed or "
+        "drifts by 300 m in a block. Multipliers below 1 are those of the paper and neglect a "
+        "part of the solution; the unbiased estimate assigns that part to the start crossing. "
+        "Errors are relative and clipped at 300 %, because a quotient of noise has no variance. "
+        "Where noise hides the attenuation (0.2 per km), most values are flagged. The few "
+        "unflagged ones are those that noise has made large, and their errors exceed the stated "
+        "ones.",
+        charts=(_chart(scenarios, lidars, result.comparisons),),
+        tables=(_first_crossing(scenarios, lidars), _network_table(scenarios, lidars)),
+        details=tuple(_case_table(scenario) for scenario in scenarios),
     )
 
 
 def _chart(
-    cases: Sequence[NetworkScenario], place: Place, comparisons: Sequence[Comparison]
+    scenarios: Sequence[NetworkScenario], lidars: LidarLine, comparisons: Sequence[Comparison]
 ) -> Chart:
-    drawn = [way.name for way in known.network_solvers(place) if way.name not in _LEFT_OUT]
+    solvers = [
+        way.name for way in network_cases.network_solvers(lidars) if way.name not in _NOT_DRAWN
+    ]
     return Chart(
-        name=f"work-precision-{place.name.replace(' ', '')}",
-        title=f"Error of extinction against run time, {place.name}",
+        name=f"work-precision-{lidars.name.replace(' ', '')}",
+        title=f"Error of extinction against run time, {lidars.name}",
         caption="Root mean square error at the near crossings, of values with and without flags, "
-        "with its Monte Carlo error. The marks of a way, joined, are noise of "
-        f"{', '.join(f'{100 * noise:g}' for noise in known.NOISES)} % of each bin; scipy has "
-        f"{_noise(known.PEER_NOISE)} only.",
+        "with its Monte Carlo error. The joined marks of a method are for noise of "
+        f"{', '.join(f'{100 * noise:g}' for noise in network_cases.NOISES)} % of each bin; scipy "
+        "has "
+        f"{_noise(network_cases.PEER_NOISE)} only.",
         panels=tuple(
             Panel(
                 title=air,
                 x_label="CPU time per profile (µs)",
-                y_label="" if number else "RMS error of extinction (%)",
+                y_label="" if index else "RMS error of extinction (%)",
                 series=(
-                    *(_way_series(cases, air, name) for name in drawn),
-                    _peer_series([c for c in comparisons if (c.place, c.air) == (place.name, air)]),
+                    *(_solver_series(scenarios, air, name) for name in solvers),
+                    _peer_series(
+                        [
+                            comparison
+                            for comparison in comparisons
+                            if (comparison.place, comparison.air) == (lidars.name, air)
+                        ]
+                    ),
                 ),
             )
-            for number, air in enumerate(_DRAWN_AIRS)
+            for index, air in enumerate(_DRAWN_AIRS)
         ),
     )
 
 
-def _way_series(cases: Sequence[NetworkScenario], air: str, way: str) -> Series:
+def _solver_series(scenarios: Sequence[NetworkScenario], air: str, solver: str) -> Series:
     points = [
-        (case.scores[way].microseconds, rmse.value, rmse.error)
-        for case in cases
-        if case.air == air and (rmse := case.scores[way].rmse) is not None
+        (scenario.scores[solver].microseconds, rmse.value, rmse.error)
+        for scenario in scenarios
+        if scenario.air == air and (rmse := scenario.scores[solver].rmse) is not None
     ]
     return Series(
-        way,
+        solver,
         tuple(x for x, _, _ in points),
         tuple(100.0 * y for _, y, _ in points),
-        # A bar that reaches 0 has no place on a logarithmic axis.
+        # An error bar that reaches 0 cannot be drawn on a logarithmic axis.
         tuple(100.0 * max(y - bar, 0.1 * y) for _, y, bar in points),
         tuple(100.0 * (y + bar) for _, y, bar in points),
         joined=True,
@@ -130,27 +142,27 @@ def _way_series(cases: Sequence[NetworkScenario], air: str, way: str) -> Series:
 def _peer_series(comparisons: Sequence[Comparison]) -> Series:
     return Series(
         "scipy least_squares",
-        tuple(one.peer_microseconds for one in comparisons),
-        tuple(100.0 * one.peer for one in comparisons),
+        tuple(comparison.peer_microseconds for comparison in comparisons),
+        tuple(100.0 * comparison.peer for comparison in comparisons),
         hollow=True,
     )
 
 
-def _first_crossing(cases: Sequence[NetworkScenario], place: Place) -> Table:
-    names = [way.name for way in known.network_solvers(place)]
+def _first_crossing(scenarios: Sequence[NetworkScenario], lidars: LidarLine) -> Table:
+    names = [way.name for way in network_cases.network_solvers(lidars)]
     return Table(
-        title=f"{place.name.capitalize()}: visibility at the first crossing, mean / RMS error in %",
+        title=f"{lidars.name.capitalize()}: visibility at the first crossing, mean / RMS error, %",
         columns=("air", "noise", *names),
         rows=tuple(
             (
-                case.air,
-                _noise(case.noise),
-                *(_bias_and_rmse(case.scores[name]) for name in names),
+                scenario.air,
+                _noise(scenario.noise),
+                *(_bias_and_rmse(scenario.scores[name]) for name in names),
             )
-            for case in cases
+            for scenario in scenarios
         ),
-        note="All values that are not withheld, flagged or not. In brackets: Monte Carlo standard "
-        "error of the last digit.",
+        note="All values that are not withheld, with and without flags. In brackets: Monte Carlo "
+        "standard error of the last digit.",
     )
 
 
@@ -159,23 +171,27 @@ def _bias_and_rmse(score: NetworkScore) -> str:
     return _NONE if bias is None or rmse is None else f"{_percents(bias)} / {_percents(rmse)}"
 
 
-def _network_table(cases: Sequence[NetworkScenario], place: Place) -> Table:
+def _network_table(scenarios: Sequence[NetworkScenario], lidars: LidarLine) -> Table:
     return Table(
-        title=f"{place.name.capitalize()}: extinction by the network, all near crossings",
+        title=f"{lidars.name.capitalize()}: extinction by the network, all near crossings",
         columns=("air", "noise", *_COLUMNS),
         rows=tuple(
-            (case.air, _noise(case.noise), *_cells(case.scores[known.NETWORK.name]))
-            for case in cases
+            (
+                scenario.air,
+                _noise(scenario.noise),
+                *_cells(scenario.scores[network_cases.NETWORK.name]),
+            )
+            for scenario in scenarios
         ),
         note=_NOTE,
     )
 
 
-def _case_table(case: NetworkScenario) -> Table:
+def _case_table(scenario: NetworkScenario) -> Table:
     return Table(
-        title=f"{case.place.capitalize()}, {case.air}, noise {_noise(case.noise)}",
-        columns=("way", *_COLUMNS),
-        rows=tuple((name, *_cells(score)) for name, score in case.scores.items()),
+        title=f"{scenario.place.capitalize()}, {scenario.air}, noise {_noise(scenario.noise)}",
+        columns=("method", *_COLUMNS),
+        rows=tuple((name, *_cells(score)) for name, score in scenario.scores.items()),
         note=_NOTE,
     )
 
@@ -195,10 +211,12 @@ _COLUMNS: Final = (
     "reads",
 )
 _NOTE: Final = (
-    "Solved: share of values that are not withheld. Within: share of unflagged values within so "
-    "many stated standard errors; 68.3, 95 and 99.7 % where errors are as stated. Median crossing: "
-    "of the RMS errors of visibility at each. CPU time per profile, and as multiples of "
-    f"{READ}. In brackets: Monte Carlo standard error of the last digit, from block to block."
+    "Solved: share of values that are not withheld. Within: share of unflagged values within this "
+    "number of stated standard errors; 68.3, 95 and 99.7 % for correct errors. Median crossing: "
+    "median over the crossings of the RMS error of visibility. CPU time per profile, and in "
+    f"multiples of {READ}. In brackets: Monte Carlo standard error of the last digit, from block "
+    "to "
+    "block."
 )
 
 
@@ -226,22 +244,22 @@ def _cells(score: NetworkScore) -> tuple[str, ...]:
 
 def _figure(points: Sequence[FigurePoint]) -> Part:
     return Part(
-        title="Figure 2 of the paper, and the right signs",
+        title="Figure 2 of the paper, and the correct signs",
         text="Systematic error of visibility with a multiplier of 0.8 in homogeneous air of 2 per "
         "km, lidars 2 and 3 apart by 500 m, beams 1 and 3 at 120 and 90 degrees (drabenko2021). "
-        "Without signs: its formula with the plain lengths of the triangle's sides, the only "
-        "reading whose values fit the axis of the figure; the drawn curves themselves were not "
-        "compared. Below the "
-        "crossing of beams 1 and 3, crossing 1 is the far one on both of its beams, and all signs "
-        "turn: the error at crossing 1 is above 1 and grows beyond bounds, up to a pole, below "
-        "which the estimate is refused. A cycle that starts at a near crossing, and leads away "
-        "from the lidars, keeps it below 1. At the crossing, it is 1 whatever the multiplier.",
+        "Without signs: the formula with unsigned lengths of the sides of the triangle, the only "
+        "reading whose values fit the axis of the figure; the drawn curves were not compared. "
+        "Below the crossing of beams 1 and 3, crossing 1 is the far one on both of its beams, and "
+        "all signs change: the error at crossing 1 is above 1 and grows without limit up to a "
+        "pole, below which there is no estimate. A cycle that starts at a near crossing and leads "
+        "away from the lidars keeps the error below 1. At the crossing, it is 1 for every "
+        "multiplier.",
         charts=(
             Chart(
                 name="paper-figure-2",
                 title="Systematic error of visibility with a multiplier of 0.8",
-                caption="By the distance of lidars 1 and 3. Hollow: signals without noise, "
-                f"solved. Errors above {_HIGHEST:g} are in the table only.",
+                caption="By the distance of lidars 1 and 3. Hollow: retrieved from signals without "
+                f"noise. Errors above {_HIGHEST:g} are in the table only.",
                 panels=(
                     _figure_panel(points, "paper, without signs", "printed"),
                     _figure_panel(points, "crossing 1, with signs", "signed"),
@@ -249,13 +267,14 @@ def _figure(points: Sequence[FigurePoint]) -> Part:
                 ),
             ),
         ),
-        tables=tuple(_figure_table(points, first) for first in known.FIGURE_FIRST_LIDARS),
+        tables=tuple(_figure_table(points, first) for first in network_cases.FIGURE_FIRST_LIDARS),
     )
 
 
 def _figure_panel(points: Sequence[FigurePoint], title: str, name: str) -> Panel:
     series = [
-        _figure_series(points, first, name, f"{first:g} m") for first in known.FIGURE_FIRST_LIDARS
+        _figure_series(points, first, name, f"{first:g} m")
+        for first in network_cases.FIGURE_FIRST_LIDARS
     ]
     if name == "near":
         series.append(_figure_series(points, None, "simulated", "signals without noise"))
@@ -310,7 +329,7 @@ def _figure_table(points: Sequence[FigurePoint], first: float) -> Table:
             for point in points
             if point.first_lidar == first
         ),
-        note="(true - estimate) / true. Solved: signals without noise, from the near crossing.",
+        note="(true - estimate) / true. Solved: from signals without noise, at the near crossing.",
     )
 
 
@@ -321,13 +340,14 @@ def _or_none(value: float | None) -> str:
 # Visibility -----------------------------------------------------------------------------------
 
 
-def _visibility(sights: Sequence[Sight]) -> Part:
+def _visibility(scores: Sequence[VisibilityScore]) -> Part:
     return Part(
         title="Visibility by three contrasts",
-        text=f"Of unflagged extinction by the network of {known.THREE_BY_TWO.name} in a "
-        f"{known.SIGHTS_AIR.name}, all near crossings. A contrast multiplies values and errors "
-        "alike; taken for another one, it is an error itself: 0.02 sees 31 % farther than 0.05, "
-        "and exp(-3) 0.14 %.",
+        text=f"Of unflagged extinction by the network of {network_cases.THREE_BY_TWO.name} in a "
+        f"{network_cases.VISIBILITY_AIR.name}, all near crossings. A contrast multiplies values "
+        "and errors "
+        "alike. A wrong contrast is an error itself: visibility for 0.02 is 31 % larger than for "
+        "0.05, and 0.14 % larger for exp(-3).",
         tables=(
             Table(
                 title="Errors of visibility, m",
@@ -344,20 +364,20 @@ def _visibility(sights: Sequence[Sight]) -> Part:
                 ),
                 rows=tuple(
                     (
-                        _noise(one.noise),
-                        f"{one.contrast:.4g}",
-                        f"{one.constant:.4f}",
-                        f"{one.visibility:.0f}",
-                        bracketed(one.bias, sign=True),
-                        bracketed(one.rmse),
-                        f"{100.0 * one.rmse.value / one.visibility:.1f}",
-                        percent(one.within_error.value),
-                        percent(one.within_interval.value),
+                        _noise(score.noise),
+                        f"{score.contrast:.4g}",
+                        f"{score.constant:.4f}",
+                        f"{score.visibility:.0f}",
+                        bracketed(score.bias, sign=True),
+                        bracketed(score.rmse),
+                        f"{100.0 * score.rmse.value / score.visibility:.1f}",
+                        percent(score.within_error.value),
+                        percent(score.within_interval.value),
                     )
-                    for one in sights
+                    for score in scores
                 ),
-                note="Within 1: linear standard error. Interval: from the lower to the upper "
-                "visibility, turned over from extinction. 68.3 % where errors are as stated.",
+                note="Within 1: within the linear standard error. Interval: from the lower to the "
+                "upper visibility, converted from extinction. 68.3 % for correct errors.",
             ),
         ),
     )
@@ -368,34 +388,34 @@ def _visibility(sights: Sequence[Sight]) -> Part:
 
 def _peers(comparisons: Sequence[Comparison]) -> Part:
     return Part(
-        title="Beside a plain fit",
-        text=f"Noise {_noise(known.PEER_NOISE)}, without prior: a profile's extinctions and "
-        "beam constants by scipy.optimize.least_squares, weighted as if point values were "
-        "independent, without errors or flags, and with every point, where ours leaves out "
-        "those in too much noise.",
+        title="Comparison with a plain fit",
+        text=f"Noise {_noise(network_cases.PEER_NOISE)}, without prior: extinctions and "
+        "beam constants of a profile by scipy.optimize.least_squares, weighted as if point values "
+        "were independent, without errors or flags, and with all points; lidarops leaves out those "
+        "that are too noisy.",
         tables=(
             Table(
                 title="Network without prior and scipy, the same profiles",
                 columns=(
-                    "network", "air", "profiles", "ours, RMSE %", "scipy, RMSE %", "apart / stated",
-                    "ours, µs", "scipy, µs", "ratio",
+                    "network", "air", "profiles", "lidarops, RMSE %", "scipy, RMSE %",
+                    "difference / stated", "lidarops, µs", "scipy, µs", "ratio",
                 ),
                 rows=tuple(
                     (
-                        one.place,
-                        one.air,
-                        f"{one.profiles:,}",
-                        f"{100.0 * one.ours:.3g}",
-                        f"{100.0 * one.peer:.3g}",
-                        f"{one.apart:.2f}",
-                        f"{one.ours_microseconds:,.0f}",
-                        f"{one.peer_microseconds:,.0f}",
-                        f"{one.peer_microseconds / one.ours_microseconds:,.0f}",
+                        comparison.place,
+                        comparison.air,
+                        f"{comparison.profiles:,}",
+                        f"{100.0 * comparison.ours:.3g}",
+                        f"{100.0 * comparison.peer:.3g}",
+                        f"{comparison.apart:.2f}",
+                        f"{comparison.ours_microseconds:,.0f}",
+                        f"{comparison.peer_microseconds:,.0f}",
+                        f"{comparison.peer_microseconds / comparison.ours_microseconds:,.0f}",
                     )
-                    for one in comparisons
+                    for comparison in comparisons
                 ),
-                note="Of extinction at the near crossings that ours solves, clipped at 300 %. "
-                "Apart: root mean square difference over our stated standard errors.",
+                note="Of extinction at the near crossings that lidarops solves, clipped at 300 %. "
+                "Difference: root mean square, over the stated standard errors of lidarops.",
             ),
         ),
     )  # fmt: skip
@@ -404,17 +424,18 @@ def _peers(comparisons: Sequence[Comparison]) -> Part:
 def _cycles(rates: Sequence[SolverRate]) -> Part:
     return Part(
         title="Cycles per second",
-        text="Random cycles, one thread, least CPU time of interleaved repeats. Values and "
-        "variances at the first crossing; numpy.linalg.solve gives all crossings without variances. "
+        text="Random cycles, one thread, shortest CPU time of interleaved repeats. Values and "
+        "variances at the first crossing; numpy.linalg.solve gives all crossings without "
+        "variances. "
         "The read is a vectorised maximum of the same arrays in the same run.",
         tables=tuple(
             Table(
                 title=f"Cycles of {beams} beams",
-                columns=("way", "whose", "cycles", "million / s", "ns each", "reads"),
+                columns=("method", "by", "cycles", "million / s", "ns each", "reads"),
                 rows=tuple(
                     (
                         rate.way,
-                        _whose(rate),
+                        _provider(rate),
                         f"{rate.size:,}",
                         f"{1e3 / rate.nanoseconds:,.3g}",
                         f"{rate.nanoseconds:,.4g}",
@@ -430,17 +451,17 @@ def _cycles(rates: Sequence[SolverRate]) -> Part:
     )
 
 
-def _profiles(found: MultiPositionThroughput) -> Part:
+def _profiles(result: NetworkThroughput) -> Part:
     return Part(
         title="Whole profiles",
         text="From signals to extinction with errors, visibility and flags: point values, "
-        "integrals and their covariances, and the solution. One thread. Two threads with half "
-        f"of the cycles of 3 beams each are {found.gain:.2f} times as fast on the wall, which says "
-        "something only of a machine with two idle cores.",
+        "integrals and their covariances, and the solution. One thread. Two threads with half of "
+        f"the cycles of 3 beams each are {result.gain:.2f} times as fast in wall time, which is "
+        "meaningful only on a machine with two idle cores.",
         tables=tuple(
             Table(
                 title=f"Profiles of {beams} beams",
-                columns=("way", "profiles", "µs each", "reads"),
+                columns=("method", "profiles", "µs each", "reads"),
                 rows=tuple(
                     (
                         rate.way,
@@ -448,18 +469,18 @@ def _profiles(found: MultiPositionThroughput) -> Part:
                         f"{rate.nanoseconds / 1e3:,.3g}",
                         f"{rate.reads:,.1f}",
                     )
-                    for rate in found.profiles
+                    for rate in result.profiles
                     if rate.beams == beams
                 ),
                 note=f"Reads: multiples of {READ} of the power.",
             )
-            for beams in sorted({rate.beams for rate in found.profiles})
+            for beams in sorted({rate.beams for rate in result.profiles})
         ),
     )
 
 
-def _whose(rate: SolverRate) -> str:
-    return "ours" if rate.ours else "floor" if rate.way == READ else "peer"
+def _provider(rate: SolverRate) -> str:
+    return "lidarops" if rate.ours else "floor" if rate.way == READ else "peer"
 
 
 def _noise(noise: float) -> str:

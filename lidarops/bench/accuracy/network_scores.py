@@ -1,4 +1,4 @@
-"""What the benchmark of networks of lidars finds, and how errors are scored."""
+"""Results of the benchmark of networks of lidars, and the scores of errors."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from lidarops.retrieve.network.extinction_field import MultiPositionResult
 Booleans = npt.NDArray[np.bool_]
 
 CLIPPED: Final = 3.0
-"""Largest relative error that counts, as a quotient of noise has no variance."""
+"""Limit of relative errors: a quotient of noise has no variance."""
 WITHIN: Final = (*SIGMAS, 3.0)
-"""Standard errors."""
+"""Numbers of standard errors."""
 READ: Final = "read (np.max)"
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkScore:
-    """Errors of one way at the near crossings, relative to the truth. None where nothing is left.
+    """Errors of one solver at the near crossings, relative to the truth; None without values.
 
-    Monte Carlo errors are those of the scatter from block to block, as profiles of a block share
+    Monte Carlo errors come from the scatter between blocks, because profiles of a block share
     their mean field.
     """
 
@@ -44,12 +44,12 @@ class NetworkScore:
     within: tuple[MonteCarloFigure, MonteCarloFigure, MonteCarloFigure] | None
     """Share of unflagged values within 1, 1.96 and 3 stated standard errors."""
     visibility_bias: tuple[MonteCarloFigure | None, ...]
-    """Of visibility at each near crossing, the nearest first."""
+    """Mean error of visibility at each near crossing, the nearest first."""
     visibility_rmse: tuple[MonteCarloFigure | None, ...]
     chi_square: float | None
     """Mean reduced chi-square of networks."""
     microseconds: float
-    """CPU time of a profile, least of the chunks."""
+    """CPU time of a profile: the shortest of the chunks."""
     reads: float
     """The same as a multiple of the read of the same array in the same run."""
 
@@ -63,11 +63,11 @@ class NetworkScenario:
     noise: float
     profiles: int
     scores: Mapping[str, NetworkScore]
-    """By way."""
+    """Scores by the name of the solver."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class VisibilityScore:
     """Errors of unflagged visibility by one definition, from extinction of the network."""
 
     noise: float
@@ -75,20 +75,20 @@ class Sight:
     constant: float
     """Visibility times extinction."""
     visibility: float
-    """Mean of the truth, m."""
+    """m, mean true visibility."""
     bias: MonteCarloFigure
     """m."""
     rmse: MonteCarloFigure
     """m."""
     within_error: MonteCarloFigure
-    """Share of truths within one linear standard error."""
+    """Share of true values within one linear standard error."""
     within_interval: MonteCarloFigure
-    """Share of truths from the lower to the upper visibility."""
+    """Share of true values between the lower and the upper visibility."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Our network without prior beside `scipy.optimize.least_squares`, on the same profiles."""
+    """The network method without prior and `scipy.optimize.least_squares` on the same profiles."""
 
     place: str
     air: str
@@ -97,71 +97,71 @@ class Comparison:
     """Root mean square error of extinction at the near crossings, relative, clipped."""
     peer: float
     apart: float
-    """Root mean square difference over our stated standard errors."""
+    """Root mean square difference over the stated standard errors of the network method."""
     ours_microseconds: float
     peer_microseconds: float
 
 
 @dataclass(frozen=True, slots=True)
 class SolverRate:
-    """CPU time of one way to solve cycles, or profiles of a network."""
+    """CPU time of one solver for cycles, or for profiles of a network."""
 
     way: str
     beams: int
     size: int
-    """Cycles or profiles of a call."""
+    """Cycles or profiles in a call."""
     nanoseconds: float
-    """Of each, least of the repeats."""
+    """Per cycle or profile: the shortest of the repeats."""
     reads: float
     """The same as a multiple of the read of the same arrays in the same run."""
     ours: bool
 
 
 @dataclass(frozen=True, slots=True)
-class MultiPosition:
-    """The accuracy benchmark of networks of lidars."""
+class NetworkAccuracy:
+    """Result of the accuracy benchmark of networks of lidars."""
 
     date: str
     machine: Machine
     cases: tuple[NetworkScenario, ...]
     figure: tuple[FigurePoint, ...]
     """Figure 2 of drabenko2021."""
-    sights: tuple[Sight, ...]
+    sights: tuple[VisibilityScore, ...]
     comparisons: tuple[Comparison, ...]
     cycles: tuple[SolverRate, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class MultiPositionThroughput:
-    """The throughput benchmark of networks of lidars."""
+class NetworkThroughput:
+    """Result of the throughput benchmark of networks of lidars."""
 
     date: str
     machine: Machine
     cycles: tuple[SolverRate, ...]
     profiles: tuple[SolverRate, ...]
     gain: float
-    """Time on the wall of one thread over that of two with half of the cycles each."""
+    """Wall time of one thread over that of two threads with half of the cycles each."""
 
 
 # Scores ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Errors:
-    """(profile, near crossing) errors of one way; NaN where withheld."""
+class CrossingErrors:
+    """(profile, near crossing) errors of one solver; NaN where values are withheld."""
 
     extinction: Array
     """Relative, clipped."""
     visibility: Array
     """Relative, clipped."""
     deviation: Array
-    """Of extinction over stated standard errors."""
+    """Error of extinction over the stated standard error."""
     flagged: Booleans
     chi_square: Array
     """(profile,)."""
 
 
-def errors_of(result: MultiPositionResult, truth: Array, near: Booleans) -> Errors:
+def crossing_errors(result: MultiPositionResult, truth: Array, near: Booleans) -> CrossingErrors:
     """Return the errors of a result.
 
     Parameters
@@ -171,30 +171,30 @@ def errors_of(result: MultiPositionResult, truth: Array, near: Booleans) -> Erro
         Extinction, m-1.
     near : (crossing,) bool
     """
-    found, truth = result.extinction[:, near], truth[:, near]
+    extinction, truth = result.extinction[:, near], truth[:, near]
     stated = result.extinction_standard_error[:, near]
-    return Errors(
-        np.clip(found / truth - 1.0, -CLIPPED, CLIPPED),
-        np.clip(truth / found - 1.0, -CLIPPED, CLIPPED),
-        (found - truth) / stated,
+    return CrossingErrors(
+        np.clip(extinction / truth - 1.0, -CLIPPED, CLIPPED),
+        np.clip(truth / extinction - 1.0, -CLIPPED, CLIPPED),
+        (extinction - truth) / stated,
         result.flags.flagged[:, near],
         result.reduced_chi_square,
     )
 
 
-def joined(parts: Sequence[Errors]) -> Errors:
+def join_errors(chunks: Sequence[CrossingErrors]) -> CrossingErrors:
     """Return the errors of all profiles."""
-    return Errors(
-        np.concatenate([part.extinction for part in parts]),
-        np.concatenate([part.visibility for part in parts]),
-        np.concatenate([part.deviation for part in parts]),
-        np.concatenate([part.flagged for part in parts]),
-        np.concatenate([part.chi_square for part in parts]),
+    return CrossingErrors(
+        np.concatenate([chunk.extinction for chunk in chunks]),
+        np.concatenate([chunk.visibility for chunk in chunks]),
+        np.concatenate([chunk.deviation for chunk in chunks]),
+        np.concatenate([chunk.flagged for chunk in chunks]),
+        np.concatenate([chunk.chi_square for chunk in chunks]),
     )
 
 
 def mean_by_block(values: npt.NDArray[np.generic], kept: Booleans) -> MonteCarloFigure | None:
-    """Return the mean of kept values, with the error that their blocks scatter by.
+    """Return the mean of kept values, with its error from the scatter between blocks.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def mean_by_block(values: npt.NDArray[np.generic], kept: Booleans) -> MonteCarlo
 
     Returns
     -------
-    Measured or None
+    MonteCarloFigure or None
         None where nothing is kept. The mean is a ratio of sums over blocks, and so is its error.
     """
     blocks = -(-len(values) // BLOCK)
@@ -223,20 +223,20 @@ def _rows(values: npt.NDArray[np.float64]) -> Array:
 
 
 def share_by_block(inside: Booleans, kept: Booleans) -> MonteCarloFigure | None:
-    """Return the share of kept values that are inside; the error is never 0."""
-    found = mean_by_block(inside, kept)
-    if found is None:
+    """Return the share of kept values that are inside, with an error above 0."""
+    share = mean_by_block(inside, kept)
+    if share is None:
         return None
     profiles = int(np.count_nonzero(_rows(kept.astype(np.float64))))
-    # Where all or none are inside, half a profile keeps the error from being zero.
-    likely = (found.value * profiles + 0.5) / (profiles + 1)
+    # Half a profile keeps the error above zero where all or none are inside.
+    probability = (share.value * profiles + 0.5) / (profiles + 1)
     return MonteCarloFigure(
-        found.value, max(found.error, math.sqrt(likely * (1 - likely) / profiles))
+        share.value, max(share.error, math.sqrt(probability * (1 - probability) / profiles))
     )
 
 
 def root_by_block(errors: Array, kept: Booleans) -> MonteCarloFigure | None:
-    """Return the root mean square of kept errors, with the error that their blocks scatter by."""
+    """Return the root mean square of kept errors, with its error from the scatter of blocks."""
     square = mean_by_block(errors**2, kept)
     if square is None:
         return None
@@ -244,12 +244,12 @@ def root_by_block(errors: Array, kept: Booleans) -> MonteCarloFigure | None:
     return MonteCarloFigure(value, square.error / (2.0 * value) if value > 0 else 0.0)
 
 
-def score(errors: Errors, microseconds: float, reads: float) -> NetworkScore:
-    """Return the score of one way in one case."""
+def score(errors: CrossingErrors, microseconds: float, reads: float) -> NetworkScore:
+    """Return the score of one solver in one case."""
     solved = np.isfinite(errors.extinction) & np.isfinite(errors.deviation)
     trusted = solved & ~errors.flagged
-    every = np.ones_like(solved)
-    flagged = share_by_block(errors.flagged, every)
+    all_values = np.ones_like(solved)
+    flagged = share_by_block(errors.flagged, all_values)
     first, second, third = (
         share_by_block(np.abs(errors.deviation) <= sigmas, trusted) for sigmas in WITHIN
     )
@@ -263,10 +263,12 @@ def score(errors: Errors, microseconds: float, reads: float) -> NetworkScore:
         unflagged_rmse=root_by_block(errors.extinction, trusted),
         within=None if first is None or second is None or third is None else (first, second, third),
         visibility_bias=tuple(
-            mean_by_block(errors.visibility[:, c], solved[:, c]) for c in columns
+            mean_by_block(errors.visibility[:, crossing], solved[:, crossing])
+            for crossing in columns
         ),
         visibility_rmse=tuple(
-            root_by_block(errors.visibility[:, c], solved[:, c]) for c in columns
+            root_by_block(errors.visibility[:, crossing], solved[:, crossing])
+            for crossing in columns
         ),
         chi_square=float(fitted.mean()) if fitted.size else None,
         microseconds=microseconds,

@@ -1,4 +1,4 @@
-"""Random networks of lidars, and air and lidars that are not as assumed."""
+"""Random networks of lidars, with air and lidars that violate the assumptions."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.bench.accuracy.network_cases import BLOCK, Air, Place, Signals, signals
-from lidarops.bench.stability.random_scenes import Failure, Judged
+from lidarops.bench.accuracy.network_cases import BLOCK, Air, LidarLine, Signals, signals
+from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.errors import LidarOpsError
 from lidarops.flags import Quality
@@ -19,32 +19,32 @@ Random = np.random.Generator
 
 _FULL_OVERLAP: Final = 100.0
 _DOUBTED: Final = np.int32(Quality.UNSTABLE_INVERSION)
-"""Stands for any of the retrieval's own flags that doubt a value."""
+"""Quality bit that stands for any flag of the retrieval that doubts a value."""
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What the retrieval is given."""
+class _Measurement:
+    """Input of the retrieval."""
 
     power: Array
     variance: Array
     exponent: float = 1.0
 
 
-def random_network(rng: Random) -> Place:
-    """Return 3 or 4 lidars on a line with 1 or 2 beams each, which meet above it."""
-    count = int(rng.integers(3, 5))
-    east = np.linspace(-600.0, 600.0, count) + rng.uniform(-150.0, 150.0, count)
+def _random_network(rng: Random) -> LidarLine:
+    """Return 3 or 4 lidars on a line with 1 or 2 beams each that meet above it."""
+    lidar_count = int(rng.integers(3, 5))
+    east = np.linspace(-600.0, 600.0, lidar_count) + rng.uniform(-150.0, 150.0, lidar_count)
     target = rng.uniform([-300.0, 300.0], [300.0, 900.0], (2, 2))
-    beams = int(rng.integers(1, 3))
+    beam_count = int(rng.integers(1, 3))
     elevations = tuple(
         tuple(
             float(np.degrees(np.arctan2(height + rng.uniform(-150.0, 150.0), x - lidar)))
-            for x, height in target[:beams]
+            for x, height in target[:beam_count]
         )
         for lidar in east
     )
-    return Place("random", tuple(float(x) for x in east), elevations, farthest=2500.0)
+    return LidarLine("random", tuple(float(x) for x in east), elevations, farthest=2500.0)
 
 
 def _homogeneous(rng: Random) -> Air:
@@ -60,132 +60,138 @@ def _layered(rng: Random) -> Air:
 
 def _plume(rng: Random, *, drift: float = 0.0) -> Air:
     value = float(np.exp(rng.uniform(np.log(1e-4), np.log(5e-3))))
-    more, wide = rng.uniform(0.3, 3.0), rng.uniform(50.0, 300.0)
-    where = rng.uniform([-300.0, 300.0], [300.0, 900.0])
+    excess, width = rng.uniform(0.3, 3.0), rng.uniform(50.0, 300.0)
+    centre = rng.uniform([-300.0, 300.0], [300.0, 900.0])
 
     def at(profile: int) -> Callable[[Array, Array], Array]:
-        middle = where[0] + drift * (profile / BLOCK - 0.5)
+        east_centre = centre[0] + drift * (profile / BLOCK - 0.5)
 
         def field(east: Array, up: Array) -> Array:
-            apart = ((east - middle) ** 2 + (up - where[1]) ** 2) / (2.0 * wide**2)
-            return np.asarray(value * (1.0 + more * np.exp(-apart)))
+            square_distance = ((east - east_centre) ** 2 + (up - centre[1]) ** 2) / (2.0 * width**2)
+            return np.asarray(value * (1.0 + excess * np.exp(-square_distance)))
 
         return field
 
     return Air("plume", at, moving=drift != 0.0)
 
 
-def _thin(rng: Random) -> Air:
-    """Return a layer through which a beam is in a few bins, so that its signal bends in a fit."""
+def _thin_layer(rng: Random) -> Air:
+    """Return a layer of a few bins, in which the signal is curved within a fit."""
     value = float(np.exp(rng.uniform(np.log(1e-4), np.log(5e-3))))
-    more, deep = rng.uniform(0.3, 3.0), rng.uniform(10.0, 60.0)
-    middle = rng.uniform(300.0, 900.0)
+    excess, depth = rng.uniform(0.3, 3.0), rng.uniform(10.0, 60.0)
+    height = rng.uniform(300.0, 900.0)
 
     def field(_: Array, up: Array) -> Array:
-        return np.asarray(value * (1.0 + more * np.exp(-((up - middle) ** 2) / (2.0 * deep**2))))
+        return np.asarray(value * (1.0 + excess * np.exp(-((up - height) ** 2) / (2.0 * depth**2))))
 
     return Air("thin layer", lambda _: field)
 
 
-def _drifting(rng: Random) -> Air:
+def _drifting_plume(rng: Random) -> Air:
     return _plume(rng, drift=300.0)
 
 
-def _as_seen(told: Told, _: Signals, __: Random) -> Told:
-    return told
+def _undamaged(measurement: _Measurement, _: Signals, __: Random) -> _Measurement:
+    return measurement
 
 
-def _quiet(told: Told, seen: Signals, rng: Random) -> Told:
-    """Draw anew with the noise of long averages, in which a bend of a signal is not lost."""
+def _with_little_noise(measurement: _Measurement, clean: Signals, rng: Random) -> _Measurement:
+    """Draw again with the noise of long averages, which does not hide curved signals."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(3e-2))))
-    return Told(*seen.draw(noise, len(told.power), int(rng.integers(2**31)), additive=0.0))
-
-
-def _with_overlap(told: Told, seen: Signals, rng: Random) -> Told:
-    lost = rng.uniform(0.0, 0.2, (seen.network.beams, 1))
-    scale = rng.uniform(50.0, 300.0)
-    return Told(
-        told.power * (1.0 - lost * np.exp(-(seen.range - _FULL_OVERLAP) / scale)), told.variance
+    return _Measurement(
+        *clean.draw(noise, len(measurement.power), int(rng.integers(2**31)), additive=0.0)
     )
 
 
-def _with_outliers(told: Told, _: Signals, rng: Random) -> Told:
-    hit = rng.random(told.power.shape) < 0.01
-    size = rng.uniform(5.0, 100.0, told.power.shape) * np.sqrt(told.variance)
-    return Told(told.power + hit * size, told.variance)
+def _with_overlap(measurement: _Measurement, clean: Signals, rng: Random) -> _Measurement:
+    loss = rng.uniform(0.0, 0.2, (clean.network.beams, 1))
+    scale = rng.uniform(50.0, 300.0)
+    return _Measurement(
+        measurement.power * (1.0 - loss * np.exp(-(clean.range - _FULL_OVERLAP) / scale)),
+        measurement.variance,
+    )
 
 
-def _with_gaps(told: Told, _: Signals, rng: Random) -> Told:
-    lost = rng.random(told.power.shape) < rng.uniform(0.0, 0.2)
-    return Told(np.where(lost, np.nan, told.power), told.variance)
+def _with_outliers(measurement: _Measurement, _: Signals, rng: Random) -> _Measurement:
+    outlying = rng.random(measurement.power.shape) < 0.01
+    size = rng.uniform(5.0, 100.0, measurement.power.shape) * np.sqrt(measurement.variance)
+    return _Measurement(measurement.power + outlying * size, measurement.variance)
 
 
-def _with_exponent(told: Told, _: Signals, rng: Random) -> Told:
-    return Told(told.power, told.variance, float(rng.uniform(0.8, 1.25)))
+def _with_gaps(measurement: _Measurement, _: Signals, rng: Random) -> _Measurement:
+    missing = rng.random(measurement.power.shape) < rng.uniform(0.0, 0.2)
+    return _Measurement(np.where(missing, np.nan, measurement.power), measurement.variance)
 
 
-def _with_offset(told: Told, _: Signals, rng: Random) -> Told:
-    """Leave a background of a part of the noise of the far bins."""
-    left = rng.normal(0.0, rng.uniform(0.0, 0.5), (*told.power.shape[:2], 1))
-    return Told(told.power + left * np.sqrt(told.variance[..., -1:]), told.variance)
+def _with_exponent(measurement: _Measurement, _: Signals, rng: Random) -> _Measurement:
+    return _Measurement(measurement.power, measurement.variance, float(rng.uniform(0.8, 1.25)))
 
 
-_FIELD_OF: Final = "the exponent cannot be told from the field: the user declares it"
-_NOT_CANCELLED: Final = "the overlap of a lidar does not cancel, and beams that agree may share it"
+def _with_offset(measurement: _Measurement, _: Signals, rng: Random) -> _Measurement:
+    """Add a background of a fraction of the noise of the far bins."""
+    offset = rng.normal(0.0, rng.uniform(0.0, 0.5), (*measurement.power.shape[:2], 1))
+    return _Measurement(
+        measurement.power + offset * np.sqrt(measurement.variance[..., -1:]), measurement.variance
+    )
+
+
+_UNKNOWN_EXPONENT: Final = "the signals do not determine the exponent: the user declares it"
+_NOT_CANCELLED: Final = "overlap errors do not cancel, and beams that agree may share them"
 FAILURES: Final[tuple[tuple[Failure, Any, Any], ...]] = (
-    (Failure("none, homogeneous", satisfied=True), _homogeneous, _as_seen),
-    (Failure("none, layered", satisfied=True), _layered, _as_seen),
-    (Failure("none, plume", satisfied=True), _plume, _as_seen),
-    (Failure("plume that drifts within a block"), _drifting, _as_seen),
+    (Failure("none, homogeneous", satisfied=True), _homogeneous, _undamaged),
+    (Failure("none, layered", satisfied=True), _layered, _undamaged),
+    (Failure("none, plume", satisfied=True), _plume, _undamaged),
+    (Failure("plume that drifts within a block"), _drifting_plume, _undamaged),
     (Failure("gaps"), _layered, _with_gaps),
     (Failure("outliers"), _layered, _with_outliers),
     (Failure("overlap error", unseen=_NOT_CANCELLED), _layered, _with_overlap),
-    (Failure("wrong exponent", unseen=_FIELD_OF), _layered, _with_exponent),
+    (Failure("wrong exponent", unseen=_UNKNOWN_EXPONENT), _layered, _with_exponent),
     (Failure("background left in the signals"), _layered, _with_offset),
-    (Failure("layer of a few bins"), _thin, _quiet),
+    (Failure("layer of a few bins"), _thin_layer, _with_little_noise),
 )
 
 
-def judge_networks(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
-    """Solve blocks of profiles of random networks, class by class."""
-    for number, (failure, air_of, damage) in enumerate(FAILURES):
-        # What bends do is as large in every layer, and half as many tell it.
-        if air_of is _thin and cluster % 2 == 1:
+def score_networks(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+    """Yield results of blocks of profiles of random networks, class by class."""
+    for index, (failure, draw_air, damage) in enumerate(FAILURES):
+        # Curvature has a similar effect in every layer: half of the clusters are enough.
+        if draw_air is _thin_layer and cluster % 2 == 1:
             continue
-        rng = np.random.default_rng((73, cluster, number))
-        found = _tried(rng, air_of, damage, profiles)
-        if found is None:
+        rng = np.random.default_rng((73, cluster, index))
+        solved = _solve_damaged(rng, draw_air, damage, profiles)
+        if solved is None:
             continue
-        result, truth = found
+        result, truth = solved
         bits = np.where(result.flags.flagged, _DOUBTED, np.int32(0))
         error = np.where(result.near_crossing, result.extinction - truth, np.nan)
         stated = result.extinction_standard_error
-        # A value is to be had where its standard error is small.
+        # Values with a small standard error should not be flagged.
         with np.errstate(invalid="ignore"):
-            could = np.isfinite(error) & (stated < 0.1 * truth)
+            solvable = np.isfinite(error) & (stated < 0.1 * truth)
         yield (
-            Judged(failure, "extinction", error, stated, 0.0, bits, solvable=could),
+            ScoredValues(failure, "extinction", error, stated, 0.0, bits, solvable=solvable),
             profiles,
         )
 
 
-def _tried(
-    rng: Random, air_of: Any, damage: Any, profiles: int
+def _solve_damaged(
+    rng: Random, draw_air: Any, damage: Any, profiles: int
 ) -> tuple[extinction_field.MultiPositionResult, Array] | None:
-    """Return what is found and the truth; None where the beams do not meet."""
+    """Return the result and the truth; None where the beams do not meet."""
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
-    net = random_network(rng).network()
+    net = _random_network(rng).network()
     if net.crossings < 2 or not np.all(np.diff(np.bincount(net.passages.beam)) == 0):
         return None
-    seen = signals(net, air_of(rng))
-    power, variance = seen.draw(noise, profiles, int(rng.integers(2**31)))
-    told = damage(Told(power, variance), seen, rng)
+    clean = signals(net, draw_air(rng))
+    power, variance = clean.draw(noise, profiles, int(rng.integers(2**31)))
+    measurement = damage(_Measurement(power, variance), clean, rng)
     try:
-        found = extinction_field.retrieve_network(
-            told.power, seen.range, net, variance=told.variance, exponent=told.exponent,
-            full_overlap_range=_FULL_OVERLAP, blocks=np.arange(profiles) // BLOCK,
+        result = extinction_field.retrieve_network(
+            measurement.power, clean.range, net, variance=measurement.variance,
+            exponent=measurement.exponent, full_overlap_range=_FULL_OVERLAP,
+            blocks=np.arange(profiles) // BLOCK,
         )  # fmt: skip
     except LidarOpsError:
-        # Beams without two crossings in reach are refused, not answered.
+        # Beams without two crossings in range raise an error.
         return None
-    return found, seen.truth(profiles)
+    return result, clean.truth(profiles)
