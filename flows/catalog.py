@@ -77,7 +77,7 @@ def main(
     with usage.told():
         catalog.validate_parameters({"campaign": campaign, "wait": wait})
         settings = load_campaign(campaign, archive=archive, output=out, catalog=url)
-        selection.refuse_nowhere(settings, archive=archive)
+        selection.check_archive_and_catalog(settings, archive=archive)
     with usage.told():
         summary = catalog(campaign, archive, out, wait, catalog=url)
     raise typer.Exit(1 if summary.refused else 0)

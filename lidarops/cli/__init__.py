@@ -1,6 +1,6 @@
-"""The command line: one function call a command.
+"""The command line: each command calls one function of the library.
 
-Exit codes: 0 all well, 1 something was refused or failed, 2 wrong use.
+Exit codes: 0 success, 1 something was refused or failed, 2 wrong use.
 """
 
 from lidarops.cli import (

@@ -32,7 +32,7 @@ def aggregate(
     out: Annotated[
         Path,
         typer.Argument(
-            help="Output of a campaign, a folder of products, or a campaign file.",
+            help="Output folder of a campaign, a folder of products, or a campaign file.",
             metavar="OUT_OR_CAMPAIGN",
         ),
     ],
@@ -47,17 +47,17 @@ def aggregate(
         datetime | None, typer.Option(help="Only products that start before this UTC time.")
     ] = None,
     means: Annotated[
-        str | None, typer.Option(help="Write means too: day or month.", metavar="PERIOD")
+        str | None, typer.Option(help="Also write means over each day or month.", metavar="PERIOD")
     ] = None,
     weights: Annotated[
-        str, typer.Option(help="Of the profiles of a mean: plain or inverse-variance.")
+        str, typer.Option(help="Weights of the profiles in a mean: plain or inverse-variance.")
     ] = "plain",
-    stac: Annotated[bool, typer.Option("--stac", help="Write a STAC catalog too.")] = False,
+    stac: Annotated[bool, typer.Option("--stac", help="Also write a STAC catalog.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write an index of products, and one virtual dataset for each instrument, kind and channel.
 
-    All goes to the folder aggregates, and can be thrown away and made again.
+    Writes to the folder aggregates, which can be deleted and made again at any time.
 
     Example: lidarops aggregate demo
 

@@ -1,4 +1,4 @@
-"""The typer application, the options that commands share, and how they speak."""
+"""The typer application, the options that commands share, and their output."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ app = typer.Typer(
 CampaignFile = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN")]
 ArchiveOption = Annotated[
     str | None,
-    typer.Option("--archive", help="Folder or URL of the raw files; wins over the campaign file."),
+    typer.Option("--archive", help="Folder or URL of the raw files; overrides the campaign file."),
 ]
 OutOption = Annotated[
-    # No Path, which would make a folder of a URL.
+    # Not a Path: it would turn a URL into a folder name.
     str | None,
-    typer.Option("--out", help="Folder of catalog, products and reports; wins over the file."),
+    typer.Option(
+        "--out", help="Folder of catalog, products and reports; overrides the campaign file."
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 InstrumentOption = Annotated[
@@ -49,7 +51,7 @@ CatalogOption = Annotated[
     str | None,
     typer.Option(
         "--catalog",
-        help="SQLAlchemy URL of catalog and ledger; wins over LIDAROPS_CATALOG and the file.",
+        help="SQLAlchemy URL of catalog and ledger; overrides LIDAROPS_CATALOG and the file.",
         metavar="URL",
     ),
 ]
@@ -57,18 +59,18 @@ StationOption = Annotated[
     list[str] | None, typer.Option("--station", help="Only this station; may be repeated.")
 ]
 ProductOption = Annotated[
-    list[str] | None, typer.Option("--product", help="Only this kind; may be repeated.")
+    list[str] | None, typer.Option("--product", help="Only this kind of product; may be repeated.")
 ]
 WaitOption = Annotated[
     float,
-    typer.Option("--wait", min=0, help="s to wait for another run on the same catalog."),
+    typer.Option("--wait", min=0, help="Seconds to wait for another run on the same catalog."),
 ]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-_COLUMN = 12
-"""Characters, least width of a column of a table."""
+_LEAST_COLUMN_WIDTH = 12
+"""Least width of a table column, in characters."""
 
 WRONG_USE = 2
 REFUSED = 1
@@ -80,7 +82,7 @@ def tell(error: LidarOpsError) -> None:
 
 
 def plainly(command: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Show an error of ours as a sentence, not as a traceback."""
+    """Decorate a command to show a lidarops error as one line, not as a traceback."""
 
     @wraps(command)
     def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -105,25 +107,25 @@ def _main(
 
 
 def no_url(folder: str | None) -> str | None:
-    """Refuse a URL where a folder is asked for: as a path it would be a folder of that name."""
+    """Refuse a URL where a folder is needed: as a path it would name a folder."""
     if folder is not None and "://" in folder:
         raise typer.BadParameter(f"{folder!r} is a URL; give a folder")
     return folder
 
 
 def utc(moment: datetime | None) -> datetime | None:
-    """Read a time without a zone as UTC."""
+    """Return a time with its zone; without a zone it is UTC."""
     return None if moment is None else moment.replace(tzinfo=moment.tzinfo or UTC)
 
 
 def leave(*, failed: bool) -> None:
-    """Exit with 1 where something failed."""
+    """Exit with code 1 if something failed."""
     if failed:
         raise typer.Exit(REFUSED)
 
 
 class Bar:
-    """Progress over something whose number becomes known on the way."""
+    """A progress bar whose total grows while it advances."""
 
     def __init__(self, grow: Callable[[int], None], advance: Callable[[int], None]) -> None:
         self.grow = grow
@@ -132,7 +134,7 @@ class Bar:
 
 @contextmanager
 def growing_bar(name: str, unit: str) -> Iterator[Bar]:
-    """Show progress, throughput and time to go on standard error where that is a terminal."""
+    """Show progress, throughput and remaining time on standard error if that is a terminal."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -156,7 +158,7 @@ def growing_bar(name: str, unit: str) -> Iterator[Bar]:
         MofNCompleteColumn(),
         Speed(""),
         TimeElapsedColumn(),
-        TextColumn("to go"),
+        TextColumn("remaining"),
         TimeRemainingColumn(),
     )
     with Progress(
@@ -175,7 +177,7 @@ def growing_bar(name: str, unit: str) -> Iterator[Bar]:
 
 @contextmanager
 def progress_bar(name: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show progress on standard error where that is a terminal."""
+    """Show progress on standard error if that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -194,17 +196,17 @@ def progress_bar(name: str, total: int | None) -> Iterator[Callable[[int], None]
 
 
 def show(table: Table) -> None:
-    """Print a table that has rows."""
+    """Print a table, unless it has no rows."""
     from rich.console import Console
 
     if table.row_count:
-        # In narrower columns words fold to single letters.
-        least = _COLUMN * len(table.columns)
-        Console(width=max(Console().width, least)).print(table)
+        # In narrower columns words would fold to single letters.
+        least_width = _LEAST_COLUMN_WIDTH * len(table.columns)
+        Console(width=max(Console().width, least_width)).print(table)
 
 
 def make_table(title: str, *columns: str) -> Table:
-    """Make an empty table whose cells fold."""
+    """Return an empty table whose cells fold."""
     from rich.table import Table
 
     table = Table(title=title, title_justify="left")
@@ -217,5 +219,5 @@ def add_row(table: Table, *cells: Any) -> None:
     """Add a row of plain text."""
     from rich.text import Text
 
-    # Text, because a path or a reason may hold what rich would take for markup.
+    # Text, because rich would read brackets in a path or reason as markup.
     table.add_row(*(Text(str(cell)) for cell in cells))

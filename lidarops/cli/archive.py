@@ -1,4 +1,4 @@
-"""Commands that work on the archive of a campaign."""
+"""Commands that work on the archive of a campaign: catalog, plan, reprocess."""
 
 from __future__ import annotations
 
@@ -52,31 +52,33 @@ if TYPE_CHECKING:
     from lidarops.run.staleness import Judgement, Selection
 
 _LEAST_MEMORY = 2**20
-"""Bytes; what is less was given without its unit."""
+"""Bytes; a smaller size probably lacks its unit."""
 
-_EMPTY = "its retrievals left nothing to use"
-_NONE = "nothing to do: no scene of the archive is asked for"
+_UNUSABLE = "its retrievals gave no usable value"
+_NO_SCENE = "nothing to do: the selection contains no scene of the archive"
 
 AllStepsOption = Annotated[
     bool,
     typer.Option(
-        "--all-steps", help="Leave nothing out for giving nothing, and read every file whole."
+        "--all-steps", help="Run every step, even those without effect, and read files in full."
     ),
 ]
 
 
 def _size(text: str | None) -> str | None:
-    """Refuse what is no size before the archive is looked at, which may take an hour."""
+    """Refuse an invalid size before the archive is scanned, which may take an hour."""
     if text is None:
         return None
     from dask.utils import parse_bytes
 
     try:
-        given = parse_bytes(text)
+        size = parse_bytes(text)
     except ValueError as error:
-        raise typer.BadParameter(f"{text!r} is no size such as 2GiB") from error
-    if given < _LEAST_MEMORY:
-        raise typer.BadParameter(f"{text!r} is too little for a worker: give a size such as 2GiB")
+        raise typer.BadParameter(f"{text!r} is not a size such as 2GiB") from error
+    if size < _LEAST_MEMORY:
+        raise typer.BadParameter(
+            f"{text!r} is too little for a worker: give a size with its unit, such as 2GiB"
+        )
     return text
 
 
@@ -87,11 +89,11 @@ def catalog(
     archive: ArchiveOption = None,
     out: OutOption = None,
     catalog: CatalogOption = None,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
     wait: WaitOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Scan the archive, or bring its catalog up to date; list what is refused and why.
+    """Create or update the catalog of the archive; list refused files and why.
 
     Example: lidarops catalog catalogs/demo.yaml
     """
@@ -131,15 +133,15 @@ def show_plan(
     since: SinceOption = None,
     until: UntilOption = None,
     stale: Annotated[
-        bool, typer.Option("--stale", help="Only what is to be made, and why.")
+        bool, typer.Option("--stale", help="Show only the products to be made, and why.")
     ] = False,
     wait: WaitOption = 0.0,
     all_steps: AllStepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the scenes, their steps, what is left out and why, and what is stale. Runs nothing.
+    """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
 
-    With the CPU time that it is going to take.
+    Also shows the estimated CPU time.
 
     Example: lidarops plan catalogs/demo.yaml
     """
@@ -148,42 +150,42 @@ def show_plan(
     from lidarops.run.selection import selects_no_scene
 
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
-    wanted = _selection(instrument, station, product, since, until)
-    found = assess(settings, selection=wanted, everything=not stale, wait=wait)
+    selection = _selection(instrument, station, product, since, until)
+    judgements = assess(settings, selection=selection, everything=not stale, wait=wait)
     machine = cost_estimate.load_calibration()
     making, everything = cost_estimate.Tally(machine), cost_estimate.Tally(machine)
     scenes = []
-    none = True
-    for each in found:
-        none = False
-        scene, whole = each.scene, settings.all_steps
+    no_scene = True
+    for judged in judgements:
+        no_scene = False
+        scene, whole = judged.scene, settings.all_steps
         times = {
-            "to_be_made": making.add(scene, each.needed(), whole=whole),
-            "everything": everything.add(scene, each.requested, whole=whole),
+            "to_be_made": making.add(scene, judged.needed(), whole=whole),
+            "everything": everything.add(scene, judged.requested, whole=whole),
         }
         if as_json:
-            scenes.append({**_plain(each), "estimated_cpu_seconds": times})
+            scenes.append({**_plain(judged), "estimated_cpu_seconds": times})
             continue
         title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
         if not stale:
-            took = f"about {times['everything']:.2g} s of CPU time"
-            show(_plan_table(f"{title}, {took}", each.requested))
-        show(_stale_table(f"{title}, about {times['to_be_made']:.2g} s of CPU time", each))
-    none = none and selects_no_scene(settings, wanted)
-    # What is fresh too was not looked at.
-    told = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
+            estimate = f"about {times['everything']:.2g} s of CPU time"
+            show(_plan_table(f"{title}, {estimate}", judged.requested))
+        show(_stale_table(f"{title}, about {times['to_be_made']:.2g} s of CPU time", judged))
+    no_scene = no_scene and selects_no_scene(settings, selection)
+    # With --stale, fresh scenes were not judged.
+    tallies = {"to be made": making} | ({} if stale else {"everything, with --force": everything})
     if as_json:
         total = {
-            name.partition(",")[0].replace(" ", "_"): each.parts for name, each in told.items()
+            name.partition(",")[0].replace(" ", "_"): tally.parts for name, tally in tallies.items()
         }
         estimate = {**total, "costs": machine.words, "calibrated": not machine.note}
-        found_none = {"no_scene_asked_for": none}
-        document = {"scenes": scenes, **found_none, "estimated_cpu_seconds": estimate}
+        no_scene_found = {"no_scene_asked_for": no_scene}
+        document = {"scenes": scenes, **no_scene_found, "estimated_cpu_seconds": estimate}
         typer.echo(json.dumps(document, indent=2))
         return
-    if none:
-        typer.echo(_NONE)
-    show(_time_table(told))
+    if no_scene:
+        typer.echo(_NO_SCENE)
+    show(_time_table(tallies))
     typer.echo(f"estimated CPU time: {machine.words}")
 
 
@@ -200,35 +202,42 @@ def reprocess(
     since: SinceOption = None,
     until: UntilOption = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Process what is asked for though it is fresh.")
+        bool, typer.Option("--force", help="Process everything selected, even what is fresh.")
     ] = False,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Processes; 1 where not given.")
+        int | None, typer.Option(min=1, max=1024, help="Number of worker processes; default 1.")
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Address of a dask scheduler to run on.")
+        str | None, typer.Option("--scheduler", help="Address of a running dask scheduler to use.")
     ] = None,
     tls: Annotated[
         tuple[Path, Path, Path] | None,
-        typer.Option("--tls", help="Certificate of the authority, own certificate, own key."),
+        typer.Option(
+            "--tls",
+            help="Certificate of the authority, own certificate and own key, for --scheduler.",
+        ),
     ] = None,
     cluster: Annotated[
         str | None,
-        typer.Option("--cluster", help="slurm, kubernetes, or a YAML file of a cluster."),
+        typer.Option(
+            "--cluster", help="slurm, kubernetes, or a YAML file that describes a cluster."
+        ),
     ] = None,
     memory_limit: Annotated[
         str | None,
         typer.Option(
-            "--memory-limit", help="Most memory of a worker, such as 2GiB.", callback=_size
+            "--memory-limit", help="Memory limit of a worker, such as 2GiB.", callback=_size
         ),
     ] = None,
     wait: WaitOption = 0.0,
     remove_orphans: Annotated[
         bool,
-        typer.Option("--remove-orphans", help="Remove products that nothing asks for any more."),
+        typer.Option(
+            "--remove-orphans", help="Remove products that the campaign no longer requests."
+        ),
     ] = False,
     profiles_per_chunk: Annotated[
-        int | None, typer.Option(min=1, help="Profiles a dask chunk; changes no result.")
+        int | None, typer.Option(min=1, help="Profiles per dask chunk; affects no result.")
     ] = None,
     all_steps: AllStepsOption = False,
     log_level: LogLevelOption = "warning",
@@ -236,9 +245,9 @@ def reprocess(
     log_file: LogFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Catalog the archive, make what is stale, and write the report.
+    """Update the catalog, make all stale products, and write a report.
 
-    A run with nothing to do writes nothing. Exit code 1 where something is refused or failed.
+    Writes nothing if there is nothing to do. Exit code 1 if anything was refused or failed.
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
@@ -248,28 +257,28 @@ def reprocess(
 
     set_up(log_level, as_json=log_json, file=log_file)
     settings = _loaded(campaign, archive, out, catalog, all_steps=all_steps)
-    wanted = _selection(instrument, station, product, since, until)
-    there = _cluster(workers, scheduler, tls, cluster, memory_limit)
+    selection = _selection(instrument, station, product, since, until)
+    connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
     with growing_bar("reprocess", "granules") as bar:
         options = pipeline.Options(
             force=force,
             workers=workers or 1,
             memory=memory_limit,
-            cluster=there,
+            cluster=connect,
             wait=wait,
             profiles_per_chunk=profiles_per_chunk,
             progress=lambda outcome: bar.advance(outcome.granules),
             expect=bar.grow,
         )
-        result = pipeline.bring_up_to_date(settings, selection=wanted, options=options)
-    none = result.record is None and selects_no_scene(settings, wanted)
-    if none and not as_json:
-        _tell_none(settings, result, removing=remove_orphans)
+        result = pipeline.bring_up_to_date(settings, selection=selection, options=options)
+    no_scene = result.record is None and selects_no_scene(settings, selection)
+    if no_scene and not as_json:
+        _print_without_scene(settings, result, removing=remove_orphans)
     elif not as_json:
-        _tell(settings, result, removing=remove_orphans)
-    unreported = missing_report(settings) if result.record is None else ""
-    if unreported and not as_json:
-        typer.echo(unreported)
+        _print_result(settings, result, removing=remove_orphans)
+    report_note = missing_report(settings) if result.record is None else ""
+    if report_note and not as_json:
+        typer.echo(report_note)
     page, removed = None, None
     try:
         if result.record is not None:
@@ -277,11 +286,11 @@ def reprocess(
         if remove_orphans:
             removed = pipeline.remove_orphans(settings, result, wait=wait)
     finally:
-        # The run has ended, whatever becomes of its page and of what is left over.
+        # The result is printed even if the page or the removal failed.
         if as_json:
             summary = _run_summary(settings, result, page)
-            told = {"no_scene_asked_for": none, "removed": removed or 0}
-            typer.echo(json.dumps({**summary, **told, "unreported": unreported}, indent=2))
+            summary |= {"no_scene_asked_for": no_scene, "removed": removed or 0}
+            typer.echo(json.dumps({**summary, "unreported": report_note}, indent=2))
         elif page is not None:
             typer.echo(f"report:   {page}")
     if removed is not None and not as_json:
@@ -293,7 +302,7 @@ def reprocess(
 
 
 def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:
-    """Build the page of a run; None where it cannot be, which is told."""
+    """Build the report page of a run; if that fails, show the error and return None."""
     from lidarops.run.archive import report_run
 
     try:
@@ -326,9 +335,9 @@ def _cluster(
     cluster: str | None,
     memory: str | None,
 ) -> Callable[[], AbstractContextManager[Client]] | None:
-    """Return what reaches the cluster that is asked for; None for this machine."""
+    """Return a function that connects to the selected cluster; None for this machine."""
     if tls and scheduler is None:
-        raise typer.BadParameter("--tls is for --scheduler; a cluster's file has its own")
+        raise typer.BadParameter("--tls belongs to --scheduler; a cluster file has its own tls")
     if scheduler is None and cluster is None:
         return None
     from lidarops.run import clusters
@@ -356,7 +365,9 @@ def _selection(
     kinds = [kind.value for kind in ProductKind]
     for name in products or ():
         if name not in kinds:
-            raise typer.BadParameter(f"{name!r} is no kind of product: {', '.join(kinds)}")
+            raise typer.BadParameter(
+                f"{name!r} is not a kind of product; the kinds are {', '.join(kinds)}"
+            )
     return Selection(
         stations=tuple(stations or ()),
         instruments=tuple(instruments or ()),
@@ -377,33 +388,35 @@ def _plan_table(title: str, plan: Plan) -> Table:
     from lidarops.figures.wording import decided_on
     from lidarops.plan.signal_rules import idle_window
 
-    table = make_table(title, "channel", "step", "does", "why", "rule", "number")
+    table = make_table(title, "channel", "step", "does", "reason", "rule", "number")
     for step in plan.steps:
         settings = ", ".join(f"{key} {value}" for key, value in step.settings.items())
         idle = idle_window(step, plan.steps)
         done = f"no effect: {idle}" if idle else settings or "yes"
-        does = (step.channel, step.name, done, step.reason)
-        add_row(table, *does, step.rule, decided_on(step.number))
+        cells = (step.channel, step.name, done, step.reason)
+        add_row(table, *cells, step.rule, decided_on(step.number))
     for left in plan.left_out:
-        told = (left.channel, left.name, "left out", left.reason)
-        add_row(table, *told, left.rule, decided_on(left.number))
+        cells = (left.channel, left.name, "left out", left.reason)
+        add_row(table, *cells, left.rule, decided_on(left.number))
     return table
 
 
-def _time_table(told: Mapping[str, Tally]) -> Table:
-    table = make_table("Estimated CPU time in s", "", "scenes", "theirs", "start", "report", "all")
-    for name, tally in told.items():
-        spent = (f"{seconds:.2g}" for seconds in tally.parts.values())
-        add_row(table, name, tally.count, *spent)
+def _time_table(tallies: Mapping[str, Tally]) -> Table:
+    table = make_table(
+        "Estimated CPU time in s", "", "scenes", "processing", "start", "report", "all"
+    )
+    for name, tally in tallies.items():
+        times = (f"{seconds:.2g}" for seconds in tally.parts.values())
+        add_row(table, name, tally.count, *times)
     return table
 
 
 def _stale_table(title: str, judged: Judgement) -> Table:
-    table = make_table(f"{title}: to be made", "product", "channel", "because")
-    for each in judged.stale:
-        add_row(table, each.kind.value, each.channel, each.reason)
+    table = make_table(f"{title}: to be made", "product", "channel", "reason")
+    for product in judged.stale:
+        add_row(table, product.kind.value, product.channel, product.reason)
     if judged.held:
-        add_row(table, "none", "", f"not tried again, nothing has changed: {judged.held}")
+        add_row(table, "none", "", f"not tried again, because nothing has changed: {judged.held}")
     return table
 
 
@@ -411,8 +424,8 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     from lidarops.plan.signal_rules import idle_window
 
     stale = [
-        {"kind": each.kind.value, "channel": each.channel, "reason": each.reason}
-        for each in judged.stale
+        {"kind": product.kind.value, "channel": product.channel, "reason": product.reason}
+        for product in judged.stale
     ]
     plan = judged.requested
     idle = [idle_window(step, plan.steps) for step in plan.steps]
@@ -420,8 +433,13 @@ def _plain(judged: Judgement) -> dict[str, Any]:
         {**step.as_dict(), **({"no_effect": why} if why else {})}
         for step, why in zip(plan.steps, idle, strict=True)
     ]
-    told = {**plan.as_dict(), "steps": steps}
-    return {**told, "stale": stale, "fresh": judged.fresh, "held": judged.held}
+    return {
+        **plan.as_dict(),
+        "steps": steps,
+        "stale": stale,
+        "fresh": judged.fresh,
+        "held": judged.held,
+    }
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
@@ -444,9 +462,15 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "files_set_aside": dict(result.set_aside),
         "empty_scenes": dict(result.empty_scenes),
         "more_of_both": result.more_unused,
-        "not_in_files": [{**asdict(each), "nowhere": each.nowhere} for each in result.unmet],
-        "orphans": {each.path: each.reason for each in result.orphans if not each.requested},
-        "kept_products": {each.path: each.reason for each in result.orphans if each.requested},
+        "not_in_files": [
+            {**asdict(request), "nowhere": request.nowhere} for request in result.unmet
+        ],
+        "orphans": {
+            orphan.path: orphan.reason for orphan in result.orphans if not orphan.requested
+        },
+        "kept_products": {
+            orphan.path: orphan.reason for orphan in result.orphans if orphan.requested
+        },
     }
 
 
@@ -461,13 +485,13 @@ def _refused(campaign: Campaign, result: Result) -> list[Granule]:
         return store.refused()
 
 
-def _tell(campaign: Campaign, result: Result, *, removing: bool) -> None:
+def _print_result(campaign: Campaign, result: Result, *, removing: bool) -> None:
     table = make_table("Products", "scene", "kind", "channel", "values", "unflagged", "flags")
     for scene in () if result.record is None else result.record.scenes:
         for product in scene.products:
             flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
-            of = (scene.scene, product.kind.value, product.channel)
-            add_row(table, *of, product.values, product.unflagged, flags)
+            name = (scene.scene, product.kind.value, product.channel)
+            add_row(table, *name, product.values, product.unflagged, flags)
         if scene.error:
             add_row(table, scene.scene, "none", "", "", "", scene.error)
     show(table)
@@ -478,22 +502,22 @@ def _tell(campaign: Campaign, result: Result, *, removing: bool) -> None:
     if not removing:
         show(_orphans_table(result, None))
     show(_kept_table(result))
-    show(_empty_table(result))
+    show(_unusable_table(result))
     show(_failures_table(result))
     if result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
         typer.echo(f"products: {campaign.products_root}{ended}")
         return
-    typer.echo("nothing to do: every product that is asked for is fresh or cannot be made")
+    typer.echo("nothing to do: every requested product is fresh or cannot be made")
 
 
-def _unused_table(result: Result, told: Collection[str]) -> Table:
+def _unused_table(result: Result, listed: Collection[str]) -> Table:
     title = "Not used" + (
         f" ({result.more_unused} more on other days)" if result.more_unused else ""
     )
-    table = make_table(title, "file or scene", "because")
+    table = make_table(title, "file or scene", "reason")
     for path, reason in result.set_aside.items():
-        if path not in told:
+        if path not in listed:
             add_row(table, path, reason)
     for scene, reason in result.empty_scenes.items():
         add_row(table, scene, reason)
@@ -503,15 +527,15 @@ def _unused_table(result: Result, told: Collection[str]) -> Table:
 def _unmet_table(result: Result) -> Table:
     from lidarops.figures.wording import lacking
 
-    title = "Asked for, and not in the files"
-    table = make_table(title, "instrument", "channel", "asked for by", "because", "missing in")
-    for each in result.unmet:
-        told = (each.instrument, each.channel, each.requested_by, each.reason)
-        add_row(table, *told, lacking(each))
+    title = "Requested, but not in the files"
+    table = make_table(title, "instrument", "channel", "requested by", "reason", "missing in")
+    for request in result.unmet:
+        cells = (request.instrument, request.channel, request.requested_by, request.reason)
+        add_row(table, *cells, lacking(request))
     return table
 
 
-def _tell_none(campaign: Campaign, result: Result, *, removing: bool) -> None:
+def _print_without_scene(campaign: Campaign, result: Result, *, removing: bool) -> None:
     refused = _refused(campaign, result)
     show(_refused_table(refused))
     show(_unused_table(result, {granule.path for granule in refused}))
@@ -520,12 +544,12 @@ def _tell_none(campaign: Campaign, result: Result, *, removing: bool) -> None:
         show(_orphans_table(result, None))
     show(_kept_table(result))
     show(_failures_table(result))
-    typer.echo(_NONE)
+    typer.echo(_NO_SCENE)
 
 
 def _orphans_table(result: Result, removed: int | None) -> Table:
     fate = "kept; --remove-orphans removes them" if removed is None else f"{removed} removed"
-    table = make_table(f"Products that nothing asks for ({fate})", "file", "because")
+    table = make_table(f"Products that the campaign no longer requests ({fate})", "file", "reason")
     for orphan in result.orphans:
         if not orphan.requested:
             add_row(table, orphan.path, orphan.reason)
@@ -533,34 +557,34 @@ def _orphans_table(result: Result, removed: int | None) -> Table:
 
 
 def _kept_table(result: Result) -> Table:
-    title = "Products that are asked for, and could not be made again (kept)"
-    table = make_table(title, "file", "because")
+    title = "Requested products that could not be made again (kept)"
+    table = make_table(title, "file", "reason")
     for orphan in result.orphans:
         if orphan.requested:
             add_row(table, orphan.path, orphan.reason)
     return table
 
 
-def _empty_table(result: Result) -> Table:
-    table = make_table("Without a value to use", "scene", "problem")
-    told = _of_this_run(result)
+def _unusable_table(result: Result) -> Table:
+    table = make_table("Without a usable value", "scene", "problem")
+    processed = _processed_scenes(result)
     for scene in result.unusable_scenes:
-        if scene in told:
-            add_row(table, scene, _EMPTY)
+        if scene in processed:
+            add_row(table, scene, _UNUSABLE)
     return table
 
 
-def _of_this_run(result: Result) -> set[str]:
+def _processed_scenes(result: Result) -> set[str]:
     return {scene.scene for scene in (() if result.record is None else result.record.scenes)}
 
 
 def _failures_table(result: Result) -> Table:
-    told = _of_this_run(result)
-    table = make_table("Of earlier runs, and nothing has changed since", "scene", "problem")
+    processed = _processed_scenes(result)
+    table = make_table("From earlier runs, unchanged since", "scene", "problem")
     for scene, error in result.failures.items():
-        if scene not in told:
+        if scene not in processed:
             add_row(table, scene, error)
     for scene in result.unusable:
-        if scene not in told:
-            add_row(table, scene, _EMPTY)
+        if scene not in processed:
+            add_row(table, scene, _UNUSABLE)
     return table

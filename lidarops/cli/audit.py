@@ -1,4 +1,4 @@
-"""Commands that ask the ledger: what was run, and is everything still as it was recorded."""
+"""Commands that read the ledger: list the runs, and verify the recorded files."""
 
 from __future__ import annotations
 
@@ -33,10 +33,12 @@ def runs(
     campaign: CampaignFile,
     out: OutOption = None,
     catalog: CatalogOption = None,
-    limit: Annotated[int, typer.Option(min=1, help="Only the newest.")] = 20,
+    limit: Annotated[
+        int, typer.Option(min=1, help="Number of runs to show, the newest first.")
+    ] = 20,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the runs of a campaign, the newest first: how they ended, and what took the time.
+    """Show the runs of a campaign, the newest first: status, numbers and time per stage.
 
     Example: lidarops runs catalogs/demo.yaml
     """
@@ -45,13 +47,13 @@ def runs(
 
     settings = load_campaign(campaign, output=out, catalog=catalog)
     with Store(settings.catalog_url, settings.name, create=False) as store:
-        found = store.runs(limit=limit)
+        listed = store.runs(limit=limit)
     if as_json:
-        typer.echo(json.dumps([_plain(run) for run in found], indent=2))
+        typer.echo(json.dumps([_plain(run) for run in listed], indent=2))
         return
     columns = ("run", "status", "took", "scenes", "products", "failed", "refused", "stages", "by")
     table = make_table(f"Runs of {settings.name}", *columns)
-    for run in found:
+    for run in listed:
         took = "" if run.finished is None else str(run.finished - run.started).partition(".")[0]
         stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in run.seconds.items())
         numbers = (run.scenes, run.products, run.failed, run.refused)
@@ -79,19 +81,19 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Read all products and their inputs again, and name each that is not as recorded.
+    """Read all products and their inputs again; list files that differ from the ledger.
 
     Example: lidarops verify catalogs/demo.yaml
     """
     from lidarops.campaign.model import load_campaign
     from lidarops.catalog.store import Store
-    from lidarops.catalog.verify import verify_archive as audit
-    from lidarops.run.selection import refuse_nowhere
+    from lidarops.catalog.verify import verify_archive
+    from lidarops.run.selection import check_archive_and_catalog
 
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     if archive and not products_only:
-        refuse_nowhere(settings, archive=archive)
-    looked = 0
+        check_archive_and_catalog(settings, archive=archive)
+    checked = 0
 
     with (
         Store(settings.catalog_url, settings.name, create=False) as store,
@@ -99,18 +101,18 @@ def verify(
     ):
 
         def count(done: int) -> None:
-            nonlocal looked
-            looked += done
+            nonlocal checked
+            checked += done
             advance(done)
 
-        found = list(audit(settings, store, inputs=not products_only, progress=count))
+        mismatches = list(verify_archive(settings, store, inputs=not products_only, progress=count))
     if as_json:
-        told = {"files": looked, "mismatches": [asdict(each) for each in found]}
-        typer.echo(json.dumps(told, indent=2))
+        summary = {"files": checked, "mismatches": [asdict(file) for file in mismatches]}
+        typer.echo(json.dumps(summary, indent=2))
     else:
         table = make_table("Not as recorded", "what", "file", "problem")
-        for each in found:
-            add_row(table, each.what, each.path, each.problem)
+        for file in mismatches:
+            add_row(table, file.what, file.path, file.problem)
         show(table)
-        typer.echo(f"{looked} files read, {len(found)} not as recorded")
-    leave(failed=bool(found))
+        typer.echo(f"{checked} files read, {len(mismatches)} not as recorded")
+    leave(failed=bool(mismatches))

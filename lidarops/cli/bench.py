@@ -1,4 +1,4 @@
-"""Command that measures."""
+"""The command that measures accuracy, throughput and stability."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lidarops.cli.app import (
 from lidarops.errors import CampaignError
 
 if TYPE_CHECKING:
-    from lidarops.bench.harness.terms import Effort, Finding
+    from lidarops.bench.harness.terms import BenchmarkOutput, Effort
 
 
 @app.command()
@@ -36,7 +36,7 @@ def bench(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, archive, costs, elastic, homogeneous, multiangle, multiposition, pipeline "
+            help="all, archive, costs, elastic, homogeneous, multiangle, network, pipeline "
             "or reader."
         ),
     ] = None,
@@ -44,18 +44,22 @@ def bench(
         Path | None,
         typer.Option(help="Folder of the EARLINET elastic intercomparison, for the case elastic."),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Two minutes or so.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Measure less, in about two minutes.")
+    ] = False,
     repeats: Annotated[
-        int | None, typer.Option(min=1, max=100, help="Counted repeats of each timing.")
+        int | None, typer.Option(min=1, max=100, help="Number of repeats of each timing.")
     ] = None,
     out: Annotated[
-        str | None, typer.Option("--out", help="Folder of page and JSON.", callback=no_url)
+        str | None, typer.Option("--out", help="Folder for the page and its JSON.", callback=no_url)
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure errors against the least possible ones, or speed against a floor of the same run.
+    """Measure accuracy, throughput or stability.
 
-    Or see what stiff and extreme cases come to, and how often a wrong value has no flag.
+    Accuracy compares errors with the least possible errors; throughput compares times with a floor
+    measured in the same run; stability shows the results of stiff and extreme cases, and how often
+    a wrong value has no flag.
 
     Example: lidarops bench accuracy --case homogeneous --quick --out bench
 
@@ -85,9 +89,9 @@ def bench(
         leave(failed=_failed(finding))
         return
     for part in finding.report.parts:
-        for found in part.tables:
-            table = make_table(found.title, *found.columns)
-            for cells in found.rows:
+        for content in part.tables:
+            table = make_table(content.title, *content.columns)
+            for cells in content.rows:
                 add_row(table, *cells)
             show(table)
     if page is not None:
@@ -95,21 +99,21 @@ def bench(
     leave(failed=_failed(finding))
 
 
-def _refuse(given: dict[str, object]) -> None:
-    """Refuse what stability does not take."""
-    for name, value in given.items():
+def _refuse(options: dict[str, object]) -> None:
+    """Refuse options that the benchmark stability does not have."""
+    for name, value in options.items():
         if value:
             raise CampaignError(
-                "is not taken by the benchmark 'stability'", field=name, remedy="leave it out"
+                "is no option of the benchmark 'stability'", field=name, remedy="leave it out"
             )
 
 
-def _stability(effort: Effort) -> Finding:
+def _stability(effort: Effort) -> BenchmarkOutput:
     from lidarops.bench.stability import study
 
     return study.run_stability(effort)
 
 
-def _failed(finding: Finding) -> bool:
-    """Return whether a case went otherwise than it is known to."""
+def _failed(finding: BenchmarkOutput) -> bool:
+    """Return whether a case gave another result than expected."""
     return bool(getattr(finding.result, "failed", False))

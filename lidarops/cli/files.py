@@ -1,4 +1,4 @@
-"""Commands that look at one file or one run."""
+"""Commands that show one file or one run."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from lidarops.cli.app import JsonOption, app, plainly, show
 @app.command()
 @plainly
 def report(
-    run: Annotated[Path, typer.Argument(help="Folder of a run, or its run.json.", metavar="RUN")],
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+    run: Annotated[
+        Path, typer.Argument(help="Report folder of a run, or its run.json.", metavar="RUN")
+    ],
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
 ) -> None:
-    """Build the HTML report and figures of a run again.
+    """Build the HTML report of a run and its figures again.
 
     Example: lidarops report demo/report/RUN --workers 2
     """
@@ -34,11 +36,11 @@ def report(
 def inspect(
     file: Annotated[Path, typer.Argument(help="A raw file or a product.", metavar="FILE")],
     provenance: Annotated[
-        bool, typer.Option("--provenance", help="Print a product's PROV-JSON.")
+        bool, typer.Option("--provenance", help="Print the PROV-JSON of a product.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what a raw file or a product holds.
+    """Show the content of a raw file or a product.
 
     Example: lidarops inspect demo/raw/coast/h2492106.010000
     """

@@ -1,4 +1,4 @@
-"""Logs: a line of text or of JSON an event."""
+"""Logs: one line of text or JSON per event."""
 
 from __future__ import annotations
 
@@ -15,43 +15,46 @@ from lidarops.errors import CatalogError
 LogLevelOption = Annotated[
     str, typer.Option("--log-level", help="debug, info, warning or error.", metavar="LEVEL")
 ]
-LogJsonOption = Annotated[bool, typer.Option("--log-json", help="One JSON object a log line.")]
+LogJsonOption = Annotated[
+    bool, typer.Option("--log-json", help="Write one JSON object per log line.")
+]
 LogFileOption = Annotated[
-    Path | None, typer.Option("--log-file", help="Append the log here, not to standard error.")
+    Path | None,
+    typer.Option("--log-file", help="Append the log to this file instead of standard error."),
 ]
 
 _LEVELS: Final = ("debug", "info", "warning", "error")
-_OURS: Final = frozenset(
+_EXTRA_FIELDS: Final = frozenset(
     {"run", "scene", "granule", "granules", "product", "products", "seconds", "reason"}
 )
 
 
 class JsonLines(logging.Formatter):
-    """Formats a record as one line of JSON, with the facts that came as `extra`."""
+    """Formats a log record as one line of JSON, including the fields passed as `extra`."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        about = {
+        fields = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(),
             "level": record.levelname.lower(),
             "logger": record.name,
             "message": record.getMessage(),
-            **{key: value for key, value in vars(record).items() if key in _OURS},
+            **{key: value for key, value in vars(record).items() if key in _EXTRA_FIELDS},
         }
         if record.exc_info:
-            about["exception"] = self.formatException(record.exc_info)
-        return json.dumps(about, default=str)
+            fields["exception"] = self.formatException(record.exc_info)
+        return json.dumps(fields, default=str)
 
 
 def set_up(level: str, *, as_json: bool, file: Path | None) -> None:
-    """Let the package's log go to a file or to standard error.
+    """Send the log of the package to a file or to standard error.
 
     Raises
     ------
     CatalogError
         If the file cannot be opened.
     typer.BadParameter
-        If there is no such level.
+        If the level is unknown.
     """
     if level.lower() not in _LEVELS:
         raise typer.BadParameter(f"{level!r} is not one of {', '.join(_LEVELS)}")
@@ -66,9 +69,9 @@ def set_up(level: str, *, as_json: bool, file: Path | None) -> None:
         ) from error
     text = logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S")
     handler.setFormatter(JsonLines() if as_json else text)
-    for old in list(logger.handlers):
-        logger.removeHandler(old)
-        old.close()
+    for previous in list(logger.handlers):
+        logger.removeHandler(previous)
+        previous.close()
     logger.addHandler(handler)
     logger.setLevel(level.upper())
     logger.propagate = False

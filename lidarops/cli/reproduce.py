@@ -1,4 +1,4 @@
-"""Command that makes a product again."""
+"""The command that makes a product again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def reproduce(
     product: Annotated[Path, typer.Argument(help="A product.", metavar="PRODUCT")],
     archive: Annotated[
         str | None,
-        typer.Option("--archive", help="Folder or URL of the raw files; looked for if not told."),
+        typer.Option("--archive", help="Folder or URL of the raw files; searched for by default."),
     ] = None,
     ancillary: Annotated[
         Path | None,
@@ -27,22 +27,21 @@ def reproduce(
         str | None,
         typer.Option(
             "--catalog",
-            help="SQLAlchemy URL of a catalog that knows where raw files were moved to;"
-            " looked for if not told.",
+            help="SQLAlchemy URL of a catalog that knows where raw files were moved;"
+            " searched for by default.",
             metavar="URL",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a product again from its own provenance; exit code 0 where every byte is the same.
+    """Make a product again from its provenance. Exit code 0 if every byte is the same.
 
     Example: lidarops reproduce demo/products/hill/hill-vertical/elastic/2024/*355o*0922*.nc
     """
     from dataclasses import asdict
 
-    from lidarops.run.reproduction import explain_difference
-    from lidarops.run.reproduction import reproduce_product as make_again
+    from lidarops.run.reproduction import explain_difference, reproduce_product
 
-    result = make_again(product, archive=archive, ancillary=ancillary, catalog=catalog)
+    result = reproduce_product(product, archive=archive, ancillary=ancillary, catalog=catalog)
     typer.echo(json.dumps(asdict(result), indent=2) if as_json else explain_difference(result))
     leave(failed=not result.identical)

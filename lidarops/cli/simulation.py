@@ -1,4 +1,4 @@
-"""Command that writes simulated campaigns."""
+"""The command that writes simulated campaigns."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def simulate(
     campaign: CampaignFile,
     archive: ArchiveOption = None,
     out: OutOption = None,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
 ) -> None:
-    """Write a simulated campaign of raw Licel files, with its truth.
+    """Write the raw Licel files of a simulated campaign, and the truth behind them.
 
     Example: lidarops simulate catalogs/demo.yaml --workers 2
     """

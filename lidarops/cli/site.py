@@ -1,4 +1,4 @@
-"""Command that makes the archive browser."""
+"""The command that makes the archive browser."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def site(
     out: Annotated[
         Path, typer.Argument(help="Output folder of a campaign, with its products.", metavar="OUT")
     ],
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Make a static site of all products: calendar, figures, flags, provenance, downloads.
 
-    It lies in OUT/site, needs no server and no network, and is brought up to date when it is made
-    again. Exit code 1 where a product cannot be shown whole.
+    Writes to OUT/site; the pages need neither server nor network. Run it again to update the site.
+    Exit code 1 if a product cannot be shown completely.
 
     Example: lidarops site demo --workers 2
     """
@@ -54,7 +54,7 @@ def site(
             )
         )
     else:
-        table = make_table("Cannot be shown whole", "file", "reason")
+        table = make_table("Cannot be shown completely", "file", "reason")
         for problem in made.problems:
             add_row(table, problem.path, problem.reason)
         show(table)

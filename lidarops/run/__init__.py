@@ -1,1 +1,12 @@
-"""An archive brought up to date: what is stale, runs, clusters, reproduction, publication."""
+"""Bring the archive of a campaign up to date.
+
+- `archive`: catalog, plan, process and report; what the command line and the flows call.
+- `options`, `selection`: how to run, and which part of the campaign.
+- `staleness`: decides which products are stale, and why; `leftovers`: scenes without product, and
+  products that the campaign no longer requests.
+- `executor`: processes scenes, in this process or on dask workers (`worker`); `clusters` starts or
+  reaches such workers on this machine, Slurm or Kubernetes (`kubernetes`).
+- `session`: enters one run in the ledger, scene by scene.
+- `reproduction`: makes one product again from its provenance.
+- `publication`: copies products to an object store.
+"""

@@ -379,7 +379,7 @@ class _Pass:
             self._failing = self._failing + 1 if outcome.error and not scene.final else 0
             if self._failing >= MOST_FAILURES_IN_A_ROW:
                 stop.now(
-                    f"{MOST_FAILURES_IN_A_ROW} scenes in a row failed, the last one: {outcome.error}"
+                    f"{MOST_FAILURES_IN_A_ROW} scenes in a row failed, the last: {outcome.error}"
                 )
             if self._options.progress:
                 self._options.progress(outcome)

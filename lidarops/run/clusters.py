@@ -1,8 +1,8 @@
-"""Where scenes are processed: this machine, a running dask scheduler, Slurm or Kubernetes.
+"""Start or reach the workers that process scenes: local, a dask scheduler, Slurm or Kubernetes.
 
-A cluster is named on the command line or described by a small YAML file. Workers have one thread
-each, since netCDF4 writes from one thread of a process only, and BLAS and numba gain nothing from
-more. They need the archive, the folder of products and the software; nothing else is sent to them.
+A cluster is named on the command line or described by a small YAML file. Each worker has one
+thread, because netCDF4 writes from only one thread of a process, and BLAS and numba gain nothing
+from more. Workers need the software and access to the archive and the folder of products.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lidarops.run.executor import MALLOC_TRIM_VARIABLE, local_client
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-# What a cluster that is absent, refuses or is configured wrongly can raise.
+# Exceptions of a cluster that is absent, refuses, or is configured wrongly.
 _FAILURES = (OSError, TimeoutError, RuntimeError, ValueError, TypeError)
 
 Memory = Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$", description="such as 2GiB")]
@@ -37,7 +37,7 @@ _ENVIRONMENT = (
 
 
 class ClusterError(LidarOpsError):
-    """A cluster that is described wrongly, or cannot be started or reached."""
+    """A cluster is described wrongly, or cannot be started or reached."""
 
 
 class _Model(BaseModel):
@@ -45,9 +45,14 @@ class _Model(BaseModel):
 
 
 class Tls(_Model):
-    """Certificates of a dask cluster: without them whoever reaches a scheduler runs code on it."""
+    """TLS certificates of a dask cluster.
 
-    ca: Path = Field(description="certificate of the authority that signed the cluster's")
+    Without them, anyone who reaches the scheduler can run code on the cluster.
+    """
+
+    ca: Path = Field(
+        description="certificate of the authority that signed the cluster's certificate"
+    )
     certificate: Path
     key: Path
 
@@ -58,21 +63,22 @@ class Local(_Model):
     kind: Literal["local"] = "local"
     workers: Workers = 1
     memory: Memory | None = Field(
-        default=None, description="of a worker; an equal share of the machine's where not given"
+        default=None,
+        description="memory limit of a worker; default an equal share of the machine's memory",
     )
 
 
 class Scheduler(_Model):
-    """A dask scheduler that runs already."""
+    """A running dask scheduler with its own workers."""
 
     kind: Literal["scheduler"] = "scheduler"
     address: str = Field(pattern=r"^(tcp|tls)://[^/\s]+:\d+$")
-    tls: Tls | None = Field(default=None, description="the settings of dask itself where not given")
-    wait: Seconds = Field(default=60.0, description="s, for a first worker")
+    tls: Tls | None = Field(default=None, description="default: the settings of dask")
+    wait: Seconds = Field(default=60.0, description="s to wait for the first worker")
 
 
 class Slurm(_Model):
-    """Workers as Slurm jobs; certificates for the time of the run are made unless given."""
+    """Workers as Slurm jobs; unless given, certificates are made for the time of the run."""
 
     kind: Literal["slurm"] = "slurm"
     workers: Workers = 4
@@ -84,12 +90,14 @@ class Slurm(_Model):
         default=None, description="network interface of scheduler and workers, such as ib0"
     )
     folder: Path = Field(
-        default=Path("slurm"), description="shared by all nodes: certificates and logs"
+        default=Path("slurm"), description="folder on all nodes, for certificates and logs"
     )
-    prologue: tuple[str, ...] = Field(default=(), description="shell lines before the worker")
+    prologue: tuple[str, ...] = Field(
+        default=(), description="shell lines to run before the worker"
+    )
     directives: tuple[str, ...] = Field(default=(), description="further #SBATCH options")
     tls: Tls | None = None
-    wait: Seconds = Field(default=3600.0, description="s, for a first worker: queues are long")
+    wait: Seconds = Field(default=3600.0, description="s to wait for the first worker in the queue")
 
 
 class Kubernetes(_Model):
@@ -101,8 +109,10 @@ class Kubernetes(_Model):
     namespace: Name = "lidarops"
     deployment: Name = "lidarops-worker"
     api: str = Field(default="https://kubernetes.default.svc", pattern=r"^https?://[^/\s]+$")
-    tls: Tls | None = Field(default=None, description="the settings of dask itself where not given")
-    wait: Seconds = Field(default=600.0, description="s, for a first worker: nodes are started")
+    tls: Tls | None = Field(default=None, description="default: the settings of dask")
+    wait: Seconds = Field(
+        default=600.0, description="s to wait for the first worker, e.g. while nodes start"
+    )
 
 
 Cluster = Local | Scheduler | Slurm | Kubernetes
@@ -117,19 +127,19 @@ def choose_cluster(
     cluster: str | None = None,
     memory: str | None = None,
 ) -> Cluster:
-    """Make the cluster of what stands on a command line.
+    """Return the cluster that the command-line options describe.
 
     Parameters
     ----------
     workers : int, optional
-        Processes on this machine; with `cluster` the number of its workers.
+        Number of local processes; with `cluster`, of its workers.
     scheduler : str, optional
         Address of a dask scheduler, such as ``tls://head:8786``.
     cluster : str, optional
         ``slurm`` or ``kubernetes`` with the defaults of `Slurm` or `Kubernetes`, or the path of a
         YAML file that describes one.
     memory : str, optional
-        Most memory of a worker of this machine, such as ``2GiB``; of others it is told elsewhere.
+        Memory limit of a local worker, such as ``2GiB``; other clusters set it themselves.
 
     Returns
     -------
@@ -138,22 +148,22 @@ def choose_cluster(
     Raises
     ------
     ClusterError
-        If the choice contradicts itself or is described wrongly: wrong use.
+        If options contradict each other or the description is invalid (wrong use).
     """
-    chosen = _chosen(workers, scheduler, cluster)
+    chosen = _choose(workers, scheduler, cluster)
     if memory is None:
         return chosen
     if not isinstance(chosen, Local):
         raise ClusterError(
-            "is for workers of this machine",
+            "applies only to workers of this machine",
             field="memory_limit",
-            remedy="give the memory in the cluster's file, or where its workers are started",
+            remedy="set the memory in the cluster file, or where the workers are started",
             wrong_use=True,
         )
     return chosen.model_copy(update={"memory": memory})
 
 
-def _chosen(workers: int | None, scheduler: str | None, cluster: str | None) -> Cluster:
+def _choose(workers: int | None, scheduler: str | None, cluster: str | None) -> Cluster:
     if scheduler is not None:
         if cluster is not None or workers is not None:
             raise ClusterError(
@@ -162,19 +172,19 @@ def _chosen(workers: int | None, scheduler: str | None, cluster: str | None) -> 
                 remedy="give --scheduler alone, or --cluster and --workers",
                 wrong_use=True,
             )
-        return _validated({"kind": "scheduler", "address": scheduler}, None)
-    settings: dict[str, Any] = {"kind": "local"} if cluster is None else _described(cluster)
+        return _validate({"kind": "scheduler", "address": scheduler}, None)
+    settings: dict[str, Any] = {"kind": "local"} if cluster is None else _read_description(cluster)
     if workers is not None:
         settings["workers"] = workers
-    return _validated(settings, None if cluster in (None, *_KINDS) else cluster)
+    return _validate(settings, None if cluster in (None, *_KINDS) else cluster)
 
 
-def _described(cluster: str) -> dict[str, Any]:
+def _read_description(cluster: str) -> dict[str, Any]:
     if cluster in _KINDS:
         return {"kind": cluster}
     try:
         text = Path(cluster).read_text(encoding="utf-8")
-        twice = duplicate_keys(yaml.compose(text, Loader=yaml.SafeLoader))
+        duplicates = duplicate_keys(yaml.compose(text, Loader=yaml.SafeLoader))
         raw = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ClusterError(
@@ -183,8 +193,8 @@ def _described(cluster: str) -> dict[str, Any]:
             remedy="give slurm, kubernetes, or the path of a YAML file",
             wrong_use=True,
         ) from error
-    if twice:
-        raise ClusterError("; ".join(twice), file=cluster, wrong_use=True)
+    if duplicates:
+        raise ClusterError("; ".join(duplicates), file=cluster, wrong_use=True)
     if not isinstance(raw, dict):
         raise ClusterError(
             "is not a mapping",
@@ -195,38 +205,38 @@ def _described(cluster: str) -> dict[str, Any]:
     return raw
 
 
-def _validated(settings: dict[str, Any], file: str | None) -> Cluster:
+def _validate(settings: dict[str, Any], file: str | None) -> Cluster:
     try:
         return _ADAPTER.validate_python(settings)
     except ValidationError as error:
-        told = [
-            f"{'.'.join(str(part) for part in each['loc'][1:]) or 'kind'}: {each['msg']}"
-            for each in error.errors(include_url=False)
+        problems = [
+            f"{'.'.join(str(key) for key in problem['loc'][1:]) or 'kind'}: {problem['msg']}"
+            for problem in error.errors(include_url=False)
         ]
-        addressed = any("address" in each["loc"] for each in error.errors())
+        in_address = any("address" in problem["loc"] for problem in error.errors())
         raise ClusterError(
-            "; ".join(told),
+            "; ".join(problems),
             file=file,
             remedy="give the address of a scheduler, such as tls://head:8786"
-            if addressed
-            else "see lidarops/run/clusters.py for every key and its bounds",
+            if in_address
+            else "see lidarops/run/clusters.py for all keys and their limits",
             wrong_use=True,
         ) from error
 
 
 @contextmanager
 def connect_client(cluster: Cluster) -> Iterator[Client]:
-    """Start or reach a cluster; what was started ends with the context.
+    """Start or reach a cluster; stop at the end of the context what was started.
 
     Parameters
     ----------
     cluster : Cluster
-        From `choose_cluster`, or made by hand.
+        From `choose_cluster`, or constructed directly.
 
     Yields
     ------
     distributed.Client
-        With one worker at least. `lidarops.run.executor` refuses those with other code of lidarops.
+        With at least one worker. Scenes fail on workers with other code of lidarops.
 
     Raises
     ------
@@ -235,38 +245,38 @@ def connect_client(cluster: Cluster) -> Iterator[Client]:
     """
     with ExitStack() as stack:
         try:
-            connected = _connected(cluster, stack)
+            client = _connect(cluster, stack)
         except _FAILURES as error:
             raise ClusterError(
                 f"no {cluster.kind} cluster: {error!r}",
                 field="cluster",
                 remedy=_REMEDIES[cluster.kind],
             ) from error
-        yield connected
+        yield client
 
 
-def _connected(cluster: Cluster, stack: ExitStack) -> Client:
+def _connect(cluster: Cluster, stack: ExitStack) -> Client:
     from distributed import Client  # noqa: PLC0415 - takes a second to import
 
     if isinstance(cluster, Local):
         return stack.enter_context(local_client(cluster.workers, memory=cluster.memory))
-    reached = stack.enter_context(_address(cluster))
-    connected: Client = stack.enter_context(Client(reached, **_connection(cluster)))
-    connected.wait_for_workers(1, timeout=cluster.wait)
-    return connected
+    address = stack.enter_context(_address(cluster))
+    client: Client = stack.enter_context(Client(address, **_connection(cluster)))
+    client.wait_for_workers(1, timeout=cluster.wait)
+    return client
 
 
 _REMEDIES = {
-    "local": "ask for fewer workers or more memory",
-    "scheduler": "look whether the scheduler and a worker run, and for the certificates of tls://",
-    "slurm": "see squeue and the logs in the cluster's folder",
-    "kubernetes": "see kubectl get pods; the role of deploy/kubernetes must be bound",
+    "local": "start fewer workers, or give them more memory",
+    "scheduler": "check that the scheduler and a worker run, and the certificates for tls://",
+    "slurm": "see squeue, and the logs in the folder of the cluster",
+    "kubernetes": "see kubectl get pods, and check that the role of deploy/kubernetes is bound",
 }
 
 
 @contextmanager
 def _address(cluster: Scheduler | Slurm | Kubernetes) -> Iterator[Any]:
-    """Give what a `Client` connects to; what had to be started stops with the context."""
+    """Yield what a `Client` connects to; stop at the end of the context what was started."""
     if isinstance(cluster, Scheduler):
         yield cluster.address
     elif isinstance(cluster, Kubernetes):
@@ -275,9 +285,12 @@ def _address(cluster: Scheduler | Slurm | Kubernetes) -> Iterator[Any]:
         ):
             yield cluster.address
     else:
-        # Every death of a worker is to be seen by the engine, which counts it for its scene.
-        with dask.config.set({"distributed.scheduler.allowed-failures": 0}), _slurm(cluster) as own:
-            yield own
+        # The executor counts the deaths of workers, per scene.
+        with (
+            dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+            _slurm(cluster) as jobs,
+        ):
+            yield jobs
 
 
 def _slurm(cluster: Slurm) -> Any:
@@ -289,7 +302,7 @@ def _slurm(cluster: Slurm) -> Any:
         ) from error
     folder = cluster.folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    started = SLURMCluster(
+    jobs = SLURMCluster(
         cores=1,
         processes=1,
         memory=cluster.memory,
@@ -297,7 +310,7 @@ def _slurm(cluster: Slurm) -> Any:
         account=cluster.account,
         walltime=cluster.walltime,
         interface=cluster.interface,
-        # Whoever reaches a scheduler without certificates runs code as its user.
+        # Anyone who reaches a scheduler without certificates can run code as its user.
         security=_security(cluster.tls) or True,
         shared_temp_directory=str(folder),
         log_directory=str(folder),
@@ -305,9 +318,9 @@ def _slurm(cluster: Slurm) -> Any:
         job_extra_directives=list(cluster.directives),
         scheduler_options={"dashboard": False, "dashboard_address": None},
     )
-    # As many as are asked for, also after one is cancelled or a node is lost.
-    started.adapt(minimum_jobs=cluster.workers, maximum_jobs=cluster.workers)
-    return started
+    # Keep this number, also after a job is cancelled or a node is lost.
+    jobs.adapt(minimum_jobs=cluster.workers, maximum_jobs=cluster.workers)
+    return jobs
 
 
 def _connection(cluster: Cluster) -> dict[str, Any]:
@@ -321,13 +334,13 @@ def _security(tls: Tls | None) -> Security | None:
 
     if tls is None:
         return None
-    parts = {"cert": str(tls.certificate), "key": str(tls.key)}
+    files = {"cert": str(tls.certificate), "key": str(tls.key)}
     return Security(
         require_encryption=True,
         tls_ca_file=str(tls.ca),
         **{
-            f"tls_{role}_{part}": path
+            f"tls_{role}_{name}": path
             for role in ("scheduler", "worker", "client")
-            for part, path in parts.items()
+            for name, path in files.items()
         },
     )

@@ -1,4 +1,4 @@
-"""Scale a Kubernetes deployment for the time of a run, with the rights of the pod that asks."""
+"""Scale a Kubernetes deployment for the time of a run, with the rights of the calling pod."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 IDENTITY = Path("/var/run/secrets/kubernetes.io/serviceaccount")
-"""Where Kubernetes gives a pod its ``token``, and the ``ca.crt`` of the API's authority."""
+"""Folder in which Kubernetes gives a pod its ``token`` and the API's ``ca.crt``."""
 
 _TIMEOUT = 30.0
 
 
 @contextmanager
 def scaled(api: str, namespace: str, deployment: str, *, replicas: int) -> Iterator[None]:
-    """Run a deployment with some replicas, and with none afterwards.
+    """Run a deployment with some replicas; scale it to none at the end of the context.
 
     Parameters
     ----------
@@ -52,14 +52,14 @@ def _scale(api: str, namespace: str, deployment: str, replicas: int) -> None:
                 "Authorization": f"Bearer {(IDENTITY / 'token').read_text().strip()}",
             },
         )
-        answer = connection.getresponse()
-        told = answer.read().decode(errors="replace")
+        response = connection.getresponse()
+        text = response.read().decode(errors="replace")
     except HTTPException as error:
         raise ConnectionError(f"{api}{path}: {error!r}") from error
     finally:
         connection.close()
-    if answer.status >= 300:
-        raise ConnectionError(f"{api}{path}: {answer.status} {told[:500]}")
+    if response.status >= 300:
+        raise ConnectionError(f"{api}{path}: {response.status} {text[:500]}")
 
 
 def _connection(api: str) -> HTTPConnection:

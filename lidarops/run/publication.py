@@ -1,4 +1,4 @@
-"""Copy the products of a campaign to an object store, for those who have no access to its disk."""
+"""Copy the products of a campaign to an object store."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from lidarops.system.stores import Published, RemoteStore
 
 
 def publish_products(campaign: Campaign, url: str) -> Published:
-    """Bring a store up to date with the products in the ledger of a campaign.
+    """Copy the products in the ledger of a campaign to a store, as far as they changed.
 
     Parameters
     ----------
     campaign : Campaign
     url : str
-        Where the products go, such as ``s3://bucket/prefix``; credentials come from where the
-        driver looks for them.
+        Destination, such as ``s3://bucket/prefix``; the driver finds the credentials.
 
     Returns
     -------
@@ -29,15 +28,14 @@ def publish_products(campaign: Campaign, url: str) -> Published:
     CatalogError
         If there is no ledger or it cannot be read, or the URL is unknown.
     ProductError
-        If the store cannot be written, or a product is missing or not what the ledger
-        says.
+        If the store cannot be written, or a product is missing or differs from the ledger.
     """
     with (
         Store(campaign.catalog_url, campaign.name, create=False) as store,
         store.all_made() as made,
     ):
-        products = {each.path: each.sha256 for each in made}
-    # One a store: what was sent to one says nothing of another.
+        products = {product.path: product.sha256 for product in made}
+    # One journal per store.
     name = hashlib.sha256(url.encode()).hexdigest()[:12]
     journal = Path(campaign.output) / f"published-{name}.sha256"
     return RemoteStore(url).publish(campaign.products_root, products, journal)

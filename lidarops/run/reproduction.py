@@ -1,4 +1,4 @@
-"""Make a product again from nothing but its own provenance, and compare the bytes."""
+"""Make a product again from its own provenance, and compare the bytes."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from lidarops.records import Granule, InputRecord, LeftOut, Plan, Role, Scene, S
 from lidarops.system.stores import RemoteStore, is_url
 
 _RAW: Final = (Role.SIGNAL, Role.DARK)
-"""Roles of files of the archive; those of the others lie beside the campaign file."""
-_SHOWN: Final = 20
-"""Files of one kind of trouble that are told by name."""
+"""Roles of files in the archive; paths of other inputs start from the campaign folder."""
+_MOST_LISTED: Final = 20
+"""Differences of one kind that are listed by name; the others are counted."""
 _IF_MOVED: Final = (
-    "Raw files that were moved are found by content in a catalog that has seen them since: run"
-    " lidarops catalog, and tell where it is with --catalog if it does not lie above the product."
+    "Moved raw files are found by content in an up-to-date catalog: run lidarops catalog, and give"
+    " its URL with --catalog if it is not in a folder above the product."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One thing that is not what it was when the product was made."""
+    """One difference between the recorded and the present state."""
 
     what: str
     """``input``, ``code``, ``package``, ``processing``, ``attribute``, ``variable``, ``bytes``."""
@@ -54,59 +54,59 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """What came of making a product again."""
+    """Result of making a product again."""
 
     product: str
     identical: bool
     """Whether every byte is the same."""
     differences: tuple[Difference, ...]
-    """Empty where it is identical with the same software."""
+    """Empty if the bytes are identical."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
-    """What a product tells of how it was made."""
+class _Origin:
+    """The provenance of a product."""
 
     file: Path
-    about: Mapping[str, Any]
-    """Of the entity ``lidarops:product``."""
+    attributes: Mapping[str, Any]
+    """Attributes of the entity ``lidarops:product``."""
     settings: Mapping[str, Any]
     plan: Plan
     inputs: tuple[InputRecord, ...]
     code_version: str
     versions: Mapping[str, str]
     epoch: str
-    """Of the environment in which the product was dated; empty where there was none."""
+    """SOURCE_DATE_EPOCH by which the product was dated; empty if there was none."""
 
     @classmethod
-    def of(cls, file: Path) -> _Told:
+    def of(cls, file: Path) -> _Origin:
         document = read_provenance(file)
         try:
             entities = document["entity"]
-            about = entities["lidarops:product"]
+            attributes = entities["lidarops:product"]
             software = document["agent"]["lidarops:software"]
-            told = cls(
+            origin = cls(
                 file=file,
-                about=about,
-                settings=json.loads(about["lidarops:settings"]),
+                attributes=attributes,
+                settings=json.loads(attributes["lidarops:settings"]),
                 plan=_plan(json.loads(entities["lidarops:plan"]["lidarops:json"])),
                 inputs=_inputs(entities, document["used"]),
                 code_version=software["lidarops:code_version"],
-                versions=dict(each.split(" ", 1) for each in software["lidarops:versions"]),
+                versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
                 epoch=_epoch(file),
             )
         except (KeyError, ValueError, TypeError) as error:
-            raise _untold(file, repr(error)) from error
-        for record in told.inputs:
-            # Copies are put under that name, which whoever made the product may have chosen.
+            raise _insufficient(file, repr(error)) from error
+        for record in origin.inputs:
+            # Copies are written under this path, which a forged product could choose freely.
             if record.role in _RAW and not _inside(record.path):
                 raise ProductError(
                     f"names a raw file outside its archive: {record.path}",
                     file=file,
                     field="provenance",
-                    remedy="lidarops writes no such product: do not trust it",
+                    remedy="lidarops does not write such products: do not trust this one",
                 )
-        return told
+        return origin
 
 
 def _inside(path: str) -> bool:
@@ -115,34 +115,34 @@ def _inside(path: str) -> bool:
     return not (pure.is_absolute() or ".." in pure.parts)
 
 
-def _untold(file: Path, problem: str) -> ProductError:
+def _insufficient(file: Path, problem: str) -> ProductError:
     return ProductError(
-        f"does not tell enough to make the product again: {problem}",
+        f"its provenance is not sufficient to make the product again: {problem}",
         file=file,
         field="provenance",
-        remedy="reprocess the campaign: products of older versions tell less",
+        remedy="reprocess the campaign with this version of lidarops",
     )
 
 
-def _plan(told: Mapping[str, Any]) -> Plan:
+def _plan(fields: Mapping[str, Any]) -> Plan:
     return Plan(
-        told["scene"],
-        tuple(Step(**step) for step in told["steps"]),
-        tuple(LeftOut(**left) for left in told["left_out"]),
+        fields["scene"],
+        tuple(Step(**step) for step in fields["steps"]),
+        tuple(LeftOut(**left) for left in fields["left_out"]),
     )
 
 
 def _inputs(
     entities: Mapping[str, Any], uses: Mapping[str, Mapping[str, Any]]
 ) -> tuple[InputRecord, ...]:
-    """Return the inputs of a document, in which files of equal content are one entity."""
+    """Return the inputs of a PROV document, in which files of equal content are one entity."""
     paths = {
         name: iter([paths] if isinstance(paths, str) else list(paths))
         for name, entity in entities.items()
         for paths in [entity.get("lidarops:path")]
         if paths is not None
     }
-    # Numbered in the order in which the writer sorted them, as are the paths of an entity.
+    # The writer numbered the uses in sorted order; the paths of an entity have the same order.
     numbered = [uses[name] for name in sorted(uses, key=lambda name: int(name[len("_:use") :]))]
     return tuple(
         InputRecord(
@@ -159,8 +159,8 @@ def _epoch(file: Path) -> str:
         attributes = product.attrs
     if f"that of {EPOCH_VARIABLE}" not in str(attributes["comment"]):
         return ""
-    made = datetime.fromisoformat(str(attributes["date_created"]))
-    return str(round(made.timestamp()))
+    created = datetime.fromisoformat(str(attributes["date_created"]))
+    return str(round(created.timestamp()))
 
 
 def reproduce_product(
@@ -170,25 +170,25 @@ def reproduce_product(
     ancillary: str | Path | None = None,
     catalog: str | None = None,
 ) -> Reproduction:
-    """Make a product again in a temporary folder and compare it with what it is.
+    """Make a product again in a temporary folder, and compare the two files.
 
-    Station, facts of the instrument, settings, plan and digests of all inputs are those that the
-    product itself holds; no campaign file is read, and a catalog only where raw files are not
-    what they were under their names: there, files that were moved are found by content.
+    Station, facts of the instrument, settings, plan and digests of all inputs come from the product
+    itself. No campaign file is read. A catalog is read only if raw files are missing or changed,
+    to find moved files by content.
 
     Parameters
     ----------
     product : path or str
-        Of one instrument or of a network.
+        A product of an instrument or of a network.
     archive : path or str, optional
-        Folder or URL of the raw files; without it, the nearest folder above the product that
-        holds them, itself or in a folder of its own.
+        Folder or URL of the raw files; default the nearest folder above the product that holds
+        them, directly or in one of its subfolders.
     ancillary : path or str, optional
-        Folder of the campaign file, from which soundings and overlap functions are named;
-        looked for like the archive where it is not given.
+        Folder of the campaign file, to which the paths of soundings and overlap functions are
+        relative; searched for like the archive by default.
     catalog : str, optional
-        SQLAlchemy URL of a catalog that has seen where raw files were moved to; without it that
-        of ``LIDAROPS_CATALOG``, or the nearest ``catalog.sqlite`` above the product.
+        SQLAlchemy URL of a catalog that knows where raw files were moved; default that of
+        ``LIDAROPS_CATALOG``, or the nearest ``catalog.sqlite`` above the product.
 
     Returns
     -------
@@ -197,73 +197,73 @@ def reproduce_product(
     Raises
     ------
     ProductError
-        If the file is no product, does not tell enough, or its inputs are nowhere to be found.
+        If the file is no product, its provenance is insufficient, or its inputs are not found.
     CatalogError
-        If the folder, store or catalog that is given is not there or cannot be used.
+        If the given folder, store or catalog does not exist or cannot be used.
     """
     local = None if is_url(str(archive)) else archive
-    for field, given in (("--archive", local), ("--ancillary", ancillary)):
-        if given is not None and not Path(given).is_dir():
-            raise CatalogError("is no folder", file=given, field=field, wrong_use=True)
-    told = _Told.of(Path(product))
-    raw = [record for record in told.inputs if record.role in _RAW]
-    beside = [record for record in told.inputs if record.role not in _RAW]
-    with _staged(told, raw, archive, catalog) as (root, wrong):
-        folder = _beside(told, beside, ancillary) if beside else root
-        changed = [*wrong, *_changed(folder, beside, str(folder))]
+    for field, folder in (("--archive", local), ("--ancillary", ancillary)):
+        if folder is not None and not Path(folder).is_dir():
+            raise CatalogError("is no folder", file=folder, field=field, wrong_use=True)
+    origin = _Origin.of(Path(product))
+    raw = [record for record in origin.inputs if record.role in _RAW]
+    others = [record for record in origin.inputs if record.role not in _RAW]
+    with _staged(origin, raw, archive, catalog) as (root, wrong):
+        ancillaries = _ancillary_folder(origin, others, ancillary) if others else root
+        changed = [*wrong, *_changed(ancillaries, others, str(ancillaries))]
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))
-        software = tuple(_software(told))
+        software = tuple(_software(origin))
         with tempfile.TemporaryDirectory(prefix="lidarops-") as out:
-            found = tuple(_made_again(told, root, folder, Path(out)))
-    # The same bytes from other software are the same product.
-    return Reproduction(
-        str(product), identical=not found, differences=(*found, *software) if found else ()
-    )
+            differences = tuple(_made_again(origin, root, ancillaries, Path(out)))
+    # Other software is a difference only if the bytes differ.
+    if differences:
+        differences = (*differences, *software)
+    return Reproduction(str(product), identical=not differences, differences=differences)
 
 
 @contextmanager
 def _staged(
-    told: _Told, records: Sequence[InputRecord], archive: str | Path | None, catalog: str | None
+    origin: _Origin, records: Sequence[InputRecord], archive: str | Path | None, catalog: str | None
 ) -> Iterator[tuple[Path, list[Difference]]]:
-    """Give a local folder of the raw files under their old names, and what is wrong with them."""
+    """Yield a local folder with the raw files under their recorded names, and their differences."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
         staged = Path(name)
-        there = {record.path: record.path for record in records}
+        unmoved = {record.path: record.path for record in records}
         if is_url(str(archive)):
             store = RemoteStore(str(archive))
             root, place, bring = staged, store.url, _from_store(store, staged)
-            bring(there)
+            bring(unmoved)
         else:
-            root = _raw_folder(told, records, catalog) if archive is None else Path(archive)
+            root = _raw_folder(origin, records, catalog) if archive is None else Path(archive)
             place, bring = str(root), _from_folder(root, staged)
         changed = list(_changed(root, records, place))
-        wrong = {each.name for each in changed}
+        wrong = {difference.name for difference in changed}
         lost = [record for record in records if record.path in wrong]
-        moved = _moved(told, lost, catalog)
+        moved = _moved(origin, lost, catalog)
         if moved:
-            bring({**there, **moved} if root is not staged else moved)
+            bring({**unmoved, **moved} if root is not staged else moved)
             root = staged
-            wrong = {each.name for each in _changed(root, lost, place)}
-        yield root, [each for each in changed if each.name in wrong]
+            wrong = {difference.name for difference in _changed(root, lost, place)}
+        yield root, [difference for difference in changed if difference.name in wrong]
 
 
 def _from_store(store: RemoteStore, staged: Path) -> Callable[[Mapping[str, str]], None]:
-    """Return what copies files, old name -> name, from behind a URL."""
+    """Return a function that copies files, recorded name -> present name, from a store."""
 
     def bring(names: Mapping[str, str]) -> None:
         with tempfile.TemporaryDirectory(prefix="lidarops-") as fetched:
             store.fetch(sorted(set(names.values())), Path(fetched))
             for old, now in names.items():
                 if (Path(fetched) / now).is_file():
-                    # Two names may have become one.
+                    # Copied, not moved: two recorded names may have the same present name.
                     shutil.copyfile(Path(fetched) / now, _cleared(staged / old))
 
     return bring
 
 
 def _from_folder(folder: Path, staged: Path) -> Callable[[Mapping[str, str]], None]:
-    """Return what links to files of a folder, old name -> name."""
+    """Return a function that links to files, recorded name -> present name, of a folder."""
 
     def bring(names: Mapping[str, str]) -> None:
         for old, now in names.items():
@@ -279,21 +279,21 @@ def _cleared(target: Path) -> Path:
     return target
 
 
-def _moved(told: _Told, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
-    """Return old name -> name of the files whose content a catalog knows under another name."""
-    url = catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(told.file)
+def _moved(origin: _Origin, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
+    """Return recorded name -> present name of files that a catalog knows under another name."""
+    url = catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(origin.file)
     if not lost or not url:
         return {}
     try:
-        with Store(url, str(told.about["lidarops:campaign"]), create=False) as store:
-            found = store.paths_by_digest({record.sha256 for record in lost})
+        with Store(url, str(origin.attributes["lidarops:campaign"]), create=False) as store:
+            present = store.paths_by_digest({record.sha256 for record in lost})
     except CatalogError:
-        # Nobody has asked for one that was only come across.
+        # A catalog that was not given but only found may be unusable.
         if catalog is not None:
             raise
         return {}
-    now = {record.path: found.get(record.sha256, record.path) for record in lost}
-    return {old: new for old, new in now.items() if old != new and _inside(new)}
+    names = {record.path: present.get(record.sha256, record.path) for record in lost}
+    return {old: new for old, new in names.items() if old != new and _inside(new)}
 
 
 def _nearest_catalog(file: Path) -> str:
@@ -303,26 +303,28 @@ def _nearest_catalog(file: Path) -> str:
     return ""
 
 
-def _raw_folder(told: _Told, records: Sequence[InputRecord], catalog: str | None) -> Path:
-    found = _folder_with(told.file, [record.path for record in records])
-    if found is None:
-        found = _folder_with(told.file, list(_moved(told, records, catalog).values()))
-    if found is None:
-        raise _nowhere(told, records, "--archive")
-    return found
+def _raw_folder(origin: _Origin, records: Sequence[InputRecord], catalog: str | None) -> Path:
+    folder = _folder_with(origin.file, [record.path for record in records])
+    if folder is None:
+        folder = _folder_with(origin.file, list(_moved(origin, records, catalog).values()))
+    if folder is None:
+        raise _not_found(origin, records, "--archive")
+    return folder
 
 
-def _beside(told: _Told, records: Sequence[InputRecord], given: str | Path | None) -> Path:
-    if given is not None:
-        return Path(given)
-    found = _folder_with(told.file, [record.path for record in records])
-    if found is None:
-        raise _nowhere(told, records, "--ancillary")
-    return found
+def _ancillary_folder(
+    origin: _Origin, records: Sequence[InputRecord], ancillary: str | Path | None
+) -> Path:
+    if ancillary is not None:
+        return Path(ancillary)
+    folder = _folder_with(origin.file, [record.path for record in records])
+    if folder is None:
+        raise _not_found(origin, records, "--ancillary")
+    return folder
 
 
 def _folder_with(file: Path, paths: Sequence[str]) -> Path | None:
-    """Return the nearest folder above a file, or in one above, that holds one of some paths."""
+    """Return the nearest folder above a file, or subfolder of one, that holds any of the paths."""
     for parent in file.resolve().parents:
         for folder in (parent, *_folders_in(parent)):
             if any((folder / path).is_file() for path in paths):
@@ -330,11 +332,11 @@ def _folder_with(file: Path, paths: Sequence[str]) -> Path | None:
     return None
 
 
-def _nowhere(told: _Told, records: Sequence[InputRecord], option: str) -> ProductError:
+def _not_found(origin: _Origin, records: Sequence[InputRecord], option: str) -> ProductError:
     return ProductError(
-        f"was made from {records[0].path}, which lies in no folder above the product",
-        file=told.file,
-        remedy=f"tell where with {option}",
+        f"was made from {records[0].path}, which is in no folder above the product",
+        file=origin.file,
+        remedy=f"give its folder with {option}",
     )
 
 
@@ -359,39 +361,44 @@ def _changed(folder: Path, records: Iterable[InputRecord], place: str) -> Iterat
                 yield Difference("input", record.path, problem)
 
 
-def _software(told: _Told) -> Iterator[Difference]:
-    if told.code_version != code_version():
-        yield Difference("code", "lidarops", f"{code_version()}, was {told.code_version}")
+def _software(origin: _Origin) -> Iterator[Difference]:
+    if origin.code_version != code_version():
+        yield Difference("code", "lidarops", f"{code_version()}, was {origin.code_version}")
     now = package_versions()
-    for name in sorted({*told.versions, *now}):
-        if told.versions.get(name) != now.get(name):
-            problem = f"{now.get(name, 'absent')}, was {told.versions.get(name, 'absent')}"
+    for name in sorted({*origin.versions, *now}):
+        if origin.versions.get(name) != now.get(name):
+            problem = f"{now.get(name, 'absent')}, was {origin.versions.get(name, 'absent')}"
             yield Difference("package", name, problem)
 
 
-def _made_again(told: _Told, root: Path, folder: Path, out: Path) -> Iterator[Difference]:
-    """Give what differs between a product and what is made of its inputs now."""
-    channel, kind = (str(told.about[f"lidarops:{key}"]) for key in ("channel", "kind"))
-    with _dated(told.epoch):
+def _made_again(origin: _Origin, root: Path, folder: Path, out: Path) -> Iterator[Difference]:
+    """Yield the differences between a product and the one made from its inputs now."""
+    channel, kind = (str(origin.attributes[f"lidarops:{key}"]) for key in ("channel", "kind"))
+    with _dated(origin.epoch):
         outcome = process_scene(
-            Job(_campaign(told, root, folder, out), _scene(told, root), told.plan, only=channel)
+            Job(
+                _campaign(origin, root, folder, out),
+                _scene(origin, root),
+                origin.plan,
+                only=channel,
+            )
         )
     if outcome.error:
-        yield Difference("processing", told.plan.scene, outcome.error)
+        yield Difference("processing", origin.plan.scene, outcome.error)
         return
-    record = next((each for each in outcome.products if each.kind.value == kind), None)
+    record = next((made for made in outcome.products if made.kind.value == kind), None)
     if record is None:
-        yield Difference("processing", told.plan.scene, f"makes no {kind} product any more")
+        yield Difference("processing", origin.plan.scene, f"no longer gives a {kind} product")
         return
-    with told.file.open("rb") as stream:
+    with origin.file.open("rb") as stream:
         before = hashlib.file_digest(stream, "sha256").hexdigest()
     if record.sha256 != before:
-        yield from _compared(told.file, out / "products" / record.path)
+        yield from _compared(origin.file, out / "products" / record.path)
 
 
 @contextmanager
 def _dated(epoch: str) -> Iterator[None]:
-    """Set the date of products to that of the environment in which one was made."""
+    """Set SOURCE_DATE_EPOCH to the one by which the product was dated."""
     before = os.environ.pop(EPOCH_VARIABLE, None)
     if epoch:
         os.environ[EPOCH_VARIABLE] = epoch
@@ -403,36 +410,38 @@ def _dated(epoch: str) -> Iterator[None]:
             os.environ[EPOCH_VARIABLE] = before
 
 
-def _campaign(told: _Told, root: Path, folder: Path, out: Path) -> Campaign:
-    settings = told.settings
+def _campaign(origin: _Origin, root: Path, folder: Path, out: Path) -> Campaign:
+    settings = origin.settings
     try:
         campaign = Campaign.model_validate(
             {
                 **settings["campaign"],
-                "name": told.about["lidarops:campaign"],
+                "name": origin.attributes["lidarops:campaign"],
                 "archive": str(root),
                 "output": str(out),
                 "metadata": settings["metadata"],
-                **_instruments(told),
+                **_instruments(origin),
             }
         )
     except (KeyError, TypeError, ValidationError) as error:
-        raise _untold(told.file, str(error)) from error
+        raise _insufficient(origin.file, str(error)) from error
     campaign._folder = str(folder)  # noqa: SLF001 - as `lidarops.campaign.model.load_campaign` sets it
     return campaign
 
 
-def _instruments(told: _Told) -> dict[str, Any]:
-    """Return stations, instruments and network of a campaign, as far as a product tells them."""
-    settings = told.settings
+def _instruments(origin: _Origin) -> dict[str, Any]:
+    """Return the stations, instruments and network that a product records."""
+    settings = origin.settings
     if "network" in settings:
         members = settings["members"]
         return {
-            "stations": {each["keys"]["station"]: each["station"] for each in members.values()},
-            "instruments": {name: _instrument(each, {}) for name, each in members.items()},
+            "stations": {
+                member["keys"]["station"]: member["station"] for member in members.values()
+            },
+            "instruments": {name: _instrument(member, {}) for name, member in members.items()},
             "networks": {settings["keys"]["instrument"]: settings["network"]},
         }
-    kind, keys = str(told.about["lidarops:kind"]), settings["keys"]
+    kind, keys = str(origin.attributes["lidarops:kind"]), settings["keys"]
     return {
         "stations": {keys["station"]: settings["station"]},
         "instruments": {keys["instrument"]: _instrument(settings, {kind: settings["products"]})},
@@ -449,21 +458,21 @@ def _instrument(settings: Mapping[str, Any], products: Mapping[str, Any]) -> dic
     }
 
 
-def _scene(told: _Told, root: Path) -> Scene:
-    settings = told.settings
+def _scene(origin: _Origin, root: Path) -> Scene:
+    settings = origin.settings
     try:
         if "network" not in settings:
-            return _part(told, root, settings["keys"], told.inputs)
+            return _member_scene(origin, root, settings["keys"], origin.inputs)
         members = tuple(
-            _part(told, root, each["keys"], _files_of(told, each["files"]))
-            # Texts are sorted in a product; the network names its instruments in their order.
+            _member_scene(origin, root, member["keys"], _files_of(origin, member["files"]))
+            # The members of a product are sorted by name; the network defines their order.
             for name in settings["network"]["instruments"]
-            for each in [settings["members"].get(name)]
-            if each is not None
+            for member in [settings["members"].get(name)]
+            if member is not None
         )
-        whole = _part(told, root, settings["keys"], ())
+        whole = _member_scene(origin, root, settings["keys"], ())
     except (KeyError, TypeError, ValueError) as error:
-        raise _untold(told.file, repr(error)) from error
+        raise _insufficient(origin.file, repr(error)) from error
     granules = (granule for member in members for granule in member.granules)
     dark = (granule for member in members for granule in member.dark)
     return replace(
@@ -474,27 +483,29 @@ def _scene(told: _Told, root: Path) -> Scene:
     )
 
 
-def _files_of(told: _Told, names: Sequence[str]) -> tuple[InputRecord, ...]:
+def _files_of(origin: _Origin, names: Sequence[str]) -> tuple[InputRecord, ...]:
     """Return the raw files of one member of a network."""
-    return tuple(record for record in told.inputs if record.path in set(names))
+    return tuple(record for record in origin.inputs if record.path in set(names))
 
 
-def _part(told: _Told, root: Path, keys: Mapping[str, str], inputs: Iterable[InputRecord]) -> Scene:
-    """Return what one instrument gives to the scene of a product."""
-    start, stop = (datetime.fromisoformat(moment) for moment in told.settings["window"])
+def _member_scene(
+    origin: _Origin, root: Path, keys: Mapping[str, str], inputs: Iterable[InputRecord]
+) -> Scene:
+    """Return the scene of one instrument with its part of the inputs."""
+    start, stop = (datetime.fromisoformat(moment) for moment in origin.settings["window"])
     granules = [
         _granule(root, record, keys["instrument"]) for record in inputs if record.role in _RAW
     ]
     granules.sort(key=_order)
     return Scene(
-        id=told.plan.scene,
-        campaign=str(told.about["lidarops:campaign"]),
+        id=origin.plan.scene,
+        campaign=str(origin.attributes["lidarops:campaign"]),
         station=keys["station"],
         instrument=keys["instrument"],
         start=start,
         stop=stop,
-        granules=tuple(each for each in granules if each.role is Role.SIGNAL),
-        dark=tuple(each for each in granules if each.role is Role.DARK),
+        granules=tuple(granule for granule in granules if granule.role is Role.SIGNAL),
+        dark=tuple(granule for granule in granules if granule.role is Role.DARK),
     )
 
 
@@ -519,7 +530,7 @@ def _granule(root: Path, record: InputRecord, instrument: str) -> Granule:
 
 
 def _compared(before: Path, after: Path) -> Iterator[Difference]:
-    """Give what differs between two NetCDF files of which some byte does."""
+    """Yield the differences between two NetCDF files whose bytes differ."""
     count = 0
     try:
         with (
@@ -532,7 +543,7 @@ def _compared(before: Path, after: Path) -> Iterator[Difference]:
     except (OSError, ValueError) as error:
         raise LidarOpsError(f"cannot be read: {error}", file=before) from error
     if not count:
-        yield Difference("bytes", before.name, "stored otherwise, with the same content")
+        yield Difference("bytes", before.name, "the same content, stored in other bytes")
 
 
 def _attributes(owner: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[Difference]:
@@ -554,9 +565,9 @@ def _short(value: Any) -> str:
 
 
 def _variables(old: xr.Dataset, new: xr.Dataset) -> Iterator[Difference]:
-    for name in sorted({str(each) for each in (*old.variables, *new.variables)}):
+    for name in sorted({str(variable) for variable in (*old.variables, *new.variables)}):
         if name not in old.variables or name not in new.variables:
-            state = "is new" if name in new.variables else "is no more"
+            state = "is new" if name in new.variables else "no longer exists"
             yield Difference("variable", name, state)
             continue
         before, after = old.variables[name], new.variables[name]
@@ -570,28 +581,31 @@ def _values(before: np.ndarray[Any, Any], after: np.ndarray[Any, Any]) -> str:
     if before.shape != after.shape or before.dtype != after.dtype:
         return f"has {after.dtype}{after.shape}, had {before.dtype}{before.shape}"
     # As bytes: NaN equals itself, and the sign of zero counts.
-    other = before.view(np.uint8) != after.view(np.uint8) if before.ndim else before != after
+    differs = before.view(np.uint8) != after.view(np.uint8) if before.ndim else before != after
     if before.ndim:
-        other = other.reshape(*before.shape, -1).any(axis=-1)
-    count = int(np.count_nonzero(other))
+        differs = differs.reshape(*before.shape, -1).any(axis=-1)
+    count = int(np.count_nonzero(differs))
     if not count:
         return ""
     if before.dtype.kind != "f":
         return f"{count} of {before.size} values differ"
-    most = float(np.max(np.abs(np.float64(after) - np.float64(before))[other]))
+    most = float(np.max(np.abs(np.float64(after) - np.float64(before))[differs]))
     return f"{count} of {before.size} values differ, by {most:.3g} at most"
 
 
 def explain_difference(result: Reproduction) -> str:
-    """Return what came of it in words, one line a difference."""
+    """Return the result in words, one line per difference."""
     if result.identical:
-        return f"{result.product}: identical, every byte"
+        return f"{result.product}: identical in every byte"
     lines = [f"{result.product}: not the same"]
-    for what in dict.fromkeys(each.what for each in result.differences):
-        named = [each for each in result.differences if each.what == what]
-        lines += [f"  {what} {each.name}: {each.problem}" for each in named[:_SHOWN]]
-        if len(named) > _SHOWN:
-            lines.append(f"  ... and {len(named) - _SHOWN} more of {what}")
-    if any(each.what == "input" for each in result.differences):
+    for what in dict.fromkeys(difference.what for difference in result.differences):
+        alike = [difference for difference in result.differences if difference.what == what]
+        lines += [
+            f"  {what} {difference.name}: {difference.problem}"
+            for difference in alike[:_MOST_LISTED]
+        ]
+        if len(alike) > _MOST_LISTED:
+            lines.append(f"  ... and {len(alike) - _MOST_LISTED} more of {what}")
+    if any(difference.what == "input" for difference in result.differences):
         lines.append(f"  {_IF_MOVED}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What dask runs on every worker of this machine before its first scene."""
+"""Prepare the dask workers of this machine before their first scene."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ from typing import Final
 
 from lidarops.system import processes
 
-_NOISY: Final = ("distributed.scheduler", "distributed.nanny", "distributed.worker.state_machine")
-"""Loggers that show, some in tracebacks, what lidarops tells in its own words: workers that died,
-and scenes that were abandoned. What a worker's memory comes to is told by another."""
+_SILENCED: Final = (
+    "distributed.scheduler",
+    "distributed.nanny",
+    "distributed.worker.state_machine",
+)
+"""Loggers that report, partly in tracebacks, what lidarops reports itself: workers that died, and
+abandoned scenes. Another logger warns about the memory of a worker, and stays."""
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep dask from telling what lidarops tells itself."""
-    before = {name: logging.getLogger(name).level for name in _NOISY}
-    _hush()
+    """Silence the loggers of dask that repeat what lidarops reports."""
+    before = {name: logging.getLogger(name).level for name in _SILENCED}
+    _silence()
     try:
         yield
     finally:
@@ -28,15 +32,15 @@ def quiet() -> Iterator[None]:
             logging.getLogger(name).setLevel(level)
 
 
-def _hush() -> None:
-    for name in _NOISY:
+def _silence() -> None:
+    for name in _SILENCED:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def dask_setup(_worker: object) -> None:
     """Prepare a worker; dask calls a function of this name."""
-    _hush()
+    _silence()
     processes.keep_memory()
-    # Ctrl-C goes to all processes of a terminal, and the workers are to end their scenes.
+    # Ctrl-C reaches all processes of a terminal, but workers should finish their scenes.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)

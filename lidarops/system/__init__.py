@@ -1,1 +1,1 @@
-"""File systems, object stores and processes of a machine."""
+"""Processes of this machine (`processes`) and object stores behind URLs (`stores`)."""

@@ -226,7 +226,7 @@ def test_a_product_that_tells_too_little_is_refused(campaign: Campaign, tmp_path
         )
     )
     write_product(product, tmp_path / "old.nc")
-    with pytest.raises(ProductError, match="does not tell enough"):
+    with pytest.raises(ProductError, match="not sufficient"):
         reproduce_product(tmp_path / "old.nc", archive=campaign.archive)
 
 

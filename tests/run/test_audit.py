@@ -179,7 +179,7 @@ def test_a_selection_without_any_scene_is_told_from_one_whose_products_are_fresh
     def said(*words: str) -> str:
         return CliRunner().invoke(app, ["reprocess", str(archive.file), *words]).output
 
-    none = "no scene of the archive is asked for"
+    none = "the selection contains no scene of the archive"
     assert none in said("--since", "2026-04-01")
     assert none in said("--until", "2026-03-01", "--instrument", "poor")
     kind = ["--product", "homogeneous"]

@@ -291,7 +291,7 @@ def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(
 
 def test_a_selection_without_a_scene_is_told_to_people_and_programs(archive: Archive) -> None:
     archive.write()
-    said = "no scene of the archive is asked for"
+    said = "the selection contains no scene of the archive"
     for command in ("plan", "reprocess"):
         for options, none in ((["--since", "2030-01-01"], True), (["--station", "coast"], False)):
             line = [command, str(archive.file), *options]
@@ -357,10 +357,10 @@ def test_the_run_in_which_a_scene_comes_to_nothing_says_so(
     command = ["reprocess", str(archive.file), "--instrument", "rich", "--force"]
     command += ["--until", "2026-03-02"]
     shown = CliRunner().invoke(app, [*command, "--product", "homogeneous"])
-    assert (shown.exit_code, "left nothing to use" in shown.stdout) == (0, False)
+    assert (shown.exit_code, "gave no usable value" in shown.stdout) == (0, False)
     shown = CliRunner().invoke(app, command)
     assert shown.exit_code == 1
-    assert shown.stdout.count("left nothing to use") == 1
+    assert shown.stdout.count("gave no usable value") == 1
     assert "earlier runs" not in shown.stdout
     told = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
     assert told["unusable_scenes"] == ["rich_20260301T000000"]

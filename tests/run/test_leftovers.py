@@ -87,14 +87,14 @@ def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None
         assert scene.plan.hash == plan_closure(scene.plan, planned_products(scene.plan)).hash
         told = [left.reason for left in scene.left_out if left.rule == "section_level"]
         assert len(told) == 1
-        assert "climbs by 750 m" in told[0]
+        assert "the beam climbs 750 m" in told[0]
         every = (*scene.plan.left_out, *scene.left_out)
         assert len(set(every)) == len(every)
     # One for all, as there may be many scenes.
     assert len({id(scene.left_out) for scene in record.scenes}) < len(record.scenes)
     page = report_run(archive.write(), record).page
-    assert "climbs by 750 m" in page.read_text()
-    assert "climbs by 750 m" in (page.parent / "run.json").read_text()
+    assert "the beam climbs 750 m" in page.read_text()
+    assert "the beam climbs 750 m" in (page.parent / "run.json").read_text()
 
 
 def test_a_report_names_scenes_that_can_give_nothing(

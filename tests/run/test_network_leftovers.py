@@ -198,7 +198,7 @@ def _no_network(net: Net) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_no_longer_meeting, "no beam meets others"),
+        (_no_longer_meeting, "no beam has two crossings with other beams"),
         (_another_channel, GONE),
         (_no_network, GONE),
     ],

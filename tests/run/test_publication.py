@@ -81,7 +81,7 @@ def test_the_command_line_publishes_and_says_what_it_did(
     assert digests(store) == expected
     (store / "note.txt").write_text("of somebody else")
     again = runner.invoke(app, words, env={"COLUMNS": "300"})
-    assert "0 sent, 2 unchanged, 1 others in the store left alone" in again.stdout
+    assert "0 sent, 2 unchanged, 1 other files left alone" in again.stdout
     product = next(campaign.products_root.rglob("*.nc"))
     product.write_bytes(product.read_bytes()[:-1] + b"?")
     next(store.rglob(product.name)).unlink()
