@@ -1,4 +1,4 @@
-"""Many files as one Dataset: the same as opening and stacking them one by one."""
+"""Many files as one Dataset equal the stack of the single files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def stacked(pilar) -> xr.Dataset:
 
 
 def make(tmp_path, name="a", minute=30, **changes):
-    """A small file that starts at 17:minute."""
+    """Write a small file that starts at 17:minute; return its path."""
     path = tmp_path / name
     path.parent.mkdir(parents=True, exist_ok=True)
     line = changes.pop("line_2", LINE_2).replace("17:30:", f"17:{minute:02d}:")
@@ -206,11 +206,11 @@ def test_sources(tmp_path):
 
 
 def catalogued(folder: Path, paths: list[Path]) -> list[Granule]:
-    """Granules of files, as a catalog would have them."""
-    found = []
+    """Return the granules of files, as in a catalog."""
+    granules = []
     for path in paths:
         header = licel.read_header(path)
-        found.append(
+        granules.append(
             Granule(
                 path=str(path.relative_to(folder)),
                 size=header.size,
@@ -227,19 +227,21 @@ def catalogued(folder: Path, paths: list[Path]) -> list[Granule]:
                 header_digest=licel.header_digest(header),
             )
         )
-    return found
+    return granules
 
 
 @pytest.fixture
 def headers_read(monkeypatch) -> list[str]:
-    """Paths of the files whose headers were read."""
-    seen: list[str] = []
+    """Return a list that collects the paths of the headers read."""
+    headers_seen: list[str] = []
     read = RawFile.read_header
-    monkeypatch.setattr(RawFile, "read_header", lambda file: seen.append(file.path) or read(file))
-    return seen
+    monkeypatch.setattr(
+        RawFile, "read_header", lambda file: headers_seen.append(file.path) or read(file)
+    )
+    return headers_seen
 
 
-def test_of_files_that_are_known_to_be_alike_one_header_is_read(tmp_path, headers_read):
+def test_one_header_is_read_of_files_with_equal_digests(tmp_path, headers_read):
     other_shots = (ANALOG.replace("000101", "000102"), PHOTON)
     paths = [make(tmp_path, f"a{k}", k, line_2=f"{LINE_2[:-2]}{k:02d}") for k in (5, 1, 3)]
     paths += [make(tmp_path, f"b{k}", k, datasets=other_shots) for k in (4, 2)]
@@ -257,11 +259,11 @@ def test_of_files_that_are_known_to_be_alike_one_header_is_read(tmp_path, header
     assert known.analog_532p.data.name == read.analog_532p.data.name
 
 
-def test_a_header_is_read_where_the_catalog_does_not_tell_what_is_asked(tmp_path, headers_read):
+def test_a_header_is_read_if_the_catalog_lacks_a_value(tmp_path, headers_read):
     paths = [make(tmp_path, f"a{k}", k) for k in range(4)]
     granules = catalogued(tmp_path, paths)
     headers_read.clear()
-    # A place: the catalog may have the station's.
+    # With a requested position: the catalog may hold that of the station.
     open_archive(granules, root=tmp_path)
     assert len(headers_read) == 4
     headers_read.clear()
@@ -269,7 +271,7 @@ def test_a_header_is_read_where_the_catalog_does_not_tell_what_is_asked(tmp_path
     open_archive(unknown, root=tmp_path, header_position="ignore")
     assert [Path(path).name for path in headers_read] == ["a0", "a1"]
     headers_read.clear()
-    # The first file is no longer what the catalog says: nothing is concluded from it.
+    # The first file has changed since the scan, so its header stands for no other.
     make(tmp_path, "a0", 0, line_2=LINE_2.replace("LidarPi", "LidarPo"))
     open_archive(granules, root=tmp_path, header_position="ignore")
     assert [Path(path).name for path in headers_read] == ["a0", "a1"]
@@ -315,7 +317,7 @@ def test_channels_in_another_order_are_the_same_channels(tmp_path):
     np.testing.assert_allclose(opened.analog_532p[:, 0] * 101 * 4096 / 500, [0, 10], atol=1e-4)
 
 
-def test_what_varies_from_file_to_file_is_a_variable(tmp_path):
+def test_properties_that_vary_are_variables(tmp_path):
     make(tmp_path, "a", 10)
     other = ANALOG.replace("0800", "0900").replace("0.500", "0.020").replace("BT0", "BT1")
     make(tmp_path, "b", 20, datasets=(other.replace("000101", "000099"), PHOTON))

@@ -31,7 +31,7 @@ def write(tmp_path, **changes):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """(offset, bytes) of every read."""
+    """Return a list that collects (offset, bytes) of every read."""
     seen = []
     pread, preadv = os.pread, os.preadv
 
@@ -167,12 +167,12 @@ def test_only_the_needed_bins_are_read(data_root, reads):
     assert sum(length for _, length in reads) <= 16_384
     offset = licel.read_header(path).datasets[7].offset
     reads.clear()
-    part = opened.photon_532p.isel(range=slice(100, 110)).values
+    profile = opened.photon_532p.isel(range=slice(100, 110)).values
     assert reads == [(offset + 400, 40)]
     reads.clear()
-    one = opened.photon_532p[0, 103].item()
+    value = opened.photon_532p[0, 103].item()
     assert reads == [(offset + 412, 4)]
-    assert one == part[0, 3]
+    assert value == profile[0, 3]
     reads.clear()
     assert opened.photon_532p.isel(range=slice(5, 5)).shape == (1, 0)
     assert opened.photon_532p.isel(range=slice(5, 5)).values.size == 0
@@ -230,7 +230,7 @@ def test_a_changed_file_is_refused(file):
         opened.photon_532p.load()
 
 
-def test_a_whole_profile_is_checked_for_its_place(tmp_path):
+def test_the_position_of_a_whole_profile_is_checked(tmp_path):
     content = bytearray(raw_file())
     content[licel.parse_header(bytes(content)).datasets[1].offset - 1] = 0
     path = tmp_path / "x"
@@ -311,7 +311,7 @@ def test_channels_on_other_grids(tmp_path):
     assert opened.range_3.values.tolist() == [3.75, 11.25]
 
 
-def test_wavelength_that_is_none_is_no_attribute(tmp_path):
+def test_an_impossible_wavelength_is_not_an_attribute(tmp_path):
     path = write(tmp_path, datasets=(ANALOG.replace("00532.p", "53200.o"),))
     attributes = xr.open_dataset(path, engine="licel").analog_53200o.attrs
     assert "wavelength" not in attributes

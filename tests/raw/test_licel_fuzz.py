@@ -1,4 +1,4 @@
-"""Damaged files: read as what they are, or refused; nothing else, in bounded memory."""
+"""Damaged files are read faithfully or refused, in bounded memory."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ MUTATIONS = [flip, overwrite, truncate, insert, delete, swap_digit, enlarge, rep
 
 
 def shrunk(path) -> bytes:
-    """A real header over three bins a dataset."""
+    """Return the bytes of a real file, cut to three bins per dataset."""
     header = licel.read_header(path)
     bins = f" {header.datasets[0].bins:05d} ".encode()
     text = header.source.replace(bins, b" 00003 ")
@@ -94,18 +94,18 @@ def originals(data_root) -> list[bytes]:
 
 @pytest.fixture
 def measured():
-    """Memory is traced."""
+    """Trace memory."""
     tracemalloc.start()
     yield
     tracemalloc.stop()
 
 
 def survives(path, content) -> bool:
-    """Whether the file is accepted. Then it must be written back as it is."""
+    """Return whether the file is accepted; then it must be written back unchanged."""
     rewrite(path, content)
     read, message, peak = measured_reading(path)
     limit = 10 * len(content) + SMALL_CONSTANT
-    # What other threads and the caches of the first time take is not taken again.
+    # Memory of other threads, and of caches filled for the first time, is not counted twice.
     assert min(peak, measured_reading(path)[2] if peak > limit else peak) <= limit
     if read is None:
         assert str(path) in message
@@ -115,7 +115,7 @@ def survives(path, content) -> bool:
 
 
 def measured_reading(path):
-    """Return header and counts, the message where they are refused, and the memory it took."""
+    """Return header and counts, the message of a refusal, and the peak memory."""
     read, message = None, ""
     before = start_measuring()
     try:
@@ -164,7 +164,7 @@ def test_mutants_are_read_or_refused(tmp_path, originals):
             if content:
                 mutate(content, rng)
         accepted += survives(path, bytes(content))
-    # Neither is everything refused nor everything let through.
+    # Some mutants are refused, some are accepted.
     assert MUTANTS / 20 < accepted < MUTANTS / 2
 
 
@@ -207,7 +207,7 @@ def test_arbitrary_bytes_behind_a_true_beginning(content, size):
         (b" 1 0 1 00001 1 0 7.5 1.o 0 0 0 0 8 1 1 B" + b"\r\n") * 2000,
     ],
 )
-def test_what_could_take_long_does_not(tmp_path, content, measured):
+def test_long_lines_are_refused_quickly(tmp_path, content, measured):
     assert not survives(tmp_path / "file", content)
 
 

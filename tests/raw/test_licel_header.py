@@ -1,4 +1,4 @@
-"""Every variant of the header, and every refusal."""
+"""Variants of the header, and refused headers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_raymetrics_place():
     assert header.zenith_angle == 0.0
 
 
-def test_weather_that_cannot_be_is_not_believed():
+def test_impossible_weather_is_ignored():
     header = place("0100 -060.0 -003.1 00 00 00.0 0000.0")
     assert (header.temperature, header.pressure) == (None, None)
     assert "impossible" in header.notes[0]
@@ -189,7 +189,7 @@ def test_mistyped_wavelength():
     assert math.isnan(dataset.wavelength)
 
 
-def test_zero_shots_is_no_value(tmp_path):
+def test_values_without_shots_are_nan(tmp_path):
     path = tmp_path / "x"
     path.write_bytes(raw_file((ANALOG.replace("000101", "000000"), PHOTON)))
     (header,), values = licel.read_physical([path])
@@ -240,7 +240,7 @@ def test_inactive_datasets_are_not_stored(tmp_path):
         licel.select(header, ["analog_532p_2"])
 
 
-def test_inactive_datasets_that_are_stored_are_stepped_over(tmp_path):
+def test_stored_inactive_datasets_are_skipped(tmp_path):
     path = tmp_path / "x"
     path.write_bytes(raw_file((INACTIVE, ANALOG, PHOTON)))
     header, counts = licel.read_counts(path)
@@ -347,7 +347,7 @@ def test_truncation_names_expected_and_found_bytes(tmp_path):
         ({"datasets": (ANALOG + " " + "x" * 1100,)}, "header"),
     ],
 )
-def test_absurd_headers_are_refused(changes, field):
+def test_impossible_headers_are_refused(changes, field):
     with pytest.raises(RawFormatError) as error:
         parse(**changes)
     assert error.value.file == "x.dat"
@@ -365,7 +365,7 @@ def test_other_files_are_refused(tmp_path, content):
         licel.read_header(path)
 
 
-def test_what_is_not_a_file_is_refused(tmp_path):
+def test_only_regular_files_are_opened(tmp_path):
     with pytest.raises(RawFormatError, match="cannot be opened"):
         licel.read_header(tmp_path / "absent")
     with pytest.raises(RawFormatError, match="not a regular file"):

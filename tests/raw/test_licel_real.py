@@ -15,19 +15,19 @@ from lidarops.raw import licel
 
 @pytest.fixture(scope="session")
 def files(data_root) -> list[Path]:
-    other = {".csv", ".nc", ".txt"}
+    other_suffixes = {".csv", ".nc", ".txt"}
     paths = [
         path
         for folder in ("manaus", "manaus_raman", "pilar", "saopaulo", "synthetic")
         for path in sorted((data_root / folder).rglob("*"))
-        if path.is_file() and path.suffix not in other
+        if path.is_file() and path.suffix not in other_suffixes
     ]
     assert len(paths) >= 201
     return paths
 
 
 def rebuild(header: licel.Header) -> licel.Header:
-    """The same header from its numbers alone."""
+    """Return the same header, rebuilt from its numbers."""
     datasets = [
         licel.new_dataset(
             kind=d.kind,
@@ -89,7 +89,7 @@ def test_physical_values_equal_the_formulas(files):
 
 
 def test_headers_are_what_instruments_write(files):
-    # From numbers alone, byte for byte; only the altitude of one source is unlike Licel's.
+    # Rebuilt from numbers, byte for byte; one source writes its altitude in another way.
     for path in files:
         header = licel.read_header(path)
         rebuilt = rebuild(header)
@@ -115,8 +115,8 @@ def test_physical_values_of_many_files_are_those_of_single_files(files):
 
 def test_counts_of_the_nearest_bins(files):
     _, whole = licel.read_counts(files[-1])
-    _, part = licel.read_counts(files[-1], bins=7)
-    for name, values in part.items():
+    _, nearest = licel.read_counts(files[-1], bins=7)
+    for name, values in nearest.items():
         np.testing.assert_array_equal(values, whole[name][:7])
 
 

@@ -1,4 +1,4 @@
-"""What is written is read back: random headers and counts, and what cannot be written."""
+"""Written files are read back; headers and counts that cannot be written are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reader benchmark measures what it says it measures; how fast is not asserted."""
+"""The reader benchmark returns consistent rates; speed is not asserted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def test_ways_and_rates(tmp_path):
     paths = [tmp_path / f"file{number}" for number in range(3)]
     for path in paths:
         path.write_bytes(raw_file())
-    results = readers.reader(paths, repeats=2)
+    results = readers.measure_readers(paths, repeats=2)
     assert [result.name for result in results] == [
         "read bytes (floor)",
         "numpy (floor)",
@@ -34,6 +34,6 @@ def test_ways_and_rates(tmp_path):
 
 def test_needs_files(tmp_path):
     with pytest.raises(RawFormatError, match="at least one file"):
-        readers.reader([])
+        readers.measure_readers([])
     with pytest.raises(RawFormatError, match="cannot be opened"):
-        readers.reader([tmp_path / "absent"])
+        readers.measure_readers([tmp_path / "absent"])

@@ -1,4 +1,4 @@
-"""A small simulated campaign for the tests of the simulation."""
+"""Fixture with a small simulated campaign."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Change = Callable[[dict[str, Any]], object]
 
 @pytest.fixture
 def small(tmp_path: Path) -> Callable[..., Campaign]:
-    """Return a maker of the small campaign; `changes` edit its tree."""
+    """Return a function that builds the small campaign; `changes` edit its settings."""
 
     def make(*changes: Change, archive: str = "raw") -> Campaign:
         tree = copy.deepcopy(TREE)

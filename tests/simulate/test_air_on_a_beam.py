@@ -1,4 +1,4 @@
-"""What beams pass through: every part of the air against its formula, and places against maps."""
+"""Air along beams: every part of the atmosphere against its formula."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def _air(altitude=0.0, seed=1, **parts):
 
 
 def _particles(beam=LEVEL, hours=0.0, wavelength=GREEN, distance=DISTANCE, seed=1, **parts):
-    """Extinction and backscatter by particles alone."""
+    """Return extinction and backscatter of particles alone."""
     moment = START + timedelta(hours=hours)
     full = _air(seed=seed, **parts).along(beam, distance, moment, wavelength)
     clear = _air().along(beam, distance, moment, wavelength)
     return full.extinction - clear.extinction, full.backscatter - clear.backscatter
 
 
-def test_a_level_beam_in_layered_air_is_homogeneous_and_no_other_is():
+def test_only_a_level_beam_in_layered_air_is_homogeneous():
     air = _air(altitude=300, boundary_layer={}, clouds=[])
     for azimuth in (0, 37, 270):
         assert air.along(LEVEL._replace(azimuth=azimuth), DISTANCE, START, GREEN).homogeneous
@@ -65,49 +65,49 @@ def test_clouds_have_edges_and_hours():
     np.testing.assert_allclose(extinction, 0.01 * inside, atol=1e-15)
     np.testing.assert_allclose(backscatter, 0.01 / 20 * inside, atol=1e-15)
     assert not _particles(UP, hours=1.5, clouds=[cloud])[0].any()
-    # On a slant beam it is farther.
+    # On a slant beam the cloud is farther away.
     slant, _ = _particles(UP._replace(zenith_angle=60.0), clouds=[cloud])
     np.testing.assert_allclose(DISTANCE[slant > 1e-3].min(), 2000, atol=7.5)
 
 
 def test_a_gradient_grows_towards_its_azimuth():
     gradient = {"extinction": 1e-4, "azimuth": 90, "scale": 5000, "top": 1000}
-    found, _ = _particles(gradients=[gradient])
-    np.testing.assert_allclose(found, 1e-4 * np.exp(DISTANCE / 5000), rtol=1e-9)
-    back, _ = _particles(LEVEL._replace(azimuth=270.0), gradients=[gradient])
-    np.testing.assert_allclose(back, 1e-4 * np.exp(-DISTANCE / 5000), rtol=1e-9)
+    extinction, _ = _particles(gradients=[gradient])
+    np.testing.assert_allclose(extinction, 1e-4 * np.exp(DISTANCE / 5000), rtol=1e-9)
+    opposite, _ = _particles(LEVEL._replace(azimuth=270.0), gradients=[gradient])
+    np.testing.assert_allclose(opposite, 1e-4 * np.exp(-DISTANCE / 5000), rtol=1e-9)
     across, _ = _particles(LEVEL._replace(azimuth=0.0), gradients=[gradient])
     np.testing.assert_allclose(across, 1e-4, rtol=1e-9)
     above, _ = _particles(UP, gradients=[gradient])
     np.testing.assert_allclose(above, 1e-4 * (DISTANCE <= 1000), atol=1e-15)
 
 
-def test_a_plume_goes_with_the_wind():
+def test_a_plume_drifts_with_the_wind():
     plume = {
         "extinction": 1e-3, "east": -3000, "north": 500, "height": 0,
         "horizontal_depth": 400, "vertical_depth": 100, "wind_east": 5,
     }  # fmt: skip
     beam = Beam(0.0, 500.0, 0.0, 90.0, 90.0)
     for minutes in (10, 15, 20):
-        found, _ = _particles(beam, hours=minutes / 60, plumes=[plume])
+        extinction, _ = _particles(beam, hours=minutes / 60, plumes=[plume])
         centre = -3000 + 5 * 60 * minutes
         expected = 1e-3 * np.exp(-0.5 * ((DISTANCE - centre) / 400) ** 2)
-        np.testing.assert_allclose(found, expected, atol=1e-14)
-    # Aside, it is thinner by the distance from its axis.
+        np.testing.assert_allclose(extinction, expected, atol=1e-14)
+    # Off its axis the plume is thinner.
     aside, _ = _particles(beam._replace(north=1300.0), hours=0.25, plumes=[plume])
     centred, _ = _particles(beam, hours=0.25, plumes=[plume])
     np.testing.assert_allclose(aside, centred * math.exp(-0.5 * 4), atol=1e-14)
 
 
-def test_profiles_and_soundings_are_those_given():
+def test_profiles_and_soundings_are_interpolated_as_given():
     profile = {
         "height": [0, 1000, 2000], "extinction": [1e-4, 2e-4, 0],
         "aerosol": {"lidar_ratio": 40, "angstrom_exponent": 2},
     }  # fmt: skip
-    found, back = _particles(UP, wavelength=1064e-9, profiles=[profile])
+    extinction, backscatter = _particles(UP, wavelength=1064e-9, profiles=[profile])
     expected = np.interp(DISTANCE, [0, 1000, 2000], [1e-4, 2e-4, 0], right=0) / 4
-    np.testing.assert_allclose(found, expected, atol=1e-15)
-    np.testing.assert_allclose(back, expected / 40, atol=1e-16)
+    np.testing.assert_allclose(extinction, expected, atol=1e-15)
+    np.testing.assert_allclose(backscatter, expected / 40, atol=1e-16)
     # A sounding of the standard atmosphere is the standard atmosphere.
     levels = {
         "altitude": [0.0, 11_000.0],
@@ -123,8 +123,10 @@ def test_turbulence_is_log_normal_with_its_correlation():
     course = {"minimum": 1e-4, "maximum": 1e-4}
     wide = {"deviation": 0.4, "horizontal_length": 200, "vertical_length": 50}
     distance = np.linspace(0, 400_000, 8001)  # 2000 correlation lengths, steps of 50 m
-    found, _ = _particles(distance=distance, homogeneous={"extinction": course}, turbulence=wide)
-    factor = found / 1e-4
+    extinction, _ = _particles(
+        distance=distance, homogeneous={"extinction": course}, turbulence=wide
+    )
+    factor = extinction / 1e-4
     # 256 waves are normal to 1 / 256, and 400 km hold some 800 independent values.
     assert factor.mean() == pytest.approx(1, abs=0.06)
     logarithm = np.log(factor)
@@ -136,7 +138,7 @@ def test_turbulence_is_log_normal_with_its_correlation():
         assert correlation == pytest.approx(expected, abs=0.1)
 
 
-def test_turbulence_is_the_same_for_all_who_look_and_goes_with_the_wind():
+def test_turbulence_is_the_same_for_all_beams_and_drifts_with_the_wind():
     parts = {
         "homogeneous": {"extinction": {"minimum": 1e-4, "maximum": 1e-4}},
         "turbulence": {
@@ -151,11 +153,11 @@ def test_turbulence_is_the_same_for_all_who_look_and_goes_with_the_wind():
     # 75 s later the air has moved by 100 bins.
     later, _ = _particles(LEVEL, hours=75 / 3600, **parts)
     np.testing.assert_allclose(later[100:], from_west[:-100], rtol=1e-6)
-    other, _ = _particles(LEVEL, seed=2, **parts)
-    assert np.abs(np.log(other / from_west)).mean() > 0.1
+    other_seed, _ = _particles(LEVEL, seed=2, **parts)
+    assert np.abs(np.log(other_seed / from_west)).mean() > 0.1
 
 
-def test_equal_states_are_the_same_air():
+def test_equal_states_mean_the_same_air():
     cloud = {
         "extinction": 0.01, "base": 1000, "top": 1500,
         "start": START.isoformat(), "stop": (START + timedelta(hours=1)).isoformat(),

@@ -24,7 +24,7 @@ BIN_TIME = 50e-9
 
 
 def _steps(noise, offset, **more):
-    """A recorder whose voltages are steps: 1 mV is one step."""
+    """Return a recorder with steps of 1 mV."""
     bits = more.pop("adc_bits", 12)
     return Digitiser(
         noise=noise, dark_offset=offset, adc_range=2.0**bits, adc_bits=bits,
@@ -33,7 +33,7 @@ def _steps(noise, offset, **more):
 
 
 def _summed(mean, deviation):
-    """Mean and variance of a rounded normal by the sum over all steps."""
+    """Return mean and variance of a rounded normal variable by the sum over all steps."""
     steps = np.arange(np.floor(mean - 12 * deviation) - 1, np.ceil(mean + 12 * deviation) + 2)
     chance = ndtr((steps + 0.5 - mean) / deviation) - ndtr((steps - 0.5 - mean) / deviation)
     first = (steps - mean) @ chance
@@ -75,7 +75,7 @@ def test_noise_below_a_step_is_not_averaged_out():
 
 @pytest.mark.parametrize("excess", [1.0, 1.3, 2.0])
 @pytest.mark.parametrize(("rate", "noise"), [(0.5, 0.05), (4.0, 0.1), (30.0, 0.05), (3.0, 0.4)])
-def test_few_photoelectrons_dither_by_their_own_charge(excess, rate, noise):
+def test_the_charge_spread_of_few_photoelectrons_dithers(excess, rate, noise):
     # The exact mixture: Poisson numbers, gamma charges, Gaussian noise, steps.
     gain = 0.02  # 0.4 steps for a photoelectron in a bin
     recorder = _steps(noise, 20.3, gain=gain, excess_noise=excess)
@@ -100,7 +100,7 @@ def test_few_photoelectrons_dither_by_their_own_charge(excess, rate, noise):
 
 
 def _shot_by_shot(rate, recorder, shots, bins, seed):
-    """Every sample of every shot, with gamma-distributed charges, rounded and clipped."""
+    """Draw every sample of every shot: gamma-distributed charges, rounded and clipped."""
     random = np.random.default_rng(seed)
     number = random.poisson(rate * 1e6 * BIN_TIME, (shots, bins))
     spread = recorder.excess_noise - 1.0
@@ -226,12 +226,12 @@ def test_without_shots_nothing_is_measured():
         ({"adc_bits": 40}, "adc_bits"),
     ],
 )
-def test_absurd_digitisers_are_refused_by_name(change, name):
+def test_impossible_digitisers_are_refused(change, name):
     with pytest.raises(SimulationInputError, match=name):
         Digitiser(**({"gain": 1.0, "noise": 0.5, "dark_offset": 3.0} | change))
 
 
-def test_noise_of_almost_nothing_is_refused_by_name():
+def test_too_little_noise_is_refused():
     random = np.random.default_rng(0)
     light = release(np.ones(5), shots=10, bin_width=BIN_WIDTH, random=random)
     with pytest.raises(SimulationInputError, match="noise"):

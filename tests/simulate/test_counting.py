@@ -1,4 +1,4 @@
-"""Photon counters against single events, in time, one after the other."""
+"""Photon counters against single events in time order."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _registered(arrivals, dead_time, paralyzable):
 
 @cache
 def _events(rate, paralyzable, dead_time=DEAD_TIME, windows=300_000):
-    """Photoelectrons and counts in windows of one bin, one after the other."""
+    """Return photoelectrons and counts in consecutive windows of one bin."""
     random = np.random.default_rng(11)
     span = windows * BIN_TIME
     arrivals = np.sort(random.random(random.poisson(rate * 1e6 * span)) * span)
@@ -52,9 +52,9 @@ def _counted(rate, paralyzable, shots=500, bins=60_000, dead_time=DEAD_TIME, see
 def test_counts_agree_with_single_events(rate, paralyzable):
     released, registered = _events(rate, paralyzable)
     number, counted = _counted(rate, paralyzable)
-    # Per photoelectron, which takes out the noise of how many there were.
-    part = registered.mean() / released.mean()
-    assert counted.mean() / number.mean() == pytest.approx(part, rel=0.005)
+    # Per photoelectron, which removes the noise of their number.
+    share = registered.mean() / released.mean()
+    assert counted.mean() / number.mean() == pytest.approx(share, rel=0.005)
     ratio = counted.var() / 500 / registered.var()
     # Standard errors: sqrt(2 / 60 000) = 0.006 of ours, and of the events that of a Poisson.
     assert 0.97 < ratio < 1.03
@@ -104,7 +104,7 @@ def test_a_paralyzable_counter_folds_back():
     assert _counted(600.0, paralyzable=False, bins=2000)[1].mean() > 2 * folded
 
 
-def test_two_photoelectrons_coincide_as_often_as_they_must():
+def test_two_photoelectrons_coincide_with_the_exact_probability():
     # One shot, no photoelectrons in the bin before: the chance that two at random places of a
     # bin are closer than the dead time.
     bins, dead_time = 600_000, 2e-9
@@ -112,8 +112,8 @@ def test_two_photoelectrons_coincide_as_often_as_they_must():
     light = release(np.full(bins, 30.0), shots=1, bin_width=BIN_WIDTH, random=random)
     pairs = (light.number == 2) & (np.roll(light.number, 1) == 0)
     lost = 2 - count_photons(light, dead_time=dead_time, random=random)[pairs].mean()
-    part = dead_time / BIN_TIME
-    assert lost == pytest.approx(2 * part - part**2, abs=4 * np.sqrt(2 * part / pairs.sum()))
+    share = dead_time / BIN_TIME
+    assert lost == pytest.approx(2 * share - share**2, abs=4 * np.sqrt(2 * share / pairs.sum()))
 
 
 @pytest.mark.parametrize("paralyzable", [False, True])
@@ -130,9 +130,9 @@ def test_a_bright_bin_blinds_the_start_of_the_next(paralyzable):
     starts = np.repeat(np.arange(rate.size) * BIN_TIME, sizes)
     arrivals = np.sort(starts + events.random(starts.size) * BIN_TIME)
     kept = _registered(arrivals, DEAD_TIME, paralyzable)
-    seen = np.histogram(kept, np.arange(rate.size + 1) * BIN_TIME)[0][1::2]
-    lost = 1 - seen.sum() / sizes[1::2].sum()
-    # By themselves the dim bins would lose 2 per cent.
+    counted_in_dim = np.histogram(kept, np.arange(rate.size + 1) * BIN_TIME)[0][1::2]
+    lost = 1 - counted_in_dim.sum() / sizes[1::2].sum()
+    # On their own, the dim bins would lose 2 percent.
     assert ours == pytest.approx(lost, abs=4 * np.sqrt(lost / sizes[1::2].sum()))
     assert lost > 0.032
 
@@ -162,7 +162,7 @@ def test_fast_counts_have_the_moments_of_the_full_ones(rate, paralyzable):
     st.booleans(),
     st.integers(0, 2**32),
 )
-def test_counts_are_never_more_than_photoelectrons(rates, shots, dead_time, paralyzable, seed):
+def test_counts_never_exceed_photoelectrons(rates, shots, dead_time, paralyzable, seed):
     random = np.random.default_rng(seed)
     light = release(np.array(rates), shots=shots, bin_width=BIN_WIDTH, random=random)
     assert light.rate.max() <= BRIGHTEST
@@ -183,7 +183,7 @@ def test_without_shots_nothing_is_measured():
     assert not fast.any()
 
 
-def test_absurd_light_is_refused_by_name():
+def test_impossible_light_is_refused():
     random = np.random.default_rng(0)
     for rate, shots, width, name in (
         ([-1.0], 5, 7.5, "rate"),

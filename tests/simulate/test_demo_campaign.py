@@ -1,4 +1,4 @@
-"""The demo campaign: well determined, honest, and small enough."""
+"""The demo campaign: its extinction can be retrieved, and it is small."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_demo_is_small(demo):
     assert result.size < 80e6
 
 
-def test_the_demo_has_every_kind_of_light(demo):
+def test_the_demo_covers_night_and_day(demo):
     truth = demo[1].truth
     coast = truth.isel(granule=truth["instrument"].values == "coast-horizontal")
     sky = coast["background_photon_532o"].values
@@ -44,7 +44,7 @@ def _counts(result, path, channel):
 
 
 def _fit(distance, power, variance, guess):
-    """Converged least squares of {1, f, df/dsigma}: the reference, and nothing of ours."""
+    """Converged least squares of {1, f, df/dsigma}, independent of the package."""
     p = np.array(guess)
     for _ in range(8):
         f = np.exp(-2 * p[2] * distance) / distance**2
@@ -85,15 +85,15 @@ def test_the_homogeneous_path_is_retrievable(demo, section, channel):
             step = 100 / 4096
             variance = (0.3**2 + step**2 / 12) / dataset.shots + 1.2 * 0.05 * model / exposure
             known[0] += float(truth[f"dark_offset_{channel}"][index])
-        found, error, chi2 = _fit(
+        estimate, error, chi2 = _fit(
             distance[inside], power[inside], variance[inside], (*known, sigma)
         )
-        scores.append((found - sigma) / error)
+        scores.append((estimate - sigma) / error)
         relative.append(error / (sigma + 1 / distance[inside].mean()))
         misfit.append(chi2)
     scores = np.array(scores)
     assert scores.size > 280
-    # Right within three standard errors, which are neither too small nor too large.
+    # Correct within three standard errors, which are neither too small nor too large.
     assert (np.abs(scores) < 3).mean() >= 0.99
     assert scores.std() == pytest.approx(1, abs=0.15)
     assert abs(scores.mean()) < 0.25
@@ -104,7 +104,7 @@ def test_the_homogeneous_path_is_retrievable(demo, section, channel):
     assert not peak or max(peak) < 0.095
 
 
-def test_the_vertical_path_is_plainly_not_homogeneous(demo):
+def test_the_vertical_path_is_clearly_not_homogeneous(demo):
     # The best homogeneous fit on a grid of extinction leaves far more than noise, always.
     _, result = demo
     truth = result.truth

@@ -52,7 +52,7 @@ def _profile(bins, offset=0.0):
 
 
 def _lag(first, second, bins, reach=14):
-    """Lag of the noise of `second` behind that of `first`, by the peak of the correlation."""
+    """Return the lag of the noise of `second` behind that of `first`: the correlation peak."""
     noise = [x - x.mean(axis=0) for x in (first, second)]
     noise = [x / x.std(axis=0) for x in noise]
     inside = slice(reach, bins - reach)
@@ -82,8 +82,8 @@ def test_the_lag_of_two_recorders_is_in_their_noise(lag):
         late = delay_recorder(light, lead - lag, bins, random=random)
         photon.append(count_photons(early, dead_time=DEAD_TIME, random=random))
         analog.append(digitise(late, RECORDER, random=random))
-    found = _lag(np.array(photon, float), np.array(analog, float), bins)
-    assert found == pytest.approx(lag, abs=0.2)
+    estimate = _lag(np.array(photon, float), np.array(analog, float), bins)
+    assert estimate == pytest.approx(lag, abs=0.2)
 
 
 @settings(deadline=None, max_examples=40)
@@ -91,19 +91,22 @@ def test_the_lag_of_two_recorders_is_in_their_noise(lag):
 def test_a_cut_bin_loses_no_photoelectrons(first, seed):
     random = np.random.default_rng(seed)
     light = release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=random)
-    seen = delay_recorder(light, first, 40, random=random)
-    assert seen.number.shape == seen.rate.shape == (40,)
-    assert np.all(seen.number >= 0)
+    delayed = delay_recorder(light, first, 40, random=random)
+    assert delayed.number.shape == delayed.rate.shape == (40,)
+    assert np.all(delayed.number >= 0)
     whole = int(np.floor(first + 1e-9))
     outer = light.number[whole : whole + 41].sum()
     inner = light.number[whole + 1 : whole + 40].sum()
-    assert inner <= seen.number.sum() <= outer
+    assert inner <= delayed.number.sum() <= outer
     np.testing.assert_allclose(
-        seen.rate, np.interp(first + np.arange(40), np.arange(60), light.rate), rtol=0.12, atol=1.0
+        delayed.rate,
+        np.interp(first + np.arange(40), np.arange(60), light.rate),
+        rtol=0.12,
+        atol=1.0,
     )
 
 
-def test_a_shifted_recorder_sees_the_light_of_its_own_bins():
+def test_a_shifted_recorder_records_the_light_of_its_own_bins():
     # Poisson numbers in bins cut anew have the mean of the bins themselves.
     bins, first = 300, 20.35
     random = np.random.default_rng(71)
@@ -111,18 +114,18 @@ def test_a_shifted_recorder_sees_the_light_of_its_own_bins():
     axis, own = _profile(400), _profile(400, offset=0.35 * BIN_WIDTH)[20 : 20 + bins]
     for _ in range(400):
         light = release(axis, shots=600, bin_width=BIN_WIDTH, random=random)
-        seen = delay_recorder(light, first, bins, random=random)
-        total += seen.number
+        delayed = delay_recorder(light, first, bins, random=random)
+        total += delayed.number
     expected = own * 400 * 600 * 0.05
     error = (total - expected) / np.sqrt(expected)
     # The straight line within a bin leaves 3e-4 of the signal where it bends most.
     bend = 3e-4 * np.sqrt(expected)
     assert np.all(np.abs(error) < 4.5 + bend)
     assert error.std() < 1.4
-    np.testing.assert_allclose(seen.rate, own, rtol=1e-3)
+    np.testing.assert_allclose(delayed.rate, own, rtol=1e-3)
 
 
-def test_recorders_off_the_axis_are_refused_by_name():
+def test_recorders_off_the_axis_are_refused():
     random = np.random.default_rng(0)
     light = release(np.ones(50), shots=5, bin_width=BIN_WIDTH, random=random)
     for first, bins in ((-0.5, 10), (41, 10), (40.5, 10), (0, 0), (np.nextafter(40, 50), 11)):
@@ -131,7 +134,7 @@ def test_recorders_off_the_axis_are_refused_by_name():
     assert delay_recorder(light, 40, 10, random=random).number.size == 10
 
 
-def test_a_whole_lag_draws_nothing():
+def test_a_lag_of_whole_bins_draws_no_random_number():
     random, other = np.random.default_rng(5), np.random.default_rng(5)
     light = release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=random)
     release(_profile(60), shots=50, bin_width=BIN_WIDTH, random=other)
@@ -185,9 +188,9 @@ def test_jitter_of_shots_is_one_factor_for_a_file():
     ours = np.array([
         release(r, shots=shots, bin_width=BIN_WIDTH, random=random).number for r in rate
     ])  # fmt: skip
-    expected, found = np.cov(single.T), np.cov(ours.T)
-    np.testing.assert_allclose(found, expected, rtol=0.13)
-    assert found[0, 1] > 0.3 * found[1, 1]
+    expected, covariance = np.cov(single.T), np.cov(ours.T)
+    np.testing.assert_allclose(covariance, expected, rtol=0.13)
+    assert covariance[0, 1] > 0.3 * covariance[1, 1]
 
 
 def test_a_thick_cloud_hides_what_is_above():

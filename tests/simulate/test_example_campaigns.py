@@ -1,4 +1,4 @@
-"""The campaigns in catalogs/: each can be simulated, read and retrieved from."""
+"""The campaigns in catalogs/ can be simulated, read and used for retrievals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _short(repository, tmp_path, name, **settings):
     return campaign.model_copy(update={"simulation": simulation})
 
 
-def test_a_scan_comes_over_the_zenith(repository, tmp_path):
+def test_a_scan_crosses_the_zenith(repository, tmp_path):
     campaign = _short(repository, tmp_path, "scan", duration=40 * 60)
     result = simulate_campaign(campaign)
     west, east = [90, 85, 80, 75, 70, 60, 45, 30], [0, 30, 45, 60, 70, 75, 80, 85, 90]
@@ -34,7 +34,7 @@ def test_a_scan_comes_over_the_zenith(repository, tmp_path):
     np.testing.assert_array_equal(signal["azimuth"], [azimuth for _, azimuth in expected])
     np.testing.assert_array_equal(result.truth["zenith_angle"], signal["zenith_angle"])
     np.testing.assert_array_equal(result.truth["azimuth"], signal["azimuth"])
-    # The beam along the ground sees one extinction.
+    # The level beam has one extinction.
     level = result.truth["zenith_angle"].values == 90
     np.testing.assert_array_equal(result.truth["homogeneous"].values == 1, level)
     assert np.isfinite(result.truth["extinction"].values[level]).all()
@@ -58,7 +58,7 @@ def test_both_sides_of_a_layered_sky_are_alike(repository, tmp_path):
             assert slant * math.cos(math.radians(angle)) == pytest.approx(vertical, rel=0.05)
 
 
-def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
+def test_a_network_shares_one_atmosphere(repository, tmp_path):
     campaign = _short(repository, tmp_path, "network")
     result = simulate_campaign(campaign)
     truth = result.truth
@@ -75,7 +75,7 @@ def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
     def extinction(name):
         return truth[f"profile_extinction_{name}_lidar"].isel({f"wavelength_{name}_lidar": 0})
 
-    # Each beam crosses the two others, where both lidars see the same air.
+    # Each beam crosses the two others; there both lidars measure the same air.
     names = list(directions)
     places = [campaign.stations[name] for name in names]
     net = geometry.build_network(
@@ -88,16 +88,17 @@ def test_a_network_looks_at_one_atmosphere(repository, tmp_path):
     assert net.crossings == 3
     assert net.near_crossing.all()
     for crossing in range(3):
-        here = net.passages.crossing == crossing
+        at_crossing = net.passages.crossing == crossing
         series = []
-        for beam, distance in zip(net.passages.beam[here], net.passages.range[here], strict=True):
-            there = truth[f"range_{names[beam]}_lidar"].values
+        beams, distances = net.passages.beam[at_crossing], net.passages.range[at_crossing]
+        for beam, distance in zip(beams, distances, strict=True):
+            cells = truth[f"range_{names[beam]}_lidar"].values
             series.append(
-                np.log(extinction(names[beam]).values[:, np.argmin(np.abs(there - distance))])
+                np.log(extinction(names[beam]).values[:, np.argmin(np.abs(cells - distance))])
             )
-        assert 1500.0 < net.passages.range[here].min() < 1700.0
-        assert 2900.0 < net.passages.range[here].max() < 3050.0
-        # Half a bin apart at most, which eddies of 400 m hardly tell.
+        assert 1500.0 < distances.min() < 1700.0
+        assert 2900.0 < distances.max() < 3050.0
+        # At most half a bin apart, far less than eddies of 400 m.
         assert np.abs(series[0] - series[1]).mean() < 0.02
         assert np.corrcoef(*series)[0, 1] > 0.98
     # Haze is thicker in the west.
@@ -110,19 +111,19 @@ def test_an_archive_of_four_stations(repository, tmp_path):
     result = simulate_campaign(campaign)
     refused = dict(zip(result.truth["path"].values, result.truth["refused"].values, strict=True))
     sites = {"manaus": "Manaus", "saopaulo": "Sao Paul", "pilar": "LidarPi", "golmud": "Golmud"}
-    seen = set()
+    stations = set()
     for path in result.paths:
         if refused[path]:
             continue
         header = licel.read_header(result.archive / path)
-        seen.add(path.partition("/")[0])
+        stations.add(path.partition("/")[0])
         assert header.site == sites[path.partition("/")[0]]
         assert header.zenith_angle == 0
-    assert seen == sites.keys()
+    assert stations == sites.keys()
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda t: t["simulation"].update(origin="nowhere"), "nowhere"),
         (lambda t: t["stations"]["north"].update(latitude=-47), "flat"),
@@ -135,10 +136,10 @@ def test_an_archive_of_four_stations(repository, tmp_path):
         ),
     ],
 )
-def test_what_a_network_cannot_be_is_told(repository, tmp_path, change, said):
+def test_an_impossible_network_is_refused(repository, tmp_path, change, message):
     campaign = load_campaign(repository / "catalogs/network.yaml", archive=tmp_path / "raw")
     tree = campaign.model_dump()
     change(tree)
-    with pytest.raises(CampaignError, match=said):
+    with pytest.raises(CampaignError, match=message):
         simulate_campaign(Campaign.model_validate(tree))
     assert not (tmp_path / "raw").exists()

@@ -50,7 +50,7 @@ def test_fast_files_agree_with_the_truth_within_their_noise(small):
         assert z.std() == pytest.approx(1, abs=0.03), name
 
 
-def test_fast_truth_is_the_truth_of_its_own_air(small):
+def test_the_truth_of_a_fast_simulation_fits_its_signals(small):
     def fast(tree):
         tree["simulation"]["fast"] = True
         tree["simulation"]["duration"] = 3600
@@ -72,8 +72,8 @@ def test_fast_truth_is_the_truth_of_its_own_air(small):
         distance = truth["range_hill_lidar"].values
         depth = truth["profile_optical_depth_hill_lidar"].values[row, 0]
         middle = depth - 0.5 * np.diff(depth, prepend=0)
-        back = truth["profile_backscatter_hill_lidar"].values[row, 0]
-        shape = back * np.exp(-2 * middle) / distance**2 * 30e12 * 0.05
+        backscatter = truth["profile_backscatter_hill_lidar"].values[row, 0]
+        shape = backscatter * np.exp(-2 * middle) / distance**2 * 30e12 * 0.05
         sky = float(truth["background_analog_1064o"][row])
         noise = np.sqrt(0.2**2 / 600 + 1.2 * 0.05 * (shape + sky) / 30)
         score = ((signal - shape - sky) / noise)[distance > 300]
@@ -108,7 +108,7 @@ def test_a_thin_layer_is_not_missed_by_coarse_truth(small):
         assert depths["fine"][end] == pytest.approx(depth, rel=1e-6)
 
 
-def test_profiles_of_long_campaigns_are_told_now_and_then(small):
+def test_long_campaigns_store_some_true_profiles(small):
     result = simulate_campaign(small(lambda t: t["simulation"].update(truth={"profiles": 2})))
     assert result.truth.sizes["profile_hill_lidar"] == 2
     assert list(result.truth["profile_granule_hill_lidar"].values) == [20, 22]
@@ -118,7 +118,7 @@ def test_profiles_of_long_campaigns_are_told_now_and_then(small):
     assert "profile_hill_lidar" not in none.truth.sizes
 
 
-def test_lasers_and_dark_offsets_drift_and_the_truth_says_so(small):
+def test_the_truth_holds_the_drift_of_laser_and_dark_offset(small):
     def drifting(tree):
         tree["simulation"]["duration"] = 7200
         del _simulated(tree)["hill-lidar"]

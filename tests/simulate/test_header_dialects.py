@@ -1,4 +1,4 @@
-"""Headers in the dialects of real stations, clocks that jump, and ways of measuring that change."""
+"""Headers in the dialects of real stations, jumping clocks and changing acquisitions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _headers(result):
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_every_dialect_says_the_same(small, dialect):
+def test_every_dialect_holds_the_same_values(small, dialect):
     result = simulate_campaign(small(_speaking(dialect)))
     headers = _headers(result)
     assert len(headers) == 4
@@ -66,7 +66,7 @@ def test_every_dialect_says_the_same(small, dialect):
 @pytest.mark.parametrize(
     ("dialect", "site", "zenith", "lasers", "dataset"),
     [
-        # As in the files of these stations, but for the times.
+        # As in the files of these stations, except for the times.
         (
             "manaus",
             b"Sao Paulo",
@@ -97,13 +97,13 @@ def test_every_dialect_says_the_same(small, dialect):
         ),
     ],
 )
-def test_lines_are_those_of_the_station(small, dialect, site, zenith, lasers, dataset):
+def test_header_lines_equal_those_of_the_station(small, dialect, site, zenith, lasers, dataset):
     result = simulate_campaign(small(_speaking(dialect)))
     lines = (result.archive / result.paths[0]).read_bytes().split(b"\r\n")
     times = b"31/12/2024 23:50:00 31/12/2024 23:51:00 0900 -046.7 -023.6"
     line = b" " + b" ".join([site, times, zenith])
     assert [text.rstrip() for text in lines[1:4]] == [line, lasers, dataset]
-    # Padded to 78 characters, but for a line 2 that is longer.
+    # Padded to 78 characters, except for a longer line 2.
     assert [len(text) for text in lines[:5]] == [78, max(78, len(line)), 78, 78, 78]
 
 
@@ -114,7 +114,7 @@ def test_manaus_names_files_by_tens_of_seconds(small):
         simulate_campaign(small(_speaking("manaus", interval=4, shots=20), archive="often"))
 
 
-def test_positions_may_come_the_other_way_round_or_without_signs(small):
+def test_positions_may_be_swapped_or_without_signs(small):
     def turned(tree):
         tree["instruments"]["hill-lidar"]["header_position"] = "latitude_first"
 
@@ -134,12 +134,12 @@ def test_bins_and_shots_may_change_within_a_day(small):
     ]
     campaign = small(_speaking("pilar", changes=changes))
     headers = _headers(simulate_campaign(campaign))
-    found = [
+    acquisitions = [
         (h.channels[0].shots, h.channels[0].bins, h.channels[0].bin_width, (h.stop - h.start))
         for h in headers
     ]
     minute, half = timedelta(seconds=60), timedelta(seconds=30)
-    assert found == [
+    assert acquisitions == [
         (600, 800, 7.5, minute),
         (300, 400, 7.5, half),
         (300, 400, 15, half),
@@ -153,7 +153,7 @@ def test_bins_and_shots_may_change_within_a_day(small):
     assert sorted(len(scene.granules) for scene in scenes) == [1, 1, 2]
 
 
-def test_files_of_a_gap_are_missing_and_the_others_are_the_same(small):
+def test_a_gap_changes_no_other_file(small):
     def coast(tree):
         del tree["simulation"]["instruments"]["hill-lidar"]
 
@@ -163,19 +163,19 @@ def test_files_of_a_gap_are_missing_and_the_others_are_the_same(small):
             {"start": "2024-12-31T23:53:30Z", "stop": "2024-12-31T23:57:00Z"}
         ]
 
-    whole, part = (
+    whole, gapped = (
         simulate_campaign(small(coast, archive="whole")),
-        simulate_campaign(small(gap, archive="part")),
+        simulate_campaign(small(gap, archive="gapped")),
     )
-    missing = set(whole.paths) - set(part.paths)
-    # Of the files that start at 53, 54, 55 and 56 minutes; names have the time of the stop.
+    missing = set(whole.paths) - set(gapped.paths)
+    # Files that start at minutes 53 to 56; names hold the stop time.
     assert missing == {f"coast/h24C3123.{minute}0000" for minute in (54, 55, 56, 57)}
-    assert part.truth.sizes["granule"] == 16
-    for path in part.paths:
-        assert (part.archive / path).read_bytes() == (whole.archive / path).read_bytes()
+    assert gapped.truth.sizes["granule"] == 16
+    for path in gapped.paths:
+        assert (gapped.archive / path).read_bytes() == (whole.archive / path).read_bytes()
 
 
-def test_a_clock_that_jumps_back_leaves_no_file_behind(small):
+def test_a_clock_that_jumps_back_loses_no_file(small):
     def summer_time(tree):
         tree["simulation"]["duration"] = 7200
         del tree["simulation"]["instruments"]["hill-lidar"]
@@ -194,7 +194,7 @@ def test_a_clock_that_jumps_back_leaves_no_file_behind(small):
     for header, middle, off in zip(headers, result.truth["time"].values, error, strict=True):
         true = header.start.replace(tzinfo=None) + timedelta(seconds=30 - off)
         assert np.datetime64(true) == middle
-    # The hour that the clock lived through twice is used once.
+    # The hour that occurs twice on the clock is used once.
     store = Store(campaign.catalog_url, campaign.name)
     scan_archive(campaign, store)
     granules = store.granules()
@@ -214,7 +214,7 @@ def test_a_year_may_end_within_an_archive(small):
     assert opened["time"].values.min() < np.datetime64("2025-01-01") < opened["time"].values.max()
 
 
-def test_line_ends_inside_the_data_end_nothing(small):
+def test_line_ends_inside_the_data_are_data(small):
     def bright(tree):
         # About 2573 counts a bin, which are 0x0A0D.
         tree["simulation"]["instruments"]["hill-lidar"]["detectors"][1]["background"] = {

@@ -1,4 +1,4 @@
-"""The simulator refuses what would otherwise become a wrong number without a word."""
+"""The simulator refuses impossible input instead of returning wrong numbers."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def digitise(rate, shots=600, recorder=RECORDER):
 
 @pytest.mark.parametrize("record", [count, digitise])
 @pytest.mark.parametrize("rate", [[1.0, np.nan], [1.0, -1.0]])
-def test_a_rate_that_is_none_is_not_recorded(record, rate):
+def test_impossible_rates_are_refused(record, rate):
     with pytest.raises(SimulationInputError, match="rate"):
         record(rate)
 
 
 @pytest.mark.parametrize("record", [count, digitise])
-def test_shots_are_counted_up(record):
+def test_negative_shots_are_refused(record):
     with pytest.raises(SimulationInputError, match="shots"):
         record([1.0], shots=-5)
 
@@ -67,12 +67,12 @@ def test_counts_never_wrap(record):
     assert record([250.0], shots=600).min() > 0
 
 
-def test_moments_of_no_rate_are_refused():
+def test_moments_of_an_impossible_rate_are_refused():
     with pytest.raises(SimulationInputError, match="rate"):
         counter_moments(np.array([np.nan]), dead_time=4e-9, bin_time=BIN_TIME)
 
 
-def test_a_naive_clock_is_refused():
+def test_a_time_without_zone_is_refused():
     with pytest.raises(SimulationInputError, match="time zone"):
         solar_elevation(datetime(2024, 6, 21, 12), 49.0, 36.0)  # noqa: DTZ001
     assert solar_elevation(datetime(2024, 6, 21, 9, 36, tzinfo=UTC), 49.0, 36.0) > 60.0
@@ -80,7 +80,7 @@ def test_a_naive_clock_is_refused():
         solar_elevation(datetime(2024, 6, 21, tzinfo=UTC), 149.0, 36.0)
 
 
-def test_ranges_that_are_none_are_refused():
+def test_impossible_ranges_are_refused():
     with pytest.raises(SimulationInputError, match="bin_width"):
         bin_centres(10, -7.5)
     r = bin_centres(10, 7.5)
@@ -88,7 +88,7 @@ def test_ranges_that_are_none_are_refused():
         backscatter_signal(r[::-1], extinction=r * 0, backscatter=r * 0, system_constant=1.0)
 
 
-def test_air_beyond_the_sounding_thins_as_the_standard_does():
+def test_air_above_a_sounding_follows_the_standard_atmosphere():
     levels = np.array([0.0, 3000.0, 12_000.0])
     pressure, temperature = us_standard(levels)
     settings = AtmosphereSettings.model_validate(
@@ -116,13 +116,13 @@ def test_air_beyond_the_sounding_thins_as_the_standard_does():
         ({"start": "2024-06-21"}, {"start": "9999-12-31"}, "age of lasers"),
     ],
 )
-def test_what_a_raw_file_cannot_hold_is_named_before_anything_is_written(old, new, message):
-    told = {
+def test_values_that_do_not_fit_a_raw_file_are_refused(old, new, message):
+    settings = {
         "seed": 1,
         "start": "2024-06-21T00:00:00Z",
         "duration": 600,
         "instruments": {
-            "one": {
+            "lidar": {
                 "kind": "vertical",
                 "acquisition": {"bin_width": 7.5},
                 "detectors": [
@@ -136,8 +136,8 @@ def test_what_a_raw_file_cannot_hold_is_named_before_anything_is_written(old, ne
             }
         },
     }
-    SimulationSettings.model_validate(told)
-    text = json.dumps(told)
+    SimulationSettings.model_validate(settings)
+    text = json.dumps(settings)
     (key, good), (_, bad) = *old.items(), *new.items()
     good_text, bad_text = (json.dumps(value).strip('"') for value in (good, bad))
     changed = text.replace(f'"{key}": {good_text}', f'"{key}": {bad_text}')
@@ -147,7 +147,7 @@ def test_what_a_raw_file_cannot_hold_is_named_before_anything_is_written(old, ne
         SimulationSettings.model_validate(json.loads(changed))
 
 
-def test_an_archive_that_cannot_be_made_is_named(tmp_path, small):
+def test_an_archive_that_cannot_be_created_is_named(tmp_path, small):
     (tmp_path / "raw").write_text("a file")
     with pytest.raises(CatalogError, match="cannot be made"):
         simulate_campaign(small(archive="raw/deeper"))

@@ -1,4 +1,4 @@
-"""Damage of every kind: what it does to the bytes, and what the chain makes of it."""
+"""Damage of every kind: the changed bytes, and the handling by the processing."""
 
 from __future__ import annotations
 
@@ -48,21 +48,21 @@ def damaged(small):
 def _granules(campaign):
     store = Store(campaign.catalog_url, campaign.name)
     scan_archive(campaign, store)
-    found = store.granules()
+    granules = store.granules()
     store.close()
-    return found
+    return granules
 
 
-def test_the_catalog_refuses_what_must_be_refused_and_nothing_else(damaged):
+def test_the_catalog_refuses_exactly_the_unreadable_files(damaged):
     campaign, result = damaged
     truth = result.truth
-    told = dict(zip(truth["path"].values, truth["refused"].values, strict=True))
-    assert sum(told.values()) == 8
-    found = {g.path: g for g in _granules(campaign) if g.role is Role.SIGNAL}
-    assert found.keys() == told.keys()
-    for path, granule in found.items():
-        assert (granule.status is Status.REFUSED) == bool(told[path]), (path, granule.reason)
-        assert bool(granule.reason) == bool(told[path])
+    refused = dict(zip(truth["path"].values, truth["refused"].values, strict=True))
+    assert sum(refused.values()) == 8
+    granules = {g.path: g for g in _granules(campaign) if g.role is Role.SIGNAL}
+    assert granules.keys() == refused.keys()
+    for path, granule in granules.items():
+        assert (granule.status is Status.REFUSED) == bool(refused[path]), (path, granule.reason)
+        assert bool(granule.reason) == bool(refused[path])
 
 
 def test_the_copy_of_a_file_is_set_aside(damaged):
@@ -76,10 +76,10 @@ def test_the_copy_of_a_file_is_set_aside(damaged):
     assert original.read_bytes() == (result.archive / expected[0]).read_bytes()
 
 
-def test_what_must_be_flagged_is_flagged_by_the_retrieval(small):
+def test_the_retrieval_flags_exactly_the_damaged_profiles(small):
     def retrieved(tree):
         _all_kinds(tree)
-        # So weak that no good file comes near the limits of the photon counter.
+        # Weak enough that no good file comes near the limits of the photon counter.
         _coast(tree)["detectors"][0]["signal_rate"] = 0.5
         tree["instruments"]["coast-lidar"]["products"] = {
             "homogeneous": {
@@ -116,18 +116,18 @@ def test_what_must_be_flagged_is_flagged_by_the_retrieval(small):
     for index, kind in enumerate(truth["damage"].values):
         expected = raised.get(DamageKind(kind), {}) if kind else {}
         for channel in ("photon_532o", "analog_532o"):
-            found = flags.get((truth["time"].values[index], channel))
+            flag = flags.get((truth["time"].values[index], channel))
             if kind and DamageKind(kind).refused:
-                assert found is None, kind
+                assert flag is None, kind
                 continue
             used += 1
-            wanted = expected.get(channel, Quality(0))
-            assert found & alarms & wanted == wanted, (kind, channel, found)
-            assert wanted or not found & alarms, (kind, channel, found)
+            required = expected.get(channel, Quality(0))
+            assert flag & alarms & required == required, (kind, channel, flag)
+            assert required or not flag & alarms, (kind, channel, flag)
     assert used == 2 * (2 * len(KINDS) + 1 - 8)
 
 
-def test_random_damage_is_found_too(small):
+def test_random_damage_is_refused_too(small):
     def chance(tree):
         tree["simulation"]["duration"] = 60 * 120
         _coast(tree)["acquisition"]["bins"] = 64
@@ -143,7 +143,7 @@ def test_random_damage_is_found_too(small):
     assert refused == set(truth["path"].values[truth["refused"].values == 1])
 
 
-def test_damage_is_what_it_is_called(small, damaged):
+def test_each_kind_of_damage_changes_the_stated_bytes(small, damaged):
     clean = simulate_campaign(small(_without_damage, archive="clean"))
     _, result = damaged
     paths = [path for path in result.truth["path"].values if not path.endswith(".copy")]
@@ -168,7 +168,7 @@ def _read(content):
 
 
 def _changed(good, bad):
-    """Number of bins of each channel that differ, the header being the same."""
+    """Return the number of differing bins of each channel; the headers must be equal."""
     assert good.partition(b"\r\n\r\n")[0] == bad.partition(b"\r\n\r\n")[0]
     before, after = _read(good)[1], _read(bad)[1]
     return {name: int((before[name] != after[name]).sum()) for name in before}
@@ -325,7 +325,7 @@ def test_a_vertical_sign_on_a_level_path_is_refused(small):
         simulate_campaign(small(level))
 
 
-def test_a_refused_file_says_which_one_it_is(damaged):
+def test_the_error_names_the_refused_file(damaged):
     _, result = damaged
     for path in result.truth["path"].values[result.truth["refused"].values == 1]:
         with pytest.raises(RawFormatError, match=Path(path).name):

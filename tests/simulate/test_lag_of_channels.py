@@ -1,4 +1,4 @@
-"""Two recorders of one detector with a lag see the same photoelectrons."""
+"""Two recorders of one detector with a lag record the same photoelectrons."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def lag_of(analog, photon, lags=range(-4, 12)):
     noise = [channel - channel.mean(axis=0) for channel in (analog, photon)]
     correlation = []
     for lag in lags:
-        one, other = noise[0][:, window + lag], noise[1][:, window]
-        correlation.append((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum()))
+        first, second = noise[0][:, window + lag], noise[1][:, window]
+        correlation.append((first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum()))
     correlation = np.array(correlation)
     best = int(correlation.argmax())
-    before, here, after = correlation[best - 1 : best + 2]
-    crossing = 0.5 * (before - after) / (before - 2.0 * here + after)
-    return lags[best] + crossing, here
+    before, highest, after = correlation[best - 1 : best + 2]
+    shift = 0.5 * (before - after) / (before - 2.0 * highest + after)
+    return lags[best] + shift, highest
 
 
 @pytest.mark.parametrize("lag", [0, 3, 7])
@@ -35,14 +35,14 @@ def test_lag_shows_in_the_noise(small, lag):
         del tree["instruments"]["coast-lidar"]["dark_files"]
         for facts in tree["instruments"]["coast-lidar"]["facts"]:
             facts["channels"]["photon_532o"]["range_offset"] = 0.0
-            # An analog recorder that starts before the laser shows everything later.
+            # A recorder that starts before the laser shows the signal in later bins.
             facts["channels"]["analog_532o"] = {"range_offset": -lag * BIN}
 
     result = simulate_campaign(small(late, archive=f"lag{lag}"))
     archive = open_archive([str(result.archive / path) for path in result.paths])
-    found, correlation = lag_of(
+    estimate, correlation = lag_of(
         archive["analog_532o"].to_numpy().astype(float),
         archive["photon_532o"].to_numpy().astype(float),
     )
-    assert found == pytest.approx(lag, abs=0.2)
+    assert estimate == pytest.approx(lag, abs=0.2)
     assert correlation > 0.2

@@ -49,7 +49,7 @@ def test_a_homogeneous_path_is_the_integral_over_each_bin(extinction):
         assert abs(signal[index] / exact - 1) <= 4e-4
 
 
-def test_light_that_changes_its_wavelength_is_attenuated_by_both():
+def test_raman_light_is_attenuated_at_both_wavelengths():
     distance = bin_centres(500, 7.5)
     out, back = np.full(500, 3e-4), np.full(500, 2e-4)
     both = {"system_constant": 1e12, "full_overlap_range": 200.0, "backscatter": np.ones(500)}
@@ -76,7 +76,7 @@ def test_isotropic_scatterers_of_one_kind():
     "change",
     [{"extinction": -1e-4}, {"backscatter": -1e-6}, {"returning_extinction": np.inf}],
 )
-def test_air_that_does_not_exist_is_refused_by_name(change):
+def test_impossible_air_is_refused(change):
     air = {"extinction": 1e-4, "backscatter": 1e-6, "returning_extinction": 1e-4} | change
     with pytest.raises(SimulationInputError, match=next(iter(change))):
         backscatter_signal(
@@ -192,7 +192,7 @@ def _lidar(**changes):
     )
 
 
-def test_the_photons_of_a_lidar_are_those_of_its_laser():
+def test_photons_add_up_from_laser_to_detector():
     lidar = _lidar()
     # 100 mJ at 532 nm are 2.678e17 photons; from 1 km, 1e-6 m-1 sr-1 sends 7.5e-12 of them per
     # metre of telescope squared and bin: counted by hand, photon by photon.
@@ -214,7 +214,7 @@ def test_the_photons_of_a_lidar_are_those_of_its_laser():
     assert lidar.power_constant == pytest.approx(peak)
 
 
-def test_what_a_lidar_sees_scales_as_it_must():
+def test_the_system_constant_scales_with_the_lidar():
     base = _lidar().system_constant
     assert _lidar(energy=0.2).system_constant == pytest.approx(2 * base)
     assert _lidar(aperture_diameter=0.6).system_constant == pytest.approx(4 * base)
@@ -237,7 +237,7 @@ def test_a_pulse_of_a_lidar_smears_a_cloud():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"aperture_diameter": 0.0}, "aperture_diameter"),
         ({"energy": -1.0}, "energy"),
@@ -252,8 +252,8 @@ def test_a_pulse_of_a_lidar_smears_a_cloud():
         ({"energy": math.nan}, "energy"),
     ],
 )
-def test_lidars_that_nobody_built_are_refused_by_name(change, told):
-    with pytest.raises(SimulationInputError, match=told):
+def test_impossible_lidars_are_refused(change, message):
+    with pytest.raises(SimulationInputError, match=message):
         _lidar(**change)
 
 

@@ -58,7 +58,7 @@ def test_a_rectangular_pulse_has_the_exact_near_range_factor(duration, first, st
     distance = length * first + step * np.arange(500)
     ours = _homogeneous(distance, 0.0, RectangularPulse(duration), resolution=resolution)
     exact = 1 / (distance * (distance - length))
-    # Next to the lidar, the rounding of R - c tau / 2 alone costs more digits.
+    # Next to the lidar, rounding of R - c tau / 2 costs more digits.
     digits = 1e-15 * distance / (distance - length)
     assert np.all(np.abs(ours / exact - 1) <= 2e-14 + digits)
     assert np.all(np.abs(ours / exact - 1)[distance > 1.01 * length] <= 1e-12)
@@ -140,7 +140,7 @@ def test_the_origin_of_time_is_as_stated():
 
 
 def _power(name, time):
-    """Power of the shapes (1/s), written down from their definitions."""
+    """Return the power of a pulse shape by its definition, 1/s."""
     if name == "rectangle":
         return 1 / 20e-9 if 0 <= time <= 20e-9 else 0.0
     if name in {"gauss", "peak"}:
@@ -185,7 +185,7 @@ def test_every_shape_is_its_integral(name, far):
     assert ours == pytest.approx(exact, rel=3e-5)
 
 
-def test_properties_are_straight_between_their_points():
+def test_optical_properties_are_linear_between_their_points():
     # Two points only: extinction and backscatter rise linearly, the optical depth as R^2.
     distance = np.array([500.0, 1500.0, 2900.0, 3500.0])
     ours = pulsed_signal(
@@ -289,7 +289,7 @@ def test_a_long_pulse_over_the_telescope_stays_finite():
         ({"returning_extinction": np.full(50, -1.0)}, "returning_extinction"),
     ],
 )
-def test_absurd_input_is_refused_by_name(change, name):
+def test_impossible_input_is_refused(change, name):
     good = {
         "extinction": np.full(50, 1e-4),
         "backscatter": np.full(50, 1e-6),
@@ -314,14 +314,14 @@ def test_absurd_input_is_refused_by_name(change, name):
         lambda: ExponentialPulse(0.0),
     ],
 )
-def test_pulses_of_no_laser_are_refused(make):
+def test_impossible_pulses_are_refused(make):
     with pytest.raises(SimulationInputError):
         make()
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(50, 800), st.floats(3, 30), st.booleans())
-def test_any_overlap_object_gives_what_its_formula_gives(full, width, exponential):
+def test_an_overlap_object_equals_the_built_in_formula(full, width, exponential):
     # The same overlap by the built-in formula and evaluated from outside.
     class Outside:
         def __call__(self, distance):

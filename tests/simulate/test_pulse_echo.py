@@ -1,4 +1,4 @@
-"""Pulses that last, against integrals of the lidar equation."""
+"""Signals of finite pulses against integrals of the lidar equation."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _shape(shape, width):
     [("rectangle", 100e-9), ("rectangle", 20e-9), ("gaussian", 60e-9), ("exponential", 15e-9)],
 )
 def test_a_pulse_is_smeared_as_the_integral_says(sigma, shape, width):
-    found = _echo(sigma, shape, width)
+    signal = _echo(sigma, shape, width)
     pulse, (first, last) = _shape(shape, width)
 
     def rate(at):
@@ -59,13 +59,13 @@ def test_a_pulse_is_smeared_as_the_integral_says(sigma, shape, width):
         inside, weights = np.polynomial.legendre.leggauss(4)
         points = start + 0.5 * STEP * (inside + 1)
         expected = 1e6 * sum(w * rate(p) for w, p in zip(weights, points, strict=True)) / 2
-        assert found[number] == pytest.approx(expected, rel=2e-5)
+        assert signal[number] == pytest.approx(expected, rel=2e-5)
 
 
 def test_a_rectangular_pulse_without_extinction_has_a_closed_form():
     # The mean over s of (R - s)^-2 is 1 / ((R - l/2) (R + l/2)); over a bin, a logarithm.
     width = 2 * 15.0 / SPEED_OF_LIGHT
-    found = _echo(0.0, "rectangle", width)
+    signal = _echo(0.0, "rectangle", width)
     near, far = DISTANCE - 0.5 * STEP, DISTANCE + 0.5 * STEP
     beyond = DISTANCE > 60
 
@@ -74,12 +74,12 @@ def test_a_rectangular_pulse_without_extinction_has_a_closed_form():
 
     expected = 1e6 * (antiderivative(far[beyond]) - antiderivative(near[beyond])) / STEP
     # Cells of a quarter of a bin: an error of the second order in their size.
-    np.testing.assert_allclose(found[beyond], expected, rtol=3e-4)
-    np.testing.assert_allclose(found[40:], expected[32:], rtol=1.5e-5)
+    np.testing.assert_allclose(signal[beyond], expected, rtol=3e-4)
+    np.testing.assert_allclose(signal[40:], expected[32:], rtol=1.5e-5)
 
 
-def test_a_short_pulse_is_no_pulse():
-    found = _echo(2e-4, "gaussian", 5e-9, full=300.0)
+def test_a_short_pulse_gives_the_short_pulse_signal():
+    signal = _echo(2e-4, "gaussian", 5e-9, full=300.0)
     path = _path(2e-4)
     point = backscatter_signal(
         DISTANCE,
@@ -89,14 +89,14 @@ def test_a_short_pulse_is_no_pulse():
         full_overlap_range=300.0,
     )
     far = DISTANCE > 400
-    np.testing.assert_allclose(found[far], point[far], rtol=2e-4)
+    np.testing.assert_allclose(signal[far], point[far], rtol=2e-4)
 
 
 def test_nothing_diverges_at_the_lidar():
-    found = _echo(1e-4, "rectangle", 1e-6, full=500.0)
-    assert np.isfinite(found).all()
-    assert (found >= 0).all()
-    assert found[:20].max() < 100 * found[200]
+    signal = _echo(1e-4, "rectangle", 1e-6, full=500.0)
+    assert np.isfinite(signal).all()
+    assert (signal >= 0).all()
+    assert signal[:20].max() < 100 * signal[200]
 
 
 def test_the_base_of_a_cloud_is_blurred_by_the_pulse(small):

@@ -1,4 +1,4 @@
-"""Simulated archives: deterministic, readable, true to their truth, damaged as asked."""
+"""Simulated archives: deterministic, readable, and consistent with their truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _contents(root):
 
 
 def _signals(root, path):
-    """Physical values by channel, from the bytes."""
+    """Return header and physical values by channel."""
     content = (Path(root) / path).read_bytes()
     header = licel.parse_header(content, file=path)
     values = {
@@ -45,8 +45,8 @@ def test_the_same_seed_gives_the_same_bytes(small):
     assert _contents(first.archive) == _contents(second.archive)
     assert first.paths == second.paths
     assert first.truth.identical(second.truth)
-    other = simulate_campaign(small(lambda t: t["simulation"].update(seed=8), archive="three"))
-    changed, before = _contents(other.archive), _contents(first.archive)
+    reseeded = simulate_campaign(small(lambda t: t["simulation"].update(seed=8), archive="three"))
+    changed, before = _contents(reseeded.archive), _contents(first.archive)
     assert changed.keys() == before.keys()
     assert all(changed[name] != before[name] for name in changed)
 
@@ -59,9 +59,9 @@ def test_a_file_does_not_depend_on_the_others(small):
         del _simulated(tree)["hill-lidar"]
         _simulated(tree)["coast-lidar"]["damage"] = [{"kind": "garbage", "index": 3}]
 
-    part = _contents(simulate_campaign(small(shorter, archive="part")).archive)
-    different = {name for name in part if part[name] != whole.get(name)}
-    # The damaged file, and the dark file after the end, which now is at another time.
+    shortened = _contents(simulate_campaign(small(shorter, archive="part")).archive)
+    different = {name for name in shortened if shortened[name] != whole.get(name)}
+    # The damaged file, and the dark file after the end, which is now earlier.
     assert different == {"coast/h24C3123.540000", "coast/dark/d2510100.010000"}
 
 
@@ -82,7 +82,7 @@ def test_simulating_again_changes_nothing(small):
     assert _contents(simulate_campaign(campaign).archive) == before
 
 
-def test_files_are_named_and_headed_as_licel_does(small):
+def test_names_and_headers_follow_licel(small):
     result = simulate_campaign(small())
     assert sorted(_contents(result.archive)) == sorted(result.paths)
     assert result.size == sum(map(len, _contents(result.archive).values()))
@@ -106,7 +106,7 @@ def test_files_are_named_and_headed_as_licel_does(small):
     assert "coast/h24C3123.510000" in result.paths  # the month is hexadecimal
 
 
-def test_the_truth_has_its_schema(small):
+def test_the_schema_of_the_truth(small):
     truth = simulate_campaign(small()).truth
     profiles = {"profile_hill_lidar": 4, "wavelength_hill_lidar": 2, "range_hill_lidar": 200}
     assert dict(truth.sizes) == {"granule": 24} | profiles
@@ -130,7 +130,7 @@ def test_the_truth_has_its_schema(small):
 
 
 def _expected(truth, index, channel, distance):
-    """P* + B R^-2 exp(-2 sigma R) of the truth: the lidar equation written anew."""
+    """Return P* + B R^-2 exp(-2 sigma R) with the values of the truth."""
     sigma = float(truth["extinction"][index])
     background = float(truth[f"background_{channel}"][index])
     amplitude = float(truth[f"amplitude_{channel}"][index])
@@ -163,7 +163,7 @@ def test_files_agree_with_the_truth_within_their_noise(small):
         assert z.shape == (20, beyond.sum()), name
         assert abs(z.mean()) < 4 / np.sqrt(z.size), name
         assert z.std() == pytest.approx(1.0, abs=0.03), name
-        # Bin by bin as well: no range is favoured.
+        # The same for every bin.
         assert np.abs(z.mean(axis=0) * np.sqrt(20)).max() < 5, name
         assert (z.mean(axis=0) ** 2).mean() * 20 == pytest.approx(1.0, abs=0.25), name
     # The dead time of the other period does not explain the later files.
@@ -194,7 +194,7 @@ def test_a_trigger_delay_of_the_facts_shifts_a_channel(small):
     path = plain.truth["path"].values[0]
     _, before = _signals(plain.archive, path)
     _, after = _signals(moved.archive, path)
-    # Ten bins later, and nothing but sky before the pulse leaves.
+    # Ten bins later, with sky background only before the pulse leaves.
     rate = _expected(plain.truth, 0, "photon_532o", (np.arange(600) + 0.5) * 7.5)[50:-10]
     noise = np.sqrt(0.2**2 / 600 + 1.2 * 0.05**2 * rate / 30)
     score = (after["analog_532o"][60:] - before["analog_532o"][50:-10]) / noise / np.sqrt(2)
@@ -228,16 +228,16 @@ def test_progress_counts_every_file(small):
     assert sum(steps) == len(result.paths)
 
 
-def test_strangers_in_the_archive_are_not_mixed_in(small):
+def test_foreign_files_in_the_archive_are_refused(small):
     campaign = small()
-    stranger = Path(campaign.archive) / "coast" / "h24C3122.000000"
-    stranger.parent.mkdir(parents=True)
-    stranger.write_bytes(b"a real measurement")
-    (stranger.parent / "readme").write_text("not matched by any pattern")
+    foreign = Path(campaign.archive) / "coast" / "h24C3122.000000"
+    foreign.parent.mkdir(parents=True)
+    foreign.write_bytes(b"a real measurement")
+    (foreign.parent / "readme").write_text("not matched by any pattern")
     with pytest.raises(CampaignError, match="h24C3122"):
         simulate_campaign(campaign)
     assert _contents(campaign.archive).keys() == {"coast/h24C3122.000000", "coast/readme"}
-    stranger.unlink()
+    foreign.unlink()
     assert simulate_campaign(campaign).paths
 
 
@@ -246,7 +246,7 @@ def _drop_dead_time(tree):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda t: t.pop("simulation"), "has no simulation"),
         (
@@ -262,9 +262,9 @@ def _drop_dead_time(tree):
     ],
 )
 def test_a_simulation_that_contradicts_the_campaign_is_refused_before_it_writes(
-    small, change, said
+    small, change, message
 ):
     campaign = small(change)
-    with pytest.raises(CampaignError, match=said):
+    with pytest.raises(CampaignError, match=message):
         simulate_campaign(campaign)
     assert not Path(campaign.archive).exists()

@@ -1,4 +1,4 @@
-"""What a campaign file may say of its simulation."""
+"""Simulation settings: valid ones, and those that are refused."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_the_small_campaign_counts_its_files(small):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda t: t["simulation"].update(seed=-1), "seed"),
         (lambda t: t["simulation"].update(colour="red"), "colour"),
@@ -77,12 +77,12 @@ def test_the_small_campaign_counts_its_files(small):
         ),
     ],
 )
-def test_a_campaign_that_cannot_be_simulated_is_told(small, change, said):
-    with pytest.raises(ValidationError, match=said):
+def test_a_campaign_that_cannot_be_simulated_is_refused(small, change, message):
+    with pytest.raises(ValidationError, match=message):
         small(change)
 
 
-def test_models_refuse_what_physics_refuses():
+def test_impossible_settings_are_refused():
     with pytest.raises(ValidationError, match="digitiser steps"):
         AnalogRecorder(gain=0.1, noise=0.001, dark_offset=3.0, adc_range=500)
     with pytest.raises(ValidationError, match="clip noise at zero"):
@@ -115,7 +115,7 @@ def test_settings_are_frozen(small):
 
 
 def _as_lidar(tree, **keys):
-    """Make the coast lidar one that looks at given air."""
+    """Give the coast lidar an atmosphere of its own."""
     coast = _coast(tree)
     del coast["aerosol_extinction"]
     coast["kind"] = "lidar"
@@ -126,7 +126,7 @@ _LEVEL = {"homogeneous": {"extinction": {"minimum": 1e-4, "maximum": 1e-4}}}
 
 
 @pytest.mark.parametrize(
-    ("keys", "said"),
+    ("keys", "message"),
     [
         ({}, "has no atmosphere"),
         ({"atmosphere": {"haze": {}}}, "haze"),
@@ -211,15 +211,15 @@ _LEVEL = {"homogeneous": {"extinction": {"minimum": 1e-4, "maximum": 1e-4}}}
         ({"atmosphere": _LEVEL, "laser": {"jitter": 2}}, "jitter"),
     ],
 )
-def test_absurd_air_and_pointing_are_told(small, keys, said):
-    with pytest.raises(ValidationError, match=said):
+def test_impossible_air_and_pointing_are_refused(small, keys, message):
+    with pytest.raises(ValidationError, match=message):
         small(lambda tree: _as_lidar(tree, **keys))
-    # The same lidar in front of possible air is all right.
+    # The same lidar with possible air is accepted.
     assert small(lambda tree: _as_lidar(tree, atmosphere=_LEVEL)).simulation
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"dialect": "martian"}, "dialect"),
         ({"gaps": [{"start": "2025-01-02", "stop": "2025-01-01"}]}, "later than start"),
@@ -234,8 +234,8 @@ def test_absurd_air_and_pointing_are_told(small, keys, said):
         ({"bin_width": 0}, "bin_width"),
     ],
 )
-def test_absurd_acquisitions_are_told(small, change, said):
-    with pytest.raises(ValidationError, match=said):
+def test_impossible_acquisitions_are_refused(small, change, message):
+    with pytest.raises(ValidationError, match=message):
         small(lambda tree: _coast(tree)["acquisition"].update(change))
 
 
@@ -275,13 +275,13 @@ def test_optics_give_the_strength_of_the_signal():
         detector(optics=optics | {"area": 0})
 
 
-def test_a_two_sided_scan_passes_the_zenith_once():
+def test_a_two_sided_scan_crosses_the_zenith_once():
     scan = Pointing(zenith_angles=[0, 30, 60], azimuth=200, two_sided=True)
     assert scan.cycle() == ((60, 20), (30, 20), (0, 200), (30, 200), (60, 200))
     assert Pointing(zenith_angles=[80, 10]).cycle() == ((80, 0), (10, 0))
 
 
-def test_every_kind_of_damage_says_how_it_is_handled():
+def test_every_kind_of_damage_has_a_handling():
     by_handling = dict.fromkeys(Handling, 0)
     for kind in DamageKind:
         by_handling[kind.handling] += 1

@@ -1,4 +1,4 @@
-"""Cells of range in which the truth of a simulation is told."""
+"""Range cells of the truth of a simulation."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_steps_near_the_lidar_do_not_grow_with_the_number_of_bins(bins, bin_widt
 
 
 def test_an_optical_depth_between_cells_is_right_below_800_m():
-    """A haze of a scale of 150 m, to 60 km: a depth taken linearly between the ends of cells."""
+    """Haze with a scale height of 150 m: linear interpolation of the depth within cells."""
     edges = cell_stops(8000, 7.5, None) * 7.5
     depth = 0.05 * -np.expm1(-edges / 150.0)
     height = np.linspace(0.0, 800.0, 1601)
@@ -44,5 +44,5 @@ def test_an_optical_depth_between_cells_is_right_below_800_m():
     assert np.abs(error).max() < 3e-4
 
 
-def test_no_cells_where_none_are_wanted():
+def test_no_cells_on_request():
     assert cell_stops(2400, 7.5, 0).size == 1

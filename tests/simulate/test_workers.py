@@ -1,4 +1,4 @@
-"""Bytes and truth do not depend on who writes the files, how many at a time, or in which order."""
+"""Bytes and truth do not depend on workers, batches or order."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _contents(root):
 
 
 def _scenery(tree):
-    """Chance everywhere: drifting lasers, random damage, random air."""
+    """Add random effects: drifting lasers and random damage."""
     for instrument in tree["simulation"]["instruments"].values():
         instrument["laser"] = {"per_hour": -0.05, "jitter": 0.05}
         instrument["random_damage"] = {"fraction": 0.3, "kinds": ["garbage", "duplicate", "glitch"]}
@@ -47,7 +47,7 @@ def test_two_processes_write_what_one_writes(small, monkeypatch):
         assert second.size == first.size == sum(map(len, expected.values()))
         assert sum(steps) == len(first.paths)
 
-        # What a worker finds wrong is said as it is said here.
+        # Errors in a worker are raised like errors in this process.
         def unwritable(tree):
             tree["stations"]["coast"]["altitude"] = 8000
             tree["instruments"]["coast-lidar"]["station"] = "coast"
@@ -71,7 +71,7 @@ def test_any_order_gives_the_same_files(small):
             assert simulator.simulate(planned)[0] == content
 
 
-def test_the_files_are_known_before(small):
+def test_the_plan_names_all_files(small):
     campaign = small(_scenery)
     assert plan_simulation(campaign).paths == simulate_campaign(campaign).paths
     with pytest.raises(CampaignError, match="no simulation"):
@@ -89,6 +89,6 @@ def test_the_command_line_writes_the_same_with_workers(small, tmp_path):
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == 0, result.output
         assert f"{len(expected)} raw files" in result.output
-        found = _contents(folder)
-        assert found.pop("truth.nc")
-        assert found == expected
+        contents = _contents(folder)
+        assert contents.pop("truth.nc")
+        assert contents == expected
