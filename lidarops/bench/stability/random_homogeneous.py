@@ -1,4 +1,4 @@
-"""Random homogeneous paths, and paths that are not homogeneous."""
+"""Random homogeneous paths, and random violations of homogeneity."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from lidarops.bench.accuracy.multiangle_cases import correlated
-from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Judged, Mask
+from lidarops.bench.stability.random_scenes import VISIBLE, Failure, Mask, ScoredValues
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.retrieve.homogeneous import path_fit
 
@@ -28,15 +28,15 @@ _LENGTHS: Final = (100.0, 12e3)
 _STEPS: Final = (3.75, 7.5, 15.0, 37.5)
 _BINS: Final = (8, 800)
 _SOLVABLE: Final = 0.075
-"""Least standard error of extinction over extinction + 1 / mean range up to which a path counts as
-solvable: 4 of them reach the lower bound of the search, -0.3 / last range."""
+"""Largest least standard error of extinction over extinction + 1 / mean range of a solvable path:
+4 of them reach the lower bound of the search, -0.3 / last range."""
 _DEEPEST: Final = 600.0
-"""Optical depth, there and back, from the lidar to the first bin, above which the amplitude at
-range zero leaves the numbers that a computer has."""
+"""Two-way optical depth from the lidar to the first bin above which the amplitude at range zero
+leaves the range of floats."""
 
 
 @dataclass(frozen=True, slots=True)
-class Scenes:
+class Paths:
     """Paths of one geometry; arrays are (profile, 1)."""
 
     range: Array
@@ -58,16 +58,16 @@ class Scenes:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """What a violation makes of paths."""
+class ViolatedPaths:
+    """Signals of paths with a violation, and their true extinction."""
 
     signal: Array
     """(profile, bin) above the background."""
     extinction: Array
-    """(profile,) the truth: its mean where it varies."""
+    """(profile,) m-1; the mean where it varies."""
 
 
-Violation = Callable[[Scenes, Random], Seen]
+Violation = Callable[[Paths, Random], ViolatedPaths]
 
 
 def between(rng: Random, low: float, high: float, count: int) -> Array:
@@ -75,7 +75,7 @@ def between(rng: Random, low: float, high: float, count: int) -> Array:
     return np.exp(rng.uniform(np.log(low), np.log(high), (count, 1)))
 
 
-def random_paths(cluster: int, profiles: int) -> tuple[Scenes, Random]:
+def random_paths(cluster: int, profiles: int) -> tuple[Paths, Random]:
     """Return random paths of one geometry."""
     rng = np.random.default_rng((71, cluster))
     start = float(between(rng, *_STARTS, 1)[0, 0])
@@ -83,86 +83,90 @@ def random_paths(cluster: int, profiles: int) -> tuple[Scenes, Random]:
     bins = int(np.clip(round(length / step) + 1, *_BINS))
     background = between(rng, *_BACKGROUNDS, profiles)
     background[rng.random(profiles) < _NO_BACKGROUND] = 0.0
-    found = Scenes(
+    paths = Paths(
         np.asarray(start + step * np.arange(bins, dtype=np.float64)),
         between(rng, *_EXTINCTIONS, profiles),
         between(rng, *_SIGNALS, profiles),
         background,
     )
-    return found, rng
+    return paths, rng
 
 
-def _none(paths: Scenes, _: Random) -> Seen:
-    return Seen(paths.clean, paths.extinction[:, 0])
+def _none(paths: Paths, _: Random) -> ViolatedPaths:
+    return ViolatedPaths(paths.clean, paths.extinction[:, 0])
 
 
 def _sign(rng: Random, count: int) -> Array:
     return np.asarray(rng.choice([-1.0, 1.0], (count, 1)))
 
 
-def _slope(paths: Scenes, rng: Random) -> Seen:
+def _slope(paths: Paths, rng: Random) -> ViolatedPaths:
     count = len(paths.signal)
     scale = between(rng, 1e3, 1e5, count) * _sign(rng, count)
-    return Seen(paths.clean * np.exp(-paths.depth / scale), paths.extinction[:, 0])
+    return ViolatedPaths(paths.clean * np.exp(-paths.depth / scale), paths.extinction[:, 0])
 
 
-def _curved(paths: Scenes, rng: Random) -> Seen:
+def _curved(paths: Paths, rng: Random) -> ViolatedPaths:
     count = len(paths.signal)
     amount = between(rng, 1e-3, 1.0, count) * _sign(rng, count)
-    place = paths.depth / paths.depth[:, -1:] - 0.5
-    return Seen(paths.clean * np.exp(amount * place**2), paths.extinction[:, 0])
+    position = paths.depth / paths.depth[:, -1:] - 0.5
+    return ViolatedPaths(paths.clean * np.exp(amount * position**2), paths.extinction[:, 0])
 
 
-def _plume(paths: Scenes, rng: Random) -> Seen:
-    """Put a cloud into the path: backscatter and extinction by the same factor."""
+def _plume(paths: Paths, rng: Random) -> ViolatedPaths:
+    """Add a cloud to the path: backscatter and extinction increase by the same factor."""
     count = len(paths.signal)
     middle = rng.random((count, 1)) * paths.depth[:, -1:]
     width = between(rng, 0.01, 0.5, count) * paths.depth[:, -1:]
-    more = between(rng, 1e-2, 10.0, count) * np.exp(-0.5 * ((paths.depth - middle) / width) ** 2)
+    plume = between(rng, 1e-2, 10.0, count) * np.exp(-0.5 * ((paths.depth - middle) / width) ** 2)
     step = paths.range[1] - paths.range[0]
-    added = paths.extinction * step * (np.cumsum(more, axis=1) - 0.5 * (more + more[:, :1]))
-    truth = paths.extinction * (1.0 + more.mean(axis=1, keepdims=True))
-    return Seen(paths.clean * (1.0 + more) * np.exp(-2.0 * added), truth[:, 0])
+    added = paths.extinction * step * (np.cumsum(plume, axis=1) - 0.5 * (plume + plume[:, :1]))
+    truth = paths.extinction * (1.0 + plume.mean(axis=1, keepdims=True))
+    return ViolatedPaths(paths.clean * (1.0 + plume) * np.exp(-2.0 * added), truth[:, 0])
 
 
-def _overlap(paths: Scenes, rng: Random) -> Seen:
+def _overlap(paths: Paths, rng: Random) -> ViolatedPaths:
     count = len(paths.signal)
     lost = rng.uniform(0.0, 0.3, (count, 1))
     scale = between(rng, 0.02, 1.0, count) * paths.depth[:, -1:]
-    return Seen(paths.clean * (1.0 - lost * np.exp(-paths.depth / scale)), paths.extinction[:, 0])
+    return ViolatedPaths(
+        paths.clean * (1.0 - lost * np.exp(-paths.depth / scale)), paths.extinction[:, 0]
+    )
 
 
-def _turbulent(paths: Scenes, rng: Random) -> Seen:
+def _turbulent(paths: Paths, rng: Random) -> ViolatedPaths:
     amount = between(rng, 1e-3, 0.2, len(paths.signal))
     eddies = correlated(rng, paths.clean.shape, rng.uniform(0.0, 0.95))
-    return Seen(paths.clean * np.exp(amount * eddies), paths.extinction[:, 0])
+    return ViolatedPaths(paths.clean * np.exp(amount * eddies), paths.extinction[:, 0])
 
 
-def _afterpulse(paths: Scenes, rng: Random) -> Seen:
+def _afterpulse(paths: Paths, rng: Random) -> ViolatedPaths:
     count = len(paths.signal)
-    part = between(rng, 1e-4, 0.1, count)
+    share = between(rng, 1e-4, 0.1, count)
     scale = between(rng, 0.05, 1.0, count) * paths.depth[:, -1:]
-    more = part * paths.signal * np.exp(-paths.depth / scale)
-    return Seen(paths.clean + more, paths.extinction[:, 0])
+    afterpulse = share * paths.signal * np.exp(-paths.depth / scale)
+    return ViolatedPaths(paths.clean + afterpulse, paths.extinction[:, 0])
 
 
-def _saturated(paths: Scenes, rng: Random) -> Seen:
+def _saturated(paths: Paths, rng: Random) -> ViolatedPaths:
     top = rng.uniform(0.3, 0.99, (len(paths.signal), 1)) * paths.signal
-    return Seen(np.minimum(paths.clean, top), paths.extinction[:, 0])
+    return ViolatedPaths(np.minimum(paths.clean, top), paths.extinction[:, 0])
 
 
-def _bent(paths: Scenes, rng: Random) -> Seen:
-    """Bend the detector: it loses a part in proportion to the signal."""
+def _bent(paths: Paths, rng: Random) -> ViolatedPaths:
+    """Make the detector nonlinear: it loses a share proportional to the signal."""
     lost = between(rng, 1e-3, 0.3, len(paths.signal))
-    return Seen(paths.clean * (1.0 - lost * paths.clean / paths.signal), paths.extinction[:, 0])
+    return ViolatedPaths(
+        paths.clean * (1.0 - lost * paths.clean / paths.signal), paths.extinction[:, 0]
+    )
 
 
 def _with_gaps(power: Array, rng: Random) -> Array:
-    few = rng.random(power.shape) < rng.uniform(0.0, 0.4, (len(power), 1))
+    missing = rng.random(power.shape) < rng.uniform(0.0, 0.4, (len(power), 1))
     first = rng.integers(0, power.shape[1], (len(power), 1))
-    place = np.arange(power.shape[1])
-    hole = (place >= first) & (place < first + rng.integers(0, 1 + power.shape[1] // 3))
-    return np.where(few | hole, np.nan, power)
+    index = np.arange(power.shape[1])
+    gap = (index >= first) & (index < first + rng.integers(0, 1 + power.shape[1] // 3))
+    return np.where(missing | gap, np.nan, power)
 
 
 def _with_outliers(power: Array, rng: Random) -> Array:
@@ -172,11 +176,11 @@ def _with_outliers(power: Array, rng: Random) -> Array:
 
 
 _SAME_SHAPE: Final = (
-    "an exponential of range has the shape of extinction itself: only the declared model error"
+    "an exponential of range has the shape of extinction itself: only the stated model error"
     " can cover it"
 )
 _SHORT_SCALE: Final = (
-    "where it changes over the whole section it has nearly the shape of extinction and background"
+    "a change over the whole section has nearly the shape of extinction and background"
 )
 FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
     (Failure("none", satisfied=True), _none),
@@ -194,11 +198,11 @@ FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
 )
 
 
-def least_relative_error(paths: Scenes) -> Array:
-    """Return (profile,) the least error of extinction over extinction + 1 / mean range.
+def least_relative_error(paths: Paths) -> Array:
+    """Return the least error of extinction over extinction + 1 / mean range, (profile,).
 
-    The inverse of the information matrix of background, amplitude and extinction with unit
-    noise, by elimination of the two linear unknowns.
+    From the inverse information matrix of background, amplitude and extinction with unit noise,
+    by elimination of the two linear unknowns.
     """
     shape = paths.clean
     middle = np.sum(shape**2 * paths.depth, axis=1, keepdims=True) / np.sum(
@@ -206,78 +210,80 @@ def least_relative_error(paths: Scenes) -> Array:
     )
     slope = 2.0 * shape * (paths.depth - middle)
     flat = shape - shape.mean(axis=1, keepdims=True)
-    left = slope - slope.mean(axis=1, keepdims=True)
+    remainder = slope - slope.mean(axis=1, keepdims=True)
     norm = np.maximum(np.sum(flat**2, axis=1, keepdims=True), np.finfo(float).tiny)
-    left = left - flat * np.sum(left * flat, axis=1, keepdims=True) / norm
-    least = 1.0 / np.sqrt(np.maximum(np.sum(left**2, axis=1), np.finfo(float).tiny))
+    remainder = remainder - flat * np.sum(remainder * flat, axis=1, keepdims=True) / norm
+    least = 1.0 / np.sqrt(np.maximum(np.sum(remainder**2, axis=1), np.finfo(float).tiny))
     scale = paths.extinction[:, 0] + 1.0 / float(paths.range.mean())
     return np.asarray(least / scale)
 
 
 def visible_misfit(range_: Array, signal: Array) -> Array:
-    """Return (profile,) what the model cannot take up of signals, over unit noise.
+    """Return the misfit of the model to signals without noise, over unit noise, (profile,).
 
-    The norm of what the best fit leaves over of the signals without noise: to first order their
-    departure less its projections on what background, amplitude and extinction can change.
+    The norm of the residuals of the best fit: to first order, the departure of the signals from
+    the model less its projections on the derivatives by background, amplitude and extinction.
     """
-    found = path_fit.fit_homogeneous_path(signal, range_, variance=1.0)
-    return np.sqrt(found.reduced_chi2 * (found.valid_bins - 3))
+    fit = path_fit.fit_homogeneous_path(signal, range_, variance=1.0)
+    return np.sqrt(fit.reduced_chi2 * (fit.valid_bins - 3))
 
 
-def judge_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
-    """Solve random paths of one geometry, class by class."""
+def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+    """Yield the scores of random paths of one geometry, for every class of violation."""
     paths, rng = random_paths(cluster, profiles)
     with np.errstate(under="ignore", over="ignore", invalid="ignore", divide="ignore"):
         least = least_relative_error(paths)
-    bounds = path_fit.HIGHEST_OPTICAL_DEPTH / float(paths.depth[0, -1])
-    within = paths.extinction[:, 0] < 0.9 * bounds
+    highest = path_fit.HIGHEST_OPTICAL_DEPTH / float(paths.depth[0, -1])
+    within = paths.extinction[:, 0] < 0.9 * highest
     within &= 2.0 * paths.extinction[:, 0] * paths.range[0] < _DEEPEST
     for failure, violate in FAILURES:
         with np.errstate(under="ignore"):
-            seen = violate(paths, rng)
-        power = paths.background + seen.signal + rng.standard_normal(seen.signal.shape)
+            violated = violate(paths, rng)
+        power = paths.background + violated.signal + rng.standard_normal(violated.signal.shape)
         if failure.name == "gaps":
             power = _with_gaps(power, rng)
         elif failure.name == "outliers":
             power = _with_outliers(power, rng)
         noise = None if "not stated" in failure.name else 1.0
         wider = _widening(paths.range.size) if noise is None else 1.0
-        could: Mask = within & (wider * least <= _SOLVABLE)
-        hidden = None if violate is _none else visible_misfit(paths.range, seen.signal) < VISIBLE
-        yield from _solved(failure, paths, seen, power, (noise, could, hidden))
+        solvable: Mask = within & (wider * least <= _SOLVABLE)
+        hidden = (
+            None if violate is _none else visible_misfit(paths.range, violated.signal) < VISIBLE
+        )
+        yield from _solved(failure, paths, violated, power, (noise, solvable, hidden))
 
 
 def _widening(bins: int) -> float:
-    """Return how much wider 4 standard errors are where the noise is estimated from the bins."""
+    """Return the factor on 4 standard errors where the noise is estimated from the bins."""
     freedom = 18.0 / 35.0 * (bins - 2)
     return float(stats.t.isf(stats.norm.sf(4.0), freedom) / 4.0)
 
 
 def _solved(
     failure: Failure,
-    paths: Scenes,
-    seen: Seen,
+    paths: Paths,
+    violated: ViolatedPaths,
     power: Array,
     known: tuple[float | None, Mask, Mask | None],
-) -> Iterator[tuple[Judged, int]]:
-    noise, could, hidden = known
-    found = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
-    bits = np.asarray(found.quality)
-    # Where bins are missing, less can be told than of all of them.
-    likely = could if failure.satisfied and failure.name != "gaps" else None
+) -> Iterator[tuple[ScoredValues, int]]:
+    noise, solvable, hidden = known
+    fit = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
+    bits = np.asarray(fit.quality)
+    # Missing bins lose information.
+    expected = solvable if failure.satisfied and failure.name != "gaps" else None
     count = len(power)
     yield (
-        Judged(
-            failure, "extinction", found.extinction - seen.extinction,
-            found.extinction_standard_error, found.extinction_model_error, bits, solvable=likely,
+        ScoredValues(
+            failure, "extinction", fit.extinction - violated.extinction,
+            fit.extinction_standard_error, fit.extinction_model_error, bits, solvable=expected,
             hidden=hidden,
         ),
         count,
     )  # fmt: skip
     yield (
-        Judged(
-            failure, "background", found.background - paths.background[:, 0],
-            found.background_standard_error, found.background_model_error, bits, solvable=likely,
+        ScoredValues(
+            failure, "background", fit.background - paths.background[:, 0],
+            fit.background_standard_error, fit.background_model_error, bits, solvable=expected,
             hidden=hidden,
         ),
         count,

@@ -33,11 +33,11 @@ _DEAD_TIME: Final = 4e-9
 # Pulses ---------------------------------------------------------------------------------------
 
 
-def pulsed(distance: Array, extinction: float, duration: float, **more: Any) -> Answer:
-    """Return the signal of a rectangular pulse from homogeneous air, constant and backscatter 1."""
+def pulsed(distance: Array, extinction: float, duration: float, **options: Any) -> Answer:
+    """Return the signal of a rectangular pulse in homogeneous air of unit backscatter."""
     path = np.array([1e-3, 1.1 * distance[-1]])
-    arguments = {"full_overlap_range": 0.0} | more
-    found = pulse.pulsed_signal(
+    arguments = {"full_overlap_range": 0.0} | options
+    power = pulse.pulsed_signal(
         distance,
         extinction=np.full(2, extinction),
         backscatter=np.ones(2),
@@ -46,7 +46,7 @@ def pulsed(distance: Array, extinction: float, duration: float, **more: Any) -> 
         path=path,
         **arguments,
     )
-    return Answer({"signal": found})
+    return Answer({"signal": power})
 
 
 def clear_rectangle(distance: Array, duration: float) -> Array:
@@ -65,18 +65,18 @@ def hazy_rectangle(distance: Array, duration: float, extinction: float) -> Array
 
 
 def bin_mean(distance: Array, width: float, extinction: float) -> Array:
-    """Return the same over a bin."""
+    r"""Return the mean of :math:`e^{-2 \sigma R} / R^2` over a bin."""
     duration = 2.0 * width / SPEED_OF_LIGHT
     return hazy_rectangle(distance + 0.5 * width, duration, extinction)
 
 
 def _short(distance: Array, extinction: float) -> Answer:
     path = np.concatenate([np.linspace(1e-3, distance[0], 400, endpoint=False), distance])
-    found = short.backscatter_signal(
+    power = short.backscatter_signal(
         path, extinction=np.full(path.size, extinction), backscatter=np.ones(path.size),
         system_constant=1.0,
     )  # fmt: skip
-    return Answer({"signal": found[-distance.size :]})
+    return Answer({"signal": power[-distance.size :]})
 
 
 _NEAR_AND_FAR: Final = np.array([20.0, 50.0, 300.0, 1000.0, 5000.0, 15000.0])
@@ -86,9 +86,9 @@ _LONG_PULSE: Final = 7.5 * (np.arange(800, dtype=np.float64) + 0.5)
 
 
 def _near_lidar(**arguments: Any) -> Answer:
-    found = pulsed(_LONG_PULSE, 1e-4, 1e-6, **arguments).value("signal")
-    return Answer({"signal": found, "finite": float(np.isfinite(found).all()),
-                   "signal at 3.75 m": found[0]})  # fmt: skip
+    power = pulsed(_LONG_PULSE, 1e-4, 1e-6, **arguments).value("signal")
+    return Answer({"signal": power, "finite": float(np.isfinite(power).all()),
+                   "signal at 3.75 m": power[0]})  # fmt: skip
 
 
 def _pulses() -> tuple[StiffCase, ...]:
@@ -174,11 +174,11 @@ def _recorders() -> tuple[StiffCase, ...]:
     )
     return (
         *(
-            _case(f"counter at {rate:g} MHz, {'' if folded else 'non-'}paralyzable",
-                  build=partial(dict, rate=rate, paralyzable=folded), solve=_counted,
+            _case(f"counter at {rate:g} MHz, {'' if paralyzable else 'non-'}paralyzable",
+                  build=partial(dict, rate=rate, paralyzable=paralyzable), solve=_counted,
                   expected=(Near("mean over theory", 1.0, mean),
                             Near("variance over theory", 1.0, variance)))
-            for rate, folded, mean, variance in counters
+            for rate, paralyzable, mean, variance in counters
         ),
         _case("B c 600 MHz is counted as a lower rate, paralyzable", solve=_counted,
               build=lambda: {"rate": 600.0, "paralyzable": True},
@@ -217,8 +217,8 @@ def _scattering(wavelength: float) -> Answer:
 
 
 def _profile(**arguments: Any) -> Answer:
-    found = molecular.MolecularProfile.from_profile(**arguments)
-    return Answer({"pressure": found.pressure})
+    profile = molecular.MolecularProfile.from_profile(**arguments)
+    return Answer({"pressure": profile.pressure})
 
 
 def _air() -> tuple[StiffCase, ...]:
@@ -270,5 +270,5 @@ def _air() -> tuple[StiffCase, ...]:
 
 
 def stiff_forward_cases() -> tuple[StiffCase, ...]:
-    """Return all of them."""
+    """Return all stiff cases of the forward model."""
     return (*_pulses(), *_recorders(), *_air())

@@ -34,7 +34,7 @@ from lidarops.retrieve.homogeneous import path_fit
 _case = partial(StiffCase, retrieval=Retrieval.HOMOGENEOUS)
 _DIGITS: Final = 60
 _NEWTON: Final = 400
-"""Steps of the oracle's root, which starts far above it."""
+"""Most Newton steps to the exact root, from a start far above it."""
 _WRONG: Final = Quality.POOR_FIT | Quality.NOT_HOMOGENEOUS
 _ANY: Final = Quality(REJECTING)
 
@@ -67,7 +67,7 @@ class Path:
 
     @property
     def scenario(self) -> Scenario:
-        """The same for the least errors of `lidarops.bench.accuracy.homogeneous_cases`."""
+        """The path as a scenario of `lidarops.bench.accuracy.homogeneous_cases`."""
         return Scenario(self.start, self.length, self.extinction, self.signal, self.background)
 
     def noisy(self, profiles: int = 200, seed: int = 1) -> Array:
@@ -76,37 +76,37 @@ class Path:
         return np.asarray(self.power + noise)
 
     def arguments(self, **changed: Any) -> dict[str, Any]:
-        """Return arguments of `solve_path` for noisy profiles of unit variance."""
+        """Return arguments of `solve_path` for profiles with noise of unit variance."""
         return {"power": self.noisy(), "range": self.range, "variance": 1.0, **changed}
 
 
 CLEAR: Final = Path()
 
 
-# How they are solved --------------------------------------------------------------------------
+# Solvers --------------------------------------------------------------------------
 
 
 def solve_path(**arguments: Any) -> Answer:
-    """Solve, and return every value."""
-    found = path_fit.fit_homogeneous_path(**arguments)
+    """Return all values of a fit."""
+    fit = path_fit.fit_homogeneous_path(**arguments)
     names = ("background", "amplitude", "extinction")
-    values = {name: getattr(found, name) for name in names}
-    values |= {f"{name}_standard_error": getattr(found, f"{name}_standard_error") for name in names}
-    return Answer(values | {"reduced_chi2": found.reduced_chi2}, np.asarray(found.quality))
+    values = {name: getattr(fit, name) for name in names}
+    values |= {f"{name}_standard_error": getattr(fit, f"{name}_standard_error") for name in names}
+    return Answer(values | {"reduced_chi2": fit.reduced_chi2}, np.asarray(fit.quality))
 
 
 def cubic(**arguments: Any) -> Answer:
-    """Find the background by the cubic."""
-    found = cubic_and_tail.cubic(**arguments)
+    """Return the background by the cubic."""
+    estimate = cubic_and_tail.cubic(**arguments)
     values = {
-        "background": found.background,
-        "background_standard_error": found.background_standard_error,
+        "background": estimate.background,
+        "background_standard_error": estimate.background_standard_error,
     }
-    return Answer(values, np.asarray(found.quality))
+    return Answer(values, np.asarray(estimate.quality))
 
 
 def scattered(path: Path, **arguments: Any) -> Answer:
-    """Return errors over the Cramér-Rao bound, over all profiles whether rejected or not."""
+    """Return errors over the Cramér-Rao bound, of all profiles, rejected or not."""
     answer = solve_path(**arguments)
     error = answer.value("extinction") - path.extinction
     bound = least_errors(path.scenario)["extinction"]
@@ -120,14 +120,14 @@ def scattered(path: Path, **arguments: Any) -> Answer:
     return Answer(values, answer.quality)
 
 
-# The oracle -----------------------------------------------------------------------------------
+# Exact root -----------------------------------------------------------------------------------
 
 
 def exact_root(power: Array, range_: Array, lag: int) -> float:
-    """Return the largest root of the cubic of bobrovsky2024, of these very numbers.
+    """Return the largest root of the cubic of bobrovsky2024 in 60 digits.
 
-    60 digits, by Newton's method from above, where the derivative of a quartic with a positive
-    leading coefficient is convex beyond its last turn.
+    By Newton's method from above: beyond its last turning point, the derivative of a quartic with
+    a positive leading coefficient is convex.
     """
     with localcontext() as context:
         context.prec = _DIGITS
@@ -142,7 +142,7 @@ def exact_root(power: Array, range_: Array, lag: int) -> float:
             linear += 2 * (2 * a * c + b * b)
             constant += 2 * b * c
         bound = 1 + max(abs(square), abs(linear), abs(constant)) / cube
-        x = min(bound, 10 * max(abs(one) for one in p))
+        x = min(bound, 10 * max(abs(value) for value in p))
         for _ in range(_NEWTON):
             slope = (3 * cube * x + 2 * square) * x + linear
             if slope == 0:
@@ -154,7 +154,7 @@ def exact_root(power: Array, range_: Array, lag: int) -> float:
         return float(x)
 
 
-# The list of the study ------------------------------------------------------------------------
+# Cases of the study ------------------------------------------------------------------------
 
 _THIN: Final = Path(start=10500.0, length=100.0, background=7e5)
 _DEEP: Final = Path(background=1e11)
@@ -166,12 +166,12 @@ _FINE: Final = Path(bins=4096, background=25e3)
 _STEEP: Final = Path(length=1700.0, extinction=1e-5, signal=1e5)
 
 
-def _exact(path: Path, **more: Any) -> dict[str, Any]:
-    return {"power": path.power, "range": path.range, **more}
+def _exact(path: Path, **options: Any) -> dict[str, Any]:
+    return {"power": path.power, "range": path.range, **options}
 
 
-def _single(path: Path, **more: Any) -> dict[str, Any]:
-    return {"power": path.power.astype(np.float32), "range": path.range, **more}
+def _single(path: Path, **options: Any) -> dict[str, Any]:
+    return {"power": path.power.astype(np.float32), "range": path.range, **options}
 
 
 def _rooted(path: Path, lag: int, kind: type[np.floating[Any]] = np.float64) -> float:
@@ -185,9 +185,9 @@ def _saturated(*, masked: bool) -> dict[str, Any]:
 
 
 def _overlapped(scale: float) -> dict[str, Any]:
-    seen = 1.0 - np.exp(-((CLEAR.range / scale) ** 2))
+    overlap = 1.0 - np.exp(-((CLEAR.range / scale) ** 2))
     noise = CLEAR.noisy() - CLEAR.power
-    power = CLEAR.background + (CLEAR.power - CLEAR.background) * seen + noise
+    power = CLEAR.background + (CLEAR.power - CLEAR.background) * overlap + noise
     return CLEAR.arguments(power=power)
 
 
@@ -205,15 +205,15 @@ def _counted(shots: int, base: float, signal: float, profiles: int) -> dict[str,
     }
 
 
-def _bent() -> Array:
+def _irregular_range() -> Array:
     return np.sort(np.random.default_rng(3).uniform(2500.0, 10500.0, 225))
 
 
-def _bent_arguments(**more: Any) -> dict[str, Any]:
-    r = _bent()
+def _irregular_arguments(**options: Any) -> dict[str, Any]:
+    r = _irregular_range()
     model = CLEAR.background + CLEAR.signal * (2500.0 / r) ** 2 * np.exp(-6e-5 * (r - 2500.0))
     noise = np.random.default_rng(4).standard_normal((200, r.size))
-    return {"power": model + noise, "range": r, "variance": 1.0, **more}
+    return {"power": model + noise, "range": r, "variance": 1.0, **options}
 
 
 def _raised(first: int, bins: int, by: float) -> dict[str, Any]:
@@ -237,7 +237,8 @@ def _study() -> tuple[StiffCase, ...]:
               expected=(Flagged(_ANY),)),
         _case("S1 least squares, the same of float32 powers", build=lambda: _single(_THIN),
               solve=solve_path, expected=(Covered("background", 7e5), Covered("extinction", 3e-5))),
-        _case("S2 background of 1e8 signals, float32", build=lambda: _single(_DEEP), solve=solve_path,
+        _case("S2 background of 1e8 signals, float32", build=lambda: _single(_DEEP),
+              solve=solve_path,
               expected=(Flagged(Quality.NO_SIGNAL), Near("background", 1e11, 1e-7))),
         _case("S2 cubic, the same, float64, lag 1, against 60 digits",
               build=lambda: _exact(_DEEP, lag=1, variance=0.0), solve=cubic,
@@ -287,7 +288,7 @@ def _study() -> tuple[StiffCase, ...]:
               expected=(Flagged(_WRONG),)),
         _case("S13 the same, masked", build=lambda: _saturated(masked=True), solve=solve_path,
               expected=(Covered("extinction", 3e-5, valued=0.99),)),
-        _case("S14 overlap of scale 1 km: a bias that nothing tells", solve=solve_path,
+        _case("S14 overlap of scale 1 km: a bias that no test detects", solve=solve_path,
               build=lambda: _overlapped(1000.0),
               expected=(Covered("extinction", 3e-5, errors=6.0, valued=0.9),)),
         _case("S14 overlap of scale 2 km", build=lambda: _overlapped(2000.0), solve=solve_path,
@@ -299,28 +300,28 @@ def _study() -> tuple[StiffCase, ...]:
         _case("S16 inverted signal",
               build=lambda: CLEAR.arguments(power=740.0 - CLEAR.noisy()), solve=solve_path,
               expected=(Flagged(Quality.NEGATIVE_AMPLITUDE),)),
-        _case("S17 ranges that are not uniform", build=_bent_arguments, solve=solve_path,
+        _case("S17 ranges that are not uniform", build=_irregular_arguments, solve=solve_path,
               expected=(Covered("extinction", 3e-5, valued=0.99),)),
-        _case("S17 the same, cubic", build=lambda: _bent_arguments(method="cubic"), solve=solve_path,
-              expected=(Refused(RetrievalInputError, "range"),)),
-        _case("S18 cloud of 200 on 4 bins", build=lambda: _raised(100, 4, 200.0), solve=solve_path,
-              expected=(Between("reduced_chi2", 100.0, np.inf), Flagged(_WRONG))),
+        _case("S17 the same, cubic", build=lambda: _irregular_arguments(method="cubic"),
+              solve=solve_path, expected=(Refused(RetrievalInputError, "range"),)),
+        _case("S18 cloud of 200 on 4 bins", build=lambda: _raised(100, 4, 200.0),
+              solve=solve_path, expected=(Between("reduced_chi2", 100.0, np.inf), Flagged(_WRONG))),
         _case("one bin 8 standard deviations off", build=lambda: _raised(100, 1, 8.0),
               solve=solve_path, expected=(Flagged(Quality.OUTLIER, 0.95),
                                      Covered("extinction", 3e-5, valued=0.5))),
     )  # fmt: skip
 
 
-# What cannot be solved, and what must not matter ----------------------------------------------
+# Unsolvable cases, and invariances ----------------------------------------------
 
 
 def _flat(value: float) -> dict[str, Any]:
     return {"power": np.full((3, 225), value), "range": CLEAR.range}
 
 
-def _few(bins: int, **more: Any) -> dict[str, Any]:
+def _few(bins: int, **options: Any) -> dict[str, Any]:
     path = replace(CLEAR, bins=bins)
-    return {"power": path.noisy(20), "range": path.range, "variance": 1.0, **more}
+    return {"power": path.noisy(20), "range": path.range, "variance": 1.0, **options}
 
 
 def _holed(first: int, bins: int, value: float = np.nan) -> dict[str, Any]:
@@ -348,12 +349,12 @@ def _mixed() -> dict[str, Any]:
 
 def _one_by_one() -> Answer:
     together = path_fit.fit_homogeneous_path(**_mixed())
-    apart = [
+    separate = [
         path_fit.fit_homogeneous_path(**_mixed() | {"power": row}) for row in _mixed()["power"]
     ]
     same = all(
         np.array_equal(
-            getattr(together, name), [getattr(one, name) for one in apart], equal_nan=True
+            getattr(together, name), [getattr(fit, name) for fit in separate], equal_nan=True
         )
         for name in ("background", "amplitude", "extinction", "quality", "reduced_chi2")
     )
@@ -370,7 +371,7 @@ def _long(bins: int, method: str) -> dict[str, Any]:
 
 
 def _memory(**arguments: Any) -> Answer:
-    """Return the most memory that a solution holds at once."""
+    """Return the peak memory of a solution."""
     tracemalloc.start()
     solve_path(**arguments)
     peak = tracemalloc.get_traced_memory()[1]
@@ -378,7 +379,7 @@ def _memory(**arguments: Any) -> Answer:
     return Answer({"MB": peak / 1e6})
 
 
-# 1e-6 of a value is 1e-4 of its standard error here: what different ways to it may differ by.
+# 1e-6 of a value is 1e-4 of its standard error here: the tolerance between methods.
 _SAME: Final = (Near("change", 0.0, 1e-6, relative=False), Near("same flags", 1.0, 0.0))
 
 
@@ -426,8 +427,8 @@ def _unsolvable() -> tuple[StiffCase, ...]:
               solve=solve_path, expected=(Covered("extinction", 3e-5), Flagged(_ANY))),
         _case("infinite variance in all bins", build=lambda: CLEAR.arguments(variance=np.inf),
               solve=solve_path, expected=(Flagged(_ANY), *no_value)),
-        _case("a variance of 1e300", build=lambda: CLEAR.arguments(variance=1e300), solve=solve_path,
-              expected=(Flagged(_ANY),)),
+        _case("a variance of 1e300", build=lambda: CLEAR.arguments(variance=1e300),
+              solve=solve_path, expected=(Flagged(_ANY),)),
         _case("200 000 bins, direct", build=partial(_long, 200_000, "direct"), solve=solve_path,
               expected=(Covered("extinction", 3e-5, valued=1.0),)),
         _case("a million bins", build=partial(_long, 1_000_000, "auto"), solve=solve_path,
@@ -453,14 +454,14 @@ def _unsolvable() -> tuple[StiffCase, ...]:
 
 def _rescaled(power: Array, range: Array, variance: float) -> Answer:  # noqa: A002
     factor = np.sqrt(variance)
-    one = path_fit.fit_homogeneous_path(power, range, variance=variance)
-    other = path_fit.fit_homogeneous_path(power / factor, range, variance=1.0)
+    scaled = path_fit.fit_homogeneous_path(power, range, variance=variance)
+    unscaled = path_fit.fit_homogeneous_path(power / factor, range, variance=1.0)
     change = max(
-        float(np.max(np.abs(one.extinction / other.extinction - 1.0))),
-        float(np.max(np.abs(one.background / factor / other.background - 1.0))),
+        float(np.max(np.abs(scaled.extinction / unscaled.extinction - 1.0))),
+        float(np.max(np.abs(scaled.background / factor / unscaled.background - 1.0))),
     )
-    alike = float(np.array_equal(one.quality, other.quality))
-    return Answer({"change": change, "same flags": alike}, np.asarray(one.quality))
+    alike = float(np.array_equal(scaled.quality, unscaled.quality))
+    return Answer({"change": change, "same flags": alike}, np.asarray(scaled.quality))
 
 
 def _refusals() -> tuple[StiffCase, ...]:
@@ -489,5 +490,5 @@ def _refusals() -> tuple[StiffCase, ...]:
 
 
 def stiff_homogeneous_cases() -> tuple[StiffCase, ...]:
-    """Return all of them."""
+    """Return all stiff cases of the homogeneous path."""
     return (*_study(), *_unsolvable(), *_refusals())

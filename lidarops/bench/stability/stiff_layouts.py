@@ -1,4 +1,4 @@
-"""What an array looks like in memory must not matter: one answer for every layout."""
+"""Cases for the memory layout of arrays: every layout must give the same result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _read_only(array: Any) -> Any:
 
 
 def _strided(array: Any) -> Any:
-    """Return a view of every second value of a longer array, its first axis turned."""
+    """Return a view of every second value of a longer array, its first axis reversed."""
     wide = np.zeros((*array.shape[:-1], 2 * array.shape[-1]), dtype=array.dtype)
     wide[..., ::2] = array
     turned = np.ascontiguousarray(wide[::-1])[::-1] if array.ndim > 1 else wide
@@ -42,8 +42,8 @@ LAYOUTS: Final[dict[str, Layout]] = {
     "big-endian": lambda array: array.astype(array.dtype.newbyteorder(">")),
     "read-only": _read_only,
     "with strides": _strided,
-    "in Fortran's order": np.asfortranarray,
-    "masked, nothing of it": np.ma.masked_array,
+    "in Fortran order": np.asfortranarray,
+    "masked, without masked values": np.ma.masked_array,
     "as a list": lambda array: array.tolist(),
 }
 REFUSED: Final[dict[str, Layout]] = {
@@ -55,38 +55,40 @@ REFUSED: Final[dict[str, Layout]] = {
 
 
 def _homogeneous(array: Any, layout: Layout) -> Mapping[str, Any]:
-    found = path_fit.fit_homogeneous_path(layout(array), layout(CLEAR.range), variance=1.0)
-    return {n: getattr(found, n) for n in ("background", "extinction", "quality", "reduced_chi2")}
+    fit = path_fit.fit_homogeneous_path(layout(array), layout(CLEAR.range), variance=1.0)
+    return {n: getattr(fit, n) for n in ("background", "extinction", "quality", "reduced_chi2")}
 
 
 def _signal(array: Any, layout: Layout) -> Mapping[str, Any]:
     distance = 7.5 * np.arange(1, array.shape[-1] + 1, dtype=np.float64)
-    found = counts_to_signal.photon_signal(
+    signal = counts_to_signal.photon_signal(
         layout(array), layout(np.full(array.shape[0], 600)), layout(distance), bin_width=7.5,
         dead_time=4e-9,
     )  # fmt: skip
-    return {n: getattr(found, n) for n in ("power", "variance", "quality")}
+    return {n: getattr(signal, n) for n in ("power", "variance", "quality")}
 
 
 def _elastic(array: Any, layout: Layout) -> Mapping[str, Any]:
-    given = stiff_elastic.elastic_arguments(array.shape[0])
-    changed = {n: layout(np.asarray(given[n])) for n in ("range", "molecular_backscatter")}
-    found = inversion.invert_elastic(**given | changed | {"power": layout(array)})
-    return {n: getattr(found, n) for n in ("backscatter", "backscatter_standard_error", "valid")}
+    arguments = stiff_elastic.elastic_arguments(array.shape[0])
+    changed = {n: layout(np.asarray(arguments[n])) for n in ("range", "molecular_backscatter")}
+    solution = inversion.invert_elastic(**arguments | changed | {"power": layout(array)})
+    return {n: getattr(solution, n) for n in ("backscatter", "backscatter_standard_error", "valid")}
 
 
 def _scans(array: Any, layout: Layout) -> Mapping[str, Any]:
-    given = stiff_scans.scan_arguments(profiles=array.shape[0])
-    changed = {n: layout(np.asarray(given[n])) for n in ("zenith_angle", "altitude")}
-    found = optical_depth.retrieve_optical_depth(**given | changed | {"signal": layout(array)})
-    return {n: getattr(found, n) for n in ("optical_depth", "extinction", "quality")}
+    arguments = stiff_scans.scan_arguments(profiles=array.shape[0])
+    changed = {n: layout(np.asarray(arguments[n])) for n in ("zenith_angle", "altitude")}
+    solution = optical_depth.retrieve_optical_depth(
+        **arguments | changed | {"signal": layout(array)}
+    )
+    return {n: getattr(solution, n) for n in ("optical_depth", "extinction", "quality")}
 
 
 def _network(array: Any, layout: Layout) -> Mapping[str, Any]:
-    given = stiff_networks.network_arguments()
-    changed = {"power": layout(array), "range": layout(given["range"])}
-    found = extinction_field.retrieve_network(**given | changed)
-    return {n: getattr(found, n) for n in ("extinction", "extinction_standard_error")}
+    arguments = stiff_networks.network_arguments()
+    changed = {"power": layout(array), "range": layout(arguments["range"])}
+    solution = extinction_field.retrieve_network(**arguments | changed)
+    return {n: getattr(solution, n) for n in ("extinction", "extinction_standard_error")}
 
 
 def _labeled(array: Any, chunk: int) -> Mapping[str, Any]:
@@ -99,23 +101,23 @@ def _labeled(array: Any, chunk: int) -> Mapping[str, Any]:
     sections = [(2500.0, 6000.0), (6000.0, 10000.0)]
     if chunk:
         power = power.chunk({"time": chunk, "range": 50})
-    found = labeled.fit_homogeneous_path(power, sections=sections, variance=1.0).compute()
-    return {str(name): found[name].to_numpy() for name in found.data_vars}
+    result = labeled.fit_homogeneous_path(power, sections=sections, variance=1.0).compute()
+    return {str(name): result[name].to_numpy() for name in result.data_vars}
 
 
 def _plain(array: Any) -> Any:
     return array
 
 
-def _alike(solver: Solver, array: Callable[[], Any], *ways: Any) -> Answer:
-    """Return whether two ways give the same bits."""
-    one, other = (solver(array(), way) for way in ways)
+def _same_bits(solver: Solver, array: Callable[[], Any], *layouts: Any) -> Answer:
+    """Return whether two layouts give the same bits."""
+    one, other = (solver(array(), layout) for layout in layouts)
     same = [np.array_equal(one[n], other[n], equal_nan=one[n].dtype.kind == "f") for n in one]
     return Answer({"same bits": float(all(same))})
 
 
-def _unlike(solver: Solver, name: str, error: str, array: Callable[[], Any]) -> Answer:
-    """Return the largest change by single precision, in standard errors."""
+def _single_precision(solver: Solver, name: str, error: str, array: Callable[[], Any]) -> Answer:
+    """Return the largest change due to single precision, in standard errors."""
     one = solver(array(), _plain)
     other = solver(array().astype(np.float32), _plain)
     stated = np.asarray(one[error]) if error in one else np.abs(np.asarray(one[name])) * 1e-3
@@ -153,7 +155,7 @@ def _laid_out(retrieval: Retrieval, name: str, layout: Layout) -> StiffCase:
         f"{retrieval.value}: arrays {name}",
         retrieval,
         dict,
-        partial(_alike, solver, array, layout, _plain),
+        partial(_same_bits, solver, array, layout, _plain),
         (Near("same bits", 1.0, 0.0),),
     )
 
@@ -161,14 +163,14 @@ def _laid_out(retrieval: Retrieval, name: str, layout: Layout) -> StiffCase:
 def _refused(retrieval: Retrieval, name: str, layout: Layout) -> StiffCase:
     solver, array, field = _SOLVED[retrieval]
 
-    def signals_alone(values: Any) -> Any:
+    def signals_only(values: Any) -> Any:
         return layout(values) if np.ndim(values) > 1 else values
 
     return StiffCase(
         f"{retrieval.value}: signals as {name}",
         retrieval,
         dict,
-        partial(_alike, solver, array, signals_alone, _plain),
+        partial(_same_bits, solver, array, signals_only, _plain),
         (Refused(RetrievalInputError, field),),
     )
 
@@ -179,13 +181,13 @@ def _single(retrieval: Retrieval, quantity: str) -> StiffCase:
         f"{retrieval.value}: float32",
         retrieval,
         dict,
-        partial(_unlike, solver, quantity, f"{quantity}_standard_error", array),
+        partial(_single_precision, solver, quantity, f"{quantity}_standard_error", array),
         (Near("change", 0.0, 1.0, relative=False),),
     )
 
 
 def _whole_numbers() -> Answer:
-    """Compare integers with the same numbers as floats."""
+    """Compare integers with the same values as floats."""
     power = np.rint(100.0 * CLEAR.noisy(20))
     one = _homogeneous(power.astype(np.int64), _plain)
     other = _homogeneous(power, _plain)
@@ -193,15 +195,15 @@ def _whole_numbers() -> Answer:
 
 
 def _blocks() -> Answer:
-    """Compare profiles one by one with all at once, some of them all NaN."""
+    """Compare a batch in which some profiles are NaN with a batch of valid profiles."""
     power = CLEAR.noisy(60)
     power[10:30] = np.nan
-    found = path_fit.fit_homogeneous_path(power, CLEAR.range, variance=1.0)
+    fit = path_fit.fit_homogeneous_path(power, CLEAR.range, variance=1.0)
     clean = path_fit.fit_homogeneous_path(CLEAR.noisy(60), CLEAR.range, variance=1.0)
     kept = np.delete(np.arange(60), np.arange(10, 30))
-    same = np.array_equal(found.extinction[kept], clean.extinction[kept])
-    lost = np.isnan(found.extinction[10:30]).all()
-    missing = (found.quality[10:30] & int(Quality.INPUT_MISSING) != 0).all()
+    same = np.array_equal(fit.extinction[kept], clean.extinction[kept])
+    lost = np.isnan(fit.extinction[10:30]).all()
+    missing = (fit.quality[10:30] & int(Quality.INPUT_MISSING) != 0).all()
     return Answer({"same bits": float(same and lost and missing)})
 
 
@@ -213,17 +215,17 @@ def _turned() -> Answer:
 
 
 def memory_layout_cases() -> tuple[StiffCase, ...]:
-    """Return all of them."""
+    """Return all cases of memory layouts."""
     same = (Near("same bits", 1.0, 0.0),)
     chunks = tuple(
-        StiffCase(f"dask, chunks of {counted} by 50 bins", Retrieval.HOMOGENEOUS, dict,
-             partial(_alike, _labeled, lambda: CLEAR.noisy(20), size, 0), same)
-        for size, counted in ((1, "one profile"), (7, "7 profiles"))
+        StiffCase(f"dask, chunks of {label} by 50 bins", Retrieval.HOMOGENEOUS, dict,
+             partial(_same_bits, _labeled, lambda: CLEAR.noisy(20), size, 0), same)
+        for size, label in ((1, "one profile"), (7, "7 profiles"))
     )  # fmt: skip
     return (
-        *(_laid_out(r, name, way) for r in _SOLVED for name, way in LAYOUTS.items()
+        *(_laid_out(r, name, layout) for r in _SOLVED for name, layout in LAYOUTS.items()
           if not (r is Retrieval.SIGNAL and name == "as a list")),
-        *(_refused(r, name, way) for r in _SOLVED for name, way in REFUSED.items()),
+        *(_refused(r, name, layout) for r in _SOLVED for name, layout in REFUSED.items()),
         *(_single(r, quantity) for r, quantity in _FLOAT32.items()),
         *chunks,
         StiffCase("whole numbers", Retrieval.HOMOGENEOUS, dict, _whole_numbers, same),

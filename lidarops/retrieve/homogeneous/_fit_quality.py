@@ -88,8 +88,9 @@ def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimi
     known_variance : bool
     """
     limits_of = _known_limits if known_variance else _estimated_limits
-    counts = (np.array([float(count)]) for count in (bins, bins - 2, shapes))
-    least, most, _, outlier, widening = (float(limit[0]) for limit in limits_of(*counts, 3))
+    counts = [np.array([float(count)]) for count in (bins, bins - 2, shapes)]
+    limits = limits_of(counts[0], counts[1], counts[2], 3)
+    least, most, _, outlier, widening = (float(limit[0]) for limit in limits)
     curvature, square = _shape_limits(bins, shapes, known_variance=known_variance)
     return CommonLimits(
         LOWEST_SIGNAL, LARGEST_RELATIVE_ERROR, least, most, curvature, square, outlier, widening
@@ -170,7 +171,8 @@ def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limit
         key = (key << 20) + count.astype(np.int64)
     _, sample, kind = np.unique(key, return_index=True, return_inverse=True)
     limits_of = _known_limits if known_variance else _estimated_limits
-    limits = limits_of(*(count[sample] for count in counts), unknowns)
+    bins, differences, shapes = (count[sample] for count in counts)
+    limits = limits_of(bins, differences, shapes, unknowns)
     return _Limits(*(limit[kind] for limit in limits))
 
 
