@@ -45,15 +45,15 @@ SCENES = {
     Quality.UNSTABLE_INVERSION: "test_labeled_elastic::"
     "test_an_inversion_away_from_the_reference_stops_where_it_is_unstable",
     Quality.NO_LEVERAGE: "test_labeled_multiangle::"
-    "test_what_is_left_of_a_cycle_is_used_as_far_as_it_goes",
+    "test_incomplete_cycles_are_used_as_far_as_possible",
     Quality.POOR_STRATIFICATION: "test_labeled_multiangle::"
-    "test_extinction_stays_withheld_where_single_altitudes_stand_in",
+    "test_extinction_stays_withheld_if_single_altitudes_replace_joint",
     Quality.EXTRAPOLATED: "test_labeled_multiangle::"
     "test_every_missing_value_is_explained_whatever_the_method",
     Quality.ONE_SIDED: "test_labeled_multiangle::"
     "test_an_angle_to_one_side_is_flagged_and_has_a_systematic_error",
     Quality.HIGH_CORRELATION: "test_labeled_multiangle::"
-    "test_where_energy_jitters_single_altitudes_stand",
+    "test_single_altitudes_stay_valid_if_shot_energy_jitters",
     Quality.NOT_LEVEL: "test_archives::test_the_campaign_knows_the_pointing_better_than_the_header",
 }
 """The test of a scene that raises the bit; the bit stands in it by name."""
@@ -63,18 +63,21 @@ BY_FIELD = {
         "prior_dominated",
         "test_mld::test_published_claim_is_not_reproduced_at_15_degrees",
     ),
-    Quality.INTERPOLATED: ("interpolated", "test_optical_depth::test_broken_profiles_stay_alone"),
+    Quality.INTERPOLATED: (
+        "interpolated",
+        "test_optical_depth::test_invalid_profiles_do_not_affect_others",
+    ),
     Quality.LOW_LEVERAGE: (
         "low_leverage",
-        "test_optical_depth::test_tiny_leverage_is_told_with_an_honest_error",
+        "test_optical_depth::test_tiny_leverage_is_flagged_and_has_a_correct_error",
     ),
     Quality.NO_RESIDUAL: (
         "no_residual",
-        "test_smooth_profile::test_noise_known_from_few_residuals_widens_the_errors",
+        "test_smooth_profile::test_noise_estimated_from_few_residuals_widens_the_errors",
     ),
     Quality.UNDERSMOOTHED: (
         "undersmoothed",
-        "test_smooth_profile::test_profile_with_more_structure_than_smoothing_is_for_is_flagged",
+        "test_smooth_profile::test_profile_with_too_much_structure_for_smoothing_is_flagged",
     ),
     Quality.HORIZONTAL_GRADIENT: ("gradient", "test_kano_hamilton"),
 }

@@ -1,4 +1,4 @@
-"""Common altitudes: interpolation against a known atmosphere, its noise against simulations."""
+"""Interpolation to common altitudes: against a known atmosphere, and its noise in simulations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def layer(height):
 
 
 def height_of(range_, angle):
-    """Return the height at a range, from the triangle to the Earth's centre."""
+    """Return the height at a range, from the triangle with the centre of the Earth."""
     slanted = range_ * np.cos(np.radians(angle))
     earth = slant_paths.EARTH_RADIUS
     sphere = np.sqrt(earth**2 + range_**2 + 2 * earth * slanted) - earth
@@ -31,21 +31,21 @@ def scan():
 
 
 @pytest.mark.parametrize(("interpolation", "largest"), [("cubic", 3e-6), ("linear", 2e-4)])
-def test_layer_is_kept(interpolation, largest):
+def test_layer_is_reproduced(interpolation, largest):
     signal = scan()
     common = to_altitude(
         signal, RANGE, ANGLE, ALTITUDE, variance=1e-8 * signal**2, interpolation=interpolation
     )
     error = np.abs(np.log(common.signal) - layer(ALTITUDE))
     assert np.nanmax(error) < largest
-    assert np.nanmax(error) > largest * 1e-3  # else the bound would say nothing
+    assert np.nanmax(error) > largest * 1e-3  # otherwise the bound would be too loose
     reached = RANGE[-1] >= slant_paths.slant_path(ANGLE, ALTITUDE) * ALTITUDE
     assert np.array_equal(np.isfinite(common.signal), reached)
 
 
 @pytest.mark.parametrize("interpolation", ["cubic", "linear"])
 @pytest.mark.parametrize("ratio", [3.0, 200.0])
-def test_noise_is_carried_without_bias(interpolation, ratio):
+def test_noise_is_propagated_without_bias(interpolation, ratio):
     rng = np.random.default_rng(11)
     mean = np.exp(-RANGE[:300] / 3000.0)
     signal = mean + mean / ratio * rng.normal(size=(8000, 1, 300))
@@ -65,7 +65,7 @@ def test_noise_is_carried_without_bias(interpolation, ratio):
     assert np.all(np.abs(bias) < 4.5 / np.sqrt(8000))
 
 
-def test_missing_bins_take_their_neighbours_only():
+def test_missing_bins_affect_their_neighbours_only():
     signal = scan()
     signal[0, 100] = np.nan
     altitude = RANGE[95:107] + 2.5
@@ -77,14 +77,14 @@ def test_missing_bins_take_their_neighbours_only():
     assert on_the_bins.signal[0, 0] == pytest.approx(signal[0, 95], rel=1e-14)
 
 
-def test_noise_around_zero_stays():
+def test_noise_around_zero_is_kept():
     signal = np.where(np.arange(RANGE.size) % 2, -1.0, 3.0)[np.newaxis]
     common = to_altitude(signal, RANGE, [0.0], [1001.25], variance=100.0, interpolation="linear")
     assert common.signal[0, 0] == pytest.approx(1.0, rel=1e-9)
     assert common.variance[0, 0] == pytest.approx(50.0, rel=1e-9)
 
 
-def test_accepts_what_archives_hold():
+def test_accepts_other_array_types_and_shapes():
     signal = scan()
     plain = to_altitude(signal, RANGE, ANGLE, ALTITUDE, variance=1e-6)
     several = to_altitude(
@@ -96,8 +96,8 @@ def test_accepts_what_archives_hold():
         station_altitude=50.0,
     )
     assert several.signal[1] == pytest.approx(plain.signal, nan_ok=True, rel=1e-9)
-    nothing = to_altitude(np.full_like(signal, np.nan), RANGE, ANGLE, ALTITUDE, variance=1.0)
-    assert np.all(np.isnan(nothing.signal))
+    empty = to_altitude(np.full_like(signal, np.nan), RANGE, ANGLE, ALTITUDE, variance=1.0)
+    assert np.all(np.isnan(empty.signal))
     beyond = to_altitude(signal, RANGE, [0.0, 20.0, 50.0, 75.0, 89.0], ALTITUDE, variance=1.0)
     assert np.all(np.isnan(beyond.signal[-1]))
 
@@ -116,7 +116,7 @@ def test_accepts_what_archives_hold():
         ({"station_altitude": np.nan}, "station_altitude"),
     ],
 )
-def test_refuses_what_does_not_fit(change, field):
+def test_invalid_arguments_are_refused(change, field):
     arguments = {
         "signal": scan(),
         "range": RANGE,

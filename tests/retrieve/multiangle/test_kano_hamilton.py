@@ -1,4 +1,4 @@
-"""Regression on the slant path, height by height: against numpy, exact numbers and simulations."""
+"""Regression on the slant path at single altitudes: against numpy, exact numbers, simulations."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ HEIGHT = np.arange(300.0, 2100.0, 30.0)
 
 def fit(y, variance, path, distance=None, keep=None, *, sides=False, inhomogeneity=0.0):
     """Return table, residuals and leverages of the general kernel."""
-    profiles, angles, bins = y.shape
-    distance = np.zeros((2, angles, bins)) if distance is None else distance
-    keep = np.ones((profiles, 0, bins)) if keep is None else keep
-    table = np.empty((profiles, kh.COLUMNS, bins))
+    profiles, angles, altitudes = y.shape
+    distance = np.zeros((2, angles, altitudes)) if distance is None else distance
+    keep = np.ones((profiles, 0, altitudes)) if keep is None else keep
+    table = np.empty((profiles, kh.COLUMNS, altitudes))
     residual, leverage = np.empty(y.shape), np.empty(y.shape)
-    added = np.full(bins, inhomogeneity)
+    added = np.full(altitudes, inhomogeneity)
     kh.fit_levels(y, variance, keep, added, path, distance, sides, table, residual, leverage)
     return table, residual, leverage
 
@@ -55,9 +55,9 @@ def tiled(y, variance, path, keep=None, inhomogeneity=0.0):
     return table
 
 
-def some_beams(rng, profiles=3, angles=7, bins=70):
-    path = np.repeat(np.sort(rng.uniform(1, 4, angles))[:, np.newaxis], bins, axis=1)
-    y = rng.normal(size=(profiles, angles, bins)) - 20
+def some_beams(rng, profiles=3, angles=7, altitudes=70):
+    path = np.repeat(np.sort(rng.uniform(1, 4, angles))[:, np.newaxis], altitudes, axis=1)
+    y = rng.normal(size=(profiles, angles, altitudes)) - 20
     return y, rng.uniform(0.5, 2, y.shape), path
 
 
@@ -115,16 +115,16 @@ def test_gradients_agree_with_numpy():
 
 @given(st.integers(0, 2**31), st.permutations(range(7)))
 @settings(max_examples=25, deadline=None)
-def test_order_of_the_beams_is_of_no_effect(seed, order):
-    y, variance, path = some_beams(np.random.default_rng(seed), bins=5)
-    there, back = (
+def test_order_of_the_beams_has_no_effect(seed, order):
+    y, variance, path = some_beams(np.random.default_rng(seed), altitudes=5)
+    ordered, permuted = (
         tiled(y, variance, path),
         tiled(y[:, list(order)], variance[:, list(order)], path[list(order)]),
     )
-    assert back == pytest.approx(there, rel=1e-11, abs=1e-12)
+    assert permuted == pytest.approx(ordered, rel=1e-11, abs=1e-12)
 
 
-def test_missing_beams_are_as_if_never_measured():
+def test_missing_beams_have_no_effect():
     rng = np.random.default_rng(3)
     y, variance, path = some_beams(rng)
     missing = rng.random(7) < 0.4
@@ -155,18 +155,18 @@ def test_noise_free_beams_give_the_truth(last):
 
 
 @pytest.mark.parametrize("path", [[2.0, 2.0, 2.0], [1.5]])
-def test_equal_paths_tell_nothing(path):
+def test_equal_paths_give_no_optical_depth(path):
     x = np.repeat(np.array(path)[:, np.newaxis], 3, axis=1)
-    for table in (tiled(np.ones((1, *x.shape)), np.ones((1, *x.shape)), x),):
-        assert np.all(np.isnan(table[:, kh.TAU]))
-        assert np.all(table[:, kh.INFORMATION] == 0)
+    table = tiled(np.ones((1, *x.shape)), np.ones((1, *x.shape)), x)
+    assert np.all(np.isnan(table[:, kh.TAU]))
+    assert np.all(table[:, kh.INFORMATION] == 0)
     assert np.all(np.isnan(fit(np.ones((1, *x.shape)), np.ones((1, *x.shape)), x)[0][:, kh.TAU]))
 
 
 # Noise --------------------------------------------------------------------------------------
 
 
-def test_regression_reaches_the_bound_and_knows_its_error():
+def test_regression_reaches_the_bound_and_states_its_error():
     rng = np.random.default_rng(5)
     path = 1 / np.cos(np.radians(np.linspace(0, 30, 6)))
     x = np.repeat(path[:, np.newaxis], 8, axis=1)
@@ -175,12 +175,12 @@ def test_regression_reaches_the_bound_and_knows_its_error():
     bound = 0.147 / 2 / np.sqrt(np.sum((path - path.mean()) ** 2))
     assert rms(table[:, kh.TAU]) == pytest.approx(bound, rel=0.02)
     np.testing.assert_allclose(1 / np.sqrt(table[:, kh.INFORMATION]), bound, rtol=1e-10)
-    one, two = coverage(table[:, kh.TAU], bound)
-    assert one == pytest.approx(68, abs=2)
-    assert two == pytest.approx(95, abs=1.5)
+    within_1, within_2 = coverage(table[:, kh.TAU], bound)
+    assert within_1 == pytest.approx(68, abs=2)
+    assert within_2 == pytest.approx(95, abs=1.5)
 
 
-def test_inhomogeneity_is_found_and_intervals_are_right():
+def test_inhomogeneity_is_estimated_and_standard_errors_are_right():
     atmosphere = clear(60)
     signal, variance, tau = signals(
         np.random.default_rng(6), 200, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.03
@@ -189,13 +189,13 @@ def test_inhomogeneity_is_found_and_intervals_are_right():
         signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton", robust=False
     )
     np.testing.assert_allclose(result.inhomogeneity, 0.03, rtol=0.06)
-    one, two = coverage(result.optical_depth - tau, result.optical_depth_standard_error)
-    assert one == pytest.approx(68, abs=2)
-    assert two == pytest.approx(95, abs=1.5)
+    within_1, within_2 = coverage(result.optical_depth - tau, result.optical_depth_standard_error)
+    assert within_1 == pytest.approx(68, abs=2)
+    assert within_2 == pytest.approx(95, abs=1.5)
     intercept = result.log_intercept - np.log(atmosphere[2])
-    one, two = coverage(intercept, result.log_intercept_standard_error)
-    assert one == pytest.approx(68, abs=2)
-    assert two == pytest.approx(95, abs=1.5)
+    within_1, within_2 = coverage(intercept, result.log_intercept_standard_error)
+    assert within_1 == pytest.approx(68, abs=2)
+    assert within_2 == pytest.approx(95, abs=1.5)
     assert np.nanmean(result.reduced_chi_square) == pytest.approx(1, abs=0.02)
 
 
@@ -211,7 +211,7 @@ def test_weak_signals_are_not_biased(ratio):
     )
     error = result.optical_depth[:, 2:] - 0.2
     assert abs(np.nanmean(error)) < 0.05 * np.nanstd(error)
-    # Taking the samples above twice their noise instead is off by far more.
+    # Selecting samples above twice their noise has a far larger bias.
     strong = signal > 2 * noise
     y = np.where(strong, np.log(np.where(strong, signal, 1.0)), 0.0)
     x = np.repeat(PATHS[:, np.newaxis], 12, axis=1)
@@ -258,7 +258,7 @@ def test_clean_blocks_skip_the_robust_passes():
 # Gradients ----------------------------------------------------------------------------------
 
 
-def test_scans_to_both_sides_do_not_see_a_gradient():
+def test_gradient_does_not_affect_scans_to_both_sides():
     rng = np.random.default_rng(10)
     angles = np.concatenate([-ANGLES[1::2], ANGLES[::2]])
     atmosphere = clear(60)
@@ -277,7 +277,7 @@ def test_scans_to_both_sides_do_not_see_a_gradient():
     assert np.nanmax(both.optical_depth_gradient_error) < 1e-12
 
 
-def test_scans_to_one_side_bound_a_gradient_and_tell_of_it():
+def test_scans_to_one_side_bound_and_flag_a_gradient():
     rng = np.random.default_rng(11)
     atmosphere = clear(100)
     results = []
@@ -293,12 +293,12 @@ def test_scans_to_one_side_bound_a_gradient_and_tell_of_it():
     assert tilted.flags.gradient.mean() > 0.9
     bias = np.mean(tilted.optical_depth - tau, axis=0)
     bound = tilted.optical_depth_gradient_error.mean(axis=0)
-    # The bound for 5 percent per km is what that gradient does.
+    # The bound for 5 percent per km is the bias by that gradient.
     assert bound == pytest.approx(np.abs(bias), abs=0.006)
     assert bound[28] > 3 * clean.optical_depth_standard_error[:, 28].mean()
 
 
-def test_azimuths_far_apart_find_the_gradient_at_no_cost():
+def test_beams_to_all_sides_fit_the_gradient_at_no_cost():
     rng = np.random.default_rng(12)
     angles = np.tile([0.0, 40.0, 60.0, 75.0], 3)
     height = np.array([1000.0])
@@ -315,7 +315,7 @@ def test_azimuths_far_apart_find_the_gradient_at_no_cost():
             assert one[kh.INFORMATION] / both[kh.INFORMATION] < 1.05**2
 
 
-def test_inhomogeneity_that_changes_with_height_is_followed():
+def test_inhomogeneity_that_changes_with_altitude_is_followed():
     rng = np.random.default_rng(13)
     height = np.arange(100.0, 4100.0, 50.0)
     spread = np.where(height < 2000, 0.01, 0.2)
@@ -323,9 +323,9 @@ def test_inhomogeneity_that_changes_with_height_is_followed():
     result = retrieve_optical_depth(
         signal, [0.0, 35.0, 66.0], height, variance=1e-12, method="kano_hamilton", robust=False
     )
-    found = result.inhomogeneity[0]
-    assert found[:30] == pytest.approx(0.01, rel=0.3)
-    assert found[-30:] == pytest.approx(0.2, rel=0.3)
+    inhomogeneity = result.inhomogeneity[0]
+    assert inhomogeneity[:30] == pytest.approx(0.01, rel=0.3)
+    assert inhomogeneity[-30:] == pytest.approx(0.2, rel=0.3)
 
 
 def test_student_factor_widens_for_few_residuals():
@@ -337,7 +337,7 @@ def test_student_factor_widens_for_few_residuals():
 
 
 def gappy(signal):
-    """Beams and their fit, altitude by altitude, of signals at six angles."""
+    """Return beams and their fit of signals at six angles."""
     angles = np.linspace(0.0, 60.0, signal.shape[1])
     scan = slant_paths.make_scan(angles, HEIGHT, None)
     beams = _block.make_beam_block(signal, np.full(signal.shape, 1e-4), scan)
@@ -350,7 +350,7 @@ def test_information_is_whole_where_beams_begin_late_or_end():
     np.testing.assert_array_equal(_block.kept_information(*gappy(signal)), 1.0)
 
 
-def test_information_that_gaps_leave_is_that_of_the_other_beams():
+def test_information_left_by_gaps_is_that_of_the_other_beams():
     signal = np.ones((2, 6, HEIGHT.size))
     signal[1, 5, 7] = signal[1, 1, 20:23] = np.nan
     kept = _block.kept_information(*gappy(signal))

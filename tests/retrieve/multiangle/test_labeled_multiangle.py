@@ -1,4 +1,4 @@
-"""Profiles of a scanning lidar, simulated by the lidar equation, and what is retrieved of them."""
+"""The multi-angle product from profiles of a scanning lidar, simulated by the lidar equation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SETTINGS = {
 
 
 def optical_depth(height):
-    """Molecules, and haze of scale height 1.2 km."""
+    """Return the optical depth of molecules, and of haze with a scale height of 1.2 km."""
     height = np.asarray(height, dtype=np.float64)
     return 0.05 * -np.expm1(-height / 8000.0) + 0.3 * -np.expm1(-height / 1200.0)
 
@@ -40,7 +40,7 @@ def backscatter(height):
 
 
 def power(zenith):
-    """Received power along beams without background, (beam, range)."""
+    """Return the received power along beams without background, (beam, range)."""
     cosine = np.cos(np.radians(zenith))[:, np.newaxis]
     height = RANGE * cosine
     return 3e14 * backscatter(height) / RANGE**2 * np.exp(-2.0 * optical_depth(height) / cosine)
@@ -55,7 +55,7 @@ def scan(
     scatter: float = 0.01,
     jitter: float = 0.0,
 ) -> tuple[xr.Dataset, dict[str, Any]]:
-    """Return profiles as the signal chain leaves them, and where they look to.
+    """Return conditioned profiles, and their pointing and times.
 
     Noise is white with the standard deviation `sigma`; the backscatter of each beam and cycle is
     off by `scatter` from altitude to altitude, and the energy of each profile by `jitter`.
@@ -98,13 +98,13 @@ def solve(conditioned: xr.Dataset, pointing: dict[str, Any], **changes: Any) -> 
     return retrieve_scan(conditioned, **(pointing | SETTINGS | changes))
 
 
-def has(found: xr.Dataset, bit: Quality) -> np.ndarray:
-    return (found["quality_flag"].to_numpy() & int(bit)) != 0
+def has(product: xr.Dataset, bit: Quality) -> np.ndarray:
+    return (product["quality_flag"].to_numpy() & int(bit)) != 0
 
 
-def assert_explained(found: xr.Dataset) -> None:
-    flagged = found["quality_flag"].to_numpy() != 0
-    for name, variable in found.data_vars.items():
+def assert_explained(product: xr.Dataset) -> None:
+    flagged = product["quality_flag"].to_numpy() != 0
+    for name, variable in product.data_vars.items():
         if variable.dims == ("time", "altitude"):
             assert np.all(flagged | np.isfinite(variable.to_numpy())), name
 
@@ -114,19 +114,19 @@ AIR = MolecularProfile(
     pressure=101325.0 * np.exp(-np.arange(0.0, 40e3, 500.0) / 8000.0),
     temperature=np.full(80, 273.0),
 )
-"""Of the scale height of the molecules that are simulated."""
+"""With the scale height of the simulated molecules."""
 FAR = Background((16200.0, 18000.0), AIR, 532e-9)
 
 
-def errors(found: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors over standard errors, and where nothing but one-sidedness is flagged."""
+def errors(product: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors over standard errors, and where only one-sidedness is flagged."""
     truth = optical_depth(ALTITUDE - STATION)
-    off = (found["optical_depth"] - truth) / found["optical_depth_standard_error"]
-    plain = (found["quality_flag"].to_numpy() & ~int(Quality.ONE_SIDED)) == 0
+    off = (product["optical_depth"] - truth) / product["optical_depth_standard_error"]
+    plain = (product["quality_flag"].to_numpy() & ~int(Quality.ONE_SIDED)) == 0
     return off.to_numpy(), plain
 
 
-# The truth comes back
+# Against the truth
 
 
 @pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
@@ -142,9 +142,9 @@ def test_unflagged_optical_depths_lie_within_three_standard_errors(
     off, plain = [], []
     for seed in range(1, 5):
         profiles = scan(32, zenith, seed, sigma=noise[0], scatter=noise[1])
-        found = solve(*profiles, method=method, background=background)
-        assert_explained(found)
-        for kept, part in zip((off, plain), errors(found), strict=True):
+        product = solve(*profiles, method=method, background=background)
+        assert_explained(product)
+        for kept, part in zip((off, plain), errors(product), strict=True):
             kept.append(part)
     good = np.concatenate(plain)
     size = np.abs(np.concatenate(off)[good])
@@ -153,51 +153,51 @@ def test_unflagged_optical_depths_lie_within_three_standard_errors(
     assert good.mean() >= (0.4 if background is FAR else 0.1)
 
 
-def test_where_energy_jitters_single_altitudes_stand():
+def test_single_altitudes_stay_valid_if_shot_energy_jitters():
     profiles = scan(32, sigma=0.05, scatter=0.002, jitter=0.02)
     joint = solve(*profiles, method="joint", background=FAR)
     assert has(joint, Quality.HIGH_CORRELATION).all()
-    found = solve(*profiles, background=FAR)
-    assert "left out joint" in found.attrs["steps"]
-    off, _ = errors(found)
-    stands = ~has(found, Quality.rejecting())
+    product = solve(*profiles, background=FAR)
+    assert "left out joint" in product.attrs["steps"]
+    off, _ = errors(product)
+    stands = ~has(product, Quality.rejecting())
     assert stands.mean() > 0.5
     assert np.mean(np.abs(off[stands]) < 3) >= 0.99
-    assert_explained(found)
+    assert_explained(product)
 
 
 def test_extinction_is_that_of_the_layers():
-    found = solve(*scan(32), method="joint", background=FAR)
+    product = solve(*scan(32), method="joint", background=FAR)
     tops = np.append(0.0, ALTITUDE - STATION)
     truth = np.diff(optical_depth(tops)) / np.diff(tops)
-    off = ((found["extinction"] - truth) / found["extinction_standard_error"]).to_numpy()
-    good = ~has(found, Quality.rejecting())
+    off = ((product["extinction"] - truth) / product["extinction_standard_error"]).to_numpy()
+    good = ~has(product, Quality.rejecting())
     assert np.mean(np.abs(off[good]) < 3) >= 0.98
-    assert float(found["extinction_standard_error"].median()) < 3e-5
+    assert float(product["extinction_standard_error"].median()) < 3e-5
 
 
 @pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
 def test_optical_depths_of_layers_lie_within_their_errors(method):
-    wanted = [(STATION, STATION + 600.0), (STATION + 610.0, STATION + 1500.0)]
+    layers = [(STATION, STATION + 600.0), (STATION + 610.0, STATION + 1500.0)]
     off = []
     for seed in range(4):
-        found = solve(*scan(32, seed=seed), method=method, background=FAR, layers=wanted)
-        bounds = found["layer_bnds"].to_numpy()
+        product = solve(*scan(32, seed=seed), method=method, background=FAR, layers=layers)
+        bounds = product["layer_bnds"].to_numpy()
         np.testing.assert_allclose(bounds, STATION + np.array([[0, 600], [600, 1500]]))
-        np.testing.assert_allclose(found["layer_altitude"], STATION + np.array([300, 1050]))
+        np.testing.assert_allclose(product["layer_altitude"], STATION + np.array([300, 1050]))
         truth = np.diff(optical_depth(bounds - STATION), axis=1)[:, 0]
         error = np.hypot(
-            found["layer_optical_depth_standard_error"],
-            found["layer_optical_depth_gradient_error"],
+            product["layer_optical_depth_standard_error"],
+            product["layer_optical_depth_gradient_error"],
         )
-        off.append(((found["layer_optical_depth"] - truth) / error).to_numpy())
-        reject = has(found, Quality.rejecting())
+        off.append(((product["layer_optical_depth"] - truth) / error).to_numpy())
+        reject = has(product, Quality.rejecting())
         hidden = np.stack([reject[:, 5], reject[:, 5] | reject[:, 20]], axis=1)
-        np.testing.assert_array_equal(np.isnan(found["layer_optical_depth"]), hidden)
-        # As a difference of the optical depths, to the last bits.
-        depth = found["optical_depth"].to_numpy()
+        np.testing.assert_array_equal(np.isnan(product["layer_optical_depth"]), hidden)
+        # Equal to the difference of the optical depths but for rounding.
+        depth = product["optical_depth"].to_numpy()
         layer = np.where(hidden[:, 1], np.nan, depth[:, 20] - depth[:, 5])
-        np.testing.assert_allclose(found["layer_optical_depth"][:, 1], layer, atol=1e-12)
+        np.testing.assert_allclose(product["layer_optical_depth"][:, 1], layer, atol=1e-12)
     size = np.abs(np.concatenate(off))
     size = size[np.isfinite(size)]
     assert size.size > 100
@@ -205,20 +205,20 @@ def test_optical_depths_of_layers_lie_within_their_errors(method):
     assert "layer_optical_depth" not in solve(*scan(3), method=method)
 
 
-def test_monotone_profiles_and_chi_square_come_along():
-    found = solve(*scan(16), background=FAR)
-    depth, risen = found["optical_depth"].to_numpy(), found["monotone_optical_depth"].to_numpy()
+def test_product_has_monotone_profiles_and_chi_square():
+    product = solve(*scan(16), background=FAR)
+    depth, risen = product["optical_depth"].to_numpy(), product["monotone_optical_depth"].to_numpy()
     np.testing.assert_array_equal(np.isnan(depth), np.isnan(risen))
     for one, plain in zip(risen, depth, strict=True):
         steps = np.diff(one[np.isfinite(one)])
         assert np.all(steps >= 0)
         rising = np.all(np.diff(plain[np.isfinite(plain)], prepend=0.0) >= 0)
         assert np.array_equal(one, plain, equal_nan=True) == rising
-    assert float(found["reduced_chi2"].mean()) == pytest.approx(1.0, abs=0.15)
+    assert float(product["reduced_chi2"].mean()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_extinction_stays_withheld_where_single_altitudes_stand_in():
-    """Energy that jitters, in a cloud whose extinction varies along the paths."""
+def test_extinction_stays_withheld_if_single_altitudes_replace_joint():
+    """Jittering shot energy, in a cloud whose extinction varies along the paths."""
     rng = np.random.default_rng(3)
     height, cycles, beams = 10.0 * np.arange(1, 61), 24, 8
     zenith = np.linspace(0.0, 60.0, beams)
@@ -238,75 +238,75 @@ def test_extinction_stays_withheld_where_single_altitudes_stand_in():
         },
         coords={"altitude": height, "beam_zenith_angle": ("beam", zenith)},
     )
-    found = labeled.retrieve_optical_depth(beams, station_altitude=0.0)
-    assert "left out joint" in found.attrs["steps"]
-    assert has(found, Quality.POOR_STRATIFICATION).all()
-    assert np.isfinite(found["optical_depth"]).any()
+    product = labeled.retrieve_optical_depth(beams, station_altitude=0.0)
+    assert "left out joint" in product.attrs["steps"]
+    assert has(product, Quality.POOR_STRATIFICATION).all()
+    assert np.isfinite(product["optical_depth"]).any()
     for name in ("extinction", "extinction_standard_error", "extinction_gradient_error"):
-        assert np.isnan(found[name]).all()
+        assert np.isnan(product[name]).all()
 
 
 def test_signal_left_in_the_tail_is_flagged_where_it_matters():
     conditioned, pointing = scan(32, sigma=0.02, scatter=0.003)
-    found = solve(conditioned, pointing, method="kano_hamilton")
-    off, _ = errors(found)
+    product = solve(conditioned, pointing, method="kano_hamilton")
+    off, _ = errors(product)
     wrong = np.abs(off) > 4
     assert wrong.mean() > 0.2
-    assert np.mean(has(found, Quality.BACKGROUND_UNCERTAIN)[wrong]) > 0.99
-    # The nearest air outshines what is left.
-    assert not has(found, Quality.BACKGROUND_UNCERTAIN)[:, :3].all()
+    assert np.mean(has(product, Quality.BACKGROUND_UNCERTAIN)[wrong]) > 0.99
+    # Near the lidar the signal is far stronger than the signal left in the tail.
+    assert not has(product, Quality.BACKGROUND_UNCERTAIN)[:, :3].all()
 
 
-# What it is made of
+# Cycles, beams and inputs
 
 
 def test_cycles_times_and_shots():
     conditioned, pointing = scan(3)
-    found = solve(conditioned, pointing)
-    assert dict(found.sizes) == {"time": 3, "altitude": 60, "beam": 10, "nv": 2}
+    product = solve(conditioned, pointing)
+    assert dict(product.sizes) == {"time": 3, "altitude": 60, "beam": 10, "nv": 2}
     bounds = pointing["time_bnds"].reshape(3, 10, 2)
-    np.testing.assert_array_equal(found["time_bnds"][:, 0], bounds[:, 0, 0])
-    np.testing.assert_array_equal(found["time_bnds"][:, 1], bounds[:, -1, 1])
+    np.testing.assert_array_equal(product["time_bnds"][:, 0], bounds[:, 0, 0])
+    np.testing.assert_array_equal(product["time_bnds"][:, 1], bounds[:, -1, 1])
     np.testing.assert_array_equal(
-        found["time"], bounds[:, 0, 0] + (bounds[:, -1, 1] - bounds[:, 0, 0]) // 2
+        product["time"], bounds[:, 0, 0] + (bounds[:, -1, 1] - bounds[:, 0, 0]) // 2
     )
-    np.testing.assert_array_equal(found["shots"], 6000)
-    np.testing.assert_array_equal(found["beams"], 10)
-    np.testing.assert_allclose(found["beam_zenith_angle"], np.abs(np.sort(TWO_SIDED)))
-    np.testing.assert_allclose(found["beam_azimuth"], [200.0] * 5 + [20.0] * 5)
-    assert "joint" in found.attrs["steps"]
+    np.testing.assert_array_equal(product["shots"], 6000)
+    np.testing.assert_array_equal(product["beams"], 10)
+    np.testing.assert_allclose(product["beam_zenith_angle"], np.abs(np.sort(TWO_SIDED)))
+    np.testing.assert_allclose(product["beam_azimuth"], [200.0] * 5 + [20.0] * 5)
+    assert "joint" in product.attrs["steps"]
 
 
-def test_missing_files_leave_their_cycle_with_the_others():
+def test_a_cycle_keeps_the_beams_left_by_missing_files():
     conditioned, pointing = scan(6)
     whole = solve(conditioned, pointing)
     kept = np.setdiff1d(np.arange(60), [21, 24, 25])
-    found = solve(*take(conditioned, pointing, kept))
-    assert found["beams"].to_numpy().tolist() == [10, 10, 7, 10, 10, 10]
-    assert found["shots"].to_numpy().tolist() == [6000, 6000, 4200, 6000, 6000, 6000]
-    gone = np.isnan(found["residual"].to_numpy()).all(axis=2)
+    product = solve(*take(conditioned, pointing, kept))
+    assert product["beams"].to_numpy().tolist() == [10, 10, 7, 10, 10, 10]
+    assert product["shots"].to_numpy().tolist() == [6000, 6000, 4200, 6000, 6000, 6000]
+    gone = np.isnan(product["residual"].to_numpy()).all(axis=2)
     assert np.flatnonzero(gone[2]).tolist() == [1, 4, 5]
     assert not gone[[0, 1, 3, 4, 5]].any()
-    np.testing.assert_array_equal(found["time"], whole["time"])
-    off, plain = errors(found)
+    np.testing.assert_array_equal(product["time"], whole["time"])
+    off, plain = errors(product)
     assert np.nanmax(np.abs(off[2])[plain[2]], initial=0.0) < 4
-    assert_explained(found)
+    assert_explained(product)
 
 
-def test_what_is_left_of_a_cycle_is_used_as_far_as_it_goes():
+def test_incomplete_cycles_are_used_as_far_as_possible():
     conditioned, pointing = scan(6)
     kept = np.setdiff1d(np.arange(60), [*range(22, 30), *range(41, 50)])
-    found = solve(*take(conditioned, pointing, kept), method="kano_hamilton")
-    assert found["beams"].to_numpy().tolist() == [10, 10, 2, 10, 1, 10]
-    # Two beams to one side, of a scan to both: nothing cancels a gradient.
-    two, full = found.isel(time=2), found.isel(time=1)
+    product = solve(*take(conditioned, pointing, kept), method="kano_hamilton")
+    assert product["beams"].to_numpy().tolist() == [10, 10, 2, 10, 1, 10]
+    # Two beams to one side, of a scan to both sides: a gradient does not cancel.
+    two, full = product.isel(time=2), product.isel(time=1)
     assert has(two, Quality.ONE_SIDED)[np.isfinite(two["optical_depth"])].all()
     wider = two["optical_depth_standard_error"] > full["optical_depth_standard_error"]
     assert wider.to_numpy()[np.isfinite(two["optical_depth"])].all()
-    assert np.isnan(found["optical_depth"][4]).all()
-    assert np.isnan(found["reach"][4])
-    assert has(found, Quality.NO_LEVERAGE)[4].all()
-    assert_explained(found)
+    assert np.isnan(product["optical_depth"][4]).all()
+    assert np.isnan(product["reach"][4])
+    assert has(product, Quality.NO_LEVERAGE)[4].all()
+    assert_explained(product)
 
 
 @pytest.mark.parametrize("method", [m.value for m in MultiAngleMethod])
@@ -317,23 +317,25 @@ def test_every_missing_value_is_explained_whatever_the_method(method):
     conditioned["quality"][33, 200:400] |= np.int32(Quality.SATURATED)
     conditioned["quality"][40:48, 60:120] |= np.int32(Quality.SATURATED)
     conditioned["quality"][2, 30:40] |= np.int32(Quality.PILE_UP)
-    found = solve(conditioned, pointing, method=method)
-    assert_explained(found)
-    assert has(found, Quality.INPUT_MISSING)[2].all()
-    assert has(found, Quality.PILE_UP)[0].any()
-    assert found["beams"].to_numpy().tolist() == [9, 10, 0, 10, 10]
-    assert has(found, Quality.EXTRAPOLATED).any()
+    product = solve(conditioned, pointing, method=method)
+    assert_explained(product)
+    assert has(product, Quality.INPUT_MISSING)[2].all()
+    assert has(product, Quality.PILE_UP)[0].any()
+    assert product["beams"].to_numpy().tolist() == [9, 10, 0, 10, 10]
+    assert has(product, Quality.EXTRAPOLATED).any()
 
 
 def test_an_angle_to_one_side_is_flagged_and_has_a_systematic_error():
-    one, two = (solve(*scan(4, zenith), method="kano_hamilton") for zenith in (ONE_SIDE, TWO_SIDED))
-    assert has(one, Quality.ONE_SIDED)[np.isfinite(one["optical_depth"])].all()
-    assert not has(two, Quality.ONE_SIDED)[:, 5:50].any()
-    ratio = one["optical_depth_gradient_error"] / two["optical_depth_gradient_error"]
+    one_sided, two_sided = (
+        solve(*scan(4, zenith), method="kano_hamilton") for zenith in (ONE_SIDE, TWO_SIDED)
+    )
+    assert has(one_sided, Quality.ONE_SIDED)[np.isfinite(one_sided["optical_depth"])].all()
+    assert not has(two_sided, Quality.ONE_SIDED)[:, 5:50].any()
+    ratio = one_sided["optical_depth_gradient_error"] / two_sided["optical_depth_gradient_error"]
     assert float(ratio[:, 5:50].median()) > 100
     half = solve(*scan(4, ONE_SIDE), method="kano_hamilton", largest_gradient=2.5e-5)
     np.testing.assert_allclose(
-        2.0 * half["optical_depth_gradient_error"], one["optical_depth_gradient_error"]
+        2.0 * half["optical_depth_gradient_error"], one_sided["optical_depth_gradient_error"]
     )
 
 
@@ -342,12 +344,12 @@ def test_beams_along_the_horizon_and_unknown_ones_are_left_out():
     conditioned, pointing = scan(3, zenith)
     pointing["zenith_angle"][12] = 180.0
     pointing["zenith_angle"][5] = np.nan
-    found = solve(conditioned, pointing)
-    np.testing.assert_allclose(found["beam_zenith_angle"], ONE_SIDE)
-    assert found["beams"].to_numpy().tolist() == [9, 10, 10]
+    product = solve(conditioned, pointing)
+    np.testing.assert_allclose(product["beam_zenith_angle"], ONE_SIDE)
+    assert product["beams"].to_numpy().tolist() == [9, 10, 10]
     bounds = pointing["time_bnds"]
-    assert found["time_bnds"].to_numpy()[0, 0] == bounds[0, 0]
-    assert found["time_bnds"].to_numpy()[0, 1] == bounds[9, 1]
+    assert product["time_bnds"].to_numpy()[0, 0] == bounds[0, 0]
+    assert product["time_bnds"].to_numpy()[0, 1] == bounds[9, 1]
 
 
 def test_profiles_of_one_visit_are_averaged_by_their_shots():
@@ -375,18 +377,18 @@ def test_an_overlap_divides_the_signal():
         variance=conditioned["variance"] * overlap**2,
     )
     plain = solve(conditioned, pointing, method="kano_hamilton")
-    found = solve(dimmed, pointing, method="kano_hamilton", overlap=unknown)
+    product = solve(dimmed, pointing, method="kano_hamilton", overlap=unknown)
     above = ALTITUDE - STATION > 900.0
     np.testing.assert_allclose(
-        found["log_intercept"][:, above], plain["log_intercept"][:, above], atol=1e-9
+        product["log_intercept"][:, above], plain["log_intercept"][:, above], atol=1e-9
     )
-    assert_explained(found)
+    assert_explained(product)
     with_hole = solve(dimmed, pointing, overlap=np.where(RANGE < 1500, np.nan, overlap))
     first = np.isnan(with_hole["residual"].to_numpy()[:, 5]).sum(axis=1)
     assert np.all(first >= np.count_nonzero(ALTITUDE - STATION < 1450))
 
 
-# Bits do not hang on chunks
+# Values do not depend on chunks
 
 
 @pytest.mark.parametrize("size", [1, 7, 64, 10_000])
@@ -399,7 +401,7 @@ def test_any_chunking_gives_the_same_bits(size):
     xr.testing.assert_identical(whole, chunked)
 
 
-def test_bins_that_no_beam_reaches_and_pieces_do_not_matter(monkeypatch):
+def test_bins_beyond_the_highest_altitude_and_piece_sizes_do_not_matter(monkeypatch):
     conditioned, pointing = scan(12)
     cut = solve(conditioned, pointing, background=FAR)
     monkeypatch.setattr(labeled_altitudes, "_BESIDE", 10**6)
@@ -407,14 +409,14 @@ def test_bins_that_no_beam_reaches_and_pieces_do_not_matter(monkeypatch):
     xr.testing.assert_identical(cut, solve(conditioned, pointing, background=FAR))
 
 
-def test_beams_stay_lazy_until_they_are_wanted():
+def test_beams_stay_lazy():
     conditioned, pointing = scan(3)
     beams = labeled_altitudes.on_altitudes(conditioned.chunk(time=10), **(pointing | SETTINGS))
     assert beams["signal"].chunks is not None
     assert beams["shots"].chunks is None
 
 
-# What is refused
+# Refusals
 
 
 @pytest.mark.parametrize(
@@ -432,21 +434,21 @@ def test_beams_stay_lazy_until_they_are_wanted():
         ({"layers": [(1000.0, 500.0)]}, "layers"),
     ],
 )
-def test_what_cannot_be_right_is_refused(change, field):
+def test_invalid_arguments_are_refused(change, field):
     with pytest.raises(RetrievalInputError) as caught:
         solve(*scan(3), **change)
     assert caught.value.field == field
 
 
-def test_where_nothing_tells_what_is_left_in_the_tail_all_is_uncertain():
+def test_all_is_uncertain_if_the_signal_left_in_the_tail_is_unknown():
     conditioned, pointing = scan(3)
     # The signal before the tail is hidden.
     before = (conditioned["range"] > 5000.0) & (conditioned["range"] < 16000.0)
     hidden = conditioned.assign(
         quality=conditioned["quality"] | before.astype(np.int32) * np.int32(Quality.SATURATED)
     )
-    found = solve(hidden, pointing, method="kano_hamilton")
-    stands = np.isfinite(found["optical_depth"].to_numpy())
+    product = solve(hidden, pointing, method="kano_hamilton")
+    stands = np.isfinite(product["optical_depth"].to_numpy())
     assert stands.any()
-    assert has(found, Quality.BACKGROUND_UNCERTAIN)[stands].all()
-    assert_explained(found)
+    assert has(product, Quality.BACKGROUND_UNCERTAIN)[stands].all()
+    assert_explained(product)

@@ -1,4 +1,4 @@
-"""Regularised differentiation: its limits, its record on the published cloud, its data share."""
+"""Regularised differentiation: limits, errors on the published cloud, data share."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCATTER = float(np.std(np.log1p(np.random.default_rng(0).uniform(-0.25, 0.25, 10
 
 
 def weights(path, strength, order=0, average="path"):
-    """Return what the method multiplies the logarithms by."""
+    """Return the factors by which the method multiplies the logarithms."""
     settings = Regularisation(order=order, choice="fixed", strength=strength, average=average)
     operator = mld.make_operator(np.asarray(path, dtype=float), settings)
     kept = 1 / (1 + strength * operator.penalty)
@@ -60,7 +60,7 @@ def retrieve(signal, angles, method, **options):
 @given(st.lists(st.floats(1.0, 5.0), min_size=3, max_size=12, unique_by=lambda x: round(x, 2)))
 @settings(max_examples=60, deadline=None)
 def test_between_the_end_beams_and_the_regression(path):
-    # Level slopes are the straight line of Kano and Hamilton.
+    # A constant slope is the straight line of Kano and Hamilton.
     line = kano_hamilton(path)
     assert weights(path, 1e12, order=1) == pytest.approx(line, abs=1e-9 * np.max(np.abs(line)))
     ends = np.zeros(len(path))
@@ -71,7 +71,7 @@ def test_between_the_end_beams_and_the_regression(path):
     assert weights(path, 1e15, order=0) == pytest.approx(0.0, abs=1e-9 / span)
 
 
-def test_level_slopes_are_the_regression_to_rounding():
+def test_constant_slopes_are_the_regression_to_rounding():
     for last in (15.0, 75.0):
         path = 1 / np.cos(np.radians(np.linspace(0, last, 12)))
         line = kano_hamilton(path)
@@ -112,14 +112,14 @@ def test_condition_stays_moderate(last, beams, largest):
     assert mld.make_operator(path, Regularisation()).condition < largest
 
 
-# The record on the published cloud ----------------------------------------------------------
+# Errors on the published cloud --------------------------------------------------------------
 
 
 def test_published_claim_is_not_reproduced_at_15_degrees():
     signal, angles = published(15.0)
     result = retrieve(signal, angles, "mld")
     error = result.optical_depth - TAU
-    # Low on average by half of the optical depth: the data say a fifth, the prior the rest.
+    # Low on average by half of the optical depth: a fifth comes from the data, the rest is prior.
     assert rms(error) == pytest.approx(2.08, abs=0.05)
     assert error[:, -1].mean() == pytest.approx(-2.31, abs=0.1)
     assert np.median(result.data_share) == pytest.approx(0.23, abs=0.06)
@@ -128,7 +128,7 @@ def test_published_claim_is_not_reproduced_at_15_degrees():
     assert np.all(np.isnan(result.extinction[result.flags.prior_dominated]))
     regression = retrieve(signal, angles, "kano_hamilton")
     assert rms(regression.optical_depth - TAU) == pytest.approx(2.38, abs=0.05)
-    # The smaller error is bought: two angles at 30 degrees with 10 percent of noise do better.
+    # Two angles at 30 degrees with 10 percent of noise do better.
     rng = np.random.default_rng(22)
     angles = np.array([0.0, 30.0])
     path = 1 / np.cos(np.radians(angles))[:, np.newaxis]
@@ -182,7 +182,7 @@ def test_standard_error_is_the_scatter_at_a_fixed_strength():
     assert result.optical_depth_standard_error[0] == pytest.approx(scatter, rel=0.05)
 
 
-def test_missing_beams_are_as_if_never_measured():
+def test_missing_beams_have_no_effect():
     signal, angles = published(30.0, profiles=20)
     signal[:, 2, 3:] = np.nan
     subset = retrieve(np.delete(signal, 2, axis=1), np.delete(angles, 2), "mld")
@@ -206,6 +206,6 @@ def test_missing_beams_are_as_if_never_measured():
         ({"choice": "fixed", "strength": np.nan}, "strength"),
     ],
 )
-def test_refuses_settings_that_do_not_exist(change, field):
+def test_invalid_settings_are_refused(change, field):
     with pytest.raises(RetrievalInputError, match=field):
         Regularisation(**change)

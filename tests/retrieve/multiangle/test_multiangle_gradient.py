@@ -1,4 +1,4 @@
-"""Methods that fit no horizontal gradient say that they do not see one."""
+"""Methods that fit no horizontal gradient flag that they cannot detect one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ALTITUDE = np.arange(100.0, 3000.0, 50.0)
 
 
 def level_sky(gradient: float) -> tuple[np.ndarray, np.ndarray]:
-    """Signals of level layers, whose backscatter grows to one side by `gradient` (m-1)."""
+    """Return signals of level layers whose backscatter grows to one side by `gradient` (m-1)."""
     path = 1.0 / np.cos(np.deg2rad(ZENITH))[:, np.newaxis]
     aside = ALTITUDE * np.tan(np.deg2rad(ZENITH))[:, np.newaxis]
     signal = np.exp(gradient * aside - 2.0 * path * 1e-4 * ALTITUDE)
@@ -21,23 +21,23 @@ def level_sky(gradient: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("method", ["two_angle", "mld", "kano_hamilton", "joint"])
-def test_who_sees_no_gradient_says_so(method):
+def test_methods_blind_to_a_gradient_flag_it(method):
     signal, variance = level_sky(2e-4)
-    found = optical_depth.retrieve_optical_depth(
+    result = optical_depth.retrieve_optical_depth(
         signal, ZENITH, ALTITUDE, variance=variance, method=method
     )
-    known = np.isfinite(found.optical_depth)
+    known = np.isfinite(result.optical_depth)
     assert known.any()
     if method in ("two_angle", "mld"):
-        assert found.flags.one_sided[known].all()
+        assert result.flags.one_sided[known].all()
         return
-    assert not found.flags.one_sided[known].any()
+    assert not result.flags.one_sided[known].any()
     true = np.broadcast_to(1e-4 * ALTITUDE, known.shape)
-    assert np.abs(found.optical_depth - true)[known].max() < 0.01
+    assert np.abs(result.optical_depth - true)[known].max() < 0.01
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_prior_that_is_not_known_is_refused(bad):
+def test_a_prior_that_is_not_finite_is_refused(bad):
     signal, variance = level_sky(0.0)
     prior = np.full(ALTITUDE.size, bad)
     with pytest.raises(RetrievalInputError, match="prior_optical_depth"):

@@ -1,4 +1,4 @@
-"""The whole retrieval: error and coverage in scenes, extreme cases, blocks, and what it refuses."""
+"""The whole retrieval: error and coverage in scenes, extreme cases, blocks, and refusals."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ PROFILES = (
 def small():
     """Signals, variance, altitudes and optical depths of a small clear scene."""
     atmosphere = clear(80)
-    found = signals(
+    signal, variance, tau = signals(
         np.random.default_rng(1), 16, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.03
     )
-    return *found[:2], atmosphere[0], found[2]
+    return signal, variance, atmosphere[0], tau
 
 
 def assert_same(first, second):
@@ -90,21 +90,21 @@ def test_clear_air_to_six_kilometres():
     assert rms(error) <= rms(single.optical_depth - tau) / 5
     assert rms(joint.extinction - atmosphere[1]) <= 0.010e-3
     assert joint.steps[-1].step == "joint"
-    one, two = coverage(error, joint.optical_depth_standard_error)
-    assert 62 < one < 78
-    assert two > 93
+    within_1, within_2 = coverage(error, joint.optical_depth_standard_error)
+    assert 62 < within_1 < 78
+    assert within_2 > 93
     assert coverage(joint.extinction - atmosphere[1], joint.extinction_standard_error)[1] > 93
 
 
-def test_weak_light_keeps_its_intervals():
+def test_standard_errors_hold_in_weak_light():
     atmosphere = clear()
     signal, variance, tau = signals(
         np.random.default_rng(3), 150, ANGLES, atmosphere, ratio=300, inhomogeneity=0.03
     )
     joint = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance)
-    one, two = coverage(joint.optical_depth - tau, joint.optical_depth_standard_error)
-    assert 60 < one < 82
-    assert two > 92
+    within_1, within_2 = coverage(joint.optical_depth - tau, joint.optical_depth_standard_error)
+    assert 60 < within_1 < 82
+    assert within_2 > 92
     assert np.isfinite(joint.inhomogeneity).any()
     assert np.nanpercentile(joint.inhomogeneity, 90) < 0.045
     assert not joint.flags.poor_stratification.any()
@@ -124,9 +124,9 @@ def test_cloud_at_30_degrees(correlation):
     )
     joint = retrieve_optical_depth(signal, STEEP, atmosphere[0], variance=variance)
     error = joint.optical_depth - tau
-    one, two = coverage(error, joint.optical_depth_standard_error)
-    assert 58 < one < 78
-    assert two > 91
+    within_1, within_2 = coverage(error, joint.optical_depth_standard_error)
+    assert 58 < within_1 < 78
+    assert within_2 > 91
     if correlation == 0:
         assert rms(error) <= 0.16
         assert rms(joint.extinction - atmosphere[1]) <= 3.0e-3
@@ -137,7 +137,7 @@ def test_cloud_at_30_degrees(correlation):
 
 
 @pytest.mark.parametrize("total", [5.0, 20.0])
-def test_thick_cloud_is_withheld_where_it_swallows_the_beams(total):
+def test_thick_cloud_is_withheld_where_it_attenuates_the_beams(total):
     height = 10.0 * np.arange(1, 61)
     tau = depth(height, np.full(60, total / 600.0))
     rng = np.random.default_rng(5)
@@ -159,7 +159,7 @@ def test_thick_cloud_is_withheld_where_it_swallows_the_beams(total):
 
 
 @pytest.mark.parametrize(("last", "varies"), [(15, True), (30, True), (15, False), (30, False)])
-def test_extinction_that_varies_along_the_paths_is_told(last, varies):
+def test_extinction_that_varies_along_the_paths_is_flagged(last, varies):
     height, extinction, _ = cloud()
     angles = np.linspace(0, last, 6)
     path = 1 / np.cos(np.radians(angles))[:, np.newaxis]
@@ -170,7 +170,7 @@ def test_extinction_that_varies_along_the_paths_is_told(last, varies):
     assert np.isfinite(result.extinction).any() != varies
 
 
-def test_optical_depth_can_be_bounded_for_the_declared_gradient():
+def test_gradient_error_bounds_the_bias_by_the_declared_gradient():
     atmosphere = clear(100)
     signal, variance, tau = signals(
         np.random.default_rng(7), 32, ANGLES, atmosphere, inhomogeneity=0.03, gradient=0.04 / 1000
@@ -212,7 +212,7 @@ def test_layers_are_far_more_certain_than_differences():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_one_path_tells_nothing(small, method):
+def test_one_path_gives_no_optical_depth(small, method):
     signal, variance, height, _ = small
     for angles in ([ANGLES[3]], [30.0, 30.0, 30.0], [88.0, 89.0]):
         n = len(angles)
@@ -225,7 +225,7 @@ def test_one_path_tells_nothing(small, method):
         assert np.all(result.quality == Quality.NO_LEVERAGE)
 
 
-def test_tiny_leverage_is_told_with_an_honest_error():
+def test_tiny_leverage_is_flagged_and_has_a_correct_error():
     path = 1 + np.linspace(0, 0.001, 12)
     height, extinction, _ = clear(60)
     tau = depth(height, extinction)
@@ -239,7 +239,7 @@ def test_tiny_leverage_is_told_with_an_honest_error():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_beams_at_the_horizon_are_as_if_never_measured(small, method):
+def test_beams_at_the_horizon_have_no_effect(small, method):
     signal, variance, height, _ = small
     horizon = np.concatenate([signal, np.ones_like(signal[:, :2])], axis=1)
     noise = np.concatenate([variance, np.ones_like(variance[:, :2])], axis=1)
@@ -252,7 +252,7 @@ def test_beams_at_the_horizon_are_as_if_never_measured(small, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_broken_profiles_stay_alone(small, method):
+def test_invalid_profiles_do_not_affect_others(small, method):
     signal, variance, height, tau = small
     broken = signal.copy()
     broken[0], broken[2], broken[3] = np.inf, -signal[2], np.nan
@@ -272,7 +272,7 @@ def test_broken_profiles_stay_alone(small, method):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("variance_of", [np.nan, np.inf])
-def test_samples_without_a_variance_are_as_good_as_missing(small, method, variance_of):
+def test_samples_without_a_variance_count_as_missing(small, method, variance_of):
     signal, variance, height, _ = small
     unknown = np.array(variance)
     unknown[3] = variance_of
@@ -291,7 +291,7 @@ def test_samples_without_a_variance_are_as_good_as_missing(small, method, varian
         assert np.all(result.quality[6, 40:50] == Quality.NO_LEVERAGE)
 
 
-def test_holes_are_bridged_or_left(small):
+def test_gaps_are_interpolated_or_left(small):
     signal, variance, height, tau = small
     rng = np.random.default_rng(9)
     holes = np.where(rng.random(signal.shape) < 0.3, np.nan, signal)
@@ -308,7 +308,7 @@ def test_holes_are_bridged_or_left(small):
 
 
 def test_gaps_cost_no_more_than_the_samples_they_take():
-    """Heights that see other beams than their neighbours share less of their noise with these."""
+    """Altitudes with different beams have less noise in common."""
     rng, atmosphere = np.random.default_rng(21), cloud()
     errors, with_gaps, deviations = [], [], []
     for _ in range(12):
@@ -317,26 +317,30 @@ def test_gaps_cost_no_more_than_the_samples_they_take():
         )
         gaps = np.where(rng.random(signal.shape) < 0.3, np.nan, signal)
         whole = retrieve_optical_depth(signal, STEEP, atmosphere[0], variance=variance)
-        found = retrieve_optical_depth(gaps, STEEP, atmosphere[0], variance=variance)
+        holed = retrieve_optical_depth(gaps, STEEP, atmosphere[0], variance=variance)
         errors.append(whole.optical_depth - tau)
-        with_gaps.append(found.optical_depth - tau)
-        deviations.append(with_gaps[-1] / found.optical_depth_standard_error)
+        with_gaps.append(holed.optical_depth - tau)
+        deviations.append(with_gaps[-1] / holed.optical_depth_standard_error)
     assert rms(np.array(with_gaps)) < 1.35 * rms(np.array(errors))
     assert np.mean(np.abs(deviations) > 4.0) < 0.01
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("bins", [1, 3])
-def test_few_altitudes_and_one_profile_run(small, method, bins):
+@pytest.mark.parametrize("altitudes", [1, 3])
+def test_few_altitudes_and_one_profile_are_solved(small, method, altitudes):
     signal, variance, height, tau = small
     result = retrieve_optical_depth(
-        signal[0, :, :bins], ANGLES, height[:bins], variance=variance[0, :, :bins], method=method
+        signal[0, :, :altitudes],
+        ANGLES,
+        height[:altitudes],
+        variance=variance[0, :, :altitudes],
+        method=method,
     )
-    assert result.optical_depth.shape == (bins,)
-    assert result.residual.shape == (12, bins)
+    assert result.optical_depth.shape == (altitudes,)
+    assert result.residual.shape == (12, altitudes)
     assert result.reach.shape == ()
     if method != "mld":
-        error = result.optical_depth - tau[:bins]
+        error = result.optical_depth - tau[:altitudes]
         assert np.all(np.abs(error) < 5 * result.optical_depth_standard_error)
 
 
@@ -358,7 +362,7 @@ def test_constant_extinction_leaves_the_smoother_saturated():
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
-def test_units_of_the_signal_are_of_no_effect(small, scale):
+def test_units_of_the_signal_have_no_effect(small, scale):
     signal, variance, height, _ = small
     plain = retrieve_optical_depth(signal, ANGLES, height, variance=variance)
     other = retrieve_optical_depth(signal * scale, ANGLES, height, variance=variance * scale**2)
@@ -385,7 +389,7 @@ def test_two_beams_have_no_residual(small):
     path = 1 / np.cos(np.radians(ANGLES[ends]))
     logarithm = np.log(signal[:, ends])
     expected = (logarithm[:, 0] - logarithm[:, 1]) / 2 / (path[1] - path[0])
-    # What the correction for noise adds is far below that noise.
+    # The correction for noise is far smaller than the noise.
     assert result.optical_depth == pytest.approx(expected, abs=2e-3)
 
 
@@ -393,7 +397,7 @@ def test_two_beams_have_no_residual(small):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_blocks_depend_on_nothing_outside(small, method):
+def test_blocks_are_independent(small, method):
     signal, variance, height, _ = small
     labels = np.repeat([7, 2, 5], [5, 10, 1])
     options = {"method": method, "layers": [(0.0, 600.0), (800.0, 1400.0)]}
@@ -406,12 +410,12 @@ def test_blocks_depend_on_nothing_outside(small, method):
             signal[rows], ANGLES, height, variance=variance[rows], **options
         )
         for name in PROFILES:
-            there = getattr(whole, name)[rows]
-            assert np.array_equal(there, getattr(alone, name), equal_nan=True), name
+            values = getattr(whole, name)[rows]
+            assert np.array_equal(values, getattr(alone, name), equal_nan=True), name
     assert [step.block for step in whole.steps[:: len(whole.steps) // 3]] == [2, 5, 7]
 
 
-def test_leading_axes_and_layout_are_of_no_effect(small):
+def test_leading_axes_and_layout_have_no_effect(small):
     signal, variance, height, _ = small
     plain = retrieve_optical_depth(signal, ANGLES, height, variance=variance)
     shaped = retrieve_optical_depth(
@@ -429,7 +433,7 @@ def test_leading_axes_and_layout_are_of_no_effect(small):
     assert single.optical_depth == pytest.approx(plain.optical_depth, abs=1e-5)
 
 
-def test_altitudes_above_the_sea_are_those_above_the_lidar(small):
+def test_station_altitude_only_shifts_the_altitudes(small):
     signal, variance, height, _ = small
     plain = retrieve_optical_depth(signal, ANGLES, height, variance=variance)
     raised = retrieve_optical_depth(
@@ -441,7 +445,7 @@ def test_altitudes_above_the_sea_are_those_above_the_lidar(small):
 
 @given(st.integers(0, 2**31), st.sampled_from(METHODS))
 @settings(max_examples=20, deadline=None)
-def test_anything_finite_or_not_gives_a_result(seed, method):
+def test_any_input_gives_a_result(seed, method):
     rng = np.random.default_rng(seed)
     signal = rng.normal(size=(3, 5, 30)) * 10.0 ** rng.integers(-200, 200)
     signal[rng.random(signal.shape) < 0.2] = rng.choice([np.nan, np.inf, 0.0, -1.0, 1e308])
@@ -454,10 +458,10 @@ def test_anything_finite_or_not_gives_a_result(seed, method):
     assert not np.any(valued & (result.flags.no_data | result.flags.extrapolated))
 
 
-# What is left out, and what is refused ------------------------------------------------------
+# Skipped steps and refusals -----------------------------------------------------------------
 
 
-def test_auto_stays_with_single_altitudes_where_they_are_certain_enough(small):
+def test_auto_takes_single_altitudes_within_the_tolerance(small):
     signal, variance, height, _ = small
     for tolerance, expected in ((0.1, "kano_hamilton"), (1e-4, "joint")):
         result = retrieve_optical_depth(
@@ -503,7 +507,7 @@ def test_known_inhomogeneity_is_not_estimated(small):
         ({"layers": ["low"]}, "layers"),
     ],
 )
-def test_refuses_what_does_not_fit(small, change, field):
+def test_invalid_arguments_are_refused(small, change, field):
     signal, variance, height, _ = small
     arguments = {
         "signal": signal,

@@ -47,35 +47,35 @@ def test_a_gap_begins_a_cycle():
     assert numbered(SWEEP, seconds=short) == [0] * 5
 
 
-def test_a_long_look_at_low_elevation_is_no_gap():
-    """As scanners dwell where the signal is weak: 200 s among 20 s."""
+def test_a_long_dwell_at_low_elevation_is_no_gap():
+    """Scanners dwell longer where the signal is weak: 200 s among 20 s."""
     dwell = np.tile([20.0, 20.0, 20.0, 20.0, 200.0], 3)
     seconds = np.append(0.0, np.cumsum(dwell + 2.0)[:-1])
     assert numbered(SWEEP * 3, seconds=seconds, lengths=dwell) == [0] * 5 + [1] * 5 + [2] * 5
-    # One of the long looks is lost, in the middle of a cycle that begins with the second angle.
+    # One of the long dwells is lost, in the middle of a cycle that begins with the second angle.
     turned = [SWEEP[i] for i in (3, 4, 0, 1, 2)] * 3
     dwell = np.tile([20.0, 200.0, 20.0, 20.0, 20.0], 3)
     seconds = np.append(0.0, np.cumsum(dwell + 2.0)[:-1])
     kept = np.arange(15) != 6
-    found = numbered(np.array(turned)[kept], seconds=seconds[kept], lengths=dwell[kept])
-    assert found == [0] * 5 + [1] * 4 + [2] * 5
-    # A pause that no lost file explains.
+    numbers = numbered(np.array(turned)[kept], seconds=seconds[kept], lengths=dwell[kept])
+    assert numbers == [0] * 5 + [1] * 4 + [2] * 5
+    # A pause too long for a lost file.
     seconds[8:] += 400.0
     assert numbered(turned, seconds=seconds, lengths=dwell) == [0] * 5 + [1] * 3 + [2] * 5 + [3] * 2
 
 
 @settings(deadline=None, max_examples=50)
 @given(st.integers(0, 10_000), st.floats(0.02, 0.05))
-def test_noise_of_the_encoders_neither_splits_nor_merges(seed, noise):
+def test_encoder_noise_neither_splits_nor_merges_directions(seed, noise):
     rng = np.random.default_rng(seed)
     zenith = np.tile([60.0, 30.0, 0.0, 30.0, 60.0], 12)
     azimuth = np.tile([180.0, 180.0, 40.0, 0.0, 0.0], 12)
     shaky = np.abs(zenith + rng.normal(0.0, noise, 60))
     turned = (azimuth + rng.normal(0.0, noise, 60)) % 360.0
-    found = directions(shaky, turned)
-    assert found.index.tolist() == [0, 1, 2, 3, 4] * 12
-    np.testing.assert_allclose(found.zenith_angle, [60, 30, 0, 30, 60], atol=0.08)
-    off = (found.azimuth - [180.0, 180.0, 180.0, 0.0, 0.0] + 180.0) % 360.0 - 180.0
+    result = directions(shaky, turned)
+    assert result.index.tolist() == [0, 1, 2, 3, 4] * 12
+    np.testing.assert_allclose(result.zenith_angle, [60, 30, 0, 30, 60], atol=0.08)
+    off = (result.azimuth - [180.0, 180.0, 180.0, 0.0, 0.0] + 180.0) % 360.0 - 180.0
     np.testing.assert_allclose(off[[0, 1, 3, 4]], 0.0, atol=0.06)
     assert numbered(shaky, turned) == np.repeat(np.arange(12), 5).tolist()
 
@@ -92,16 +92,16 @@ def test_a_sweep_over_the_zenith_is_one_cycle():
     zenith = [60.0, 30.0, 0.0, 30.0, 60.0]
     azimuth = [270.0, 270.0, 12.3, 90.0, 90.0]
     assert numbered(zenith * 2, azimuth * 2) == [0] * 5 + [1] * 5
-    # Without azimuths the second half looks where the first half did.
+    # Without azimuths the second half has the directions of the first half.
     assert numbered(zenith) == [0, 0, 0, 1, 1]
 
 
-def test_signed_zenith_angles_lead_to_both_sides():
+def test_signed_zenith_angles_point_to_both_sides():
     signed = [-60.0, -30.0, 0.0, 30.0, 60.0]
-    found = directions(signed, [90.0] * 5)
-    np.testing.assert_array_equal(found.index, np.arange(5))
-    np.testing.assert_allclose(found.azimuth, [270.0, 270.0, 90.0, 90.0, 90.0])
-    np.testing.assert_allclose(found.zenith_angle, np.abs(signed))
+    result = directions(signed, [90.0] * 5)
+    np.testing.assert_array_equal(result.index, np.arange(5))
+    np.testing.assert_allclose(result.azimuth, [270.0, 270.0, 90.0, 90.0, 90.0])
+    np.testing.assert_allclose(result.zenith_angle, np.abs(signed))
     with pytest.raises(RetrievalInputError, match="azimuth"):
         directions(signed)
 
@@ -116,7 +116,7 @@ def test_back_and_forth_has_a_cycle_for_each_way():
 def test_several_profiles_in_each_direction_are_one_visit():
     assert numbered(np.repeat(SWEEP * 2, 3)) == [0] * 15 + [1] * 15
     assert numbered([30.0] * 7) == [0] * 7
-    # Some directions, wherever they stand in the sweep.
+    # Two profiles in some directions, anywhere in the sweep.
     for twice in ([0, 0, 30, 30, 60, 75], [0, 0, 30, 60, 75], [0, 30, 60, 75, 75], [0, 75, 75]):
         assert numbered(twice * 3) == np.repeat([0, 1, 2], len(twice)).tolist()
     # Back and forth, three profiles each: six follow each other where it turns.
@@ -124,10 +124,10 @@ def test_several_profiles_in_each_direction_are_one_visit():
     assert numbered([*there, *there[::-1], *there]) == [0] * 9 + [1] * 9 + [2] * 9
 
 
-def test_directions_are_told_apart_by_a_quarter_of_a_degree():
-    found = directions([30.0, 30.2, 30.8, 29.9, 0.1, 0.0], [10.0, 370 - 360, 10.0, 10.1, 3, 9])
-    assert found.index.tolist() == [1, 1, 2, 1, 0, 0]
-    np.testing.assert_allclose(found.zenith_angle, [0.05, 30.1 - 0.2 / 3, 30.8], atol=1e-12)
+def test_directions_differ_by_more_than_a_quarter_of_a_degree():
+    result = directions([30.0, 30.2, 30.8, 29.9, 0.1, 0.0], [10.0, 370 - 360, 10.0, 10.1, 3, 9])
+    assert result.index.tolist() == [1, 1, 2, 1, 0, 0]
+    np.testing.assert_allclose(result.zenith_angle, [0.05, 30.1 - 0.2 / 3, 30.8], atol=1e-12)
 
 
 def test_azimuth_goes_around():
@@ -135,9 +135,9 @@ def test_azimuth_goes_around():
 
 
 def test_the_zenith_lies_in_the_first_plane():
-    found = directions([50.0, 0.0, 50.0, 50.0, 50.0], [40.0, 0.0, 220.0, 130.0, 310.0])
-    assert found.index.tolist() == [2, 1, 0, 4, 3]
-    assert found.azimuth.tolist() == pytest.approx([220.0, 40.0, 40.0, 310.0, 130.0])
+    result = directions([50.0, 0.0, 50.0, 50.0, 50.0], [40.0, 0.0, 220.0, 130.0, 310.0])
+    assert result.index.tolist() == [2, 1, 0, 4, 3]
+    assert result.azimuth.tolist() == pytest.approx([220.0, 40.0, 40.0, 310.0, 130.0])
 
 
 def test_profiles_without_a_direction_go_with_the_one_before():
@@ -156,14 +156,14 @@ def test_profiles_without_a_direction_go_with_the_one_before():
 )
 def test_cycles_are_runs_without_a_return_or_a_long_gap(zenith, steps):
     seconds = np.cumsum(steps)[: len(zenith)]
-    found = np.array(numbered(zenith, seconds=seconds))
-    assert found[0] == 0
-    assert set(np.diff(found)) <= {0, 1}
+    numbers = np.array(numbered(zenith, seconds=seconds))
+    assert numbers[0] == 0
+    assert set(np.diff(numbers)) <= {0, 1}
     index = directions(zenith).index
     gaps = np.diff(seconds)
     longest = 3 * np.median(gaps) if gaps.size else 0.0
-    for number in range(found[-1] + 1):
-        members = np.flatnonzero(found == number)
+    for number in range(numbers[-1] + 1):
+        members = np.flatnonzero(numbers == number)
         visits = index[members][np.append(True, np.diff(index[members]) != 0)]
         assert len(set(visits)) == visits.size
         assert np.all(gaps[members[:-1]] - 0.5 <= longest)
@@ -183,7 +183,7 @@ def test_cycles_are_runs_without_a_return_or_a_long_gap(zenith, steps):
         ([0.0, 10.0], [0.0, 500.0], [[0, 1], [1, 2]], "azimuth"),
     ],
 )
-def test_what_cannot_be_right_is_refused(zenith, azimuth, bounds, field):
+def test_invalid_arguments_are_refused(zenith, azimuth, bounds, field):
     with pytest.raises(RetrievalInputError) as caught:
         cycles(zenith, azimuth, bounds)
     assert caught.value.field == field

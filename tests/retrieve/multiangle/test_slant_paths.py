@@ -1,4 +1,4 @@
-"""Slant paths: the spherical one against exact geometry, and which beams are usable."""
+"""Slant paths against exact geometry, and the selection of usable beams."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def test_spherical_path_keeps_its_digits(angle):
 
 
 @pytest.mark.parametrize("angle", [0.0, 30.0, 60.0, 75.0])
-def test_secant_is_what_the_sphere_gives_up_to_75_degrees(angle):
+def test_secant_equals_the_spherical_path_up_to_75_degrees(angle):
     path = slant_paths.slant_path(np.array([angle]), HEIGHT)[0]
     assert path == pytest.approx(1 / np.cos(np.radians(angle)), rel=1e-15)
-    # The curvature that the secant leaves out changes an optical depth by at most 0.6 percent.
+    # The curvature that the secant neglects changes an optical depth by at most 0.6 percent.
     assert abs(path[-1] / float(exact(angle, 5000.0)) - 1) < 0.006
 
 
@@ -51,7 +51,7 @@ def test_long_paths_are_not_used():
     assert np.nanmax(scan.path) <= 10.0
 
 
-def test_a_negative_angle_leads_backwards():
+def test_a_negative_angle_points_opposite_to_its_azimuth():
     scan = slant_paths.make_scan([-40.0, 40.0], HEIGHT, [10.0, 190.0])
     assert scan.path[0] == pytest.approx(scan.path[1])
     assert scan.east[0] == pytest.approx(scan.east[1])
@@ -64,10 +64,10 @@ def test_a_negative_angle_leads_backwards():
     st.floats(0.0, 2 * np.pi),
 )
 @settings(max_examples=200, deadline=None)
-def test_beams_surround_the_zenith_when_no_half_plane_holds_them(azimuth, turn):
+def test_beams_surround_the_zenith_if_no_half_plane_contains_them(azimuth, turn):
     directions = np.array(azimuth)
     normals = np.linspace(0, 2 * np.pi, 3601)
-    # The zero vector is outside the convex hull if one half plane strictly holds all directions.
+    # The zero vector is outside the convex hull if a half plane strictly contains all directions.
     closest = np.min(np.cos(directions[:, np.newaxis] - normals), axis=0).max()
     if abs(closest) > 2e-3:
         assert slant_paths.surrounds_zenith(directions + turn) == (closest < 0)
@@ -95,6 +95,6 @@ def test_opposite_beams_surround_the_zenith(azimuth, around):
         (["a"], HEIGHT, None, "zenith_angle"),
     ],
 )
-def test_refuses_what_cannot_be_a_scan(angles, altitude, azimuth, field):
+def test_invalid_geometry_is_refused(angles, altitude, azimuth, field):
     with pytest.raises(RetrievalInputError, match=field):
         slant_paths.make_scan(angles, altitude, azimuth)

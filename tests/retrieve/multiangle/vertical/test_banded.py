@@ -1,4 +1,4 @@
-"""The banded solution against dense algebra and against 60 digits."""
+"""The banded solution against dense algebra and arithmetic of 60 digits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STATION = 35.0
 
 
 def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
-    """Precision bands, estimates, penalty and weights of random profiles."""
+    """Return precision bands, estimates, penalty and weights of random profiles."""
     information = rng.uniform(1.0, 100.0, (profiles, heights))
     information[rng.random((profiles, heights)) < missing] = 0.0
     information[:, heights // 2] = 5.0
@@ -94,7 +94,7 @@ def test_solution_keeps_8_digits_of_60(smoothing, correlation):
 
 
 def _exact(bands, stiffness, lam, estimates):
-    """Solve in the precision of mpmath; return the solution and the last variance."""
+    """Return the solution and the last variance, computed by mpmath."""
     heights = estimates.size
     a = [[mp.mpf(float(b)) for b in row] for row in bands]
     k = [[mp.mpf(float(b)) for b in row] for row in stiffness]
@@ -142,7 +142,7 @@ def test_penalty_is_the_integral_of_the_squared_slope_of_extinction():
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
 @settings(max_examples=25, deadline=None)
-def test_lanes_do_not_know_of_each_other(seed, count):
+def test_lanes_are_independent_of_each_other(seed, count):
     rng = np.random.default_rng(seed)
     bands, estimates, stiffness, lam = systems(rng, count, 12)
     together = solved(bands, estimates, stiffness, lam)
@@ -161,13 +161,13 @@ def test_precision_is_the_inverse_of_the_covariance_of_an_autoregressive_process
     information = np.linspace(2.0, 9.0, 10)[np.newaxis].copy()
     information[0, list(missing)] = 0.0
     bands = correlated_precision(information, np.ones((1, 10)), 0.6)
-    there = np.flatnonzero(information[0])
-    apart = np.abs(np.subtract.outer(there, there))
-    # A hole of two heights and more separates what is below it from what is above.
+    known = np.flatnonzero(information[0])
+    apart = np.abs(np.subtract.outer(known, known))
+    # A gap of two altitudes or more separates the altitudes below it from those above.
     if missing == (3, 4):
-        apart = np.where((there[:, None] < 3) == (there < 3), apart, 99)
+        apart = np.where((known[:, None] < 3) == (known < 3), apart, 99)
     decay = np.where(apart < 99, 0.6**apart, 0.0)
-    error = 1.0 / np.sqrt(information[0, there])
+    error = 1.0 / np.sqrt(information[0, known])
     covariance = decay * np.outer(error, error)
-    found = dense(bands[:, 0])[np.ix_(there, there)]
-    np.testing.assert_allclose(found @ covariance, np.eye(there.size), atol=1e-12)
+    precision = dense(bands[:, 0])[np.ix_(known, known)]
+    np.testing.assert_allclose(precision @ covariance, np.eye(known.size), atol=1e-12)

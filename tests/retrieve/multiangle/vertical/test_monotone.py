@@ -20,33 +20,33 @@ ROWS = arrays(
 @settings(deadline=None)
 @given(ROWS)
 def test_equals_isotonic_regression_cut_at_zero(profiles):
-    for row, found in zip(profiles, project(profiles), strict=True):
+    for row, projection in zip(profiles, project(profiles), strict=True):
         expected = np.maximum(isotonic_regression(row).x, 0.0)
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(projection, expected, atol=1e-12)
 
 
 @settings(deadline=None)
 @given(ROWS, st.integers(0, 2**32 - 1))
 def test_is_the_nearest_admissible_profile(profiles, seed):
-    found = project(profiles)
+    projection = project(profiles)
     other = np.sort(np.abs(np.random.default_rng(seed).normal(size=profiles.shape)), axis=1)
-    # The admissible profiles are a convex cone: no direction into it comes nearer.
-    gain = ((profiles - found) * (other - found)).sum(axis=1)
+    # The admissible profiles are a convex cone: no direction into it leads nearer.
+    gain = ((profiles - projection) * (other - projection)).sum(axis=1)
     assert np.all(gain <= 1e-9)
-    assert np.all(np.diff(found, axis=1) >= 0.0)
-    assert np.all(found >= 0.0)
+    assert np.all(np.diff(projection, axis=1) >= 0.0)
+    assert np.all(projection >= 0.0)
 
 
 @settings(deadline=None)
 @given(ROWS, st.data())
-def test_missing_heights_are_passed_over(profiles, data):
+def test_missing_altitudes_are_skipped(profiles, data):
     holes = data.draw(arrays(np.bool_, profiles.shape))
-    found = project(np.where(holes, np.nan, profiles))
-    np.testing.assert_array_equal(np.isnan(found), holes)
-    for row, hole, got in zip(profiles, holes, found, strict=True):
+    projection = project(np.where(holes, np.nan, profiles))
+    np.testing.assert_array_equal(np.isnan(projection), holes)
+    for row, hole, values in zip(profiles, holes, projection, strict=True):
         if not hole.all():
             alone = project(row[np.newaxis, ~hole])[0]
-            np.testing.assert_array_equal(got[~hole], alone)
+            np.testing.assert_array_equal(values[~hole], alone)
 
 
 def test_profile_that_is_admissible_stays():

@@ -1,4 +1,4 @@
-"""The choice of smoothness against dense likelihoods, and its rules."""
+"""The choice of smoothness: criteria against dense algebra, and rules."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def block(profiles, correlation, rng):
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
 def test_likelihood_is_the_restricted_one_of_the_marginal_distribution(correlation):
-    """Gauss: the estimates are a straight line, an integrated random walk and noise."""
+    """Gaussian model: estimates are a straight line, an integrated random walk and noise."""
     bands, estimates, stiffness, unit = block(3, correlation, np.random.default_rng(0))
-    found = score_smoothing(bands, estimates, stiffness, unit).likelihood
+    likelihood = score_smoothing(bands, estimates, stiffness, unit).likelihood
     prior = np.linalg.pinv(dense(stiffness), rcond=1e-11, hermitian=True)
     line = ALTITUDE[:, np.newaxis]
     expected = np.zeros(GRID.size)
@@ -49,7 +49,7 @@ def test_likelihood_is_the_restricted_one_of_the_marginal_distribution(correlati
                 + np.linalg.slogdet(inner)[1]
                 + estimates[t] @ rest @ estimates[t]
             )
-    difference = found - expected
+    difference = likelihood - expected
     np.testing.assert_allclose(difference, difference.mean(), atol=1e-5)
 
 
@@ -61,15 +61,15 @@ def test_risk_estimates_the_true_error_without_bias():
     covariance = np.linalg.inv(dense(bands[:, 0]))
     stiffness, unit = _banded.penalty(ALTITUDE, 0.0), 50.0 * ALTITUDE[-1] ** 3
     noise = rng.multivariate_normal(np.zeros(HEIGHTS), covariance, size=64)
-    found = score_smoothing(bands, truth + noise, stiffness, unit)
+    scored = score_smoothing(bands, truth + noise, stiffness, unit)
     weight = dense(bands[:, 0])
     for i in range(0, GRID.size, 6):
         smoother = np.linalg.inv(weight + GRID[i] * unit * dense(stiffness)) @ weight
         error = (truth + noise) @ smoother.T - truth
         loss = np.einsum("ti,ij,tj->", error, weight, error)
         expected = loss + 64 * HEIGHTS
-        assert found.risk[i] == pytest.approx(expected, rel=0.07)
-        assert found.freedom[i] == pytest.approx(np.trace(smoother), rel=1e-6)
+        assert scored.risk[i] == pytest.approx(expected, rel=0.07)
+        assert scored.freedom[i] == pytest.approx(np.trace(smoother), rel=1e-6)
 
 
 @pytest.mark.parametrize(("profiles", "heights", "every"), [(130, 400, 3), (130, 25, 1)])
@@ -78,13 +78,13 @@ def test_long_block_is_scored_on_every_nth_profile(profiles, heights, every):
     bands = correlated_precision(np.ones_like(estimates), np.zeros_like(estimates), 0.0)
     stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1), 0.0)
     chosen = np.ascontiguousarray(bands[:, ::every])
-    part = score_smoothing(chosen, estimates[::every].copy(), stiffness, 1e8)
+    thinned = score_smoothing(chosen, estimates[::every].copy(), stiffness, 1e8)
     whole = score_smoothing(bands, estimates, stiffness, 1e8)
-    np.testing.assert_array_equal(whole.likelihood, part.likelihood)
+    np.testing.assert_array_equal(whole.likelihood, thinned.likelihood)
     assert whole.profiles == profiles
 
 
-def test_profile_unlike_the_others_has_no_say_in_the_risk():
+def test_profile_unlike_the_others_does_not_change_the_risk():
     bands, estimates, stiffness, unit = block(20, 0.0, np.random.default_rng(2))
     clean = score_smoothing(bands[:, 1:], estimates[1:], stiffness, unit)
     estimates[0] += 30.0 * (-1.0) ** np.arange(HEIGHTS)
@@ -94,23 +94,23 @@ def test_profile_unlike_the_others_has_no_say_in_the_risk():
 
 
 def scores(likely, risky, profiles=300):
-    """Parabolas with their minima at given indices, and degrees of freedom from 20 down to 1."""
+    """Return parabolas with minima at given indices, and degrees of freedom from 20 down to 1."""
     index = np.arange(GRID.size)
     freedom = np.geomspace(20.0, 1.0, GRID.size)
     return Scores((index - likely) ** 2.0, (index - risky) ** 2.0, freedom, profiles)
 
 
-def test_likelihood_is_followed_where_the_risk_agrees():
+def test_likelihood_decides_where_the_risk_agrees():
     assert choose_smoothing(scores(30, 29)).smoothing == GRID[30]
     assert choose_smoothing(scores(30, 35)).smoothing == GRID[30]
 
 
-def test_risk_is_followed_where_it_asks_for_more_freedom_up_to_a_decade():
+def test_risk_decides_where_it_gives_more_freedom_up_to_a_decade():
     assert choose_smoothing(scores(30, 25)).smoothing == GRID[25]
     assert choose_smoothing(scores(30, 5)).smoothing == GRID[30 - PER_DECADE]
 
 
-def test_two_degrees_of_freedom_are_left():
+def test_at_least_two_degrees_of_freedom_are_left():
     choice = choose_smoothing(scores(66, 66))
     assert choice.saturated
     assert 2.0 <= choice.effective_degrees_of_freedom < 2.1

@@ -1,4 +1,4 @@
-"""Stated errors where samples are missing here and there: neighbours that come from other beams."""
+"""Standard errors where samples are missing: neighbouring altitudes from different beams."""
 
 from __future__ import annotations
 
@@ -13,28 +13,30 @@ STEEP = np.linspace(0.0, 30.0, 6)
 
 
 def errors_with_gaps(atmosphere, angles, correlation, missing, **noise):
-    """Return errors and stated errors of the optical depth and of extinction, many blocks."""
+    """Return errors and standard errors of optical depth and of extinction, of many blocks."""
     rng = np.random.default_rng(77)
-    found = []
+    blocks = []
     for _ in range(24):
         signal, variance, tau = signals(
             rng, 16, angles, atmosphere, correlation=correlation, **noise
         )
         signal[rng.random(signal.shape) < missing] = np.nan
-        one = retrieve_optical_depth(signal, angles, atmosphere[0], variance=variance)
-        assert np.array_equal(np.isnan(one.extinction), np.isnan(one.extinction_standard_error))
-        found.append(
+        result = retrieve_optical_depth(signal, angles, atmosphere[0], variance=variance)
+        assert np.array_equal(
+            np.isnan(result.extinction), np.isnan(result.extinction_standard_error)
+        )
+        blocks.append(
             (
-                one.optical_depth - tau,
-                one.optical_depth_standard_error,
-                one.extinction - atmosphere[1],
-                one.extinction_standard_error,
+                result.optical_depth - tau,
+                result.optical_depth_standard_error,
+                result.extinction - atmosphere[1],
+                result.extinction_standard_error,
             )
         )
-    return np.stack(found, axis=1)
+    return np.stack(blocks, axis=1)
 
 
-# Errors of extinction are stated too wide without any gap, so that only too small ones count.
+# Standard errors of extinction are too large even without gaps: only too small ones matter.
 @pytest.mark.parametrize(("correlation", "missing"), [(0.7, 0.3), (0.9, 0.1), (0.9, 0.3)], ids=str)
 def test_stated_errors_of_a_cloud_hold_with_gaps(correlation, missing):
     depth, stated, extinction, of_extinction = errors_with_gaps(
@@ -54,7 +56,7 @@ def test_stated_errors_of_clear_air_hold_with_gaps():
 
 @pytest.mark.parametrize("hole", [(1, 60, 61), (3, 30, 60)], ids=["one sample", "half a beam"])
 def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
-    """Undoubted estimates must not share more of their noise than all of it."""
+    """The correlated share of the noise of an estimate must not exceed 1."""
     rng, atmosphere = np.random.default_rng(1), clear(120)
     deviations = []
     for correlation in (0.97, 0.99):
@@ -65,33 +67,35 @@ def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
             )  # fmt: skip
             beam, first, past = hole
             signal[:, [1, beam], first:past] = np.nan
-            one = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance)
-            valued = np.isfinite(one.extinction)
-            assert np.all(one.extinction_standard_error[valued] > 0.0)
-            assert np.all(one.optical_depth_standard_error[np.isfinite(one.optical_depth)] > 0.0)
+            result = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance)
+            valued = np.isfinite(result.extinction)
+            assert np.all(result.extinction_standard_error[valued] > 0.0)
+            assert np.all(
+                result.optical_depth_standard_error[np.isfinite(result.optical_depth)] > 0.0
+            )
             deviations.append(
-                ((one.extinction - atmosphere[1]) / one.extinction_standard_error)[valued]
+                ((result.extinction - atmosphere[1]) / result.extinction_standard_error)[valued]
             )
     assert np.mean(np.abs(np.concatenate(deviations)) > 4.0) < 5e-4
 
 
-def noise_with_gaps(rng, correlation, beams=8, heights=60):
+def noise_with_gaps(rng, correlation, beams=8, altitudes=60):
     """Return information, share and true covariance of means over beams, a third missing.
 
-    Beams whose noise is all shared along height, of variance 1.
+    The noise of each beam is fully correlated along altitude, with variance 1.
     """
-    there = rng.random((heights, beams)) > 1.0 / 3.0
-    there[:, 0] |= ~there.any(axis=1)
-    weight = there / there.sum(axis=1, keepdims=True)
-    apart = np.abs(np.subtract.outer(np.arange(heights), np.arange(heights)))
+    present = rng.random((altitudes, beams)) > 1.0 / 3.0
+    present[:, 0] |= ~present.any(axis=1)
+    weight = present / present.sum(axis=1, keepdims=True)
+    apart = np.abs(np.subtract.outer(np.arange(altitudes), np.arange(altitudes)))
     covariance = (weight @ weight.T) * correlation**apart
-    information = there.sum(axis=1).astype(np.float64)
+    information = present.sum(axis=1).astype(np.float64)
     return information, information / beams, covariance
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.7, 0.9, 0.95])
-def test_precision_with_gaps_tells_how_certain_a_mean_is(correlation):
-    """Of a constant, the precision states a variance that the weights that follow from it have."""
+def test_precision_with_gaps_gives_the_variance_of_a_mean(correlation):
+    """The variance of a constant by the precision is that of the mean with its weights."""
     rng, ratios = np.random.default_rng(3), []
     for _ in range(100):
         information, share, covariance = noise_with_gaps(rng, correlation)
@@ -106,19 +110,19 @@ def test_precision_with_gaps_tells_how_certain_a_mean_is(correlation):
     assert np.sqrt(np.mean(ratios)) == pytest.approx(1.0, abs=0.1)
 
 
-def test_precision_of_even_noise_is_that_without_gaps():
+def test_precision_of_uniform_noise_is_that_without_gaps():
     information, share = np.full((2, 30), 5.0), np.full((2, 30), 0.8)
     plain = _correlation.correlated_precision(information, share, 0.9)
-    found = gaps.gap_precision(information, share, 0.9)
-    np.testing.assert_allclose(found, plain, rtol=1e-12)
+    bands = gaps.gap_precision(information, share, 0.9)
+    np.testing.assert_allclose(bands, plain, rtol=1e-12)
 
 
-def test_no_number_is_demanded_of_heights_that_share_nothing():
+def test_altitudes_without_correlated_noise_stay_independent():
     information = np.tile([4.0, 0.0, 9.0], (1, 5))
     share = np.where(np.arange(15) % 2 == 0, 0.0, 1e-300)[np.newaxis]
-    found = gaps.gap_precision(information, share, 0.9)
-    np.testing.assert_array_equal(found[0], information)
-    assert not found[1:].any()
+    bands = gaps.gap_precision(information, share, 0.9)
+    np.testing.assert_array_equal(bands[0], information)
+    assert not bands[1:].any()
 
 
 def test_only_samples_missing_between_others_are_gaps():
@@ -129,8 +133,8 @@ def test_only_samples_missing_between_others_are_gaps():
     signal[4, 1] = np.nan
     signal[5, 0, 2] = -1.0
     variance = np.full(signal.shape, 0.1)
-    there = signal > 0.0
-    found = gaps.profiles_with_gaps(there, signal, variance)
-    np.testing.assert_array_equal(found, [False, True, False, False, False, False])
-    variance[0, 1, 3], there[0, 1, 3] = np.nan, False
-    assert gaps.profiles_with_gaps(there, signal, variance)[0]
+    present = signal > 0.0
+    gappy = gaps.profiles_with_gaps(present, signal, variance)
+    np.testing.assert_array_equal(gappy, [False, True, False, False, False, False])
+    variance[0, 1, 3], present[0, 1, 3] = np.nan, False
+    assert gaps.profiles_with_gaps(present, signal, variance)[0]
