@@ -191,7 +191,7 @@ def digitise_fast(
         raise SimulationInputError(
             f"of {shots} with {recorder.adc_bits} bits do not fit into 32 bits",
             field="shots",
-            remedy="take fewer shots, or digitise",
+            remedy="take fewer shots, or use digitise",
         )
     noise = random.standard_normal(rate.size, dtype=np.float32)
     dark = _dark(recorder, rate.shape)

@@ -128,7 +128,7 @@ def count_fast(
         raise SimulationInputError(
             f"of {shots} give {most:.3g} counts, more than 32 bits hold",
             field="shots",
-            remedy="take fewer shots, or count_photons",
+            remedy="take fewer shots, or use count_photons",
         )
     noise = random.standard_normal(rate.size, dtype=np.float32)
     before = 2.0 * _before(dead_time, bin_time)

@@ -126,7 +126,7 @@ class GeometricalOverlap:
         return values
 
 
-def vanishes(shape: Overlap) -> bool:
+def finite_at_lidar(shape: Overlap) -> bool:
     """Return whether O / R^2, and so the signal, stays finite at the lidar."""
     near = np.array([1e-3, 1e-2])
     values = shape(near)

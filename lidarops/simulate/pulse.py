@@ -27,7 +27,7 @@ from scipy.special import ndtr
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.overlap import Overlap, SineOverlap, vanishes
+from lidarops.simulate.overlap import Overlap, SineOverlap, finite_at_lidar
 
 Array = NDArray[np.float64]
 
@@ -316,7 +316,7 @@ def _refuse_near(distance: Array, cells: Response, shape: Overlap) -> None:
             remedy="give a shorter pulse (in s) or a longer range",
         )
     reached = (distance > cells.edges[0]) & (distance <= cells.edges[-1])
-    if reached.any() and not vanishes(shape):
+    if reached.any() and not finite_at_lidar(shape):
         raise SimulationInputError(
             f"must vanish with the square of the range, or the signal within the pulse"
             f" ({cells.edges[-1]:g} m) is infinite",

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.lidar import Lidar
-from lidarops.simulate.overlap import GeometricalOverlap, SineOverlap, vanishes
+from lidarops.simulate.overlap import GeometricalOverlap, SineOverlap, finite_at_lidar
 from lidarops.simulate.pulse import GaussianPulse, RectangularPulse
 from lidarops.simulate.signal import (
     backscatter_signal,
@@ -168,13 +168,13 @@ def test_every_overlap_vanishes_with_the_square_of_the_range(shape):
     near = np.array([-5.0, 0.0, 1e-3, 1e-2, 1e-1])
     values = shape(near)
     assert np.all(values[:2] == 0)
-    assert vanishes(shape)
+    assert finite_at_lidar(shape)
     far = shape(np.geomspace(1e-3, 2e4, 4000))
     assert np.all((far >= 0) & (far <= 1))
     assert far.max() > 0.5
     if values[2] > 0:
         assert values[3] / values[2] == pytest.approx(100, rel=1e-3)
-    assert not vanishes(SineOverlap(0.0))
+    assert not finite_at_lidar(SineOverlap(0.0))
 
 
 def _lidar(**changes):

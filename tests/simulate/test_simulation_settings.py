@@ -87,7 +87,7 @@ def test_impossible_settings_are_refused():
         AnalogRecorder(gain=0.1, noise=0.001, dark_offset=3.0, adc_range=500)
     with pytest.raises(ValidationError, match="clip noise at zero"):
         AnalogRecorder(gain=0.1, noise=0.5, dark_offset=1.0)
-    with pytest.raises(ValidationError, match="darker than night"):
+    with pytest.raises(ValidationError, match="day must be at least night"):
         Background(night=2.0, day=1.0)
     with pytest.raises(ValidationError, match="less than minimum"):
         DiurnalCourse(minimum=2.0, maximum=1.0)
@@ -134,7 +134,7 @@ _LEVEL = {"homogeneous": {"extinction": {"minimum": 1e-4, "maximum": 1e-4}}}
         ({"atmosphere": {"boundary_layer": {"aerosol": {"lidar_ratio": 0}}}}, "lidar_ratio"),
         (
             {"atmosphere": {"homogeneous": {"extinction": {"minimum": 1, "maximum": 100}}}},
-            "0.1 per km",
+            "0.1 km-1",
         ),
         (
             {
