@@ -1,7 +1,12 @@
-"""Prefect flows over lidarops: thin, no logic of their own.
+"""Prefect flows that call lidarops and add no logic of their own.
 
-Importing this package sets what an ephemeral Prefect server needs on a machine without any
-set-up, and what the reaper of dead runs relies on; a value in the environment wins.
+- `reprocess`: bring the products of a campaign up to date.
+- `catalog`: update the catalog only.
+- `maintenance`: end runs whose process is dead.
+- `notifications`: set up automations that report failed or missing runs.
+
+Importing this package sets the environment variables that a temporary Prefect server needs and that
+`maintenance` relies on; variables that are already set are kept.
 """
 
 from __future__ import annotations
@@ -10,19 +15,19 @@ import os
 from typing import Final
 
 WITH_FAILURES: Final = "Completed with failures"
-"""Name of the state of a run that did all it could, of an archive in which not all is well.
+"""State of a run that ended, but with refused files, failed scenes or the like.
 
 Its event is ``prefect.flow-run.Completed with failures``: Prefect names events after states.
 """
 
-# Prefect gives its own server 20 s to start, which a busy machine exceeds.
+# By default Prefect waits 20 s for its server to start, too short on a busy machine.
 os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "120")
-# A station may have no network, and reprocessing is nobody else's business.
+# A station may have no network, and usage data should not leave it.
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
-# s; what `flows.maintenance` judges a run by. Prefect's own 180 would block a schedule for longer.
+# s; `flows.maintenance` ends runs without heartbeat. The default of 180 s would block schedules.
 os.environ.setdefault("PREFECT_FLOWS_HEARTBEAT_FREQUENCY", "30")
-# What a server for the time of one run, without deployments, does not need to look after.
+# Services that a temporary server without deployments does not need.
 for _service in (
     "CANCELLATION_CLEANUP",
     "CLEANUP_RECONCILER",

@@ -1,4 +1,4 @@
-"""Flow: bring the catalog of a campaign up to date.
+"""Flow: update the catalog of a campaign.
 
 ``python -m flows.catalog catalogs/demo.yaml``
 """
@@ -12,8 +12,8 @@ import typer
 from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
-from flows import usage
 from flows.reprocess import Seconds, Workers
+from flows.usage import plain_errors
 from lidarops.campaign.model import load_campaign
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
@@ -31,20 +31,20 @@ def catalog(
     workers: Workers = 1,
     catalog: str | None = None,
 ) -> ScanSummary:
-    """Scan the archive of a campaign and publish what it refuses as an artifact.
+    """Scan the archive of a campaign, and publish a table of refused files as an artifact.
 
     Parameters
     ----------
     campaign : str
         Path of the campaign file.
     archive, out : str, optional
-        As on the command line.
+        Override the campaign file, as on the command line.
     wait : float
         s to wait for another run on the same archive.
     workers : int, optional
-        Processes, where thousands of files are new.
+        Number of processes; more than one is used if thousands of files are new.
     catalog : str, optional
-        As on the command line: SQLAlchemy URL of catalog and ledger.
+        SQLAlchemy URL of catalog and ledger; overrides the campaign file.
 
     Returns
     -------
@@ -68,17 +68,17 @@ def main(
     archive: str | None = None,
     out: str | None = None,
     url: Annotated[
-        str | None, typer.Option("--catalog", help="SQLAlchemy URL of catalog and ledger")
+        str | None, typer.Option("--catalog", help="SQLAlchemy URL of catalog and ledger.")
     ] = None,
-    wait: Annotated[float, typer.Option(min=0, help="s to wait for another run")] = 0.0,
+    wait: Annotated[float, typer.Option(min=0, help="Seconds to wait for another run.")] = 0.0,
 ) -> None:
-    """Bring the catalog of a campaign up to date as a Prefect flow."""
-    # Within the flow all of this would be told after the start of a server, in tracebacks.
-    with usage.told():
+    """Update the catalog of a campaign as a Prefect flow."""
+    # Check before the flow, which would start a server first and show tracebacks.
+    with plain_errors():
         catalog.validate_parameters({"campaign": campaign, "wait": wait})
         settings = load_campaign(campaign, archive=archive, output=out, catalog=url)
         selection.check_archive_and_catalog(settings, archive=archive)
-    with usage.told():
+    with plain_errors():
         summary = catalog(campaign, archive, out, wait, catalog=url)
     raise typer.Exit(1 if summary.refused else 0)
 

@@ -1,10 +1,10 @@
-"""Flow: end the runs whose process is dead.
+"""Flow: end runs whose process is dead.
 
-A worker that loses power leaves its run in the state Running for ever, where it occupies the one
-slot of its deployment: nothing is scheduled any more. Such a run gives no sign of life.
+If a worker loses power, Prefect keeps its run in the state Running for ever. The run occupies the
+one slot of its deployment, so that nothing is scheduled any more. Such a run sends no heartbeats.
 
-``python -m flows.maintenance`` looks once; with ``--every 15`` it stays and looks every 15 s,
-which needs no worker and is what ``deploy/`` starts.
+``python -m flows.maintenance`` checks once. With ``--every 15`` it keeps running and checks every
+15 s; this needs no worker, and is what ``deploy/`` starts.
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ from pydantic import Field
 
 HEARTBEAT = "prefect.flow-run.heartbeat"
 TAG = "lidarops"
-"""On every deployment of ``deploy/prefect.yaml``."""
+"""Tag of every deployment in ``deploy/prefect.yaml``."""
 
 _PAGE = 200
 
 Silence = Annotated[float, Field(ge=60, le=86_400)]
-"""s; two heartbeats at least, as one may be late."""
+"""s; at least two heartbeats, because one may be late."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reaped:
-    """A run that was ended."""
+    """A run that was ended because its process is dead."""
 
     id: UUID
     name: str
     silent: float
-    """s since its last sign of life."""
+    """s since its last heartbeat."""
 
 
 def reap_runs(
     client: SyncPrefectClient, *, silence: float = 90.0, start: float = 600.0
 ) -> list[Reaped]:
-    """End the deployed runs, tagged as lidarops', that give no sign of life.
+    """End deployed runs with the tag ``lidarops`` that send no heartbeats.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def reap_runs(
     silence : float
         s without a heartbeat after which a run counts as dead.
     start : float
-        s that a claimed run may take until it runs, as nodes may have to be started.
+        s that a claimed run may take to start, e.g. while nodes start.
 
     Returns
     -------
@@ -80,12 +80,12 @@ def reap_runs(
     for run in list(_active_runs(client)):
         since = max(_changed(run), _last_heartbeat(client, run))
         silent = (now - since).total_seconds()
-        # The first heartbeat comes with the state Running; what precedes may take long.
+        # Heartbeats begin with the state Running; a run may be pending for long.
         if silent <= (start if run.state_type is StateType.PENDING else silence):
             continue
-        message = f"no sign of life for {silent:.0f} s: worker and process are taken for dead"
+        message = f"no heartbeat for {silent:.0f} s: worker and process are considered dead"
         try:
-            # Not forced: the server refuses it for a run that has ended in the meantime.
+            # Without force, the server refuses the state for a run that has ended meanwhile.
             client.set_flow_run_state(run.id, Crashed(message=message))
         except ObjectNotFound:
             continue
@@ -99,14 +99,14 @@ def _now() -> datetime:
 
 def _active_runs(client: SyncPrefectClient) -> Iterator[FlowRun]:
     active = [StateType.RUNNING, StateType.PENDING, StateType.CANCELLING]
-    chosen = FlowRunFilter(
+    run_filter = FlowRunFilter(
         state=FlowRunFilterState(type=FlowRunFilterStateType(any_=active)),
-        # Runs without a deployment hold no slot, and those of others may give no heartbeat.
+        # Runs without a deployment hold no slot; runs of others may send no heartbeats.
         deployment_id=FlowRunFilterDeploymentId(is_null_=False),
         tags=FlowRunFilterTags(all_=[TAG]),
     )
     offset = 0
-    while page := client.read_flow_runs(flow_run_filter=chosen, limit=_PAGE, offset=offset):
+    while page := client.read_flow_runs(flow_run_filter=run_filter, limit=_PAGE, offset=offset):
         yield from page
         offset += len(page)
 
@@ -129,19 +129,19 @@ def _last_heartbeat(client: SyncPrefectClient, run: FlowRun) -> datetime:
 
 @flow(name="lidarops-maintenance", retries=2, retry_delay_seconds=10)
 def maintenance(silence: Silence = 90.0, start: Silence = 600.0) -> int:
-    """End the runs whose process is dead.
+    """End runs whose process is dead.
 
     Parameters
     ----------
     silence : float
         s without a heartbeat after which a run counts as dead.
     start : float
-        s that a claimed run may take until it runs.
+        s that a claimed run may take to start.
 
     Returns
     -------
     int
-        How many runs were ended.
+        Number of ended runs.
     """
     with get_client(sync_client=True) as client:
         reaped = reap_runs(client, silence=silence, start=start)
@@ -151,11 +151,17 @@ def maintenance(silence: Silence = 90.0, start: Silence = 600.0) -> int:
 
 
 def main(
-    every: Annotated[float | None, typer.Option(min=5, help="s; stay and look again")] = None,
-    silence: Annotated[float, typer.Option(min=60, help="s without a heartbeat")] = 90.0,
-    start: Annotated[float, typer.Option(min=60, help="s until a claimed run runs")] = 600.0,
+    every: Annotated[
+        float | None, typer.Option(min=5, help="Keep running and check every so many seconds.")
+    ] = None,
+    silence: Annotated[
+        float, typer.Option(min=60, help="Seconds without heartbeat until a run is dead.")
+    ] = 90.0,
+    start: Annotated[
+        float, typer.Option(min=60, help="Seconds that a claimed run may take to start.")
+    ] = 600.0,
 ) -> None:
-    """End the runs whose process is dead, once or for as long as this process lives."""
+    """End runs whose process is dead, once or repeatedly."""
     if every is None:
         maintenance(silence, start)
         return
@@ -165,7 +171,7 @@ def main(
                 for run in reap_runs(client, silence=silence, start=start):
                     typer.echo(f"run {run.name} ended: silent for {run.silent:.0f} s")
         except HTTPError as error:
-            # The server may be restarting; who watches over runs must not end with it.
+            # The server may be restarting; maintenance must survive that.
             typer.echo(f"the server does not answer: {error!r}", err=True)
         time.sleep(every)
 

@@ -1,9 +1,9 @@
-"""Set up, once, who is told of a night that failed or did not come.
+"""Set up notifications of nightly runs that failed or are missing.
 
-``python -m flows.notifications https://hooks.example.org/lidar`` makes two automations on the
-Prefect server, which post ``{"text": ...}`` to that address; called again, it replaces them. Chat
-services understand this; mail and others are chosen in Prefect's pages, for the same automations.
-``--failures`` makes a third, of runs that ended in the state `flows.WITH_FAILURES`.
+``python -m flows.notifications https://hooks.example.org/lidar`` creates two automations on the
+Prefect server, which post ``{"text": ...}`` to that address; a further call replaces them. Chat
+services accept this format; mail and others can be selected in Prefect's pages, for the same
+automations. ``--failures`` adds a third, for runs in the state `flows.WITH_FAILURES`.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from flows import WITH_FAILURES
 
 BLOCK = "lidarops-operators"
 FAILED = "lidarops: a run failed"
-ABSENT = "lidarops: no night was completed"
+ABSENT = "lidarops: no nightly run was completed"
 TROUBLED = "lidarops: a run completed with failures"
 
 _BODY = "{{ flow_run.name }} is {{ flow_run.state.name }}: {{ flow_run.state.message }}"
 
 
 def automations(block: UUID, *, within: timedelta, failures: bool = False) -> list[Automation]:
-    """Describe the automations.
+    """Return the automations.
 
     Parameters
     ----------
     block : UUID
-        The notification block that is used.
+        Id of the notification block to use.
     within : timedelta
-        Time in which one nightly run must be completed.
+        Time within which a nightly run must be completed.
     failures : bool
-        Whether to tell too of runs that are completed, with something refused or failed.
+        Whether to report also runs that were completed with failures.
 
     Returns
     -------
@@ -62,7 +62,7 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
                 SendNotification(
                     block_document_id=block,
                     subject=ABSENT,
-                    body=f"No nightly run was completed for {within}: look for a worker.",
+                    body=f"No nightly run was completed for {within}: check that a worker runs.",
                 )
             ],
         ),
@@ -70,15 +70,15 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
 
 
 def _ended(block: UUID, name: str, *states: str) -> Automation:
-    """Describe what tells of every run that ends in one of some states."""
+    """Return an automation that reports every run that ends in one of the states."""
     trigger = EventTrigger(
         expect=_events(*states),
         match_related=_tagged("lidarops"),
         posture=Posture.Reactive,
         threshold=1,
     )
-    told = SendNotification(block_document_id=block, subject=name, body=_BODY)
-    return Automation(name=name, trigger=trigger, actions=[told])
+    notification = SendNotification(block_document_id=block, subject=name, body=_BODY)
+    return Automation(name=name, trigger=trigger, actions=[notification])
 
 
 def _events(*states: str) -> set[str]:
@@ -92,23 +92,25 @@ def _tagged(tag: str) -> ResourceSpecification:
 
 
 def main(
-    url: Annotated[str, typer.Argument(help="of a web hook")],
-    hours: Annotated[float, typer.Option(min=1, help="in which a night must be completed")] = 26.0,
+    url: Annotated[str, typer.Argument(help="URL of a web hook.")],
+    hours: Annotated[
+        float, typer.Option(min=1, help="Hours within which a nightly run must be completed.")
+    ] = 26.0,
     *,
     failures: Annotated[
-        bool, typer.Option("--failures", help="tell of runs completed with failures too")
+        bool, typer.Option("--failures", help="Also report runs that were completed with failures.")
     ] = False,
 ) -> None:
-    """Tell somebody of runs that fail, and of nights without a run."""
+    """Send notifications of failed runs, and of nights without a run."""
     hook = CustomWebhookNotificationBlock(
         name=BLOCK, url=url, json_data={"text": "{{subject}}\n{{body}}"}
     )
-    # Prefect types what may also be awaited as either.
+    # Prefect types the result as value or awaitable.
     block = cast("UUID", hook.save(BLOCK, overwrite=True))
-    wanted = automations(block, within=timedelta(hours=hours), failures=failures)
-    there = {name for name in (FAILED, TROUBLED, ABSENT) if _removed(name)}
-    for automation in wanted:
-        if automation.name not in there:
+    new = automations(block, within=timedelta(hours=hours), failures=failures)
+    replaced = {name for name in (FAILED, TROUBLED, ABSENT) if _removed(name)}
+    for automation in new:
+        if automation.name not in replaced:
             typer.echo(f"new: {automation.name}")
         automation.create()
 

@@ -1,14 +1,14 @@
 """Flow: bring the products of a campaign up to date.
 
-``python -m flows.reprocess catalogs/demo.yaml`` needs no set-up: without a Prefect server in the
-environment it starts one for the time of the run.
+``python -m flows.reprocess catalogs/demo.yaml`` needs no set-up: if the environment names no
+Prefect server, it starts a temporary one.
 
-One Prefect task processes all scenes that are due, with a dask cluster of its own: a task costs
-tens of milliseconds and a file fewer. What is done is entered scene by scene in the ledger, so
-that a task that is tried again goes on where it was.
+One Prefect task processes all stale scenes, with its own dask cluster, because a task costs tens of
+milliseconds, more than a file. The ledger records every scene as it ends, so that a retried task
+continues where it stopped.
 
-A run after which something is refused or failed, now or before and still so, ends in the state
-`flows.WITH_FAILURES`, as nobody sees the exit code of a run on a schedule.
+If files are refused or scenes failed, in this run or since an earlier one, the run ends in the
+state `flows.WITH_FAILURES`, because nobody sees the exit code of a scheduled run.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ from prefect.tasks import exponential_backoff
 from prefect.utilities.annotations import quote
 from pydantic import Field
 
-from flows import WITH_FAILURES, usage
+from flows import WITH_FAILURES
+from flows.usage import plain_errors
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.campaign.product_settings import Instant
 from lidarops.catalog.ledger import RunStatus
@@ -57,15 +58,15 @@ _T = TypeVar("_T")
 Workers = Annotated[int, Field(ge=1, le=10_000)]
 Seconds = Annotated[float, Field(ge=0, le=86_400)]
 
-_TOLD_EVERY = 15.0
-"""s between reports of progress, each of which is a request to the server."""
-_NAMED = 20
-"""Scenes or files of one kind of trouble that the log names: each line is kept by the server."""
+_PROGRESS_INTERVAL = 15.0
+"""s between reports of progress; each is a request to the server."""
+_MOST_NAMED = 20
+"""Scenes or files of one kind of problem that the log names; the server stores every line."""
 
 
 def _may_pass(_task: object, _run: TaskRun, state: State[Any]) -> bool:
-    """Tell whether trying again may help: a store, a database or a cluster that is away."""
-    # Who waits at a terminal is better told at once.
+    """Return whether a retry may help, e.g. if a store, database or cluster is unavailable."""
+    # A user at a terminal should see the error at once.
     if runtime.deployment.id is None:
         return False
     return isinstance(state.data, OSError | CatalogError | clusters.ClusterError | ProductError)
@@ -80,16 +81,16 @@ _RETRY: dict[str, Any] = {
 
 
 def _opaque(value: _T) -> _T:
-    """Keep Prefect from walking an argument in search of futures: a run holds thousands."""
+    """Keep Prefect from searching an argument for futures: a run holds thousands of objects."""
     return cast("_T", quote(value))
 
 
 class _Progress:
-    """Publishes how far a run is, now and then."""
+    """Publishes the progress of a run."""
 
     def __init__(self, campaign: str) -> None:
-        described = f"Granules of campaign {campaign} that are due"
-        self._artifact = cast("UUID", create_progress_artifact(0.0, description=described))
+        description = f"Granules of stale scenes of campaign {campaign}"
+        self._artifact = cast("UUID", create_progress_artifact(0.0, description=description))
         self._expected = 0
         self._done = 0
         self._next = 0.0
@@ -100,7 +101,7 @@ class _Progress:
     def advance(self, outcome: SceneOutcome) -> None:
         self._done += outcome.granules
         if time.monotonic() >= self._next:
-            self._next = time.monotonic() + _TOLD_EVERY
+            self._next = time.monotonic() + _PROGRESS_INTERVAL
             share = min(1.0, self._done / max(self._expected, 1))
             update_progress_artifact(self._artifact, 100.0 * share)
 
@@ -132,21 +133,23 @@ def process_task(
 
 
 def _unfinished(result: Result) -> LidarOpsError:
-    """Return what a run is told by that did not come to its end."""
-    remedy = "run again: what is done stays done"
+    """Return the error of a run that did not finish."""
+    remedy = "run again: finished scenes are kept"
     if result.status is not RunStatus.STOPPED:
         return SceneError(f"the run is {result.status}", remedy=remedy)
     errors = [
         scene.error for scene in (result.record.scenes if result.record else ()) if scene.error
     ]
-    told = f": {errors[-1]}" if errors else ""
-    # A run gives up where products cannot be written, which may pass; see `_may_pass`.
-    return ProductError(f"the run gave up, as scene after scene failed{told}", remedy=remedy)
+    last_error = f": {errors[-1]}" if errors else ""
+    # A run stops if products cannot be written, which a retry may cure; see `_may_pass`.
+    return ProductError(
+        f"the run stopped, because scene after scene failed{last_error}", remedy=remedy
+    )
 
 
 @task(name="report", **_RETRY)
 def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
-    """Write the report of a run and publish its table, its link and its quicklook."""
+    """Write the report of a run, and publish its table, link and quicklook as artifacts."""
     built = report_run(campaign, record, workers=workers)
     key = campaign.name.lower()
     create_table_artifact(
@@ -154,7 +157,7 @@ def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
     )
     create_link_artifact(built.page.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
     if built.quicklook is not None:
-        # The server may stand on another machine, so the picture travels in the artifact.
+        # The server may run on another machine, so the artifact contains the picture.
         encoded = base64.b64encode(built.quicklook.read_bytes()).decode()
         create_image_artifact(image_url=f"data:image/png;base64,{encoded}", key=f"{key}-quicklook")
     return built.page
@@ -162,17 +165,19 @@ def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
 
 @task(name="publish", **_RETRY)
 def publish_task(campaign: Campaign, url: str) -> None:
-    """Bring an object store up to date with the products."""
-    done = publish_products(campaign, url)
-    get_run_logger().info("%s: %d sent, %d unchanged", url, len(done.uploaded), done.unchanged)
+    """Copy new and changed products to an object store."""
+    published = publish_products(campaign, url)
+    get_run_logger().info(
+        "%s: %d sent, %d unchanged", url, len(published.uploaded), published.unchanged
+    )
 
 
 def _run_name() -> str:
-    """Name a run after its campaign, what it does, and when it was due."""
-    given = runtime.flow_run.parameters
+    """Return the name of a run: campaign, full or incremental, and scheduled time."""
+    parameters = runtime.flow_run.parameters
     due = runtime.flow_run.scheduled_start_time or datetime.now(UTC)
-    kind = "full" if given.get("full") else "incremental"
-    return f"{Path(given['campaign']).stem}-{kind}-{due:%Y%m%dT%H%M}"
+    kind = "full" if parameters.get("full") else "incremental"
+    return f"{Path(parameters['campaign']).stem}-{kind}-{due:%Y%m%dT%H%M}"
 
 
 @flow(name="lidarops-reprocess", flow_run_name=_run_name)
@@ -195,41 +200,41 @@ def reprocess(
     *,
     full: bool = False,
 ) -> tuple[Result, Path | None]:
-    """Make the products of a campaign that are missing or stale, and the report of the run.
+    """Make the missing and stale products of a campaign, and the report of the run.
 
     Parameters
     ----------
     campaign : str
         Path of the campaign file.
     archive, out : str, optional
-        As on the command line.
+        Override the campaign file, as on the command line.
     workers : int, optional
-        Processes; 1 where not given.
+        Number of worker processes; default 1.
     instruments, stations, products : list of str, optional
-        Only these; kinds of products.
+        Only these instruments, stations and kinds of product.
     since, until : datetime, optional
         Only scenes that touch this interval.
     scheduler, cluster : str, optional
-        As on the command line: `lidarops.run.clusters.choose_cluster`.
+        As on the command line; see `lidarops.run.clusters.choose_cluster`.
     wait : float
         s to wait for another run on the same archive.
     publish : str, optional
-        URL of an object store that the products are copied to.
+        URL of an object store to which the products are copied.
     catalog : str, optional
-        As on the command line: SQLAlchemy URL of catalog and ledger.
+        SQLAlchemy URL of catalog and ledger; overrides the campaign file.
     memory_limit : str, optional
-        Most memory of a worker of this machine, such as ``2GiB``.
+        Memory limit of a local worker, such as ``2GiB``.
     full : bool
-        Also what is fresh.
+        Whether to make also fresh products again.
 
     Returns
     -------
     result : Result
     report : Path or None
-        The HTML page; None where there was nothing to do.
+        The HTML page; None if there was nothing to do.
 
-    Both come as the data of a state of its own name, `flows.WITH_FAILURES`, where something is
-    refused or failed; who calls the flow gets the data.
+    If anything is refused or failed, the flow ends in the state `flows.WITH_FAILURES`, and the
+    results are the data of this state; callers of the flow get the data.
     """
     chosen = clusters.choose_cluster(
         workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
@@ -237,18 +242,18 @@ def reprocess(
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
-    # First, as copy and report may fail.
-    message = _tell_troubles(settings, result) if result.troubled else ""
-    # Also where nothing was due: an earlier copy may have failed.
+    # First, because copy and report may fail.
+    message = _log_problems(settings, result) if result.troubled else ""
+    # Even if nothing was stale: an earlier copy may have failed.
     if publish is not None:
         publish_task(_opaque(settings), publish)
     built = None
     if result.record is None:
-        none = selects_no_scene(settings, selection)
-        what = "no scene of the archive is asked for" if none else "nothing to do"
-        get_run_logger().info("campaign %s: %s", settings.name, what)
-        if said := missing_report(settings):
-            get_run_logger().warning("campaign %s: %s", settings.name, said)
+        no_scene = selects_no_scene(settings, selection)
+        reason = "the selection contains no scene of the archive" if no_scene else "nothing to do"
+        get_run_logger().info("campaign %s: %s", settings.name, reason)
+        if report_note := missing_report(settings):
+            get_run_logger().warning("campaign %s: %s", settings.name, report_note)
     else:
         local = chosen.workers if isinstance(chosen, clusters.Local) else 1
         built = report_task(_opaque(settings), _opaque(result.record), local)
@@ -256,7 +261,7 @@ def reprocess(
         get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
     if not result.troubled:
         return result, built
-    # Prefect takes a state that is returned for the flow's own, and gives callers its data.
+    # Prefect uses a returned state as that of the flow, and gives its data to callers.
     ended: State[Any] = Completed(name=WITH_FAILURES, message=message, data=(result, built))
     return cast("tuple[Result, Path | None]", ended)
 
@@ -277,41 +282,41 @@ def _selection(
     )
 
 
-def _tell_troubles(campaign: Campaign, result: Result) -> str:
-    """Log what is refused or failed by name, as far as it is not too much; return the numbers."""
+def _log_problems(campaign: Campaign, result: Result) -> str:
+    """Log refused and failed files and scenes, some by name; return their numbers as text."""
     scenes = () if result.record is None else result.record.scenes
-    failed = {**result.failures, **{each.scene: each.error for each in scenes if each.error}}
-    named = {
+    failed = {**result.failures, **{scene.scene: scene.error for scene in scenes if scene.error}}
+    problems = {
         "scenes failed": failed,
-        "scenes left nothing to use": dict.fromkeys(
-            (*result.unusable, *(each.scene for each in scenes if each.unusable)),
-            "its retrievals left nothing to use",
+        "scenes without a usable value": dict.fromkeys(
+            (*result.unusable, *(scene.scene for scene in scenes if scene.unusable)),
+            "its retrievals gave no usable value",
         ),
         "files refused": _refused(campaign, result),
-        "scenes can give no product": result.empty_scenes,
-        "good files stand in no scene": result.set_aside,
-        "channels named and in no file": {
-            f"{each.channel} of {each.instrument}, for {each.requested_by}": each.reason
-            for each in result.unmet
-            if each.nowhere
+        "scenes without product": result.empty_scenes,
+        "good files in no scene": result.set_aside,
+        "requested channels in no file": {
+            f"{request.channel} of {request.instrument}, for {request.requested_by}": request.reason
+            for request in result.unmet
+            if request.nowhere
         },
         "products without a raw file (reprocess --remove-orphans removes them)": result.lost,
     }
     logger = get_run_logger()
-    for what, troubles in named.items():
-        for name, reason in list(troubles.items())[:_NAMED]:
+    for kind, reasons in problems.items():
+        for name, reason in list(reasons.items())[:_MOST_NAMED]:
             logger.warning("%s: %s", name, reason)
-        if len(troubles) > _NAMED:
-            logger.warning("... and %d more %s", len(troubles) - _NAMED, what)
-    numbers = {what: len(each) for what, each in named.items()}
-    numbers["more on days in which nothing changed"] = result.more_unused
-    told = ", ".join(f"{number} {what}" for what, number in numbers.items() if number)
-    logger.warning("campaign %s: %s", campaign.name, told)
-    return told
+        if len(reasons) > _MOST_NAMED:
+            logger.warning("... and %d more %s", len(reasons) - _MOST_NAMED, kind)
+    numbers = {kind: len(reasons) for kind, reasons in problems.items()}
+    numbers["more unused scenes and files on unchanged days"] = result.more_unused
+    summary = ", ".join(f"{number} {kind}" for kind, number in numbers.items() if number)
+    logger.warning("campaign %s: %s", campaign.name, summary)
+    return summary
 
 
 def _refused(campaign: Campaign, result: Result) -> Mapping[str, str]:
-    """Return file -> reason of what is refused, by the catalog or by a scene of the run."""
+    """Return file -> reason of the files refused by the catalog or by a scene of the run."""
     with Store(campaign.catalog_url, campaign.name) as store:
         early = store.refused()
     late = (
@@ -327,30 +332,46 @@ def main(
     archive: str | None = None,
     out: str | None = None,
     catalog: Annotated[
-        str | None, typer.Option(help="SQLAlchemy URL of catalog and ledger")
+        str | None, typer.Option(help="SQLAlchemy URL of catalog and ledger.")
     ] = None,
-    instrument: Annotated[list[str] | None, typer.Option(help="only this one")] = None,
-    station: Annotated[list[str] | None, typer.Option(help="only this one")] = None,
-    product: Annotated[list[ProductKind] | None, typer.Option(help="only this kind")] = None,
-    since: Annotated[datetime | None, typer.Option(help="only scenes that end later, UTC")] = None,
-    until: Annotated[datetime | None, typer.Option(help="only scenes that start before")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, max=10_000)] = None,
-    scheduler: Annotated[str | None, typer.Option(help="address of a dask scheduler")] = None,
+    instrument: Annotated[
+        list[str] | None, typer.Option(help="Only this one; may be repeated.")
+    ] = None,
+    station: Annotated[
+        list[str] | None, typer.Option(help="Only this one; may be repeated.")
+    ] = None,
+    product: Annotated[
+        list[ProductKind] | None, typer.Option(help="Only this kind of product; may be repeated.")
+    ] = None,
+    since: Annotated[
+        datetime | None, typer.Option(help="Only scenes that end after this UTC time.")
+    ] = None,
+    until: Annotated[
+        datetime | None, typer.Option(help="Only scenes that start before this UTC time.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=10_000, help="Number of workers.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a running dask scheduler to use.")
+    ] = None,
     cluster: Annotated[
-        str | None, typer.Option(help="slurm, kubernetes, or a YAML file that describes one")
+        str | None, typer.Option(help="slurm, kubernetes, or a YAML file that describes a cluster.")
     ] = None,
     memory_limit: Annotated[
-        str | None, typer.Option(help="most memory of a worker here, such as 2GiB")
+        str | None, typer.Option(help="Memory limit of a local worker, such as 2GiB.")
     ] = None,
-    wait: Annotated[float, typer.Option(min=0, help="s to wait for another run")] = 0.0,
+    wait: Annotated[float, typer.Option(min=0, help="Seconds to wait for another run.")] = 0.0,
     publish: Annotated[
-        str | None, typer.Option(help="URL of a store that the products are copied to")
+        str | None, typer.Option(help="URL of a store to which the products are copied.")
     ] = None,
     *,
-    full: Annotated[bool, typer.Option("--force", "--full", help="also what is fresh")] = False,
+    full: Annotated[
+        bool, typer.Option("--force", "--full", help="Make fresh products again, too.")
+    ] = False,
 ) -> None:
     """Bring the products of a campaign up to date as a Prefect flow."""
-    given: dict[str, Any] = {
+    parameters: dict[str, Any] = {
         "campaign": campaign,
         "archive": archive,
         "out": out,
@@ -368,18 +389,18 @@ def main(
         "publish": publish,
         "full": full,
     }
-    # Within the flow all of this would be told after the start of a server, in tracebacks.
-    with usage.told():
-        valid = reprocess.validate_parameters(given)
+    # Check before the flow, which would start a server first and show tracebacks.
+    with plain_errors():
+        valid = reprocess.validate_parameters(parameters)
         settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
-        of_selection = ("instruments", "stations", "products", "since", "until")
-        check_selection(settings, _selection(*(valid[name] for name in of_selection)))
+        selection_names = ("instruments", "stations", "products", "since", "until")
+        check_selection(settings, _selection(*(valid[name] for name in selection_names)))
         clusters.choose_cluster(
             workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
         )
         check_archive_and_catalog(settings, archive=archive)
-    with usage.told():
-        result, built = reprocess(**given)
+    with plain_errors():
+        result, built = reprocess(**parameters)
     if result.record is None:
         typer.echo("nothing to do")
     else:

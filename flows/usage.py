@@ -1,4 +1,4 @@
-"""How the flows tell what is wrong where they are called from a command line."""
+"""Show errors of flows that are called from a command line."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _REFUSED = 1
 
 
 @contextmanager
-def told() -> Iterator[None]:
-    """Show an error as a sentence; exit with 2 where it is wrong use, and with 1 else."""
+def plain_errors() -> Iterator[None]:
+    """Show an error as one line and exit with code 2 for wrong use, else with 1."""
     try:
         yield
     except (LidarOpsError, ParameterTypeError) as error:

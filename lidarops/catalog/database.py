@@ -15,11 +15,11 @@ from lidarops.catalog.schema import METADATA, SCHEMA, SCHEMA_VERSION
 from lidarops.errors import CatalogError
 
 BATCH = 1000
-"""Rows a statement, where a list of them is asked for."""
-_MOVE_AWAY: Final = "move it away: a new one is made from the archive, and products are made again"
+"""Largest number of values in the list of one statement."""
+_MOVE_AWAY: Final = "move it away; lidarops then makes a new one, and all products again"
 _URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
 _BROKEN: Final = ("malformed", "not a database")
-"""Words of SQLite about a file that is damaged."""
+"""Words in the messages of SQLite about a damaged file."""
 
 
 class Database:
@@ -32,12 +32,12 @@ class Database:
     campaign : str
         Name of the campaign; several may share a database.
     create : bool
-        Whether to make the catalog where there is none.
+        Whether to make the catalog if there is none.
 
     Raises
     ------
     CatalogError
-        If the database cannot be opened, is of another version of lidarops, or is not there.
+        If the database does not exist, cannot be opened, or has another schema version.
     """
 
     def __init__(self, url: str, campaign: str, *, create: bool = True) -> None:
@@ -46,7 +46,7 @@ class Database:
         self._url = _parsed(url)
         self._sqlite = self._url.get_backend_name() == "sqlite"
         if self._sqlite and self._url.database:
-            # Asked first, because opening it would make it.
+            # Check first, because opening would create the file.
             if not create and not Path(self._url.database).exists():
                 raise self._absent()
             _make_folder(Path(self._url.database).parent)
@@ -68,42 +68,42 @@ class Database:
         return self._url.render_as_string(hide_password=True)
 
     def close(self) -> None:
-        """Give the database connections back."""
+        """Close the database connections."""
         self._engine.dispose()
 
     @contextmanager
     def transaction(self) -> Iterator[sa.Connection]:
-        """Give a connection whose changes are kept together, or not at all."""
+        """Yield a connection; commit all its changes at the end, or none if an error is raised."""
         try:
             with self._engine.begin() as connection:
                 yield connection
         except sa.exc.SQLAlchemyError as error:
-            raise self._told(error) from error
+            raise self._catalog_error(error) from error
 
     @contextmanager
     def stream(self, query: sa.Select[Any]) -> Iterator[Iterator[sa.Row[Any]]]:
-        """Give the rows of a query one by one: never more than a few thousand in memory."""
+        """Yield the rows of a query one by one, with at most a few thousand in memory."""
         try:
             with self._engine.connect() as connection:
                 options = {"stream_results": True, "yield_per": 5000}
                 yield iter(connection.execution_options(**options).execute(query))
         except sa.exc.SQLAlchemyError as error:
-            raise self._told(error) from error
+            raise self._catalog_error(error) from error
 
     def insert(self, table: sa.Table) -> Any:
-        """Return an insert that can say what to do with a row that is there."""
+        """Return an insert statement that can handle rows that already exist."""
         return _insert(table, in_sqlite=self._sqlite)
 
     def insert_new(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of whole rows that leaves a row which is there as it is."""
+        """Return an insert of complete rows that leaves existing rows unchanged."""
         return _conflicting(table, in_sqlite=self._sqlite, replacing=False)
 
     def upsert(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of whole rows that takes the place of a row which is there."""
+        """Return an insert of complete rows that replaces existing rows."""
         return _conflicting(table, in_sqlite=self._sqlite, replacing=True)
 
     def clock(self) -> sa.ColumnElement[float]:
-        """Return the database's time in s: the one clock that all its users share."""
+        """Return the time of the database in s, the one clock that all its users share."""
         if self._sqlite:
             return sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Float())
         return sa.literal_column("extract(epoch from clock_timestamp())::float8", sa.Float())
@@ -131,10 +131,10 @@ class Database:
             remedy=_MOVE_AWAY,
         )
 
-    def _told(self, error: sa.exc.SQLAlchemyError) -> CatalogError:
+    def _catalog_error(self, error: sa.exc.SQLAlchemyError) -> CatalogError:
         cause = str(getattr(error, "orig", None) or error).strip()
         if "full" in cause:
-            remedy = "make space on the disk, then run again: what is done stays done"
+            remedy = "make space on the disk, then run again: finished scenes are kept"
         elif "readonly" in cause or "read-only" in cause:
             remedy = "make the folder writable, or choose another with --out or LIDAROPS_CATALOG"
         elif self._sqlite and any(word in cause for word in _BROKEN):
@@ -150,10 +150,10 @@ def _insert(table: sa.Table, *, in_sqlite: bool) -> Any:
 
 @cache
 def _conflicting(table: sa.Table, *, in_sqlite: bool, replacing: bool) -> sa.TextClause:
-    """Return an insert as text.
+    """Return an insert with a rule for existing rows, as text.
 
-    SQLAlchemy keeps no compiled form of one that says what to do with a row that is there, and to
-    compile it each time takes longer than to carry it out.
+    SQLAlchemy does not cache the compiled form of such an insert, and compiling it each time takes
+    longer than executing it.
     """
     statement = _insert(table, in_sqlite=in_sqlite)
     if replacing:
@@ -167,18 +167,18 @@ def _conflicting(table: sa.Table, *, in_sqlite: bool, replacing: bool) -> sa.Tex
     else:
         statement = statement.on_conflict_do_nothing()
     dialect = (sqlite if in_sqlite else postgresql).dialect(paramstyle="named")
-    # Text alone does not know how the database holds times.
+    # Types are needed because a text statement does not know how times are stored.
     typed = [sa.bindparam(column.name, type_=column.type) for column in table.columns]
     return sa.text(str(statement.compile(dialect=dialect))).bindparams(*typed)
 
 
 def refuse_wrong_url(url: str) -> None:
-    """Refuse what is no URL of a database; connects to none.
+    """Refuse an invalid database URL, without connecting.
 
     Raises
     ------
     CatalogError
-        Also where the driver is not installed.
+        If the URL is invalid or its driver is not installed.
     """
     _engine(_parsed(url)).dispose()
 
@@ -188,7 +188,7 @@ def _parsed(url: str) -> sa.URL:
         return sa.make_url(url)
     except sa.exc.ArgumentError as error:
         raise CatalogError(
-            "is no URL of a database", file=url, remedy=_URLS, wrong_use=True
+            "is not a database URL", file=url, remedy=_URLS, wrong_use=True
         ) from error
 
 
@@ -197,7 +197,7 @@ def _engine(url: sa.URL) -> sa.Engine:
         return sa.create_engine(url)
     except sa.exc.NoSuchModuleError as error:
         raise CatalogError(
-            f"there is no such kind of database: {error}",
+            f"unknown kind of database: {error}",
             file=url.render_as_string(hide_password=True),
             remedy=_URLS,
             wrong_use=True,
@@ -215,7 +215,7 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CatalogError(
-            f"the catalog's folder cannot be made: {error.strerror}",
+            f"the folder of the catalog cannot be made: {error.strerror}",
             file=folder,
             remedy="choose another folder with --out",
         ) from error
@@ -223,7 +223,7 @@ def _make_folder(folder: Path) -> None:
 
 def _tune_sqlite(connection: Any, _record: Any) -> None:
     cursor = connection.cursor()
-    # Asked first, because setting it writes.
+    # Query first, because setting it writes.
     if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
         cursor.execute("PRAGMA journal_mode=WAL")
     cursor.execute("PRAGMA synchronous=NORMAL")

@@ -1,4 +1,4 @@
-"""The catalog's half of the database: granules, one row a raw file."""
+"""The catalog part of the database: granules, one row per raw file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
 
 class Fingerprint(NamedTuple):
-    """What a scan compares a file with."""
+    """What the catalog knows of a file, for comparison in a scan."""
 
     path: str
     size: int
@@ -36,7 +36,7 @@ class Fingerprint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DaySum:
-    """The granules of one role on one day, summed up: equal where no row has changed."""
+    """Sums over the granules of one role on one day; unchanged if no row changed."""
 
     day: int
     role: Role
@@ -50,7 +50,7 @@ class Granules(Database):
 
     @contextmanager
     def fingerprints(self) -> Iterator[Iterator[Fingerprint]]:
-        """Give a fingerprint of every granule, by path, without holding them all."""
+        """Yield a fingerprint of every granule, ordered by path, without holding them all."""
         columns = (_C.path, _C.size, _C.mtime_ns, _C.scan_key, _C.stamp_low, _C.stamp_high)
         query = (
             sa.select(*columns, _C.sha256, _C.start)
@@ -62,7 +62,7 @@ class Granules(Database):
 
     @contextmanager
     def unread(self) -> Iterator[Iterator[tuple[str, int, datetime | None]]]:
-        """Give path, size and start of good granules that were never read whole."""
+        """Yield path, size and start of good granules without SHA-256 (never read in full)."""
         query = (
             sa.select(_C.path, _C.size, _C.start)
             .where(
@@ -76,7 +76,7 @@ class Granules(Database):
             yield ((path, size, start) for path, size, start in rows)
 
     def replace(self, rows: Sequence[GranuleRow]) -> None:
-        """Insert granules in place of rows of the same path."""
+        """Insert granules, replacing rows of the same path."""
         if not rows:
             return
         layouts = {row.values["layout"]: row.layout for row in rows}
@@ -100,7 +100,7 @@ class Granules(Database):
         connection.execute(gone, [{"gone": path} for path in paths])
 
     def store_digests(self, digests: Mapping[str, str]) -> None:
-        """Enter the sha256 of files that were read whole, by path."""
+        """Enter the SHA-256 of files, by path."""
         if not digests:
             return
         with self.transaction() as connection:
@@ -116,9 +116,9 @@ class Granules(Database):
             )
 
     def granules(self, *, status: Status | None = None) -> list[Granule]:
-        """Return the granules of the campaign, by instrument, start time and path."""
-        wanted = [] if status is None else [_C.status == status.value]
-        return self._granules(*wanted)
+        """Return the granules of the campaign, ordered by instrument, start time and path."""
+        conditions = [] if status is None else [_C.status == status.value]
+        return self._granules(*conditions)
 
     def granules_of(self, first: int, last: int, *, dark_days: int) -> list[Granule]:
         """Return good granules that start on days `first` to `last`, and dark ones around them.
@@ -128,15 +128,15 @@ class Granules(Database):
         first, last : int
             Days since 1970-01-01, both included.
         dark_days : int
-            How many days earlier and later dark granules may be.
+            Days before `first` and after `last` from which dark granules are included.
         """
         near = _C.day.between(first - dark_days, last + dark_days)
-        here = _C.day.between(first, last)
-        role = sa.or_(here, _C.role == Role.DARK.value)
+        on_days = _C.day.between(first, last)
+        role = sa.or_(on_days, _C.role == Role.DARK.value)
         return self._granules(near, role, _C.status == Status.GOOD.value)
 
-    def _granules(self, *wanted: sa.ColumnElement[bool]) -> list[Granule]:
-        query = sa.select(*_OF_GRANULE).where(_C.campaign == self.campaign, *wanted)
+    def _granules(self, *conditions: sa.ColumnElement[bool]) -> list[Granule]:
+        query = sa.select(*_GRANULE_COLUMNS).where(_C.campaign == self.campaign, *conditions)
         query = query.order_by(_C.instrument, _C.start, _C.path)
         with self.transaction() as connection:
             layouts = {
@@ -151,9 +151,9 @@ class Granules(Database):
         return self.granules(status=Status.REFUSED)
 
     def count(self, *, status: Status | None = None) -> int:
-        """Return how many granules there are."""
-        wanted = [] if status is None else [_C.status == status.value]
-        query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *wanted)
+        """Return the number of granules."""
+        conditions = [] if status is None else [_C.status == status.value]
+        query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *conditions)
         with self.transaction() as connection:
             return int(connection.scalar(query) or 0)
 
@@ -178,7 +178,7 @@ class Granules(Database):
             ]
 
     def layouts(self) -> list[tuple[str, tuple[ChannelLayout, ...]]]:
-        """Return every instrument with what some good signal granules of it hold."""
+        """Return pairs of instrument and layout of channels that occur in good signal granules."""
         inner = sa.select(_C.instrument, _C.layout).distinct().where(*self._signals()).subquery()
         query = (
             sa.select(inner.c.instrument, LAYOUT.c.channels)
@@ -194,23 +194,23 @@ class Granules(Database):
         return _C.campaign == self.campaign, _C.status == good, _C.role == signal
 
     def holdings(self, edges: Sequence[datetime]) -> list[Holding]:
-        """Return which channels good signal granules hold.
+        """Return how many good signal granules hold which channels, by instrument and period.
 
         Parameters
         ----------
         edges : sequence of datetime
-            Rising; where stretches end and begin.
+            Ascending times that separate the periods.
 
         Returns
         -------
         list of Holding
-            One for each instrument, stretch and layout of channels.
+            One per instrument, period and layout of channels.
         """
         begins = [datetime.min.replace(tzinfo=UTC), *edges]
         later = [(_C.start >= naive(edge), k) for k, edge in enumerate(edges, 1)]
-        stretch = sa.case(*reversed(later), else_=0) if later else sa.literal_column("0")
+        period = sa.case(*reversed(later), else_=0) if later else sa.literal_column("0")
         inner = (
-            sa.select(_C.instrument, stretch.label("stretch"), _C.layout)
+            sa.select(_C.instrument, period.label("period"), _C.layout)
             .where(*self._signals())
             .subquery()
         )
@@ -223,25 +223,25 @@ class Granules(Database):
         )
         with self.transaction() as connection:
             return [
-                Holding(instrument, begins[place], _layout_from(channels), files)
-                for instrument, place, _, files, channels in connection.execute(query)
+                Holding(instrument, begins[index], _layout_from(channels), files)
+                for instrument, index, _, files, channels in connection.execute(query)
             ]
 
     def paths_by_digest(self, digests: Collection[str]) -> dict[str, str]:
-        """Return sha256 -> path of granules that hold these contents."""
-        found: dict[str, str] = {}
-        wanted = sorted(digests)
+        """Return SHA-256 -> path of the granules with these digests."""
+        paths: dict[str, str] = {}
+        ordered = sorted(digests)
         with self.transaction() as connection:
-            for first in range(0, len(wanted), BATCH):
-                part = wanted[first : first + BATCH]
+            for first in range(0, len(ordered), BATCH):
+                batch = ordered[first : first + BATCH]
                 query = sa.select(_C.sha256, _C.path).where(
-                    _C.campaign == self.campaign, _C.sha256.in_(part)
+                    _C.campaign == self.campaign, _C.sha256.in_(batch)
                 )
-                found.update((row.sha256, row.path) for row in connection.execute(query))
-        return found
+                paths.update((row.sha256, row.path) for row in connection.execute(query))
+        return paths
 
 
-_OF_GRANULE: Final = tuple(
+_GRANULE_COLUMNS: Final = tuple(
     _C[name]
     for name in (
         "path", "size", "mtime_ns", "instrument", "role", "status", "reason", "notes", "start",
@@ -273,7 +273,7 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
         role=_ROLES[role],
         status=_STATUSES[status],
         reason=reason,
-        # Most granules have none, and there are millions.
+        # Skip the parsing for most of the millions of granules.
         notes=() if notes == "[]" else tuple(json.loads(notes)),
         start=None if start is None else start.replace(tzinfo=UTC),
         stop=None if stop is None else stop.replace(tzinfo=UTC),

@@ -1,6 +1,6 @@
-"""Raw files -> granules, by their headers.
+"""Make granules from the headers of raw files.
 
-Other processes read headers too, and this is all that they import: little, to start quickly.
+Processes that read headers import only this module, so it imports little, to start quickly.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 
-from lidarops.catalog.rows import AGAIN, GranuleRow, row_of
+from lidarops.catalog.rows import RETRY, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
 
 _UNREADABLE: Final = "cannot be read"
-"""How the reason starts where a file is refused that may be readable another time."""
+"""Start of the reason if a refused file may be readable another time."""
 
 _HEADER_BYTES = 16384
 _FAR_FROM_STATION = 0.5
-"""degree; a header position farther than this from the station gets a note."""
+"""degree; a header position farther from the station gets a note."""
 
 
 class Due(NamedTuple):
-    """A file whose header is to be read."""
+    """A file whose header must be read."""
 
     file: RawFile
     instrument: str
@@ -36,7 +36,7 @@ class Due(NamedTuple):
     rivals: tuple[str, ...]
     """Other instruments that claim the file."""
     scan_key: str
-    """Digest of the settings that matter for it."""
+    """Digest of the settings that affect its granule."""
 
 
 class _Pointing(NamedTuple):
@@ -48,7 +48,7 @@ class _Pointing(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where an instrument stands and looks, as far as the campaign says."""
+    """Position and pointing of an instrument, as far as the campaign gives them."""
 
     latitude: float
     longitude: float
@@ -64,7 +64,7 @@ class _Place:
 
 @dataclass(frozen=True, slots=True)
 class Headers:
-    """What headers are read with."""
+    """The source of raw files and the settings with which their headers are read."""
 
     source: Source
     _campaign: str
@@ -72,9 +72,9 @@ class Headers:
 
     @classmethod
     def of(cls, campaign: Campaign, source: Source, entered_as: str) -> Self:
-        """Take what matters for headers out of a campaign, whose import takes long.
+        """Extract the settings for headers from a campaign, whose module takes long to import.
 
-        Rows are entered under the name that the catalog has for it.
+        Rows get the name `entered_as`, by which the catalog knows the campaign.
         """
         places = {
             name: _Place(
@@ -91,22 +91,22 @@ class Headers:
         return cls(source, entered_as, places)
 
     def place(self, instrument: str) -> _Place:
-        """Return where an instrument stands and looks."""
+        """Return position and pointing of an instrument."""
         return self._places[instrument]
 
     def row(self, due: Due, granule: Granule) -> GranuleRow:
         """Return the row of a granule."""
-        later = granule.reason.startswith(_UNREADABLE)
-        return row_of(granule, self._campaign, AGAIN if later else due.scan_key)
+        retry = granule.reason.startswith(_UNREADABLE)
+        return row_of(granule, self._campaign, RETRY if retry else due.scan_key)
 
 
 def read_row(headers: Headers, due: Due) -> GranuleRow:
-    """Return the row of what the header of a file tells; see `read_header`."""
+    """Read the header of a file and return its row; see `read_header`."""
     return headers.row(due, read_header(headers, due))
 
 
 def read_header(headers: Headers, due: Due) -> Granule:
-    """Return the granule of a file; refused, with the reason, where it cannot be used."""
+    """Return the granule of a file; if it is unusable, a refused one with the reason."""
     file = due.file
     if printable(file.path) != file.path:
         return _refused(due, "has a name that is not UTF-8 (rename it)")
@@ -142,8 +142,8 @@ def _accepted(due: Due, header: licel.Header, place: _Place) -> Granule:
     latitude, longitude = place.latitude, place.longitude
     if place.header_position != "ignore":
         latitude, longitude = header.position(place.header_position)
-        away = max(abs(latitude - place.latitude), abs(longitude - place.longitude))
-        if away > _FAR_FROM_STATION:
+        distance = max(abs(latitude - place.latitude), abs(longitude - place.longitude))
+        if distance > _FAR_FROM_STATION:
             note = _position_note(latitude, longitude, place.latitude, place.longitude)
             notes = (*notes, note)
     return Granule(
@@ -171,9 +171,9 @@ def _position_note(latitude: float, longitude: float, north: float, east: float)
     remedy = (
         "they look swapped: set header_position of the instrument"
         if swapped
-        else "the campaign's position is used; header_position: ignore silences this"
+        else "the position of the campaign is used; header_position: ignore silences this"
     )
     return (
-        f"header position {latitude:.1f} N {longitude:.1f} E is not the station's"
+        f"header position {latitude:.1f} N {longitude:.1f} E is not that of the station"
         f" {north:.1f} N {east:.1f} E ({remedy})"
     )

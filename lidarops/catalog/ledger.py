@@ -1,4 +1,4 @@
-"""The ledger's half of the database: what was made, from what, by which run."""
+"""The ledger part of the database: products, their inputs, and the runs that made them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import sqlalchemy as sa
 
 from lidarops.catalog.database import BATCH
 from lidarops.catalog.granules import Granules
-from lidarops.catalog.rows import AGAIN, aware, naive
+from lidarops.catalog.rows import RETRY, aware, naive
 from lidarops.catalog.schema import (
     FILE_SET,
     GRANULE,
@@ -42,15 +42,15 @@ from lidarops.records import (
 
 
 class RunStatus(StrEnum):
-    """How a run stands."""
+    """Status of a run."""
 
     RUNNING = "running"
     FINISHED = "finished"
     INTERRUPTED = "interrupted"
     STOPPED = "stopped"
-    """The target could not be written."""
+    """Products could not be written."""
     DIED = "died"
-    """Its process ended without a word."""
+    """Its process died."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class Dependence:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A product as the ledger holds it."""
+    """A product in the ledger."""
 
     path: str
     scene: str
@@ -86,33 +86,33 @@ class Made:
 
 @dataclass(frozen=True, slots=True)
 class NewProduct:
-    """A product to be entered."""
+    """A new product for the ledger."""
 
     record: ProductRecord
     mtime_ns: int
     depends_on: Dependence
     inputs: tuple[InputRecord, ...]
     kept: str = ""
-    """Where the version before it is kept, below the output folder."""
+    """Path of the kept previous version below the output folder; empty if none is kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What became of one scene, to be entered as it ends."""
+    """The outcome of one scene, entered as it ends."""
 
     outcome: SceneOutcome
     day: int
     key: str
     final: bool
-    """Whether the same inputs cannot but fail again."""
+    """Whether another try on the same inputs would end the same way."""
     products: tuple[NewProduct, ...] = ()
     digests: Mapping[str, str] = field(default_factory=dict)
-    """Of raw files, by path: those that the catalog does not know yet."""
+    """SHA-256 of raw files by path, as far as the catalog does not have them yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """How the last try of a scene ended."""
+    """Result of the last try of a scene."""
 
     key: str
     error: str
@@ -123,7 +123,7 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run as the ledger tells it."""
+    """One run in the ledger."""
 
     id: str
     started: datetime
@@ -138,7 +138,7 @@ class Run:
     failed: int = 0
     refused: int = 0
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """By stage, summed over scenes."""
+    """Time per stage, s, summed over scenes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ class OldVersion:
     run: str
     replaced_by: str
     kept: str
-    """Below the output folder; empty where the file is gone."""
+    """Path below the output folder; empty if the file was not kept."""
 
 
 _P: Final = PRODUCT.c
@@ -166,7 +166,7 @@ class Ledger(Granules):
     # Runs
 
     def begin_run(self, run: Run, token: str) -> None:
-        """Enter a run that starts, and close those whose process ended without a word."""
+        """Enter a starting run, and close runs whose process died."""
         with self.transaction() as connection:
             self._hold(connection, token)
             connection.execute(
@@ -188,7 +188,7 @@ class Ledger(Granules):
             connection.execute(sa.insert(RUN), values)
 
     def end_run(self, run: str, status: RunStatus, *, refused: int, token: str) -> None:
-        """Enter how a run ended."""
+        """Enter the end of a run."""
         with self.transaction() as connection:
             self._hold(connection, token)
             connection.execute(
@@ -212,7 +212,7 @@ class Ledger(Granules):
     # Outcomes
 
     def begin_scene(self, scene: str, day: int, run: str, token: str) -> None:
-        """Note that a scene is taken in hand: where its process dies, the note stays."""
+        """Note the start of a scene; the note stays if the process dies."""
         row = {
             "campaign": self.campaign, "scene": scene, "day": day, "key": "", "run": run,
             "error": "", "final": False, "crashes": 1,
@@ -229,7 +229,7 @@ class Ledger(Granules):
             )
 
     def record(self, entry: Entry, run: str, token: str) -> None:
-        """Enter what became of a scene: products, inputs, digests, timings, in one transaction."""
+        """Enter the outcome of a scene in one transaction: products, inputs, digests, timings."""
         outcome = entry.outcome
         with self.transaction() as connection:
             self._hold(connection, token)
@@ -249,7 +249,7 @@ class Ledger(Granules):
             )
 
     def _hold(self, connection: sa.Connection, token: str) -> None:
-        """Refuse to write for a holder that has lost the lock."""
+        """Refuse to write if the lock was lost."""
         held = connection.execute(
             sa.update(LOCK)
             .where(LOCK.c.campaign == self.campaign, LOCK.c.token == token)
@@ -257,9 +257,9 @@ class Ledger(Granules):
         )
         if held.rowcount != 1:
             raise CatalogError(
-                "another run has taken over, because this one gave no sign of life",
+                "another run has taken over, because this one sent no heartbeat",
                 file=self.place,
-                remedy="see lidarops runs; what this run entered before stays",
+                remedy="see lidarops runs; the scenes that this run entered are kept",
             )
 
     def _enter_products(self, connection: sa.Connection, entry: Entry, run: str) -> None:
@@ -352,12 +352,12 @@ class Ledger(Granules):
             connection.execute(self.insert_new(STAGE), stages)
 
     def _refuse(self, connection: sa.Connection, refused: Iterable[Granule]) -> None:
-        """Enter granules that turned out unreadable; the next scan looks at them again."""
+        """Enter granules that could not be read; the next scan tries them again."""
         for granule in refused:
             connection.execute(
                 sa.update(GRANULE)
                 .where(GRANULE.c.campaign == self.campaign, GRANULE.c.path == granule.path)
-                .values(status=Status.REFUSED.value, reason=granule.reason, scan_key=AGAIN)
+                .values(status=Status.REFUSED.value, reason=granule.reason, scan_key=RETRY)
             )
 
     # Products
@@ -370,13 +370,13 @@ class Ledger(Granules):
 
     @contextmanager
     def all_made(self) -> Iterator[Iterator[Made]]:
-        """Give every product by path, without holding them all."""
+        """Yield every product, ordered by path, without holding them all."""
         query = sa.select(*_MADE).where(_P.campaign == self.campaign).order_by(_P.path)
         with self.stream(query) as rows:
             yield (_made_from(row) for row in rows)
 
     def products(self) -> list[Mapping[str, Any]]:
-        """Return the ledger's rows of products, by path."""
+        """Return the rows of all products, ordered by path."""
         query = sa.select(PRODUCT).where(_P.campaign == self.campaign).order_by(_P.path)
         with self.transaction() as connection:
             return [dict(row) for row in connection.execute(query).mappings()]
@@ -402,7 +402,7 @@ class Ledger(Granules):
 
     @contextmanager
     def all_inputs(self) -> Iterator[Iterator[tuple[str, str, str]]]:
-        """Give role, path and sha256 of every file that a product was made from, by path."""
+        """Yield role, path and SHA-256 of every input of a product, ordered by path."""
         link = PRODUCT_INPUT.c
         query = (
             sa.select(link.role, FILE_SET.c.path, FILE_SET.c.sha256)
@@ -415,7 +415,7 @@ class Ledger(Granules):
             yield ((role, path, sha256) for role, path, sha256 in rows)
 
     def touch_products(self, stamps: Mapping[str, int]) -> None:
-        """Enter new modification times of products whose content was found unchanged."""
+        """Enter new modification times (ns) of products whose content is unchanged."""
         if stamps:
             with self.transaction() as connection:
                 connection.execute(
@@ -426,7 +426,7 @@ class Ledger(Granules):
                 )
 
     def forget_products(self, paths: Collection[str], token: str) -> None:
-        """Remove products, and the files that nothing else was made from."""
+        """Remove products, and their inputs that no other product uses."""
         with self.transaction() as connection:
             self._hold(connection, token)
             self._drop_products(connection, paths)
@@ -446,7 +446,7 @@ class Ledger(Granules):
             )
 
     def superseded(self) -> list[OldVersion]:
-        """Return the versions of products that were replaced, by path."""
+        """Return the replaced versions of products, ordered by path."""
         old = SUPERSEDED.c
         query = (
             sa.select(old.path, old.sha256, old.run, old.replaced_by, old.kept)
@@ -459,7 +459,7 @@ class Ledger(Granules):
     # Scenes and verdicts
 
     def tried(self, first: int, last: int) -> dict[str, Tried]:
-        """Return how the last try of every scene of these days ended."""
+        """Return the result of the last try of every scene on days `first` to `last`."""
         known = SCENE.c
         query = sa.select(
             known.scene, known.key, known.error, known.final, known.crashes, known.day
@@ -468,7 +468,7 @@ class Ledger(Granules):
             return {row[0]: Tried(*row[1:]) for row in connection.execute(query)}
 
     def tried_on_others(self, days: Collection[int]) -> list[str]:
-        """Return the scenes that were tried on other days than these."""
+        """Return the scenes of other days than these that were tried."""
         known = SCENE.c
         where = known.campaign == self.campaign
         with self.transaction() as connection:
@@ -487,30 +487,30 @@ class Ledger(Granules):
             return {row.scene: row.error for row in connection.execute(query)}
 
     def unusable_scenes(self, *, without: Collection[str] = ()) -> list[str]:
-        """Return the scenes whose retrievals left nothing to use, as `SceneOutcome.unusable`.
+        """Return the scenes whose retrievals gave no usable value; see `SceneOutcome.unusable`.
 
         Parameters
         ----------
         without : collection of str
-            Paths of products that do not count.
+            Paths of products to ignore.
         """
-        # Not counted by day: a run over a part of a scene leaves its other products as they are.
+        # Not stored with the scene: a run over a selection leaves its other products unchanged.
         judged = (
             _P.campaign == self.campaign,
             _P.kind.in_([kind.value for kind in EXPECTED_USABLE]),
         )
-        # Few, so that the paths can be compared here: a statement takes only so many of them.
-        suspects = sa.select(_P.scene).where(*judged, _P.usable == 0)
-        query = sa.select(_P.scene, _P.path, _P.usable).where(*judged, _P.scene.in_(suspects))
-        found: dict[str, bool] = {}
+        # Paths are compared below, because a statement can hold only a limited number.
+        candidates = sa.select(_P.scene).where(*judged, _P.usable == 0)
+        query = sa.select(_P.scene, _P.path, _P.usable).where(*judged, _P.scene.in_(candidates))
+        unusable: dict[str, bool] = {}
         with self.stream(query) as rows:
             for scene, path, usable in rows:
                 if path not in without:
-                    found[scene] = found.get(scene, True) and usable == 0
-        return sorted(scene for scene, empty in found.items() if empty)
+                    unusable[scene] = unusable.get(scene, True) and usable == 0
+        return sorted(scene for scene, all_rejected in unusable.items() if all_rejected)
 
     def forget_scenes(self, scenes: Collection[str]) -> None:
-        """Remove what is noted of scenes that are no more."""
+        """Remove the entries of scenes that no longer exist."""
         names = sorted(scenes)
         with self.transaction() as connection:
             for first in range(0, len(names), BATCH):
@@ -522,24 +522,24 @@ class Ledger(Granules):
                 )
 
     def verdicts(self) -> dict[int, tuple[str, int, int]]:
-        """Return day -> signature, barren scenes and granules set aside, where all was fresh."""
-        found = VERDICT.c
-        query = sa.select(found.day, found.signature, found.barren, found.set_aside).where(
-            found.campaign == self.campaign
+        """Return settled day -> signature, number of empty scenes, of granules set aside."""
+        verdict = VERDICT.c
+        query = sa.select(verdict.day, verdict.signature, verdict.barren, verdict.set_aside).where(
+            verdict.campaign == self.campaign
         )
         with self.transaction() as connection:
             return {row[0]: (row[1], row[2], row[3]) for row in connection.execute(query)}
 
     def store_verdicts(self, verdicts: Mapping[int, tuple[str, int, int]]) -> None:
-        """Note that everything which these days ask for is fresh."""
+        """Note that all requested products of these days are fresh."""
         if not verdicts:
             return
         rows = [
             {
                 "campaign": self.campaign, "day": day, "signature": signature,
-                "barren": barren, "set_aside": set_aside,
+                "barren": empty_scenes, "set_aside": set_aside,
             }
-            for day, (signature, barren, set_aside) in verdicts.items()
+            for day, (signature, empty_scenes, set_aside) in verdicts.items()
         ]  # fmt: skip
         with self.transaction() as connection:
             connection.execute(self.upsert(VERDICT), rows)

@@ -1,4 +1,4 @@
-"""One writer an archive: a lock in the database, with a heartbeat."""
+"""One writer at a time: a lock in the database, with a heartbeat."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from lidarops.catalog.schema import LOCK
 from lidarops.errors import CatalogError
 
 HEARTBEAT: Final = 5.0
-"""s between signs of life."""
+"""s between heartbeats."""
 SILENCE: Final = 60.0
-"""s without one after which a holder counts as dead."""
+"""s without heartbeat after which a holder counts as dead."""
 _POLL: Final = 0.5
 
 _L = LOCK.c
@@ -34,7 +34,7 @@ _held: set[str] = set()
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who holds a lock."""
+    """The holder of a lock."""
 
     token: str
     name: str
@@ -43,17 +43,17 @@ class Holder:
     process_started: str
     acquired: float
     silent: float
-    """s since the last sign of life, by the database's clock."""
+    """s since the last heartbeat, by the clock of the database."""
 
     @property
     def dead(self) -> bool:
-        """Whether it cannot be at work any more."""
+        """Whether the holder no longer works: it is silent, or its process has ended."""
         if self.silent > SILENCE:
             return True
         if self.machine != _machine():
             return False
         if self.process == os.getpid() and self.token not in _held:
-            # Of this very process, which could not give it back: the disk was full.
+            # A lock of this process that it could not release, because the disk was full.
             return True
         return _start_of(self.process) != self.process_started
 
@@ -61,14 +61,14 @@ class Holder:
 class Lock:
     """The right to write to the catalog of one campaign.
 
-    Taken with the first write, so that a run with nothing to do writes nothing at all. The holder
-    gives a sign of life every few seconds; one that is dead loses the lock to the next who asks.
+    It is acquired before the first write, so that a run with nothing to do writes nothing. The
+    holder sends a heartbeat every few seconds. If it is dead, the next process takes over the lock.
 
     Parameters
     ----------
     database : Database
     wait : float
-        s to wait for another holder, at most.
+        Longest time to wait for another holder, s.
     """
 
     def __init__(self, database: Database, *, wait: float = 0.0) -> None:
@@ -87,7 +87,7 @@ class Lock:
 
     @staticmethod
     def holder_name() -> str:
-        """Return user, host and process of this one."""
+        """Return user, host and number of this process."""
         try:
             user = getpass.getuser()
         except (KeyError, OSError):
@@ -95,17 +95,17 @@ class Lock:
         return f"{user}@{socket.gethostname()} process {os.getpid()}"
 
     def acquire(self) -> bool:
-        """Take the lock.
+        """Acquire the lock.
 
         Returns
         -------
         bool
-            Whether it had to be waited for: what was read before may then be outdated.
+            Whether it had to wait; data read before may then be outdated.
 
         Raises
         ------
         CatalogError
-            Naming the holder, where it does not give the lock back in time.
+            If the holder, which the message names, does not release the lock in time.
         """
         if self.held:
             return False
@@ -123,7 +123,7 @@ class Lock:
         return waited
 
     def release(self) -> None:
-        """Give the lock back, where it is held."""
+        """Release the lock if it is held."""
         if not self.held:
             return
         self._stop.set()
@@ -133,13 +133,13 @@ class Lock:
         _held.discard(self.token)
         try:
             with self._database.transaction() as connection:
-                connection.execute(sa.delete(LOCK).where(*self._mine()))
+                connection.execute(sa.delete(LOCK).where(*self._own_row()))
         except CatalogError as error:
-            # On a full disk: whoever comes next finds this process gone and takes over.
+            # The disk is full: the next process takes over when this one has ended.
             _LOG.warning("the lock stays until the next run: %s", error)
 
     def holder(self) -> Holder | None:
-        """Return who holds the lock now."""
+        """Return the present holder of the lock."""
         clock = self._database.clock()
         query = sa.select(LOCK, (clock - _L.heartbeat).label("silent")).where(
             _L.campaign == self._database.campaign
@@ -158,7 +158,7 @@ class Lock:
             row.silent,
         )
 
-    def _mine(self) -> tuple[sa.ColumnElement[bool], ...]:
+    def _own_row(self) -> tuple[sa.ColumnElement[bool], ...]:
         return _L.campaign == self._database.campaign, _L.token == self.token
 
     def _try(self) -> bool:
@@ -179,7 +179,7 @@ class Lock:
         if current is None:
             statement = statement.on_conflict_do_nothing()
         else:
-            # Only from the very holder that was found dead: another may have been quicker.
+            # Only if the dead holder still has it: another process may have been faster.
             changes = {
                 column.name: statement.excluded[column.name]
                 for column in LOCK.columns
@@ -190,8 +190,8 @@ class Lock:
             )
         with database.transaction() as connection:
             connection.execute(statement)
-            mine = sa.select(sa.func.count()).select_from(LOCK).where(*self._mine())
-            return bool(connection.scalar(mine))
+            own = sa.select(sa.func.count()).select_from(LOCK).where(*self._own_row())
+            return bool(connection.scalar(own))
 
     def _beat(self) -> None:
         while not self._stop.wait(HEARTBEAT):
@@ -199,27 +199,29 @@ class Lock:
                 with self._database.transaction() as connection:
                     connection.execute(
                         sa.update(LOCK)
-                        .where(*self._mine())
+                        .where(*self._own_row())
                         .values(heartbeat=self._database.clock())
                     )
             except CatalogError:
-                # A busy or full disk: whoever writes next is told, and the next beat may do.
+                # The disk is busy or full: the next write reports it; the next beat may succeed.
                 continue
 
     def _refused(self) -> CatalogError:
         current = self.holder()
         if current is None:
-            told = "another run holds the catalog"
+            problem = "another run holds the catalog"
         else:
             since = datetime.fromtimestamp(current.acquired, UTC)
-            told = f"held by {current.name} since {since:%Y-%m-%d %H:%M:%S} UTC"
+            problem = f"held by {current.name} since {since:%Y-%m-%d %H:%M:%S} UTC"
         return CatalogError(
-            told, file=self._database.place, remedy="wait for it, with --wait SECONDS, or stop it"
+            problem,
+            file=self._database.place,
+            remedy="wait for it with --wait SECONDS, or stop it",
         )
 
 
 def _machine() -> str:
-    """Return what a process number is unique on: host, boot and namespace of processes."""
+    """Return host, boot and process namespace, within which a process number is unique."""
     return ":".join((socket.gethostname(), _read("/proc/sys/kernel/random/boot_id"), _namespace()))
 
 
@@ -231,8 +233,8 @@ def _namespace() -> str:
 
 
 def _start_of(process: int) -> str:
-    """Return when a process started, as its system counts; empty where there is none."""
-    # The name of the program, in brackets, may hold blanks.
+    """Return the start time of a process in units of its system; empty if it does not run."""
+    # The program name, in brackets, may hold blanks.
     fields = _read(f"/proc/{process}/stat").rpartition(")")[2].split()
     if len(fields) > 19:
         return "" if fields[0] == "Z" else fields[19]

@@ -1,6 +1,6 @@
-"""Granules as rows of the catalog: made where headers are read, which other processes do too.
+"""Granules as rows of the catalog.
 
-So it imports little, and no database.
+Processes that read headers make these rows, so this module imports little, and no database.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any, Final, NamedTuple
 
 from lidarops.records import ChannelLayout, Granule
 
-AGAIN: Final = ""
-"""Scan key of a file that could not be read: it is looked at again with every scan."""
+RETRY: Final = ""
+"""Scan key of a file that could not be read: every scan tries it again."""
 
 _HALF: Final = (1 << 31) - 1
 
@@ -26,21 +26,21 @@ class GranuleRow(NamedTuple):
     values: dict[str, Any]
     """By column."""
     layout: str
-    """Row of the layout that it names."""
+    """JSON text of its layout of channels."""
 
 
 def naive(moment: datetime | None) -> datetime | None:
-    """Return a time as the tables hold it: UTC, without a zone."""
+    """Return a time as stored in the tables: UTC, without a zone."""
     return None if moment is None else moment.astimezone(UTC).replace(tzinfo=None)
 
 
 def aware(moment: datetime | None) -> datetime | None:
-    """Return a time of the tables with its zone."""
+    """Return a stored time with its zone, UTC."""
     return None if moment is None else moment.replace(tzinfo=UTC)
 
 
 def day_of(moment: datetime) -> int:
-    """Return the days since 1970-01-01 of a time, in UTC."""
+    """Return the UTC day of a time, in days since 1970-01-01."""
     return (moment.astimezone(UTC).date() - datetime(1970, 1, 1, tzinfo=UTC).date()).days
 
 
@@ -53,14 +53,14 @@ def row_of(granule: Granule, campaign: str, scan_key: str) -> GranuleRow:
     campaign : str
         Its name.
     scan_key : str
-        Digest of the settings that it was read with; `AGAIN` where it could not be read.
+        Digest of the settings with which it was read; `RETRY` if it could not be read.
     """
     digest, text = _layout_row(granule.layout)
     return GranuleRow(_values(granule, campaign, scan_key, digest), text)
 
 
 def _stamp(granule: Granule, scan_key: str, layout: str) -> tuple[int, int]:
-    """Return two numbers that change with anything that a scan found of a file."""
+    """Return two numbers that change with anything that a scan reads from a file."""
     facts = (
         granule.path,
         granule.size,
@@ -80,7 +80,7 @@ def _stamp(granule: Granule, scan_key: str, layout: str) -> tuple[int, int]:
     return int.from_bytes(digest[:4], "big") & _HALF, int.from_bytes(digest[4:8], "big") & _HALF
 
 
-# The files of an archive share few layouts.
+# An archive has few different layouts.
 @lru_cache(maxsize=128)
 def _layout_row(layout: tuple[ChannelLayout, ...]) -> tuple[str, str]:
     text = json.dumps([asdict(channel) for channel in layout], separators=(",", ":"))

@@ -1,4 +1,4 @@
-"""Raw files -> granules: an incremental, header-only scan of an archive."""
+"""Update the catalog from an archive: an incremental scan that reads only headers."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from lidarops.system.stores import without_keys
 _BATCH = 2000
 _SCAN_VERSION = 1
 _TOGETHER = 250
-"""Headers that a process reads before it is asked again."""
+"""Headers in one batch for a process."""
 _WORTH_PROCESSES = 5000
-"""Headers to read, for which processes are worth their start."""
+"""Least number of headers to read for which further processes are started."""
 _MOST_PROCESSES = 8
-"""The one process that writes the catalog keeps no more than a few others busy."""
+"""Further processes would wait for the one that writes the catalog."""
 
 Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class ScanSummary:
-    """What a scan found."""
+    """Numbers of files in a scan."""
 
     files: int
     added: int
@@ -45,18 +45,18 @@ class ScanSummary:
     refused: int
     """Refused granules in the whole catalog, not only the new ones."""
     moved: int = 0
-    """Files under a new path whose content was known: neither added nor vanished."""
+    """Files with a new path and known content; they count neither as added nor as vanished."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Claim:
-    """The files that one role of one instrument claims."""
+    """A file pattern of one role of one instrument."""
 
     instrument: str
     role: Role
     folder: re.Pattern[str] | None
     name: re.Pattern[str]
-    """Of the rest of the path behind the folder; of the whole path where `folder` is None."""
+    """Pattern of the path after the folder; of the whole path if `folder` is None."""
     scan_key: str
 
 
@@ -68,27 +68,27 @@ def scan_archive(
     before_write: Callable[[], object] | None = None,
     workers: int = 1,
 ) -> ScanSummary:
-    """Bring the catalog up to date with the archive.
+    """Update the catalog from the archive.
 
-    Only files whose size, modification time or campaign settings changed are opened. Of these
-    the headers are read, and the whole file only to tell whether the content that a product was
-    made from has changed or has moved. A file that cannot be used becomes a refused granule with
-    a reason. Where nothing changed, nothing is written. Memory does not grow with the archive,
-    but with what changed in it.
+    Only files whose size, modification time or campaign settings changed are opened. Of these, only
+    the header is read; the whole file is read only if a product was made from it or it may have
+    moved, to compare the content. An unusable file becomes a refused granule with a reason. If
+    nothing changed, nothing is written. Memory grows with the number of changed files, not with the
+    archive.
 
     Parameters
     ----------
     campaign : Campaign
-        With an absolute `archive`, or a URL that fsspec knows.
+        Its `archive` is an absolute path, or a URL that fsspec knows.
     store : Store
         The catalog to update.
     progress : callable, optional
         Called with the number of files done since the last call.
     before_write : callable, optional
-        Called before anything is written; may raise to prevent it.
+        Called before anything is written; it may raise an error to prevent this.
     workers : int, optional
-        Most processes of this machine to read headers with, where thousands of files are new or
-        changed; changes nothing that is entered. Those of a URL are read by this process.
+        Largest number of local processes that read headers, used if thousands of files are new or
+        changed; does not affect the catalog. Headers behind a URL are read by this process.
 
     Returns
     -------
@@ -97,8 +97,8 @@ def scan_archive(
     Raises
     ------
     CatalogError
-        If the archive cannot be listed, or none of the files that the catalog knows is there and
-        no other is claimed: nothing is forgotten then.
+        If the archive cannot be listed, or if it holds no claimed file although the catalog knows
+        some; the catalog then stays unchanged.
     """
     work = _Scan(campaign, store, progress, before_write)
     remote = isinstance(work.source, RemoteSource)
@@ -108,8 +108,8 @@ def scan_archive(
         Processes(processes, Headers.of(campaign, work.source, store.campaign)) as readers,
     ):
         due = work.due(_joined(work.source.files(), known))
-        found = readers.each(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
-        for _, row in found:
+        rows = readers.each(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
+        for _, row in rows:
             work.enter(row)
     return work.finish()
 
@@ -117,13 +117,13 @@ def scan_archive(
 def _joined(
     files: Iterator[RawFile], known: Iterator[Fingerprint]
 ) -> Iterator[tuple[RawFile | None, Fingerprint | None]]:
-    """Pair what the file system lists with what the catalog knows; both come by path."""
+    """Pair the files of the archive with those of the catalog; both are sorted by path."""
     before = next(known, None)
     last = None
     for file in files:
         path = printable(file.path)
         if path == last:
-            # A name that is no text and looks like another one's text: it has its own refusal.
+            # The printable form of a name that is not UTF-8 may equal another path.
             continue
         last = path
         while before is not None and before.path < path:
@@ -158,16 +158,16 @@ class _Scan:
         self._folder: str | None = None
         self._near: list[_Claim] = []
         self._files = self._changed = 0
-        self._told = 0
+        self._reported = 0
         self._judged: deque[Fingerprint | None] = deque()
         self._pending: list[GranuleRow] = []
-        # What is new in an empty catalog cannot have been moved.
+        # With an empty catalog, no new file can be a moved one.
         self._new: set[str] | None = set() if store.count() else None
         self._added = 0
         self._gone: list[Fingerprint] = []
 
     def due(self, pairs: Iterable[tuple[RawFile | None, Fingerprint | None]]) -> Iterator[Due]:
-        """Judge each file by what is there and what was known of it; give those to be read."""
+        """Compare each file with the catalog, and yield those whose header must be read."""
         for file, before in pairs:
             owners = [] if file is None else self._owners(file.path)
             if file is None or not owners:
@@ -176,7 +176,7 @@ class _Scan:
                 continue
             self._files += 1
             if self._files % _BATCH == 0:
-                self._tell()
+                self._report_progress()
             key = _key(owners)
             if before is None or (before.size, before.mtime_ns, before.scan_key) != (
                 file.size,
@@ -202,7 +202,7 @@ class _Scan:
         ]
 
     def enter(self, row: GranuleRow) -> None:
-        """Enter what was read of the next file that was due, if it is not what is known."""
+        """Enter the row of the next file in `due`, unless it is unchanged."""
         before = self._judged.popleft()
         values = row.values
         if before is None:
@@ -212,7 +212,7 @@ class _Scan:
         elif (before.stamp_low, before.stamp_high) == (values["stamp_low"], values["stamp_high"]):
             return
         else:
-            # Only a content that a product was made from is worth reading whole.
+            # Read a whole file only if a product was made from it.
             readable = before.sha256 and values["status"] == Status.GOOD
             digest = self._digest(values["path"]) if readable else None
             values["sha256"] = digest
@@ -239,13 +239,13 @@ class _Scan:
         if self._before_write is not None:
             self._before_write()
 
-    def _tell(self) -> None:
-        if self._progress and self._files > self._told:
-            self._progress(self._files - self._told)
-        self._told = self._files
+    def _report_progress(self) -> None:
+        if self._progress and self._files > self._reported:
+            self._progress(self._files - self._reported)
+        self._reported = self._files
 
     def finish(self) -> ScanSummary:
-        """Write what is left, and sum up."""
+        """Write the remaining rows, and return the numbers."""
         if self._gone and not self._files:
             raise self._emptied()
         self._flush()
@@ -256,7 +256,7 @@ class _Scan:
         if self._gone:
             self._write()
             self._store.forget([before.path for before in self._gone])
-        self._tell()
+        self._report_progress()
         added = self._added - len(moved)
         return ScanSummary(
             files=self._files,
@@ -269,43 +269,43 @@ class _Scan:
         )
 
     def _emptied(self) -> CatalogError:
-        # The folder of a disk that is not mounted looks like this.
+        # This is how an unmounted disk looks.
         return CatalogError(
-            "holds no file that an instrument of the campaign claims, and the catalog knows"
-            f" {len(self._gone)}: nothing is forgotten",
+            "holds no file that an instrument of the campaign claims, although the catalog knows"
+            f" {len(self._gone)}; the catalog stays unchanged",
             file=without_keys(self._archive),
             field="archive",
-            remedy="see that it is mounted, that it is the archive of this campaign, and that files"
-            " and dark_files match; where it was emptied on purpose, give another catalog, or"
-            f" move {self._store.place} away, if no other campaign is in it",
+            remedy="check that it is mounted, that it is the archive of this campaign, and that"
+            " files and dark_files match; if it was emptied on purpose, use another catalog, or"
+            f" move {self._store.place} away if it holds no other campaign",
         )
 
     def _moved(self) -> dict[str, str]:
-        """Return path -> sha256 of new files that hold what a vanished one held."""
+        """Return path -> SHA-256 of new files with the content of a vanished one."""
         lost: dict[tuple[int, datetime | None], Counter[str]] = defaultdict(Counter)
         for before in self._gone:
             if before.sha256:
                 lost[before.size, before.start][before.sha256] += 1
-        found: dict[str, str] = {}
+        moved: dict[str, str] = {}
         if not (lost and self._new):
-            return found
+            return moved
         with self._store.unread() as rows:
             for path, size, start in rows:
                 candidates = lost.get((size, start)) if path in self._new else None
                 digest = self._digest(path) if candidates else None
                 if candidates and digest and candidates[digest] > 0:
                     candidates[digest] -= 1
-                    found[path] = digest
-        return found
+                    moved[path] = digest
+        return moved
 
 
 def scan_keys(campaign: Campaign) -> dict[tuple[str, Role], str]:
-    """Return what changes with the settings that the files of an instrument and role are read with.
+    """Return a digest of the settings that affect the granules of each instrument and role.
 
     Returns
     -------
     dict
-        (instrument, role) -> scan key of the files that no other claims.
+        (instrument, role) -> scan key of files that only this instrument claims.
     """
     return {(claim.instrument, claim.role): claim.scan_key for claim in _claims(campaign)}
 
@@ -331,15 +331,15 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                 ],
             ]
             digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16]
-            claims.extend(_Claim(key, role, *_parts(pattern), digest) for pattern in patterns)
+            claims.extend(_Claim(key, role, *_split(pattern), digest) for pattern in patterns)
     return claims
 
 
-def _parts(pattern: str) -> tuple[re.Pattern[str] | None, re.Pattern[str]]:
-    """Split a pattern, as the files of a folder share what is before their names."""
+def _split(pattern: str) -> tuple[re.Pattern[str] | None, re.Pattern[str]]:
+    """Split a pattern into folder and name, because files of a folder share the first."""
     folder, slash, name = pattern.rpartition("/")
     if "**" in name:
-        # Such a name reaches into folders below.
+        # Such a name also matches files in subfolders.
         return None, _regex(pattern)
     return _regex(folder + slash), _regex(name)
 
@@ -351,9 +351,9 @@ def _key(owners: list[_Claim]) -> str:
 
 
 def _regex(pattern: str) -> re.Pattern[str]:
-    parts = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+    expressions = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
     tokens = re.split(r"(\*\*/|\*\*|\*|\?)", pattern)
-    return re.compile("".join(parts.get(token, re.escape(token)) for token in tokens) + r"\Z")
+    return re.compile("".join(expressions.get(token, re.escape(token)) for token in tokens) + r"\Z")
 
 
 def _due(file: RawFile, owners: list[_Claim], key: str) -> Due:

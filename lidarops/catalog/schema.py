@@ -1,4 +1,4 @@
-"""The tables of catalog and ledger, and the version that they carry."""
+"""The tables of catalog and ledger, and their schema version."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from typing import Final
 import sqlalchemy as sa
 
 SCHEMA_VERSION: Final = 4
-"""Raised with every change of a table: a database of another version is refused by name, if it
-cannot be brought up to date as one of version 2 or 3 can."""
+"""Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
 
-# PostgreSQL would sort by the language of the server, the file system is listed by code point.
+# Paths are listed by code point; PostgreSQL would sort them by the locale of the server.
 _PATH = sa.String(1024).with_variant(sa.String(1024, collation="C"), "postgresql")
 _NAME = sa.String(40)
 _SCENE = sa.String(160)
@@ -49,11 +48,10 @@ GRANULE = sa.Table(
     sa.Column("altitude", sa.Float),
     sa.Column("layout", sa.ForeignKey("layout.hash")),
     sa.Column("sha256", _DIGEST),
-    # Null also where the file was catalogued before there was this column.
     sa.Column("header_digest", sa.String(16)),
-    # Days since 1970-01-01 of the start; null where that is not known.
+    # Day of the start, in days since 1970-01-01; null if the start is unknown.
     sa.Column("day", sa.Integer),
-    # Two halves of a digest of the row, whose sums over a day tell whether anything in it changed.
+    # Two halves of a digest of the row; their sums over a day change if any row of it changes.
     sa.Column("stamp_low", sa.BigInteger, nullable=False),
     sa.Column("stamp_high", sa.BigInteger, nullable=False),
     sa.Index("granule_by_day", "campaign", "day", "role", "status", "stamp_low", "stamp_high"),
@@ -96,7 +94,7 @@ PRODUCT = sa.Table(
     sa.Column("inputs_hash", _DIGEST, nullable=False),
     sa.Column("code_version", _NAME, nullable=False),
     sa.Column("run", sa.ForeignKey("run.id"), nullable=False),
-    # Values that may be used; null where the kind does not judge them.
+    # Number of usable values; null if they were not counted.
     sa.Column("usable", sa.BigInteger),
     sa.Index("product_by_day", "campaign", "day"),
     sqlite_with_rowid=False,
@@ -108,7 +106,7 @@ PRODUCT_INPUT = sa.Table(
     sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("product", _PATH, primary_key=True),
     sa.Column("role", sa.String(10), primary_key=True),
-    # The products of a scene share their files, so these are kept once for all of them.
+    # The products of a scene share their files, so each set of files is stored once.
     sa.Column("file_set", sa.String(32), nullable=False),
     sa.Index("product_input_by_set", "file_set"),
     sqlite_with_rowid=False,
@@ -132,7 +130,7 @@ SUPERSEDED = sa.Table(
     sa.Column("run", sa.ForeignKey("run.id"), primary_key=True),
     # The run that wrote the version, and the one that replaced it.
     sa.Column("replaced_by", sa.ForeignKey("run.id"), nullable=False),
-    # Where the old file is kept, below the output folder; empty where it is not.
+    # Path of the kept old file below the output folder; empty if it was not kept.
     sa.Column("kept", _PATH, nullable=False),
 )
 
@@ -142,13 +140,13 @@ SCENE = sa.Table(
     sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("scene", _SCENE, primary_key=True),
     sa.Column("day", sa.Integer, nullable=False),
-    # What the scene was judged by when it was last tried.
+    # Digest of everything that could affect the outcome of the last try.
     sa.Column("key", _DIGEST, nullable=False),
     sa.Column("run", sa.ForeignKey("run.id"), nullable=False),
     sa.Column("error", sa.Text, nullable=False),
-    # Whether the same inputs cannot but fail again.
+    # Whether another try on the same inputs would fail again.
     sa.Column("final", sa.Boolean, nullable=False),
-    # Tries that began and did not end: what was processed when its process died.
+    # Number of tries that started and did not end because the process died.
     sa.Column("crashes", sa.Integer, nullable=False),
     sa.Index("scene_by_day", "campaign", "day"),
     sqlite_with_rowid=False,
@@ -169,9 +167,9 @@ VERDICT = sa.Table(
     METADATA,
     sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("day", sa.Integer, primary_key=True),
-    # What the day looked like when everything that it asks for was found fresh.
+    # State of the day (see Signature) when all its requested products were fresh.
     sa.Column("signature", _DIGEST, nullable=False),
-    # Scenes of the day that can give no product.
+    # Scenes of the day without product.
     sa.Column("barren", sa.Integer, nullable=False),
     # Good granules of the day that belong to no scene.
     sa.Column("set_aside", sa.Integer, nullable=False),

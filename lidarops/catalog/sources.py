@@ -1,4 +1,4 @@
-"""Where the raw files of an archive are: listed by path, read one by one."""
+"""The raw files of an archive, in a folder or behind a URL: list them, read them one by one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarops.system.stores import RemoteStore
 
 
 class RawFile(NamedTuple):
-    """A file of the archive as the file system lists it."""
+    """A file of the archive, as the file system lists it."""
 
     path: str
     size: int
@@ -23,43 +23,43 @@ class RawFile(NamedTuple):
 
 
 def printable(path: str) -> str:
-    """Return a path that can be stored and shown: names may hold bytes that are no text."""
+    """Return a path that can be stored and shown: names may hold bytes that are not UTF-8."""
     return path if path.isascii() else path.encode("utf-8", "backslashreplace").decode()
 
 
 def _rank(entry: os.DirEntry[str]) -> str:
-    """Return what puts entries into the order that the paths of their files have."""
+    """Return the sort key that orders entries like the paths of their files."""
     name = printable(entry.name)
     return f"{name}/" if entry.is_dir(follow_symlinks=False) else name
 
 
 def _listed(entry: os.DirEntry[str], path: str) -> RawFile:
     try:
-        about = entry.stat()
+        status = entry.stat()
     except OSError:
-        # A link to nowhere is a file that cannot be read, and must be said to be one.
+        # A broken link is listed too, so that it is reported as unreadable.
         return RawFile(path, 0, 0)
-    return RawFile(path, about.st_size, about.st_mtime_ns)
+    return RawFile(path, status.st_size, status.st_mtime_ns)
 
 
 class Source:
-    """Where the raw files are: a local folder."""
+    """An archive in a local folder."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
 
     @staticmethod
     def of(archive: str) -> Source:
-        """Return the source of an archive, by its folder or URL."""
+        """Return the source of an archive, given its folder or URL."""
         return RemoteSource(archive) if "://" in archive else Source(Path(archive))
 
     def files(self) -> Iterator[RawFile]:
-        """List files in the order of their paths, whatever the file system's own."""
+        """List files, sorted by path."""
         self.refuse_absent()
         yield from self._walk(str(self._root), "")
 
     def refuse_absent(self) -> None:
-        """Refuse a folder that is not there.
+        """Raise an error if the folder does not exist.
 
         Raises
         ------
@@ -96,31 +96,31 @@ class Source:
             os.close(descriptor)
 
     def digest(self, path: str) -> str:
-        """Return the sha256 of a file."""
+        """Return the SHA-256 of a file."""
         with open(self._opened(path), "rb") as stream:  # noqa: PTH123 - is open already
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
     def _opened(self, path: str) -> int:
         file = f"{self._root}/{path}"
-        # Opening a pipe would wait for ever.
+        # Opening a pipe would block for ever.
         if not os.path.isfile(file):  # noqa: PTH113 - a Path costs as much as reading the file
-            raise OSError(errno.EINVAL, "is no regular file, or a link to nowhere")
+            raise OSError(errno.EINVAL, "is no regular file, or a broken link")
         return os.open(file, os.O_RDONLY | os.O_CLOEXEC)
 
 
 class RemoteSource(Source):
-    """A store behind an fsspec URL."""
+    """An archive behind an fsspec URL."""
 
     def __init__(self, url: str) -> None:
         self._store = RemoteStore(url)
 
     def files(self) -> Iterator[RawFile]:
-        """List files in the order of their paths."""
+        """List files, sorted by path."""
         for stored in self._store.files():
             yield RawFile(stored.path, stored.size, stored.stamp)
 
     def refuse_absent(self) -> None:
-        """Refuse nothing: to ask a store may take as long as to list it."""
+        """Do nothing: checking a store may take as long as listing it."""
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""
@@ -128,14 +128,14 @@ class RemoteSource(Source):
             return self._store.head(path, size)
 
     def digest(self, path: str) -> str:
-        """Return the sha256 of a file."""
+        """Return the SHA-256 of a file."""
         with _of_one_file():
             return self._store.digest(path)
 
 
 @contextmanager
 def _of_one_file() -> Iterator[None]:
-    """Tell a file that cannot be read, which is refused, from a store that is away."""
+    """Re-raise the cause if one file cannot be read; keep other errors of the store."""
     try:
         yield
     except CatalogError as error:

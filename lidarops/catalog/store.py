@@ -1,4 +1,4 @@
-"""Catalog and ledger of a campaign in one database."""
+"""The database of a campaign: catalog and ledger."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lidarops.catalog.lock import Lock
 
 
 class Store(Ledger):
-    """The catalog and ledger of one campaign: granules, and what was made from them.
+    """Catalog and ledger of one campaign: granules, runs and products.
 
     Parameters
     ----------
@@ -18,22 +18,22 @@ class Store(Ledger):
     campaign : str
         Name of the campaign; several may share a database.
     create : bool
-        Whether to make the catalog where there is none.
+        Whether to make the catalog if there is none.
 
     Raises
     ------
     CatalogError
-        If the database cannot be opened, or is of another version of lidarops, or is not there.
+        If the database does not exist, cannot be opened, or has another schema version.
     """
 
     def runs(self, *, limit: int | None = None) -> list[Run]:
         """Return the runs of the campaign, the newest first, with their stage timings.
 
-        One that its process did not end, and that no living one can be at work on, has died.
+        A run that is marked as running has died if no living process holds the lock.
         """
-        found = super().runs(limit=limit)
+        runs = super().runs(limit=limit)
         holder = Lock(self).holder()
         if holder is not None and not holder.dead:
-            return found
+            return runs
         died = {RunStatus.RUNNING: RunStatus.DIED}
-        return [replace(run, status=died.get(run.status, run.status)) for run in found]
+        return [replace(run, status=died.get(run.status, run.status)) for run in runs]

@@ -1,4 +1,4 @@
-"""Versions of products that a rerun replaces: kept beside the products where that is wanted."""
+"""Keep the versions of products that a rerun replaces, if the campaign says so."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final
 from lidarops.errors import CatalogError
 
 FOLDER: Final = "superseded"
-"""Below the output folder."""
+"""Folder of kept versions, below the output folder."""
 
 _NO_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.EXDEV, errno.EMLINK, errno.ENOSYS})
 
@@ -28,31 +28,31 @@ def keep(output: Path, product: str, sha256: str) -> str:
     product : str
         Path below the folder of products.
     sha256 : str
-        What the ledger says of its content, which names the version.
+        Digest of its content in the ledger, which becomes part of the name.
 
     Returns
     -------
     str
-        Path of the kept version below `output`; empty where there is no file to keep.
+        Path of the kept version below `output`; empty if there is no file.
 
     Raises
     ------
     CatalogError
-        If it cannot be kept.
+        If the version cannot be kept.
     """
     source = output / "products" / product
     name = Path(FOLDER) / Path(product).with_suffix(f".{sha256[:12]}{source.suffix}")
     target = output / name
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        # A product is replaced by renaming, so that a second link keeps the old one without a copy.
+        # New products replace old ones by renaming, so a hard link keeps the old file.
         target.unlink(missing_ok=True)
         _link(source, target)
     except FileNotFoundError:
         return ""
     except OSError as error:
         raise CatalogError(
-            f"the version that is replaced cannot be kept: {error.strerror or error}",
+            f"the replaced version cannot be kept: {error.strerror or error}",
             file=target,
             remedy="make space, or set superseded: remove in the campaign file",
         ) from error
@@ -71,19 +71,19 @@ def _link(source: Path, target: Path) -> None:
 
 
 def drop(output: Path, kept: str) -> None:
-    """Remove a kept version, where it turned out that nothing replaced it."""
+    """Remove a kept version that was not replaced after all."""
     if kept:
         with suppress(OSError):
             (output / kept).unlink(missing_ok=True)
 
 
 def sweep(output: Path) -> list[str]:
-    """Remove the hidden temporary files that a killed process left among products and reports.
+    """Remove hidden temporary files that killed processes left among products and reports.
 
     Returns
     -------
     list of str
-        Their paths.
+        Paths of the removed files.
     """
     swept = []
     for folder in ("products", FOLDER, "report"):

@@ -106,7 +106,7 @@ def scenes_without_product(planned: Iterable[Planned], campaign: Campaign) -> di
             reasons[scene.id] = nothing_to_do(plan)
         elif not any(granule.path in in_networks for granule in scene.granules):
             reasons[scene.id] = (
-                f"nothing to do: used by network {' and '.join(networks)} only, of which no other"
+                f"nothing to do: used only by network {' and '.join(networks)}, of which no other"
                 " instrument has files at that time"
             )
     return reasons

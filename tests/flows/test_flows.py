@@ -289,7 +289,7 @@ def test_a_night_without_the_raw_files_of_products_says_which_and_what_to_do(
     assert "--remove-orphans" in state.message
     assert "20260301T000000" in caplog.text
     (raw / "h9").unlink()
-    with pytest.raises(CatalogError, match="nothing is forgotten"):
+    with pytest.raises(CatalogError, match="the catalog stays unchanged"):
         reprocess(str(campaign_file))
 
 
@@ -317,8 +317,8 @@ def test_a_night_tells_the_channels_that_no_file_holds(
     assert result.troubled
     monkeypatch.setattr(flows.reprocess, "get_run_logger", lambda: logging.getLogger("night"))
     with caplog.at_level(logging.WARNING, "night"):
-        message = flows.reprocess._tell_troubles(campaign, result)
-    assert message == "1 channels named and in no file"
+        message = flows.reprocess._log_problems(campaign, result)
+    assert message == "1 requested channels in no file"
     assert "photon_999o of lidar, for homogeneous: the files hold no such" in caplog.text
 
 

@@ -234,7 +234,9 @@ def test_workers_that_come_later_get_scenes_before_one_has_ended(
     monkeypatch.setattr(executor, "RECOUNT_INTERVAL", 0.0)
     monkeypatch.setattr(executor, "_submit", Begun)
     monkeypatch.setattr(
-        executor, "_outcome_of", lambda _, job: EndedScene(job, failed_outcome(job, "no"), final=True)
+        executor,
+        "_outcome_of",
+        lambda _, job: EndedScene(job, failed_outcome(job, "no"), final=True),
     )
     jobs = scene_jobs(archive.write()) * 4
     assert len(list(process_jobs(jobs, client=Growing()))) == len(jobs)

@@ -69,35 +69,35 @@ def test_a_run_with_nothing_to_do_writes_nothing(archive: Archive) -> None:
 
 
 def _dead_time(archive: Archive) -> None:
-    archive.settings["instruments"]["rich"]["facts"][1]["channels"]["photon_532o"]["dead_time"] = 5e-9
+    archive.tree["instruments"]["rich"]["facts"][1]["channels"]["photon_532o"]["dead_time"] = 5e-9
 
 
 def _lidar_ratio(archive: Archive) -> None:
-    archive.settings["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
+    archive.tree["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
 
 
 def _sections(archive: Archive) -> None:
-    archive.settings["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 825]]
+    archive.tree["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 825]]
 
 
 def _closed_period(archive: Archive) -> None:
     """A calibration that is valid from the last day on."""
-    facts = archive.settings["instruments"]["rich"]["facts"]
+    facts = archive.tree["instruments"]["rich"]["facts"]
     facts[1]["valid_to"] = "2026-03-04T00:00:00Z"
     facts.append({**facts[1], "valid_from": "2026-03-04T00:00:00Z", "azimuth": 12.0})
     del facts[2]["valid_to"]
 
 
 def _new_overlap(archive: Archive) -> None:
-    archive.settings["instruments"]["rich"]["facts"][0]["full_overlap_range"] = 500.0
+    archive.tree["instruments"]["rich"]["facts"][0]["full_overlap_range"] = 500.0
 
 
 def _title(archive: Archive) -> None:
-    archive.settings["title"] = "Another title"
+    archive.tree["title"] = "Another title"
 
 
 def _name(archive: Archive) -> None:
-    archive.settings["instruments"]["poor"]["name"] = "Poor lidar"
+    archive.tree["instruments"]["poor"]["name"] = "Poor lidar"
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_what_is_made_bit_by_bit_is_what_is_made_at_once(archive: Archive, tmp_p
         change(archive)
         reprocess(archive.write())
     other = Archive(tmp_path / "other")
-    other.settings = archive.settings
+    other.tree = archive.tree
     reprocess(other.write())
     assert archive.contents("out/products") == other.contents("out/products")
 
@@ -371,7 +371,7 @@ def test_products_that_nothing_asks_for_are_not_told_as_empty(archive: Archive) 
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
         connection.execute("update product set usable = 0 where kind = 'elastic'")
     assert bring_up_to_date(archive.write()).unusable
-    del archive.settings["instruments"]["rich"]["products"]["elastic"]
+    del archive.tree["instruments"]["rich"]["products"]["elastic"]
     for _ in range(2):
         result = bring_up_to_date(archive.write())
         assert result.orphans
@@ -449,7 +449,7 @@ def test_a_scene_that_cannot_but_fail_is_not_tried_until_something_changes(
 
 
 def test_replaced_versions_are_kept_where_the_campaign_says_so(archive: Archive) -> None:
-    archive.settings["superseded"] = "keep"
+    archive.tree["superseded"] = "keep"
     assert reprocess(archive.write()) is None
     before = archive.contents("out/products")
     _lidar_ratio(archive)
@@ -518,7 +518,7 @@ def _vanished(archive: Archive) -> None:
 
 
 def _nothing_asked(archive: Archive) -> None:
-    archive.settings["instruments"]["poor"]["products"] = {}
+    archive.tree["instruments"]["poor"]["products"] = {}
     _title(archive)
 
 

@@ -58,7 +58,7 @@ class Net:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.file = folder / "net.yaml"
-        self.settings = _tree()
+        self.tree = _tree()
         for seed, name in enumerate(PLACES):
             self.raw(f"{name}/h0", seed)
 
@@ -68,7 +68,7 @@ class Net:
         )
 
     def write(self) -> Campaign:
-        self.file.write_text(yaml.safe_dump(self.settings))
+        self.file.write_text(yaml.safe_dump(self.tree))
         return load_campaign(self.file)
 
     def lose(self, *stations: str) -> None:
@@ -108,11 +108,11 @@ def test_lidars_that_serve_a_network_alone_are_no_trouble(net: Net) -> None:
     code, told = net.command()
     assert (code, told["empty_scenes"]) == (0, {})
     shown = CliRunner().invoke(app, ["plan", str(net.file), "--station", "west"]).stdout
-    assert "used by network valley" in shown
+    assert "used only by network valley" in shown
 
 
 def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
-    net.settings["instruments"]["west-lidar"]["products"] = {"signal": {}}
+    net.tree["instruments"]["west-lidar"]["products"] = {"signal": {}}
     net.write()
     for kind, some in (("visibility", True), ("signal", False)):
         line = ["plan", str(net.file), "--json", "--product", kind, "--instrument", "valley"]
@@ -136,11 +136,11 @@ def test_a_network_that_can_give_nothing_is_told_once(net: Net) -> None:
 
 @pytest.mark.parametrize("why", ["asked", "alone"])
 def test_a_lidar_that_can_give_nothing_is_told_beside_a_network(net: Net, why: str) -> None:
-    lidar = net.settings["instruments"]["west-lidar"]
+    lidar = net.tree["instruments"]["west-lidar"]
     if why == "asked":
         lidar["products"] = {"signal": {"channels": ["photon_355o"]}}
     else:
-        net.settings["instruments"]["other"] = {**lidar, "files": "other/h*"}
+        net.tree["instruments"]["other"] = {**lidar, "files": "other/h*"}
         net.raw("other/h0", 9)
     (name,) = bring_up_to_date(net.write()).empty_scenes
     assert name == ("west-lidar" if why == "asked" else "other") + "_20260301T000000"
@@ -171,8 +171,8 @@ def test_a_product_whose_network_lost_members_is_kept(net: Net, lost: list[str],
 
 
 def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:
-    net.settings["instruments"]["other"] = {
-        **net.settings["instruments"]["west-lidar"], "files": "other/h*", "products": {"signal": {}},
+    net.tree["instruments"]["other"] = {
+        **net.tree["instruments"]["west-lidar"], "files": "other/h*", "products": {"signal": {}},
     }  # fmt: skip
     net.raw("other/h0", 9)
     assert reprocess(net.write())
@@ -184,15 +184,15 @@ def test_a_product_whose_network_lost_all_is_an_orphan(net: Net) -> None:
 
 
 def _no_longer_meeting(net: Net) -> None:
-    net.settings["networks"]["valley"]["visibility"]["smallest_angle"] = 85
+    net.tree["networks"]["valley"]["visibility"]["smallest_angle"] = 85
 
 
 def _another_channel(net: Net) -> None:
-    net.settings["networks"]["valley"]["visibility"]["channel"] = "analog_532o"
+    net.tree["networks"]["valley"]["visibility"]["channel"] = "analog_532o"
 
 
 def _no_network(net: Net) -> None:
-    del net.settings["networks"]
+    del net.tree["networks"]
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ class Archive:
     def __init__(self, folder: Path, *, days: int = 4) -> None:
         self.folder = folder
         self.file = folder / "campaign.yaml"
-        self.settings = tree()
+        self.tree = tree()
         if self.file.exists():
             # A copy of one that was made before.
             return
@@ -85,7 +85,7 @@ class Archive:
 
     def write(self) -> Campaign:
         """Write the campaign file and load it."""
-        self.file.write_text(yaml.safe_dump(self.settings))
+        self.file.write_text(yaml.safe_dump(self.tree))
         return load_campaign(self.file)
 
     def flip(self, name: str, place: int = -40) -> None:
