@@ -108,7 +108,7 @@ def scan_archive(
         Processes(processes, Headers.of(campaign, work.source, store.campaign)) as readers,
     ):
         due = work.due(_joined(work.source.files(), known))
-        rows = readers.each(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
+        rows = readers.map_items(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
         for _, row in rows:
             work.enter(row)
     return work.finish()

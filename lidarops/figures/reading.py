@@ -81,12 +81,12 @@ class Readers:
 
     def read_all(self, readings: Iterable[ReadTask[Content]]) -> Iterator[Content | ReadFailure]:
         """Yield the content of each product, in their order."""
-        for _, content in self._processes.each(_read, readings, at_a_time=_AT_A_TIME):
+        for _, content in self._processes.map_items(_read, readings, at_a_time=_AT_A_TIME):
             yield content
 
     def lengths(self, paths: Iterable[Path]) -> Iterator[int | ReadFailure]:
         """Yield the number of profiles of each product, in their order, without reading data."""
-        for _, length in self._processes.each(_length, paths, at_a_time=_LENGTHS_AT_A_TIME):
+        for _, length in self._processes.map_items(_length, paths, at_a_time=_LENGTHS_AT_A_TIME):
             yield length
 
     def later(self, task: Callable[[object, Item], Content], item: Item) -> Callable[[], Content]:

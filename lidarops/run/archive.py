@@ -36,7 +36,7 @@ from lidarops.run.options import Options, Result
 from lidarops.run.selection import check_selection, unmet_requests
 from lidarops.run.session import Session
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, Selection, Signature
-from lidarops.system.processes import load_ahead, one_ahead, unswept
+from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -119,7 +119,7 @@ def bring_up_to_date(
     with (
         Store(campaign.catalog_url, campaign.name) as store,
         Lock(store, wait=options.wait) as lock,
-        unswept(),
+        objects_frozen(),
     ):
         while True:
             try:
@@ -278,7 +278,7 @@ class _Pass:
         if days:
             if self._options.workers > 1 and not self._options.cluster and client is None:
                 # The modules load while this process judges the scenes.
-                load_ahead(_WORKER_MODULES)
+                preload_modules(_WORKER_MODULES)
             with Stop() as stop:
                 self._process(days, client, stop)
                 caught = stop.signal
@@ -388,7 +388,7 @@ class _Pass:
         judged = map(self._judge.days, self._judge.batches(days))
         on_workers = client is not None or self._options.cluster or self._options.workers > 1
         # Judge ahead, so that workers do not wait.
-        return one_ahead(judged) if on_workers else judged
+        return prefetch_one(judged) if on_workers else judged
 
     def _jobs(self, days: Sequence[int], client: Client | None) -> Iterator[Job]:
         """Yield the jobs of stale scenes, the largest of each group of days first."""

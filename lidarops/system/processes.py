@@ -1,7 +1,7 @@
-"""Several processes of this machine, or threads, for work that is done piece by piece.
+"""Local processes and threads for work that can be split into items.
 
-What is found is the same, and in the same order, whoever finds it: where no process may or can
-be started, or one is lost, the work is done in this one.
+Results and their order do not depend on the number of processes. If processes may not or cannot be
+started, or one is lost, this process does the work.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from itertools import chain, islice
 from multiprocessing import forkserver, resource_tracker
 from typing import Any, Final, Generic, Self, TypeVar
 
-_AHEAD: Final = 8
-"""Lots of items for a process that are on their way at the same time."""
-_MAPPED_ALONE: Final = (-3, 32 << 20)
-"""glibc's M_MMAP_THRESHOLD, and the most it admits in byte."""
-_GIVEN_BACK: Final = (-1, 256 << 20)
-"""glibc's M_TRIM_THRESHOLD, byte: a task of a scene leaves 100 to 200 MB, which the next one
-needs."""
+_BATCHES_AHEAD: Final = 8
+"""Batches of items submitted per process."""
+_MMAP_THRESHOLD: Final = (-3, 32 << 20)
+"""M_MMAP_THRESHOLD of glibc, and its largest value in bytes."""
+_TRIM_THRESHOLD: Final = (-1, 256 << 20)
+"""M_TRIM_THRESHOLD of glibc, and its value in bytes: a scene leaves 100 to 200 MB, which the next
+scene needs again."""
 _ONE_THREAD: Final = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 )
-"""What a library looks at as it is loaded; as dask has it for its workers."""
-_OF_LIBRARIES: Final = frozenset(
+"""Variables that libraries read when they are loaded; dask sets the same for its workers."""
+_LIBRARY_VARIABLES: Final = frozenset(
     {*_ONE_THREAD, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
 )
-"""Variables that dask sets in this process too, as it starts workers, and netCDF4 for itself."""
+"""Variables that dask, when it starts workers, and netCDF4 also set in this process."""
 
 _NO_MORE: Final[Any] = object()
 
 Kept = TypeVar("Kept")
 Item = TypeVar("Item")
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 _LOG = logging.getLogger(__name__)
 
 
-def load_ahead(modules: Collection[str]) -> None:
-    """Begin a process that loads modules, and that those started here from now on are forked from.
+def preload_modules(modules: Collection[str]) -> None:
+    """Start a server process that loads modules, from which further processes are forked.
 
-    Each of them would take seconds to load them for itself. It ends with the last process that
-    knows of it. Does nothing where forks are not safe, or where there is one.
+    Otherwise each process would take seconds to load the modules. The server ends with the last
+    process that uses it. Does nothing if forks are not safe, or if the server exists.
 
     Parameters
     ----------
@@ -65,9 +65,9 @@ def load_ahead(modules: Collection[str]) -> None:
     os.environ.update(unset)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:
-        # First, as it lets signals through again.
+        # First, because it unblocks signals.
         resource_tracker.ensure_running()
-        # Ctrl-C goes to all processes of a terminal; this one ends the others.
+        # Ctrl-C reaches all processes of a terminal, but this process ends the others.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         forkserver.ensure_running()
         _LOADED[os.getpid()] = _environment()
@@ -80,59 +80,59 @@ def load_ahead(modules: Collection[str]) -> None:
 
 
 def start_method() -> str:
-    """Return how processes are to be started, as `multiprocessing` names it.
+    """Return the start method of `multiprocessing` for new processes.
 
-    They have the environment of this process as it is now, the one of `load_ahead` only where
-    that is the same.
+    They get the present environment of this process. The server of `preload_modules` is used only
+    if it has the same environment.
     """
-    # A fork of this process would inherit the locks of whatever threads are running.
+    # A fork of this process would inherit the locks of running threads.
     return "forkserver" if _LOADED.get(os.getpid()) == _environment() else "spawn"
 
 
 def _environment() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if name not in _OF_LIBRARIES}
+    return {name: value for name, value in os.environ.items() if name not in _LIBRARY_VARIABLES}
 
 
-def one_ahead(items: Iterable[Item]) -> Iterator[Item]:
-    """Give items, the next of which another thread finds while one is in use.
+def prefetch_one(items: Iterable[Item]) -> Iterator[Item]:
+    """Yield items, while another thread already computes the next one.
 
     Raises
     ------
     Exception
-        What finding an item raises, in its place.
+        The exception of an item, raised in its place.
     """
     rest = iter(items)
     with ThreadPoolExecutor(1, "ahead") as thread:
-        coming = thread.submit(next, rest, _NO_MORE)
+        upcoming = thread.submit(next, rest, _NO_MORE)
         while True:
-            item = coming.result()
+            item = upcoming.result()
             if item is _NO_MORE:
                 return
-            coming = thread.submit(next, rest, _NO_MORE)
+            upcoming = thread.submit(next, rest, _NO_MORE)
             yield item
 
 
 class Processes(Generic[Kept]):
-    """Some processes, to be used in a with; started when there is work for them, one by one.
+    """A context manager of some processes, which start one by one when there is work.
 
     Parameters
     ----------
     number : int
-        Most processes beside this one; none is ever started for fewer than 2.
+        Largest number of further processes; none is started for fewer than 2.
     kept : object
-        What all tasks are called with, sent to each process once.
+        First argument of all tasks, sent to each process once.
     """
 
     def __init__(self, number: int, kept: Kept) -> None:
         self._kept = kept
         self._number = number
         self._pool: ProcessPoolExecutor | None = None
-        # A daemonic process, as a worker of dask is, may not have any of its own.
+        # A daemonic process, such as a dask worker, may not have child processes.
         self._alone = number < 2 or bool(multiprocessing.current_process().daemon)
 
     @property
     def number(self) -> int:
-        """How many there may be beside this one: none where all is done here."""
+        """Largest number of further processes; 0 if this process does all the work."""
         return 0 if self._alone else self._number
 
     def __enter__(self) -> Self:
@@ -142,30 +142,30 @@ class Processes(Generic[Kept]):
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def each(
+    def map_items(
         self,
-        task: Callable[[Kept, Item], Found],
+        task: Callable[[Kept, Item], Result],
         items: Iterable[Item],
         *,
         at_a_time: int,
         fewest: int = 2,
-    ) -> Iterator[tuple[Item, Found]]:
-        """Do a task for each item; items are taken as they are needed, some ahead.
+    ) -> Iterator[tuple[Item, Result]]:
+        """Call a task for each item; items are consumed as needed, some ahead.
 
         Parameters
         ----------
         task : callable
-            Called with what is kept and an item. All three, and what it returns or raises, can
-            be pickled.
+            Called with `kept` and an item. All of these, and its result or exception, must be
+            picklable.
         items : iterable
         at_a_time : int
-            Items that are handed to a process together, so that it waits less for the next.
+            Number of items per batch for a process.
         fewest : int, optional
-            Items for which processes are worth their start.
+            Least number of items for which processes are started.
 
         Yields
         ------
-        item, found
+        item, result
             In the order of items.
         """
         rest = iter(items)
@@ -173,34 +173,34 @@ class Processes(Generic[Kept]):
             first = list(islice(rest, fewest))
             rest = chain(first, rest)
             if len(first) == fewest:
-                yield from self._each_there(task, rest, at_a_time)
+                yield from self._each_in_processes(task, rest, at_a_time)
                 return
         for item in rest:
             yield item, task(self._kept, item)
 
-    def _each_there(
-        self, task: Callable[[Kept, Item], Found], items: Iterator[Item], at_a_time: int
-    ) -> Iterator[tuple[Item, Found]]:
-        lots = iter(lambda: list(islice(items, at_a_time)), [])
-        ahead: deque[tuple[list[Item], Callable[[], list[Found]]]] = deque()
+    def _each_in_processes(
+        self, task: Callable[[Kept, Item], Result], items: Iterator[Item], at_a_time: int
+    ) -> Iterator[tuple[Item, Result]]:
+        batches = iter(lambda: list(islice(items, at_a_time)), [])
+        ahead: deque[tuple[list[Item], Callable[[], list[Result]]]] = deque()
         while True:
-            for lot in islice(lots, _AHEAD * self._number - len(ahead)):
-                ahead.append((lot, self.later(partial(_lot, task), lot)))
+            for batch in islice(batches, _BATCHES_AHEAD * self._number - len(ahead)):
+                ahead.append((batch, self.later(partial(_run_batch, task), batch)))
             if not ahead:
                 return
-            lot, found = ahead.popleft()
-            yield from zip(lot, found(), strict=True)
+            batch, results = ahead.popleft()
+            yield from zip(batch, results(), strict=True)
 
-    def later(self, task: Callable[[Kept, Item], Found], item: Item) -> Callable[[], Found]:
-        """Begin a task; return what gives, or raises, what it came to.
+    def later(self, task: Callable[[Kept, Item], Result], item: Item) -> Callable[[], Result]:
+        """Start a task; return a function that waits for its result and returns or raises it.
 
-        It waits for that. Without processes the task is done when it is asked for.
+        Without processes, that function calls the task.
         """
-        here = partial(task, self._kept, item)
-        there = self._submit(task, item)
-        return here if there is None else partial(self._waited, there, here)
+        run_here = partial(task, self._kept, item)
+        future = self._submit(task, item)
+        return run_here if future is None else partial(self._wait, future, run_here)
 
-    def _submit(self, task: Callable[[Kept, Item], Found], item: Item) -> Future[Found] | None:
+    def _submit(self, task: Callable[[Kept, Item], Result], item: Item) -> Future[Result] | None:
         if self._alone:
             return None
         if self._pool is None:
@@ -211,25 +211,25 @@ class Processes(Generic[Kept]):
                 initargs=(self._kept,),
             )
         try:
-            return self._pool.submit(_there, task, item)
-        # One was lost, or none can be started; or what forks them ended as it was asked to.
+            return self._pool.submit(_run_task, task, item)
+        # A process was lost, none can be started, or the server that forks them has ended.
         except (BrokenProcessPool, OSError, EOFError) as error:
             self._lost(error)
             return None
 
-    def _waited(self, there: Future[Found], here: Callable[[], Found]) -> Found:
-        # Never cancelled here: the thread that marks what a lost process leaves undone would stop
-        # at a future that was, and the processes that are left would wait for ever.
+    def _wait(self, future: Future[Result], run_here: Callable[[], Result]) -> Result:
+        # Never cancel here: the thread that marks the tasks of a lost process would stop at a
+        # cancelled future, and the remaining processes would wait for ever.
         try:
-            return there.result()
-        # A process was killed, for its memory say; or not begun when one could not be started.
+            return future.result()
+        # A process was killed (e.g. for its memory), or could not be started.
         except (BrokenProcessPool, CancelledError) as error:
             self._lost(error)
-        return here()
+        return run_here()
 
     def _lost(self, error: BaseException) -> None:
         if not self._alone:
-            _LOG.warning("a process was lost, its work is done here: %s", error)
+            _LOG.warning("a process was lost; this one does its work: %s", error)
             self._alone = True
             if self._pool is not None:
                 self._pool.shutdown(wait=False, cancel_futures=True)
@@ -237,13 +237,13 @@ class Processes(Generic[Kept]):
 
 
 _LOADED: dict[int, dict[str, str]] = {}
-"""This process, where one that loads modules was begun -> the environment that it has."""
+"""Id of this process, if it started a server of `preload_modules` -> environment of the server."""
 _KEPT: list[Any] = []
-"""In a process that was started here: what it keeps for all tasks."""
+"""In a started process: the first argument of all tasks."""
 
 
 def _prepare(kept: object) -> None:
-    # Ctrl-C goes to all processes of a terminal; the one that started this one ends it.
+    # Ctrl-C reaches all processes of a terminal, but the parent ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_memory()
@@ -251,7 +251,7 @@ def _prepare(kept: object) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process where the one that started it was killed, and can no longer do so."""
+    """End this process when its parent is killed and can no longer do so."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -259,27 +259,28 @@ def _end_with_parent() -> None:
 
 
 def keep_memory() -> None:
-    """Let the C library of this process keep what arrays leave, for the next ones.
+    """Let the C library of this process keep the memory of freed arrays for new ones.
 
-    To map each anew takes a third of the time of small work, a sixth of that of scenes.
+    Mapping it anew would take a third of the time of small tasks, and a sixth of that of scenes.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt
-    # Of another system.
+    # Not glibc.
     except (OSError, TypeError, AttributeError):
         return
-    for option, value in (_MAPPED_ALONE, _GIVEN_BACK):
+    for option, value in (_MMAP_THRESHOLD, _TRIM_THRESHOLD):
         set_option(option, value)
 
 
 @contextmanager
-def unswept() -> Iterator[None]:
-    """Keep the garbage collector off what is there now; counted references are dropped as ever.
+def objects_frozen() -> Iterator[None]:
+    """Exclude all existing objects from garbage collection within the context.
 
-    It would go through all that was loaded, in a fifth of a second, for a little garbage.
+    Each collection would otherwise take 0.2 s to scan all loaded modules, for little garbage.
+    Reference counting is not affected.
     """
     if gc.get_freeze_count():
-        # Of somebody else, and what is frozen is thawed together.
+        # Frozen by other code; unfreezing would also unfreeze its objects.
         yield
         return
     gc.freeze()
@@ -289,9 +290,9 @@ def unswept() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _there(task: Callable[[Any, Item], Found], item: Item) -> Found:
+def _run_task(task: Callable[[Any, Item], Result], item: Item) -> Result:
     return task(_KEPT[0], item)
 
 
-def _lot(task: Callable[[Kept, Item], Found], kept: Kept, items: list[Item]) -> list[Found]:
+def _run_batch(task: Callable[[Kept, Item], Result], kept: Kept, items: list[Item]) -> list[Result]:
     return [task(kept, item) for item in items]

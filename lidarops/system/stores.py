@@ -1,8 +1,8 @@
-"""Object stores and other file systems behind an fsspec URL: raw files from, products to.
+"""Object stores and other file systems behind an fsspec URL: read raw files, write products.
 
-``s3://``, ``gs://`` and whatever else fsspec knows; ``http(s)://`` can be read only. Keys and
-endpoints come from where the drivers look for them, such as ``AWS_ACCESS_KEY_ID`` and
-``FSSPEC_S3_ENDPOINT_URL``; none is kept here.
+``s3://``, ``gs://`` and all others that fsspec knows; ``http(s)://`` is read-only. The drivers find
+keys and endpoints in variables such as ``AWS_ACCESS_KEY_ID`` and ``FSSPEC_S3_ENDPOINT_URL``; this
+module stores none.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from typing import Any, Final
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
 
 _READ_ONLY: Final = frozenset({"http", "https"})
-# Here an object appears when its upload is complete, or not at all.
+# Schemes by which an object appears only when its upload is complete.
 _ATOMIC: Final = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az"})
-# A secret may hold slashes, so what looks like one goes up to the last @; the @ of Azure parts a
-# container from its account.
+# A secret may hold slashes, so it is matched up to the last @. In Azure URLs the @ separates
+# container and account.
 _KEYS: Final = re.compile(r"(?<=://)(?:[^/:\s]*:\S*|(?<!abfs://)(?<!abfss://)[^/\s]*)@")
 _BATCH: Final = 100
-"""Files on their way at the same time."""
+"""Files that are transferred at the same time."""
 
-# What the drivers raise besides OSError; only of a driver that is loaded can it come.
+# Exceptions of drivers besides OSError; only loaded drivers can raise them.
 _DRIVER_ERRORS: Final = (
     ("aiohttp", "ClientError"),
     ("botocore.exceptions", "BotoCoreError"),
@@ -40,33 +40,33 @@ _DRIVER_ERRORS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """An object as its store lists it."""
+    """An object in the listing of a store."""
 
     path: str
-    """Relative to the URL."""
+    """Path relative to the URL."""
     size: int
-    """Byte."""
+    """Size in bytes."""
     stamp: int
-    """Changes when the object does: its time in ns, or a number made of its tag."""
+    """Changes with the object: its modification time in ns, or a number derived from its tag."""
 
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """What `RemoteStore.publish` did."""
+    """Result of `RemoteStore.publish`."""
 
     uploaded: tuple[str, ...]
     unchanged: int
     others: int
-    """Objects in the store that are none of the products; they are left alone."""
+    """Number of objects in the store that are no products; they are left alone."""
 
 
 def is_url(location: str) -> bool:
-    """Tell a URL from a folder."""
+    """Return whether a location is a URL, not a folder."""
     return "://" in location
 
 
 def without_keys(text: str) -> str:
-    """Return a URL, or a text that holds some, without what stands before an @ in the address."""
+    """Return a text without the credentials in its URLs (the part before the @)."""
     return _KEYS.sub("", text)
 
 
@@ -87,7 +87,7 @@ class RemoteStore:
         import fsspec  # noqa: PLC0415 - most archives are local, and the import takes 0.1 s
 
         self.url = without_keys(url)
-        """As it may be told."""
+        """The URL without credentials."""
         self._scheme = url.partition("://")[0]
         try:
             self._fs, prefix = fsspec.core.url_to_fs(url)
@@ -96,37 +96,37 @@ class RemoteStore:
                 f"the URL cannot be opened: {without_keys(str(error))}",
                 file=self.url,
                 remedy="use a URL that fsspec knows and install its driver: lidarops[s3] for s3://",
-                # What is known lacks its driver only.
+                # An ImportError means that only the driver is missing.
                 wrong_use=isinstance(error, ValueError),
             ) from error
         self._prefix = prefix.rstrip("/")
 
     def files(self) -> Iterator[Stored]:
-        """List everything below the URL in the order of the paths.
+        """List all objects below the URL, sorted by path.
 
         Raises
         ------
         CatalogError
-            If the store cannot be reached or does not list.
+            If the store cannot be reached or listed.
         """
-        with self._told(CatalogError, "cannot be listed"):
-            # Another process may have written since this one has looked.
+        with self._errors_as(CatalogError, "cannot be listed"):
+            # Another process may have written since the last listing.
             self._fs.invalidate_cache()
-            listing = self._found()
-            # A web server's index names files without their sizes.
-            unsized = [name for name, about in listing.items() if about.get("size") is None]
+            listing = self._find()
+            # The index of a web server has no sizes.
+            unsized = [name for name, info in listing.items() if info.get("size") is None]
             listing |= {name: self._fs.info(name) for name in unsized}
         for name in sorted(listing):
-            about = listing[name]
+            info = listing[name]
             path = name.removeprefix(self._prefix).lstrip("/")
-            yield Stored(path, int(about["size"] or 0), _stamp(about))
+            yield Stored(path, int(info["size"] or 0), _stamp(info))
 
-    def _found(self) -> dict[str, Any]:
-        # Drivers that walk through folders leave out what they cannot list, unless told not to.
+    def _find(self) -> dict[str, Any]:
+        # By default, drivers that walk through folders skip what they cannot list.
         strict = {} if self._scheme in _ATOMIC else {"on_error": "raise"}
         listing: dict[str, Any] = self._fs.find(self._prefix, detail=True, **strict)
         if not listing:
-            # Raises where there is nothing at all, which is no empty place.
+            # Raises an error if the place does not exist.
             self._fs.ls(self._prefix, detail=False)
         return listing
 
@@ -138,7 +138,7 @@ class RemoteStore:
         CatalogError
             If it cannot be read.
         """
-        with self._told(CatalogError, f"{path} cannot be read"):
+        with self._errors_as(CatalogError, f"{path} cannot be read"):
             data: bytes = self._fs.cat_file(self._name(path), start=0, end=size)
         return data
 
@@ -151,13 +151,13 @@ class RemoteStore:
             If it cannot be read.
         """
         with (
-            self._told(CatalogError, f"{path} cannot be read"),
+            self._errors_as(CatalogError, f"{path} cannot be read"),
             self._fs.open(self._name(path), "rb") as stream,
         ):
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Copy files to a local folder, under their paths; what the store lacks is left out.
+        """Copy files to a local folder under their paths; skip files that the store lacks.
 
         Parameters
         ----------
@@ -167,16 +167,16 @@ class RemoteStore:
         Raises
         ------
         CatalogError
-            If the store cannot be reached, so that what it lacks is not known.
+            If the store cannot be reached.
         """
         pairs = [(self._name(path), str(folder / path)) for path in paths]
         for path in paths:
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        with self._told(CatalogError, "cannot be read"):
+        with self._errors_as(CatalogError, "cannot be read"):
             try:
                 self._fs.get(*_columns(pairs), batch_size=_BATCH)
             except FileNotFoundError:
-                # Rare, so the files that are there may be asked for twice.
+                # Rare, so existing files may be fetched twice.
                 for name, target in pairs:
                     with suppress(FileNotFoundError):
                         self._fs.get_file(name, target)
@@ -184,18 +184,18 @@ class RemoteStore:
     def publish(self, root: Path, products: Mapping[str, str], journal: Path) -> Published:
         """Upload the products that the store lacks or holds in another version.
 
-        A reader of the store sees a product whole, the old one or the new one. Interrupted, a
-        second call completes the first. What was sent is told by a journal and not by the times
-        of files, as the store has another clock.
+        Readers of the store always see a complete product, the old or the new one. After an
+        interruption, the next call completes the work. A journal records what was sent, because
+        the clock of the store may differ from the local one.
 
         Parameters
         ----------
         root : path
             The folder of the products.
         products : mapping of str to str
-            Path relative to `root`, and SHA-256 as the ledger has it.
+            Path relative to `root` -> SHA-256 in the ledger.
         journal : path
-            Text file that this method keeps, one a store; lost, everything is sent again.
+            Text file of this method, one per store; without it everything is sent again.
 
         Returns
         -------
@@ -205,7 +205,7 @@ class RemoteStore:
         ------
         ProductError
             If the store is read-only, cannot be reached, or holds less than was sent, or if a
-            product is missing or no longer what the ledger says.
+            product is missing or differs from the ledger.
         """
         if self._scheme in _READ_ONLY:
             raise ProductError(
@@ -214,19 +214,19 @@ class RemoteStore:
                 remedy="publish to s3://, gs:// or a mounted folder",
                 wrong_use=True,
             )
-        there = {stored.path: stored.size for stored in self._existing()}
+        sizes = {stored.path: stored.size for stored in self._existing()}
         sent = _read_journal(journal)
         due = [
             path
             for path, sha256 in sorted(products.items())
-            if sent.get(path) != sha256 or there.get(path) != _size(root / path)
+            if sent.get(path) != sha256 or sizes.get(path) != _size(root / path)
         ]
         for first in range(0, len(due), _BATCH):
             batch = {path: products[path] for path in due[first : first + _BATCH]}
-            with self._told(ProductError, "cannot be written"):
+            with self._errors_as(ProductError, "cannot be written"):
                 self._upload(root, batch)
             _append_journal(journal, batch)
-        return Published(tuple(due), len(products) - len(due), len(there.keys() - products.keys()))
+        return Published(tuple(due), len(products) - len(due), len(sizes.keys() - products.keys()))
 
     def _existing(self) -> Sequence[Stored]:
         try:
@@ -241,7 +241,7 @@ class RemoteStore:
             with _reading(root / path), (root / path).open("rb") as file:
                 if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
                     raise ProductError(
-                        "is not what the ledger says", file=root / path, remedy="reprocess"
+                        "differs from the ledger", file=root / path, remedy="run lidarops reprocess"
                     )
         targets = [self._name(path) for path in products]
         sources = [str(root / path) for path in products]
@@ -256,9 +256,9 @@ class RemoteStore:
                 raise ProductError(f"holds {held} of {sent} bytes", file=f"{self.url}/{path}")
 
     def _put_and_rename(self, source: str, target: str) -> None:
-        where = PurePosixPath(target)
-        self._fs.makedirs(str(where.parent), exist_ok=True)
-        temporary = str(where.with_name(f".{where.name}.{secrets.token_hex(8)}.part"))
+        path = PurePosixPath(target)
+        self._fs.makedirs(str(path.parent), exist_ok=True)
+        temporary = str(path.with_name(f".{path.name}.{secrets.token_hex(8)}.part"))
         try:
             self._fs.put_file(source, temporary)
             self._fs.mv(temporary, target)
@@ -271,7 +271,7 @@ class RemoteStore:
         return f"{self._prefix}/{path}"
 
     @contextmanager
-    def _told(self, kind: type[LidarOpsError], problem: str) -> Iterator[None]:
+    def _errors_as(self, kind: type[LidarOpsError], problem: str) -> Iterator[None]:
         try:
             yield
         except LidarOpsError:
@@ -286,7 +286,7 @@ class RemoteStore:
 
 @contextmanager
 def _reading(product: Path) -> Iterator[None]:
-    """Tell a product that cannot be read from a store that cannot be written."""
+    """Raise a ProductError that names the product if it cannot be read."""
     try:
         yield
     except OSError as error:
@@ -308,12 +308,12 @@ def _columns(pairs: Sequence[tuple[str, str]]) -> tuple[list[str], list[str]]:
 
 
 def _read_journal(journal: Path) -> dict[str, str]:
-    """Read lines as sha256sum writes them; of a path the last one counts."""
+    """Read lines in the format of sha256sum; the last line of a path counts."""
     try:
         lines = journal.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         return {}
-    # The last line may have been cut by a crash: its product is then sent again.
+    # A crash may have cut the last line; its product is then sent again.
     pairs = (line.split("  ", 1) for line in lines if "  " in line)
     return {path: sha256 for sha256, path in pairs}
 
@@ -321,7 +321,7 @@ def _read_journal(journal: Path) -> dict[str, str]:
 def _append_journal(journal: Path, products: Mapping[str, str]) -> None:
     journal.parent.mkdir(parents=True, exist_ok=True)
     with journal.open("a", encoding="utf-8") as file:
-        # The first line break ends a line that a crash may have cut.
+        # Start with a line break, because a crash may have cut the last line.
         file.write("\n" + "".join(f"{sha256}  {path}\n" for path, sha256 in products.items()))
 
 
@@ -330,9 +330,9 @@ def _failures() -> tuple[type[Exception], ...]:
     return (OSError, *(getattr(module, name) for module, name in loaded if module is not None))
 
 
-def _stamp(about: dict[str, Any]) -> int:
+def _stamp(info: dict[str, Any]) -> int:
     for key in ("mtime", "LastModified", "last_modified", "updated", "created", "ETag", "etag"):
-        value = about.get(key)
+        value = info.get(key)
         if isinstance(value, int | float):
             return int(value * 1e9)
         if value is not None:

@@ -87,7 +87,7 @@ def test_the_command_line_publishes_and_says_what_it_did(
     next(store.rglob(product.name)).unlink()
     damaged = runner.invoke(app, words)
     assert damaged.exit_code == 1
-    assert "is not what the ledger says" in damaged.output
+    assert "differs from the ledger" in damaged.output
     assert digests(store).items() <= expected.items()
 
 

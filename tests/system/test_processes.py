@@ -20,7 +20,7 @@ import pytest
 
 from lidarops.errors import CatalogError
 from lidarops.system import processes
-from lidarops.system.processes import Processes, one_ahead
+from lidarops.system.processes import Processes, prefetch_one
 
 
 def product(kept: int, item: int) -> int:
@@ -60,37 +60,37 @@ class TestEach:
     @pytest.mark.parametrize("number", [1, 2])
     def test_keeps_the_order(self, number: int) -> None:
         with Processes(number, 2) as pool:
-            assert list(pool.each(product, range(40), at_a_time=3)) == doubled(range(40))
-            others = {found for _, found in pool.each(process, range(40), at_a_time=3)}
-            assert list(pool.each(product, [], at_a_time=3)) == []
+            assert list(pool.map_items(product, range(40), at_a_time=3)) == doubled(range(40))
+            others = {found for _, found in pool.map_items(process, range(40), at_a_time=3)}
+            assert list(pool.map_items(product, [], at_a_time=3)) == []
         assert (os.getpid() not in others) == (number > 1)
 
     def test_takes_items_as_they_are_needed(self) -> None:
         taken = count()
         with Processes(2, 2) as pool:
-            found = pool.each(product, taken, at_a_time=1)
+            found = pool.map_items(product, taken, at_a_time=1)
             assert list(islice(found, 30)) == doubled(range(30))
         assert next(taken) < 100
 
     @pytest.mark.usefixtures("no_process")
     def test_starts_no_process_for_few_items(self) -> None:
         with Processes(2, 2) as pool:
-            found = pool.each(product, range(9), at_a_time=3, fewest=10)
+            found = pool.map_items(product, range(9), at_a_time=3, fewest=10)
             assert list(found) == doubled(range(9))
 
     @pytest.mark.usefixtures("no_process")
     def test_a_daemon_that_may_start_no_process_does_it_itself(self, monkeypatch) -> None:
         monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
         with Processes(2, 2) as pool:
-            assert list(pool.each(product, range(9), at_a_time=3)) == doubled(range(9))
+            assert list(pool.map_items(product, range(9), at_a_time=3)) == doubled(range(9))
             assert pool.later(product, 7)() == 14
 
     def test_loses_nothing_with_a_process(self, caplog: pytest.LogCaptureFixture) -> None:
         with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
             last = pool.later(product, 7)
-            assert list(pool.each(deadly, range(40), at_a_time=2)) == doubled(range(40))
+            assert list(pool.map_items(deadly, range(40), at_a_time=2)) == doubled(range(40))
             assert last() == 14
-            assert {found for _, found in pool.each(process, range(4), at_a_time=1)} == {
+            assert {found for _, found in pool.map_items(process, range(4), at_a_time=1)} == {
                 os.getpid()
             }
         assert caplog.text.count("a process was lost") == 1
@@ -106,7 +106,7 @@ class TestEach:
         monkeypatch.setattr(Future, "set_exception", slowly)
         others = multiprocessing.active_children()
         with Processes(2, 2) as pool:
-            assert list(pool.each(deadly, range(40), at_a_time=2)) == doubled(range(40))
+            assert list(pool.map_items(deadly, range(40), at_a_time=2)) == doubled(range(40))
         left = [child for child in multiprocessing.active_children() if child not in others]
         for child in left:
             child.join(60)
@@ -128,18 +128,18 @@ class TestEach:
         for method in ("spawn", "forkserver"):
             monkeypatch.setattr(multiprocessing.get_context(method), "Process", unstartable)
         with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
-            assert list(pool.each(product, range(9), at_a_time=2)) == doubled(range(9))
+            assert list(pool.map_items(product, range(9), at_a_time=2)) == doubled(range(9))
         assert caplog.text.count("a process was lost") == 1
 
     @pytest.mark.parametrize("number", [1, 2])
     def test_raises_what_a_task_raises(self, number: int) -> None:
         with Processes(number, 2) as pool:
-            found = pool.each(failing, range(40), at_a_time=1)
+            found = pool.map_items(failing, range(40), at_a_time=1)
             assert list(islice(found, 5)) == [(item, item) for item in range(5)]
             with pytest.raises(CatalogError, match=r"archive: is away \(wait\)"):
                 next(found)
             # That was no loss of a process.
-            others = {one for _, one in pool.each(process, [1, 2], at_a_time=1)}
+            others = {one for _, one in pool.map_items(process, [1, 2], at_a_time=1)}
         assert (os.getpid() not in others) == (number > 1)
 
     def test_leaves_no_process_where_who_asks_gives_up(self) -> None:
@@ -149,7 +149,7 @@ class TestEach:
 
 
 def _interrupted(pool: Processes[int]) -> None:
-    for item, _ in pool.each(product, count(), at_a_time=1):
+    for item, _ in pool.map_items(product, count(), at_a_time=1):
         if item == 20:
             raise KeyboardInterrupt
 
@@ -157,7 +157,7 @@ def _interrupted(pool: Processes[int]) -> None:
 AHEAD = """
 import multiprocessing, os, signal, sys, time
 from lidarops.system import processes
-from lidarops.system.processes import Processes, load_ahead, start_method
+from lidarops.system.processes import Processes, preload_modules, start_method
 
 def seen(kept, item):
     held = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
@@ -168,12 +168,12 @@ def variable(kept, name):
 
 if __name__ == "__main__":
     assert start_method() == "spawn"
-    load_ahead(["colorsys", "no_such_module"])
-    load_ahead(["wave"])
+    preload_modules(["colorsys", "no_such_module"])
+    preload_modules(["wave"])
     assert start_method() == "forkserver"
     assert "OMP_NUM_THREADS" not in os.environ
     with Processes(2, 2) as pool:
-        found = dict(pool.each(seen, range(6), at_a_time=1))
+        found = dict(pool.map_items(seen, range(6), at_a_time=1))
     assert all(loaded for loaded, *_ in found.values()), found
     assert "colorsys" not in sys.modules
     assert os.getpid() not in {pid for _, pid, *_ in found.values()}
@@ -194,10 +194,10 @@ if __name__ == "__main__":
 WORKERS = """
 import os
 from lidarops.run.executor import local_client
-from lidarops.system.processes import load_ahead, start_method
+from lidarops.system.processes import preload_modules, start_method
 
 if __name__ == "__main__":
-    load_ahead(["distributed.nanny"])
+    preload_modules(["distributed.nanny"])
     with local_client(2) as client:
         parents = set(client.run(os.getppid).values())
     import netCDF4
@@ -209,8 +209,8 @@ if __name__ == "__main__":
 
 class TestOneAhead:
     def test_gives_all_in_order(self) -> None:
-        assert list(one_ahead(range(9))) == list(range(9))
-        assert list(one_ahead([])) == []
+        assert list(prefetch_one(range(9))) == list(range(9))
+        assert list(prefetch_one([])) == []
 
     def test_finds_the_next_one_meanwhile_and_no_more(self) -> None:
         begun = [threading.Event() for _ in range(4)]
@@ -220,7 +220,7 @@ class TestOneAhead:
                 event.set()
                 yield number
 
-        items = one_ahead(found())
+        items = prefetch_one(found())
         assert next(items) == 0
         assert begun[1].wait(10)
         items.close()
@@ -231,7 +231,7 @@ class TestOneAhead:
             yield 1
             raise CatalogError("is away", file="archive", remedy="wait")
 
-        items = one_ahead(found())
+        items = prefetch_one(found())
         assert next(items) == 1
         with pytest.raises(CatalogError, match="is away"):
             next(items)
@@ -279,14 +279,14 @@ class TestLater:
 
 def test_what_was_there_is_not_swept_and_is_afterwards():
     assert gc.get_freeze_count() == 0
-    with processes.unswept():
+    with processes.objects_frozen():
         frozen = gc.get_freeze_count()
         assert frozen > 1000
-        with processes.unswept():
+        with processes.objects_frozen():
             assert gc.get_freeze_count() <= frozen
         # The inner one has nothing to thaw.
         assert gc.get_freeze_count() > 1000
     assert gc.get_freeze_count() == 0
-    with pytest.raises(ValueError, match="inside"), processes.unswept():
+    with pytest.raises(ValueError, match="inside"), processes.objects_frozen():
         raise ValueError("inside")
     assert gc.get_freeze_count() == 0

@@ -89,7 +89,7 @@ def test_publish_after_a_crash_in_the_journal(tmp_path: Path, url: str) -> None:
 def test_publish_refuses_a_product_that_is_not_the_ledgers(tmp_path: Path, url: str) -> None:
     made = products(tmp_path, a=b"one")
     (tmp_path / "coast" / "a.nc").write_bytes(b"eno")
-    with pytest.raises(ProductError, match="not what the ledger says"):
+    with pytest.raises(ProductError, match="differs from the ledger"):
         RemoteStore(url).publish(tmp_path, made, tmp_path / "journal")
     with pytest.raises(CatalogError, match="cannot be listed"):
         list(RemoteStore(url).files())
