@@ -24,9 +24,6 @@ from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_eart
 
 Floats = NDArray[np.float64]
 
-QUANTITIES: Final = ("extinction", "visibility")
-"""Quantities of a series."""
-
 _EXTINCTION: Final = (
     "extinction",
     "extinction_standard_error",

@@ -399,9 +399,9 @@ def _blocks(
 ) -> QuadMesh:
     """Draw the columns of a raster, with empty columns at gaps."""
     left, right = axis.x(raster.start), axis.x(raster.stop)
-    apart = 1 + np.flatnonzero(left[1:] - right[:-1] > 1e-9)
-    edges = np.append(np.insert(left, apart, right[apart - 1]), right[-1])
-    filled = np.ma.masked_invalid(np.insert(values, apart, np.nan, axis=0))
+    gaps = 1 + np.flatnonzero(left[1:] - right[:-1] > 1e-9)
+    edges = np.append(np.insert(left, gaps, right[gaps - 1]), right[-1])
+    filled = np.ma.masked_invalid(np.insert(values, gaps, np.nan, axis=0))
     return panel.pcolormesh(edges, raster.edges / 1e3, filled.T, cmap=colors, norm=norm)
 
 

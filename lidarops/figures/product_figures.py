@@ -151,7 +151,7 @@ def error_budget_figure(profile: Profile, *, title: str = "") -> Figure:
     bottom, top = (edge / 1e3 for edge in profile.reference)
     return _described(
         figure,
-        f"{title}: backscatter of particles against range at {moment} with its standard error,"
+        f"{title}: particle backscatter against range at {moment} with its standard error,"
         f" and the errors from noise, background, reference, lidar ratio and molecules. Reference"
         f" window {bottom:.3g} to {top:.3g} km.",
     )
@@ -269,8 +269,8 @@ def flags_overview(shares: Mapping[str, Mapping[Quality, float]], *, title: str 
     row, column = np.unravel_index(int(values.argmax()), values.shape)
     return _described(
         figure,
-        f"{title}: share of values by quality bit. The largest is {percent(values[row, column])}"
-        f" {bit_name(bits[column])} in {labels[row]}.",
+        f"{title}: share of values by quality bit. The largest share is"
+        f" {percent(values[row, column])}, {bit_name(bits[column])} in {labels[row]}.",
     )
 
 

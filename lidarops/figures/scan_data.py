@@ -137,8 +137,6 @@ class ScanResiduals:
     percent: the part that does not average out."""
     cycles: int
     """Number of cycles with a residual."""
-    altitudes: int
-    """Number of altitudes in a row."""
 
 
 def clearest_cycle(
@@ -374,7 +372,6 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
         rms=100.0 * np.sqrt(_ratio(sums.squares[order].sum(axis=1), beam_count)),
         rms_of_mean=100.0 * np.sqrt(_ratio(squares_of_means, beam_count)),
         cycles=sums.cycles,
-        altitudes=size,
     )
 
 

@@ -45,7 +45,6 @@ class SceneRow:
     """A row of the table of scenes."""
 
     scene: str
-    station: str
     instrument: str
     start: str
     granules: int
@@ -187,7 +186,6 @@ def _scene_row(
     flagged = run_tables.flagged_words(scene)
     return SceneRow(
         scene=scene.scene,
-        station=scene.station,
         instrument=scene.instrument,
         start=run_tables.moment(scene.start).removesuffix(":00 UTC").removesuffix(" UTC"),
         granules=scene.granules,

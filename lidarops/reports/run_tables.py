@@ -132,9 +132,7 @@ def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
         return []
     took = sum(scene.cpu_seconds for scene in measured)
     estimated = sum(scene.estimated_seconds for scene in measured)
-    estimate = (
-        f"; estimated: {duration(estimated)} ({record.costs}), with the start-up of one worker only"
-    )
+    estimate = f"; estimate {duration(estimated)}, with the start-up of one worker ({record.costs})"
     return [("CPU time of scenes", f"{duration(took)}{estimate if estimated else ''}")]
 
 

@@ -87,7 +87,7 @@ def test_twenty_thousand_products_take_less_than_a_megabyte(archive: tuple[Path,
 def test_a_query_returns_exactly_the_products_that_overlap(archive: tuple[Path, list[Facts]]):
     index, products = archive
     since, until = "2018-02-03T12:00", datetime(2018, 5, 1, tzinfo=UTC)
-    found = find_products(index, kind="elastic", channel="photon_532o", since=since, until=until)
+    table = find_products(index, kind="elastic", channel="photon_532o", since=since, until=until)
     selection = ProductSelection(
         ProductKind.ELASTIC,
         "photon_532o",
@@ -102,16 +102,16 @@ def test_a_query_returns_exactly_the_products_that_overlap(archive: tuple[Path, 
         )
     ]
     assert 60 < len(expected) < 80
-    assert found.path.tolist() == [facts.path for facts in expected]
-    assert found.attrs["root"] == str(index.parents[1])
+    assert table.path.tolist() == [facts.path for facts in expected]
+    assert table.attrs["root"] == str(index.parents[1])
 
 
 def test_the_index_keeps_every_fact(archive: tuple[Path, list[Facts]]):
     index, products = archive
-    found = find_products(index)
+    table = find_products(index)
     by_path = {facts.path: facts for facts in products}
-    assert len(found) == len(products)
-    for row in found.sample(50, random_state=1).itertuples():
+    assert len(table) == len(products)
+    for row in table.sample(50, random_state=1).itertuples():
         facts = by_path[row.path]
         assert UUID(row.id) == UUID(facts.id)
         assert row.sha256_prefix == facts.sha256[:32]
@@ -123,10 +123,10 @@ def test_the_index_keeps_every_fact(archive: tuple[Path, list[Facts]]):
 
 
 def test_a_query_without_matches_is_empty(archive: tuple[Path, list[Facts]]):
-    found = find_products(archive[0], station="nowhere")
-    assert isinstance(found, pd.DataFrame)
-    assert found.empty
-    assert "path" in found
+    table = find_products(archive[0], station="nowhere")
+    assert isinstance(table, pd.DataFrame)
+    assert table.empty
+    assert "path" in table
 
 
 def test_wrong_arguments_list_the_choices(archive: tuple[Path, list[Facts]]):
@@ -147,15 +147,15 @@ def test_the_index_of_real_files_can_be_queried(tmp_path: Path):
         add_day(tmp_path, day)
     index = tmp_path / write_index(tmp_path, facts_of(tmp_path))
     assert index.name == INDEX
-    found = find_in_index(index, ProductSelection(since=datetime(2026, 3, 2, tzinfo=UTC)))
-    assert found.root == tmp_path.resolve()
-    assert [path[-11:-3] for path in found.paths] == ["2T000000", "3T000000"]
+    indexed = find_in_index(index, ProductSelection(since=datetime(2026, 3, 2, tzinfo=UTC)))
+    assert indexed.root == tmp_path.resolve()
+    assert [path[-11:-3] for path in indexed.paths] == ["2T000000", "3T000000"]
 
 
 def test_an_unknown_wavelength_is_missing(tmp_path: Path):
     facts = replace(fabricated(1)[0], wavelength=float("nan"))
-    found = find_products(tmp_path / write_index(tmp_path, [facts]))
-    assert np.isnan(found.wavelength[0])
+    table = find_products(tmp_path / write_index(tmp_path, [facts]))
+    assert np.isnan(table.wavelength[0])
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 and something else PAR1"])

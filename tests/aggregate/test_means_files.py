@@ -135,8 +135,8 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
     some = count.to_numpy() > 0
     assert some.any()
     assert not some.all()
-    found = means.backscatter_standard_error.to_numpy()
-    np.testing.assert_allclose(found[some], expected.to_numpy()[some], rtol=3e-3)
+    errors = means.backscatter_standard_error.to_numpy()
+    np.testing.assert_allclose(errors[some], expected.to_numpy()[some], rtol=3e-3)
     for name, factor in (
         ("extinction", data.lidar_ratio.item()),
         ("scattering_ratio", 1.0 / data.molecular_backscatter.isel(product=0)),
@@ -144,8 +144,8 @@ def test_shared_errors_do_not_decrease_with_the_number_of_profiles(tmp_path: Pat
         total = data[f"{name}_standard_error"] ** 2
         rest = np.sqrt(np.maximum(total - random(factor), 0.0)).where(used).sum("time") / count
         expected = np.sqrt(random(factor).sum("time") / count**2 + rest**2)
-        found = means[f"{name}_standard_error"].to_numpy()
-        np.testing.assert_allclose(found[some], expected.to_numpy()[some], rtol=3e-3)
+        errors = means[f"{name}_standard_error"].to_numpy()
+        np.testing.assert_allclose(errors[some], expected.to_numpy()[some], rtol=3e-3)
     assert np.isnan(means.backscatter.to_numpy()[~some]).all()
     assert (means.quality_flag.to_numpy()[~some] & int(Quality.rejecting()) != 0).all()
     assert (means.usable.to_numpy()[~some] == 2).all()
@@ -172,11 +172,11 @@ def test_fully_shared_errors_are_averaged(kind: ProductKind, names: list[str], t
     data = open_products(tmp_path).astype(np.float64).load()
     for name in names:
         assert float(means[f"{name}_observations"].max()) >= 4
-        found = means[f"{name}_standard_error"].to_numpy()
+        errors = means[f"{name}_standard_error"].to_numpy()
         expected = data[f"{name}_standard_error"].max("time").to_numpy()
-        some = np.isfinite(found)
+        some = np.isfinite(errors)
         assert some.any()
-        np.testing.assert_allclose(found[some], expected[some], rtol=1e-6)
+        np.testing.assert_allclose(errors[some], expected[some], rtol=1e-6)
         assert "they are averaged" in means[name].attrs["comment"]
         assert data[f"{name}_standard_error"].attrs["error_kind"] == ErrorKind.BOTH
 
@@ -187,10 +187,10 @@ def test_means_of_visibility_state_the_systematic_error_of_extinction(tmp_path: 
     data = open_products(tmp_path, usable=1).astype(np.float64).load()
     # The synthetic retrieval has a systematic error of 3 percent and a random error of 2 percent.
     expected = 0.03 * data.visibility_in_air.mean("time")
-    found = means.visibility_in_air_systematic_error
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
-    assert found.attrs["error_kind"] == "systematic"
-    assert found.name in means.visibility_in_air.attrs["ancillary_variables"].split()
+    error = means.visibility_in_air_systematic_error
+    np.testing.assert_allclose(error, expected, rtol=1e-4)
+    assert error.attrs["error_kind"] == "systematic"
+    assert error.name in means.visibility_in_air.attrs["ancillary_variables"].split()
 
 
 @pytest.mark.parametrize("law", [WavelengthLaw.NONE, WavelengthLaw.KRUSE])

@@ -81,15 +81,15 @@ def test_an_index_gives_the_same_data_as_the_folder(archive: Path):
     pytest.importorskip("pyarrow")
     index = archive / write_index(archive, facts_of(archive))
     selection = {"kind": "elastic", "since": "2026-03-02", "until": "2026-03-03T00:00"}
-    found = open_products(index, **selection).load()
-    assert found.sizes["time"] == 5
-    xr.testing.assert_identical(found, open_products(archive, **selection).load())
+    data = open_products(index, **selection).load()
+    assert data.sizes["time"] == 5
+    xr.testing.assert_identical(data, open_products(archive, **selection).load())
 
 
 def test_files_open_in_any_order(archive: Path):
     paths = [archive / facts.path for facts in facts_of(archive) if facts.kind == "elastic"]
-    found = open_products(reversed(paths)).load()
-    xr.testing.assert_identical(found, open_products(archive, kind="elastic").load())
+    data = open_products(reversed(paths)).load()
+    xr.testing.assert_identical(data, open_products(archive, kind="elastic").load())
 
 
 def test_products_of_several_groups_are_not_mixed(archive: Path):

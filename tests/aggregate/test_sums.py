@@ -31,28 +31,28 @@ def mean(*samples: Sample, inverse_variance: bool = False):
 
 
 def test_a_plain_mean_of_independent_errors():
-    found = mean(sample([1.0, 2.0, 6.0], [0.3, 0.4, 1.2]))
-    assert found.mean == pytest.approx(3.0)
-    assert found.standard_error == pytest.approx(1.3 / 3.0)
-    assert found.standard_deviation == pytest.approx(np.sqrt(7.0))
-    assert found.observations == 3
+    result = mean(sample([1.0, 2.0, 6.0], [0.3, 0.4, 1.2]))
+    assert result.mean == pytest.approx(3.0)
+    assert result.standard_error == pytest.approx(1.3 / 3.0)
+    assert result.standard_deviation == pytest.approx(np.sqrt(7.0))
+    assert result.observations == 3
 
 
 def test_a_weighted_mean_has_the_least_error():
     values, errors = np.array([1.0, 2.0]), np.array([0.1, 0.2])
-    found = mean(sample(values, errors), inverse_variance=True)
-    assert found.mean == pytest.approx((1.0 / 0.01 + 2.0 / 0.04) / 125.0)
-    assert found.standard_error == pytest.approx(1.0 / np.sqrt(125.0))
+    result = mean(sample(values, errors), inverse_variance=True)
+    assert result.mean == pytest.approx((1.0 / 0.01 + 2.0 / 0.04) / 125.0)
+    assert result.standard_error == pytest.approx(1.0 / np.sqrt(125.0))
 
 
 def test_shared_errors_do_not_decrease():
-    found = mean(sample([1.0] * 100, [0.5] * 100, random=[0.3] * 100, shared=([0.4] * 100,)))
-    assert found.standard_error == pytest.approx(np.hypot(0.03, 0.4))
+    result = mean(sample([1.0] * 100, [0.5] * 100, random=[0.3] * 100, shared=([0.4] * 100,)))
+    assert result.standard_error == pytest.approx(np.hypot(0.03, 0.4))
 
 
 def test_shared_errors_keep_their_signs():
-    found = mean(sample([1.0, 1.0], [0.4, 0.4], random=[0.0, 0.0], shared=([0.4, -0.4],)))
-    assert found.standard_error == 0.0
+    result = mean(sample([1.0, 1.0], [0.4, 0.4], random=[0.0, 0.0], shared=([0.4, -0.4],)))
+    assert result.standard_error == 0.0
 
 
 def test_systematic_errors_are_averaged_with_the_weights():
@@ -66,11 +66,11 @@ def test_unusable_and_missing_values_do_not_count(inverse_variance: bool):
     values = [[1.0, np.nan], [3.0, 5.0], [1e30, 7.0], [2.0, 8.0]]
     errors = [[0.1, 0.1], [0.1, np.nan], [0.1, 0.1], [np.nan, 0.1]]
     usable = [[True, True], [True, True], [False, False], [True, False]]
-    found = mean(sample(values, errors, usable=usable), inverse_variance=inverse_variance)
-    np.testing.assert_allclose(found.mean, [2.0, np.nan])
-    np.testing.assert_array_equal(found.observations, [2, 0])
-    assert np.isnan(found.standard_error[1])
-    assert np.isnan(found.standard_deviation[1])
+    result = mean(sample(values, errors, usable=usable), inverse_variance=inverse_variance)
+    np.testing.assert_allclose(result.mean, [2.0, np.nan])
+    np.testing.assert_array_equal(result.observations, [2, 0])
+    assert np.isnan(result.standard_error[1])
+    assert np.isnan(result.standard_deviation[1])
 
 
 def test_a_zero_error_cannot_be_a_weight():
@@ -88,18 +88,18 @@ def test_adding_in_parts_gives_the_same_mean(values, cut, inverse_variance):
     errors = np.linspace(1.0, 2.0, len(values))
     whole = sample(values, errors)
     parts = [whole.take(np.arange(len(values))[part]) for part in (slice(cut), slice(cut, None))]
-    found, expected = (
+    result, expected = (
         mean(*samples, inverse_variance=inverse_variance) for samples in (parts, [whole])
     )
     scale = 1e-12 * max(1.0, np.max(np.abs(values)))
-    np.testing.assert_allclose(found.mean, expected.mean, atol=scale, rtol=1e-12)
-    np.testing.assert_allclose(found.standard_error, expected.standard_error, rtol=1e-12)
+    np.testing.assert_allclose(result.mean, expected.mean, atol=scale, rtol=1e-12)
+    np.testing.assert_allclose(result.standard_error, expected.standard_error, rtol=1e-12)
     np.testing.assert_allclose(
-        found.standard_deviation, expected.standard_deviation, atol=1e3 * scale, rtol=1e-9
+        result.standard_deviation, expected.standard_deviation, atol=1e3 * scale, rtol=1e-9
     )
     if len(values) > 1:
         np.testing.assert_allclose(
-            found.standard_deviation, np.std(values, ddof=1), atol=1e3 * scale, rtol=1e-9
+            result.standard_deviation, np.std(values, ddof=1), atol=1e3 * scale, rtol=1e-9
         )
 
 
@@ -113,7 +113,7 @@ def test_the_standard_error_covers_the_truth(inverse_variance: bool):
     values = truth + rng.standard_normal((profiles, trials)) * noise[:, None]
     values += slope[:, None] * cause
     total = np.broadcast_to(np.hypot(noise, slope)[:, None], values.shape)
-    found = mean(
+    result = mean(
         sample(
             values,
             total,
@@ -122,7 +122,7 @@ def test_the_standard_error_covers_the_truth(inverse_variance: bool):
         ),
         inverse_variance=inverse_variance,
     )
-    normalised = (found.mean - truth) / found.standard_error
+    normalised = (result.mean - truth) / result.standard_error
     # Chi-square limits of the sample variance, exceeded with a probability of 1e-3.
     low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], trials) / trials
     assert low < np.mean(normalised**2) < high

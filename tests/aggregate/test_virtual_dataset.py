@@ -60,8 +60,8 @@ def test_two_hundred_products_have_the_mean_of_the_eager_ones(tmp_path: Path):
     assert view.products == 200
     virtual = open_view(tmp_path / view.path, usable=2)
     values = eager(tmp_path, "extinction").astype(np.float64)
-    found = float(virtual.extinction.astype(np.float64).mean())
-    assert found == pytest.approx(np.nanmean(values), rel=1e-6)
+    mean = float(virtual.extinction.astype(np.float64).mean())
+    assert mean == pytest.approx(np.nanmean(values), rel=1e-6)
     # The dataset is lazy.
     assert virtual.extinction.chunks is not None
     assert len(virtual.extinction.chunks[0]) == 200

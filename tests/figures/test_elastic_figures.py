@@ -203,7 +203,7 @@ class TestErrorBudget:
     def test_the_description_names_quantity_and_reference(self, product):
         figure = product_figures.error_budget_figure(clearest_profile(product), title="lidar")
         words = product_figures.alt_text(figure)
-        assert words.startswith("lidar: backscatter of particles")
+        assert words.startswith("lidar: particle backscatter")
         assert "0.2" in words
         assert "0.25" in words
         rendered = product_figures.render(figure)
@@ -239,28 +239,28 @@ class TestGallery:
         record = _run(archive, ("e/elastic.nc", made))
         folder = tmp_path / "report"
         folder.mkdir()
-        found = gallery.fill(record, folder)
-        assert not found.problems
-        names = [picture.file.removesuffix(".png") for picture in found.pictures]
+        drawn = gallery.fill(record, folder)
+        assert not drawn.problems
+        names = [picture.file.removesuffix(".png") for picture in drawn.pictures]
         assert names == [f"elastic_horizontal_{CHANNEL}", f"profile_horizontal_{CHANNEL}"]
-        for picture in found.pictures:
+        for picture in drawn.pictures:
             assert (folder / picture.file).stat().st_size > 10_000
             assert CHANNEL in picture.caption
             assert picture.alt
-        assert found.flags is not None
+        assert drawn.flags is not None
 
     def test_a_damaged_product_is_listed_and_the_others_are_drawn(self, archive, made, tmp_path):
         record = _run(archive, ("e/bad.nc", made), ("e/good.nc", made.isel(time=slice(0, 6))))
         bad = archive.root / "e/bad.nc"
         bad.write_bytes(bad.read_bytes()[:2000])
-        found = gallery.fill(record, tmp_path)
-        assert [problem.path for problem in found.problems] == ["e/bad.nc"]
-        assert len(found.pictures) == 2
+        drawn = gallery.fill(record, tmp_path)
+        assert [problem.path for problem in drawn.problems] == ["e/bad.nc"]
+        assert len(drawn.pictures) == 2
 
     def test_a_run_without_references_has_no_profile(self, archive, made, tmp_path):
         made["quality_flag"][:] |= np.int32(Quality.NO_REFERENCE)
         made["reference_bottom"][:] = np.nan
         made["reference_top"][:] = np.nan
-        found = gallery.fill(_run(archive, ("e/none.nc", made)), tmp_path)
-        assert [picture.file.split("_")[0] for picture in found.pictures] == ["elastic"]
-        assert not found.problems
+        drawn = gallery.fill(_run(archive, ("e/none.nc", made)), tmp_path)
+        assert [picture.file.split("_")[0] for picture in drawn.pictures] == ["elastic"]
+        assert not drawn.problems

@@ -46,30 +46,30 @@ def truth(made: xr.Dataset, extinction: float = EXTINCTION) -> xr.Dataset:
 def test_series_hold_values_errors_and_truth(made):
     series = read_crossings(made, truth(made), instruments=NAMES)
     assert [crossing.label for crossing in series] == ["crossing 0", "crossing 1", "crossing 2"]
-    for v, one in enumerate(series):
+    for v, crossing in enumerate(series):
         np.testing.assert_array_equal(
-            one.estimates["extinction"].value, made["extinction"].values[:, v]
+            crossing.estimates["extinction"].value, made["extinction"].values[:, v]
         )
         whole = np.hypot(
             made["extinction_standard_error"], made["extinction_systematic_error"]
         ).values[:, v]
-        np.testing.assert_allclose(one.estimates["extinction"].standard_error, whole)
-        np.testing.assert_allclose(one.estimates["extinction"].truth, EXTINCTION)
+        np.testing.assert_allclose(crossing.estimates["extinction"].standard_error, whole)
+        np.testing.assert_allclose(crossing.estimates["extinction"].truth, EXTINCTION)
         np.testing.assert_allclose(
-            one.estimates["visibility"].truth, -np.log(0.05) / EXTINCTION / 1e3, rtol=1e-6
+            crossing.estimates["visibility"].truth, -np.log(0.05) / EXTINCTION / 1e3, rtol=1e-6
         )
-        assert one.near < 1600.0
-        found = compare(one, "extinction")
-        assert found is not None
-        assert found.within_3 == 1.0
-        assert found.count == 12
+        assert crossing.near < 1600.0
+        comparison = compare(crossing, "extinction")
+        assert comparison is not None
+        assert comparison.within_3 == 1.0
+        assert comparison.count == 12
 
 
 def test_a_wrong_truth_gives_a_bias(made):
-    (one, *_) = read_crossings(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
-    found = compare(one, "extinction")
-    assert found is not None
-    assert found.bias < -3.0
+    (crossing, *_) = read_crossings(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
+    comparison = compare(crossing, "extinction")
+    assert comparison is not None
+    assert comparison.bias < -3.0
 
 
 def test_truth_is_the_mean_over_the_beams_at_the_crossing(made):
@@ -82,20 +82,20 @@ def test_truth_is_the_mean_over_the_beams_at_the_crossing(made):
         known[f"range_{suffix}"] = (f"r{number}", middle)
         field = np.broadcast_to(1e-4 + 1e-7 * middle, (60, 1, middle.size))
         known[f"profile_extinction_{suffix}"] = ((f"p{number}", f"w{number}", f"r{number}"), field)
-    for v, one in enumerate(read_crossings(made, known, instruments=NAMES)):
+    for v, crossing in enumerate(read_crossings(made, known, instruments=NAMES)):
         expected = 1e-4 + 1e-7 * np.nanmean(made["beam_range"].values[:, v])
-        np.testing.assert_allclose(one.estimates["extinction"].truth, expected, rtol=1e-6)
+        np.testing.assert_allclose(crossing.estimates["extinction"].truth, expected, rtol=1e-6)
 
 
 def test_scenes_are_joined_in_time(made):
     halves = [made.isel(time=slice(6, 12)), made.isel(time=slice(6))]
-    joined = join_crossings([one for half in halves for one in read_crossings(half)])
+    joined = join_crossings([crossing for half in halves for crossing in read_crossings(half)])
     whole = read_crossings(made)
-    assert [one.crossing for one in joined] == [0, 1, 2]
-    for one, other in zip(joined, whole, strict=True):
-        np.testing.assert_array_equal(one.time, other.time)
+    assert [crossing.crossing for crossing in joined] == [0, 1, 2]
+    for crossing, expected in zip(joined, whole, strict=True):
+        np.testing.assert_array_equal(crossing.time, expected.time)
         np.testing.assert_array_equal(
-            one.estimates["visibility"].value, other.estimates["visibility"].value
+            crossing.estimates["visibility"].value, expected.estimates["visibility"].value
         )
 
 
@@ -151,9 +151,9 @@ def test_series_are_drawn_with_errors_and_truth(made):
         assert gids.count(f"values-{quantity}") == 3
         assert gids.count(f"truth-{quantity}") == 3
         lines = [line for line in panel.lines if line.get_gid() == f"values-{quantity}"]
-        for line, one in zip(lines, series, strict=True):
+        for line, crossing in zip(lines, series, strict=True):
             np.testing.assert_allclose(
-                line.get_ydata(), scale * one.estimates[quantity].value, rtol=1e-6
+                line.get_ydata(), scale * crossing.estimates[quantity].value, rtol=1e-6
             )
         assert "km" in panel.get_ylabel()
     assert "0 of 12 rejected" in product_figures.alt_text(figure)

@@ -44,28 +44,28 @@ def test_blocks_are_means_of_usable_bins(count, bins, profiles, seed):
     flag = random.choice([0, 0, 0, *(int(bit) for bit in Quality)], size=(count, bins))
     product["quality_flag"][:] = flag.astype(np.int32)
     product["signal"].values[random.random((count, bins)) < 0.1] = np.nan
-    found = read_raster(product, profiles=profiles)
+    image = read_raster(product, profiles=profiles)
     columns = [slice(i, min(i + profiles, count)) for i in range(0, count, profiles)]
     rows = [slice(j, j + 1) for j in range(bins)]
-    np.testing.assert_allclose(found.mean, oracle(product, columns, rows), rtol=1e-5, atol=1e-3)
-    assert found.with_care == np.isin(flag, CARE).sum()
+    np.testing.assert_allclose(image.mean, oracle(product, columns, rows), rtol=1e-5, atol=1e-3)
+    assert image.with_care == np.isin(flag, CARE).sum()
     visible = BAD & ~int(Quality.INPUT_MISSING)
     rejected = [(flag[c] & visible != 0).mean(axis=0) for c in columns]
-    np.testing.assert_array_equal(found.flagged, np.array(rejected) >= 0.5)
+    np.testing.assert_array_equal(image.flagged, np.array(rejected) >= 0.5)
 
 
 @given(bins=st.integers(2, 3000), share=st.floats(0.01, 1.0))
 @settings(max_examples=20, deadline=None)
 def test_rows_merge_without_loss(bins, share):
     product = signal(times(START, 3, 60.0), bins=bins, bin_width=5.0)
-    found = read_raster(product)
-    cut = found.shown_to(share * bins * 5.0)
+    image = read_raster(product)
+    cut = image.shown_to(share * bins * 5.0)
     assert cut.edges.size - 1 <= raster.ROWS
-    assert cut.edges[-1] >= share * bins * 5.0 - 1e-6 or cut.edges[-1] == found.edges[-1]
-    rows = int(np.searchsorted(found.edges, cut.edges[-1]))
-    np.testing.assert_allclose(cut.total.sum(), found.total[:, :rows].sum(), rtol=1e-4)
-    assert cut.used.sum() == found.used[:, :rows].sum()
-    assert cut.bins.sum() == found.bins[:rows].sum()
+    assert cut.edges[-1] >= share * bins * 5.0 - 1e-6 or cut.edges[-1] == image.edges[-1]
+    rows = int(np.searchsorted(image.edges, cut.edges[-1]))
+    np.testing.assert_allclose(cut.total.sum(), image.total[:, :rows].sum(), rtol=1e-4)
+    assert cut.used.sum() == image.used[:, :rows].sum()
+    assert cut.bins.sum() == image.bins[:rows].sum()
 
 
 def test_many_bins_are_read_in_blocks(monkeypatch):
@@ -83,22 +83,22 @@ def test_many_bins_are_read_in_blocks(monkeypatch):
 
 def test_columns_touch_except_at_gaps():
     time = np.concatenate([times(START, 10, 60.0), times(START + timedelta(hours=2), 4, 60.0)])
-    found = read_raster(signal(time), profiles=3)
-    gaps = (found.start[1:] - found.stop[:-1]) / np.timedelta64(1, "m")
+    image = read_raster(signal(time), profiles=3)
+    gaps = (image.start[1:] - image.stop[:-1]) / np.timedelta64(1, "m")
     # 10 profiles in 4 columns, then 4 in 2: one gap, from 10 min to 2 h.
     np.testing.assert_allclose(gaps, [0, 0, 0, 110, 0], atol=1e-9)
-    assert found.profiles.tolist() == [3, 3, 3, 1, 3, 1]
-    assert found.start[0] == np.datetime64("2024-03-01T00:00:00")
+    assert image.profiles.tolist() == [3, 3, 3, 1, 3, 1]
+    assert image.start[0] == np.datetime64("2024-03-01T00:00:00")
 
 
 def test_background_is_the_mean_with_its_error():
     product = signal(times(START, 6, 60.0))
     product["background"].values[4:] = np.nan
-    found = read_raster(product, profiles=2)
+    image = read_raster(product, profiles=2)
     expected = product["background"].values[:4].reshape(2, 2).mean(axis=1)
-    np.testing.assert_allclose(found.background[:2], expected, rtol=1e-6)
-    np.testing.assert_allclose(found.background_error[:2], 4e-3 / np.sqrt(2), rtol=1e-6)
-    assert np.isnan(found.background[2])
+    np.testing.assert_allclose(image.background[:2], expected, rtol=1e-6)
+    np.testing.assert_allclose(image.background_error[:2], 4e-3 / np.sqrt(2), rtol=1e-6)
+    assert np.isnan(image.background[2])
 
 
 def test_reach_ends_where_noise_dominates():
@@ -114,8 +114,8 @@ def test_reach_ends_where_noise_dominates():
 
 
 def test_altitude_is_a_line_in_range():
-    found = read_raster(signal(times(START, 3, 60.0)))
-    np.testing.assert_allclose(found.altitude, (120.0, 0.94))
+    image = read_raster(signal(times(START, 3, 60.0)))
+    np.testing.assert_allclose(image.altitude, (120.0, 0.94))
     assert read_raster(signal(times(START, 3, 60.0)).drop_vars("altitude")).altitude is None
 
 
@@ -156,10 +156,12 @@ def test_consecutive_rasters_with_the_same_rows_are_joined():
     following = rasters_of(0, 1, 5)
     (whole,) = joined(following)
     assert whole.start.size == 180
-    np.testing.assert_array_equal(whole.mean, np.concatenate([one.mean for one in following]))
-    np.testing.assert_array_equal(whole.flagged, np.concatenate([one.flagged for one in following]))
+    np.testing.assert_array_equal(whole.mean, np.concatenate([image.mean for image in following]))
+    np.testing.assert_array_equal(
+        whole.flagged, np.concatenate([image.flagged for image in following])
+    )
     np.testing.assert_array_equal(whole.edges, following[0].edges)
-    assert whole.with_care == sum(one.with_care for one in following)
+    assert whole.with_care == sum(image.with_care for image in following)
     assert share_with_care([whole]) == pytest.approx(share_with_care(following))
     assert whole.bits == following[0].bits | following[1].bits | following[2].bits
 
@@ -167,13 +169,13 @@ def test_consecutive_rasters_with_the_same_rows_are_joined():
 def test_other_rasters_are_not_joined():
     overlapping, backwards = rasters_of(0, 0.5), rasters_of(1, 0)
     other_rows = [*rasters_of(0), *rasters_of(1, bins=31)]
-    for apart in (overlapping, backwards, other_rows):
-        assert joined(apart) == apart
+    for separate in (overlapping, backwards, other_rows):
+        assert joined(separate) == separate
     assert joined([]) == []
 
 
 def test_joining_does_not_change_the_figure(monkeypatch):
     parts = rasters_of(0, 1, 2, 6, 6.5)
-    one = product_figures.render(product_figures.draw_quicklook(parts, title="joined"))
+    expected = product_figures.render(product_figures.draw_quicklook(parts, title="joined"))
     monkeypatch.setattr(panels, "joined", list)
-    assert product_figures.render(product_figures.draw_quicklook(parts, title="joined")) == one
+    assert product_figures.render(product_figures.draw_quicklook(parts, title="joined")) == expected

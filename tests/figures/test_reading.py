@@ -150,14 +150,14 @@ class TestReaders:
             refused = list(readers.read_all(readings([*paths, Path("no.nc")], refusing)))
         assert shapes == [(count, 4) for count in range(2, 10)]
         assert known == [100.0 + count for count in range(2, 10)]
-        told = [ReadFailure("signal: is of no use")] * len(paths)
-        assert refused == [*told, ReadFailure("the file is missing")]
+        failures = [ReadFailure("signal: is of no use")] * len(paths)
+        assert refused == [*failures, ReadFailure("the file is missing")]
 
     def test_processes_are_started_where_they_are_worth_it(self, paths):
         for workers, products, others in ((2, 99, False), (1, 1000, False), (2, 100, True)):
             with Readers(workers, products) as readers:
-                found = set(readers.read_all(readings(paths, process)))
-            assert (os.getpid() not in found) == others
+                processes = set(readers.read_all(readings(paths, process)))
+            assert (os.getpid() not in processes) == others
 
     def test_death_of_a_process_stops_nothing(self, paths, monkeypatch, caplog):
         monkeypatch.setattr(reading, "_AT_A_TIME", 1)
@@ -182,13 +182,13 @@ class TestReaders:
 
     def test_reduce_to_the_same_rasters(self, paths):
         with Readers(2, 1000) as readers:
-            there = list(readers.read_all(readings(paths, read_raster)))
+            parallel = list(readers.read_all(readings(paths, read_raster)))
         with Readers() as readers:
-            here = list(readers.read_all(readings(paths, read_raster)))
-        for one, other in zip(here, there, strict=True):
-            np.testing.assert_array_equal(one.total, other.total)
-            assert replace(one, bits=other.bits).bits == one.bits
-            assert (one.units, one.altitude, one.with_care) == (
+            serial = list(readers.read_all(readings(paths, read_raster)))
+        for expected, other in zip(serial, parallel, strict=True):
+            np.testing.assert_array_equal(expected.total, other.total)
+            assert replace(expected, bits=other.bits).bits == expected.bits
+            assert (expected.units, expected.altitude, expected.with_care) == (
                 other.units,
                 other.altitude,
                 other.with_care,

@@ -245,11 +245,11 @@ def test_thin_is_the_block_mean_of_unflagged_values(count, points, seed):
     blocks = [block[good[block]] for block in blocks if good[block].any()]
     assert thinned.time.size == len(blocks)
     for name in ("extinction", "background"):
-        estimate, found = section.estimates[name], thinned.estimates[name]
+        estimate, mean = section.estimates[name], thinned.estimates[name]
         error = [np.sqrt((estimate.standard_error[b] ** 2).sum()) / b.size for b in blocks]
-        np.testing.assert_allclose(found.value, [estimate.value[b].mean() for b in blocks])
-        np.testing.assert_allclose(found.standard_error, error, rtol=1e-6)
-        np.testing.assert_allclose(found.truth, [estimate.truth[b].mean() for b in blocks])
+        np.testing.assert_allclose(mean.value, [estimate.value[b].mean() for b in blocks])
+        np.testing.assert_allclose(mean.standard_error, error, rtol=1e-6)
+        np.testing.assert_allclose(mean.truth, [estimate.truth[b].mean() for b in blocks])
 
 
 def test_thin_does_not_average_across_a_gap():

@@ -53,14 +53,14 @@ class Page(HTMLParser):
         self.text = " ".join(" ".join(self.words).split())
 
     def handle_starttag(self, tag, attrs):
-        given = dict(attrs)
+        attributes = dict(attrs)
         self.tags.append(tag)
         if tag not in VOID:
             self.open.append(tag)
-        self.ids += [given["id"]] if "id" in given else []
-        self.links += [given["href"]] if "href" in given else []
-        self.sources += [given["src"]] if "src" in given else []
-        self.alts += [given["alt"]] if tag == "img" else []
+        self.ids += [attributes["id"]] if "id" in attributes else []
+        self.links += [attributes["href"]] if "href" in attributes else []
+        self.sources += [attributes["src"]] if "src" in attributes else []
+        self.alts += [attributes["alt"]] if tag == "img" else []
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -301,7 +301,7 @@ class TestDecisions:
         run = replace(run_record(archive.root, [scene]), costs="calibrated yesterday")
         page = built(run, tmp_path / "report")
         assert f"look sections may be dark look 16 {CHANNEL}" in page.text
-        assert "estimated: 2.0 s (calibrated yesterday)" in page.text
+        assert "estimate 2.0 s, with the start-up of one worker (calibrated yesterday)" in page.text
 
     def test_failed_scenes_do_not_count_in_the_estimate(self, tmp_path):
         done = outcome("one", START, cpu_seconds=3.0, estimated_seconds=2.0)

@@ -157,14 +157,14 @@ def test_types_survive(tmp_path):
         tmp_path, [fab.outcome("s", refused=(granule,))], refused=(granule, granule)
     )
     back = load_run_record(save_run_record(record, tmp_path))
-    found = back.scenes[0].refused[0]
-    assert math.isnan(found.layout[0].wavelength)
-    assert found.layout[0].bin_width == -math.inf
-    assert isinstance(found.layout[0].mode, DetectionMode)
-    assert isinstance(found.status, Status)
-    assert isinstance(found.notes, tuple)
-    assert found.start == granule.start
-    assert found.start.utcoffset() == timedelta(0)
+    loaded = back.scenes[0].refused[0]
+    assert math.isnan(loaded.layout[0].wavelength)
+    assert loaded.layout[0].bin_width == -math.inf
+    assert isinstance(loaded.layout[0].mode, DetectionMode)
+    assert isinstance(loaded.status, Status)
+    assert isinstance(loaded.notes, tuple)
+    assert loaded.start == granule.start
+    assert loaded.start.utcoffset() == timedelta(0)
     assert back.scenes[0].plan.hash == record.scenes[0].plan.hash
     assert repr(back) == repr(record)
 

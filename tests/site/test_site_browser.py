@@ -60,12 +60,12 @@ def scheme(request: pytest.FixtureRequest) -> str:
 def watched(chromium: Any, scheme: str) -> Iterator[Watched]:
     size = {"width": 1280, "height": 900}
     context = chromium.new_context(viewport=size, color_scheme=scheme, accept_downloads=True)
-    found = Watched(context.new_page())
-    found.page.on("request", lambda request: found.requests.append(request.url))
-    found.page.on("requestfailed", found.failed)
-    found.page.on("console", lambda message: found.complaints.append(message.text))
-    found.page.on("pageerror", lambda error: found.complaints.append(str(error)))
-    yield found
+    watched_page = Watched(context.new_page())
+    watched_page.page.on("request", lambda request: watched_page.requests.append(request.url))
+    watched_page.page.on("requestfailed", watched_page.failed)
+    watched_page.page.on("console", lambda message: watched_page.complaints.append(message.text))
+    watched_page.page.on("pageerror", lambda error: watched_page.complaints.append(str(error)))
+    yield watched_page
     context.close()
 
 
@@ -189,17 +189,17 @@ def test_axe_finds_nothing_serious(site: Path, chromium: Any, scheme: str) -> No
     # The policy of the pages would block axe, as any script.
     context = chromium.new_context(color_scheme=scheme, bypass_csp=True)
     page = context.new_page()
-    found = []
+    violations = []
     for name, file in _pages(site).items():
         page.goto(file.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
         page.add_script_tag(path=AXE)
         result = page.evaluate("axe.run()")
         assert len(result["passes"]) > 10
-        found += [
+        violations += [
             (name, item["id"], item["impact"], item["nodes"][0]["html"][:300])
             for item in result["violations"]
         ]
     context.close()
-    assert not [item for item in found if item[2] in {"serious", "critical"}], found
-    assert not found, found
+    assert not [item for item in violations if item[2] in {"serious", "critical"}], violations
+    assert not violations, violations

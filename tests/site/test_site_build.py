@@ -87,9 +87,9 @@ def test_every_link_leads_to_a_file_of_the_output(archive: Path, site: Path) -> 
             assert not parts.scheme, target
             assert not parts.netloc, target
             if parts.path:
-                found = (page.parent / unquote(parts.path)).resolve()
-                assert found.is_file(), (page, target)
-                assert found.is_relative_to(archive.resolve())
+                file = (page.parent / unquote(parts.path)).resolve()
+                assert file.is_file(), (page, target)
+                assert file.is_relative_to(archive.resolve())
             elif parts.fragment != "main":
                 assert parts.fragment in identifiers, (page, target)
 
@@ -232,11 +232,13 @@ def test_damaged_products_are_listed_and_the_others_shown(tmp_path: Path) -> Non
     foreign = add_unknown(output, "multiangle")
     result = CliRunner().invoke(app, ["site", str(output), "--json"])
     assert result.exit_code == 1
-    told = json.loads(result.stdout)
-    assert told["products"] == 2
+    output_json = json.loads(result.stdout)
+    assert output_json["products"] == 2
     products = output / "products"
     expected = sorted(path.relative_to(products).as_posix() for path in (cut, foreign))
-    assert [problem["path"] for problem in told["problems"]] == sorted([*expected, "empty.nc"])
+    assert [problem["path"] for problem in output_json["problems"]] == sorted(
+        [*expected, "empty.nc"]
+    )
     index = (output / "site/index.html").read_text(encoding="utf-8")
     assert all(path in index for path in [*expected, "empty.nc"])
     assert str(tmp_path) not in index
@@ -339,17 +341,17 @@ def test_an_archive_without_products_has_a_site(tmp_path: Path) -> None:
 
 @given(st.text(min_size=1))
 def test_slugs_are_safe_parts_of_paths(name: str) -> None:
-    found = paths.slug(name)
-    assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", found)
-    assert found not in {".", ".."}
-    assert paths.slug(found) == found
+    slug = paths.slug(name)
+    assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", slug)
+    assert slug not in {".", ".."}
+    assert paths.slug(slug) == slug
 
 
 @given(st.text(min_size=1).filter(lambda s: "\0" not in s), st.sampled_from(["", "a/", "a/b/"]))
 def test_hrefs_lead_back_to_their_target(name: str, folder: str) -> None:
     target = f"product/{paths.slug(name)}.html"
-    found = unquote(paths.href(target, f"{folder}page.html"))
-    assert os.path.normpath(folder + found) == target
+    link = unquote(paths.href(target, f"{folder}page.html"))
+    assert os.path.normpath(folder + link) == target
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x.nc", "a/../../x.nc", ""])
