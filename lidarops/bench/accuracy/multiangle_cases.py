@@ -1,4 +1,4 @@
-"""Simulated scans of one atmosphere at several angles, and ways to find its optical depth."""
+"""Simulated scans at several angles, and methods to retrieve their optical depth."""
 
 from __future__ import annotations
 
@@ -20,18 +20,20 @@ from lidarops.retrieve.multiangle.optical_depth import (
 Array = npt.NDArray[np.float64]
 
 NOISELESS: Final = 1e7
-"""Signal over noise that leaves the scatter of the air alone."""
+"""Signal over noise at which only the scatter of the air matters."""
 LAYERS: Final = (5e-3, 10e-3, 15e-3, 20e-3, 15e-3, 10e-3, 8e-3, 5e-3)
-"""m-1, of layers of 50 m from the base of a cloud upwards."""
+"""m-1, extinction of layers of 50 m from the base of a cloud upwards."""
 CLOUD_SCATTER: Final = 0.147
 """Standard deviation of ln(1 + U(-0.25, 0.25))."""
 _CLOUD_STEP: Final = 10.0
+"""m, spacing of altitudes in a cloud."""
 _LAYER: Final = 50.0
+"""m, thickness of the layers of a cloud."""
 _OUTLIERS: Final = (0.3, 1.0)
-"""Of the logarithm."""
+"""Smallest and largest deviation of an outlier in the logarithm."""
 _STRENGTHS: Final = np.logspace(-6.0, 4.0, 25)
-_SEEN: Final = 3.0
-_FEWEST: Final = 3
+_LEAST_SNR: Final = 3.0
+_FEWEST_BEAMS: Final = 3
 
 TWO_ANGLE: Final = "two_angle"
 KANO_HAMILTON: Final = "kano_hamilton"
@@ -45,7 +47,7 @@ BOUNDED: Final = "scipy lsq_linear"
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """An atmosphere that is the same along the horizontal but for scatter, and a scan of it."""
+    """An atmosphere that is horizontally homogeneous except for scatter, and a scan of it."""
 
     label: str
     zenith_angle: Array
@@ -59,15 +61,15 @@ class Scene:
     ratio: float
     """Signal over noise at the zenith in 1 km, or at the top of a cloud."""
     inhomogeneity: float
-    """Standard deviation of the logarithm of backscatter along the horizontal."""
+    """Standard deviation of ln backscatter along the horizontal (scatter)."""
     correlation: float = 0.0
-    """Of the same, at neighbouring altitudes."""
+    """Correlation of the scatter at neighbouring altitudes."""
     outliers: float = 0.0
-    """Share of the samples that are brighter by 0.3 to 1 in the logarithm."""
+    """Share of samples that are brighter by 0.3 to 1 in the logarithm."""
     gradient: float = 0.0
     """m-1, of ln backscatter along the scan."""
     variation: float = 0.0
-    """Of ln extinction along the paths over that of ln backscatter."""
+    """Scatter of ln extinction over that of ln backscatter."""
 
     @property
     def path(self) -> Array:
@@ -80,7 +82,7 @@ class Scene:
         return np.cumsum(self._layers(), axis=-1)
 
     def draw(self, profiles: int, *seed: int) -> Scan:
-        """Simulate scans; the same numbers give the same scans.
+        """Simulate scans; the same seeds give the same scans.
 
         Parameters
         ----------
@@ -90,10 +92,10 @@ class Scene:
         rng = np.random.default_rng(seed)
         shape = (profiles, self.path.size, self.altitude.size)
         air = self.inhomogeneity * correlated(rng, shape, self.correlation)
-        return self.seen(air, rng)
+        return self.observe(air, rng)
 
-    def seen(self, air: Array, rng: np.random.Generator) -> Scan:
-        """Simulate what is seen of air with a given scatter.
+    def observe(self, air: Array, rng: np.random.Generator) -> Scan:
+        """Simulate scans of air with a given scatter.
 
         Parameters
         ----------
@@ -122,7 +124,7 @@ class Scene:
         return np.asarray(self.extinction * np.diff(self.altitude, prepend=0.0))
 
     def _noise(self, mean: Array) -> Array:
-        """Return the noise of the signal over the square of its range."""
+        """Return the noise of the signal, divided by the square of range."""
         at = min(int(np.searchsorted(self.altitude, 1000.0)), self.altitude.size - 1)
         brightness = np.exp(mean[:, :1, at : at + 1])
         return np.asarray(brightness / self.ratio / self.altitude[at] ** 2)
@@ -134,24 +136,24 @@ class Scan:
 
     scene: Scene
     signal: Array
-    """(profile, angle, altitude), corrected for range."""
+    """(profile, angle, altitude), range-corrected."""
     variance: Array
-    """As `signal`, of the noise."""
+    """Variance of the noise of `signal`."""
 
     def first(self, profiles: int) -> Scan:
-        """Return the first of the profiles."""
+        """Return the first profiles."""
         return replace(self, signal=self.signal[:profiles], variance=self.variance[:profiles])
 
 
 @dataclass(frozen=True, slots=True)
 class ScanEstimates:
-    """What a way finds, (profile, altitude); NaN where it has no value."""
+    """Result of a method, (profile, altitude); NaN where it has no value."""
 
     optical_depth: Array
     standard_error: Array | None = None
-    """None where the way states none."""
+    """None if the method states none."""
     extinction: Array | None = None
-    """m-1, as the way publishes it; None where it gives optical depth alone."""
+    """m-1, as published by the method; None if it gives optical depth only."""
     extinction_standard_error: Array | None = None
     data_share: Array | None = None
     freedom: Array | None = None
@@ -159,6 +161,7 @@ class ScanEstimates:
 
 
 Way = Callable[[Scan], ScanEstimates]
+"""A method to retrieve optical depth, ours or a peer."""
 
 
 def correlated(rng: np.random.Generator, shape: tuple[int, ...], correlation: float) -> Array:
@@ -173,7 +176,7 @@ def correlated(rng: np.random.Generator, shape: tuple[int, ...], correlation: fl
 # Scenes ---------------------------------------------------------------------------------------
 
 
-def clear_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array]:
+def hazy_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array]:
     """Return extinction (m-1) and backscatter (m-1 sr-1) of air, haze and a layer aloft.
 
     Parameters
@@ -183,7 +186,7 @@ def clear_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array
     aerosol : (profile, 1) float
         1 for a haze of 0.07 km-1 at the ground.
     layer : (profile, 1) float
-        m, height of the middle of the layer.
+        m, height of the centre of the layer.
     """
     air = 0.0116e-3 * np.exp(-height / 8000.0)
     aloft = 0.05e-3 * np.exp(-0.5 * ((height - layer) / 150.0) ** 2)
@@ -192,18 +195,19 @@ def clear_air(height: Array, aerosol: Array, layer: Array) -> tuple[Array, Array
 
 
 def clear(ratio: float, *, outliers: float = 0.0, bins: int = 201) -> Scene:
-    """Return 12 beams to 75 degrees, evenly spaced in slant path, up to 6.15 km.
+    """Return clear air and 12 beams to 75 degrees, evenly spaced in slant path, up to 6.15 km.
 
     Parameters
     ----------
     ratio : float
         Signal over noise at the zenith in 1 km.
     outliers : float
+        Share of outlying samples.
     bins : int
-        Altitudes, 30 m apart.
+        Number of altitudes, 30 m apart.
     """
     height = 150.0 + 30.0 * np.arange(bins, dtype=np.float64)
-    extinction, backscatter = clear_air(height, np.ones(1), np.full(1, 3000.0))
+    extinction, backscatter = hazy_air(height, np.ones(1), np.full(1, 3000.0))
     path = np.linspace(1.0, 1.0 / np.cos(np.radians(75.0)), 12)
     label = f"clear air, SNR {ratio:g}"
     angles = np.degrees(np.arccos(1.0 / path))
@@ -211,7 +215,7 @@ def clear(ratio: float, *, outliers: float = 0.0, bins: int = 201) -> Scene:
 
 
 def cloud(correlation: float = 0.0, *, largest: float = 30.0) -> Scene:
-    """Return 6 beams up to an angle, of a cloud with an optical depth of 4.4 in 40 altitudes."""
+    """Return a cloud with an optical depth of 4.4 in 40 altitudes, and 6 beams up to an angle."""
     extinction = np.repeat(LAYERS, round(_LAYER / _CLOUD_STEP))
     height = _CLOUD_STEP * np.arange(1, extinction.size + 1, dtype=np.float64)
     label = f"cloud, {largest:g}°, correlation {correlation:g}"
@@ -222,12 +226,12 @@ def cloud(correlation: float = 0.0, *, largest: float = 30.0) -> Scene:
 
 
 def scan_scenes() -> tuple[Scene, ...]:
-    """Return the scenes in which all ways are compared."""
+    """Return the scenes in which all methods are compared."""
     return (clear(3000.0), clear(300.0), cloud(), cloud(0.8))
 
 
 def published_cloud(largest: float, beams: int, scatter: float) -> Scene:
-    """Return the cloud as the published experiment sees it: in the middle of its 8 layers.
+    """Return the cloud of the published experiment, with altitudes at the centres of its 8 layers.
 
     Parameters
     ----------
@@ -247,19 +251,19 @@ def published_cloud(largest: float, beams: int, scatter: float) -> Scene:
 
 
 def uniform_scatter(share: float, profiles: int, scene: Scene, *seed: int) -> Scan:
-    """Return scans with an error of backscatter uniform in a range, as published.
+    """Return scans with uniformly distributed errors of backscatter, as published.
 
     Parameters
     ----------
     share : float
-        0.25 for errors from -25 to 25 %.
+        Largest relative error; 0.25 for errors from -25 to 25 %.
     profiles : int
     scene : Scene
     *seed : int
     """
     rng = np.random.default_rng(seed)
     shape = (profiles, scene.path.size, scene.altitude.size)
-    return scene.seen(np.log1p(rng.uniform(-share, share, shape)), rng)
+    return scene.observe(np.log1p(rng.uniform(-share, share, shape)), rng)
 
 
 def uniform_deviation(share: float) -> float:
@@ -272,7 +276,7 @@ def uniform_deviation(share: float) -> float:
 
 
 def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
-    """Return a scene of which nothing is as assumed, with another truth for each profile.
+    """Return a scene that violates the assumptions, with another truth for each profile.
 
     3 to 20 beams to 15-75 degrees, clear air or a cloud, scatter up to 40 % with a correlation of
     0-0.95, SNR 10 to 1e5; half with up to 10 % outliers, three in five with a gradient of up to
@@ -283,8 +287,8 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
     seed : int
     profiles : int
     calm : bool
-        Whether the scatter is drawn by its logarithm, from 0.5 %, not by its amount: little
-        scatter makes stated errors small.
+        Whether the scatter is drawn uniformly in its logarithm, from 0.5 %, instead of uniformly:
+        little scatter makes stated errors small.
     """
     rng = np.random.default_rng((7, seed))
     angles = np.linspace(0.0, rng.uniform(15.0, 75.0), int(rng.integers(3, 21)))
@@ -292,10 +296,10 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
     if rng.random() < 0.5:
         height = 150.0 + 60.0 * np.arange(100, dtype=np.float64)
         layer = rng.uniform(1500.0, 4500.0, (profiles, 1))
-        extinction, backscatter = clear_air(height, amount, layer)
+        extinction, backscatter = hazy_air(height, amount, layer)
     else:
-        one = cloud()
-        height, extinction = one.altitude, 0.5 * amount * one.extinction
+        base = cloud()
+        height, extinction = base.altitude, 0.5 * amount * base.extinction
         backscatter = np.ones(extinction.shape)
     return Scene(
         label=f"random {seed}",
@@ -314,22 +318,22 @@ def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
     )
 
 
-# Our ways -------------------------------------------------------------------------------------
+# Our methods ----------------------------------------------------------------------------------
 
 
 def scan_methods() -> Mapping[str, Way]:
-    """Return what is compared of ours, by name."""
+    """Return the methods of lidarops that are compared, by name."""
     return {
-        TWO_ANGLE: partial(_ours, method=TWO_ANGLE),
-        KANO_HAMILTON: partial(_ours, method=KANO_HAMILTON),
+        TWO_ANGLE: partial(_own_method, method=TWO_ANGLE),
+        KANO_HAMILTON: partial(_own_method, method=KANO_HAMILTON),
         "mld 0, discrepancy": partial(_mld, regularisation=Regularisation(0, "discrepancy")),
         "mld 0, Cp": partial(_mld, regularisation=Regularisation(0, "cp")),
         "mld 0, GCV": partial(_mld, regularisation=Regularisation(0, "gcv")),
         "mld 0, sum over angles": partial(_mld, regularisation=Regularisation(average="angles")),
         "mld 1, discrepancy": partial(_mld, regularisation=Regularisation(1, "discrepancy")),
         "mld 1, GCV": partial(_mld, regularisation=Regularisation(1, "gcv")),
-        MLD_PRIOR: partial(_ours, method=MLD_PRIOR),
-        JOINT: partial(_ours, method=JOINT),
+        MLD_PRIOR: partial(_own_method, method=MLD_PRIOR),
+        JOINT: partial(_own_method, method=JOINT),
     }
 
 
@@ -347,8 +351,8 @@ def retrieve(scan: Scan, method: str, *, robust: bool = True) -> MultiAngleResul
 
 
 def with_prior(scan: Scan, prior: Array) -> ScanEstimates:
-    """Solve with a given prior of the optical depth."""
-    return as_found(
+    """Retrieve by "mld_prior" with a given prior of optical depth."""
+    return to_estimates(
         retrieve_optical_depth(
             scan.signal,
             scan.scene.zenith_angle,
@@ -360,8 +364,8 @@ def with_prior(scan: Scan, prior: Array) -> ScanEstimates:
     )
 
 
-def as_found(result: MultiAngleResult) -> ScanEstimates:
-    """Return what is compared of a result."""
+def to_estimates(result: MultiAngleResult) -> ScanEstimates:
+    """Return the values of a result that are compared."""
     return ScanEstimates(
         optical_depth=result.optical_depth,
         standard_error=result.optical_depth_standard_error,
@@ -372,12 +376,12 @@ def as_found(result: MultiAngleResult) -> ScanEstimates:
     )
 
 
-def _ours(scan: Scan, *, method: str) -> ScanEstimates:
-    return as_found(retrieve(scan, method))
+def _own_method(scan: Scan, *, method: str) -> ScanEstimates:
+    return to_estimates(retrieve(scan, method))
 
 
 def _mld(scan: Scan, *, regularisation: Regularisation) -> ScanEstimates:
-    return as_found(
+    return to_estimates(
         retrieve_optical_depth(
             scan.signal,
             scan.scene.zenith_angle,
@@ -393,9 +397,9 @@ def _mld(scan: Scan, *, regularisation: Regularisation) -> ScanEstimates:
 
 
 def scan_peers() -> Mapping[str, Way]:
-    """Return what one would write with numpy and scipy, altitude by altitude.
+    """Return methods written directly with numpy and scipy, which solve each altitude on its own.
 
-    They are told the true scatter, and take samples of more than 3 times their noise.
+    They know the true scatter, and use samples of more than 3 times their noise.
     """
     return {
         LSTSQ: lstsq,
@@ -416,18 +420,18 @@ def lstsq(scan: Scan) -> ScanEstimates:
         solution = np.linalg.lstsq(design, y * root, rcond=None)[0]
         return float(solution[1]), float(np.sqrt(np.linalg.inv(design.T @ design)[1, 1]))
 
-    return _each(scan, fit, stated=True)
+    return _solve_lines(scan, fit, stated=True)
 
 
 def bounded(scan: Scan) -> ScanEstimates:
-    """Fit straight lines with an optical depth that is not negative."""
+    """Fit straight lines with the optical depth constrained to be non-negative."""
 
     def fit(x: Array, y: Array, root: Array) -> tuple[float, float]:
         design = np.stack([root, -2.0 * x * root], axis=1)
         least = ([-np.inf, 0.0], [np.inf, np.inf])
         return float(lsq_linear(design, y * root, bounds=least).x[1]), np.nan
 
-    return _each(scan, fit, stated=False)
+    return _solve_lines(scan, fit, stated=False)
 
 
 def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> ScanEstimates:
@@ -455,11 +459,11 @@ def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> ScanEstimates:
         slope = right.T @ (kept[_corner(misfit, size)] * data / values)
         return float(-0.5 * np.sum(np.sqrt(width) * slope) / (x[-1] - x[0])), np.nan
 
-    return _each(scan, fit, stated=False)
+    return _solve_lines(scan, fit, stated=False)
 
 
 def _corner(misfit: Array, size: Array) -> int:
-    """Return where the L-curve bends most."""
+    """Return the index of the largest curvature of the L-curve."""
     if misfit.size == 1:
         return 0
     tiny = np.finfo(np.float64).tiny
@@ -470,7 +474,7 @@ def _corner(misfit: Array, size: Array) -> int:
     return int(np.argmax(np.where(np.isfinite(bend), bend, -np.inf)))
 
 
-def _each(
+def _solve_lines(
     scan: Scan, fit: Callable[[Array, Array, Array], tuple[float, float]], *, stated: bool
 ) -> ScanEstimates:
     profiles, _, bins = scan.signal.shape
@@ -478,16 +482,16 @@ def _each(
     for t in range(profiles):
         for k in range(bins):
             line = _line(scan, t, k)
-            if line[0].size >= _FEWEST:
+            if line[0].size >= _FEWEST_BEAMS:
                 depth[t, k], error[t, k] = fit(*line)
     return ScanEstimates(depth, error if stated else None)
 
 
 def _line(scan: Scan, t: int, k: int) -> _Line:
     signal, variance = scan.signal[t, :, k], scan.variance[t, :, k]
-    seen = signal > _SEEN * np.sqrt(variance)
-    signal, variance = signal[seen], variance[seen]
+    used = signal > _LEAST_SNR * np.sqrt(variance)
+    signal, variance = signal[used], variance[used]
     scatter = variance / signal**2 + scan.scene.inhomogeneity**2
-    # Where nothing scatters, all beams count alike.
+    # Without scatter and noise, all beams have the same weight.
     root = 1.0 / np.sqrt(scatter) if np.all(scatter > 0.0) else np.ones(signal.size)
-    return scan.scene.path[seen], np.log(signal), root
+    return scan.scene.path[used], np.log(signal), root

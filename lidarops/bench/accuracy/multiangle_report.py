@@ -1,4 +1,4 @@
-"""What the benchmark of scans found, as tables and charts."""
+"""Tables and charts of the benchmark of scans."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lidarops.bench.accuracy.multiangle_scores import (
     SceneScore,
     measure_multiangle,
 )
-from lidarops.bench.harness.terms import RESULT, Effort, Finding, Kind
+from lidarops.bench.harness.terms import RESULT, BenchmarkOutput, Effort, Kind
 from lidarops.bench.throughput.retrievals import READ, StepCost
 from lidarops.bench.throughput.scan_kernels import (
     INPUTS,
@@ -32,16 +32,16 @@ from lidarops.reports.benchmark_page import BenchmarkReport, Part, Table
 
 _NONE: Final = "-"
 _GAIN: Final = 0.98
-"""A smaller gain in RMSE is Monte Carlo noise."""
+"""Ratio of RMSE above which a gain is Monte Carlo noise."""
 _PER_KM: Final = 1e3
 _UNDRAWN: Final = "mld 0, sum over angles"
-"""Next to `mld 0, discrepancy` in clear air, behind it in clouds."""
+"""Left out of the chart: close to `mld 0, discrepancy` in clear air, and worse in clouds."""
 _ERRORS: Final = (
-    "In brackets: Monte Carlo standard error of the last digits, of independent blocks."
+    "In brackets: Monte Carlo standard error of the last digits, from independent blocks."
 )
 
 
-def run_multiangle(kind: Kind, *, effort: Effort) -> Finding:
+def run_multiangle(kind: Kind, *, effort: Effort) -> BenchmarkOutput:
     """Run a benchmark of the retrieval from scans.
 
     Parameters
@@ -50,86 +50,89 @@ def run_multiangle(kind: Kind, *, effort: Effort) -> Finding:
     effort : Effort
     """
     if kind is Kind.ACCURACY:
-        found = measure_multiangle(quick=effort.quick, date=effort.date, progress=effort.progress)
-        return Finding(found, multiangle_accuracy_report(found, RESULT))
-    timed = measure_scan_kernels(
+        study = measure_multiangle(quick=effort.quick, date=effort.date, progress=effort.progress)
+        return BenchmarkOutput(study, multiangle_accuracy_report(study, RESULT))
+    timing = measure_scan_kernels(
         quick=effort.quick, date=effort.date, repeats=effort.repeats, progress=effort.progress
     )
-    return Finding(timed, multiangle_throughput_report(timed, RESULT))
+    return BenchmarkOutput(timing, multiangle_throughput_report(timing, RESULT))
 
 
-def multiangle_accuracy_report(found: MultiAngle, data: str = "") -> BenchmarkReport:
+def multiangle_accuracy_report(study: MultiAngle, data: str = "") -> BenchmarkReport:
     """Return the page of the accuracy benchmark."""
     return BenchmarkReport(
         title="Scans: error of optical depth and extinction against CPU time",
-        facts=facts(found.date, found.machine),
+        facts=facts(study.date, study.machine),
         parts=(
-            _scenes(found.scenes),
-            _published(found),
-            _outliers(found.outliers),
-            _safety(found.safety),
+            _scenes(study.scenes),
+            _published(study),
+            _outliers(study.outliers),
+            _safety(study.safety),
         ),
         data=data,
     )
 
 
-def multiangle_throughput_report(found: MultiAngleThroughput, data: str = "") -> BenchmarkReport:
+def multiangle_throughput_report(timing: MultiAngleThroughput, data: str = "") -> BenchmarkReport:
     """Return the page of the throughput benchmark."""
     return BenchmarkReport(
         title="Scans: time per profile",
-        facts=facts(found.date, found.machine),
-        parts=(_times(found),),
+        facts=facts(timing.date, timing.machine),
+        parts=(_times(timing),),
         data=data,
     )
 
 
-# All ways in four scenes ----------------------------------------------------------------------
+# All methods in four scenes -------------------------------------------------------------------
 
 
-def _scenes(found: Sequence[SceneScore]) -> Part:
+def _scenes(scenes: Sequence[SceneScore]) -> Part:
     return Part(
         title="Error against CPU time",
         text="Clear air: 12 beams from 0 to 75°, evenly spaced in slant path, 201 altitudes from "
         "150 m to 6.15 km, scatter of backscatter along the horizontal 3 %, signal over noise as "
         "stated at the zenith in 1 km. Cloud: 6 beams from 0 to 30°, 40 altitudes, optical depth "
         "4.4, scatter 14.7 %, independent or correlated by 0.8 between altitudes. All profiles "
-        "of a block are solved at once, and share inhomogeneity, smoothness and truth. Ours find "
-        "the scatter themselves; the peers are told it, work altitude by altitude, and take each "
-        "sample that exceeds 3 times its noise, which picks the bright ones: that is the bias of "
-        "lstsq in clear air, from which the mean signal of a window of altitudes keeps ours. "
-        "mld: order of the penalty and choice of its strength.",
+        "of a block are solved at once, and share inhomogeneity, smoothness and truth. Our methods "
+        "estimate the scatter. The peers know it, solve each altitude on its own, and use each "
+        "sample that exceeds 3 times its noise. This selects bright samples and causes the bias of "
+        "lstsq in clear air; our methods avoid it by selecting with the mean signal of a window of "
+        "altitudes. mld: order of the penalty and choice of its strength.",
         charts=(
-            _work_chart(found, "optical-depth", "optical depth", ""),
-            _work_chart(found, "extinction", "extinction", " (km⁻¹)"),
+            _work_chart(scenes, "optical-depth", "optical depth", ""),
+            _work_chart(scenes, "extinction", "extinction", " (km⁻¹)"),
         ),
-        tables=tuple(_scene_table(scene) for scene in found),
+        tables=tuple(_scene_table(scene) for scene in scenes),
     )
 
 
-def _work_chart(found: Sequence[SceneScore], name: str, quantity: str, unit: str) -> Chart:
+def _work_chart(scenes: Sequence[SceneScore], name: str, quantity: str, unit: str) -> Chart:
     return Chart(
         name=f"work-{name}",
         title=f"Error of {quantity} against CPU time",
         caption=f"Root mean square error of {quantity}, bars of 2 Monte Carlo standard errors; "
-        "hollow: peers. The line joins the ways that no other beats in both.",
+        "hollow: peers. The line joins the methods that no other beats in both error and time.",
         panels=tuple(
             Panel(
                 title=scene.label,
                 x_label="CPU time per profile (ms)",
                 y_label="" if number else f"error of {quantity}{unit}",
-                series=tuple(_point(one, name) for one in _drawn(scene)),
+                series=tuple(_point(score, name) for score in _drawn(scene)),
                 front=pareto(
-                    [(one.nanoseconds / 1e6, _rmse(one, name).value) for one in _drawn(scene)],
+                    [
+                        (score.nanoseconds / 1e6, _rmse(score, name).value)
+                        for score in _drawn(scene)
+                    ],
                     _GAIN,
                 ),
             )
-            for number, scene in enumerate(found)
+            for number, scene in enumerate(scenes)
         ),
     )
 
 
 def _drawn(scene: SceneScore) -> list[ScanScore]:
-    return [one for one in scene.scores if one.way != _UNDRAWN]
+    return [score for score in scene.scores if score.way != _UNDRAWN]
 
 
 def _rmse(score: ScanScore, name: str) -> MonteCarloFigure:
@@ -155,9 +158,9 @@ def _scene_table(scene: SceneScore) -> Table:
     return Table(
         title=f"{scene.label}, {counted(scene.profiles, 'profile')}",
         columns=(
-            "way",
+            "method",
             "profiles",
-            "ms each",
+            "ms per profile",
             "solved",
             "RMSE",
             "mean error",
@@ -171,51 +174,51 @@ def _scene_table(scene: SceneScore) -> Table:
         ),
         rows=tuple(
             (
-                one.way,
-                f"{one.profiles:,}",
-                f"{one.nanoseconds / 1e6:.3g}",
-                percent(one.solved),
-                with_error(one.rmse),
-                with_error(one.bias, sign=True),
-                _NONE if one.top_bias is None else with_error(one.top_bias, sign=True),
-                *_shares(one.coverage),
-                with_error(scaled(one.extinction_rmse, _PER_KM)),
-                *_shares(one.extinction_coverage),
-                _NONE if one.data_share is None else f"{one.data_share:.2f}",
+                score.way,
+                f"{score.profiles:,}",
+                f"{score.nanoseconds / 1e6:.3g}",
+                percent(score.solved),
+                with_error(score.rmse),
+                with_error(score.bias, sign=True),
+                _NONE if score.top_bias is None else with_error(score.top_bias, sign=True),
+                *_shares(score.coverage),
+                with_error(scaled(score.extinction_rmse, _PER_KM)),
+                *_shares(score.extinction_coverage),
+                _NONE if score.data_share is None else f"{score.data_share:.2f}",
             )
-            for one in scene.scores
+            for score in scene.scores
         ),
-        note=f"{_ERRORS} Within 1 and 1.96 stated standard errors: 68.3 and 95 % where errors are "
-        "as stated. At the top: mean error at the highest altitude. Extinction: RMSE of all "
-        "differences of optical depths; coverage of what is published, which leaves out what "
-        "comes less than 90 % from the data. Data share: median; the rest is zero for mld 0, the "
-        "altitude below for mld_prior.",
+        note=f"{_ERRORS} Within 1 and 1.96 stated standard errors: 68.3 and 95 % if the stated "
+        "errors are right. At the top: mean error at the highest altitude. Extinction: RMSE of all "
+        "differences of optical depths; coverage of published values, of which at least 90 % come "
+        "from the data. Data share: median; the remainder is zero for mld 0, and the altitude "
+        "below for mld_prior.",
     )
 
 
 def _shares(coverage: tuple[MonteCarloFigure, MonteCarloFigure] | None) -> tuple[str, str]:
     if coverage is None:
         return _NONE, _NONE
-    low, high = (with_error(scaled(one, 100.0)) for one in coverage)
+    low, high = (with_error(scaled(figure, 100.0)) for figure in coverage)
     return f"{low} %", f"{high} %"
 
 
 # The published experiment ---------------------------------------------------------------------
 
 
-def _published(found: MultiAngle) -> Part:
-    every = found.published
+def _published(study: MultiAngle) -> Part:
+    published = study.published
     return Part(
         title="The published experiment",
-        text=_verdict(found),
-        charts=(_angle_chart(every),),
+        text=_verdict(study),
+        charts=(_angle_chart(published),),
         tables=(
-            *(_published_table(every, angle, *scores.CENTRAL) for angle in (15.0, 30.0)),
-            _prior_table(found),
-            _correlation_table(found),
+            *(_published_table(published, angle, *scores.CENTRAL) for angle in (15.0, 30.0)),
+            _prior_table(study),
+            _correlation_table(study),
         ),
         details=tuple(
-            _published_table(every, angle, beams, share)
+            _published_table(published, angle, beams, share)
             for beams in scores.PUBLISHED_BEAMS
             for share in scores.PUBLISHED_SHARES
             for angle in (15.0, 30.0)
@@ -224,48 +227,53 @@ def _published(found: MultiAngle) -> Part:
     )
 
 
-def _verdict(found: MultiAngle) -> str:
-    def one(way: str, angle: float) -> PublishedCloudScore:
+def _verdict(study: MultiAngle) -> str:
+    def central(way: str, angle: float) -> PublishedCloudScore:
         return next(
             score
-            for score in found.published
+            for score in study.published
             if (score.way, score.largest_angle) == (way, angle)
             and (score.beams, score.share) == scores.CENTRAL
         )
 
-    mld, alone = one("mld 0, discrepancy", 15.0), one(scores.TWO_ANGLE_ALONE, 30.0)
-    plain, joint = one(cases.KANO_HAMILTON, 15.0), one(cases.JOINT, 15.0)
-    filtered, nothing = one(cases.MLD_PRIOR, 15.0), one(scores.NOTHING, 15.0)
-    alike = max(found.correlations, key=lambda score: (score.correlation, score.way == cases.JOINT))
+    mld, two_angle = central("mld 0, discrepancy", 15.0), central(scores.TWO_ANGLE_ALONE, 30.0)
+    line, joint = central(cases.KANO_HAMILTON, 15.0), central(cases.JOINT, 15.0)
+    prior_below, zero = central(cases.MLD_PRIOR, 15.0), central(scores.NOTHING, 15.0)
+    correlated = max(
+        study.correlations, key=lambda score: (score.correlation, score.way == cases.JOINT)
+    )
     enough = [
         angle
         for angle in scores.PUBLISHED_ANGLES
-        if one("mld 0, discrepancy", angle).rmse.value <= alone.rmse.value
+        if central("mld 0, discrepancy", angle).rmse.value <= two_angle.rmse.value
     ]
-    reached = f"from {enough[0]:g}° on" if enough else "at none of the angles tried"
-    times = mld.rmse.value / alone.rmse.value
+    reached = f"from {enough[0]:g}° on" if enough else "at none of the tested angles"
+    times = mld.rmse.value / two_angle.rmse.value
     return (
-        "A cloud of 8 layers of 50 m, optical depth 4.4, seen along 6 or 4 evenly spaced angles; "
-        "backscatter is off by up to 20 to 30 % from beam to beam and layer to layer. Published "
-        "(in a figure, without a number) is that the regularised derivative is stable at 15°, "
-        "where two angles, shown for 30° and 10 %, are not acceptable. Of single altitudes, this "
-        f"{'is not so' if times > 1.0 else 'is so'}: with 25 % at 15°, mld of order 0 is off by "
-        f"{with_error(mld.rmse)}, {times:.1f} times the {with_error(alone.rmse)} of two angles at 30° with "
-        f"10 %. Stable it is, as an answer of zero is ({nothing.rmse.value:.2f}): it gains "
-        f"{percent(1.0 - mld.rmse.value / plain.rmse.value)} on the straight line, "
-        f"{with_error(plain.rmse)}, with an error of {mld.top_bias.value:+.2f} at the top and a median "
-        f"of {percent(mld.data_share or 0.0)} of the answer from the data; the rest is the prior, "
-        "and so is its error (table of priors). The shape of two-angle profiles is another "
-        f"matter: {percent(1.0 - alone.monotone)} of those at 30° decrease somewhere. Errors "
-        f"as small as those of two angles at 30° with 10 % it reaches {reached}. With the "
-        "altitude below as prior, the second published scheme, it is off by "
-        f"{with_error(filtered.rmse)} at 15°. What helps there is smoothness over altitude: joint is "
-        f"off by {with_error(joint.rmse)}, and by {with_error(alike.rmse)} where layers scatter alike."
+        "A cloud of 8 layers of 50 m, optical depth 4.4, observed at 6 or 4 evenly spaced angles. "
+        "Backscatter deviates by up to 20 to 30 % from beam to beam and layer to layer. The "
+        "publication states (in a figure, without a number) that the regularised derivative (mld, "
+        "the historical method) is stable at 15°, while two angles, shown for 30° and 10 %, are "
+        "not acceptable. For the error at single altitudes, this "
+        f"{'is not so' if times > 1.0 else 'is so'}: with 25 % at 15°, the RMSE of mld of order 0 "
+        f"is {with_error(mld.rmse)}, {times:.1f} times the {with_error(two_angle.rmse)} of two "
+        "angles at 30° with 10 %. mld is stable only in the way that an optical depth of zero is "
+        f"stable (RMSE {zero.rmse.value:.2f}): it gains "
+        f"{percent(1.0 - mld.rmse.value / line.rmse.value)} over the straight line "
+        f"({with_error(line.rmse)}), with an error of {mld.top_bias.value:+.2f} at the top. A "
+        f"median of {percent(mld.data_share or 0.0)} of the optical depth comes from the data; the "
+        "remainder and its error come from the prior (table of priors). The shape of two-angle "
+        f"profiles is worse: {percent(1.0 - two_angle.monotone)} of those at 30° decrease "
+        "somewhere. mld reaches errors as small as those of two angles at 30° with 10 % "
+        f"{reached}. With the altitude below as prior, the second published scheme, the RMSE is "
+        f"{with_error(prior_below.rmse)} at 15°. Smoothness over altitude helps: the RMSE of joint "
+        f"is {with_error(joint.rmse)}, and {with_error(correlated.rmse)} where layers scatter "
+        "alike."
     )
 
 
-def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
-    central = [one for one in found if (one.beams, one.share) == scores.CENTRAL]
+def _angle_chart(published: Sequence[PublishedCloudScore]) -> Chart:
+    central = [score for score in published if (score.beams, score.share) == scores.CENTRAL]
     ways = (
         scores.NOTHING,
         scores.TWO_ANGLE_ALONE,
@@ -274,11 +282,11 @@ def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
         cases.MLD_PRIOR,
         cases.JOINT,
     )
-    drawn = {way: [one for one in central if one.way == way] for way in ways}
+    drawn = {way: [score for score in central if score.way == way] for way in ways}
     return Chart(
         name="angles",
         title="Published experiment: error against the largest zenith angle",
-        caption="6 beams, backscatter off by up to 25 % (10 % where stated).",
+        caption="6 beams, backscatter deviates by up to 25 % (10 % where stated).",
         panels=(
             Panel(
                 title="optical depth",
@@ -287,8 +295,8 @@ def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
                 series=tuple(
                     Series(
                         way,
-                        tuple(one.largest_angle for one in points),
-                        tuple(one.rmse.value for one in points),
+                        tuple(point.largest_angle for point in points),
+                        tuple(point.rmse.value for point in points),
                         joined=True,
                     )
                     for way, points in drawn.items()
@@ -302,8 +310,8 @@ def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
                 series=tuple(
                     Series(
                         way,
-                        tuple(one.largest_angle for one in points if one.data_share is not None),
-                        tuple(one.data_share for one in points if one.data_share is not None),
+                        tuple(p.largest_angle for p in points if p.data_share is not None),
+                        tuple(p.data_share for p in points if p.data_share is not None),
                         joined=True,
                     )
                     for way, points in drawn.items()
@@ -315,16 +323,18 @@ def _angle_chart(found: Sequence[PublishedCloudScore]) -> Chart:
 
 
 def _published_table(
-    found: Sequence[PublishedCloudScore], angle: float, beams: int, share: float
+    published: Sequence[PublishedCloudScore], angle: float, beams: int, share: float
 ) -> Table:
     chosen = [
-        one for one in found if (one.largest_angle, one.beams, one.share) == (angle, beams, share)
+        score
+        for score in published
+        if (score.largest_angle, score.beams, score.share) == (angle, beams, share)
     ]
     return Table(
         title=f"{angle:g}°, {beams} beams, {100.0 * share:.0f} %, "
         f"{counted(chosen[0].profiles, 'profile')}",
         columns=(
-            "way",
+            "method",
             "RMSE",
             "at the top",
             "extinction RMSE (km⁻¹)",
@@ -336,43 +346,54 @@ def _published_table(
         ),
         rows=tuple(
             (
-                one.way,
-                with_error(one.rmse),
-                with_error(one.top_bias, sign=True),
-                with_error(scaled(one.extinction_rmse, _PER_KM)),
-                percent(one.negative),
-                percent(one.monotone),
-                percent(one.close.value),
-                _NONE if one.data_share is None else f"{one.data_share:.2f}",
-                _NONE if one.freedom is None else f"{one.freedom:.2f}",
+                score.way,
+                with_error(score.rmse),
+                with_error(score.top_bias, sign=True),
+                with_error(scaled(score.extinction_rmse, _PER_KM)),
+                percent(score.negative),
+                percent(score.monotone),
+                percent(score.close.value),
+                _NONE if score.data_share is None else f"{score.data_share:.2f}",
+                _NONE if score.freedom is None else f"{score.freedom:.2f}",
             )
-            for one in chosen
+            for score in chosen
         ),
-        note=f"{_ERRORS} At the top: mean error there. Negative: share of optical depths; "
-        "monotone: share of profiles that nowhere decrease; data share and degrees of freedom "
-        f"of an altitude: medians. {scores.TWO_ANGLE_ALONE}: of a normal scatter of 10 %.",
+        note=f"{_ERRORS} At the top: mean error there. Negative: share of optical depths. "
+        "Monotone: share of profiles that nowhere decrease. Data share, and freedom (degrees of "
+        "freedom per altitude): medians. "
+        f"{scores.TWO_ANGLE_ALONE}: with a normal scatter of 10 %.",
     )
 
 
-def _prior_table(found: MultiAngle) -> Table:
+def _prior_table(study: MultiAngle) -> Table:
     return Table(
         title="mld_prior at 15°, 6 beams, 25 %, with a multiple of the truth as prior",
         columns=("prior / truth", "prior alone", "RMSE", "data share"),
         rows=tuple(
-            (f"{one.factor:g}", f"{one.alone:.2f}", with_error(one.rmse), f"{one.data_share:.2f}")
-            for one in found.priors
+            (
+                f"{score.factor:g}",
+                f"{score.alone:.2f}",
+                with_error(score.rmse),
+                f"{score.data_share:.2f}",
+            )
+            for score in study.priors
         ),
-        note="With the truth as prior, what is left is the share of the noise.",
+        note="With the truth as prior, the error comes from noise only.",
     )
 
 
-def _correlation_table(found: MultiAngle) -> Table:
+def _correlation_table(study: MultiAngle) -> Table:
     return Table(
         title="Layers that scatter alike: 15°, 6 beams, 14.7 %",
-        columns=("correlation", "way", "RMSE", "RMSE < 0.5"),
+        columns=("correlation", "method", "RMSE", "RMSE < 0.5"),
         rows=tuple(
-            (f"{one.correlation:g}", one.way, with_error(one.rmse), percent(one.close.value))
-            for one in found.correlations
+            (
+                f"{score.correlation:g}",
+                score.way,
+                with_error(score.rmse),
+                percent(score.close.value),
+            )
+            for score in study.correlations
         ),
         note="Correlation of the scatter of neighbouring layers. RMSE < 0.5: share of profiles.",
     )
@@ -381,33 +402,33 @@ def _correlation_table(found: MultiAngle) -> Table:
 # Outliers, random scenes ----------------------------------------------------------------------
 
 
-def _outliers(found: Sequence[OutlierScore]) -> Part:
-    ways = list(dict.fromkeys(one.way for one in found))
+def _outliers(outlier_scores: Sequence[OutlierScore]) -> Part:
+    ways = list(dict.fromkeys(score.way for score in outlier_scores))
     clean = {
-        one.way.split(",")[0]: one
-        for one in found
-        if one.outliers == 0.0 and one.way.endswith("plain")
+        score.way.split(",")[0]: score
+        for score in outlier_scores
+        if score.outliers == 0.0 and score.way.endswith("plain")
     }
     rows = []
     for way in ways:
-        for one in (one for one in found if one.way == way):
+        for score in (score for score in outlier_scores if score.way == way):
             base = clean[way.split(",")[0]]
             rows.append(
                 (
-                    f"{way}, {100.0 * one.outliers:.0f} %",
-                    with_error(one.low_rmse),
-                    f"{one.low_rmse.value / base.low_rmse.value:.2f}",
-                    with_error(one.rmse),
-                    f"{one.rmse.value / base.rmse.value:.2f}",
-                    *_shares(one.coverage),
-                    percent(one.flagged),
-                    percent(one.ran),
+                    f"{way}, {100.0 * score.outliers:.0f} %",
+                    with_error(score.low_rmse),
+                    f"{score.low_rmse.value / base.low_rmse.value:.2f}",
+                    with_error(score.rmse),
+                    f"{score.rmse.value / base.rmse.value:.2f}",
+                    *_shares(score.coverage),
+                    percent(score.flagged),
+                    percent(score.ran),
                 )
             )
     table = Table(
         title="Optical depth with outliers",
         columns=(
-            "way and share",
+            "method, share of outliers",
             "RMSE below 2 km",
             "times clean",
             "RMSE",
@@ -418,36 +439,36 @@ def _outliers(found: Sequence[OutlierScore]) -> Part:
             "robust passes",
         ),
         rows=tuple(rows),
-        note=f"{_ERRORS} Clean: the plain method without outliers, of other profiles. Flagged: "
-        "share of values with the flag of outliers. Robust passes: share of blocks that ran them.",
+        note=f"{_ERRORS} Clean: the plain method without outliers, on other profiles. Flagged: "
+        "share of values flagged as outliers. Robust passes: share of blocks that ran them.",
     )
     return Part(
         title="Outliers",
-        text="Clear air with a signal over noise of 3000; samples drawn at random are brighter by "
+        text="Clear air with a signal over noise of 3000. Randomly drawn samples are brighter by "
         "0.3 to 1 in the logarithm. Robust is the default.",
         tables=(table,),
     )
 
 
-def _safety(found: Sequence[SafetyScore]) -> Part:
+def _safety(safety: Sequence[SafetyScore]) -> Part:
     rows = tuple(
         (
-            f"{one.air}, {one.way}, {one.quantity}",
-            f"{one.values:,}",
-            *(
-                _rare(share)
-                for share in (one.random_only, one.false, one.false_ok, one.false_ok_profiles)
-            ),
-            percent(one.within.value),
-            percent(one.flagged),
-            percent(one.needless),
+            f"{score.air}, {score.way}, {score.quantity}",
+            f"{score.values:,}",
+            _rare(score.random_only),
+            _rare(score.false),
+            _rare(score.false_ok),
+            _rare(score.false_ok_profiles),
+            percent(score.within.value),
+            percent(score.flagged),
+            percent(score.needless),
         )
-        for one in found
+        for score in safety
     )
     table = Table(
         title=f"Values off by more than {scores.FALSE:g} stated errors",
         columns=(
-            "way",
+            "method",
             "values",
             "random error alone",
             "with gradient bound",
@@ -458,36 +479,35 @@ def _safety(found: Sequence[SafetyScore]) -> Part:
             "needlessly",
         ),
         rows=rows,
-        note="In brackets: Monte Carlo standard error, of scenes. Flagged: no_residual, gradient, "
-        "undersmoothed, high_correlation or poor_stratification, which doubt the stated error; "
-        "needlessly: off by less than 2.5. Within 1.96: of values without a flag. Extinction "
-        "that is withheld does not count.",
+        note="In brackets: Monte Carlo standard error, from scenes. Flagged: no_residual, "
+        "gradient, undersmoothed, high_correlation or poor_stratification: the stated error may "
+        "be too small. Needlessly: flagged, but off by less than 2.5 stated errors. Within 1.96: "
+        "share of unflagged values. Withheld extinction does not count.",
     )
     return Part(
         title="False and not flagged",
-        text=f"{found[0].scenes:,} scenes ({found[-1].scenes:,} of calm air) of which nothing is "
-        "as assumed, 8 profiles each with its own truth: 3 to 20 beams on one side to 15-75°, "
-        "clear air or a cloud, scatter up to 40 % (of calm air drawn by its logarithm, from "
-        "0.5 %) with "
-        "a correlation of 0 to 0.95, signal over noise 10 to 1e5; half with up to 10 % outliers; "
-        "three in five with a horizontal gradient of up to 10 % per km, twice what the retrieval "
-        "allows for by default; one in seven with extinction that varies along the paths. A "
-        "one-sided scan does not see the gradient: without its bound, random errors alone would "
-        "say far too little.",
+        text=f"{safety[0].scenes:,} scenes ({safety[-1].scenes:,} of calm air) that violate the "
+        "assumptions, with 8 profiles and another truth for each: 3 to 20 beams on one side to "
+        "15-75°, clear air or a cloud, scatter up to 40 % (for calm air drawn uniformly in the "
+        "logarithm, from 0.5 %) with a correlation of 0 to 0.95, signal over noise 10 to 1e5. Half "
+        "have up to 10 % outliers; three in five have a horizontal gradient of up to 10 % per km, "
+        "twice the default of the retrieval; in one in seven, extinction varies along the paths. A "
+        "one-sided scan cannot detect a gradient: without the gradient bound, the stated errors "
+        "would be far too small.",
         tables=(table,),
-        details=tuple(_flag_table(one) for one in found),
+        details=tuple(_flag_table(score) for score in safety),
     )
 
 
-def _flag_table(found: SafetyScore) -> Table:
+def _flag_table(score: SafetyScore) -> Table:
     return Table(
-        title=f"Flags of {found.air}, {found.way}, {found.quantity}",
+        title=f"Flags of {score.air}, {score.way}, {score.quantity}",
         columns=("flag", "share of values", "false of these"),
         rows=tuple(
-            (one.flag, percent(one.values), _NONE if one.false is None else _rare(one.false))
-            for one in found.flags
+            (flag.flag, percent(flag.values), _NONE if flag.false is None else _rare(flag.false))
+            for flag in score.flags
         ),
-        note="False: off by more than 4 of random error and gradient bound together.",
+        note="False: off by more than 4 times the random error and gradient bound combined.",
     )
 
 
@@ -498,29 +518,29 @@ def _rare(share: MonteCarloFigure) -> str:
 # Time -----------------------------------------------------------------------------------------
 
 
-def _times(found: MultiAngleThroughput) -> Part:
-    batches = sorted({cost.batch for cost in found.costs})
+def _times(timing: MultiAngleThroughput) -> Part:
+    batches = sorted({cost.batch for cost in timing.costs})
     return Part(
         title="CPU time per profile",
-        text=f"Clear air, {found.angles} angles, {found.altitudes} altitudes, float64, one "
+        text=f"Clear air, {timing.angles} angles, {timing.altitudes} altitudes, float64, one "
         "thread, least CPU time of interleaved repeats. make_beams, regress and vertical.smooth "
-        "are steps; the others are whole calls of solve, with all errors, residuals and flags. "
-        "Plain: without the robust passes, for which a single residual calls that is too "
-        "large for chance, and which cost more than all else. The peers give values without flags, "
-        f"lstsq with standard errors. {READ} is a vectorised maximum of the signals in the same "
+        "are steps; the others are complete retrievals, with all errors, residuals and flags. "
+        "Plain: without the robust passes, which a single residual too large for chance starts, "
+        "and which take more time than all other steps. The peers give values without flags, "
+        f"lstsq also standard errors. {READ} is a vectorised maximum of the signals in the same "
         "run.",
-        charts=(_time_ladder(found, batches),),
-        tables=tuple(_time_table(found, batch) for batch in batches),
+        charts=(_time_ladder(timing, batches),),
+        tables=tuple(_time_table(timing, batch) for batch in batches),
     )
 
 
-def _time_ladder(found: MultiAngleThroughput, batches: Sequence[int]) -> Ladder:
-    steps = list(dict.fromkeys(cost.step for cost in found.costs))
-    spent = {(cost.batch, cost.step): cost.nanoseconds / 1e3 for cost in found.costs}
+def _time_ladder(timing: MultiAngleThroughput, batches: Sequence[int]) -> Ladder:
+    steps = list(dict.fromkeys(cost.step for cost in timing.costs))
+    spent = {(cost.batch, cost.step): cost.nanoseconds / 1e3 for cost in timing.costs}
     return Ladder(
         name="multiangle-time",
-        title=f"CPU time per profile of {found.angles} angles and {found.altitudes} altitudes",
-        caption="By the number of profiles that a call is given.",
+        title=f"CPU time per profile of {timing.angles} angles and {timing.altitudes} altitudes",
+        caption="By the number of profiles in one call.",
         x_label="CPU time per profile (µs)",
         rows=tuple(steps),
         series=tuple(
@@ -530,19 +550,19 @@ def _time_ladder(found: MultiAngleThroughput, batches: Sequence[int]) -> Ladder:
     )
 
 
-def _time_table(found: MultiAngleThroughput, batch: int) -> Table:
-    costs = [cost for cost in found.costs if cost.batch == batch]
+def _time_table(timing: MultiAngleThroughput, batch: int) -> Table:
+    costs = [cost for cost in timing.costs if cost.batch == batch]
     whole = next(cost.nanoseconds for cost in costs if cost.step == cases.JOINT)
-    samples = found.angles * found.altitudes
+    samples = timing.angles * timing.altitudes
     return Table(
         title=f"Calls of {counted(batch, 'profile')}",
         columns=(
             "step",
             "whose",
             "profiles",
-            "µs each",
-            "ns a sample",
-            "ns an altitude",
+            "µs per profile",
+            "ns per sample",
+            "ns per altitude",
             "reads",
             "times joint",
         ),
@@ -553,13 +573,13 @@ def _time_table(found: MultiAngleThroughput, batch: int) -> Table:
                 f"{cost.profiles:,}",
                 f"{cost.nanoseconds / 1e3:,.2f}",
                 f"{cost.nanoseconds / samples:,.2f}",
-                f"{cost.nanoseconds / found.altitudes:,.1f}",
+                f"{cost.nanoseconds / timing.altitudes:,.1f}",
                 f"{cost.reads:,.1f}",
                 f"{cost.nanoseconds / whole:,.2f}",
             )
             for cost in costs
         ),
-        note=f"Reads: multiples of {READ}. Profiles: of one call, fewer where it is slow.",
+        note=f"Reads: multiples of {READ}. Profiles: in one call, fewer for slow methods.",
     )
 
 
@@ -573,7 +593,7 @@ def _whose(cost: StepCost) -> str:
 
 
 def scaled(figure: MonteCarloFigure, factor: float) -> MonteCarloFigure:
-    """Return a figure in another unit."""
+    """Return a figure times a factor."""
     return MonteCarloFigure(factor * figure.value, factor * figure.error)
 
 

@@ -1,4 +1,4 @@
-"""How right the optical depths and extinctions of scans are, method by method."""
+"""Accuracy of the optical depths and extinctions of scans, method by method."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PUBLISHED_ANGLES: Final = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
 PUBLISHED_SHARES: Final = (0.2, 0.25, 0.3)
 PUBLISHED_BEAMS: Final = (6, 4)
 CENTRAL: Final = (6, 0.25)
-"""Beams and share of what is shown at all angles."""
+"""Beams and largest error of backscatter of the experiment that is shown at all angles."""
 TWO_ANGLE_ALONE: Final = "two_angle, 10 %"
 NOTHING: Final = "answer 0"
 PRIORS: Final = (0.0, 0.5, 1.0, 1.5)
@@ -33,7 +33,7 @@ OUTLIERS: Final = (0.0, 0.05, 0.1)
 ANY: Final = "any air"
 CALM: Final = "calm air"
 LOW: Final = 2000.0
-"""m, up to which outliers are judged altitude by altitude."""
+"""m, altitude up to which the error with outliers is scored separately."""
 FALSE: Final = 4.0
 """Stated standard errors beyond which a value is false."""
 _NEEDLESS: Final = 2.5
@@ -43,18 +43,18 @@ _SCENE_PROFILES: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class StudySize:
-    """How much is simulated."""
+    """Numbers of simulated blocks, profiles and scenes."""
 
     blocks: int
-    """Of each scene, at least 2; they share the truth and nothing else."""
+    """Blocks of each scene, at least 2, independent except for the truth."""
     profiles: int
-    """Of a block."""
+    """Profiles of a block."""
     slow: int
-    """Profiles of a block that the peers get."""
+    """Profiles of a block for the peers."""
     published: int
-    """Profiles of a block of the published experiment, which has 5 blocks or as many as others."""
+    """Profiles of a block of the published experiment, which has at most 5 blocks."""
     random: int
-    """Random scenes, and a quarter of that of calm ones."""
+    """Random scenes; a quarter of that number of calm scenes."""
 
 
 QUICK: Final = StudySize(blocks=6, profiles=24, slow=1, published=100, random=150)
@@ -63,24 +63,24 @@ FULL: Final = StudySize(blocks=16, profiles=64, slow=2, published=250, random=30
 
 @dataclass(frozen=True, slots=True)
 class ScanScore:
-    """Errors of one way in one scene, at the altitudes that kano_hamilton reaches."""
+    """Errors of one method in one scene, at the altitudes that kano_hamilton reaches."""
 
     way: str
     profiles: int
     nanoseconds: float
     """CPU time a profile."""
     solved: float
-    """Share of these values that the way has."""
+    """Share of these altitudes with a value of the method."""
     rmse: MonteCarloFigure
     """Of optical depth."""
     bias: MonteCarloFigure
     """Mean error of optical depth."""
     top_bias: MonteCarloFigure | None
-    """Mean error at the highest of the altitudes that all profiles reach; None where the way has
-    no value there."""
+    """Mean error at the highest altitude that all profiles reach; None if the method has no value
+    there."""
     coverage: tuple[MonteCarloFigure, MonteCarloFigure] | None
-    """Share of optical depths within 1 and 1.96 stated standard errors; None where the way
-    states none."""
+    """Share of optical depths within 1 and 1.96 stated standard errors; None if the method states
+    none."""
     extinction_rmse: MonteCarloFigure
     """m-1, of differences of optical depths, published or not."""
     extinction_coverage: tuple[MonteCarloFigure, MonteCarloFigure] | None
@@ -91,18 +91,18 @@ class ScanScore:
 
 @dataclass(frozen=True, slots=True)
 class SceneScore:
-    """What the ways did with one scene."""
+    """Scores of the methods in one scene."""
 
     label: str
     profiles: int
     altitudes: int
     scores: tuple[ScanScore, ...]
-    """Without ways that have no value."""
+    """Only of methods that have a value."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublishedCloudScore:
-    """One way in the published experiment, over the middles of 8 layers of a cloud."""
+    """Errors of one method in the published experiment, at the centres of 8 layers of a cloud."""
 
     way: str
     largest_angle: float
@@ -141,7 +141,7 @@ class PriorScore:
 
 @dataclass(frozen=True, slots=True)
 class CorrelationScore:
-    """One way where the scatter of neighbouring layers goes together."""
+    """Errors of one method where the scatter of neighbouring layers is correlated."""
 
     way: str
     correlation: float
@@ -151,7 +151,7 @@ class CorrelationScore:
 
 @dataclass(frozen=True, slots=True)
 class OutlierScore:
-    """One way with samples that are too bright, in clear air."""
+    """Errors of one method with outlying samples, in clear air."""
 
     way: str
     outliers: float
@@ -178,7 +178,7 @@ class FlagShare:
 
 @dataclass(frozen=True, slots=True)
 class SafetyScore:
-    """Values that are off by more than 4 stated errors, in random scenes."""
+    """Share of values off by more than 4 stated errors, in random scenes."""
 
     air: str
     """How the scatter was drawn."""
@@ -200,7 +200,7 @@ class SafetyScore:
     flagged: float
     """Share of values with such a flag."""
     needless: float
-    """Share of values with such a flag that are within 2.5 of these errors."""
+    """Share of values with such a flag, but within 2.5 of these errors."""
     flags: tuple[FlagShare, ...]
 
 
@@ -225,18 +225,18 @@ def measure_multiangle(
     size: StudySize | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> MultiAngle:
-    """Find optical depth and extinction of simulated scans by every method and by peers.
+    """Score optical depth and extinction of simulated scans for every method and the peers.
 
     Parameters
     ----------
     quick : bool
         Fewer profiles.
     date : str
-        When it is run, as it is to be stated.
-    size : Size, optional
-        How much is simulated.
+        Date of the run, for the report.
+    size : StudySize, optional
+        Numbers of blocks, profiles and scenes.
     progress : callable
-        Is given 1 after each of 8 parts.
+        Called with 1 after each of 8 parts.
     """
     size = size or (QUICK if quick else FULL)
     compared = []
@@ -258,7 +258,7 @@ def measure_multiangle(
 
 # Statistics of blocks -------------------------------------------------------------------------
 
-Marks = dict[str, float]
+BlockMeans = dict[str, float]
 """Means over one block, by name; NaN where there is nothing to average."""
 
 
@@ -293,24 +293,24 @@ def ratio(part: Array, whole: Array) -> MonteCarloFigure:
         return MonteCarloFigure(0.0, 0.0)
     value = float(part.sum()) / total
     error = float(np.sqrt(np.sum((part - value * whole) ** 2))) / total
-    # Where none is found, one more keeps the error from being zero.
+    # Without any event the error would be zero; one event is assumed then.
     return MonteCarloFigure(value, max(error, 1.0 / total))
 
 
-def _any(marks: Sequence[Marks], name: str) -> bool:
-    return any(np.isfinite(one[name]) for one in marks)
+def _has_any(blocks: Sequence[BlockMeans], name: str) -> bool:
+    return any(np.isfinite(means[name]) for means in blocks)
 
 
 def _coverage(
-    marks: Sequence[Marks], name: str
+    blocks: Sequence[BlockMeans], name: str
 ) -> tuple[MonteCarloFigure, MonteCarloFigure] | None:
-    if not _any(marks, f"{name}0"):
+    if not _has_any(blocks, f"{name}0"):
         return None
-    low, high = (over_blocks([one[f"{name}{k}"] for one in marks]) for k in range(2))
+    low, high = (over_blocks([means[f"{name}{k}"] for means in blocks]) for k in range(2))
     return low, high
 
 
-def _inside(error: Array, stated: Array | None, sigmas: float) -> float:
+def _share_within(error: Array, stated: Array | None, sigmas: float) -> float:
     if stated is None:
         return float("nan")
     known = np.isfinite(error) & np.isfinite(stated)
@@ -321,7 +321,7 @@ def _differences(depth: Array, altitude: Array) -> Array:
     return np.asarray(np.diff(depth, axis=1, prepend=0.0) / np.diff(altitude, prepend=0.0))
 
 
-# All ways in four scenes ----------------------------------------------------------------------
+# All methods in four scenes -------------------------------------------------------------------
 
 
 def _compare(scene: Scene, size: StudySize, number: int) -> SceneScore:
@@ -339,43 +339,45 @@ def _compare(scene: Scene, size: StudySize, number: int) -> SceneScore:
 
 def _score(name: str, way: Way, scans: Sequence[Scan], within: Sequence[Mask]) -> ScanScore | None:
     way(scans[0].first(1))
-    marks, times, shares = [], [], []
+    blocks, times, shares = [], [], []
     for scan, reached in zip(scans, within, strict=True):
         begin = time.process_time()
-        found = way(scan)
+        estimates = way(scan)
         times.append((time.process_time() - begin) / len(scan.signal))
         mask = reached[: len(scan.signal)]
-        marks.append(_marks(found, scan.scene, mask))
-        if found.data_share is not None:
-            shares.append(found.data_share[mask])
-    if not _any(marks, "extinction_square"):
+        blocks.append(_block_means(estimates, scan.scene, mask))
+        if estimates.data_share is not None:
+            shares.append(estimates.data_share[mask])
+    if not _has_any(blocks, "extinction_square"):
         return None
     share = float(np.nanmedian(np.concatenate(shares))) if shares else None
     return ScanScore(
         way=name,
         profiles=sum(len(scan.signal) for scan in scans),
         nanoseconds=1e9 * float(np.median(times)),
-        solved=over_blocks([one["solved"] for one in marks]).value,
-        rmse=root(over_blocks([one["square"] for one in marks])),
-        bias=over_blocks([one["error"] for one in marks]),
-        top_bias=over_blocks([one["top"] for one in marks]) if _any(marks, "top") else None,
-        coverage=_coverage(marks, "within"),
-        extinction_rmse=root(over_blocks([one["extinction_square"] for one in marks])),
-        extinction_coverage=_coverage(marks, "extinction_within"),
+        solved=over_blocks([means["solved"] for means in blocks]).value,
+        rmse=root(over_blocks([means["square"] for means in blocks])),
+        bias=over_blocks([means["error"] for means in blocks]),
+        top_bias=over_blocks([means["top"] for means in blocks])
+        if _has_any(blocks, "top")
+        else None,
+        coverage=_coverage(blocks, "within"),
+        extinction_rmse=root(over_blocks([means["extinction_square"] for means in blocks])),
+        extinction_coverage=_coverage(blocks, "extinction_within"),
         data_share=share,
     )
 
 
-def _marks(found: ScanEstimates, scene: Scene, mask: Mask) -> Marks:
-    """Return means over the altitudes of one block that count."""
-    error = np.where(mask, found.optical_depth - scene.optical_depth, np.nan)
-    slope = _differences(found.optical_depth, scene.altitude) - scene.extinction
+def _block_means(estimates: ScanEstimates, scene: Scene, mask: Mask) -> BlockMeans:
+    """Return means over the altitudes of one block within the mask."""
+    error = np.where(mask, estimates.optical_depth - scene.optical_depth, np.nan)
+    slope = _differences(estimates.optical_depth, scene.altitude) - scene.extinction
     top = max(int(mask.all(axis=0).sum()) - 1, 0)
-    published = found.extinction
+    published = estimates.extinction
     wrong = np.full(mask.shape, np.nan)
     if published is not None:
         wrong = np.where(mask, published - scene.extinction, np.nan)
-    marks = {
+    means = {
         "solved": _mean(np.isfinite(error)[mask]),
         "square": _mean(error**2),
         "error": _mean(error),
@@ -383,9 +385,11 @@ def _marks(found: ScanEstimates, scene: Scene, mask: Mask) -> Marks:
         "extinction_square": _mean(np.where(mask, slope, np.nan) ** 2),
     }
     for k, sigmas in enumerate(SIGMAS):
-        marks[f"within{k}"] = _inside(error, found.standard_error, sigmas)
-        marks[f"extinction_within{k}"] = _inside(wrong, found.extinction_standard_error, sigmas)
-    return marks
+        means[f"within{k}"] = _share_within(error, estimates.standard_error, sigmas)
+        means[f"extinction_within{k}"] = _share_within(
+            wrong, estimates.extinction_standard_error, sigmas
+        )
+    return means
 
 
 # The published experiment ---------------------------------------------------------------------
@@ -401,12 +405,12 @@ def _published(size: StudySize) -> Iterator[PublishedCloudScore]:
             for block in range(_published_blocks(size))
         ]
         gaussian = cases.published_cloud(angle, beams, 0.1)
-        loud = [
+        noisy = [
             gaussian.draw(size.published, number, block, 2)
             for block in range(_published_blocks(size))
         ]
         yield _published_score(NOTHING, _nothing, scans, share)
-        yield _published_score(TWO_ANGLE_ALONE, cases.scan_methods()[cases.TWO_ANGLE], loud, share)
+        yield _published_score(TWO_ANGLE_ALONE, cases.scan_methods()[cases.TWO_ANGLE], noisy, share)
         for name, way in cases.scan_methods().items():
             yield _published_score(name, way, scans, share)
 
@@ -423,28 +427,31 @@ def _published_score(
     name: str, way: Way, scans: Sequence[Scan], share: float
 ) -> PublishedCloudScore:
     scene = scans[0].scene
-    found = [way(scan) for scan in scans]
-    depth = np.concatenate([one.optical_depth for one in found])
-    marks = [_marks(one, scene, np.ones(one.optical_depth.shape, np.bool_)) for one in found]
+    blocks = [way(scan) for scan in scans]
+    depth = np.concatenate([estimates.optical_depth for estimates in blocks])
+    means = [
+        _block_means(estimates, scene, np.ones(estimates.optical_depth.shape, np.bool_))
+        for estimates in blocks
+    ]
     return PublishedCloudScore(
         way=name,
         largest_angle=float(scene.zenith_angle.max()),
         beams=scene.zenith_angle.size,
         share=share,
         profiles=len(depth),
-        rmse=root(over_blocks([one["square"] for one in marks])),
-        top_bias=over_blocks([one["top"] for one in marks]),
-        extinction_rmse=root(over_blocks([one["extinction_square"] for one in marks])),
+        rmse=root(over_blocks([block["square"] for block in means])),
+        top_bias=over_blocks([block["top"] for block in means]),
+        extinction_rmse=root(over_blocks([block["extinction_square"] for block in means])),
         negative=float(np.mean(depth < 0.0)),
         monotone=float(np.mean(np.all(np.diff(depth, axis=1, prepend=0.0) >= 0.0, axis=1))),
-        close=over_blocks([_close(one.optical_depth, scene) for one in found]),
-        data_share=_median([one.data_share for one in found]),
-        freedom=_median([one.freedom for one in found], over=scene.altitude.size),
+        close=over_blocks([_close(estimates.optical_depth, scene) for estimates in blocks]),
+        data_share=_median([estimates.data_share for estimates in blocks]),
+        freedom=_median([estimates.freedom for estimates in blocks], over=scene.altitude.size),
     )
 
 
 def _median(arrays: Sequence[Array | None], over: int = 1) -> float | None:
-    known = [one.ravel() for one in arrays if one is not None]
+    known = [array.ravel() for array in arrays if array is not None]
     return float(np.nanmedian(np.concatenate(known))) / over if known else None
 
 
@@ -460,26 +467,26 @@ def _priors(size: StudySize) -> Iterator[PriorScore]:
     blocks = range(_published_blocks(size))
     scans = [cases.uniform_scatter(share, size.published, scene, block, 3) for block in blocks]
     for factor in PRIORS:
-        found = [cases.with_prior(scan, factor * truth) for scan in scans]
-        errors = [_mean((one.optical_depth - truth) ** 2) for one in found]
-        data = _median([one.data_share for one in found]) or 0.0
+        results = [cases.with_prior(scan, factor * truth) for scan in scans]
+        errors = [_mean((result.optical_depth - truth) ** 2) for result in results]
+        data = _median([result.data_share for result in results]) or 0.0
         alone = abs(factor - 1.0) * float(np.sqrt(np.mean(truth**2)))
         yield PriorScore(factor, alone, root(over_blocks(errors)), data)
 
 
 def _correlations(size: StudySize) -> Iterator[CorrelationScore]:
-    alone = cases.published_cloud(15.0, CENTRAL[0], cases.uniform_deviation(CENTRAL[1]))
+    scene = cases.published_cloud(15.0, CENTRAL[0], cases.uniform_deviation(CENTRAL[1]))
     for number, correlation in enumerate(CORRELATIONS):
         scans = []
         for block in range(_published_blocks(size)):
             rng = np.random.default_rng((number, block, 4))
-            shape = (size.published, alone.path.size, alone.altitude.size)
-            air = alone.inhomogeneity * cases.correlated(rng, shape, correlation)
-            scans.append(alone.seen(air, rng))
+            shape = (size.published, scene.path.size, scene.altitude.size)
+            air = scene.inhomogeneity * cases.correlated(rng, shape, correlation)
+            scans.append(scene.observe(air, rng))
         for name in (cases.KANO_HAMILTON, "mld 0, discrepancy", cases.MLD_PRIOR, cases.JOINT):
-            found = [cases.scan_methods()[name](scan).optical_depth for scan in scans]
-            squares = [_mean((one - alone.optical_depth) ** 2) for one in found]
-            close = over_blocks([_close(one, alone) for one in found])
+            depths = [cases.scan_methods()[name](scan).optical_depth for scan in scans]
+            squares = [_mean((depth - scene.optical_depth) ** 2) for depth in depths]
+            close = over_blocks([_close(depth, scene) for depth in depths])
             yield CorrelationScore(name, correlation, root(over_blocks(squares)), close)
 
 
@@ -492,22 +499,22 @@ def _outliers(share: float, size: StudySize) -> Iterator[OutlierScore]:
     low = scene.altitude < LOW
     for method, robust in product((cases.KANO_HAMILTON, cases.JOINT), (False, True)):
         results = [cases.retrieve(scan, method, robust=robust) for scan in scans]
-        errors = [one.optical_depth - scene.optical_depth for one in results]
-        stated = [one.optical_depth_standard_error for one in results]
+        errors = [result.optical_depth - scene.optical_depth for result in results]
+        stated = [result.optical_depth_standard_error for result in results]
         pairs = list(zip(errors, stated, strict=True))
-        inside = [over_blocks([_inside(e, s, n) for e, s in pairs]) for n in SIGMAS]
+        inside = [over_blocks([_share_within(e, s, n) for e, s in pairs]) for n in SIGMAS]
         yield OutlierScore(
             way=f"{method}, {'robust' if robust else 'plain'}",
             outliers=share,
             low_rmse=root(over_blocks([_mean(error[:, low] ** 2) for error in errors])),
             rmse=root(over_blocks([_mean(error**2) for error in errors])),
             coverage=(inside[0], inside[1]),
-            flagged=over_blocks([_mean(one.flags.outlier) for one in results]).value,
-            ran=float(np.mean([_ran(one) for one in results])),
+            flagged=over_blocks([_mean(result.flags.outlier) for result in results]).value,
+            ran=float(np.mean([_robust_passes_ran(result) for result in results])),
         )
 
 
-def _ran(result: MultiAngleResult) -> bool:
+def _robust_passes_ran(result: MultiAngleResult) -> bool:
     return any(step.ran and step.step == "robust_passes" for step in result.steps)
 
 
@@ -515,29 +522,29 @@ def _ran(result: MultiAngleResult) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Judged:
+class _SceneCounts:
     """Counts of one quantity of one random scene."""
 
     counts: Mapping[str, float]
     by_flag: Mapping[str, tuple[float, float]]
-    """Values with the flag, and false ones of these."""
+    """Number of values with the flag, and of false ones among these."""
 
 
 def _safety(size: StudySize) -> Iterator[SafetyScore]:
-    judged: dict[tuple[str, str, str], list[_Judged]] = {}
+    groups: dict[tuple[str, str, str], list[_SceneCounts]] = {}
     for calm, count in ((False, size.random), (True, -(-size.random // 4))):
         for seed in range(count):
             scene = cases.random_scene(seed, _SCENE_PROFILES, calm=calm)
             scan = scene.draw(_SCENE_PROFILES, seed, 6)
             for method in (cases.KANO_HAMILTON, cases.JOINT):
                 result = cases.retrieve(scan, method)
-                for quantity, one in _judge(result, scene).items():
+                for quantity, counts in _count_errors(result, scene).items():
                     kind = (CALM if calm else ANY, method, quantity)
-                    judged.setdefault(kind, []).append(one)
-    yield from (_safety_score(kind, scenes) for kind, scenes in judged.items())
+                    groups.setdefault(kind, []).append(counts)
+    yield from (_safety_score(kind, scenes) for kind, scenes in groups.items())
 
 
-def _judge(result: MultiAngleResult, scene: Scene) -> dict[str, _Judged]:
+def _count_errors(result: MultiAngleResult, scene: Scene) -> dict[str, _SceneCounts]:
     return {
         "optical depth": _counts(
             result.optical_depth - scene.optical_depth,
@@ -554,33 +561,33 @@ def _judge(result: MultiAngleResult, scene: Scene) -> dict[str, _Judged]:
     }
 
 
-def _counts(error: Array, random: Array, bound: Array, flags: MultiAngleFlags) -> _Judged:
+def _counts(error: Array, random: Array, bound: Array, flags: MultiAngleFlags) -> _SceneCounts:
     size, doubted, stated = np.abs(error), flags.doubtful(), np.hypot(random, bound)
     valued = np.isfinite(error)
-    # A value without a stated error is false whatever it is.
+    # A value without a stated error counts as false.
     false = valued & ~(size <= FALSE * stated)
-    plain = valued & ~doubted
+    unflagged = valued & ~doubted
     masks = {
         "values": valued,
         "random_only": valued & ~(size <= FALSE * random),
         "false": false,
-        "unflagged": plain,
-        "false_ok": false & plain,
-        "within": plain & (size <= SIGMAS[1] * stated),
+        "unflagged": unflagged,
+        "false_ok": false & unflagged,
+        "within": unflagged & (size <= SIGMAS[1] * stated),
         "needless": valued & doubted & (size <= _NEEDLESS * stated),
     }
     counts = {name: float(mask.sum()) for name, mask in masks.items()}
     counts["profiles"] = float(valued.any(axis=1).sum())
-    counts["false_ok_profiles"] = float((false & plain).any(axis=1).sum())
+    counts["false_ok_profiles"] = float((false & unflagged).any(axis=1).sum())
     by_flag = {}
-    for one in fields(flags):
-        raised = valued & getattr(flags, one.name)
-        by_flag[one.name] = (float(raised.sum()), float((raised & false).sum()))
-    return _Judged(counts, by_flag)
+    for field in fields(flags):
+        raised = valued & getattr(flags, field.name)
+        by_flag[field.name] = (float(raised.sum()), float((raised & false).sum()))
+    return _SceneCounts(counts, by_flag)
 
 
-def _safety_score(kind: tuple[str, str, str], scenes: Sequence[_Judged]) -> SafetyScore:
-    counts = {name: np.array([one.counts[name] for one in scenes]) for name in scenes[0].counts}
+def _safety_score(kind: tuple[str, str, str], scenes: Sequence[_SceneCounts]) -> SafetyScore:
+    counts = {name: np.array([scene.counts[name] for scene in scenes]) for name in scenes[0].counts}
     values = counts["values"]
     return SafetyScore(
         *kind,
@@ -598,7 +605,7 @@ def _safety_score(kind: tuple[str, str, str], scenes: Sequence[_Judged]) -> Safe
     )
 
 
-def _flag_share(name: str, scenes: Sequence[_Judged], values: Array) -> FlagShare:
-    raised, false = np.array([one.by_flag[name] for one in scenes]).T
+def _flag_share(name: str, scenes: Sequence[_SceneCounts], values: Array) -> FlagShare:
+    raised, false = np.array([scene.by_flag[name] for scene in scenes]).T
     share = ratio(false, raised) if raised.sum() else None
     return FlagShare(name, ratio(raised, values).value, share)

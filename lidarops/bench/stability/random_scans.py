@@ -1,4 +1,4 @@
-"""Random scans, and scans of air that is not level."""
+"""Random scans, each with one class of violated assumptions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarops.bench.accuracy import multiangle_cases
 from lidarops.bench.accuracy.multiangle_cases import Scan, Scene
-from lidarops.bench.stability.random_scenes import Failure, Judged
+from lidarops.bench.stability.random_scenes import Failure, ScoredValues
 from lidarops.bench.stability.stiff_cases import Array
 from lidarops.bench.stability.stiff_scans import BITS
 from lidarops.retrieve.multiangle import optical_depth
@@ -19,7 +19,7 @@ from lidarops.retrieve.multiangle import optical_depth
 Random = np.random.Generator
 
 _LARGEST_GRADIENT: Final = 5e-5
-"""m-1, that the retrieval allows for by default."""
+"""m-1, default of the retrieval."""
 
 
 def _level(scene: Scene, _: Random) -> Scene:
@@ -59,12 +59,12 @@ def _with_gaps(scan: Scan, rng: Random) -> Scan:
 
 def _with_overlap(scan: Scan, rng: Random) -> Scan:
     distance = scan.scene.path[:, np.newaxis] * scan.scene.altitude
-    seen = 1.0 - rng.uniform(0.0, 0.2) * np.exp(-distance / rng.uniform(50.0, 1000.0))
-    return replace(scan, signal=scan.signal * seen)
+    overlap = 1.0 - rng.uniform(0.0, 0.2) * np.exp(-distance / rng.uniform(50.0, 1000.0))
+    return replace(scan, signal=scan.signal * overlap)
 
 
 def _with_background(scan: Scan, rng: Random) -> Scan:
-    """Leave a part of the noise of one bin in the background of each beam."""
+    """Add to each beam a background error of a fraction of the noise of one altitude."""
     left = rng.normal(0.0, rng.uniform(0.0, 0.3), (*scan.signal.shape[:2], 1))
     return replace(scan, signal=scan.signal + left * np.sqrt(scan.variance))
 
@@ -77,61 +77,61 @@ _Change = Callable[[Scene, Random], Scene]
 _Damage = Callable[[Scan, Random], Scan]
 
 _ONE_SIDE: Final = (
-    "a scan to one side cannot tell a gradient from optical depth: the declared largest gradient"
-    " has to cover it"
+    "a scan to one side cannot separate a gradient from optical depth; the declared largest"
+    " gradient has to cover it"
 )
 FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
     (Failure("none", satisfied=True), _level, _plain),
     (Failure("gaps", satisfied=True), _level, _with_gaps),
     (Failure("outliers"), _outliers, _plain),
-    (Failure("gradient within what is declared, one side", unseen=_ONE_SIDE), _gradient, _plain),
+    (Failure("gradient within the declared one, one side", unseen=_ONE_SIDE), _gradient, _plain),
     (
-        Failure("gradient up to twice what is declared, one side", unseen=_ONE_SIDE),
+        Failure("gradient up to twice the declared one, one side", unseen=_ONE_SIDE),
         partial(_gradient, times=2.0),
         _plain,
     ),
-    (Failure("gradient up to twice what is declared, two sides"), _two_sided, _plain),
+    (Failure("gradient up to twice the declared one, two sides"), _two_sided, _plain),
     (Failure("extinction that varies along the paths"), _variation, _plain),
     (
-        Failure("overlap error", unseen="it is the same at equal ranges, which nothing compares"),
+        Failure("overlap error", unseen="it is the same at equal ranges, which are not compared"),
         _level,
         _with_overlap,
     ),
-    (Failure("background left in the beams"), _level, _with_background),
+    (Failure("background error of each beam"), _level, _with_background),
     (Failure("everything at once"), _as_drawn, _plain),
 )
 
 
-def judge_scans(cluster: int, profiles: int) -> Iterator[tuple[Judged, int]]:
+def score_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
     """Solve random scans of one geometry, class by class."""
     for number, (failure, change, damage) in enumerate(FAILURES):
         rng = np.random.default_rng((72, cluster, number))
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
         scan = damage(scene.draw(profiles, cluster, number, 72), rng)
-        found = optical_depth.retrieve_optical_depth(
+        result = optical_depth.retrieve_optical_depth(
             scan.signal, scene.zenith_angle, scene.altitude, variance=scan.variance,
             method="joint",
         )  # fmt: skip
-        yield from _judged(failure, scene, found, profiles)
+        yield from _score_quantities(failure, scene, result, profiles)
 
 
-def _judged(
-    failure: Failure, scene: Scene, found: optical_depth.MultiAngleResult, profiles: int
-) -> Iterator[tuple[Judged, int]]:
-    bits = np.asarray(found.quality).copy()
+def _score_quantities(
+    failure: Failure, scene: Scene, result: optical_depth.MultiAngleResult, profiles: int
+) -> Iterator[tuple[ScoredValues, int]]:
+    bits = np.asarray(result.quality).copy()
     for name, bit in BITS.items():
-        bits |= np.where(getattr(found.flags, name), np.int32(bit), np.int32(0))
+        bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
     truth: dict[str, Array] = {
         "optical depth": scene.optical_depth,
         "extinction": np.asarray(scene.extinction),
     }
     for quantity, true in truth.items():
         name = quantity.replace(" ", "_")
-        error: Any = getattr(found, name) - true
+        error: Any = getattr(result, name) - true
         yield (
-            Judged(
-                failure, quantity, error, getattr(found, f"{name}_standard_error"),
-                getattr(found, f"{name}_gradient_error"), bits, doubted=found.flags.doubtful(),
+            ScoredValues(
+                failure, quantity, error, getattr(result, f"{name}_standard_error"),
+                getattr(result, f"{name}_gradient_error"), bits, uncertain=result.flags.doubtful(),
                 solvable=np.isfinite(error),
             ),
             profiles,

@@ -1,4 +1,4 @@
-"""How fast the kernels and methods for scans are, beside reading their inputs."""
+"""Time of the kernels and methods for scans, compared with reading their inputs."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle.vertical import smooth_profile
 
 BEAMS: Final = "make_beams"
-"""Logarithms, their variances and how far the beams reach."""
+"""Logarithms, their variances and the reach of the beams."""
 REGRESS: Final = "regress"
-"""The weighted fit of all altitudes with its scatter, without outliers."""
+"""Weighted fit of all altitudes with estimated scatter, without the robust passes."""
 SMOOTH: Final = "vertical.smooth"
 INPUTS: Final = "read (np.max), signal and variance"
 _BATCHES: Final = (1, 64, 512)
 _QUICK_BATCHES: Final = (1, 64)
 _REPEATS: Final = 5
 _QUICK_REPEATS: Final = 3
-_FEW: Final = 1
+_PEER_PROFILES: Final = 1
+"""Profiles of one call of a peer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +57,13 @@ def measure_scan_kernels(
     quick : bool
         Fewer profiles and repeats.
     date : str
-        When it is run, as it is to be stated.
+        Date of the run, for the report.
     batches : sequence of int, optional
         Profiles of one call.
     repeats : int, optional
-        Counted rounds, of which the least time counts.
+        Timed rounds, of which the least time is taken.
     progress : callable
-        Is given 1 after each batch.
+        Called with 1 after each batch.
     """
     scene = cases.clear(3000.0)
     costs: list[StepCost] = []
@@ -76,9 +77,9 @@ def measure_scan_kernels(
 
 def _costs(scan: Scan, repeats: int) -> Iterator[StepCost]:
     batch = len(scan.signal)
-    # As a caller holds it: an array, not a view of one row.
+    # Callers pass an array, not a view of one row.
     scan = Scan(scan.scene, scan.signal, np.ascontiguousarray(scan.variance))
-    few = min(batch, _FEW)
+    few = min(batch, _PEER_PROFILES)
     ours = _kernels(scan)
     ours |= {name: partial(way, scan) for name, way in cases.scan_methods().items()}
     ours |= {
@@ -93,9 +94,9 @@ def _costs(scan: Scan, repeats: int) -> Iterator[StepCost]:
     times = least_times({**reads, **ours, **others}, repeats)
     read = times[READ] / batch
     for name, seconds in times.items():
-        got = few if name in others else batch
-        each = seconds / got
-        yield StepCost(name, batch, got, 1e9 * each, each / read, name in ours)
+        profiles = few if name in others else batch
+        per_profile = seconds / profiles
+        yield StepCost(name, batch, profiles, 1e9 * per_profile, per_profile / read, name in ours)
 
 
 def _kernels(scan: Scan) -> dict[str, Callable[[], object]]:

@@ -1,4 +1,4 @@
-"""Benchmark of scans: what is simulated, the peers, the figures and the pages."""
+"""Benchmark of scans: simulation, peers, statistics and pages."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ SHORT = multiangle_cases.clear(3000.0, bins=25)
 
 
 @pytest.fixture(scope="module")
-def found():
-    """Return the benchmark of few profiles, and how often it told of progress."""
+def study():
+    """Return the accuracy benchmark with few profiles."""
     steps = []
     scenes = (SHORT, multiangle_cases.cloud())
     with pytest.MonkeyPatch.context() as patch:
@@ -50,7 +50,7 @@ def without_noise(scene):
     return replace(scene, ratio=math.inf, inhomogeneity=0.0, correlation=0.0)
 
 
-# What is simulated ----------------------------------------------------------------------------
+# Simulation -----------------------------------------------------------------------------------
 
 
 def test_without_noise_signals_obey_the_lidar_equation():
@@ -72,13 +72,13 @@ def test_noise_and_scatter_are_as_stated_and_repeat():
     deviation = (scan.signal - clean) / np.sqrt(scan.variance)
     assert deviation.std(axis=0) == pytest.approx(1.0, abs=0.08)
     zenith = clean[0, 0] / np.sqrt(scan.variance[0, 0])
-    # Noise that is the same at all ranges grows with their square.
+    # Constant noise grows with the square of range after range correction.
     assert np.interp(1000.0, scene.altitude, zenith) == pytest.approx(3000.0, rel=0.02)
     air = multiangle_cases.cloud(0.8)
     logarithm = np.log(air.draw(4000, 4).signal / without_noise(air).draw(1, 4).signal)
     assert logarithm.std() == pytest.approx(multiangle_cases.CLOUD_SCATTER, rel=0.01)
-    both = np.mean(logarithm[..., 1:] * logarithm[..., :-1]) / logarithm.var()
-    assert both == pytest.approx(0.8, abs=0.01)
+    lag_one = np.mean(logarithm[..., 1:] * logarithm[..., :-1]) / logarithm.var()
+    assert lag_one == pytest.approx(0.8, abs=0.01)
 
 
 def test_gradient_variation_and_outliers_enter_the_logarithm():
@@ -94,11 +94,11 @@ def test_gradient_variation_and_outliers_enter_the_logarithm():
     scattered = replace(multiangle_cases.cloud(), variation=1.0)
     spread = np.log(scattered.draw(2000, 1).signal).std(axis=0)
     alone = np.log(multiangle_cases.cloud().draw(2000, 1).signal).std(axis=0)
-    # Extinction that varies piles up along the path.
+    # The effect of variable extinction accumulates along the path.
     assert np.all(spread[:, -1] > 1.5 * alone[:, -1])
 
 
-def test_the_published_cloud_is_seen_in_the_middle_of_its_layers():
+def test_the_published_cloud_has_its_altitudes_at_the_centres_of_layers():
     scene = multiangle_cases.published_cloud(15.0, 6, 0.1)
     expected = [0.125, 0.5, 1.125, 2.0, 2.875, 3.5, 3.95, 4.275]
     assert scene.optical_depth == pytest.approx(expected)
@@ -119,7 +119,7 @@ def test_the_published_scatter_is_that_of_a_uniform_error(share):
     assert np.log(ratio).std() == pytest.approx(expected, rel=0.01)
 
 
-def test_random_scenes_cover_what_is_said_of_them():
+def test_random_scenes_cover_the_documented_ranges():
     scenes = [multiangle_cases.random_scene(seed, 2) for seed in range(200)]
     assert {scene.path.size for scene in scenes} == set(range(3, 21))
     assert min(scene.zenith_angle.max() for scene in scenes) < 20.0
@@ -137,7 +137,7 @@ def test_random_scenes_cover_what_is_said_of_them():
     assert not np.array_equal(same.extinction[0], same.extinction[1])
 
 
-# Ways -----------------------------------------------------------------------------------------
+# Methods and peers ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", [SHORT, multiangle_cases.cloud()], ids=lambda scene: scene.label)
@@ -151,7 +151,7 @@ def test_straight_lines_agree_without_noise(scene):
     assert np.abs(weak - ours).max() < 1e-9
 
 
-def test_the_line_and_its_error_are_ours_where_weights_are_known():
+def test_the_line_and_its_error_equal_ours_for_known_weights():
     scene = multiangle_cases.cloud()
     scan = scene.draw(3, 5)
     peer = multiangle_cases.lstsq(scan)
@@ -181,7 +181,7 @@ def test_tikhonov_is_the_published_method_of_order_0():
         robust=False,
         regularisation=Regularisation(0, "fixed", strength),
     )
-    # That of the peer counts in units of the scatter.
+    # The strength of the peer is in units of the scatter.
     peer = multiangle_cases.tikhonov(scan, np.array([strength / scene.inhomogeneity**2]))
     assert np.abs(peer.optical_depth - ours.optical_depth).max() < 1e-6
 
@@ -194,13 +194,13 @@ def test_the_corner_is_where_the_curve_bends():
     assert multiangle_cases._corner(misfit[:1], size[:1]) == 0
 
 
-def test_peers_leave_out_what_they_cannot_see():
+def test_peers_leave_out_samples_in_noise():
     scene = replace(SHORT, ratio=5.0)
     scan = scene.draw(2, 7)
-    found = multiangle_cases.lstsq(scan)
-    seen = (scan.signal > 3.0 * np.sqrt(scan.variance)).sum(axis=1) >= 3
-    assert np.array_equal(np.isfinite(found.optical_depth), seen)
-    assert 0 < seen.sum() < seen.size
+    line = multiangle_cases.lstsq(scan)
+    solvable = (scan.signal > 3.0 * np.sqrt(scan.variance)).sum(axis=1) >= 3
+    assert np.array_equal(np.isfinite(line.optical_depth), solvable)
+    assert 0 < solvable.sum() < solvable.size
 
 
 # Statistics -----------------------------------------------------------------------------------
@@ -227,25 +227,25 @@ def test_false_values_are_counted_with_and_without_flags():
     flags["outlier"][1, 0] = True
     error = np.array([[0.5, 9.0, 5.0, np.nan], [-9.0, 0.1, 0.1, 0.1]])
     bound = np.array([[0.0, 0.0, 3.0, 0.0], [0.0, 0.0, 0.0, np.nan]])
-    judged = multiangle_scores._counts(error, np.ones(shape), bound, MultiAngleFlags(**flags))
-    # Without a stated error, the last one is false.
+    scene = multiangle_scores._counts(error, np.ones(shape), bound, MultiAngleFlags(**flags))
+    # The last value has no stated error and counts as false.
     expected = {"values": 7, "random_only": 3, "false": 3, "unflagged": 6, "false_ok": 2}
     expected |= {"within": 4, "needless": 0, "profiles": 2, "false_ok_profiles": 1}
-    assert judged.counts == expected
-    assert judged.by_flag["undersmoothed"] == (1, 1)
-    assert judged.by_flag["outlier"] == (1, 1)
-    assert judged.by_flag["gradient"] == (0, 0)
+    assert scene.counts == expected
+    assert scene.by_flag["undersmoothed"] == (1, 1)
+    assert scene.by_flag["outlier"] == (1, 1)
+    assert scene.by_flag["gradient"] == (0, 0)
 
 
-# What it finds --------------------------------------------------------------------------------
+# Results --------------------------------------------------------------------------------------
 
 
-def test_every_way_is_judged_in_every_scene(found):
+def test_every_method_is_scored_in_every_scene(study):
     names = [*multiangle_cases.scan_methods(), *multiangle_cases.scan_peers()]
-    for scene in found.scenes:
-        assert [one.way for one in scene.scores] == names
+    for scene in study.scenes:
+        assert [score.way for score in scene.scores] == names
         assert scene.profiles == SMALL.blocks * SMALL.profiles
-        by_way = {one.way: one for one in scene.scores}
+        by_way = {score.way: score for score in scene.scores}
         assert by_way["numpy lstsq"].profiles == SMALL.blocks * SMALL.slow
         line, joint = by_way["kano_hamilton"], by_way["joint"]
         assert line.solved == 1.0
@@ -258,48 +258,48 @@ def test_every_way_is_judged_in_every_scene(found):
         assert by_way["two_angle"].rmse.value > line.rmse.value
         assert by_way["mld 0, discrepancy"].bias.value < 0.0
         assert by_way["mld 0, discrepancy"].data_share < line.data_share == 1.0
-        assert all(one.nanoseconds > 0 for one in scene.scores)
+        assert all(score.nanoseconds > 0 for score in scene.scores)
 
 
-def test_the_published_experiment_is_reproduced(found):
-    def one(way, angle):
-        (score,) = [
-            one
-            for one in found.published
-            if (one.way, one.largest_angle, one.beams, one.share) == (way, angle, 6, 0.25)
+def test_the_published_experiment_is_reproduced(study):
+    def central(way, angle):
+        (only,) = [
+            score
+            for score in study.published
+            if (score.way, score.largest_angle, score.beams, score.share) == (way, angle, 6, 0.25)
         ]
-        return score
+        return only
 
     # Closed form: sigma / (2 sqrt Sxx), sigma / (sqrt 2 (x2 - x1)) for two.
     sigma = multiangle_cases.uniform_deviation(0.25)
     for angle in (15.0, 30.0):
         path = multiangle_cases.published_cloud(angle, 6, sigma).path
         line = sigma / (2.0 * math.sqrt(np.sum((path - path.mean()) ** 2)))
-        assert one("kano_hamilton", angle).rmse.value == pytest.approx(line, rel=0.12)
+        assert central("kano_hamilton", angle).rmse.value == pytest.approx(line, rel=0.12)
         ends = 0.1 / (math.sqrt(2.0) * (path[-1] - path[0]))
-        alone = one(multiangle_scores.TWO_ANGLE_ALONE, angle)
-        assert alone.rmse.value == pytest.approx(ends, rel=0.12)
-    mld = one("mld 0, discrepancy", 15.0)
+        two_angle = central(multiangle_scores.TWO_ANGLE_ALONE, angle)
+        assert two_angle.rmse.value == pytest.approx(ends, rel=0.12)
+    mld = central("mld 0, discrepancy", 15.0)
     assert mld.rmse.value == pytest.approx(2.08, abs=0.25)
     assert mld.top_bias.value < -1.5
     assert mld.data_share < 0.4
-    assert one(multiangle_scores.NOTHING, 15.0).rmse.value == pytest.approx(2.737, abs=0.001)
-    settings = {(p.largest_angle, p.beams, p.share) for p in found.published}
+    assert central(multiangle_scores.NOTHING, 15.0).rmse.value == pytest.approx(2.737, abs=0.001)
+    settings = {(p.largest_angle, p.beams, p.share) for p in study.published}
     assert {(15.0, 4, 0.3), (30.0, 4, 0.2), (60.0, 6, 0.25)} <= settings
 
 
-def test_the_prior_decides_at_15_degrees(found):
-    by_factor = {one.factor: one for one in found.priors}
+def test_the_prior_determines_the_error_at_15_degrees(study):
+    by_factor = {score.factor: score for score in study.priors}
     assert by_factor[1.0].alone == 0.0
     assert by_factor[0.0].alone == pytest.approx(2.737, abs=0.001)
     assert by_factor[1.0].rmse.value < 0.6 * by_factor[0.0].rmse.value
     assert by_factor[1.5].rmse.value > 1.2 * by_factor[1.0].rmse.value
-    alike = {one.way: one for one in found.correlations if one.correlation == 1.0}
-    assert alike["joint"].rmse.value < 0.4 * alike["kano_hamilton"].rmse.value
+    equal = {score.way: score for score in study.correlations if score.correlation == 1.0}
+    assert equal["joint"].rmse.value < 0.4 * equal["kano_hamilton"].rmse.value
 
 
-def test_outliers_hurt_the_plain_method(found):
-    by_way = {(one.way, one.outliers): one for one in found.outliers}
+def test_outliers_hurt_the_plain_method(study):
+    by_way = {(score.way, score.outliers): score for score in study.outliers}
     assert len(by_way) == 4 * len(multiangle_scores.OUTLIERS)
     clean = by_way["kano_hamilton, plain", 0.0]
     assert by_way["kano_hamilton, plain", 0.1].low_rmse.value > 3.0 * clean.low_rmse.value
@@ -309,22 +309,22 @@ def test_outliers_hurt_the_plain_method(found):
     assert by_way["joint, plain", 0.1].ran == 0.0
 
 
-def test_random_scenes_are_counted_whole(found):
-    assert [(one.air, one.way, one.quantity) for one in found.safety] == [
+def test_random_scenes_are_counted_completely(study):
+    assert [(score.air, score.way, score.quantity) for score in study.safety] == [
         (air, way, quantity)
         for air in (multiangle_scores.ANY, multiangle_scores.CALM)
         for way in ("kano_hamilton", "joint")
         for quantity in ("optical depth", "extinction")
     ]
-    for one in found.safety:
-        count = -(-SMALL.random // (4 if one.air == multiangle_scores.CALM else 1))
-        assert one.scenes == count
-        assert one.profiles <= 8 * count
-        assert one.false.value <= one.random_only.value
-        assert one.needless <= one.flagged
-        assert {share.flag for share in one.flags} == {f.name for f in fields(MultiAngleFlags)}
-    both = [one.values for one in found.safety if one.quantity == "optical depth"]
-    assert min(both) > 0
+    for score in study.safety:
+        count = -(-SMALL.random // (4 if score.air == multiangle_scores.CALM else 1))
+        assert score.scenes == count
+        assert score.profiles <= 8 * count
+        assert score.false.value <= score.random_only.value
+        assert score.needless <= score.flagged
+        assert {share.flag for share in score.flags} == {f.name for f in fields(MultiAngleFlags)}
+    values = [score.values for score in study.safety if score.quantity == "optical depth"]
+    assert min(values) > 0
 
 
 def test_times_are_multiples_of_the_read(timed):
@@ -342,9 +342,9 @@ def test_times_are_multiples_of_the_read(timed):
 # Pages ----------------------------------------------------------------------------------------
 
 
-def test_pages_hold_tables_and_figures(found, timed, tmp_path):
+def test_pages_have_tables_and_figures(study, timed, tmp_path):
     reports = {
-        "accuracy": multiangle_report.multiangle_accuracy_report(found, RESULT),
+        "accuracy": multiangle_report.multiangle_accuracy_report(study, RESULT),
         "throughput": multiangle_report.multiangle_throughput_report(timed, RESULT),
     }
     for name, report in reports.items():
@@ -364,34 +364,34 @@ def test_pages_hold_tables_and_figures(found, timed, tmp_path):
     assert len(published.tables) + len(published.details) == 12 + 2
 
 
-def test_results_survive_json(found, timed, tmp_path):
-    for result in (found, timed):
+def test_results_survive_json(study, timed, tmp_path):
+    for result in (study, timed):
         path = results.save(result, tmp_path / RESULT)
         assert results.load(type(result), path) == result
 
 
-def test_both_kinds_run(monkeypatch, found, timed):
-    asked = []
+def test_both_kinds_run(monkeypatch, study, timed):
+    calls = []
 
     def accuracy(**arguments):
-        asked.append(arguments)
-        return found
+        calls.append(arguments)
+        return study
 
     def throughput(**arguments):
-        asked.append(arguments)
+        calls.append(arguments)
         return timed
 
-    monkeypatch.setattr(multiangle_report, "measure", accuracy)
-    monkeypatch.setattr(multiangle_report, "measure_throughput", throughput)
+    monkeypatch.setattr(multiangle_report, "measure_multiangle", accuracy)
+    monkeypatch.setattr(multiangle_report, "measure_scan_kernels", throughput)
     effort = Effort(quick=True, repeats=2, date="2024-01-01")
-    assert multiangle_report.run_multiangle(Kind.ACCURACY, effort=effort).result is found
+    assert multiangle_report.run_multiangle(Kind.ACCURACY, effort=effort).result is study
     assert multiangle_report.run_multiangle(Kind.THROUGHPUT, effort=effort).result is timed
-    assert [one["quick"] for one in asked] == [True, True]
-    assert asked[1]["repeats"] == 2
+    assert [call["quick"] for call in calls] == [True, True]
+    assert calls[1]["repeats"] == 2
 
 
 @pytest.mark.parametrize(
-    ("value", "error", "sign", "said"),
+    ("value", "error", "sign", "text"),
     [
         (2.0817, 0.019, False, "2.08(2)"),
         (-0.0126, 0.0009, True, "-0.0126(9)"),
@@ -399,5 +399,5 @@ def test_both_kinds_run(monkeypatch, found, timed):
         (2.737, 0.0, False, "2.74"),
     ],
 )
-def test_errors_stand_in_the_last_digits(value, error, sign, said):
-    assert multiangle_report.with_error(MonteCarloFigure(value, error), sign=sign) == said
+def test_errors_are_given_in_units_of_the_last_digit(value, error, sign, text):
+    assert multiangle_report.with_error(MonteCarloFigure(value, error), sign=sign) == text
