@@ -95,7 +95,7 @@ def test_only_what_changed_is_opened(campaign: Campaign, store: Store, opened: l
 
 
 @pytest.mark.parametrize("others", [False, True], ids=["empty", "wrong"])
-def test_an_archive_without_any_of_its_files_is_refused_and_nothing_is_forgotten(
+def test_an_archive_without_any_of_its_files_is_refused_and_the_catalog_stays(
     campaign: Campaign, store: Store, tmp_path: Path, *, others: bool
 ) -> None:
     root = _fill(campaign)
@@ -287,7 +287,7 @@ class TestManyFiles:
         assert len(store.granules(status=Status.GOOD)) == 21
         assert "a process was lost" in caplog.text
 
-    def test_leave_no_process_where_nothing_may_be_written(
+    def test_leave_no_process_if_nothing_may_be_written(
         self, campaign: Campaign, store: Store
     ) -> None:
         _fill(campaign, 20)

@@ -87,7 +87,7 @@ def test_a_holder_gives_signs_of_life(url: str, monkeypatch: pytest.MonkeyPatch)
             pytest.fail("no heartbeat came")
 
 
-def test_a_lock_is_waited_for_as_long_as_asked(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_is_waited_for_for_the_given_time(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with Store(url, "test") as store, Lock(store) as first, Lock(store, wait=30.0) as second:
         first.acquire()
         monkeypatch.setattr(lock_module.time, "sleep", lambda _: first.release())
@@ -114,7 +114,7 @@ def test_a_catalog_is_not_made_where_it_is_only_read(tmp_path: Path) -> None:
         Store(f"sqlite:///{tmp_path}/other.sqlite", "test", create=False)
 
 
-def test_what_is_no_url_is_told() -> None:
+def test_an_invalid_url_is_refused() -> None:
     with pytest.raises(CatalogError, match="postgresql"):
         Store("not a url", "test")
 

@@ -48,11 +48,11 @@ def test_choices_of_the_command_line(tmp_path: Path) -> None:
         ("{kind: local, memory: 2}", "memory"),
         ("{kind: scheduler, address: 'head'}", "address"),
         ("[slurm]", "is not a mapping"),
-        ("{kind: slurm, kind: local}", "kind: stands twice, in lines 1 and 1"),
+        ("{kind: slurm, kind: local}", "kind: given twice, in lines 1 and 1"),
         ("{kind: [", "cannot be read"),
     ],
 )
-def test_a_wrong_description_is_told_with_file_and_field(
+def test_a_wrong_description_is_reported_with_file_and_field(
     tmp_path: Path, text: str, told: str
 ) -> None:
     described = tmp_path / "cluster.yaml"
@@ -72,13 +72,13 @@ def test_a_wrong_description_is_told_with_file_and_field(
         ({"cluster": "slurm", "memory": "2GiB"}, "memory_limit: .*of this machine"),
     ],
 )
-def test_a_choice_that_cannot_be_meant_is_wrong_use(choice: dict[str, Any], told: str) -> None:
+def test_a_contradictory_choice_is_wrong_use(choice: dict[str, Any], told: str) -> None:
     with pytest.raises(clusters.ClusterError, match=told) as caught:
         clusters.choose_cluster(**choice)
     assert caught.value.wrong_use
 
 
-def test_a_limit_of_memory_is_of_workers_here(tmp_path: Path) -> None:
+def test_a_memory_limit_applies_to_local_workers(tmp_path: Path) -> None:
     assert clusters.choose_cluster(memory="2GiB") == clusters.Local(memory="2GiB")
     described = tmp_path / "cluster.yaml"
     described.write_text("{kind: local, workers: 3, memory: 1GiB}")
@@ -102,7 +102,7 @@ def test_local_workers_are_processes_of_one_thread_on_loopback() -> None:
         assert threads == "1"
 
 
-def test_a_scheduler_that_is_absent_is_told() -> None:
+def test_an_absent_scheduler_is_reported() -> None:
     address = f"tcp://127.0.0.1:{servers.free_port()}"
     with (
         pytest.raises(clusters.ClusterError, match="no scheduler cluster") as caught,
@@ -274,7 +274,7 @@ def test_kubernetes_workers_are_scaled_up_and_down(api: str) -> None:
     assert FakeApi.seen == [(path, "Bearer secret", 7), (path, "Bearer secret", 0)]
 
 
-def test_kubernetes_that_refuses_is_told(api: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_by_kubernetes_is_reported(api: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeApi, "status", 403)
     with (
         pytest.raises(clusters.ClusterError, match=r"403 .*forbidden: user"),

@@ -65,7 +65,7 @@ class Sink(http.server.BaseHTTPRequestHandler):
         """Say nothing."""
 
 
-def told_of(problem: str) -> bool:
+def notified(problem: str) -> bool:
     return any("lidarops: a run failed" in each and problem in each for each in Sink.posted)
 
 
@@ -101,7 +101,7 @@ RECOVERY = 120.0
 """s from then until the next run is to be completed."""
 
 
-def scheduled_run_fires_and_zombie_is_cleared(
+def scheduled_run_starts_and_dead_run_is_ended(
     site: servers.Site, record_testsuite_property: Any
 ) -> None:
     refused = httpx.post(site.environment["PREFECT_API_URL"] + "/flow_runs/filter", json={})
@@ -148,10 +148,10 @@ def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:
         for told in ("new: lidarops: a run failed", ""):
             said = site.call("flows.notifications", url)
             assert told in said
-        scheduled_run_fires_and_zombie_is_cleared(site, record_testsuite_property)
+        scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         (site.folder / "campaign.yaml").unlink()
         # Prefect needs minutes to heed new automations: what failed first may not be told.
-        servers.wait_until(lambda: told_of("cannot be read"), 300, "nobody was told")
+        servers.wait_until(lambda: notified("cannot be read"), 300, "nobody was told")
         sink.shutdown()
 
 
@@ -163,5 +163,5 @@ def test_on_postgresql(tmp_path: Path, postgresql: str, record_testsuite_propert
         "LIDAROPS_CATALOG": f"postgresql+psycopg://{postgresql}",
     }
     with servers.prefect_site(tmp_path, **urls) as site:
-        scheduled_run_fires_and_zombie_is_cleared(site, record_testsuite_property)
+        scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         assert not (tmp_path / "prefect" / "prefect.db").exists()

@@ -151,7 +151,7 @@ def test_places_that_are_none_are_wrong_use_of_every_flow(
 
 
 @pytest.mark.parametrize("command", [flows.catalog.main, flows.reprocess.main])
-def test_an_archive_that_is_away_is_told_before_any_server_is_started(
+def test_a_missing_archive_is_reported_before_any_server_is_started(
     command: Callable[..., None], campaign_file: Path
 ) -> None:
     (campaign_file.parent / "raw").rename(campaign_file.parent / "away")
@@ -161,7 +161,7 @@ def test_an_archive_that_is_away_is_told_before_any_server_is_started(
     assert "not a folder" in result.output
 
 
-def test_the_scheduled_look_at_a_catalog_waits_for_a_run_and_not_for_the_next_look(
+def test_the_scheduled_catalog_scan_waits_for_a_run_and_not_for_the_next_scan(
     repository: Path,
 ) -> None:
     described = yaml.safe_load((repository / "deploy" / "prefect.yaml").read_text())
@@ -175,7 +175,7 @@ def test_the_scheduled_look_at_a_catalog_waits_for_a_run_and_not_for_the_next_lo
 
 
 @pytest.mark.usefixtures("prefect_server")
-def test_the_flow_of_the_catalog_waits_for_a_run_as_long_as_asked(
+def test_the_catalog_flow_waits_for_a_run_for_the_given_time(
     campaign_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"sqlite:///{campaign_file.parent}/other.sqlite"
@@ -250,7 +250,7 @@ def without_profile(campaign_file: Path) -> None:
 
 
 @pytest.mark.usefixtures("prefect_server")
-def test_a_troubled_night_ends_in_a_state_of_its_own_and_says_what_is_wrong(
+def test_a_run_with_failures_ends_in_its_own_state_and_reports_them(
     campaign_file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     without_profile(campaign_file)
@@ -294,7 +294,7 @@ def test_a_night_without_the_raw_files_of_products_says_which_and_what_to_do(
 
 
 @pytest.mark.usefixtures("prefect_server")
-def test_the_log_of_a_troubled_night_is_bounded(
+def test_the_log_of_a_run_with_failures_is_bounded(
     campaign_file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     for k in range(30):
@@ -305,7 +305,7 @@ def test_the_log_of_a_troubled_night_is_bounded(
     assert "and 11 more files refused" in caplog.text
 
 
-def test_a_night_tells_the_channels_that_no_file_holds(
+def test_a_run_reports_channels_that_no_file_holds(
     campaign_file: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     told = yaml.safe_load(campaign_file.read_text())
@@ -351,7 +351,7 @@ def test_a_run_that_gives_up_is_tried_again_and_one_that_is_stopped_is_not(
     assert process_task.retry_condition_fn(process_task, None, state) == again
 
 
-def test_a_night_with_failures_counts_as_one_that_came() -> None:
+def test_a_run_with_failures_counts_as_completed() -> None:
     within = timedelta(hours=26)
     plain = notifications.automations(uuid4(), within=within)
     assert [each.name for each in plain] == [notifications.FAILED, notifications.ABSENT]

@@ -50,7 +50,7 @@ def test_verify_names_every_file_that_is_not_as_recorded(archive: Archive) -> No
     assert _mismatches(archive) == told | {("signal", "poor/h11")}
 
 
-def test_the_command_line_tells_what_the_ledger_knows(archive: Archive) -> None:
+def test_the_command_line_shows_runs_and_mismatches(archive: Archive) -> None:
     runner, file = CliRunner(), str(archive.file)
     told = runner.invoke(app, ["runs", file, "--json"])
     assert told.exit_code == 0
@@ -67,7 +67,7 @@ def test_the_command_line_tells_what_the_ledger_knows(archive: Archive) -> None:
     assert runner.invoke(app, ["verify", file, "--products-only"]).exit_code == 0
 
 
-def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> None:
+def test_the_command_line_makes_stale_products_and_states_why(archive: Archive) -> None:
     runner, file = CliRunner(), str(archive.file)
     nothing = runner.invoke(app, ["reprocess", file, "--json"])
     # Its elastic retrievals have nothing to rest on, and every run says so.
@@ -96,7 +96,7 @@ def test_the_command_line_makes_what_is_stale_and_says_why(archive: Archive) -> 
 
 
 @pytest.mark.parametrize("command", ["runs", "verify"])
-def test_what_asks_the_ledger_makes_none(command: str, archive: Archive) -> None:
+def test_commands_that_read_the_ledger_create_none(command: str, archive: Archive) -> None:
     """A wrong folder has nothing that is wrong, which is not the same as all being well."""
     elsewhere = archive.folder / "elsewhere"
     asked = CliRunner().invoke(app, [command, str(archive.file), "--out", str(elsewhere)])
@@ -135,7 +135,7 @@ def test_wrong_use_names_the_choices(
 
 
 @pytest.mark.parametrize("command", ["catalog", "plan", "verify"])
-def test_an_archive_that_is_away_is_wrong_use_only_where_it_is_given(
+def test_a_missing_archive_is_wrong_use_only_if_given_as_an_option(
     archive: Archive, command: str
 ) -> None:
     def code(*words: str) -> int:
@@ -147,7 +147,7 @@ def test_an_archive_that_is_away_is_wrong_use_only_where_it_is_given(
     assert code("--archive", str(archive.folder / "away")) == 0
 
 
-def test_a_plan_waits_for_another_run_as_long_as_asked(
+def test_a_plan_waits_for_another_run_for_the_given_time(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def planned(*words: str) -> Result:
@@ -173,7 +173,7 @@ def test_a_size_of_memory_is_read_before_the_archive(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_selection_without_any_scene_is_told_from_one_whose_products_are_fresh(
+def test_a_selection_without_scene_is_reported_unlike_one_with_fresh_products(
     archive: Archive,
 ) -> None:
     def said(*words: str) -> str:
@@ -189,7 +189,7 @@ def test_a_selection_without_any_scene_is_told_from_one_whose_products_are_fresh
         assert none not in fresh
 
 
-def test_a_product_is_made_again_from_raw_files_that_were_moved(
+def test_a_product_is_reproduced_from_moved_raw_files(
     archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def made(product: Path, *words: str) -> tuple[int, str]:

@@ -70,7 +70,9 @@ def test_kills_at_random_points_do_no_damage(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_run_that_is_asked_to_stop_ends_its_scene_and_tells(tmp_path: Path, number: int) -> None:
+def test_a_run_that_gets_a_signal_finishes_its_scene_and_reports(
+    tmp_path: Path, number: int
+) -> None:
     campaign = crash_archive.make(tmp_path)
     process = crash_archive.start(tmp_path, "serial")
     while not list((tmp_path / "out").rglob("*.nc")):
@@ -89,7 +91,7 @@ def test_a_run_that_is_asked_to_stop_ends_its_scene_and_tells(tmp_path: Path, nu
     assert not bring_up_to_date(campaign).troubled
 
 
-def test_temporary_files_of_a_killed_run_are_cleared_away(tmp_path: Path) -> None:
+def test_temporary_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
     campaign = crash_archive.make(tmp_path, scenes=2)
     reprocess(campaign)
     product = next((tmp_path / "out/products").rglob("*.nc"))
@@ -123,7 +125,7 @@ sys.exit(crash_runs.run(Path({folder!r}), "serial"))
 
 
 @pytest.mark.parametrize(("name", "after"), [("fsync", 3), ("replace", 2), ("fsync", 0)])
-def test_a_disk_that_fills_up_is_told_and_the_next_run_recovers(
+def test_a_disk_that_fills_up_is_reported_and_the_next_run_recovers(
     tmp_path: Path, name: str, after: int
 ) -> None:
     calm = tmp_path / "calm"
@@ -161,7 +163,9 @@ def tiny_disk(tmp_path: Path) -> Path:
     subprocess.run(["umount", str(place)], check=False)
 
 
-def test_a_full_file_system_is_told_and_nothing_is_damaged(tmp_path: Path, tiny_disk: Path) -> None:
+def test_a_full_file_system_is_reported_and_nothing_is_damaged(
+    tmp_path: Path, tiny_disk: Path
+) -> None:
     campaign = crash_archive.make(tmp_path, scenes=8).model_copy(update={"output": str(tiny_disk)})
     # Whichever needs the space first: a product, which fails its scene, or the catalog.
     with suppress(CatalogError):
@@ -173,7 +177,7 @@ def test_a_full_file_system_is_told_and_nothing_is_damaged(tmp_path: Path, tiny_
     assert len(list((tiny_disk / "products").rglob("*.nc"))) == 24
 
 
-def test_a_target_that_cannot_be_written_is_told(tmp_path: Path, tiny_disk: Path) -> None:
+def test_a_target_that_cannot_be_written_is_reported(tmp_path: Path, tiny_disk: Path) -> None:
     campaign = crash_archive.make(tmp_path, scenes=2).model_copy(update={"output": str(tiny_disk)})
     subprocess.run(["mount", "-o", "remount,ro", str(tiny_disk)], check=True)
     with pytest.raises(CatalogError, match=r"read-only|unable to open"):

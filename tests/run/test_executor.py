@@ -27,9 +27,9 @@ from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
 from lidarops.run.executor import (
     EndedScene,
     Stop,
-    process_one_by_one,
     local_client,
     process_jobs,
+    process_one_by_one,
 )
 from lidarops.run.session import Session
 from lidarops.run.staleness import Judge
@@ -76,7 +76,7 @@ def test_a_signal_while_workers_start_leaves_no_cluster_behind(
     assert not [each for each in left if each.status is not Status.closed]
 
 
-def test_a_file_that_vanishes_after_the_scan_is_refused_as_such(archive: Archive) -> None:
+def test_a_file_that_vanishes_after_the_scan_is_refused(archive: Archive) -> None:
     campaign = archive.write()
 
     def remove_file(_granules: int) -> None:
@@ -116,7 +116,7 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(
 
 
 @pytest.mark.parametrize("crashed", [1, 4], ids=["one", "all"])
-def test_scenes_that_took_their_process_down_are_tried_in_another(
+def test_scenes_that_killed_their_process_are_tried_in_another(
     archive: Archive, crashed: int
 ) -> None:
     campaign = archive.write()
@@ -141,9 +141,7 @@ def test_scenes_that_took_their_process_down_are_tried_in_another(
         assert [run.status.value for run in store.runs()] == ["finished", "died"]
 
 
-def test_scenes_are_taken_one_by_one_and_never_many_ahead(
-    archive: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_are_consumed_one_by_one(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs = scene_jobs(archive.write()) * 50
     taken = 0
 
@@ -161,7 +159,7 @@ def test_scenes_are_taken_one_by_one_and_never_many_ahead(
     assert len(ended) == len(jobs)
 
 
-def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
+def test_a_cluster_gets_a_few_scenes_at_a_time_whatever_their_number(
     archive: Archive, client: Client
 ) -> None:
     jobs = scene_jobs(archive.write()) * 4
@@ -179,7 +177,7 @@ def test_a_cluster_has_a_few_scenes_at_hand_whatever_their_number(
     assert most <= executor.LEAST_SCENES_AHEAD + 1
 
 
-def test_workers_that_are_gone_for_good_are_not_waited_for(
+def test_lost_local_workers_are_not_waited_for(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaign = archive.write()
@@ -228,7 +226,7 @@ class Begun:
         """Have nothing to give back."""
 
 
-def test_workers_that_come_later_get_scenes_before_one_has_ended(
+def test_workers_that_join_later_get_scenes_before_any_has_ended(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executor, "RECOUNT_INTERVAL", 0.0)
@@ -242,7 +240,7 @@ def test_workers_that_come_later_get_scenes_before_one_has_ended(
     assert len(list(process_jobs(jobs, client=Growing()))) == len(jobs)
 
 
-def test_a_worker_with_other_code_is_named_and_makes_nothing(
+def test_a_worker_with_other_code_makes_nothing(
     archive: Archive, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executor, "code_version", lambda: "newer")
@@ -253,7 +251,7 @@ def test_a_worker_with_other_code_is_named_and_makes_nothing(
     assert not (archive.folder / "out" / "products").exists()
 
 
-def test_a_wish_to_stop_leaves_the_rest_for_the_next_run(archive: Archive) -> None:
+def test_a_request_to_stop_leaves_the_remaining_scenes_for_the_next_run(archive: Archive) -> None:
     campaign = archive.write()
     stop = Stop()
     ended = []
@@ -278,7 +276,7 @@ def test_every_scene_is_entered_as_it_ends(archive: Archive) -> None:
     assert {"digest", "retrieve", "write"} <= set(entered[-1][1].seconds)
 
 
-def test_a_scene_that_may_kill_waits_for_a_worker_that_is_there(
+def test_a_suspect_scene_waits_for_a_running_worker(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     waited: list[float] = []

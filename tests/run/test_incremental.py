@@ -54,7 +54,7 @@ EVERYTHING = _all(range(1, 5)) | _poor(range(1, 5))
 pytestmark = pytest.mark.usefixtures("quickly")
 
 
-def test_a_run_that_is_forced_makes_everything(archive: Archive) -> None:
+def test_a_forced_run_makes_everything(archive: Archive) -> None:
     assert made(reprocess(archive.write(), options=Options(force=True))) == EVERYTHING
 
 
@@ -125,7 +125,7 @@ def _name(archive: Archive) -> None:
         "dead time of a period", "new period", "overlap range", "title", "name",
     ],
 )  # fmt: skip
-def test_exactly_what_depends_on_a_change_is_made_again(
+def test_exactly_the_products_that_depend_on_a_change_are_made_again(
     archive: Archive, change: Callable[[Archive], None], expected: set[str]
 ) -> None:
     change(archive)
@@ -140,7 +140,9 @@ def test_exactly_what_depends_on_a_change_is_made_again(
     assert reprocess(campaign) is None
 
 
-def test_what_is_made_bit_by_bit_is_what_is_made_at_once(archive: Archive, tmp_path: Path) -> None:
+def test_incremental_runs_give_the_products_of_one_full_run(
+    archive: Archive, tmp_path: Path
+) -> None:
     for change in (_lidar_ratio, _sections, _dead_time):
         change(archive)
         reprocess(archive.write())
@@ -199,7 +201,9 @@ def test_new_files_join_their_scene_and_lost_ones_leave_it(archive: Archive) -> 
     assert made(reprocess(archive.write())) == _all(range(1, 2)) | _poor(range(2, 3))
 
 
-def test_products_of_vanished_inputs_are_told_and_kept_until_asked(archive: Archive) -> None:
+def test_products_of_vanished_inputs_are_listed_and_kept_until_removal_is_requested(
+    archive: Archive,
+) -> None:
     for path in (archive.folder / "raw/poor").glob("h1*"):
         path.unlink()
     campaign = archive.write()
@@ -216,7 +220,7 @@ def test_products_of_vanished_inputs_are_told_and_kept_until_asked(archive: Arch
     assert bring_up_to_date(campaign).orphans == ()
 
 
-def test_a_selection_makes_its_part_and_leaves_the_rest_stale(archive: Archive) -> None:
+def test_a_selection_is_made_and_the_rest_stays_stale(archive: Archive) -> None:
     _title(archive)
     campaign = archive.write()
     parts = [
@@ -237,7 +241,7 @@ def _planned(archive: Archive, *options: str) -> dict[str, Any]:
     return dict(json.loads(result.stdout))
 
 
-def test_the_plan_of_a_selection_is_of_its_products(archive: Archive) -> None:
+def test_the_plan_of_a_selection_shows_its_products_only(archive: Archive) -> None:
     archive.write()
     whole = _planned(archive)["estimated_cpu_seconds"]["everything"]
     told = _planned(archive, "--product", "homogeneous")
@@ -256,20 +260,20 @@ def test_the_plan_of_a_selection_is_of_its_products(archive: Archive) -> None:
     assert set(nothing["estimated_cpu_seconds"]["everything"].values()) == {0}
 
 
-def _bins_told(told: dict[str, Any]) -> list[str]:
+def _window_effects(told: dict[str, Any]) -> list[str]:
     steps = [step for scene in told["scenes"] for step in scene["steps"]]
     return [step.get("no_effect", "") for step in steps if step["name"] == "range_window"]
 
 
-def test_a_plan_tells_a_bin_of_no_effect(archive: Archive) -> None:
+def test_a_plan_marks_a_range_window_without_effect(archive: Archive) -> None:
     archive.write()
-    assert _bins_told(_planned(archive)) == ["signal needs all bins"] * 4
-    assert _bins_told(_planned(archive, "--product", "homogeneous")) == [""] * 4
+    assert _window_effects(_planned(archive)) == ["signal needs all bins"] * 4
+    assert _window_effects(_planned(archive, "--product", "homogeneous")) == [""] * 4
     shown = CliRunner().invoke(app, ["plan", str(archive.file)], env={"COLUMNS": "300"})
     assert shown.stdout.count("no effect: signal needs all bins") == 4
 
 
-def test_a_kind_that_nothing_is_asked_for_is_wrong_use(archive: Archive) -> None:
+def test_a_kind_that_nothing_requests_is_wrong_use(archive: Archive) -> None:
     archive.write()
     for command in ("plan", "reprocess"):
         refused = CliRunner().invoke(app, [command, str(archive.file), "--product", "visibility"])
@@ -277,9 +281,7 @@ def test_a_kind_that_nothing_is_asked_for_is_wrong_use(archive: Archive) -> None
         assert "requested: signal, homogeneous, elastic" in refused.stderr
 
 
-def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_products_that_were_never_made_are_not_fresh(archive: Archive, tmp_path: Path) -> None:
     archive.write()
     for kinds in ([], ["--product", "signal"], ["--product", "homogeneous"]):
         told = _planned(archive, "--out", str(tmp_path / "new"), *kinds)
@@ -289,7 +291,7 @@ def test_what_was_never_made_is_not_fresh_and_all_of_it_is_to_be_made(
         assert times["everything"]["all"] > 0
 
 
-def test_a_selection_without_a_scene_is_told_to_people_and_programs(archive: Archive) -> None:
+def test_a_selection_without_scene_is_reported_as_text_and_json(archive: Archive) -> None:
     archive.write()
     said = "the selection contains no scene of the archive"
     for command in ("plan", "reprocess"):
@@ -308,7 +310,7 @@ def test_force_makes_what_is_fresh(archive: Archive) -> None:
     assert archive.contents("out/products") == before
 
 
-def test_refused_files_are_told_by_a_run_with_nothing_to_do(archive: Archive) -> None:
+def test_refused_files_are_reported_by_a_run_with_nothing_to_do(archive: Archive) -> None:
     (archive.folder / "raw/rich/h-broken").write_bytes(b"broken")
     archive.raw("poor/h-twin", 600, seed=1)
     first = bring_up_to_date(archive.write())
@@ -321,7 +323,7 @@ def test_refused_files_are_told_by_a_run_with_nothing_to_do(archive: Archive) ->
     assert archive.contents() == before
 
 
-def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
+def test_unusable_scenes_are_reported_by_a_run_with_nothing_to_do(
     archive: Archive,
 ) -> None:
     campaign = archive.write()
@@ -343,7 +345,7 @@ def test_scenes_without_anything_to_use_are_told_by_a_run_with_nothing_to_do(
     assert again.troubled
 
 
-def test_the_run_in_which_a_scene_comes_to_nothing_says_so(
+def test_the_run_that_makes_an_unusable_scene_reports_it(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def nothing(job: Job) -> tuple[SceneOutcome, bool]:
@@ -366,7 +368,7 @@ def test_the_run_in_which_a_scene_comes_to_nothing_says_so(
     assert told["unusable_scenes"] == ["rich_20260301T000000"]
 
 
-def test_products_that_nothing_asks_for_are_not_told_as_empty(archive: Archive) -> None:
+def test_orphaned_products_are_not_reported_as_unusable(archive: Archive) -> None:
     archive.write()
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
         connection.execute("update product set usable = 0 where kind = 'elastic'")
@@ -410,7 +412,7 @@ def test_a_signal_ends_the_wait_for_a_cluster_at_once(archive: Archive, number: 
     assert archive.contents("out/products") == before
 
 
-def test_a_cluster_is_started_only_where_something_is_stale(archive: Archive) -> None:
+def test_a_cluster_is_started_only_if_something_is_stale(archive: Archive) -> None:
     started = []
 
     @contextmanager
@@ -427,7 +429,7 @@ def test_a_cluster_is_started_only_where_something_is_stale(archive: Archive) ->
         assert started == [True]
 
 
-def test_a_scene_that_cannot_but_fail_is_not_tried_until_something_changes(
+def test_a_scene_that_failed_for_good_is_not_tried_until_something_changes(
     archive: Archive,
 ) -> None:
     (archive.folder / "air.csv").write_text("altitude,pressure\n0,1013\n")
@@ -448,7 +450,7 @@ def test_a_scene_that_cannot_but_fail_is_not_tried_until_something_changes(
     assert healed.status is RunStatus.FINISHED
 
 
-def test_replaced_versions_are_kept_where_the_campaign_says_so(archive: Archive) -> None:
+def test_replaced_versions_are_kept_if_the_campaign_says_so(archive: Archive) -> None:
     archive.tree["superseded"] = "keep"
     assert reprocess(archive.write()) is None
     before = archive.contents("out/products")
@@ -467,13 +469,13 @@ def test_replaced_versions_are_kept_where_the_campaign_says_so(archive: Archive)
     assert archive.contents("out/superseded") == kept
 
 
-def test_a_day_of_more_is_a_day_of_work(archive: Archive) -> None:
+def test_a_new_day_is_processed_alone(archive: Archive) -> None:
     for k in range(3):
         archive.raw(f"rich/h9{k}", 9 * DAY + k, seed=k)
     assert made(reprocess(archive.write())) == _all(range(10, 11))
 
 
-def _judged_anew(archive: Archive) -> dict[int, tuple[str, int, int]]:
+def _expected_verdicts(archive: Archive) -> dict[int, tuple[str, int, int]]:
     """Signature, barren scenes and granules set aside of the days on which all is fresh."""
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
@@ -517,7 +519,7 @@ def _vanished(archive: Archive) -> None:
         path.unlink()
 
 
-def _nothing_asked(archive: Archive) -> None:
+def _nothing_requested(archive: Archive) -> None:
     archive.tree["instruments"]["poor"]["products"] = {}
     _title(archive)
 
@@ -529,20 +531,20 @@ def _dark(archive: Archive) -> None:
 @pytest.mark.parametrize(
     "change",
     [_title, _sections, _lidar_ratio, _dark, _twin, _vanished, _failing, _unreadable_later,
-     _nothing_asked],
+     _nothing_requested],
 )  # fmt: skip
-def test_days_are_settled_as_another_look_would_settle_them(
+def test_days_are_settled_as_a_new_judgement_would_settle_them(
     archive: Archive, change: Callable[[Archive], object]
 ) -> None:
     assert _verdicts(archive)
     change(archive)
     reprocess(archive.write())
-    assert _verdicts(archive) == _judged_anew(archive)
+    assert _verdicts(archive) == _expected_verdicts(archive)
     reprocess(archive.write(), options=Options(force=True))
-    assert _verdicts(archive) == _judged_anew(archive)
+    assert _verdicts(archive) == _expected_verdicts(archive)
 
 
-def test_only_days_on_which_something_failed_are_looked_at_again(
+def test_only_days_with_failures_are_judged_again(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[int] = []
@@ -585,7 +587,7 @@ def _joined(archive: Archive) -> None:
 
 
 @pytest.mark.parametrize("change", [_elsewhere, _without_dark, _joined])
-def test_what_changes_behind_a_scene_leaves_its_day_to_be_looked_at(
+def test_a_change_during_processing_leaves_the_day_unsettled(
     archive: Archive, change: Callable[[Archive], None]
 ) -> None:
     _title(archive)
@@ -598,5 +600,5 @@ def test_what_changes_behind_a_scene_leaves_its_day_to_be_looked_at(
     changed: list[int] = []
     reprocess(archive.write(), options=Options(progress=once))
     assert changed == [1]
-    assert _verdicts(archive).items() <= _judged_anew(archive).items()
+    assert _verdicts(archive).items() <= _expected_verdicts(archive).items()
     assert f"rich {changed[0]} elastic analog" in made(reprocess(archive.write()))

@@ -58,7 +58,7 @@ def _told(archive: Archive) -> dict[str, object]:
     return dict(told)
 
 
-def test_a_file_that_is_used_in_no_scene_is_named_by_every_run(archive: Archive) -> None:
+def test_a_file_in_no_scene_is_named_by_every_run(archive: Archive) -> None:
     archive.raw("poor/h-twin", 600, seed=1)
     archive.write()
     for _ in range(3):
@@ -70,7 +70,7 @@ def test_a_file_that_is_used_in_no_scene_is_named_by_every_run(archive: Archive)
     assert shown.exit_code == 1
 
 
-def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -> None:
+def test_an_empty_scene_is_named_by_every_run(archive: Archive) -> None:
     archive.tree["instruments"]["poor"]["products"] = {
         "homogeneous": {"channels": ["photon_355o"], "sections": [[750, 840]]}
     }
@@ -81,7 +81,7 @@ def test_a_scene_that_can_give_nothing_is_named_by_every_run(archive: Archive) -
         assert all("photon_355o" in why for why in told.values())
 
 
-def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None:
+def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
     """Of a kind that gives nothing no product can tell, and the plans of the others do not."""
     archive.tree["instruments"]["rich"]["products"]["homogeneous"]["sections"] = [[750, 1500]]
     archive.tree["instruments"]["rich"]["products"]["elastic"]["lidar_ratio"] = 42
@@ -103,9 +103,7 @@ def test_a_run_tells_of_products_that_it_does_not_make(archive: Archive) -> None
     assert "the beam climbs 750 m" in (page.parent / "run.json").read_text()
 
 
-def test_a_report_names_scenes_that_can_give_nothing(
-    archive: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_names_empty_scenes(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "MOST_EMPTY_SCENES", 3)
     archive.tree["instruments"]["poor"]["products"] = {
         "homogeneous": {"channels": ["photon_532o"], "sections": [[50_000, 60_000]]}
@@ -162,7 +160,7 @@ def test_a_channel_that_no_file_holds_is_named_by_every_run(
     assert CliRunner().invoke(app, early).exit_code == int(asked == "homogeneous")
 
 
-def test_a_channel_that_came_with_a_new_laser_is_told_and_no_trouble(archive: Archive) -> None:
+def test_a_channel_of_a_new_laser_is_reported_without_failure(archive: Archive) -> None:
     for path in (archive.folder / "raw/rich").glob("h3*"):
         path.write_bytes(path.read_bytes().replace(b"00532.o", b"00533.o"))
     archive.tree["instruments"]["rich"]["facts"][1]["channels"]["photon_533o"] = {"dead_time": 3e-9}
@@ -177,7 +175,7 @@ def test_a_channel_that_came_with_a_new_laser_is_told_and_no_trouble(archive: Ar
     assert not any(each["nowhere"] for each in files.values())
 
 
-def test_of_very_many_days_some_are_told_and_the_rest_counted(
+def test_unused_files_of_some_days_are_named_and_the_others_counted(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for day in range(4):
@@ -207,7 +205,7 @@ def _fail(archive: Archive, scenes: str, *, unmade: bool = False) -> None:
             connection.execute("delete from product where scene like ?", (scenes,))
 
 
-def test_failures_are_forgotten_on_days_with_others_between(archive: Archive) -> None:
+def test_failures_are_removed_on_days_between_others(archive: Archive) -> None:
     _fail(archive, "poor_%")
     for day in (0, 2):
         for path in (archive.folder / "raw/poor").glob(f"h{day}*"):
@@ -219,7 +217,7 @@ def test_failures_are_forgotten_on_days_with_others_between(archive: Archive) ->
     }
 
 
-def test_failures_are_forgotten_with_the_last_trace_of_their_day(archive: Archive) -> None:
+def test_failures_are_removed_with_the_last_files_of_their_day(archive: Archive) -> None:
     archive.tree["instruments"]["rich"]["dark_files"] = "none/d*"
     reprocess(archive.write())
     _fail(archive, "%_20260304T%", unmade=True)
@@ -240,7 +238,7 @@ def _without(archive: Archive, instrument: str) -> None:
         path.unlink()
 
 
-def test_what_is_not_asked_for_is_not_orphaned(archive: Archive) -> None:
+def test_products_outside_the_selection_are_not_orphaned(archive: Archive) -> None:
     _without(archive, "rich")
     _without(archive, "poor")
     archive.raw("other", 0, seed=1)
@@ -273,7 +271,7 @@ def _leave_over(archive: Archive) -> None:
         (FIRST.replace(day=5), None, 0),
     ],
 )
-def test_what_is_left_over_is_told_of_the_scenes_that_are_asked_for(
+def test_leftovers_of_selected_scenes_are_reported(
     archive: Archive, since: datetime, until: datetime | None, number: int
 ) -> None:
     _leave_over(archive)
@@ -310,9 +308,7 @@ def _empty(archive: Archive) -> None:
 
 
 @pytest.mark.parametrize("command", ["catalog", "plan", "reprocess"])
-def test_an_archive_that_holds_nothing_any_more_fails_and_is_not_forgotten(
-    archive: Archive, command: str
-) -> None:
+def test_an_emptied_archive_fails_and_its_catalog_stays(archive: Archive, command: str) -> None:
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
         known = store.granules()
@@ -331,7 +327,7 @@ def test_an_archive_that_holds_nothing_any_more_fails_and_is_not_forgotten(
     assert CliRunner().invoke(app, [command, str(archive.file), *other]).exit_code == 0
 
 
-def test_products_without_a_raw_file_are_a_trouble_until_they_are_removed(
+def test_products_without_raw_file_are_failures_until_they_are_removed(
     archive: Archive,
 ) -> None:
     _without(archive, "poor")
@@ -355,7 +351,7 @@ def test_products_without_a_raw_file_are_a_trouble_until_they_are_removed(
 
 
 @pytest.mark.parametrize("how", ["truncated", "unreadable"])
-def test_products_whose_files_cannot_be_used_any_more_are_kept(archive: Archive, how: str) -> None:
+def test_products_whose_files_became_unusable_are_kept(archive: Archive, how: str) -> None:
     campaign = archive.write()
     before = archive.contents("out/products")
     for path in (archive.folder / "raw/poor").glob("h2*"):
@@ -376,7 +372,7 @@ def test_products_whose_files_cannot_be_used_any_more_are_kept(archive: Archive,
     assert archive.contents("out/products") == before
 
 
-def test_products_of_scenes_that_are_cut_in_another_way_are_not_told_as_lost(
+def test_products_of_scenes_that_are_cut_differently_are_not_reported_as_lost(
     archive: Archive,
 ) -> None:
     archive.tree["scenes"] = {"window": "6h"}
@@ -386,7 +382,7 @@ def test_products_of_scenes_that_are_cut_in_another_way_are_not_told_as_lost(
     assert not found.troubled
 
 
-def test_nothing_is_removed_for_an_archive_that_is_not_there(archive: Archive) -> None:
+def test_nothing_is_removed_if_the_archive_is_missing(archive: Archive) -> None:
     _empty(archive)
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
         # As a catalog was left by what forgot the files of such an archive.
@@ -413,7 +409,7 @@ def _stopped(*_: object, **__: object) -> NoReturn:
 
 @pytest.mark.parametrize(("fails", "code"), [(_full, 1), (_stopped, 130)])
 @pytest.mark.parametrize("as_json", [False, True])
-def test_a_page_that_cannot_be_built_hides_nothing_and_is_asked_for_by_the_next_run(
+def test_a_failed_report_hides_nothing_and_the_next_run_says_how_to_make_it(
     archive: Archive,
     monkeypatch: pytest.MonkeyPatch,
     fails: Callable[..., NoReturn],
@@ -449,7 +445,7 @@ def test_a_page_that_cannot_be_built_hides_nothing_and_is_asked_for_by_the_next_
     assert str(folder) not in shown.stdout
 
 
-def test_a_run_whose_record_could_not_be_kept_says_how_to_get_another(
+def test_a_run_whose_record_could_not_be_saved_says_how_to_get_another(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archive.raw("poor/h09", 630, seed=9)
@@ -467,7 +463,7 @@ def test_a_run_whose_record_could_not_be_kept_says_how_to_get_another(
     assert (shown.exit_code, "--force" in shown.stdout) == (0, False)
 
 
-def test_what_cannot_be_removed_does_not_hide_what_was_made(archive: Archive) -> None:
+def test_a_failed_removal_does_not_hide_the_products(archive: Archive) -> None:
     archive.raw("poor/h09", 630, seed=9)
     _vanish(archive, "poor", 1)
     archive.write()
@@ -489,7 +485,7 @@ def test_what_cannot_be_removed_does_not_hide_what_was_made(archive: Archive) ->
 # Runs and scans ------------------------------------------------------------------------------
 
 
-def test_a_run_whose_process_is_gone_is_told_as_died(archive: Archive) -> None:
+def test_a_run_whose_process_is_gone_is_listed_as_died(archive: Archive) -> None:
     campaign = archive.write()
     with Store(campaign.catalog_url, campaign.name) as store:
         with Lock(store) as lock:
@@ -500,7 +496,7 @@ def test_a_run_whose_process_is_gone_is_told_as_died(archive: Archive) -> None:
         assert [run.status for run in store.runs()] == [RunStatus.DIED, RunStatus.FINISHED]
 
 
-def test_a_file_that_was_there_before_is_not_told_as_moved(archive: Archive) -> None:
+def test_a_known_file_is_not_counted_as_moved(archive: Archive) -> None:
     content = (archive.folder / "raw/poor/h00").read_bytes()
     (archive.folder / "raw/poor/h-copy").write_bytes(content)
     campaign = archive.write()

@@ -99,7 +99,7 @@ def net(tmp_path: Path) -> Net:
 # Barren --------------------------------------------------------------------------------------
 
 
-def test_lidars_that_serve_a_network_alone_are_no_trouble(net: Net) -> None:
+def test_lidars_used_only_by_a_network_are_no_failure(net: Net) -> None:
     for made in (1, 0):
         result = bring_up_to_date(net.write())
         assert (result.record is not None) == bool(made)
@@ -122,20 +122,20 @@ def test_a_plan_of_other_products_has_no_steps(net: Net) -> None:
         assert (len(scene["stale"]), scene["fresh"]) == (int(some), 0)
 
 
-def test_a_lidar_without_its_network_is_told(net: Net) -> None:
+def test_a_lidar_without_its_network_is_reported(net: Net) -> None:
     net.lose("east", "north")
     empty_scenes = bring_up_to_date(net.write()).empty_scenes
     assert list(empty_scenes) == ["west-lidar_20260301T000000"]
     assert "no other instrument has files" in empty_scenes["west-lidar_20260301T000000"]
 
 
-def test_a_network_that_can_give_nothing_is_told_once(net: Net) -> None:
+def test_an_empty_network_is_reported_once(net: Net) -> None:
     net.lose("east")
     assert list(bring_up_to_date(net.write()).empty_scenes) == ["valley_20260301T000000"]
 
 
 @pytest.mark.parametrize("why", ["asked", "alone"])
-def test_a_lidar_that_can_give_nothing_is_told_beside_a_network(net: Net, why: str) -> None:
+def test_an_empty_lidar_is_reported_beside_a_network(net: Net, why: str) -> None:
     lidar = net.tree["instruments"]["west-lidar"]
     if why == "asked":
         lidar["products"] = {"signal": {"channels": ["photon_355o"]}}

@@ -100,7 +100,7 @@ def test_publishing_before_any_run_is_refused(tmp_path: Path, campaign_file: Pat
     assert not (tmp_path / "store").exists()
 
 
-def test_a_product_that_vanished_is_told_before_and_after_it_was_sent(
+def test_a_vanished_product_is_reported_before_and_after_it_was_sent(
     tmp_path: Path, campaign_file: Path
 ) -> None:
     campaign = load_campaign(campaign_file)
@@ -117,7 +117,7 @@ def test_a_product_that_vanished_is_told_before_and_after_it_was_sent(
         assert CliRunner().invoke(app, words).exit_code == 0
 
 
-def test_keys_in_the_url_are_not_told(campaign_file: Path) -> None:
+def test_keys_in_the_url_are_not_shown(campaign_file: Path) -> None:
     campaign = load_campaign(campaign_file)
     assert reprocess(campaign) is not None
     place = f"bucket/{campaign_file.parent.name}"

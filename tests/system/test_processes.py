@@ -95,7 +95,7 @@ class TestEach:
             }
         assert caplog.text.count("a process was lost") == 1
 
-    def test_leaves_none_behind_where_one_is_lost(self, monkeypatch) -> None:
+    def test_leaves_none_behind_if_one_is_lost(self, monkeypatch) -> None:
         before = Future.set_exception
 
         def slowly(future: Future, error: BaseException) -> None:
@@ -142,7 +142,7 @@ class TestEach:
             others = {one for _, one in pool.map_items(process, [1, 2], at_a_time=1)}
         assert (os.getpid() not in others) == (number > 1)
 
-    def test_leaves_no_process_where_who_asks_gives_up(self) -> None:
+    def test_leaves_no_process_if_the_caller_gives_up(self) -> None:
         with pytest.raises(KeyboardInterrupt), Processes(2, 2) as pool:
             _interrupted(pool)
         assert not multiprocessing.active_children()
@@ -207,12 +207,12 @@ if __name__ == "__main__":
 """
 
 
-class TestOneAhead:
+class TestPrefetchOne:
     def test_gives_all_in_order(self) -> None:
         assert list(prefetch_one(range(9))) == list(range(9))
         assert list(prefetch_one([])) == []
 
-    def test_finds_the_next_one_meanwhile_and_no_more(self) -> None:
+    def test_computes_the_next_item_meanwhile_and_no_more(self) -> None:
         begun = [threading.Event() for _ in range(4)]
 
         def found() -> Iterator[int]:
@@ -226,7 +226,7 @@ class TestOneAhead:
         items.close()
         assert not begun[2].is_set()
 
-    def test_raises_in_the_place_of_an_item(self) -> None:
+    def test_raises_the_error_in_place_of_the_item(self) -> None:
         def found() -> Iterator[int]:
             yield 1
             raise CatalogError("is away", file="archive", remedy="wait")
@@ -238,7 +238,7 @@ class TestOneAhead:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks are not safe elsewhere")
-class TestLoadAhead:
+class TestPreloadModules:
     def test_processes_have_the_modules_and_end_with_the_first_one(self, tmp_path: Path) -> None:
         script = tmp_path / "ahead.py"
         script.write_text(AHEAD)
@@ -250,7 +250,7 @@ class TestLoadAhead:
         assert done.returncode == -signal.SIGKILL, done.stderr
         assert _ends(int(done.stdout))
 
-    def test_serves_workers_and_whoever_comes_after_them(self, tmp_path: Path) -> None:
+    def test_serves_workers_and_later_processes(self, tmp_path: Path) -> None:
         script = tmp_path / "workers.py"
         script.write_text(WORKERS)
         done = subprocess.run(
@@ -277,7 +277,7 @@ class TestLater:
             assert [found() for found in begun] == [3 * item for item in range(9)]
 
 
-def test_what_was_there_is_not_swept_and_is_afterwards():
+def test_existing_objects_are_not_collected_within_and_are_afterwards():
     assert gc.get_freeze_count() == 0
     with processes.objects_frozen():
         frozen = gc.get_freeze_count()

@@ -58,7 +58,7 @@ def test_a_web_server_is_scanned_like_a_folder(campaign: Campaign, tmp_path: Pat
     assert digests[0] == digests[1]
 
 
-def test_a_server_that_is_away_ends_the_scan_and_spoils_nothing(campaign: Campaign) -> None:
+def test_a_missing_server_ends_the_scan_and_the_catalog_stays(campaign: Campaign) -> None:
     with Store(campaign.catalog_url, campaign.name) as store:
         scan_archive(campaign, store)
         before = store.granules()
@@ -71,7 +71,7 @@ def test_a_server_that_is_away_ends_the_scan_and_spoils_nothing(campaign: Campai
 @pytest.mark.parametrize(
     ("error", "refused"), [(PermissionError("denied"), 1), (ConnectionResetError("cut"), None)]
 )
-def test_a_file_that_is_denied_is_refused_and_a_lost_connection_is_not_its_fault(
+def test_a_denied_file_is_refused_but_a_lost_connection_ends_the_scan(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch, error: OSError, refused: int | None
 ) -> None:
     head = RemoteStore.head

@@ -54,7 +54,7 @@ def test_publish_sends_what_is_missing_or_changed_and_nothing_else(
     }
 
 
-def test_publish_leaves_strangers_alone_and_counts_them(tmp_path: Path, url: str) -> None:
+def test_publish_leaves_other_objects_alone_and_counts_them(tmp_path: Path, url: str) -> None:
     made = products(tmp_path / "products", a=b"one", b=b"two")
     store = RemoteStore(url)
     store.publish(tmp_path / "products", made, tmp_path / "journal")
@@ -63,7 +63,7 @@ def test_publish_leaves_strangers_alone_and_counts_them(tmp_path: Path, url: str
     assert len(list(store.files())) == 2
 
 
-def test_publish_heals_a_store_that_lost_or_cut_an_object(tmp_path: Path, url: str) -> None:
+def test_publish_repairs_a_store_that_lost_or_cut_an_object(tmp_path: Path, url: str) -> None:
     import fsspec
 
     root, journal = tmp_path / "products", tmp_path / "journal"
@@ -86,7 +86,7 @@ def test_publish_after_a_crash_in_the_journal(tmp_path: Path, url: str) -> None:
     assert store.publish(root, made, journal).uploaded == ()
 
 
-def test_publish_refuses_a_product_that_is_not_the_ledgers(tmp_path: Path, url: str) -> None:
+def test_publish_refuses_a_product_that_differs_from_the_ledger(tmp_path: Path, url: str) -> None:
     made = products(tmp_path, a=b"one")
     (tmp_path / "coast" / "a.nc").write_bytes(b"eno")
     with pytest.raises(ProductError, match="differs from the ledger"):
@@ -170,7 +170,7 @@ def test_unknown_url(unknown: str) -> None:
         RemoteStore(unknown)
 
 
-def test_a_store_that_does_not_answer_is_told(
+def test_a_store_that_does_not_answer_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     s3fs = pytest.importorskip("s3fs")
@@ -203,5 +203,5 @@ def test_a_store_that_does_not_answer_is_told(
         ("no address at all", "no address at all"),
     ],
 )
-def test_keys_are_left_out_of_what_is_told(url: str, told: str) -> None:
+def test_keys_are_left_out_of_messages(url: str, told: str) -> None:
     assert without_keys(url) == told
